@@ -1,0 +1,1 @@
+//! The multimodal causal transformer world model: network, training, inference, checkpoints.

@@ -1,0 +1,1 @@
+//! Proposals, imagining them in any world, choosing one.

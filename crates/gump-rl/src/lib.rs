@@ -1,0 +1,1 @@
+//! A vectorised environment, replay buffers and policy learning.

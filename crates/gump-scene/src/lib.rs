@@ -1,0 +1,49 @@
+//! The vocabulary of traffic: inert values, no I/O, no tensors.
+//!
+//! Read this page first; every other crate speaks these words.
+//!
+//! # Terms
+//! * **agent**: anything that moves, with a box; **ego** is the agent a planner may drive.
+//! * **track**: one agent over time. **Frame**: all agents and lights at one instant.
+//! * **scenario**: recorded traffic, its future included. **Rollout**: imagined traffic.
+//! * **scene state**: what an actor may see, the past and the present, never the future.
+//! * **future**: one of several rollouts of the same scene.
+//! * **lane**, **route**: the road as a directed graph, and the ego's way through it.
+//!
+//! Conventions: SI units, radians counter-clockwise from +x, world frame in f64, an agent's pose
+//! is its **box centre**. An absent agent is absent: there are no validity masks here.
+//!
+//! ```
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 100,0 speed 15
+//!      ego vehicle 0: 10,0 velocity 8,0
+//!      agent vehicle 1: 30,0 velocity 5,0",
+//! ).unwrap();
+//! let scene = scenario.present();
+//! assert_eq!(scene.now().agents().len(), 2);
+//! assert!(scene.map.lanes_near(gump_geometry::dvec2(12.0, 1.0), 2.0).count() == 1);
+//! ```
+
+mod agent;
+pub mod fixture;
+mod frame;
+mod map;
+mod rollout;
+mod route;
+mod scenario;
+mod scene_state;
+mod seed;
+mod tag;
+
+pub use agent::{Agent, AgentId, AgentKind, AgentState};
+pub use frame::{Frame, Light, LightState};
+pub use map::{
+    Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind,
+    RoadLine, RoadLineKind, StopSign,
+};
+pub use rollout::Rollout;
+pub use route::Route;
+pub use scenario::{Scenario, ScenarioError};
+pub use scene_state::SceneState;
+pub use seed::{Rng, Seed};
+pub use tag::ScenarioTag;

@@ -1,0 +1,14 @@
+//! The ego's way through the lane graph.
+
+use gump_geometry::Polyline;
+
+use crate::LaneId;
+
+/// Lanes to follow in order, and the path along their centres.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Route {
+    /// Lanes in driving order; each is a successor or a neighbour of the one before.
+    pub lanes: Vec<LaneId>,
+    /// The path itself, world frame, metres; starts at or behind the ego's present position.
+    pub path: Polyline,
+}

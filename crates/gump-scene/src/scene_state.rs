@@ -1,0 +1,48 @@
+//! What an actor may see.
+
+use std::sync::Arc;
+
+use crate::{Agent, AgentId, Frame, MapGraph, Route};
+
+/// A copyable view of map, route and history; the last frame is now. It holds no future.
+#[derive(Clone, Copy, Debug)]
+pub struct SceneState<'a> {
+    /// The road.
+    pub map: &'a Arc<MapGraph>,
+    /// The ego's route, if one is known.
+    pub route: Option<&'a Arc<Route>>,
+    /// Frames up to now, oldest first, `dt` seconds apart, never empty.
+    pub history: &'a [Frame],
+    /// Which agent is the ego; it is present now.
+    pub ego: AgentId,
+    /// Seconds between frames.
+    pub dt: f64,
+}
+
+impl<'a> SceneState<'a> {
+    /// The present frame.
+    pub fn now(&self) -> &'a Frame {
+        self.history
+            .last()
+            .expect("the history of a scene is never empty")
+    }
+
+    /// The ego now.
+    pub fn ego_now(&self) -> &'a Agent {
+        self.now().agent(self.ego).expect("the ego is present now")
+    }
+
+    /// The history thinned to one frame every `stride`, ending now, at most `n` frames, oldest
+    /// first.
+    pub fn strided_history(&self, stride: usize, n: usize) -> Vec<&'a Frame> {
+        let mut frames: Vec<_> = self
+            .history
+            .iter()
+            .rev()
+            .step_by(stride.max(1))
+            .take(n)
+            .collect();
+        frames.reverse();
+        frames
+    }
+}

@@ -1,0 +1,1 @@
+//! A scene as tokens and back, with its grammar.
