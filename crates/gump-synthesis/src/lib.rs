@@ -1,0 +1,1 @@
+//! Scenarios made up from nothing: procedural roads and rule-driven traffic.
