@@ -1,1 +1,21 @@
 //! Scenarios made up from nothing: procedural roads and rule-driven traffic.
+//!
+//! Free of any recording and of its licence, endless, and the same for the same seed. Start with
+//! [`synthesize`].
+//!
+//! ```
+//! use gump_scene::Seed;
+//! use gump_synthesis::{SynthesisConfig, synthesize};
+//!
+//! let scenario = synthesize(&SynthesisConfig::standard(), Seed(7));
+//! assert_eq!((scenario.log.len(), scenario.now), (91, 10));
+//! assert!(scenario.present().ego_now().length > 0.0);
+//! ```
+
+mod config;
+mod family;
+mod scenario;
+
+pub use config::SynthesisConfig;
+pub use family::RoadFamily;
+pub use scenario::{synthesize, synthesize_many};
