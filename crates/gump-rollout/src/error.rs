@@ -1,0 +1,82 @@
+//! What can go wrong between a world, a policy and the engine.
+
+use gump_scene::AgentId;
+
+/// Why traffic could not be simulated; failures inside a world or a policy come as they are.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RolloutError {
+    /// The duration is not a positive number.
+    #[error("asked to simulate {0} s, expected a positive number of seconds")]
+    Duration(f64),
+    /// The world's time step cannot be divided into steps of the scene.
+    #[error("the world steps by {session} s, which is not a multiple of the scene's {scene} s")]
+    TimeStep {
+        /// Seconds between the frames of the session.
+        session: f64,
+        /// Seconds between the frames of the scene.
+        scene: f64,
+    },
+    /// The scenes of one session do not share a time step.
+    #[error("scenes with time steps of {first} s and {other} s cannot share a session")]
+    MixedTimeSteps {
+        /// Time step of the first scene, seconds.
+        first: f64,
+        /// A time step that differs, seconds.
+        other: f64,
+    },
+    /// Someone answered for more or fewer futures than were asked.
+    #[error("{who} gave {found} answers for {expected} futures")]
+    Count {
+        /// Who answered.
+        who: &'static str,
+        /// Futures in the session.
+        expected: usize,
+        /// Answers received.
+        found: usize,
+    },
+    /// The world lost the ego, so that no policy can drive it.
+    #[error("the world dropped the ego (agent {ego}) from future {future} at step {step}")]
+    EgoVanished {
+        /// The ego.
+        ego: AgentId,
+        /// Which future.
+        future: usize,
+        /// Session steps imagined by then.
+        step: usize,
+    },
+    /// A command to follow nothing.
+    #[error(
+        "a command to follow needs at least one state and a positive time step, got {n} states {dt} s apart"
+    )]
+    Trajectory {
+        /// States given.
+        n: usize,
+        /// Seconds between them.
+        dt: f64,
+    },
+    /// A command or a state that is not a number.
+    #[error("{who} gave a value that is not a finite number")]
+    NotFinite {
+        /// Who gave it.
+        who: &'static str,
+    },
+    /// A slot that the session does not have.
+    #[error("the session has {n} futures, there is none with index {future}")]
+    NoSuchFuture {
+        /// The index asked for.
+        future: usize,
+        /// Futures in the session.
+        n: usize,
+    },
+    /// A scene that a replay does not recognise.
+    #[error("the scene shows no moment of the replayed log \"{0}\"")]
+    ForeignScene(String),
+    /// A parameter outside its range.
+    #[error("the parameter {name} is {value}, expected a positive number")]
+    Parameter {
+        /// Which one.
+        name: &'static str,
+        /// What was given.
+        value: f64,
+    },
+}

@@ -1,0 +1,203 @@
+//! The closed-loop engine: a world, perhaps a policy, and imagined futures out.
+//!
+//! Bringing the world's frames to the scene's rate is `resample`'s business; how traffic moves is
+//! the world's.
+
+use gump_scene::{AgentState, Frame, Rollout, SceneState};
+use rayon::prelude::*;
+
+use crate::resample::resample;
+use crate::{BoxError, Policy, RolloutError, Session, Start, WorldModel, dynamics};
+
+/// How positions are found between the frames of a world that steps more slowly than the scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Interpolation {
+    /// Straight between frames; velocities jump there. What the paper's evaluation does.
+    Linear,
+    /// Cubic Hermite with tangents from finite differences, limited so that it never overshoots.
+    Hermite,
+}
+
+/// How long to simulate and how to bring the frames to the scene's rate.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimulateConfig {
+    /// Seconds to imagine, > 0; rounded to whole steps of the scene.
+    pub seconds: f64,
+    /// Positions between the world's frames.
+    pub interpolation: Interpolation,
+    /// Samples in the centred moving average over history and future; 0 and 1 turn it off, an
+    /// even number counts as the odd one below it.
+    pub smoothing_window: usize,
+    /// True: agents keep their height over the road they are on. False: elevation as the world
+    /// gives it.
+    pub relative_elevation: bool,
+}
+
+impl Default for SimulateConfig {
+    /// 8 s, the horizon of the Waymo Sim Agents Challenge; Hermite, no smoothing, relative
+    /// elevation.
+    fn default() -> Self {
+        Self {
+            seconds: 8.0,
+            interpolation: Interpolation::Hermite,
+            smoothing_window: 0,
+            relative_elevation: true,
+        }
+    }
+}
+
+impl SimulateConfig {
+    /// The post-processing of the paper's Waymo evaluation: linear, smoothed over 9 samples.
+    pub fn compat() -> Self {
+        Self {
+            interpolation: Interpolation::Linear,
+            smoothing_window: 9,
+            ..Self::default()
+        }
+    }
+}
+
+/// Imagines how the scenes go on, one rollout per future, start-major.
+///
+/// Rollouts come at the time step of their scene, whatever the world's own: positions are
+/// interpolated per agent, headings turn the short way, velocities are finite differences. An
+/// agent that is missing in the world's next frame is absent from then on; one that appears does
+/// so at its first frame. Frames of a world that already steps at the scene's rate are kept as
+/// they are, velocities included.
+///
+/// With a `policy`, it acts on all futures before every step *of the world*, on scenes thinned to
+/// that step, and the world takes the ego's next state as final. Without one the world drives.
+///
+/// # Errors
+/// What the world or the policy report, and [`RolloutError`] where they do not fit together.
+pub fn simulate(
+    world: &dyn WorldModel,
+    starts: &[Start<'_>],
+    mut policy: Option<&mut dyn Policy>,
+    config: &SimulateConfig,
+) -> Result<Vec<Rollout>, BoxError> {
+    if !(config.seconds > 0.0 && config.seconds.is_finite()) {
+        return Err(RolloutError::Duration(config.seconds).into());
+    }
+    let mut session = world.open(starts)?;
+    let dt = session.dt();
+    let mut futures = Vec::new();
+    for start in starts {
+        let stride = stride(dt, start.scene.dt)?;
+        let n_samples = (config.seconds / start.scene.dt).round().max(1.0) as usize;
+        let coarse = begin(start.scene, dt, stride);
+        futures.extend((0..start.n_futures).map(|_| Future {
+            scene: start.scene,
+            stride,
+            n_samples,
+            coarse: coarse.clone(),
+        }));
+    }
+    let n_steps = futures.iter().map(|f| f.n_samples.div_ceil(f.stride)).max();
+    for step in 0..n_steps.unwrap_or(0) {
+        let ego = match policy.as_deref_mut() {
+            Some(policy) => Some(decide(policy, &futures, dt, step)?),
+            None => None,
+        };
+        let frames = step_checked(&mut *session, ego.as_deref(), futures.len())?;
+        for (future, frame) in futures.iter_mut().zip(frames) {
+            future.coarse.push(frame);
+        }
+    }
+    Ok(futures
+        .into_par_iter()
+        .map(|future| future.finish(config))
+        .collect())
+}
+
+/// One future in the making, at the time step of the world.
+struct Future<'a> {
+    scene: SceneState<'a>,
+    stride: usize,
+    n_samples: usize,
+    coarse: Rollout,
+}
+
+impl Future<'_> {
+    fn finish(self, config: &SimulateConfig) -> Rollout {
+        let knots = self.coarse.imagined();
+        let samples = resample(self.scene, knots, self.stride, self.n_samples, config);
+        let mut rollout = Rollout::begin(self.scene);
+        for frame in samples {
+            rollout.push(frame);
+        }
+        rollout
+    }
+}
+
+fn stride(session: f64, scene: f64) -> Result<usize, RolloutError> {
+    let ratio = session / scene;
+    let whole = ratio.round();
+    if whole >= 1.0 && (ratio - whole).abs() < 1e-6 {
+        Ok(whole as usize)
+    } else {
+        Err(RolloutError::TimeStep { session, scene })
+    }
+}
+
+/// A rollout at the world's rate: what a policy sees while the world steps.
+fn begin(scene: SceneState<'_>, dt: f64, stride: usize) -> Rollout {
+    if stride == 1 {
+        return Rollout::begin(scene);
+    }
+    let thinned: Vec<Frame> = scene
+        .strided_history(stride, usize::MAX)
+        .into_iter()
+        .cloned()
+        .collect();
+    Rollout::begin(SceneState {
+        history: &thinned,
+        dt,
+        ..scene
+    })
+}
+
+/// Asks the policy and turns its commands into the ego's next states.
+fn decide(
+    policy: &mut dyn Policy,
+    futures: &[Future<'_>],
+    dt: f64,
+    step: usize,
+) -> Result<Vec<AgentState>, BoxError> {
+    let scenes: Vec<_> = futures.iter().map(|future| future.coarse.last()).collect();
+    for (future, scene) in scenes.iter().enumerate() {
+        let ego = scene.ego;
+        if scene.now().agent(ego).is_none() {
+            return Err(RolloutError::EgoVanished { ego, future, step }.into());
+        }
+    }
+    let commands = policy.act(&scenes)?;
+    check_count("the policy", scenes.len(), commands.len())?;
+    let states = scenes
+        .iter()
+        .zip(&commands)
+        .map(|(scene, command)| dynamics::advance(&scene.ego_now().state, command, dt));
+    Ok(states.collect::<Result<_, _>>()?)
+}
+
+fn step_checked(
+    session: &mut (dyn Session + '_),
+    ego: Option<&[AgentState]>,
+    n_futures: usize,
+) -> Result<Vec<Frame>, BoxError> {
+    let frames = session.step(ego)?;
+    check_count("the world", n_futures, frames.len())?;
+    Ok(frames)
+}
+
+fn check_count(who: &'static str, expected: usize, found: usize) -> Result<(), RolloutError> {
+    if expected == found {
+        Ok(())
+    } else {
+        Err(RolloutError::Count {
+            who,
+            expected,
+            found,
+        })
+    }
+}

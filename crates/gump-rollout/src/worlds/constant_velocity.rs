@@ -1,0 +1,52 @@
+//! The simplest world: everyone keeps its velocity.
+
+use gump_scene::{Agent, AgentId, AgentState, Frame};
+
+use super::independent::{Future, Independent};
+use crate::{BoxError, Session, Start, WorldModel};
+
+/// Every agent keeps its velocity and its heading; lights stay as they are. All futures of a scene
+/// are equal.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct ConstantVelocity;
+
+impl WorldModel for ConstantVelocity {
+    fn name(&self) -> &str {
+        "constant-velocity"
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        let open = |start: &Start<'_>, _| {
+            Ok(Coasting {
+                frame: start.scene.now().clone(),
+                ego: start.scene.ego,
+                dt: start.scene.dt,
+            })
+        };
+        Ok(Box::new(Independent::new(starts, Box::new(open))?))
+    }
+}
+
+struct Coasting {
+    frame: Frame,
+    ego: AgentId,
+    dt: f64,
+}
+
+impl Future for Coasting {
+    fn step(&mut self, ego: Option<AgentState>) -> Frame {
+        let agents = self.frame.agents().iter().map(|agent| match ego {
+            Some(state) if agent.id == self.ego => agent.with_state(state),
+            _ => coast(agent, self.dt),
+        });
+        self.frame = Frame::new(agents.collect(), self.frame.lights().to_vec());
+        self.frame.clone()
+    }
+}
+
+/// The agent `dt` seconds later at the same velocity.
+pub(crate) fn coast(agent: &Agent, dt: f64) -> Agent {
+    let mut state = agent.state;
+    state.pose.position += state.velocity * dt;
+    agent.with_state(state)
+}

@@ -1,0 +1,89 @@
+//! A session of futures that do not know of each other, stepped in parallel.
+
+use gump_scene::{AgentState, Frame};
+use rayon::prelude::*;
+
+use crate::{BoxError, RolloutError, Session, Start};
+
+/// One future of a rule-based world.
+pub(crate) trait Future: Send {
+    /// The next frame; `ego` is the ego's state in it, if someone else drives.
+    fn step(&mut self, ego: Option<AgentState>) -> Frame;
+}
+
+/// What opens future `k` of a start.
+pub(crate) type Opener<'a, F> =
+    Box<dyn Fn(&Start<'_>, usize) -> Result<F, RolloutError> + Send + 'a>;
+
+/// Futures side by side. What one does depends on its own state alone, so the number of threads
+/// changes nothing.
+pub(crate) struct Independent<'a, F> {
+    dt: f64,
+    futures: Vec<F>,
+    open: Opener<'a, F>,
+}
+
+impl<'a, F: Future> Independent<'a, F> {
+    /// Opens all futures of `starts`, start-major.
+    ///
+    /// # Errors
+    /// [`RolloutError::MixedTimeSteps`], and what `open` reports.
+    pub(crate) fn new(starts: &[Start<'_>], open: Opener<'a, F>) -> Result<Self, RolloutError> {
+        let dt = starts.first().map_or(0.1, |start| start.scene.dt);
+        let mut futures = Vec::new();
+        for start in starts {
+            check_time_step(dt, start.scene.dt)?;
+            for k in 0..start.n_futures {
+                futures.push(open(start, k)?);
+            }
+        }
+        Ok(Self { dt, futures, open })
+    }
+}
+
+impl<F: Future> Session for Independent<'_, F> {
+    fn dt(&self) -> f64 {
+        self.dt
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        let expected = self.futures.len();
+        if let Some(ego) = ego {
+            let (who, found) = ("the driver of the ego", ego.len());
+            if found != expected {
+                return Err(RolloutError::Count {
+                    who,
+                    expected,
+                    found,
+                }
+                .into());
+            }
+            if !ego.iter().all(AgentState::is_finite) {
+                return Err(RolloutError::NotFinite { who }.into());
+            }
+        }
+        let frames = self
+            .futures
+            .par_iter_mut()
+            .enumerate()
+            .map(|(i, future)| future.step(ego.map(|states| states[i])));
+        Ok(frames.collect())
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        let n = self.futures.len();
+        if future >= n {
+            return Err(RolloutError::NoSuchFuture { future, n }.into());
+        }
+        check_time_step(self.dt, start.scene.dt)?;
+        self.futures[future] = (self.open)(&start, 0)?;
+        Ok(())
+    }
+}
+
+fn check_time_step(first: f64, other: f64) -> Result<(), RolloutError> {
+    if (first - other).abs() > 1e-9 {
+        return Err(RolloutError::MixedTimeSteps { first, other });
+    }
+    Ok(())
+}
