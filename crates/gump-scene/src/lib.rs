@@ -27,6 +27,7 @@
 mod agent;
 pub mod fixture;
 mod frame;
+mod light_index;
 mod map;
 mod rollout;
 mod route;
@@ -37,6 +38,7 @@ mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use frame::{Frame, Light, LightState};
+pub use light_index::{MAX_LIGHTS, light_indices};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind,
     RoadLine, RoadLineKind, StopSign,
