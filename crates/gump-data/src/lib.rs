@@ -1,1 +1,30 @@
-//! Dataset formats in and out, with Scenario in between.
+//! Dataset formats in and out, with [`Scenario`](gump_scene::Scenario) in between.
+//!
+//! The only crate that knows a file layout. What a format states is taken as it is; what it lacks
+//! (lane widths, drivable surfaces, the ego's route) is inferred by one set of rules for all
+//! formats, counted in a [`ReadReport`] and switchable by [`ReadOptions`]. Nothing here simulates,
+//! scores or draws.
+//!
+//! Start with [`open`], which recognises a file by its content, or [`find`], which reads one
+//! scenario by a name like `FILE#3` or `FILE#637f20cafde22ff8`.
+//!
+//! # Terms
+//! * **record**: one scenario's bytes in a file; **place**: which record, at which byte.
+//! * **stated** is what a format says, **inferred** what a reader adds, **dropped** what a reader
+//!   leaves out because [`Scenario`](gump_scene::Scenario) has no room for it or it is unusable.
+//!
+//! A new format is one file beside `womd` and one line in the table of `open`.
+
+mod error;
+mod infer;
+mod open;
+mod record;
+mod stream;
+pub mod tfrecord;
+pub mod womd;
+mod write_atomically;
+
+pub use error::{DataError, Place, Problem};
+pub use open::{Reader, find, open, open_with};
+pub use record::{ReadOptions, ReadReport, ScenarioRecord};
+pub use write_atomically::write_atomically;

@@ -1,0 +1,217 @@
+//! What can be wrong with data, as one enum; sentences put the context first and the path last.
+
+use std::fmt;
+use std::io;
+use std::path::PathBuf;
+
+use gump_scene::{MapError, ScenarioError};
+
+/// Which record of which file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Place {
+    /// Index of the record in its file, from 0.
+    pub record: usize,
+    /// Where the record starts, bytes from the start of the (uncompressed) content.
+    pub offset: u64,
+    /// The file.
+    pub path: PathBuf,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (record, offset) = (self.record, self.offset);
+        write!(
+            f,
+            "record {record} at byte {offset} of {}",
+            self.path.display()
+        )
+    }
+}
+
+/// Why data could not be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// The operating system refused.
+    #[error("could not {doing}: {source}: {}", path.display())]
+    Io {
+        /// What was tried: "open", "read", "create", ...
+        doing: &'static str,
+        /// Its answer.
+        source: io::Error,
+        /// The file.
+        path: PathBuf,
+    },
+    /// There is no such file.
+    #[error("expected a file or directory, found none: {}", path.display())]
+    Missing {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file holds nothing.
+    #[error("expected at least one record, found an empty file: {}", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A directory holds no file of a known kind.
+    #[error("expected files named *.tfrecord*, found none in the directory {}", path.display())]
+    NoFiles {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The content is of no known format.
+    #[error("expected {expected}, found a file that starts with {found}: {}", path.display())]
+    UnknownFormat {
+        /// The formats that would have been understood.
+        expected: String,
+        /// The first bytes found.
+        found: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file ends inside a record.
+    #[error("expected {expected} more bytes of {part}, found {found} before the end: {place}")]
+    Truncated {
+        /// What was being read.
+        part: &'static str,
+        /// Bytes wanted.
+        expected: u64,
+        /// Bytes there.
+        found: u64,
+        /// Where.
+        place: Place,
+    },
+    /// A checksum does not match.
+    #[error("expected checksum {expected:#010x} of {part}, found {found:#010x}: {place}")]
+    Checksum {
+        /// What was checked.
+        part: &'static str,
+        /// The checksum stored in the file.
+        expected: u32,
+        /// The checksum of what was read.
+        found: u32,
+        /// Where.
+        place: Place,
+    },
+    /// A record claims an absurd length.
+    #[error("expected a record of at most {limit} bytes, found a length of {length}: {place}")]
+    TooLong {
+        /// The most that is accepted, bytes.
+        limit: u64,
+        /// The length found, bytes.
+        length: u64,
+        /// Where.
+        place: Place,
+    },
+    /// A record is not the message it should be.
+    #[error("expected a {message} message: {source}: {place}")]
+    Proto {
+        /// The message's name.
+        message: &'static str,
+        /// What the decoder says.
+        source: prost::DecodeError,
+        /// Where.
+        place: Place,
+    },
+    /// A record can be decoded but is not a usable scenario.
+    #[error("scenario {id}: {problem}: {place}")]
+    Scenario {
+        /// The scenario's own id.
+        id: String,
+        /// What is wrong.
+        problem: Problem,
+        /// Where.
+        place: Place,
+    },
+    /// A scenario cannot be expressed in the format to be written.
+    #[error("scenario {id} cannot be written: {problem}")]
+    Unwritable {
+        /// The scenario's id.
+        id: String,
+        /// Why not.
+        problem: String,
+    },
+    /// A name like `FILE#ID` names nothing.
+    #[error("expected a scenario \"{wanted}\", found {found} others: {}", path.display())]
+    NoSuchScenario {
+        /// The index or id asked for.
+        wanted: String,
+        /// How many scenarios there are.
+        found: usize,
+        /// The file or directory.
+        path: PathBuf,
+    },
+}
+
+/// Why a decoded record is not a usable scenario.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum Problem {
+    /// It has no map.
+    #[error("expected a map, found no map feature")]
+    NoMap,
+    /// It has no agents.
+    #[error("expected at least one track, found none")]
+    NoAgents,
+    /// It does not say who the ego is.
+    #[error("expected the index of the ego's track, found none")]
+    NoEgo,
+    /// An index points past the end of its list.
+    #[error("expected {what} below {len}, found {index}")]
+    Index {
+        /// What the index is.
+        what: &'static str,
+        /// Length of the list.
+        len: usize,
+        /// The index found.
+        index: i64,
+    },
+    /// A track has too few or too many states.
+    #[error("expected {expected} states in track {track}, one per time stamp, found {found}")]
+    StateCount {
+        /// The track's id.
+        track: i64,
+        /// Number of time stamps.
+        expected: usize,
+        /// Number of states.
+        found: usize,
+    },
+    /// Traffic lights are given for another number of steps than there are.
+    #[error("expected traffic lights for {expected} steps or none, found {found}")]
+    LightCount {
+        /// Number of time stamps.
+        expected: usize,
+        /// Number of steps with lights.
+        found: usize,
+    },
+    /// Two tracks have one id.
+    #[error("expected unique track ids, found {0} twice")]
+    DuplicateTrack(i64),
+    /// A state that claims to be valid is not a number.
+    #[error("expected finite numbers in track {track} at step {step}, found {field} = {value}")]
+    NotFinite {
+        /// The track's id.
+        track: i64,
+        /// The step.
+        step: usize,
+        /// The first field at fault.
+        field: &'static str,
+        /// What it holds: NaN or an infinity.
+        value: f64,
+    },
+    /// The time stamps are not one time step apart.
+    #[error("expected time stamps {expected} s apart, found {found} s before step {step}")]
+    TimeStep {
+        /// The nominal step, seconds.
+        expected: f64,
+        /// The step found, seconds.
+        found: f64,
+        /// The later step.
+        step: usize,
+    },
+    /// The map is inconsistent.
+    #[error(transparent)]
+    Map(#[from] MapError),
+    /// The result breaks a promise of every scenario.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
+}

@@ -1,0 +1,183 @@
+//! Waymo map features become [`MapParts`]: what they state, nothing inferred.
+
+use std::collections::BTreeSet;
+
+use gump_geometry::{DVec2, Polygon, Polyline, dvec2, dvec3};
+use gump_scene::{
+    Area, AreaKind, Lane, LaneId, LaneKind, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
+    RoadLineKind, StopSign,
+};
+
+use super::proto::{self, FeatureData, LaneType, RoadEdgeType, RoadLineType};
+use crate::{ReadReport, infer};
+
+/// Metres per second in one mile per hour (international mile, exact).
+pub(crate) const METERS_PER_SECOND_IN_MPH: f64 = 0.447_04;
+
+/// Sorts features into parts; features without a shape are dropped and counted.
+///
+pub(crate) fn parts_from_proto(
+    features: &[proto::MapFeature],
+    report: &mut ReadReport,
+) -> MapParts {
+    let mut parts = MapParts::default();
+    for feature in features {
+        let id = feature.id();
+        match &feature.feature_data {
+            Some(FeatureData::Lane(lane)) => parts.lanes.extend(lane_from_proto(id, lane, report)),
+            Some(FeatureData::RoadLine(line)) => {
+                let kind = line_kind(line.r#type());
+                let shape = shape(&line.polyline, "road line without points", report);
+                parts
+                    .road_lines
+                    .extend(shape.map(|(line, elevation)| RoadLine {
+                        id,
+                        kind,
+                        line,
+                        elevation,
+                    }));
+            }
+            Some(FeatureData::RoadEdge(edge)) => {
+                let kind = edge_kind(edge.r#type());
+                let shape = shape(&edge.polyline, "road edge without points", report);
+                parts
+                    .road_edges
+                    .extend(shape.map(|(line, elevation)| RoadEdge {
+                        id,
+                        kind,
+                        line,
+                        elevation,
+                    }));
+            }
+            Some(FeatureData::StopSign(sign)) => {
+                let p = sign.position.unwrap_or_default();
+                parts.stop_signs.push(StopSign {
+                    id,
+                    position: dvec3(p.x(), p.y(), p.z()),
+                    lanes: sign.lane.iter().copied().map(LaneId).collect(),
+                });
+            }
+            Some(FeatureData::Crosswalk(outline)) => {
+                parts
+                    .areas
+                    .extend(area(id, AreaKind::Crosswalk, outline, report));
+            }
+            Some(FeatureData::SpeedBump(outline)) => {
+                parts
+                    .areas
+                    .extend(area(id, AreaKind::SpeedBump, outline, report));
+            }
+            Some(FeatureData::Driveway(outline)) => {
+                parts
+                    .areas
+                    .extend(area(id, AreaKind::Driveway, outline, report));
+            }
+            None => report.drop("map feature of an unknown type", 1),
+        }
+    }
+    count_dead_links(&parts, report);
+    parts
+}
+
+fn lane_from_proto(id: i64, lane: &proto::LaneCenter, report: &mut ReadReport) -> Option<Lane> {
+    report.drop(
+        "boundary segment of a lane",
+        lane.left_boundaries.len() + lane.right_boundaries.len(),
+    );
+    let (centerline, elevation) = shape(&lane.polyline, "lane without points", report)?;
+    Some(Lane {
+        id: LaneId(id),
+        kind: match lane.r#type() {
+            LaneType::Undefined => LaneKind::Undefined,
+            LaneType::Freeway => LaneKind::Freeway,
+            LaneType::SurfaceStreet => LaneKind::SurfaceStreet,
+            LaneType::BikeLane => LaneKind::BikeLane,
+        },
+        centerline,
+        elevation,
+        width: infer::DEFAULT_LANE_WIDTH,
+        speed_limit: Some(lane.speed_limit_mph() * METERS_PER_SECOND_IN_MPH)
+            .filter(|&limit| limit > 0.0 && limit.is_finite()),
+        in_intersection: lane.interpolating(),
+        predecessors: ids(lane.entry_lanes.iter().copied()),
+        successors: ids(lane.exit_lanes.iter().copied()),
+        left_neighbors: ids(lane.left_neighbors.iter().map(|n| n.feature_id())),
+        right_neighbors: ids(lane.right_neighbors.iter().map(|n| n.feature_id())),
+    })
+}
+
+/// Each id once, in the order of first mention: a neighbour may be listed once per stretch.
+fn ids(ids: impl Iterator<Item = i64>) -> Vec<LaneId> {
+    let mut seen = BTreeSet::new();
+    ids.map(LaneId).filter(|id| seen.insert(*id)).collect()
+}
+
+fn shape(
+    points: &[proto::MapPoint],
+    without_points: &'static str,
+    report: &mut ReadReport,
+) -> Option<(Polyline, Vec<f64>)> {
+    let line = Polyline::new(plane(points));
+    if line.is_none() {
+        report.drop(without_points, 1);
+    }
+    Some((line?, points.iter().map(|p| p.z()).collect()))
+}
+
+fn area(
+    id: i64,
+    kind: AreaKind,
+    outline: &proto::Outline,
+    report: &mut ReadReport,
+) -> Option<Area> {
+    let polygon = Polygon::new(plane(&outline.polygon));
+    if polygon.is_none() {
+        report.drop("outline of fewer than 3 points", 1);
+    }
+    let polygon = polygon?;
+    // The polygon may have dropped a closing point.
+    let corners = &outline.polygon[..polygon.ring().len()];
+    Some(Area {
+        id,
+        kind,
+        elevation: corners.iter().map(|p| p.z()).collect(),
+        polygon,
+    })
+}
+
+fn plane(points: &[proto::MapPoint]) -> Vec<DVec2> {
+    points.iter().map(|p| dvec2(p.x(), p.y())).collect()
+}
+
+fn count_dead_links(parts: &MapParts, report: &mut ReadReport) {
+    let known: BTreeSet<LaneId> = parts.lanes.iter().map(|lane| lane.id).collect();
+    let dead = |ids: &[LaneId]| ids.iter().filter(|id| !known.contains(id)).count();
+    for lane in &parts.lanes {
+        let links = dead(&lane.predecessors) + dead(&lane.successors);
+        report.drop("link to a lane that is not in the map", links);
+        let neighbors = dead(&lane.left_neighbors) + dead(&lane.right_neighbors);
+        report.drop("neighbour that is not in the map", neighbors);
+    }
+}
+
+fn line_kind(kind: RoadLineType) -> RoadLineKind {
+    match kind {
+        RoadLineType::Unknown => RoadLineKind::Unknown,
+        RoadLineType::BrokenSingleWhite => RoadLineKind::BrokenSingleWhite,
+        RoadLineType::SolidSingleWhite => RoadLineKind::SolidSingleWhite,
+        RoadLineType::SolidDoubleWhite => RoadLineKind::SolidDoubleWhite,
+        RoadLineType::BrokenSingleYellow => RoadLineKind::BrokenSingleYellow,
+        RoadLineType::BrokenDoubleYellow => RoadLineKind::BrokenDoubleYellow,
+        RoadLineType::SolidSingleYellow => RoadLineKind::SolidSingleYellow,
+        RoadLineType::SolidDoubleYellow => RoadLineKind::SolidDoubleYellow,
+        RoadLineType::PassingDoubleYellow => RoadLineKind::PassingDoubleYellow,
+    }
+}
+
+fn edge_kind(kind: RoadEdgeType) -> RoadEdgeKind {
+    match kind {
+        RoadEdgeType::Unknown => RoadEdgeKind::Unknown,
+        RoadEdgeType::Boundary => RoadEdgeKind::Boundary,
+        RoadEdgeType::Median => RoadEdgeKind::Median,
+    }
+}

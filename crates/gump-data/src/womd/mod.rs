@@ -1,0 +1,80 @@
+//! Waymo Open Motion Dataset: `Scenario` messages in TFRecord files.
+
+mod map;
+pub mod proto;
+mod read;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use prost::Message;
+
+use crate::open::{BoxedSource, Format, Source};
+use crate::tfrecord::{self, TfRecordReader};
+use crate::{DataError, ReadOptions, ScenarioRecord};
+
+pub use read::scenario_from_proto;
+
+pub(crate) const FORMAT: Format = Format {
+    name: "Waymo Open Motion Dataset (TFRecord, plain or gzip)",
+    recognises: tfrecord::is_tfrecord,
+    open,
+};
+
+fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
+    let records = TfRecordReader::open(path.to_path_buf())?;
+    Ok(Box::new(Scenarios {
+        records,
+        options,
+        path: Arc::new(path.to_path_buf()),
+    }))
+}
+
+struct Scenarios {
+    records: TfRecordReader,
+    options: ReadOptions,
+    path: Arc<PathBuf>,
+}
+
+impl Source for Scenarios {
+    fn next_wanted(
+        &mut self,
+        wanted: &mut dyn FnMut(&str) -> bool,
+    ) -> Option<Result<ScenarioRecord, DataError>> {
+        loop {
+            let payload = match self.records.next()? {
+                Ok(payload) => payload,
+                Err(error) => return Some(Err(error)),
+            };
+            let place = payload.place;
+            let proto = match proto::Scenario::decode(payload.bytes.as_slice()) {
+                Ok(proto) => proto,
+                Err(source) => {
+                    let message = "waymo.open_dataset.Scenario";
+                    return Some(Err(DataError::Proto {
+                        message,
+                        source,
+                        place,
+                    }));
+                }
+            };
+            if !wanted(proto.scenario_id()) {
+                continue;
+            }
+            let offset = place.offset;
+            return Some(match scenario_from_proto(&proto, self.options) {
+                Ok((scenario, report)) => Ok(ScenarioRecord {
+                    scenario,
+                    report,
+                    offset,
+                    path: Arc::clone(&self.path),
+                }),
+                Err(problem) => Err(DataError::Scenario {
+                    id: proto.scenario_id().into(),
+                    problem,
+                    place,
+                }),
+            });
+        }
+    }
+}
