@@ -1,0 +1,1 @@
+//! Laws and snapshots of rasters.
