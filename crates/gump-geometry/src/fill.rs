@@ -109,7 +109,9 @@ fn stroke_segment(canvas: &mut Canvas<'_>, a: DVec2, b: DVec2, value: f32) {
     let Some((a, b)) = clip(a, b, canvas.width as f64, canvas.height as f64) else {
         return;
     };
-    let steps = (b - a).abs().max_element().ceil().max(1.0);
+    // A little under one pixel a step: at exactly one, rounding could skip a pixel where the
+    // coordinates are whole numbers.
+    let steps = ((b - a).abs().max_element() * 1.0001).ceil().max(1.0);
     for i in 0..=steps as usize {
         let p = a.lerp(b, i as f64 / steps);
         canvas.set(p.x.floor() as i64, p.y.floor() as i64, value);
@@ -211,6 +213,17 @@ mod tests {
                 .count(),
             0
         );
+    }
+
+    #[test]
+    fn lines_on_pixel_borders_have_no_gaps() {
+        for length in 1..400 {
+            let mut pixels = vec![0.0; 400];
+            let (a, b) = (dvec2(0.0, 0.5), dvec2(f64::from(length), 0.5));
+            stroke_polyline(&mut Canvas::new(&mut pixels, 400, 1), &[b, a], 1.0);
+            let n_set = pixels.iter().filter(|&&v| v > 0.0).count();
+            assert_eq!(n_set, (length + 1).min(400) as usize);
+        }
     }
 
     #[test]
