@@ -62,8 +62,6 @@ fn add(counts: &mut BTreeMap<&'static str, usize>, key: &'static str, n: usize) 
 /// The default fills all of them: planners need routes and drivable surfaces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Links between lanes from end points that meet, where stated links lead nowhere.
-    pub infer_links: bool,
     /// Lane widths from the lines and lanes beside them; otherwise every lane has the default.
     pub infer_widths: bool,
     /// Which lanes lie inside an intersection, from the lanes they cross, fork from and join.
@@ -79,7 +77,6 @@ pub struct ReadOptions {
 impl ReadOptions {
     /// Takes only what a format states.
     pub const STATED: Self = Self {
-        infer_links: false,
         infer_widths: false,
         infer_intersections: false,
         infer_drivable: false,
@@ -87,7 +84,6 @@ impl ReadOptions {
     };
     /// Fills every gap that can be filled.
     pub const ALL: Self = Self {
-        infer_links: true,
         infer_widths: true,
         infer_intersections: true,
         infer_drivable: true,

@@ -1,20 +1,100 @@
 //! What formats leave out, inferred by one set of rules for all of them.
 //!
-//! Every rule looks only at what a [`Scenario`](gump_scene::Scenario) itself holds, so a scenario
-//! that is written and read again is inferred the same.
+//! Every rule looks only at what a [`Scenario`] itself holds, so a scenario that is written and
+//! read again is inferred the same. Start with [`map`] and [`route`].
 
-use gump_scene::{MapParts, Scenario};
+mod drivable;
+mod intersections;
+mod route;
+mod widths;
+
+use std::sync::Arc;
+
+use gump_geometry::{DVec2, distance_to_segment};
+use gump_scene::{LaneKind, MapParts, Scenario};
 
 use crate::{ReadOptions, ReadReport};
 
-/// The width of a lane about which nothing is known, metres.
+/// The width of a lane of this kind about which nothing is known, metres.
 ///
-/// Source: the usual width in the standard drawings for North American streets, 10 to 12 feet;
-/// 3.5 m lies within, and the lanes of the mini scenarios measure so.
-pub(crate) const DEFAULT_LANE_WIDTH: f64 = 3.5;
+/// Source: lanes of 10 to 12 feet (3.0 to 3.7 m) are the rule in AASHTO's "A Policy on Geometric
+/// Design of Highways and Streets"; bicycle lanes of 5 feet (1.5 m) in its "Guide for the
+/// Development of Bicycle Facilities".
+pub(crate) fn default_width(kind: LaneKind) -> f64 {
+    match kind {
+        LaneKind::BikeLane => 1.5,
+        LaneKind::Freeway | LaneKind::SurfaceStreet | LaneKind::Undefined => 3.5,
+    }
+}
 
-/// Fills gaps of a map.
-pub(crate) fn map(_parts: &mut MapParts, _options: ReadOptions, _report: &mut ReadReport) {}
+/// Fills gaps of a map whose lanes still have their default widths.
+pub(crate) fn map(parts: &mut MapParts, options: ReadOptions, report: &mut ReadReport) {
+    if options.infer_intersections {
+        intersections::infer(&mut parts.lanes, report);
+    }
+    if options.infer_widths {
+        widths::infer(parts, report);
+    }
+    if options.infer_drivable && parts.drivable.is_empty() {
+        drivable::infer(parts, report);
+    }
+}
 
-/// Fills in the ego's route.
-pub(crate) fn route(_scenario: &mut Scenario, _options: ReadOptions, _report: &mut ReadReport) {}
+/// Fills in the ego's route if none is stated.
+pub(crate) fn route(scenario: &mut Scenario, options: ReadOptions, report: &mut ReadReport) {
+    if !options.infer_route || scenario.route.is_some() {
+        return;
+    }
+    match route::infer(scenario) {
+        Some(route) => {
+            report.infer("route from the ego's log", 1);
+            scenario.route = Some(Arc::new(route));
+        }
+        None => report.drop("route: the ego's log follows no lane", 1),
+    }
+}
+
+/// The indices of the points that keep a line within `tolerance` metres of its shape, ends
+/// included, in order.
+///
+/// Source: Douglas and Peucker 1973.
+fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
+    let last = points.len().saturating_sub(1);
+    let mut kept = vec![0];
+    let mut spans = vec![(0, last)];
+    while let Some((from, to)) = spans.pop() {
+        let distance = |i: usize| distance_to_segment(points[i], points[from], points[to]);
+        let farthest = (from + 1..to)
+            .map(|i| (i, distance(i)))
+            .max_by(|a, b| a.1.total_cmp(&b.1));
+        match farthest {
+            Some((middle, d)) if d > tolerance => {
+                spans.push((middle, to));
+                spans.push((from, middle));
+            }
+            _ if to > from => kept.push(to),
+            _ => {}
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_geometry::dvec2;
+
+    #[test]
+    fn simplifying_keeps_ends_and_corners() {
+        let corner = [
+            dvec2(0.0, 0.0),
+            dvec2(5.0, 0.01),
+            dvec2(10.0, 0.0),
+            dvec2(10.0, 4.0),
+            dvec2(10.0, 9.0),
+        ];
+        assert_eq!(simplify(&corner, 0.1), [0, 2, 4]);
+        assert_eq!(simplify(&corner[..1], 0.1), [0]);
+        assert_eq!(simplify(&corner, 0.001), [0, 1, 2, 4]);
+    }
+}

@@ -85,17 +85,13 @@ fn lane_from_proto(id: i64, lane: &proto::LaneCenter, report: &mut ReadReport) -
         lane.left_boundaries.len() + lane.right_boundaries.len(),
     );
     let (centerline, elevation) = shape(&lane.polyline, "lane without points", report)?;
+    let kind = lane_kind(lane.r#type());
     Some(Lane {
         id: LaneId(id),
-        kind: match lane.r#type() {
-            LaneType::Undefined => LaneKind::Undefined,
-            LaneType::Freeway => LaneKind::Freeway,
-            LaneType::SurfaceStreet => LaneKind::SurfaceStreet,
-            LaneType::BikeLane => LaneKind::BikeLane,
-        },
+        kind,
         centerline,
         elevation,
-        width: infer::DEFAULT_LANE_WIDTH,
+        width: infer::default_width(kind),
         speed_limit: Some(lane.speed_limit_mph() * METERS_PER_SECOND_IN_MPH)
             .filter(|&limit| limit > 0.0 && limit.is_finite()),
         in_intersection: lane.interpolating(),
@@ -157,6 +153,15 @@ fn count_dead_links(parts: &MapParts, report: &mut ReadReport) {
         report.drop("link to a lane that is not in the map", links);
         let neighbors = dead(&lane.left_neighbors) + dead(&lane.right_neighbors);
         report.drop("neighbour that is not in the map", neighbors);
+    }
+}
+
+fn lane_kind(kind: LaneType) -> LaneKind {
+    match kind {
+        LaneType::Undefined => LaneKind::Undefined,
+        LaneType::Freeway => LaneKind::Freeway,
+        LaneType::SurfaceStreet => LaneKind::SurfaceStreet,
+        LaneType::BikeLane => LaneKind::BikeLane,
     }
 }
 
