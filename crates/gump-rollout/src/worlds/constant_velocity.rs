@@ -16,17 +16,19 @@ impl WorldModel for ConstantVelocity {
     }
 
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
-        let open = |start: &Start<'_>, _| {
-            Ok(Coasting {
+        let open = |start: &Start<'_>| {
+            let future = Coasting {
                 frame: start.scene.now().clone(),
                 ego: start.scene.ego,
                 dt: start.scene.dt,
-            })
+            };
+            Ok(vec![future; start.n_futures])
         };
         Ok(Box::new(Independent::new(starts, Box::new(open))?))
     }
 }
 
+#[derive(Clone)]
 struct Coasting {
     frame: Frame,
     ego: AgentId,

@@ -11,9 +11,8 @@ pub(crate) trait Future: Send {
     fn step(&mut self, ego: Option<AgentState>) -> Frame;
 }
 
-/// What opens future `k` of a start.
-pub(crate) type Opener<'a, F> =
-    Box<dyn Fn(&Start<'_>, usize) -> Result<F, RolloutError> + Send + 'a>;
+/// What opens all futures of a start, in order.
+pub(crate) type Opener<'a, F> = Box<dyn Fn(&Start<'_>) -> Result<Vec<F>, RolloutError> + Send + 'a>;
 
 /// Futures side by side. What one does depends on its own state alone, so the number of threads
 /// changes nothing.
@@ -33,9 +32,7 @@ impl<'a, F: Future> Independent<'a, F> {
         let mut futures = Vec::new();
         for start in starts {
             check_time_step(dt, start.scene.dt)?;
-            for k in 0..start.n_futures {
-                futures.push(open(start, k)?);
-            }
+            futures.extend(open(start)?);
         }
         Ok(Self { dt, futures, open })
     }
@@ -76,7 +73,11 @@ impl<F: Future> Session for Independent<'_, F> {
             return Err(RolloutError::NoSuchFuture { future, n }.into());
         }
         check_time_step(self.dt, start.scene.dt)?;
-        self.futures[future] = (self.open)(&start, 0)?;
+        let only = Start {
+            n_futures: 1,
+            ..start
+        };
+        self.futures.splice(future..=future, (self.open)(&only)?);
         Ok(())
     }
 }

@@ -3,8 +3,10 @@
 //! They step at the time step of the scene they start from.
 
 mod constant_velocity;
+mod idm;
 mod independent;
 mod replay;
 
 pub use constant_velocity::ConstantVelocity;
+pub use idm::{Idm, IdmConfig, idm_acceleration};
 pub use replay::LogReplay;

@@ -61,7 +61,7 @@ impl WorldModel for LogReplay {
     /// [`RolloutError::ForeignScene`] if a scene shows no moment of this log,
     /// [`RolloutError::MixedTimeSteps`] if it has another time step.
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
-        let open = |start: &Start<'_>, _| {
+        let open = |start: &Start<'_>| {
             let (first, other) = (self.scenario.dt, start.scene.dt);
             if (first - other).abs() > 1e-9 {
                 return Err(RolloutError::MixedTimeSteps { first, other });
@@ -69,16 +69,18 @@ impl WorldModel for LogReplay {
             let index = self
                 .locate(start.scene.now())
                 .ok_or_else(|| RolloutError::ForeignScene(self.scenario.id.clone()))?;
-            Ok(Replaying {
+            let future = Replaying {
                 scenario: &self.scenario,
                 index,
                 frame: start.scene.now().clone(),
-            })
+            };
+            Ok(vec![future; start.n_futures])
         };
         Ok(Box::new(Independent::new(starts, Box::new(open))?))
     }
 }
 
+#[derive(Clone)]
 struct Replaying<'a> {
     scenario: &'a Scenario,
     index: usize,

@@ -1,0 +1,152 @@
+//! Reactive traffic: vehicles follow the lane graph by the Intelligent Driver Model.
+//!
+//! Here are the world and its parameters. `law` is the car-following law, `road` and `path` the
+//! way ahead, `obstacles` what stands in it, `driver` one vehicle, `traffic` one future.
+//!
+//! What this world does not do: change lanes, give way to crossing traffic that is not yet in the
+//! corridor, switch lights, or let agents appear or vanish.
+
+mod driver;
+mod law;
+mod obstacles;
+mod path;
+mod road;
+mod traffic;
+
+pub use law::idm_acceleration;
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gump_scene::MapGraph;
+
+use super::independent::Independent;
+use crate::{BoxError, RolloutError, Session, Start, WorldModel};
+use road::Road;
+
+/// Parameters of the law and of the driver around it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct IdmConfig {
+    /// Desired speed where a lane states no limit, metres per second; a vehicle that is faster at
+    /// the start keeps its own.
+    pub target_velocity: f64,
+    /// Gap kept at standstill, metres.
+    pub min_gap: f64,
+    /// Time gap kept to the vehicle ahead, seconds.
+    pub headway: f64,
+    /// Largest acceleration, metres per second squared.
+    pub max_acceleration: f64,
+    /// Comfortable deceleration `b` of the law, metres per second squared, positive.
+    pub max_deceleration: f64,
+    /// How sharply acceleration falls towards the desired speed.
+    pub exponent: f64,
+    /// Braking limit, metres per second squared, positive; the law alone knows none.
+    pub emergency_deceleration: f64,
+    /// How far ahead agents and lights matter, metres.
+    pub look_ahead: f64,
+    /// Vehicles slow down for curves to stay below this, metres per second squared.
+    pub lateral_acceleration: f64,
+}
+
+impl Default for IdmConfig {
+    /// The law of Treiber et al. (2000) with nuPlan's values for its IDM planner. Vehicles may
+    /// brake harder than comfortably, as drivers do (6 m/s², well within dry-road grip), and take
+    /// curves at no more than 3 m/s², a usual comfort bound.
+    fn default() -> Self {
+        Self {
+            target_velocity: 10.0,
+            min_gap: 1.0,
+            headway: 1.5,
+            max_acceleration: 1.0,
+            max_deceleration: 3.0,
+            exponent: 4.0,
+            emergency_deceleration: 6.0,
+            look_ahead: 80.0,
+            lateral_acceleration: 3.0,
+        }
+    }
+}
+
+impl IdmConfig {
+    fn check(&self) -> Result<(), RolloutError> {
+        let fields = [
+            ("target_velocity", self.target_velocity),
+            ("min_gap", self.min_gap),
+            ("headway", self.headway),
+            ("max_acceleration", self.max_acceleration),
+            ("max_deceleration", self.max_deceleration),
+            ("exponent", self.exponent),
+            ("emergency_deceleration", self.emergency_deceleration),
+            ("look_ahead", self.look_ahead),
+            ("lateral_acceleration", self.lateral_acceleration),
+        ];
+        match fields
+            .into_iter()
+            .find(|(_, v)| !(*v > 0.0 && v.is_finite()))
+        {
+            Some((name, value)) => Err(RolloutError::Parameter { name, value }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Reactive traffic by rules.
+///
+/// * A vehicle on a lane follows the lane graph, at forks into a lane drawn from the future's
+///   seed; the ego follows the scene's route. It keeps its place in the lane at first and comes to
+///   the centre as it drives, so nothing jumps. Where the map ends it drives straight on.
+/// * It reacts to any agent whose box reaches into the strip it will sweep, to red lights, and to
+///   yellow ones it can stop for. **Lights keep their present colour.** It slows down for curves
+///   and speed limits.
+/// * A standing vehicle beside its lane is parked and stays. A moving one off every lane brakes
+///   comfortably along its heading.
+/// * Pedestrians, bicycles and everything else keep their velocity.
+///
+/// Source: Treiber, Hennecke and Helbing 2000 for the law; the rest in the spirit of nuPlan's
+/// reactive agents, but updated synchronously.
+#[derive(Debug, Default)]
+pub struct Idm {
+    config: IdmConfig,
+    /// The road prepared last: planners open many sessions on one map.
+    prepared: Mutex<Option<(Arc<MapGraph>, Arc<Road>)>>,
+}
+
+impl Idm {
+    /// Builds the world.
+    ///
+    /// # Errors
+    /// [`RolloutError::Parameter`] if a parameter is not a positive number.
+    pub fn new(config: IdmConfig) -> Result<Self, RolloutError> {
+        config.check()?;
+        Ok(Self {
+            config,
+            prepared: Mutex::default(),
+        })
+    }
+
+    fn road(&self, map: &Arc<MapGraph>) -> Arc<Road> {
+        // The cache holds finished values only, so a panic elsewhere cannot have broken it.
+        let mut prepared = self.prepared.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*prepared {
+            Some((known, road)) if Arc::ptr_eq(known, map) => Arc::clone(road),
+            _ => {
+                let road = Arc::new(Road::new(map));
+                *prepared = Some((Arc::clone(map), Arc::clone(&road)));
+                road
+            }
+        }
+    }
+}
+
+impl WorldModel for Idm {
+    fn name(&self) -> &str {
+        "idm"
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        let open = |start: &Start<'_>| {
+            let road = self.road(start.scene.map);
+            Ok(traffic::open(&self.config, &road, start))
+        };
+        Ok(Box::new(Independent::new(starts, Box::new(open))?))
+    }
+}

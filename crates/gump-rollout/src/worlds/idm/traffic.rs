@@ -1,0 +1,156 @@
+//! One future of reactive traffic: everyone sees the same moment, then everyone moves.
+
+use std::sync::Arc;
+
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rollout, Seed};
+use rayon::prelude::*;
+
+use super::IdmConfig;
+use super::driver::{Driver, Ground, Situation};
+use super::obstacles::Obstacle;
+use super::road::Road;
+use crate::Start;
+use crate::worlds::independent::Future;
+
+/// Opens all futures of a start; what does not depend on chance is worked out once.
+pub(super) fn open<'a>(
+    config: &'a IdmConfig,
+    road: &Arc<Road>,
+    start: &Start<'_>,
+) -> Vec<Traffic<'a>> {
+    let scene = start.scene;
+    let now = scene.now();
+    let ground = Ground {
+        config,
+        road,
+        lights: now.lights(),
+    };
+    let situations: Vec<Situation> = now
+        .agents()
+        .par_iter()
+        .map(|agent| match agent.kind {
+            AgentKind::Vehicle if agent.id == scene.ego => Situation::of_ego(agent, scene, ground),
+            AgentKind::Vehicle => Situation::of(agent, scene, road),
+            _ => Situation::Fixed(Driver::Coast),
+        })
+        .collect();
+    // The ego can be handed back to the world later; it then looks at its route afresh.
+    let origin = Arc::new(Rollout::begin(gump_scene::SceneState {
+        history: &scene.history[scene.history.len() - 1..],
+        ..scene
+    }));
+    (0..start.n_futures)
+        .into_par_iter()
+        .map(|k| {
+            let seed = start.seed.fork(k as u64);
+            let drivers = now
+                .agents()
+                .iter()
+                .zip(&situations)
+                .map(|(agent, situation)| {
+                    situation.decide(agent, ground, driver_seed(seed, agent.id, 0))
+                });
+            Traffic {
+                config,
+                road: Arc::clone(road),
+                origin: Arc::clone(&origin),
+                dt: scene.dt,
+                ego: scene.ego,
+                drivers: drivers.collect(),
+                frame: now.clone(),
+                obstacles: Vec::new(),
+                seed,
+                n_handovers: 0,
+            }
+        })
+        .collect()
+}
+
+/// Every agent draws from its own stream, so that it does not matter who else is there.
+fn driver_seed(seed: Seed, id: AgentId, handover: u64) -> Seed {
+    seed.fork(id.0 as u64).fork(handover)
+}
+
+pub(super) struct Traffic<'a> {
+    config: &'a IdmConfig,
+    road: Arc<Road>,
+    origin: Arc<Rollout>,
+    dt: f64,
+    ego: AgentId,
+    /// One for each agent of the frame, in its order.
+    drivers: Vec<Driver>,
+    frame: Frame,
+    obstacles: Vec<Obstacle>,
+    seed: Seed,
+    n_handovers: u64,
+}
+
+impl Traffic<'_> {
+    /// Gives the wheel to whoever is meant to hold it.
+    fn hand_over(&mut self, driven: bool) {
+        let agents = self.frame.agents();
+        let Ok(i) = agents.binary_search_by_key(&self.ego, |agent| agent.id) else {
+            return;
+        };
+        match (driven, &self.drivers[i]) {
+            (true, _) => self.drivers[i] = Driver::Driven,
+            (false, Driver::Driven) => {
+                let agent = &agents[i];
+                let ground = Ground {
+                    config: self.config,
+                    road: &self.road,
+                    lights: self.frame.lights(),
+                };
+                self.n_handovers += 1;
+                let seed = driver_seed(self.seed, agent.id, self.n_handovers);
+                self.drivers[i] = if agent.kind == AgentKind::Vehicle {
+                    let mut scene = self.origin.at(0);
+                    let history = std::slice::from_ref(&self.frame);
+                    scene.history = history;
+                    Situation::of_ego(agent, scene, ground).decide(agent, ground, seed)
+                } else {
+                    Driver::Coast
+                };
+            }
+            (false, _) => {}
+        }
+    }
+}
+
+impl Future for Traffic<'_> {
+    fn step(&mut self, ego: Option<AgentState>) -> Frame {
+        self.hand_over(ego.is_some());
+        let ground = Ground {
+            config: self.config,
+            road: &self.road,
+            lights: self.frame.lights(),
+        };
+        // Others see the ego where it will be: its next state is already decided.
+        let seen = |agent: &Agent| match ego {
+            Some(state) if agent.id == self.ego => agent.with_state(state),
+            _ => *agent,
+        };
+        self.obstacles.clear();
+        self.obstacles.extend(
+            self.frame
+                .agents()
+                .iter()
+                .map(|agent| Obstacle::new(&seen(agent))),
+        );
+        let mut agents = Vec::with_capacity(self.drivers.len());
+        for (i, (agent, driver)) in self
+            .frame
+            .agents()
+            .iter()
+            .zip(&mut self.drivers)
+            .enumerate()
+        {
+            agents.push(match ego {
+                Some(state) if agent.id == self.ego => agent.with_state(state),
+                _ => agent.with_state(driver.step(agent, &self.obstacles, i, ground, self.dt)),
+            });
+        }
+        self.frame = Frame::new(agents, self.frame.lights().to_vec());
+        self.frame.clone()
+    }
+}
