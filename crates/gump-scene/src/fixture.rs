@@ -340,6 +340,8 @@ mod tests {
         assert_eq!(scene.route.unwrap().path.length(), 150.0);
         assert!(scene.map.is_drivable(dvec2(5.0, 0.0)) && !scene.map.is_drivable(dvec2(5.0, 9.0)));
         assert_eq!(scene.map.elevation_at(dvec2(0.0, 0.0)), Some(0.0));
+        let nearest = scene.map.nearest_road_edges(dvec2(50.0, 1.0)).next();
+        assert_eq!(nearest, Some((0, 0, 3.0)));
     }
 
     #[test]

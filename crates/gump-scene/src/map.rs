@@ -189,6 +189,7 @@ pub struct MapGraph {
     parts: MapParts,
     by_id: BTreeMap<LaneId, usize>,
     lane_segments: SegmentIndex<(usize, usize)>,
+    edge_segments: SegmentIndex<(usize, usize)>,
     elevation_points: PointIndex,
     elevations: Vec<f64>,
 }
@@ -233,6 +234,13 @@ impl MapGraph {
                 .map(move |(segment, (a, b))| (a, b, (lane, segment)))
         });
         let lane_segments = SegmentIndex::new(lane_segments.collect::<Vec<_>>());
+        let edge_segments = parts.road_edges.iter().enumerate().flat_map(|(edge, e)| {
+            e.line
+                .segments()
+                .enumerate()
+                .map(move |(segment, (a, b))| (a, b, (edge, segment)))
+        });
+        let edge_segments = SegmentIndex::new(edge_segments.collect::<Vec<_>>());
         let heights = || {
             let lanes = parts
                 .lanes
@@ -256,6 +264,7 @@ impl MapGraph {
         Ok(Self {
             by_id,
             lane_segments,
+            edge_segments,
             elevation_points,
             elevations,
             parts,
@@ -303,6 +312,17 @@ impl MapGraph {
     /// Borders of the drivable surface.
     pub fn road_edges(&self) -> &[RoadEdge] {
         &self.parts.road_edges
+    }
+
+    /// Segments of road edges as (index into [`MapGraph::road_edges`], index of the segment,
+    /// distance in metres), nearest first, lazily.
+    pub fn nearest_road_edges(
+        &self,
+        point: DVec2,
+    ) -> impl Iterator<Item = (usize, usize, f64)> + '_ {
+        self.edge_segments
+            .nearest(point)
+            .map(|((edge, segment), distance)| (edge, segment, distance))
     }
 
     /// Crosswalks, bumps, driveways, stop lines, intersections.
