@@ -143,6 +143,11 @@ pub enum DataError {
     },
 }
 
+/// The largest number accepted in a state or a map, in SI units.
+///
+/// Map projections stay below 2e7 m (half the circumference of the Earth); more is damage.
+pub(crate) const MAX_COORDINATE: f64 = 1e8;
+
 /// Why a decoded record is not a usable scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Problem {
@@ -186,16 +191,32 @@ pub enum Problem {
     /// Two tracks have one id.
     #[error("expected unique track ids, found {0} twice")]
     DuplicateTrack(i64),
-    /// A state that claims to be valid is not a number.
-    #[error("expected finite numbers in track {track} at step {step}, found {field} = {value}")]
-    NotFinite {
+    /// A state that claims to be valid is not a number, or beyond any place on Earth.
+    #[error(
+        "expected numbers within {MAX_COORDINATE} in track {track} at step {step}, \
+         found {field} = {value}"
+    )]
+    State {
         /// The track's id.
         track: i64,
         /// The step.
         step: usize,
         /// The first field at fault.
         field: &'static str,
-        /// What it holds: NaN or an infinity.
+        /// What it holds.
+        value: f64,
+    },
+    /// A map coordinate is not a number, or beyond any place on Earth.
+    #[error(
+        "expected coordinates within {MAX_COORDINATE} m in map feature {feature}, \
+         found {value} at point {point}"
+    )]
+    MapPoint {
+        /// The feature's id.
+        feature: i64,
+        /// Index of the point.
+        point: usize,
+        /// What it holds.
         value: f64,
     },
     /// The time stamps are not one time step apart.
@@ -208,6 +229,9 @@ pub enum Problem {
         /// The later step.
         step: usize,
     },
+    /// Imagined futures do not fit their scenario.
+    #[error("{0}")]
+    Rollouts(String),
     /// The map is inconsistent.
     #[error(transparent)]
     Map(#[from] MapError),

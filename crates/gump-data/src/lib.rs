@@ -17,14 +17,19 @@
 
 mod error;
 mod infer;
+mod inspect;
 mod open;
 mod record;
 mod stream;
+pub mod submission;
 pub mod tfrecord;
+mod verify;
 pub mod womd;
 mod write_atomically;
 
 pub use error::{DataError, Place, Problem};
+pub use inspect::{Summary, inspect};
 pub use open::{Reader, find, open, open_with};
 pub use record::{ReadOptions, ReadReport, ScenarioRecord};
+pub use verify::{Finding, Severity, Verification, verify};
 pub use write_atomically::write_atomically;

@@ -13,6 +13,9 @@ use crate::ReadReport;
 const TOLERANCE: f64 = 0.05;
 /// Metres between two cross sections at most: road edges bend where lanes are straight.
 const SPACING: f64 = 4.0;
+/// At most so many cross sections between two corners of a lane: a damaged file may claim lanes
+/// around the world.
+const MAX_SECTIONS: f64 = 1000.0;
 /// A strip up to this wide between a lane and the road edge is shoulder or parking bay: a parked
 /// car (2 m) and room for its door.
 const MAX_SHOULDER: f64 = 3.0;

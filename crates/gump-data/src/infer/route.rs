@@ -142,20 +142,36 @@ fn changes_into(map: &MapGraph, from: &Lane, to: &Lane) -> Option<LaneId> {
 /// The lanes strictly between two lanes along the shortest chain of links of at most
 /// [`MAX_LINKS`]; `None` if there is no such chain.
 fn chain(map: &MapGraph, from: LaneId, to: LaneId) -> Option<Vec<LaneId>> {
-    let mut paths = vec![vec![from]];
+    let mut seen = vec![(from, from)];
+    let mut level = 0..1;
     for _ in 0..MAX_LINKS {
-        let mut longer = Vec::new();
-        for path in &paths {
-            for next in map.successors(path[path.len() - 1]) {
+        for i in level.clone() {
+            let lane = seen[i].0;
+            for next in map.successors(lane) {
                 if next.id == to {
-                    return Some(path[1..].to_vec());
+                    return Some(way_back(&seen, from, lane));
                 }
-                longer.push(path.iter().copied().chain([next.id]).collect());
+                if seen.iter().all(|(id, _)| *id != next.id) {
+                    seen.push((next.id, lane));
+                }
             }
         }
-        paths = longer;
+        level = level.end..seen.len();
     }
     None
+}
+
+/// The lanes after `from` up to and including `last`, given every lane's predecessor.
+fn way_back(seen: &[(LaneId, LaneId)], from: LaneId, last: LaneId) -> Vec<LaneId> {
+    let mut way = Vec::new();
+    let mut lane = last;
+    while lane != from {
+        way.push(lane);
+        let before = seen.iter().find(|(id, _)| *id == lane);
+        lane = before.map_or(from, |(_, before)| *before);
+    }
+    way.reverse();
+    way
 }
 
 /// A lane of the route and where it is entered: at its start, or beside the sample where the

@@ -17,6 +17,8 @@ use crate::ReadReport;
 const MAX_REACH: f64 = 4.0;
 /// Metres between two measurements along a lane.
 const SPACING: f64 = 5.0;
+/// At most so many measurements per lane: a damaged file may claim lanes around the world.
+const MAX_MEASUREMENTS: f64 = 200.0;
 /// How far a bound may stray for speed, metres; far less than lines are wide.
 const TOLERANCE: f64 = 0.02;
 /// A bound must lie this much across rather than along the lane (cosine of 45 degrees).
@@ -84,7 +86,7 @@ fn bounds(parts: &MapParts) -> Bounds {
 /// The median width over the places where both sides are bounded.
 fn width(lane: &Lane, neighbors: &[Vec<&Lane>; 2], bounds: &Bounds) -> Option<f64> {
     let length = lane.centerline.length();
-    let n = (length / SPACING).ceil().max(1.0) as usize;
+    let n = (length / SPACING).ceil().clamp(1.0, MAX_MEASUREMENTS) as usize;
     let mut widths: Vec<f64> = (0..n)
         .map(|i| {
             lane.centerline

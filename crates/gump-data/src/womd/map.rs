@@ -9,20 +9,24 @@ use gump_scene::{
 };
 
 use super::proto::{self, FeatureData, LaneType, RoadEdgeType, RoadLineType};
-use crate::{ReadReport, infer};
+use crate::error::MAX_COORDINATE;
+use crate::{Problem, ReadReport, infer};
 
 /// Metres per second in one mile per hour (international mile, exact).
 pub(crate) const METERS_PER_SECOND_IN_MPH: f64 = 0.447_04;
 
 /// Sorts features into parts; features without a shape are dropped and counted.
 ///
+/// Error: [`Problem::MapPoint`].
+///
 pub(crate) fn parts_from_proto(
     features: &[proto::MapFeature],
     report: &mut ReadReport,
-) -> MapParts {
+) -> Result<MapParts, Problem> {
     let mut parts = MapParts::default();
     for feature in features {
         let id = feature.id();
+        check_points(feature)?;
         match &feature.feature_data {
             Some(FeatureData::Lane(lane)) => parts.lanes.extend(lane_from_proto(id, lane, report)),
             Some(FeatureData::RoadLine(line)) => {
@@ -76,7 +80,32 @@ pub(crate) fn parts_from_proto(
         }
     }
     count_dead_links(&parts, report);
-    parts
+    Ok(parts)
+}
+
+fn check_points(feature: &proto::MapFeature) -> Result<(), Problem> {
+    let points = match &feature.feature_data {
+        Some(FeatureData::Lane(lane)) => &lane.polyline,
+        Some(FeatureData::RoadLine(line)) => &line.polyline,
+        Some(FeatureData::RoadEdge(edge)) => &edge.polyline,
+        Some(FeatureData::StopSign(sign)) => &sign.position.into_iter().collect(),
+        Some(FeatureData::Crosswalk(o) | FeatureData::SpeedBump(o) | FeatureData::Driveway(o)) => {
+            &o.polygon
+        }
+        None => return Ok(()),
+    };
+    for (point, p) in points.iter().enumerate() {
+        let sound = |value: &f64| value.abs() <= MAX_COORDINATE;
+        if let Some(value) = [p.x(), p.y(), p.z()].into_iter().find(|v| !sound(v)) {
+            let feature = feature.id();
+            return Err(Problem::MapPoint {
+                feature,
+                point,
+                value,
+            });
+        }
+    }
+    Ok(())
 }
 
 fn lane_from_proto(id: i64, lane: &proto::LaneCenter, report: &mut ReadReport) -> Option<Lane> {

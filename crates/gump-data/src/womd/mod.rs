@@ -3,6 +3,8 @@
 mod map;
 pub mod proto;
 mod read;
+mod write;
+mod write_map;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,6 +16,7 @@ use crate::tfrecord::{self, TfRecordReader};
 use crate::{DataError, ReadOptions, ScenarioRecord};
 
 pub use read::scenario_from_proto;
+pub use write::{scenario_to_proto, write_scenarios};
 
 pub(crate) const FORMAT: Format = Format {
     name: "Waymo Open Motion Dataset (TFRecord, plain or gzip)",

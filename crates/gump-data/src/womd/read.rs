@@ -12,6 +12,7 @@ use gump_scene::{
 
 use super::map;
 use super::proto::{self, ObjectType, SignalState};
+use crate::error::MAX_COORDINATE;
 use crate::{Problem, ReadOptions, ReadReport, infer};
 
 /// Time stamps may stray from the nominal step by this fraction: Waymo's clocks drift by up to
@@ -34,7 +35,7 @@ pub fn scenario_from_proto(
     check_tracks(proto)?;
     let dt = time_step(&proto.timestamps_seconds)?;
     let ego = ego(proto)?;
-    let mut parts = map::parts_from_proto(&proto.map_features, &mut report);
+    let mut parts = map::parts_from_proto(&proto.map_features, &mut report)?;
     let log = frames(proto, &mut report)?;
     infer::map(&mut parts, options, &mut report);
     let map = Arc::new(gump_scene::MapGraph::new(parts)?);
@@ -173,8 +174,9 @@ fn agent(track: &proto::Track, state: &proto::ObjectState, step: usize) -> Resul
         ("velocity_x", state.velocity_x().into()),
         ("velocity_y", state.velocity_y().into()),
     ];
-    if let Some(&(field, value)) = fields.iter().find(|(_, value)| !value.is_finite()) {
-        return Err(Problem::NotFinite {
+    let sound = |value: f64| value.abs() <= MAX_COORDINATE;
+    if let Some(&(field, value)) = fields.iter().find(|(_, value)| !sound(*value)) {
+        return Err(Problem::State {
             track: track.id().into(),
             step,
             field,
