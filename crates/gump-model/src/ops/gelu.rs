@@ -1,0 +1,112 @@
+//! The exact (error function) GELU.
+//!
+//! What lives here: the fused operation. The error function follows Abramowitz and Stegun 7.1.26
+//! (absolute error 1.5e-7), whose exponential is the normal density that the gradient needs.
+
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
+
+use super::gemm::wide;
+use super::rows::{exp, for_pieces};
+use super::{Host, elements, fusible, gradient, output};
+
+/// Elements per task.
+const PIECE: usize = 16 * 1024;
+
+/// `x` times the standard normal probability of being below `x`; any shape.
+///
+/// Error: none beyond candle's own.
+pub fn gelu(x: &Tensor) -> Result<Tensor> {
+    if !fusible(&[x]) {
+        return x.gelu_erf();
+    }
+    x.contiguous()?.apply_op1(Gelu)
+}
+
+struct Gelu;
+
+impl CustomOp1 for Gelu {
+    fn name(&self) -> &'static str {
+        "gelu"
+    }
+
+    fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let x = elements(x, layout)?;
+        let mut y = vec![0.0; x.len()];
+        for_pieces(&mut y, PIECE, |i, y| {
+            let x = &x[i * PIECE..];
+            wide(
+                #[inline(always)]
+                || {
+                    for (y, &x) in y.iter_mut().zip(x) {
+                        *y = x * normal(x).0;
+                    }
+                },
+            );
+        });
+        Ok(output(y, layout.shape()))
+    }
+
+    fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+        let dy = dy.contiguous()?;
+        let (x_host, dy) = (Host::new(x)?, Host::new(&dy)?);
+        let (x_all, dy) = (x_host.slice::<f32>()?, dy.slice::<f32>()?);
+        let mut dx = vec![0.0; x_all.len()];
+        for_pieces(&mut dx, PIECE, |i, dx| {
+            let (x, dy) = (&x_all[i * PIECE..], &dy[i * PIECE..]);
+            wide(
+                #[inline(always)]
+                || {
+                    for ((dx, &x), &dy) in dx.iter_mut().zip(x).zip(dy) {
+                        let (below, density) = normal(x);
+                        *dx = dy * (below + x * density);
+                    }
+                },
+            );
+        });
+        Ok(Some(gradient(dx, x)?))
+    }
+}
+
+/// The standard normal distribution at `x`: probability of being below, and density.
+#[inline(always)]
+fn normal(x: f32) -> (f32, f32) {
+    const RECIPROCAL_SQRT_TAU: f32 = 0.398_942_3;
+    let bell = exp(-0.5 * x * x);
+    let z = x.abs() * std::f32::consts::FRAC_1_SQRT_2;
+    let t = 1.0 / (1.0 + 0.327_591_1 * z);
+    let mut p = 1.061_405_4;
+    p = p * t - 1.453_152;
+    p = p * t + 1.421_413_8;
+    p = p * t - 0.284_496_74;
+    p = p * t + 0.254_829_6;
+    let tail = 0.5 * p * t * bell;
+    let below = if x > 0.0 { 1.0 - tail } else { tail };
+    (below, RECIPROCAL_SQRT_TAU * bell)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{check, flat, var};
+    use super::*;
+    use candle_core::Device;
+
+    #[test]
+    fn agrees_with_candle() {
+        for shape in [&[1usize][..], &[3, 7], &[20_000, 3]] {
+            let x = var(shape, 4);
+            let wide_x = || x.affine(5.0, 0.3);
+            check(&[&x], || gelu(&wide_x()?), || wide_x()?.gelu_erf());
+        }
+    }
+
+    #[test]
+    fn absolute_error_is_small_everywhere() {
+        let xs: Vec<f32> = (-12_000..12_000).map(|i| i as f32 * 1e-3).collect();
+        let x = Tensor::new(xs.as_slice(), &Device::Cpu).unwrap();
+        let exact = x.to_dtype(candle_core::DType::F64).unwrap();
+        let exact = exact.gelu_erf().unwrap().to_vec1::<f64>().unwrap();
+        for (y, e) in flat(&gelu(&x).unwrap()).iter().zip(exact) {
+            assert!((f64::from(*y) - e).abs() < 2e-6, "{y} against {e}");
+        }
+    }
+}

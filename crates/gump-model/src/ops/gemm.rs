@@ -1,0 +1,229 @@
+//! The only place of the crate with `unsafe`: matrix products over checked slices, and the
+//! switch to the widest vector instructions the processor has.
+//!
+//! What lives here: [`Mat`], [`MatMut`], [`gemm`] and [`wide`], whose public faces are safe.
+//! What does not: any layer; those call these functions and stay free of `unsafe`.
+#![allow(
+    unsafe_code,
+    reason = "`gemm::gemm` takes raw pointers, and code compiled for optional processor features may only be called after checking for them; both are checked here, once"
+)]
+
+use gemm::Parallelism;
+
+/// A read-only matrix over a slice with any two strides.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Mat<'a> {
+    data: &'a [f32],
+    rows: usize,
+    cols: usize,
+    row_stride: usize,
+    col_stride: usize,
+}
+
+impl<'a> Mat<'a> {
+    /// A row-major matrix whose rows start `row_stride` elements apart.
+    ///
+    /// Panics when the slice is too short for the shape.
+    pub(super) fn strided(data: &'a [f32], rows: usize, cols: usize, row_stride: usize) -> Self {
+        check_extent(data.len(), rows, cols, row_stride);
+        Self {
+            data,
+            rows,
+            cols,
+            row_stride,
+            col_stride: 1,
+        }
+    }
+
+    /// A row-major matrix without gaps.
+    pub(super) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
+        Self::strided(data, rows, cols, cols)
+    }
+
+    /// The transposed view; no element moves.
+    pub(super) fn t(self) -> Self {
+        Self {
+            data: self.data,
+            rows: self.cols,
+            cols: self.rows,
+            row_stride: self.col_stride,
+            col_stride: self.row_stride,
+        }
+    }
+}
+
+/// A writable row-major matrix.
+#[derive(Debug)]
+pub(super) struct MatMut<'a> {
+    data: &'a mut [f32],
+    rows: usize,
+    cols: usize,
+    row_stride: usize,
+}
+
+impl<'a> MatMut<'a> {
+    /// A row-major matrix whose rows start `row_stride` elements apart.
+    ///
+    /// Panics when the slice is too short for the shape, or when rows would overlap.
+    pub(super) fn strided(
+        data: &'a mut [f32],
+        rows: usize,
+        cols: usize,
+        row_stride: usize,
+    ) -> Self {
+        check_extent(data.len(), rows, cols, row_stride);
+        Self {
+            data,
+            rows,
+            cols,
+            row_stride,
+        }
+    }
+
+    /// A row-major matrix without gaps.
+    pub(super) fn new(data: &'a mut [f32], rows: usize, cols: usize) -> Self {
+        Self::strided(data, rows, cols, cols)
+    }
+}
+
+fn check_extent(len: usize, rows: usize, cols: usize, row_stride: usize) {
+    assert!(rows <= 1 || cols <= row_stride, "matrix rows overlap");
+    let needed = if rows == 0 || cols == 0 {
+        0
+    } else {
+        (rows - 1) * row_stride + cols
+    };
+    assert!(needed <= len, "matrix of {needed} elements over {len}");
+}
+
+/// What a product does with the values already in its destination.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Store {
+    /// `dst = scale * lhs rhs`
+    Replace,
+    /// `dst += scale * lhs rhs`
+    Add,
+}
+
+/// Who computes a product.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Threads {
+    /// The calling thread.
+    One,
+    /// The current rayon pool; the bits do not depend on its size, because only rows and columns
+    /// are shared out, never the inner sum.
+    Pool,
+}
+
+/// Multiplies `lhs` `[m, k]` by `rhs` `[k, n]` into `dst` `[m, n]`.
+///
+/// Panics when the shapes do not fit.
+pub(super) fn gemm(
+    dst: MatMut<'_>,
+    store: Store,
+    scale: f32,
+    lhs: Mat<'_>,
+    rhs: Mat<'_>,
+    threads: Threads,
+) {
+    let MatMut {
+        data,
+        rows,
+        cols,
+        row_stride,
+    } = dst;
+    assert_eq!(rows, lhs.rows, "rows of the product");
+    assert_eq!(cols, rhs.cols, "columns of the product");
+    assert_eq!(lhs.cols, rhs.rows, "inner size of the product");
+    let stride = |s: usize| isize::try_from(s).expect("a stride is within a slice");
+    // SAFETY: the three constructors checked that every (row, column) lies in its slice and that
+    // the rows of `dst` are disjoint; `dst` is a unique borrow, so it overlaps neither operand.
+    unsafe {
+        gemm::gemm(
+            rows,
+            cols,
+            lhs.cols,
+            data.as_mut_ptr(),
+            1,
+            stride(row_stride),
+            store == Store::Add,
+            lhs.data.as_ptr(),
+            stride(lhs.col_stride),
+            stride(lhs.row_stride),
+            rhs.data.as_ptr(),
+            stride(rhs.col_stride),
+            stride(rhs.row_stride),
+            1.0,
+            scale,
+            false,
+            false,
+            false,
+            match threads {
+                Threads::One => Parallelism::None,
+                Threads::Pool => Parallelism::Rayon(0),
+            },
+        );
+    }
+}
+
+/// Runs `f` compiled for the widest vectors of this processor.
+///
+/// Mark the closure and every helper it calls `#[inline(always)]`: only inlined code is compiled
+/// wide. The instructions change, the arithmetic does not (no multiply-add is contracted and sums
+/// keep their written order), so the bits are those of the plain build.
+#[inline(always)]
+pub(super) fn wide<R>(f: impl FnOnce() -> R) -> R {
+    #[cfg(target_arch = "x86_64")]
+    {
+        #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
+        fn v4<R>(f: impl FnOnce() -> R) -> R {
+            f()
+        }
+        #[target_feature(enable = "avx2")]
+        fn v3<R>(f: impl FnOnce() -> R) -> R {
+            f()
+        }
+        if is_x86_feature_detected!("avx512f")
+            && is_x86_feature_detected!("avx512bw")
+            && is_x86_feature_detected!("avx512dq")
+            && is_x86_feature_detected!("avx512vl")
+        {
+            // SAFETY: the four features were just detected.
+            return unsafe { v4(f) };
+        }
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the feature was just detected.
+            return unsafe { v3(f) };
+        }
+    }
+    f()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn products_of_strided_and_transposed_views() {
+        // lhs is columns 1..3 of a [2, 4] matrix, rhs a [3, 2] matrix read transposed.
+        let a = [0., 1., 2., 0., 0., 3., 4., 0.];
+        let b = [1., 10., 2., 20., 3., 30.];
+        let mut c = vec![1.0; 6];
+        let lhs = Mat::strided(&a[1..], 2, 2, 4);
+        let rhs = Mat::new(&b, 3, 2).t();
+        for threads in [Threads::One, Threads::Pool] {
+            let dst = MatMut::new(&mut c, 2, 3);
+            gemm(dst, Store::Replace, 1.0, lhs, rhs, threads);
+            assert_eq!(c, [21., 42., 63., 43., 86., 129.]);
+        }
+        let dst = MatMut::new(&mut c, 2, 3);
+        gemm(dst, Store::Add, -1.0, lhs, rhs, Threads::One);
+        assert_eq!(c, [0.0; 6]);
+    }
+
+    #[test]
+    #[should_panic(expected = "matrix of 7 elements over 6")]
+    fn a_short_slice_is_refused() {
+        Mat::strided(&[0.0; 6], 2, 2, 5);
+    }
+}

@@ -1,0 +1,222 @@
+//! The affine map.
+//!
+//! What lives here: the fused operation, whose gradients never copy a transposed matrix. What does
+//! not: the parameters, which the network holds.
+
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, Layout, Result, Shape, Tensor};
+
+use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::rows::{column_sums, for_pieces, rows_per_task};
+use super::{Host, elements, fusible, gradient, output};
+
+/// `x weight^T + bias`.
+///
+/// Shape: `x` `[.., in]`, `weight` `[out, in]` as in PyTorch, `bias` `[out]`; the result `[.., out]`.
+///
+/// Error: when the shapes do not fit.
+pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
+    let (n_out, n_in) = weight.dims2()?;
+    if x.dim(D::Minus1)? != n_in || bias.is_some_and(|b| b.dims() != [n_out]) {
+        candle_core::bail!(
+            "linear: x {:?}, weight {:?}, bias {:?}",
+            x.shape(),
+            weight.shape(),
+            bias.map(Tensor::shape)
+        );
+    }
+    match bias {
+        Some(bias) if fusible(&[x, weight, bias]) => {
+            x.contiguous()?
+                .apply_op3(&weight.contiguous()?, &bias.contiguous()?, Linear)
+        }
+        None if fusible(&[x, weight]) => x.contiguous()?.apply_op2(&weight.contiguous()?, Linear),
+        _ => composed(x, weight, bias),
+    }
+}
+
+fn composed(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
+    let (n_out, n_in) = weight.dims2()?;
+    let mut shape = x.dims().to_vec();
+    *shape.last_mut().expect("x has a last axis") = n_out;
+    let y = x.reshape(((), n_in))?.matmul(&weight.t()?)?;
+    let y = match bias {
+        Some(bias) => y.broadcast_add(bias)?,
+        None => y,
+    };
+    y.reshape(shape)
+}
+
+struct Linear;
+
+impl CustomOp2 for Linear {
+    fn name(&self) -> &'static str {
+        "linear"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        weight: &CpuStorage,
+        weight_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let weight = elements(weight, weight_layout)?;
+        forward(
+            elements(x, x_layout)?,
+            x_layout,
+            weight,
+            weight_layout,
+            None,
+        )
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        weight: &Tensor,
+        _y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        backward(x, weight, &dy.contiguous()?)
+    }
+}
+
+impl CustomOp3 for Linear {
+    fn name(&self) -> &'static str {
+        "linear"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        weight: &CpuStorage,
+        weight_layout: &Layout,
+        bias: &CpuStorage,
+        bias_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (x, weight) = (elements(x, x_layout)?, elements(weight, weight_layout)?);
+        let bias = elements(bias, bias_layout)?;
+        forward(x, x_layout, weight, weight_layout, Some(bias))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        weight: &Tensor,
+        bias: &Tensor,
+        _y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let dy = dy.contiguous()?;
+        let (dx, dw) = backward(x, weight, &dy)?;
+        let db = if bias.track_op() {
+            let dy = Host::new(&dy)?;
+            let db = column_sums(dy.slice()?, bias.dim(0)?);
+            Some(gradient(db, bias)?)
+        } else {
+            None
+        };
+        Ok((dx, dw, db))
+    }
+}
+
+fn forward(
+    x: &[f32],
+    x_layout: &Layout,
+    weight: &[f32],
+    weight_layout: &Layout,
+    bias: Option<&[f32]>,
+) -> Result<(CpuStorage, Shape)> {
+    let (n_out, n_in) = weight_layout.shape().dims2()?;
+    let mut shape = x_layout.dims().to_vec();
+    *shape.last_mut().expect("x has a last axis") = n_out;
+    let rows = shape[..shape.len() - 1].iter().product();
+    let mut y = vec![0.0; rows * n_out];
+    if let Some(bias) = bias {
+        for_pieces(&mut y, rows_per_task(n_out) * n_out, |_, y| {
+            for row in y.chunks_exact_mut(n_out) {
+                row.copy_from_slice(bias);
+            }
+        });
+    }
+    let store = if bias.is_some() {
+        Store::Add
+    } else {
+        Store::Replace
+    };
+    gemm(
+        MatMut::new(&mut y, rows, n_out),
+        store,
+        1.0,
+        Mat::new(x, rows, n_in),
+        Mat::new(weight, n_out, n_in).t(),
+        Threads::Pool,
+    );
+    Ok(output(y, shape))
+}
+
+fn backward(x: &Tensor, weight: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
+    let (n_out, n_in) = weight.dims2()?;
+    let (x_host, weight_host, dy) = (Host::new(x)?, Host::new(weight)?, Host::new(dy)?);
+    let (x_all, w) = (x_host.slice::<f32>()?, weight_host.slice::<f32>()?);
+    let dy = dy.slice::<f32>()?;
+    let rows = x_all.len() / n_in.max(1);
+    let dy = Mat::new(dy, rows, n_out);
+    let dx = if x.track_op() {
+        let mut dx = vec![0.0; x_all.len()];
+        let w = Mat::new(w, n_out, n_in);
+        let dst = MatMut::new(&mut dx, rows, n_in);
+        gemm(dst, Store::Replace, 1.0, dy, w, Threads::Pool);
+        Some(gradient(dx, x)?)
+    } else {
+        None
+    };
+    let dw = if weight.track_op() {
+        let mut dw = vec![0.0; w.len()];
+        let x_all = Mat::new(x_all, rows, n_in);
+        let dst = MatMut::new(&mut dw, n_out, n_in);
+        gemm(dst, Store::Replace, 1.0, dy.t(), x_all, Threads::Pool);
+        Some(gradient(dw, weight)?)
+    } else {
+        None
+    };
+    Ok((dx, dw))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{check, var};
+    use super::*;
+
+    #[test]
+    fn agrees_with_the_composition() {
+        for (shape, n_out) in [
+            (&[1usize, 3][..], 1),
+            (&[5, 7], 9),
+            (&[2, 130, 64], 96),
+            (&[1, 1, 33], 200),
+            (&[300, 48], 48),
+        ] {
+            let n_in = shape[shape.len() - 1];
+            let (x, w, b) = (var(shape, 1), var(&[n_out, n_in], 2), var(&[n_out], 3));
+            check(
+                &[&x, &w, &b],
+                || linear(&x, &w, Some(&b)),
+                || composed(&x, &w, Some(&b)),
+            );
+            check(
+                &[&x, &w],
+                || linear(&x, &w, None),
+                || composed(&x, &w, None),
+            );
+        }
+    }
+
+    #[test]
+    fn shapes_that_do_not_fit_are_errors() {
+        let (x, w, b) = (var(&[2, 3], 1), var(&[4, 3], 2), var(&[3], 3));
+        assert!(linear(&x, &w, Some(&b)).is_err());
+        assert!(linear(&x, &w.t().unwrap(), None).is_err());
+    }
+}
