@@ -1,1 +1,46 @@
 //! What is good and what is bad: metrics of rollouts and rewards made of them.
+//!
+//! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
+//! about many futures at once, [`Reward`] says what is wanted. Nothing here steps a simulation or
+//! reads a file.
+//!
+//! # Terms
+//! * **metric** measures, **reward** combines, **score** is the number with its parts.
+//! * **gate**: a factor of a reward. **Term**: a summand.
+//! * **ADE**, **FDE**: average and final displacement from the log; *min* is over futures.
+//!
+//! ```
+//! use gump_metrics::{Collision, logged, over_rollout, summarize};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "ego vehicle 0: 0,0 velocity 5,0
+//!      agent vehicle 1: 30,0",
+//! ).unwrap();
+//! let rollout = logged(&scenario);
+//! assert_eq!(over_rollout(&Collision, &rollout, scenario.ego), Some(1.0));
+//! assert_eq!(summarize(&[rollout], Some(&scenario)).total().collision_rate(), Some(1.0));
+//! ```
+
+mod collision;
+mod comfort;
+mod displacement;
+pub mod kinematics;
+mod metric;
+mod offroad;
+mod progress;
+mod red_light;
+mod reward;
+mod road_edge;
+mod summary;
+
+pub use collision::{Collision, overlapping};
+pub use comfort::{ComfortBounds, Discomfort};
+pub use displacement::{Displacement, average_displacement};
+pub use kinematics::{Acceleration, Speed, YawRate};
+pub use metric::{ALL, Metric, Reduce, logged, over_rollout, over_rollouts};
+pub use offroad::OffRoad;
+pub use progress::Progress;
+pub use red_light::RedLight;
+pub use reward::{Gate, Reward, Score, Term};
+pub use road_edge::{DistanceToRoadEdge, signed_distance_to_road_edge};
+pub use summary::{Part, Summary, summarize};
