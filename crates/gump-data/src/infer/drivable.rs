@@ -103,9 +103,8 @@ fn cross_sections(lane: &Lane) -> Vec<Section> {
     let mut places: Vec<(DVec2, f64)> = Vec::new();
     for pair in corners.windows(2) {
         let (from, to) = (pair[0], pair[1]);
-        let n = (points[from].distance(points[to]) / SPACING)
-            .ceil()
-            .max(1.0) as usize;
+        let n = (points[from].distance(points[to]) / SPACING).ceil();
+        let n = n.clamp(1.0, MAX_SECTIONS) as usize;
         places.extend((0..n).map(|i| {
             let t = i as f64 / n as f64;
             let z = lane.elevation[from] + t * (lane.elevation[to] - lane.elevation[from]);

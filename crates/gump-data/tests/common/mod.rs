@@ -1,0 +1,44 @@
+//! What the integration tests share: paths of real data, and scenarios to write.
+
+#![allow(dead_code, reason = "each test file uses a part of this")]
+
+use std::path::PathBuf;
+
+use gump_scene::Scenario;
+
+/// A file of the shared data beside the repository; says so and yields `None` if it is absent.
+pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+    let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared");
+    let path = PathBuf::from(root).join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!("SKIPPED: the real file {name} is not beside the repository");
+    None
+}
+
+/// A small crossing with everything Waymo's messages can hold.
+pub(crate) fn crossing() -> Scenario {
+    let mut scenario = gump_scene::fixture::scenario(
+        "lane 1: -60,0 -30,0 0,0 speed 13.4112 next 2,3
+         lane 2: 0,0 60,0 speed 13.4112
+         lane 3: 0,0 10,5 15,40
+         lane 4: -60,3.5 0,3.5 left 5
+         lane 5: -60,7 0,7 right 4
+         edge: -60,-2 60,-2
+         line: -60,1.75 0,1.75
+         crosswalk: -4,-2 -1,-2 -1,9 -4,9
+         light 1 red: -5,0
+         light 4 green: -5,3.5
+         ego vehicle 10: -40,0.1 velocity 8,0
+         agent vehicle 3: -20,3.4 velocity 5,0.25 size 5.5,2.25
+         agent pedestrian 7: -3,8 velocity 0,-1.25
+         agent bicycle 8: -30,7 velocity 4,0
+         agent other 9: 20,-1.5
+         history 1.0 future 8.0 dt 0.1",
+    )
+    .expect("the fixture is well-formed");
+    scenario.objects_of_interest = vec![scenario.ego];
+    scenario.targets.sort_unstable();
+    scenario
+}
