@@ -1,1 +1,47 @@
-//! The multimodal causal transformer world model: network, training, inference, checkpoints.
+//! The multimodal causal transformer (MCT) world model: network, training, inference, checkpoints.
+//!
+//! The network reads a scene as tokens and a raster, and says what comes next. Read
+//! [`config::ModelConfig`] for its shape, `mct.rs` for the network in one sitting, `decoder.rs` for
+//! how a hidden vector becomes a state, [`train::Trainer`] for learning and
+//! [`world::TransformerWorld`] for imagining.
+//!
+//! # Terms
+//! * **key, value**: the two tokens of an object; the hidden vector at the key says the state.
+//! * **chunk**: the four poses decoded at a key, half a second apart; the first is the frame's own.
+//! * **surrogate**: a provisional state, from earlier chunks, that lets all objects of a frame be
+//!   decoded in one pass (partial autoregression).
+//! * **aggregation**: averaging what several chunks say of the same instant.
+//! * **visual memory**: keys and values of the map, computed once per scene.
+
+mod aggregation;
+mod batch;
+pub mod checkpoint;
+pub mod config;
+mod decode;
+mod decoder;
+mod embedding;
+mod error;
+mod loss;
+mod mct;
+mod network;
+pub mod ops;
+mod optimizer;
+mod parameters;
+mod sample;
+mod sampling;
+#[cfg(test)]
+mod tests;
+pub mod train;
+mod trajectory;
+mod visual;
+pub mod world;
+
+pub use config::ModelConfig;
+pub use error::ModelError;
+pub use loss::{LossConfig, LossParts};
+pub use network::Network;
+pub use optimizer::OptimizerConfig;
+pub use parameters::Parameters;
+pub use sample::SampleConfig;
+pub use sampling::{CacheMode, Mode, SamplingConfig, Surrogate};
+pub use train::{RunConfig, TrainConfig, Trainer};

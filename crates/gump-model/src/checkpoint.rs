@@ -1,0 +1,247 @@
+//! Networks and runs on disk: safetensors with the configuration in the header.
+//!
+//! A file holds everything needed to load it and is written beside its final name, then renamed, so
+//! that a crash leaves the previous one intact.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use candle_core::{DType, Device, Tensor};
+use gump_tokenizer::VOCABULARY_SIZE;
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+
+use crate::ModelError;
+use crate::config::ModelConfig;
+use crate::network::Network;
+use crate::parameters::Parameters;
+
+/// Version of the layout of names and metadata.
+const FORMAT: &str = "gump-1";
+
+/// How numbers are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// Half precision, for shipping.
+    Half,
+    /// Full precision, for resuming.
+    Full,
+}
+
+/// Tensors and header entries of a file.
+#[derive(Debug)]
+pub(crate) struct Archive {
+    pub(crate) tensors: BTreeMap<String, Tensor>,
+    pub(crate) metadata: BTreeMap<String, String>,
+    pub(crate) path: PathBuf,
+}
+
+/// Writes a network.
+///
+/// # Errors
+/// [`ModelError::Io`] with the path; the previous file, if any, is intact.
+pub fn save(network: &Network, path: &Path, precision: Precision) -> Result<(), ModelError> {
+    let tensors = network
+        .parameters()
+        .all()
+        .map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
+    write(
+        path,
+        tensors.collect(),
+        header(network.config())?,
+        precision,
+    )
+}
+
+/// Reads a network.
+///
+/// # Errors
+/// A file that cannot be read, is no checkpoint, has another vocabulary, or whose tensors do not
+/// match its configuration; the sentence names the file.
+pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
+    let archive = read(path)?;
+    let config = archive.config()?;
+    let tensors = archive
+        .tensors
+        .into_iter()
+        .filter(|(name, _)| !name.starts_with("optimizer."))
+        .collect();
+    Network::build(config, Parameters::loaded(tensors, device)).map_err(|error| match error {
+        ModelError::Io { .. } | ModelError::Checkpoint { .. } => error,
+        other => ModelError::Checkpoint {
+            what: other.to_string(),
+            path: path.to_owned(),
+        },
+    })
+}
+
+impl Archive {
+    /// The configuration in the header.
+    pub(crate) fn config(&self) -> Result<ModelConfig, ModelError> {
+        let text = self.entry("config")?;
+        serde_json::from_str(text)
+            .map_err(|error| self.error(format!("its configuration is not valid ({error})")))
+    }
+
+    /// A header entry.
+    pub(crate) fn entry(&self, key: &str) -> Result<&str, ModelError> {
+        let value = self.metadata.get(key);
+        value
+            .map(String::as_str)
+            .ok_or_else(|| self.error(format!("its header has no \"{key}\"")))
+    }
+
+    pub(crate) fn error(&self, what: String) -> ModelError {
+        ModelError::Checkpoint {
+            what,
+            path: self.path.clone(),
+        }
+    }
+}
+
+/// Header entries every file of this crate has.
+pub(crate) fn header(config: &ModelConfig) -> Result<BTreeMap<String, String>, ModelError> {
+    let config =
+        serde_json::to_string(config).map_err(|error| ModelError::Config(error.to_string()))?;
+    Ok(BTreeMap::from([
+        ("format".to_owned(), FORMAT.to_owned()),
+        ("vocabulary".to_owned(), VOCABULARY_SIZE.to_string()),
+        ("config".to_owned(), config),
+    ]))
+}
+
+/// Writes named tensors and a header, atomically.
+pub(crate) fn write(
+    path: &Path,
+    tensors: BTreeMap<String, Tensor>,
+    metadata: BTreeMap<String, String>,
+    precision: Precision,
+) -> Result<(), ModelError> {
+    let (dtype, kind) = match precision {
+        Precision::Half => (DType::F16, Dtype::F16),
+        Precision::Full => (DType::F32, Dtype::F32),
+    };
+    let mut bytes: BTreeMap<String, (Vec<usize>, Vec<u8>)> = BTreeMap::new();
+    for (name, tensor) in tensors {
+        let flat = tensor
+            .to_dtype(dtype)?
+            .to_device(&Device::Cpu)?
+            .flatten_all()?;
+        let data = match precision {
+            Precision::Half => flat
+                .to_vec1::<half::f16>()?
+                .iter()
+                .flat_map(|v| v.to_le_bytes())
+                .collect(),
+            Precision::Full => flat
+                .to_vec1::<f32>()?
+                .iter()
+                .flat_map(|v| v.to_le_bytes())
+                .collect(),
+        };
+        bytes.insert(name, (tensor.dims().to_vec(), data));
+    }
+    let mut views = Vec::with_capacity(bytes.len());
+    for (name, (shape, data)) in &bytes {
+        let view =
+            TensorView::new(kind, shape.clone(), data).map_err(|error| ModelError::Checkpoint {
+                what: error.to_string(),
+                path: path.to_owned(),
+            })?;
+        views.push((name, view));
+    }
+    let metadata: HashMap<String, String> = metadata.into_iter().collect();
+    let encoded =
+        safetensors::serialize(views, Some(metadata)).map_err(|error| ModelError::Checkpoint {
+            what: error.to_string(),
+            path: path.to_owned(),
+        })?;
+    write_beside(path, &encoded)
+}
+
+/// Reads named tensors and the header, and checks format and vocabulary.
+pub(crate) fn read(path: &Path) -> Result<Archive, ModelError> {
+    let fail = |what: String| ModelError::Checkpoint {
+        what,
+        path: path.to_owned(),
+    };
+    let io = |source| ModelError::Io {
+        action: "reading weights",
+        source,
+        path: path.to_owned(),
+    };
+    let bytes = fs::read(path).map_err(io)?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| {
+        fail(format!(
+            "expected a safetensors file, found something else ({error})"
+        ))
+    })?;
+    let metadata: BTreeMap<String, String> = header
+        .metadata()
+        .iter()
+        .flatten()
+        .map(|(k, v)| (k.clone(), v.clone()))
+        .collect();
+    let file = SafeTensors::deserialize(&bytes)
+        .map_err(|error| fail(format!("damaged weights ({error})")))?;
+    let mut tensors = BTreeMap::new();
+    for (name, view) in file.tensors() {
+        let dtype = match view.dtype() {
+            Dtype::F16 => DType::F16,
+            Dtype::F32 => DType::F32,
+            other => {
+                return Err(fail(format!(
+                    "tensor \"{name}\" has type {other:?}, expected F16 or F32"
+                )));
+            }
+        };
+        tensors.insert(
+            name,
+            Tensor::from_raw_buffer(view.data(), dtype, view.shape(), &Device::Cpu)?,
+        );
+    }
+    let archive = Archive {
+        tensors,
+        metadata,
+        path: path.to_owned(),
+    };
+    let format = archive
+        .entry("format")
+        .map_err(|_| fail("not a gump checkpoint: no format in its header".into()))?;
+    if format != FORMAT {
+        return Err(fail(format!(
+            "checkpoint format is \"{format}\", expected \"{FORMAT}\""
+        )));
+    }
+    let vocabulary = archive.entry("vocabulary")?;
+    if vocabulary != VOCABULARY_SIZE.to_string() {
+        return Err(fail(format!(
+            "vocabulary has {vocabulary} tokens, expected {VOCABULARY_SIZE}"
+        )));
+    }
+    Ok(archive)
+}
+
+/// Writes `bytes` under a temporary name and renames.
+fn write_beside(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".partial");
+    let beside = path.with_file_name(name);
+    let attempt = || {
+        let mut file = fs::File::create(&beside)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&beside, path)
+    };
+    attempt().map_err(|source| {
+        // Best effort: the error that matters is the first one.
+        let _ = fs::remove_file(&beside);
+        ModelError::Io {
+            action: "writing weights",
+            source,
+            path: path.to_owned(),
+        }
+    })
+}

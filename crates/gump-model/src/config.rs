@@ -1,0 +1,229 @@
+//! The shape of a network; a checkpoint holds one and needs nothing else to load.
+//!
+//! The file form is TOML with every key required to be known. Presets carry the published sizes
+//! and `tiny`, which trains on a laptop.
+
+use gump_raster::{Layer, RasterSpec};
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// The shape of a network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Model width, the `C` of every shape.
+    pub width: usize,
+    /// Self-attention blocks.
+    pub layers: usize,
+    /// Attention heads; must divide the width.
+    pub heads: usize,
+    /// Longest token sequence, and rows of the position table.
+    pub block_size: usize,
+    /// Layers of the GRU that decodes an agent's state.
+    pub gru_layers: usize,
+    /// Blocks (0-based) after which a trajectory head reads, shallow to deep; the last is the
+    /// deepest. Empty: no trajectory heads.
+    pub trajectory_heads: Vec<usize>,
+    /// How gated cross-attention is gated.
+    pub gate: Gate,
+    /// Probability of dropping an activation in training.
+    pub dropout: f64,
+    /// True builds the decoder that reconstructs the raster from the visual features.
+    pub reconstruction: bool,
+    /// The visual branch.
+    pub visual: VisualConfig,
+}
+
+/// How gated cross-attention is gated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Gate {
+    /// Attention and feed-forward each behind tanh of a scalar that starts at 0 (Alayrac et al.
+    /// 2022): the network starts as the text-only transformer.
+    Flamingo,
+    /// Attention behind tanh of a scalar from N(0, 0.3²), feed-forward ungated: GUMP's released
+    /// code.
+    Released,
+}
+
+/// The visual branch: what is drawn and what reads it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VisualConfig {
+    /// The convolutional network.
+    pub encoder: Encoder,
+    /// Side of the square raster, pixels.
+    pub side_px: usize,
+    /// Ground covered by a pixel, metres.
+    pub metres_per_px: f64,
+    /// Raster layers by name, in channel order.
+    pub layers: Vec<String>,
+}
+
+/// The convolutional network that reads the raster.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Encoder {
+    /// Three strided stages with a residual block each, stride 8, for CPUs.
+    Compact,
+    /// ResNet-18, stride 32.
+    Resnet18,
+    /// ResNet-34, stride 32.
+    Resnet34,
+    /// ResNet-50, stride 32.
+    Resnet50,
+}
+
+impl Encoder {
+    /// Raster pixels per visual token along one side.
+    pub fn stride(self) -> usize {
+        if self == Self::Compact { 8 } else { 32 }
+    }
+}
+
+impl ModelConfig {
+    /// Names accepted by [`ModelConfig::preset`].
+    pub const PRESETS: [&'static str; 4] = ["tiny", "small", "base", "medium"];
+
+    /// The configuration called `name`: `tiny`, or one of the paper's `small`, `base`, `medium`.
+    pub fn preset(name: &str) -> Option<Self> {
+        match name {
+            "tiny" => Some(Self::tiny()),
+            "small" => Some(Self::paper(384, 12, 6, Encoder::Resnet18, [2, 5, 8, 11])),
+            "base" => Some(Self::paper(768, 12, 12, Encoder::Resnet34, [2, 5, 8, 11])),
+            "medium" => Some(Self::paper(
+                1024,
+                24,
+                16,
+                Encoder::Resnet50,
+                [5, 11, 17, 23],
+            )),
+            _ => None,
+        }
+    }
+
+    /// The size that trains on two CPU cores: 2.8 million parameters.
+    pub fn tiny() -> Self {
+        Self {
+            width: 128,
+            layers: 4,
+            heads: 4,
+            block_size: 2048,
+            gru_layers: 1,
+            trajectory_heads: vec![3],
+            gate: Gate::Flamingo,
+            dropout: 0.0,
+            reconstruction: true,
+            visual: VisualConfig {
+                encoder: Encoder::Compact,
+                side_px: 208,
+                metres_per_px: 1.0,
+                layers: layer_names(&RasterSpec::full(208, 1.0)),
+            },
+        }
+    }
+
+    /// A published size on the paper's canvas, 416 px at 0.5 m.
+    fn paper(
+        width: usize,
+        layers: usize,
+        heads: usize,
+        encoder: Encoder,
+        depths: [usize; 4],
+    ) -> Self {
+        Self {
+            width,
+            layers,
+            heads,
+            block_size: 2048,
+            gru_layers: 2,
+            trajectory_heads: depths.to_vec(),
+            gate: Gate::Flamingo,
+            dropout: 0.1,
+            reconstruction: true,
+            visual: VisualConfig {
+                encoder,
+                side_px: 416,
+                metres_per_px: 0.5,
+                layers: layer_names(&RasterSpec::paper()),
+            },
+        }
+    }
+
+    /// Checks that the numbers fit together.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming the first contradiction.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        let fail = |what: String| Err(ModelError::Config(what));
+        if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
+            return fail(format!(
+                "width {} is not a multiple of {} heads",
+                self.width, self.heads
+            ));
+        }
+        if self.width < 14 {
+            return fail(format!(
+                "width {} leaves no room for the sine of seven fields",
+                self.width
+            ));
+        }
+        if self.layers == 0 || self.gru_layers == 0 {
+            return fail("layers and gru_layers must be at least 1".into());
+        }
+        if let Some(depth) = self
+            .trajectory_heads
+            .iter()
+            .find(|&&depth| depth >= self.layers)
+        {
+            return fail(format!(
+                "trajectory head after block {depth}, but there are {} blocks",
+                self.layers
+            ));
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            return fail(format!("dropout {} is not in 0..1", self.dropout));
+        }
+        let (side, stride) = (self.visual.side_px, self.visual.encoder.stride());
+        if side == 0 || !side.is_multiple_of(stride) {
+            return fail(format!(
+                "raster side {side} px is not a multiple of the encoder's stride {stride}"
+            ));
+        }
+        self.raster_spec().map(|_| ())
+    }
+
+    /// What the raster holds.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming a layer that does not exist.
+    pub fn raster_spec(&self) -> Result<RasterSpec, ModelError> {
+        let layer = |name: &String| {
+            name.parse::<Layer>()
+                .map_err(|_| ModelError::Config(format!("unknown raster layer \"{name}\"")))
+        };
+        Ok(RasterSpec {
+            side_px: self.visual.side_px,
+            metres_per_px: self.visual.metres_per_px,
+            layers: self
+                .visual
+                .layers
+                .iter()
+                .map(layer)
+                .collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// Visual tokens along one side.
+    pub fn visual_side(&self) -> usize {
+        self.visual.side_px / self.visual.encoder.stride()
+    }
+}
+
+fn layer_names(spec: &RasterSpec) -> Vec<String> {
+    spec.layers
+        .iter()
+        .map(|layer| layer.name().to_owned())
+        .collect()
+}

@@ -1,0 +1,177 @@
+//! From the hidden vector at a key to the agent's state: a GRU, field by field.
+//!
+//! The sequence is width, length, v_x, v_y, then four poses x, y, θ half a second apart, the first
+//! of which is the frame the key stands in. Each step sees the tokens before it.
+//!
+//! Shapes: `K` keys, `C` width, `N` bins of a field.
+
+use candle_core::{Result, Tensor};
+use gump_tokenizer::Field;
+
+use crate::ModelError;
+use crate::config::ModelConfig;
+use crate::mct::{Linear, TABLE_DEVIATION};
+use crate::ops;
+use crate::parameters::{Init, Scope};
+
+/// Poses in a chunk: the frame itself and three more, half a second apart.
+pub(crate) const CHUNK: usize = 4;
+
+/// What each step of the decoder yields.
+pub(crate) const STEPS: [Field; 4 + 3 * CHUNK] = [
+    Field::Width,
+    Field::Length,
+    Field::VelocityX,
+    Field::VelocityY,
+    Field::X,
+    Field::Y,
+    Field::Heading,
+    Field::X,
+    Field::Y,
+    Field::Heading,
+    Field::X,
+    Field::Y,
+    Field::Heading,
+    Field::X,
+    Field::Y,
+    Field::Heading,
+];
+
+/// A stacked GRU with one slot embedding per step and one output matrix for all fields.
+#[derive(Debug)]
+pub(crate) struct StateDecoder {
+    layers: Vec<GruLayer>,
+    slots: Tensor,
+    head: Linear,
+}
+
+#[derive(Debug)]
+struct GruLayer {
+    input: Linear,
+    hidden: Linear,
+}
+
+impl StateDecoder {
+    pub(crate) fn new(
+        mut scope: Scope<'_>,
+        config: &ModelConfig,
+    ) -> std::result::Result<Self, ModelError> {
+        let c = config.width;
+        let layer = |i: usize, scope: &mut Scope<'_>| {
+            let mut scope = scope.part(format!("gru.{i}"));
+            Ok::<_, ModelError>(GruLayer {
+                input: Linear::with(
+                    &mut scope,
+                    "input",
+                    c,
+                    3 * c,
+                    Init::FanIn(c),
+                    Some(Init::FanIn(c)),
+                )?,
+                hidden: Linear::with(
+                    &mut scope,
+                    "hidden",
+                    c,
+                    3 * c,
+                    Init::FanIn(c),
+                    Some(Init::FanIn(c)),
+                )?,
+            })
+        };
+        Ok(Self {
+            layers: (0..config.gru_layers)
+                .map(|i| layer(i, &mut scope))
+                .collect::<std::result::Result<_, _>>()?,
+            slots: scope.get("slots", (STEPS.len(), c), Init::Normal(TABLE_DEVIATION))?,
+            head: Linear::with(
+                &mut scope,
+                "head",
+                c,
+                gump_tokenizer::TABLE_ROWS as usize,
+                Init::FanIn(c),
+                None,
+            )?,
+        })
+    }
+
+    /// Outputs of all steps with the true tokens as input.
+    ///
+    /// `hidden` [K, C]; `tokens` [STEPS, K], the token of each step (PAD where missing).
+    /// Returns [STEPS, K, C].
+    pub(crate) fn teacher_forced(
+        &self,
+        table: &Tensor,
+        hidden: &Tensor,
+        tokens: &Tensor,
+    ) -> Result<Tensor> {
+        let (k, c) = hidden.dims2()?;
+        let n = STEPS.len();
+        let previous = tokens.narrow(0, 0, n - 1)?.contiguous()?; // [STEPS - 1, K]
+        let embedded =
+            crate::embedding::embedding_sum(table, &previous.reshape(((n - 1) * k, 1))?)?;
+        let embedded = embedded.reshape((n - 1, k, c))?.pad_with_zeros(0, 1, 0)?; // [STEPS, K, C]
+        let mut inputs = embedded.broadcast_add(&self.slots.reshape((n, 1, c))?)?;
+        for layer in &self.layers {
+            // The input side of all steps is one matrix product; only the hidden side is a chain.
+            let gates = layer.input.forward(&inputs)?; // [STEPS, K, 3C]
+            let mut state = hidden.clone();
+            let mut outputs = Vec::with_capacity(n);
+            for step in 0..n {
+                state = ops::gru_cell(&gates.get(step)?, &layer.hidden.forward(&state)?, &state)?;
+                outputs.push(state.clone());
+            }
+            inputs = Tensor::stack(&outputs, 0)?;
+        }
+        Ok(inputs)
+    }
+
+    /// The state before the first step: the hidden vector in every layer.
+    pub(crate) fn begin(&self, hidden: &Tensor) -> Vec<Tensor> {
+        vec![hidden.clone(); self.layers.len()]
+    }
+
+    /// One step: `previous` [K] are the tokens of the step before, none at step 0. Returns the
+    /// output, [K, C], for [`StateDecoder::logits`].
+    pub(crate) fn step(
+        &self,
+        table: &Tensor,
+        states: &mut [Tensor],
+        step: usize,
+        previous: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let (k, c) = states[0].dims2()?;
+        let slot = self.slots.get(step)?.reshape((1, c))?;
+        let mut input = match previous {
+            Some(tokens) => table.index_select(tokens, 0)?.broadcast_add(&slot)?,
+            None => slot.broadcast_as((k, c))?.contiguous()?,
+        };
+        for (layer, state) in self.layers.iter().zip(states) {
+            let gates = layer.input.forward(&input)?;
+            *state = ops::gru_cell(&gates, &layer.hidden.forward(state)?, state)?;
+            input = state.clone();
+        }
+        Ok(input)
+    }
+
+    /// Logits over the bins of one field: only its rows of the shared output matrix are multiplied,
+    /// which is exact because nothing outside the field may be sampled.
+    pub(crate) fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
+        let rows = self
+            .head
+            .weight()
+            .narrow(0, field.first_token() as usize, field.n_bins())?;
+        ops::linear(output, &rows, None)
+    }
+
+    /// Logits over what may follow a control or value token: the 321 keys, then BEGIN, NEWBORN and
+    /// LIGHTS_END; [N, 324].
+    pub(crate) fn control_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+        let weight = self.head.weight();
+        let keys = weight.narrow(0, 0, CONTROL_KEYS)?;
+        let specials = weight.narrow(0, gump_tokenizer::BEGIN as usize, 3)?;
+        ops::linear(hidden, &Tensor::cat(&[&keys, &specials], 0)?, None)
+    }
+}
+
+/// Keys in the control alphabet: the ego's and 320 agents'.
+pub(crate) const CONTROL_KEYS: usize = 321;

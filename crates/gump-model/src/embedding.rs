@@ -1,0 +1,256 @@
+//! Tokens as vectors: one sum of table rows per token, plus a sine for what has coordinates.
+//!
+//! All tables of the specification (tokens, classes, light indices, prompts, positions, frames)
+//! are stacked into one, so that every token of every kind is the sum of a few of its rows; the
+//! gather and its backward pass are one operation.
+
+use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
+use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TABLE_ROWS};
+
+/// Rows of the frame table; frames beyond share the last row.
+const N_FRAMES: usize = 64;
+/// Rows for light indices, 0 unused.
+const N_LIGHT_INDICES: usize = 64;
+/// Most rows a token sums: seven fields, position, frame.
+pub(crate) const ROWS_PER_TOKEN: usize = 9;
+
+/// Where each table starts in the stack of tables.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tables {
+    block_size: usize,
+}
+
+impl Tables {
+    pub(crate) const CLASS: usize = TABLE_ROWS as usize;
+    pub(crate) const LIGHT_INDEX: usize = Self::CLASS + N_CLASSES;
+    pub(crate) const PROMPT: usize = Self::LIGHT_INDEX + N_LIGHT_INDICES;
+    pub(crate) const FRAME: usize = Self::PROMPT + N_PROMPTS;
+    pub(crate) const POSITION: usize = Self::FRAME + N_FRAMES;
+
+    pub(crate) fn new(block_size: usize) -> Self {
+        Self { block_size }
+    }
+
+    /// Rows of all tables together.
+    pub(crate) fn n_rows(self) -> usize {
+        Self::POSITION + self.block_size
+    }
+
+    /// The rows that `slot` sums, at `position` in the window and in its `frame`; unused entries
+    /// are `u32::MAX`.
+    pub(crate) fn rows(self, slot: &Slot, position: usize, frame: usize) -> [u32; ROWS_PER_TOKEN] {
+        let mut rows = [u32::MAX; ROWS_PER_TOKEN];
+        let mut n = 0;
+        let mut add = |row: usize| {
+            rows[n] = row as u32;
+            n += 1;
+        };
+        match slot {
+            Slot::Prompt(tag) => add(Self::PROMPT + tag.map_or(N_PROMPTS - 1, |tag| tag.index())),
+            Slot::Begin => add(gump_tokenizer::BEGIN as usize),
+            Slot::LightsEnd => add(gump_tokenizer::LIGHTS_END as usize),
+            Slot::Newborn => add(gump_tokenizer::NEWBORN as usize),
+            Slot::Pad => add(PAD as usize),
+            Slot::Light(light) => {
+                add(gump_tokenizer::light_token(light.state) as usize);
+                add(Self::LIGHT_INDEX + usize::from(light.index).min(N_LIGHT_INDICES - 1));
+            }
+            Slot::Key(key) => {
+                add(usize::from(key.id));
+                add(Self::CLASS + gump_tokenizer::class_index(key.kind));
+            }
+            Slot::Value(state) => {
+                for field in Field::ALL {
+                    add(state.token(field) as usize);
+                }
+            }
+        }
+        add(Self::POSITION + position.min(self.block_size - 1));
+        add(Self::FRAME + frame.min(N_FRAMES - 1));
+        rows
+    }
+}
+
+/// Sine features of every bin of every field, computed once.
+///
+/// A token's features are seven blocks of `2k` entries, k = ⌊width / 14⌋, in the order of
+/// [`Field::ALL`], then zeros. Lengths and speeds use wavelengths in geometric steps from four bins
+/// to four times the field's range; headings use whole harmonics, so that θ and θ + 2π embed alike.
+#[derive(Debug)]
+pub(crate) struct SineTables {
+    width: usize,
+    /// Per field, [bins, 2k].
+    fields: Vec<Vec<f32>>,
+}
+
+impl SineTables {
+    pub(crate) fn new(width: usize) -> Self {
+        let k = width / (2 * Field::ALL.len());
+        let table = |field: Field| {
+            let bins = 0..field.n_bins() as u16;
+            bins.flat_map(|bin| sines(field, field.dequantize(bin), k))
+                .collect()
+        };
+        Self {
+            width,
+            fields: Field::ALL.into_iter().map(table).collect(),
+        }
+    }
+
+    /// Appends the features of `slot` to `out` if it has coordinates.
+    pub(crate) fn append(&self, slot: &Slot, out: &mut Vec<f32>) -> bool {
+        let (state, n_fields) = match slot {
+            Slot::Value(state) => (*state, Field::ALL.len()),
+            Slot::Light(light) => {
+                let (x, y, heading) = (light.x, light.y, light.heading);
+                (
+                    QuantizedState {
+                        x,
+                        y,
+                        heading,
+                        ..QuantizedState::default()
+                    },
+                    3,
+                )
+            }
+            _ => return false,
+        };
+        let end = out.len() + self.width;
+        let block = 2 * (self.width / (2 * Field::ALL.len()));
+        for (field, table) in Field::ALL.into_iter().zip(&self.fields).take(n_fields) {
+            out.extend_from_slice(&table[usize::from(state.get(field)) * block..][..block]);
+        }
+        out.resize(end, 0.0);
+        true
+    }
+}
+
+/// Sine features of a point on the ground, as visual tokens use them.
+pub(crate) fn sine_of_point(x: f64, y: f64, width: usize) -> Vec<f32> {
+    let k = width / (2 * Field::ALL.len());
+    let mut features = sines(Field::X, x, k);
+    features.extend(sines(Field::Y, y, k));
+    features.resize(width, 0.0);
+    features
+}
+
+/// `k` sines, then `k` cosines.
+fn sines(field: Field, value: f64, k: usize) -> Vec<f32> {
+    let phase = |m: usize| value * frequency(field, m, k);
+    (0..k)
+        .map(|m| phase(m).sin() as f32)
+        .chain((0..k).map(|m| phase(m).cos() as f32))
+        .collect()
+}
+
+/// Radians per unit of `field` for the `m`-th of `k` frequencies.
+fn frequency(field: Field, m: usize, k: usize) -> f64 {
+    if field.is_circular() {
+        return (m + 1) as f64;
+    }
+    let shortest = 4.0 * field.step();
+    let longest = 4.0 * (field.high() - field.low());
+    let t = if k > 1 {
+        m as f64 / (k - 1) as f64
+    } else {
+        0.0
+    };
+    std::f64::consts::TAU / (shortest * (longest / shortest).powf(t))
+}
+
+/// Sums table rows: `table` [R, C], `rows` [N, K] of u32 with `u32::MAX` for "none" gives [N, C].
+pub(crate) fn embedding_sum(table: &Tensor, rows: &Tensor) -> Result<Tensor> {
+    if table.device().is_cpu() {
+        return table
+            .contiguous()?
+            .apply_op2(&rows.contiguous()?, EmbeddingSum);
+    }
+    // "None" points at a row of zeros behind the table.
+    let (n_rows, width) = table.dims2()?;
+    let (n, k) = rows.dims2()?;
+    let zeros = Tensor::zeros((1, width), table.dtype(), table.device())?;
+    let padded = Tensor::cat(&[table, &zeros], 0)?;
+    let last = Tensor::full(n_rows as u32, (n, k), rows.device())?;
+    let rows = rows.minimum(&last)?.flatten_all()?;
+    padded
+        .index_select(&rows, 0)?
+        .reshape((n, k, width))?
+        .sum(1)
+}
+
+struct EmbeddingSum;
+
+impl CustomOp2 for EmbeddingSum {
+    fn name(&self) -> &'static str {
+        "embedding-sum"
+    }
+
+    fn cpu_fwd(
+        &self,
+        table: &CpuStorage,
+        tl: &Layout,
+        rows: &CpuStorage,
+        rl: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (n_rows, width) = tl.shape().dims2()?;
+        let (n, k) = rl.shape().dims2()?;
+        let table = &table.as_slice::<f32>()?[tl.start_offset()..][..n_rows * width];
+        let rows = &rows.as_slice::<u32>()?[rl.start_offset()..][..n * k];
+        let mut out = vec![0f32; n * width];
+        for (sum, rows) in out.chunks_exact_mut(width).zip(rows.chunks_exact(k)) {
+            for &row in rows.iter().filter(|row| **row != u32::MAX) {
+                let row = &table[row as usize * width..][..width];
+                sum.iter_mut().zip(row).for_each(|(s, r)| *s += r);
+            }
+        }
+        Ok((CpuStorage::F32(out), Shape::from((n, width))))
+    }
+
+    fn bwd(
+        &self,
+        table: &Tensor,
+        rows: &Tensor,
+        _res: &Tensor,
+        grad: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let scatter = ScatterRows {
+            n_rows: table.dim(0)?,
+        };
+        Ok((
+            Some(grad.contiguous()?.apply_op2_no_bwd(rows, &scatter)?),
+            None,
+        ))
+    }
+}
+
+/// The transpose of [`EmbeddingSum`]: adds every row of the gradient to the table rows it came from.
+struct ScatterRows {
+    n_rows: usize,
+}
+
+impl CustomOp2 for ScatterRows {
+    fn name(&self) -> &'static str {
+        "scatter-rows"
+    }
+
+    fn cpu_fwd(
+        &self,
+        grad: &CpuStorage,
+        gl: &Layout,
+        rows: &CpuStorage,
+        rl: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (n, width) = gl.shape().dims2()?;
+        let k = rl.shape().dims2()?.1;
+        let grad = &grad.as_slice::<f32>()?[gl.start_offset()..][..n * width];
+        let rows = &rows.as_slice::<u32>()?[rl.start_offset()..][..n * k];
+        let mut out = vec![0f32; self.n_rows * width];
+        for (grad, rows) in grad.chunks_exact(width).zip(rows.chunks_exact(k)) {
+            for &row in rows.iter().filter(|row| **row != u32::MAX) {
+                let row = &mut out[row as usize * width..][..width];
+                row.iter_mut().zip(grad).for_each(|(r, g)| *r += g);
+            }
+        }
+        Ok((CpuStorage::F32(out), Shape::from((self.n_rows, width))))
+    }
+}

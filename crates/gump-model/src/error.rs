@@ -1,0 +1,67 @@
+//! What can go wrong in this crate.
+
+use std::path::PathBuf;
+
+/// An error of the model: a configuration, a checkpoint, an input or the arithmetic below.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The tensor library failed.
+    #[error("tensor operation failed: {0}")]
+    Tensor(#[from] candle_core::Error),
+    /// A configuration contradicts itself.
+    #[error("configuration: {0}")]
+    Config(String),
+    /// A checkpoint lacks a tensor that the configuration asks for.
+    #[error("tensor \"{name}\" is missing")]
+    MissingTensor {
+        /// Its name.
+        name: String,
+    },
+    /// A tensor of a checkpoint has another shape than the configuration asks for.
+    #[error("tensor \"{name}\" has shape {found:?}, expected {expected:?}")]
+    TensorShape {
+        /// Its name.
+        name: String,
+        /// What the configuration asks for.
+        expected: Vec<usize>,
+        /// What the file holds.
+        found: Vec<usize>,
+    },
+    /// A file is not a checkpoint of this crate, or of another vocabulary.
+    #[error("{what}: {path}")]
+    Checkpoint {
+        /// What was expected and what was found.
+        what: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file could not be read or written.
+    #[error("{action}: {source}: {path}")]
+    Io {
+        /// What was being done.
+        action: &'static str,
+        /// The system's word.
+        source: std::io::Error,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Training diverged.
+    #[error(
+        "the loss is not a number at step {step} (field {field}); the last checkpoint is intact"
+    )]
+    LossNotFinite {
+        /// Optimiser step.
+        step: usize,
+        /// First loss that is not finite.
+        field: String,
+    },
+    /// There is nothing to train on.
+    #[error("no scenario offers {frames} consecutive frames at 2 Hz to train on")]
+    NoData {
+        /// Frames a sample needs.
+        frames: usize,
+    },
+    /// A scene cannot be imagined by this model.
+    #[error("scene: {0}")]
+    Scene(String),
+}

@@ -1,0 +1,348 @@
+//! What training minimises: cross-entropy of states and successors, trajectories, reconstruction.
+//!
+//! Every mean is over valid targets only; an ignored target has no value and no gradient.
+//!
+//! Source: GUMP's loss with separate means for values and keys, winner-takes-all trajectories.
+
+use candle_core::{D, Device, Tensor};
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+use crate::batch::pack;
+use crate::decoder::STEPS;
+use crate::mct::Dropout;
+use crate::network::Network;
+use crate::ops::{self, OrdinalSmoothing};
+use crate::sample::{Sample, TrajectoryTarget};
+use crate::trajectory::{FUTURE, MODES, PAST, POSE, Trajectories};
+
+/// Weights of the parts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LossConfig {
+    /// Weight of the successor of control and value tokens (released code v1.1: 0.1).
+    pub control: f64,
+    /// Weights of the trajectory heads, shallow to deep (paper: 0.25, 0.25, 0.5, 0.5); a network
+    /// with fewer heads uses the last ones.
+    pub trajectory: [f64; 4],
+    /// Weight of recalling the past in the trajectory heads, relative to the future.
+    pub past: f64,
+    /// Weight of reconstructing the raster (paper: 1).
+    pub reconstruction: f64,
+    /// Width of the label smoothing over neighbouring bins, as a standard deviation in bins; 0 is
+    /// none (paper).
+    pub smoothing_bins: f64,
+    /// Most agents per batch that a trajectory head is asked about (released code: 512).
+    pub max_trajectories: usize,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self {
+            control: 0.1,
+            trajectory: [0.25, 0.25, 0.5, 0.5],
+            past: 0.25,
+            reconstruction: 1.0,
+            smoothing_bins: 0.0,
+            max_trajectories: 512,
+        }
+    }
+}
+
+/// The parts of a loss as numbers.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct LossParts {
+    /// What was minimised.
+    pub total: f64,
+    /// Mean cross-entropy over all state targets, nats.
+    pub state: f64,
+    /// Cross-entropy per decoder step (width, length, v_x, v_y, four times x, y, θ), nats.
+    pub fields: Vec<f64>,
+    /// Cross-entropy of successors, nats.
+    pub control: f64,
+    /// Trajectory heads, weighted.
+    pub trajectory: f64,
+    /// Mean absolute error of the reconstructed raster.
+    pub reconstruction: f64,
+}
+
+impl LossParts {
+    /// The first part that is not a finite number.
+    pub fn first_not_finite(&self) -> Option<String> {
+        let named = [
+            ("control", self.control),
+            ("trajectory", self.trajectory),
+            ("reconstruction", self.reconstruction),
+            ("total", self.total),
+        ];
+        let fields = self
+            .fields
+            .iter()
+            .enumerate()
+            .map(|(i, &v)| (format!("step {i} {:?}", STEPS[i]), v));
+        let all = fields.chain(named.map(|(name, value)| (name.to_owned(), value)));
+        all.into_iter()
+            .find(|(_, value)| !value.is_finite())
+            .map(|(name, _)| name)
+    }
+}
+
+/// One forward pass over samples: the loss to differentiate and its parts.
+///
+/// With `dropout` the pass is a training pass; without, an evaluation.
+pub(crate) fn loss(
+    network: &Network,
+    samples: &[Sample],
+    config: &LossConfig,
+    training: bool,
+    dropout: Option<&Dropout>,
+) -> Result<(Tensor, LossParts), ModelError> {
+    let device = network.device();
+    let width = network.config().width;
+    let rasters: Vec<_> = samples.iter().map(|sample| sample.raster.clone()).collect();
+    let raster = network.raster_tensor(&rasters)?;
+    let features = network.visual.features(&raster, training)?;
+    let memory = network.mct.remember(&network.place(&features)?)?;
+    let sequences: Vec<_> = samples
+        .iter()
+        .map(|sample| sample.slots.as_slice())
+        .collect();
+    let batch = pack(
+        &sequences,
+        network.mct.tables(),
+        network.sines(),
+        width,
+        device,
+    )?;
+    let (b, t) = batch.shape;
+    let passed = network.mct.forward(&batch, &memory, None, dropout)?;
+    let flat = passed.hidden.reshape((b * t, width))?;
+
+    let mut parts = LossParts::default();
+    let mut total = Tensor::zeros((), candle_core::DType::F32, device)?;
+    if let Some(state) = state_loss(network, samples, t, &flat, config, &mut parts)? {
+        total = (total + state)?;
+    }
+    if let Some(control) = control_loss(network, samples, t, &flat)? {
+        parts.control = scalar(&control)?;
+        total = (total + (control * config.control)?)?;
+    }
+    let targets = trajectory_targets(samples, t, config.max_trajectories);
+    if !targets.is_empty() {
+        let weights =
+            &config.trajectory[config.trajectory.len().saturating_sub(passed.levels.len())..];
+        for ((level, head), weight) in passed
+            .levels
+            .iter()
+            .zip(&network.trajectory_heads)
+            .zip(weights)
+        {
+            let level = level.reshape((b * t, width))?;
+            let predicted = head.forward(&at_agents(&level, &targets, device)?)?;
+            let part = (trajectory_loss(&predicted, &targets, config.past, device)? * *weight)?;
+            parts.trajectory += scalar(&part)?;
+            total = (total + part)?;
+        }
+    }
+    if let Some(decoder) = network
+        .visual
+        .reconstruction()
+        .filter(|_| config.reconstruction > 0.0)
+    {
+        let part = decoder.loss(&features, &raster)?;
+        parts.reconstruction = scalar(&part)?;
+        total = (total + (part * config.reconstruction)?)?;
+    }
+    parts.total = scalar(&total)?;
+    Ok((total, parts))
+}
+
+fn scalar(tensor: &Tensor) -> candle_core::Result<f64> {
+    Ok(f64::from(tensor.to_scalar::<f32>()?))
+}
+
+/// Mean cross-entropy of all state targets; fills the per-step parts.
+fn state_loss(
+    network: &Network,
+    samples: &[Sample],
+    t: usize,
+    flat: &Tensor,
+    config: &LossConfig,
+    parts: &mut LossParts,
+) -> Result<Option<Tensor>, ModelError> {
+    let device = network.device();
+    let targets: Vec<_> = samples.iter().flat_map(|sample| &sample.states).collect();
+    let k = targets.len();
+    if k == 0 {
+        return Ok(None);
+    }
+    let rows = samples.iter().enumerate().flat_map(|(row, sample)| {
+        sample
+            .states
+            .iter()
+            .map(move |target| (row * t + target.key) as u32)
+    });
+    let hidden = flat.index_select(&Tensor::from_vec(rows.collect::<Vec<u32>>(), k, device)?, 0)?; // [K, C]
+    let tokens: Vec<u32> = (0..STEPS.len())
+        .flat_map(|step| targets.iter().map(move |target| target.token(step)))
+        .collect();
+    let tokens = Tensor::from_vec(tokens, (STEPS.len(), k), device)?;
+    let outputs = network
+        .decoder
+        .teacher_forced(&network.mct.token_table()?, &hidden, &tokens)?;
+
+    let counts: Vec<usize> = (0..STEPS.len())
+        .map(|step| targets.iter().filter(|t| t.bins[step].is_some()).count())
+        .collect();
+    let n: usize = counts.iter().sum();
+    let mut total = None;
+    for (step, field) in STEPS.into_iter().enumerate() {
+        let bins: Vec<u32> = targets
+            .iter()
+            .map(|t| t.bins[step].map_or(0, u32::from))
+            .collect();
+        let valid: Vec<f32> = targets
+            .iter()
+            .map(|t| f32::from(u8::from(t.bins[step].is_some())))
+            .collect();
+        let logits = network.decoder.logits(&outputs.get(step)?, field)?; // [K, bins]
+        let smoothing = (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
+            sigma_bins: config.smoothing_bins as f32,
+            circular: field.is_circular(),
+        });
+        let mean = ops::masked_cross_entropy(
+            &logits,
+            &Tensor::from_vec(bins, k, device)?,
+            &Tensor::from_vec(valid, k, device)?,
+            smoothing,
+        )?;
+        parts.fields.push(scalar(&mean)?);
+        let share = counts[step] as f64 / n as f64;
+        parts.state += share * parts.fields[step];
+        let part = (mean * share)?;
+        total = Some(match total {
+            None => part,
+            Some(total) => (part + total)?,
+        });
+    }
+    Ok(total)
+}
+
+/// Mean cross-entropy of what follows control and value tokens.
+fn control_loss(
+    network: &Network,
+    samples: &[Sample],
+    t: usize,
+    flat: &Tensor,
+) -> Result<Option<Tensor>, ModelError> {
+    let device = network.device();
+    let (rows, successors): (Vec<u32>, Vec<u32>) = samples
+        .iter()
+        .enumerate()
+        .flat_map(|(row, sample)| {
+            sample
+                .control
+                .iter()
+                .map(move |target| ((row * t + target.slot) as u32, target.successor))
+        })
+        .unzip();
+    let n = rows.len();
+    if n == 0 {
+        return Ok(None);
+    }
+    let hidden = flat.index_select(&Tensor::from_vec(rows, n, device)?, 0)?;
+    let logits = network.decoder.control_logits(&hidden)?;
+    let weights = Tensor::ones(n, candle_core::DType::F32, device)?;
+    let targets = Tensor::from_vec(successors, n, device)?;
+    Ok(Some(ops::masked_cross_entropy(
+        &logits, &targets, &weights, None,
+    )?))
+}
+
+/// Up to `limit` targets spread evenly over the batch, with the flat index of their key.
+fn trajectory_targets(samples: &[Sample], t: usize, limit: usize) -> Vec<(u32, &TrajectoryTarget)> {
+    let all: Vec<_> = samples
+        .iter()
+        .enumerate()
+        .flat_map(|(row, sample)| {
+            sample
+                .trajectories
+                .iter()
+                .map(move |target| ((row * t + target.key) as u32, target))
+        })
+        .collect();
+    let stride = all.len().div_ceil(limit.max(1)).max(1);
+    all.into_iter().step_by(stride).collect()
+}
+
+/// Features at key and value side by side, [A, 2C].
+fn at_agents(
+    level: &Tensor,
+    targets: &[(u32, &TrajectoryTarget)],
+    device: &Device,
+) -> candle_core::Result<Tensor> {
+    let pick = |offset: u32| {
+        let rows: Vec<u32> = targets.iter().map(|(key, _)| key + offset).collect();
+        level.index_select(&Tensor::new(rows, device)?, 0)
+    };
+    Tensor::cat(&[pick(0)?, pick(1)?], 1)
+}
+
+/// Best-of-modes regression plus classification of the best mode, plus recalling the past.
+pub(crate) fn trajectory_loss(
+    predicted: &Trajectories,
+    targets: &[(u32, &TrajectoryTarget)],
+    past_weight: f64,
+    device: &Device,
+) -> candle_core::Result<Tensor> {
+    let a = targets.len();
+    let (future, future_share) =
+        pose_tensors::<FUTURE>(targets.iter().map(|t| &t.1.future), device)?;
+    let (past, past_share) = pose_tensors::<PAST>(targets.iter().map(|t| &t.1.past), device)?;
+
+    let off = predicted
+        .future
+        .broadcast_sub(&future.reshape((a, 1, FUTURE, POSE))?)?;
+    let distance = (off.narrow(3, 0, 2)?.sqr()?.sum(3)? + 1e-5)?.sqrt()?; // [A, MODES, FUTURE]
+    let turn = off.narrow(3, 2, 2)?.abs()?.sum(3)?;
+    let share = future_share.reshape((a, 1, FUTURE))?;
+    let error = (distance + (turn * 2.0)?)?.broadcast_mul(&share)?.sum(2)?; // [A, MODES]
+
+    // The winner is picked outside the graph: no gradient flows through the choice.
+    let errors = error.to_vec2::<f32>()?;
+    let winners = errors.iter().flat_map(|row| {
+        let best = (0..MODES)
+            .min_by(|&i, &j| row[i].total_cmp(&row[j]))
+            .expect("there are modes");
+        (0..MODES).map(move |mode| f32::from(u8::from(mode == best)))
+    });
+    let winners = Tensor::from_vec(winners.collect::<Vec<f32>>(), (a, MODES), device)?;
+    let log_share = candle_nn::ops::log_softmax(&predicted.modes, D::Minus1)?;
+    let regression = (&error * &winners)?.sum_all()?;
+    let classification = (log_share * &winners)?.sum_all()?.neg()?;
+
+    let off = (&predicted.past - past)?.abs()?;
+    let recall = (off.narrow(2, 0, 2)?.sum(2)? + (off.narrow(2, 2, 2)?.sum(2)? * 2.0)?)?;
+    let recall = (recall * past_share)?.sum_all()?;
+    ((regression + classification)? + (recall * past_weight)?)? / a as f64
+}
+
+/// Poses [A, N, POSE] with zeros where missing, and per step 1 / (valid steps) or 0, [A, N].
+fn pose_tensors<'a, const N: usize>(
+    rows: impl Iterator<Item = &'a [Option<[f32; POSE]>; N]>,
+    device: &Device,
+) -> candle_core::Result<(Tensor, Tensor)> {
+    let (mut poses, mut shares) = (Vec::new(), Vec::new());
+    for row in rows {
+        let valid = row.iter().flatten().count().max(1) as f32;
+        for pose in row {
+            poses.extend(pose.unwrap_or([0.0; POSE]));
+            shares.push(if pose.is_some() { 1.0 / valid } else { 0.0 });
+        }
+    }
+    let a = shares.len() / N;
+    Ok((
+        Tensor::from_vec(poses, (a, N, POSE), device)?,
+        Tensor::from_vec(shares, (a, N), device)?,
+    ))
+}

@@ -1,0 +1,459 @@
+//! The multimodal causal transformer: the network in one sitting.
+//!
+//! Tokens become vectors, pass `layers` blocks of causal self-attention, look at the map through
+//! gated cross-attention after every third block, and leave as one hidden vector per token. The
+//! hidden vector at an agent's *key* is what [`crate::decoder`] turns into its state.
+//!
+//! Shapes: `B` sequences, `T` tokens, `C` width, `M` visual tokens, `S` scenes; `B` is a multiple of
+//! `S`, and `B / S` consecutive sequences share a scene.
+//!
+//! Source: GUMP (ECCV 2024); GPT-2 blocks; gated cross-attention after Flamingo.
+
+use candle_core::{Result, Tensor};
+use gump_scene::Seed;
+
+use crate::ModelError;
+use crate::config::{Gate, ModelConfig};
+use crate::embedding::{Tables, embedding_sum};
+use crate::ops;
+use crate::parameters::{Init, Scope};
+
+/// Every table starts from this deviation, as GPT-2's do.
+pub(crate) const TABLE_DEVIATION: f64 = 0.02;
+const NORM_EPS: f64 = 1e-5;
+
+/// Layer normalisation with scale and shift.
+#[derive(Debug)]
+pub(crate) struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    pub(crate) fn new(
+        scope: &mut Scope<'_>,
+        name: &str,
+        width: usize,
+    ) -> std::result::Result<Self, ModelError> {
+        let mut scope = scope.part(name);
+        let weight = scope.get("weight", width, Init::Constant(1.0))?;
+        Ok(Self {
+            weight,
+            bias: scope.get("bias", width, Init::Constant(0.0))?,
+        })
+    }
+
+    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        ops::layer_norm(x, &self.weight, &self.bias, NORM_EPS as f32)
+    }
+}
+
+/// A matrix, with or without bias.
+#[derive(Debug)]
+pub(crate) struct Linear {
+    weight: Tensor,
+    bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// A layer that PyTorch would build: uniform start.
+    pub(crate) fn new(
+        scope: &mut Scope<'_>,
+        name: &str,
+        inputs: usize,
+        outputs: usize,
+    ) -> std::result::Result<Self, ModelError> {
+        Self::with(
+            scope,
+            name,
+            inputs,
+            outputs,
+            Init::FanIn(inputs),
+            Some(Init::FanIn(inputs)),
+        )
+    }
+
+    pub(crate) fn with(
+        scope: &mut Scope<'_>,
+        name: &str,
+        inputs: usize,
+        outputs: usize,
+        weight: Init,
+        bias: Option<Init>,
+    ) -> std::result::Result<Self, ModelError> {
+        let mut scope = scope.part(name);
+        let weight = scope.get("weight", (outputs, inputs), weight)?;
+        Ok(Self {
+            weight,
+            bias: bias
+                .map(|init| scope.get("bias", outputs, init))
+                .transpose()?,
+        })
+    }
+
+    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        ops::linear(x, &self.weight, self.bias.as_ref())
+    }
+
+    /// The matrix, `[out, in]`.
+    pub(crate) fn weight(&self) -> &Tensor {
+        &self.weight
+    }
+}
+
+/// Seeded dropout: absent at inference.
+#[derive(Clone, Debug)]
+pub(crate) struct Dropout {
+    probability: f64,
+    seed: Seed,
+    calls: std::cell::Cell<u64>,
+}
+
+impl Dropout {
+    pub(crate) fn new(probability: f64, seed: Seed) -> Option<Self> {
+        (probability > 0.0).then(|| Self {
+            probability,
+            seed,
+            calls: 0.into(),
+        })
+    }
+}
+
+/// Drops entries of `x` and scales the rest up, if training asks for it.
+fn drop_out(x: Tensor, dropout: Option<&Dropout>) -> Result<Tensor> {
+    let Some(Dropout {
+        probability,
+        seed,
+        calls,
+    }) = dropout
+    else {
+        return Ok(x);
+    };
+    let seed = seed.fork(calls.get());
+    calls.set(calls.get() + 1);
+    let mut rng = seed.rng();
+    let keep = 1.0 / (1.0 - probability) as f32;
+    let threshold = (probability * f64::from(u32::MAX)) as u32;
+    let mask: Vec<f32> = (0..x.elem_count())
+        .map(|_| {
+            if rand::RngCore::next_u32(&mut rng) < threshold {
+                0.0
+            } else {
+                keep
+            }
+        })
+        .collect();
+    &x * Tensor::from_vec(mask, x.shape(), x.device())?
+}
+
+/// Self-attention and MLP, pre-norm.
+#[derive(Debug)]
+struct Block {
+    norm_attention: LayerNorm,
+    qkv: Linear,
+    attention_out: Linear,
+    norm_mlp: LayerNorm,
+    mlp_in: Linear,
+    mlp_out: Linear,
+    heads: usize,
+}
+
+impl Block {
+    fn new(mut scope: Scope<'_>, config: &ModelConfig) -> std::result::Result<Self, ModelError> {
+        let c = config.width;
+        let zero = Some(Init::Constant(0.0));
+        // Residual projections start small so that the variance does not grow with depth (GPT-2).
+        let residual = Init::Normal(TABLE_DEVIATION / (2.0 * config.layers as f64).sqrt());
+        Ok(Self {
+            norm_attention: LayerNorm::new(&mut scope, "norm_attention", c)?,
+            qkv: Linear::with(&mut scope, "qkv", c, 3 * c, Init::Xavier, zero)?,
+            attention_out: Linear::with(&mut scope, "attention_out", c, c, residual, zero)?,
+            norm_mlp: LayerNorm::new(&mut scope, "norm_mlp", c)?,
+            mlp_in: Linear::with(&mut scope, "mlp_in", c, 4 * c, Init::Xavier, zero)?,
+            mlp_out: Linear::with(&mut scope, "mlp_out", 4 * c, c, residual, zero)?,
+            heads: config.heads,
+        })
+    }
+
+    fn forward(
+        &self,
+        x: &Tensor,
+        cache: Option<&mut Option<(Tensor, Tensor)>>,
+        dropout: Option<&Dropout>,
+    ) -> Result<Tensor> {
+        let c = x.dim(2)?;
+        let qkv = self.qkv.forward(&self.norm_attention.forward(x)?)?; // [B, T, 3C]
+        let q = qkv.narrow(2, 0, c)?;
+        let mut k = qkv.narrow(2, c, c)?;
+        let mut v = qkv.narrow(2, 2 * c, c)?;
+        let mut offset = 0;
+        if let Some(past) = cache {
+            if let Some((past_k, past_v)) = past.as_ref() {
+                offset = past_k.dim(1)?;
+                k = Tensor::cat(&[past_k, &k], 1)?;
+                v = Tensor::cat(&[past_v, &v], 1)?;
+            }
+            *past = Some((k.contiguous()?, v.contiguous()?));
+        }
+        let attended = ops::causal_attention(&q, &k, &v, self.heads, offset, None)?; // [B, T, C]
+        let x = (x + drop_out(self.attention_out.forward(&attended)?, dropout)?)?;
+        let hidden = ops::gelu(&self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?)?; // [B, T, 4C]
+        &x + drop_out(self.mlp_out.forward(&hidden)?, dropout)?
+    }
+}
+
+/// Gated cross-attention to the map.
+#[derive(Debug)]
+struct CrossBlock {
+    norm: LayerNorm,
+    query: Linear,
+    key_value: Linear,
+    out: Linear,
+    gate_attention: Tensor,
+    norm_mlp: LayerNorm,
+    mlp_in: Linear,
+    mlp_out: Linear,
+    gate_mlp: Option<Tensor>,
+    heads: usize,
+}
+
+impl CrossBlock {
+    fn new(mut scope: Scope<'_>, config: &ModelConfig) -> std::result::Result<Self, ModelError> {
+        let c = config.width;
+        let mut matrix = |name: &str, inputs, outputs| {
+            Linear::with(&mut scope, name, inputs, outputs, Init::Xavier, None)
+        };
+        let (query, key_value, out) = (
+            matrix("query", c, c)?,
+            matrix("key_value", c, 2 * c)?,
+            matrix("out", c, c)?,
+        );
+        let (mlp_in, mlp_out) = (matrix("mlp_in", c, 4 * c)?, matrix("mlp_out", 4 * c, c)?);
+        let (gate_attention, gate_mlp) = match config.gate {
+            Gate::Flamingo => {
+                let zero = Init::Constant(0.0);
+                (
+                    scope.get("gate_attention", 1, zero)?,
+                    Some(scope.get("gate_mlp", 1, zero)?),
+                )
+            }
+            Gate::Released => (scope.get("gate_attention", 1, Init::Normal(0.3))?, None),
+        };
+        let norm = LayerNorm::new(&mut scope, "norm", c)?;
+        let norm_mlp = LayerNorm::new(&mut scope, "norm_mlp", c)?;
+        let heads = config.heads;
+        Ok(Self {
+            norm,
+            query,
+            key_value,
+            out,
+            gate_attention,
+            norm_mlp,
+            mlp_in,
+            mlp_out,
+            gate_mlp,
+            heads,
+        })
+    }
+
+    /// Keys and values of the visual tokens, [S, M, C] each.
+    fn remember(&self, visual: &Tensor) -> Result<(Tensor, Tensor)> {
+        let c = visual.dim(2)?;
+        let kv = self.key_value.forward(visual)?; // [S, M, 2C]
+        Ok((
+            kv.narrow(2, 0, c)?.contiguous()?,
+            kv.narrow(2, c, c)?.contiguous()?,
+        ))
+    }
+
+    fn forward(&self, x: &Tensor, (k, v): &(Tensor, Tensor)) -> Result<Tensor> {
+        let q = self.query.forward(&self.norm.forward(x)?)?;
+        let attended = self
+            .out
+            .forward(&ops::cross_attention(&q, k, v, self.heads)?)?;
+        let x = (x + attended.broadcast_mul(&self.gate_attention.tanh()?)?)?;
+        let mlp = self.mlp_out.forward(&ops::gelu(
+            &self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?,
+        )?)?;
+        match &self.gate_mlp {
+            Some(gate) => &x + mlp.broadcast_mul(&gate.tanh()?)?,
+            None => x + mlp,
+        }
+    }
+}
+
+/// What the transformer keeps of a scene's map: keys and values per cross-attention block,
+/// `[S, M, C]`; computed once and shared by all futures of the scene.
+#[derive(Clone, Debug)]
+pub(crate) struct VisualMemory {
+    key_values: Vec<(Tensor, Tensor)>,
+}
+
+impl VisualMemory {
+    /// The memories of several scenes as one batch, in the given order.
+    pub(crate) fn join(parts: &[&Self]) -> Result<Self> {
+        if let [only] = parts {
+            return Ok((*only).clone());
+        }
+        let blocks = parts.first().map_or(0, |part| part.key_values.len());
+        let join = |pick: &dyn Fn(&Self) -> Tensor| {
+            Tensor::cat(&parts.iter().map(|part| pick(part)).collect::<Vec<_>>(), 0)
+        };
+        let key_values = (0..blocks).map(|i| {
+            Ok((
+                join(&|part| part.key_values[i].0.clone())?,
+                join(&|part| part.key_values[i].1.clone())?,
+            ))
+        });
+        Ok(Self {
+            key_values: key_values.collect::<Result<_>>()?,
+        })
+    }
+}
+
+/// Keys and values of the tokens seen so far, per self-attention block, `[B, T, C]`.
+#[derive(Clone, Debug)]
+pub(crate) struct Cache {
+    layers: Vec<Option<(Tensor, Tensor)>>,
+}
+
+impl Cache {
+    pub(crate) fn new(layers: usize) -> Self {
+        Self {
+            layers: vec![None; layers],
+        }
+    }
+
+    /// Tokens remembered.
+    pub(crate) fn len(&self) -> usize {
+        self.layers[0].as_ref().map_or(0, |(k, _)| k.dims()[1])
+    }
+}
+
+/// What a forward pass leaves.
+#[derive(Debug)]
+pub(crate) struct Features {
+    /// After the final normalisation, [B, T, C].
+    pub(crate) hidden: Tensor,
+    /// After each block a trajectory head reads, [B, T, C] each.
+    pub(crate) levels: Vec<Tensor>,
+}
+
+/// Token embeddings and the transformer.
+#[derive(Debug)]
+pub(crate) struct Mct {
+    table: Tensor,
+    tables: Tables,
+    sine_in: Linear,
+    sine_norm: LayerNorm,
+    sine_out: Linear,
+    blocks: Vec<Block>,
+    cross: Vec<CrossBlock>,
+    norm: LayerNorm,
+    levels: Vec<usize>,
+}
+
+/// Tokens ready to embed: `B` sequences of `T` tokens each.
+#[derive(Debug)]
+pub(crate) struct TokenBatch {
+    /// Table rows per token, [B * T, ROWS_PER_TOKEN].
+    pub(crate) rows: Tensor,
+    /// Flat indices of the tokens that have coordinates, [N].
+    pub(crate) sine_positions: Tensor,
+    /// Their sine features, [N, C].
+    pub(crate) sines: Tensor,
+    /// (B, T)
+    pub(crate) shape: (usize, usize),
+}
+
+impl Mct {
+    pub(crate) fn new(
+        mut scope: Scope<'_>,
+        config: &ModelConfig,
+    ) -> std::result::Result<Self, ModelError> {
+        let c = config.width;
+        let tables = Tables::new(config.block_size);
+        Ok(Self {
+            table: scope.get(
+                "tables",
+                (tables.n_rows(), c),
+                Init::Normal(TABLE_DEVIATION),
+            )?,
+            tables,
+            sine_in: Linear::new(&mut scope, "sine_in", c, 2 * c)?,
+            sine_norm: LayerNorm::new(&mut scope, "sine_norm", 2 * c)?,
+            sine_out: Linear::new(&mut scope, "sine_out", 2 * c, c)?,
+            blocks: (0..config.layers)
+                .map(|i| Block::new(scope.part(format!("blocks.{i}")), config))
+                .collect::<std::result::Result<_, _>>()?,
+            cross: (0..config.layers)
+                .filter(|i| i % 3 == 0)
+                .map(|i| CrossBlock::new(scope.part(format!("cross.{i}")), config))
+                .collect::<std::result::Result<_, _>>()?,
+            norm: LayerNorm::new(&mut scope, "norm", c)?,
+            levels: config.trajectory_heads.clone(),
+        })
+    }
+
+    /// Where the tables lie in their stack.
+    pub(crate) fn tables(&self) -> Tables {
+        self.tables
+    }
+
+    /// The rows of the token table, [TABLE_ROWS, C], which the decoder reads too.
+    pub(crate) fn token_table(&self) -> Result<Tensor> {
+        self.table.narrow(0, 0, Tables::CLASS)
+    }
+
+    /// The MLP over sine features, [N, C] to [N, C].
+    pub(crate) fn embed_sine(&self, sines: &Tensor) -> Result<Tensor> {
+        let hidden = self
+            .sine_norm
+            .forward(&self.sine_in.forward(sines)?)?
+            .relu()?;
+        self.sine_out.forward(&hidden)
+    }
+
+    /// Reads the visual tokens once, [S, M, C].
+    pub(crate) fn remember(&self, visual: &Tensor) -> Result<VisualMemory> {
+        let key_values = self.cross.iter().map(|cross| cross.remember(visual));
+        Ok(VisualMemory {
+            key_values: key_values.collect::<Result<_>>()?,
+        })
+    }
+
+    /// One pass over `batch`, after the tokens in `cache` if there is one; the cache then holds
+    /// the new tokens too.
+    pub(crate) fn forward(
+        &self,
+        batch: &TokenBatch,
+        visual: &VisualMemory,
+        mut cache: Option<&mut Cache>,
+        dropout: Option<&Dropout>,
+    ) -> Result<Features> {
+        let (b, t) = batch.shape;
+        let mut x = embedding_sum(&self.table, &batch.rows)?; // [B * T, C]
+        if batch.sines.dim(0)? > 0 {
+            x = x.index_add(&batch.sine_positions, &self.embed_sine(&batch.sines)?, 0)?;
+        }
+        let mut x = drop_out(x.reshape((b, t, ()))?, dropout)?; // [B, T, C]
+        let mut levels = Vec::with_capacity(self.levels.len());
+        for (i, block) in self.blocks.iter().enumerate() {
+            x = block.forward(
+                &x,
+                cache.as_mut().map(|cache| &mut cache.layers[i]),
+                dropout,
+            )?;
+            if i % 3 == 0 {
+                x = self.cross[i / 3].forward(&x, &visual.key_values[i / 3])?;
+            }
+            if self.levels.contains(&i) {
+                levels.push(x.clone());
+            }
+        }
+        Ok(Features {
+            hidden: self.norm.forward(&x)?,
+            levels,
+        })
+    }
+}

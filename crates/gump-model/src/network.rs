@@ -1,0 +1,118 @@
+//! The whole network with its parameters: what a checkpoint holds and everything else calls.
+
+use candle_core::{Device, Tensor};
+use gump_raster::{Raster, RasterSpec};
+use gump_scene::Seed;
+
+use crate::ModelError;
+use crate::config::ModelConfig;
+use crate::decoder::StateDecoder;
+use crate::embedding::SineTables;
+use crate::mct::{Mct, VisualMemory};
+use crate::parameters::Parameters;
+use crate::trajectory::TrajectoryHead;
+use crate::visual::Visual;
+
+/// A GUMP network.
+#[derive(Debug)]
+pub struct Network {
+    config: ModelConfig,
+    raster_spec: RasterSpec,
+    parameters: Parameters,
+    sines: SineTables,
+    pub(crate) mct: Mct,
+    pub(crate) decoder: StateDecoder,
+    pub(crate) visual: Visual,
+    pub(crate) trajectory_heads: Vec<TrajectoryHead>,
+}
+
+impl Network {
+    /// A network that has learned nothing yet.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if the configuration contradicts itself.
+    pub fn random(config: ModelConfig, seed: Seed, device: &Device) -> Result<Self, ModelError> {
+        Self::build(config, Parameters::random(seed, device))
+    }
+
+    /// The network that `config` describes, with the given parameters.
+    ///
+    /// # Errors
+    /// A tensor that is missing, too many or of another shape, by name.
+    pub fn build(config: ModelConfig, mut parameters: Parameters) -> Result<Self, ModelError> {
+        config.validate()?;
+        let raster_spec = config.raster_spec()?;
+        let device = parameters.device().clone();
+        let mut root = parameters.root();
+        let mct = Mct::new(root.part("mct"), &config)?;
+        let decoder = StateDecoder::new(root.part("decoder"), &config)?;
+        let visual = Visual::new(root.part("visual"), &config, &device)?;
+        let trajectory_heads = (0..config.trajectory_heads.len())
+            .map(|i| TrajectoryHead::new(root.part(format!("trajectory.{i}")), config.width))
+            .collect::<Result<_, _>>()?;
+        if let Some(name) = parameters.unused().first() {
+            return Err(ModelError::Config(format!(
+                "the checkpoint's tensor \"{name}\" has no place in it"
+            )));
+        }
+        let sines = SineTables::new(config.width);
+        Ok(Self {
+            config,
+            raster_spec,
+            parameters,
+            sines,
+            mct,
+            decoder,
+            visual,
+            trajectory_heads,
+        })
+    }
+
+    /// The shape it was built from.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// Its numbers.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// What its rasters hold.
+    pub fn raster_spec(&self) -> &RasterSpec {
+        &self.raster_spec
+    }
+
+    /// Where it lives.
+    pub fn device(&self) -> &Device {
+        self.parameters.device()
+    }
+
+    /// Sine features of the vocabulary.
+    pub(crate) fn sines(&self) -> &SineTables {
+        &self.sines
+    }
+
+    /// Rasters of several scenes as one tensor, [S, P, side, side].
+    pub(crate) fn raster_tensor(&self, rasters: &[Raster]) -> Result<Tensor, ModelError> {
+        let side = self.raster_spec.side_px;
+        let data: Vec<f32> = rasters
+            .iter()
+            .flat_map(|raster| raster.data.iter().copied())
+            .collect();
+        let shape = (rasters.len(), self.raster_spec.layers.len(), side, side);
+        Ok(Tensor::from_vec(data, shape, self.device())?)
+    }
+
+    /// Visual features with their positions added, [S, M, C].
+    pub(crate) fn place(&self, features: &Tensor) -> candle_core::Result<Tensor> {
+        let positions = self.mct.embed_sine(self.visual.positions())?; // [M, C]
+        features.broadcast_add(&positions.unsqueeze(0)?)
+    }
+
+    /// Looks at the maps once, for any number of passes.
+    pub(crate) fn look(&self, rasters: &[Raster]) -> Result<VisualMemory, ModelError> {
+        let features = self.visual.features(&self.raster_tensor(rasters)?, false)?;
+        Ok(self.mct.remember(&self.place(&features)?)?)
+    }
+}

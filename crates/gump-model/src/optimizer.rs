@@ -1,0 +1,271 @@
+//! AdamW with its moments in reach, so that a checkpoint can hold them (Loshchilov & Hutter 2019).
+
+use std::collections::BTreeMap;
+
+use candle_core::backprop::GradStore;
+use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor};
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+use crate::parameters::Parameters;
+
+/// Step size and its schedule.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OptimizerConfig {
+    /// Peak learning rate (paper: 2e-4).
+    pub learning_rate: f64,
+    /// Steps of linear warm-up.
+    pub warmup: usize,
+    /// Learning rate at the end of the cosine, as a fraction of the peak.
+    pub final_fraction: f64,
+    /// Decoupled weight decay of matrices (paper: 1e-3); norms, biases, tables and gates have none.
+    pub weight_decay: f64,
+    /// Largest gradient norm; larger ones are scaled down (released code: 5).
+    pub clip: f64,
+}
+
+impl Default for OptimizerConfig {
+    fn default() -> Self {
+        Self {
+            learning_rate: 2e-4,
+            warmup: 200,
+            final_fraction: 0.05,
+            weight_decay: 1e-3,
+            clip: 5.0,
+        }
+    }
+}
+
+impl OptimizerConfig {
+    /// The learning rate of a step (0-based) of `total`.
+    pub fn rate(&self, step: usize, total: usize) -> f64 {
+        if step < self.warmup {
+            return self.learning_rate * (step + 1) as f64 / self.warmup as f64;
+        }
+        let span = total.saturating_sub(self.warmup).max(1);
+        let t = ((step - self.warmup) as f64 / span as f64).min(1.0);
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * t).cos());
+        self.learning_rate * (self.final_fraction + (1.0 - self.final_fraction) * cosine)
+    }
+}
+
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
+const EPS: f64 = 1e-8;
+
+/// First and second moments of every trainable parameter.
+#[derive(Debug)]
+pub(crate) struct AdamW {
+    moments: BTreeMap<String, (Tensor, Tensor)>,
+    steps: usize,
+}
+
+impl AdamW {
+    pub(crate) fn new(parameters: &Parameters) -> Result<Self> {
+        let zeros = |(name, var): (&str, &candle_core::Var)| {
+            Ok((name.to_owned(), (var.zeros_like()?, var.zeros_like()?)))
+        };
+        Ok(Self {
+            moments: parameters.trainable().map(zeros).collect::<Result<_>>()?,
+            steps: 0,
+        })
+    }
+
+    /// The moments as named tensors, for a checkpoint.
+    pub(crate) fn state(&self) -> impl Iterator<Item = (String, &Tensor)> {
+        self.moments.iter().flat_map(|(name, (m, v))| {
+            [
+                (format!("optimizer.m.{name}"), m),
+                (format!("optimizer.v.{name}"), v),
+            ]
+        })
+    }
+
+    /// The optimiser that a checkpoint of `steps` steps holds.
+    pub(crate) fn restore(
+        parameters: &Parameters,
+        steps: usize,
+        mut take: impl FnMut(&str) -> std::result::Result<Tensor, ModelError>,
+    ) -> std::result::Result<Self, ModelError> {
+        let mut moments = BTreeMap::new();
+        for (name, var) in parameters.trainable() {
+            let mut moment = |kind: &str| {
+                let name = format!("optimizer.{kind}.{name}");
+                let tensor = take(&name)?;
+                if tensor.shape() != var.shape() {
+                    let (expected, found) = (var.dims().to_vec(), tensor.dims().to_vec());
+                    return Err(ModelError::TensorShape {
+                        name,
+                        expected,
+                        found,
+                    });
+                }
+                // A copy of its own: the update writes in place.
+                Ok(tensor.to_device(var.device())?.copy()?)
+            };
+            moments.insert(name.to_owned(), (moment("m")?, moment("v")?));
+        }
+        Ok(Self { moments, steps })
+    }
+
+    /// One step; returns the norm of the gradient before clipping.
+    pub(crate) fn step(
+        &mut self,
+        parameters: &Parameters,
+        gradients: &GradStore,
+        config: &OptimizerConfig,
+        rate: f64,
+    ) -> Result<f64> {
+        let mut squares = 0.0;
+        for (_, var) in parameters.trainable() {
+            if let Some(gradient) = gradients.get(var) {
+                squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
+            }
+        }
+        let norm = squares.sqrt();
+        let scale = if norm > config.clip {
+            config.clip / norm
+        } else {
+            1.0
+        };
+        self.steps += 1;
+        let correction1 = 1.0 - BETA1.powi(self.steps as i32);
+        let correction2 = 1.0 - BETA2.powi(self.steps as i32);
+        for (name, var) in parameters.trainable() {
+            let Some(gradient) = gradients.get(var) else {
+                continue;
+            };
+            let gradient = gradient.contiguous()?;
+            let (m, v) = &self.moments[name];
+            m.inplace_op2(
+                &gradient,
+                &Moment {
+                    beta: BETA1,
+                    scale,
+                    squared: false,
+                },
+            )?;
+            v.inplace_op2(
+                &gradient,
+                &Moment {
+                    beta: BETA2,
+                    scale,
+                    squared: true,
+                },
+            )?;
+            let decay = if decays(name, var) {
+                config.weight_decay
+            } else {
+                0.0
+            };
+            let update = Update {
+                rate,
+                decay: rate * decay,
+                correction1,
+                correction2,
+            };
+            var.as_tensor().inplace_op3(m, v, &update)?;
+        }
+        Ok(norm)
+    }
+}
+
+/// Matrices and kernels decay; vectors, gates and embedding tables do not.
+fn decays(name: &str, tensor: &Tensor) -> bool {
+    tensor.rank() >= 2 && !name.ends_with("tables") && !name.ends_with("slots")
+}
+
+/// An exponential moving average of the gradient or of its square.
+struct Moment {
+    beta: f64,
+    scale: f64,
+    squared: bool,
+}
+
+impl InplaceOp2 for Moment {
+    fn name(&self) -> &'static str {
+        "adamw-moment"
+    }
+
+    fn cpu_fwd(
+        &self,
+        moment: &mut CpuStorage,
+        ml: &Layout,
+        gradient: &CpuStorage,
+        gl: &Layout,
+    ) -> Result<()> {
+        let n = ml.shape().elem_count();
+        let moment = &mut floats(moment)?[ml.start_offset()..][..n];
+        let gradient = &gradient.as_slice::<f32>()?[gl.start_offset()..][..n];
+        let (beta, scale) = (self.beta as f32, self.scale as f32);
+        for (m, &g) in moment.iter_mut().zip(gradient) {
+            let g = g * scale;
+            let g = if self.squared { g * g } else { g };
+            *m = beta * *m + (1.0 - beta) * g;
+        }
+        Ok(())
+    }
+}
+
+/// The parameter's step from its moments.
+struct Update {
+    rate: f64,
+    decay: f64,
+    correction1: f64,
+    correction2: f64,
+}
+
+impl InplaceOp3 for Update {
+    fn name(&self) -> &'static str {
+        "adamw-update"
+    }
+
+    fn cpu_fwd(
+        &self,
+        parameter: &mut CpuStorage,
+        pl: &Layout,
+        m: &CpuStorage,
+        ml: &Layout,
+        v: &CpuStorage,
+        vl: &Layout,
+    ) -> Result<()> {
+        let n = pl.shape().elem_count();
+        let parameter = &mut floats(parameter)?[pl.start_offset()..][..n];
+        let m = &m.as_slice::<f32>()?[ml.start_offset()..][..n];
+        let v = &v.as_slice::<f32>()?[vl.start_offset()..][..n];
+        let rate = (self.rate / self.correction1) as f32;
+        let correction2 = (1.0 / self.correction2) as f32;
+        let keep = (1.0 - self.decay) as f32;
+        for ((p, &m), &v) in parameter.iter_mut().zip(m).zip(v) {
+            *p = keep * *p - rate * m / ((v * correction2).sqrt() + EPS as f32);
+        }
+        Ok(())
+    }
+}
+
+fn floats(storage: &mut CpuStorage) -> Result<&mut [f32]> {
+    match storage {
+        CpuStorage::F32(values) => Ok(values),
+        _ => candle_core::bail!("the optimiser works in f32"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_schedule_warms_up_and_falls() {
+        let config = OptimizerConfig {
+            learning_rate: 1.0,
+            warmup: 10,
+            final_fraction: 0.1,
+            ..Default::default()
+        };
+        assert!((config.rate(0, 100) - 0.1).abs() < 1e-12);
+        assert!((config.rate(10, 100) - 1.0).abs() < 1e-12);
+        assert!((config.rate(100, 100) - 0.1).abs() < 1e-12);
+        assert!((config.rate(55, 100) - 0.55).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,469 @@
+//! One training sample: a random centre, a random run of frames, and what should be said of it.
+//!
+//! Augmentation moves and turns the *pose* everything is expressed in, before anything is drawn or
+//! tokenized, so that map and agents cannot fall out of register.
+
+use gump_geometry::Pose;
+use gump_raster::{Raster, RasterSpec, rasterize};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario, SceneState, Seed};
+use gump_tokenizer::{
+    Field, Identities, Key, PAD, QuantizedState, Slot, TokenFrame, TokenSequence, Tokenizer,
+};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+use crate::batch::{PlacedSlot, place};
+use crate::decoder::{CHUNK, CONTROL_KEYS, STEPS};
+use crate::trajectory::{FUTURE, PAST, POSE};
+
+/// Seconds between token frames.
+pub(crate) const TOKEN_DT: f64 = 0.5;
+
+/// How samples are drawn from scenarios.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SampleConfig {
+    /// Consecutive frames at 2 Hz a sample presents.
+    pub frames: usize,
+    /// Samples keep at most this many agents, those nearest to the centre.
+    pub max_agents: usize,
+    /// Probability that another vehicle than the ego is the centre (the paper re-centres too).
+    pub other_centre: f64,
+    /// Probability of moving and turning the frame of reference.
+    pub augment: f64,
+    /// Largest turn, radians (paper: π/2).
+    pub rotation: f64,
+    /// Largest move along each axis, metres (paper: 5).
+    pub translation_m: f64,
+    /// Probability of removing a track for a part of the window (paper: 0.1).
+    pub agent_dropout: f64,
+    /// Probability of blanking a frame (paper: 0.1).
+    pub frame_dropout: f64,
+    /// Probability that the last frame's values are seen perturbed, as partial-AR decoding sees
+    /// surrogates; the targets stay true.
+    pub surrogate_noise: f64,
+    /// Probability of leaving out the prompts.
+    pub prompt_dropout: f64,
+}
+
+impl Default for SampleConfig {
+    fn default() -> Self {
+        Self {
+            frames: 5,
+            max_agents: 48,
+            other_centre: 0.5,
+            augment: 0.5,
+            rotation: std::f64::consts::FRAC_PI_2,
+            translation_m: 5.0,
+            agent_dropout: 0.1,
+            frame_dropout: 0.1,
+            surrogate_noise: 0.5,
+            prompt_dropout: 0.5,
+        }
+    }
+}
+
+impl SampleConfig {
+    /// No augmentation, no dropout, the ego as centre: to overfit or to validate.
+    pub fn plain(frames: usize) -> Self {
+        Self {
+            frames,
+            max_agents: 320,
+            other_centre: 0.0,
+            augment: 0.0,
+            agent_dropout: 0.0,
+            frame_dropout: 0.0,
+            surrogate_noise: 0.0,
+            prompt_dropout: 1.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// Tokens, raster and targets of one sample.
+#[derive(Debug)]
+pub(crate) struct Sample {
+    pub(crate) slots: Vec<PlacedSlot>,
+    pub(crate) raster: Raster,
+    pub(crate) states: Vec<StateTarget>,
+    pub(crate) control: Vec<ControlTarget>,
+    pub(crate) trajectories: Vec<TrajectoryTarget>,
+}
+
+/// What the decoder should say at a key.
+#[derive(Clone, Debug)]
+pub(crate) struct StateTarget {
+    /// Index of the key in the slots.
+    pub(crate) key: usize,
+    /// Bin per step; `None` where the log has nothing.
+    pub(crate) bins: [Option<u16>; STEPS.len()],
+}
+
+impl StateTarget {
+    /// The token of a step, PAD where the log has nothing.
+    pub(crate) fn token(&self, step: usize) -> u32 {
+        self.bins[step].map_or(PAD, |bin| STEPS[step].token(bin))
+    }
+}
+
+/// What the control head should say at a slot: an index into the control alphabet.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct ControlTarget {
+    pub(crate) slot: usize,
+    pub(crate) successor: u32,
+}
+
+/// What a trajectory head should say of an agent.
+#[derive(Clone, Debug)]
+pub(crate) struct TrajectoryTarget {
+    /// Index of the key in the slots; the value follows it.
+    pub(crate) key: usize,
+    pub(crate) past: [Option<[f32; POSE]>; PAST],
+    pub(crate) future: [Option<[f32; POSE]>; FUTURE],
+}
+
+/// Index of BEGIN in the control alphabet; NEWBORN and LIGHTS_END follow.
+const CONTROL_BEGIN: u32 = CONTROL_KEYS as u32;
+const CONTROL_NEWBORN: u32 = CONTROL_BEGIN + 1;
+const CONTROL_LIGHTS_END: u32 = CONTROL_BEGIN + 2;
+
+/// The log frames a sample is drawn from.
+struct Window<'a> {
+    scenario: &'a Scenario,
+    centre: AgentId,
+    /// Log index of the first presented frame.
+    start: usize,
+    /// Log frames per token frame.
+    stride: usize,
+    world_from_scene: Pose,
+}
+
+impl Window<'_> {
+    /// The log `offset` token frames after presented frame `frame`.
+    fn frame(&self, frame: usize, offset: isize) -> Option<&Frame> {
+        let index = self.start as isize + (frame as isize + offset) * self.stride as isize;
+        self.scenario.log.get(usize::try_from(index).ok()?)
+    }
+
+    /// An agent in scene coordinates.
+    fn state(&self, agent: &Agent) -> AgentState {
+        let scene_from_world = self.world_from_scene.inverse();
+        AgentState {
+            pose: scene_from_world * agent.state.pose,
+            velocity: scene_from_world.rotate(agent.state.velocity),
+        }
+    }
+}
+
+/// Draws a sample; `None` if the scenario is too short for one.
+pub(crate) fn draw(
+    scenario: &Scenario,
+    spec: &RasterSpec,
+    tokenizer: &Tokenizer,
+    config: &SampleConfig,
+    seed: Seed,
+) -> Option<Sample> {
+    let mut rng = seed.rng();
+    let window = choose_window(scenario, config, &mut rng)?;
+    let frames: Vec<Frame> = (0..config.frames)
+        .filter_map(|i| Some(thin(window.frame(i, 0)?, &window, config)))
+        .collect();
+    let frames = drop_agents(frames, window.centre, config.agent_dropout, &mut rng);
+    let views: Vec<&Frame> = frames.iter().collect();
+    let now = config.frames.min(3) - 1;
+    let identities = Identities::shuffled(&views, window.centre, window.world_from_scene, &mut rng);
+    let encoded = tokenizer.encode(
+        &scenario.map,
+        &views,
+        window.centre,
+        window.world_from_scene,
+        &identities,
+    );
+    let prompts = prompts(scenario, config, &mut rng);
+    let sequence = TokenSequence::new(prompts, encoded.sequence.frames().to_vec()).ok()?;
+    let mut slots = place(&sequence);
+    let (states, trajectories) = targets(&slots, &window, &identities);
+    let control = control_targets(&slots);
+    let mut sample = Sample {
+        raster: draw_raster(&window, spec, now),
+        slots: Vec::new(),
+        states,
+        control,
+        trajectories,
+    };
+    if rng.random_bool(config.surrogate_noise) {
+        perturb_last_frame(&mut slots, sequence.frames(), &mut rng);
+    }
+    sample.slots = slots;
+    blank_frames(&mut sample, config, &mut rng);
+    Some(sample)
+}
+
+/// A centre agent and a run of frames in which it is present throughout.
+fn choose_window<'a>(
+    scenario: &'a Scenario,
+    config: &SampleConfig,
+    rng: &mut Rng,
+) -> Option<Window<'a>> {
+    let stride = (TOKEN_DT / scenario.dt).round().max(1.0) as usize;
+    let span = (config.frames - 1) * stride;
+    let starts = scenario.log.len().checked_sub(span)?;
+    let mut start = rng.random_range(0..starts);
+    let present = |id: AgentId, start: usize| {
+        (0..config.frames).all(|i| scenario.log[start + i * stride].agent(id).is_some())
+    };
+    let mut centre = scenario.ego;
+    if rng.random_bool(config.other_centre) {
+        let moving = |agent: &&Agent| {
+            agent.kind == AgentKind::Vehicle
+                && agent.state.speed() > 1.0
+                && present(agent.id, start)
+        };
+        let others: Vec<_> = scenario.log[start].agents().iter().filter(moving).collect();
+        if !others.is_empty() {
+            centre = others[rng.random_range(0..others.len())].id;
+        }
+    }
+    if !present(centre, start) {
+        centre = scenario.ego;
+        start = (0..starts).find(|&start| present(centre, start))?;
+    }
+    let now = scenario.log[start + (config.frames.min(3) - 1) * stride]
+        .agent(centre)?
+        .state
+        .pose;
+    let augment = rng.random_bool(config.augment);
+    let mut within = |bound: f64| {
+        if augment && bound > 0.0 {
+            rng.random_range(-bound..bound)
+        } else {
+            0.0
+        }
+    };
+    let shift = Pose::new(
+        within(config.translation_m),
+        within(config.translation_m),
+        within(config.rotation),
+    );
+    Some(Window {
+        scenario,
+        centre,
+        start,
+        stride,
+        world_from_scene: now * shift,
+    })
+}
+
+/// The frame with only its nearest `max_agents` agents.
+fn thin(frame: &Frame, window: &Window<'_>, config: &SampleConfig) -> Frame {
+    let mut agents = frame.agents().to_vec();
+    if agents.len() > config.max_agents {
+        let centre = window.world_from_scene.position;
+        agents.sort_by(|a, b| {
+            let key = |agent: &Agent| {
+                if agent.id == window.centre {
+                    -1.0
+                } else {
+                    agent.state.pose.position.distance(centre)
+                }
+            };
+            key(a).total_cmp(&key(b)).then(a.id.cmp(&b.id))
+        });
+        agents.truncate(config.max_agents);
+    }
+    Frame::new(agents, frame.lights().to_vec())
+}
+
+/// Removes whole tracks for a random part of the window, which makes births and disappearances.
+fn drop_agents(frames: Vec<Frame>, centre: AgentId, probability: f64, rng: &mut Rng) -> Vec<Frame> {
+    let mut ids: Vec<AgentId> = frames
+        .iter()
+        .flat_map(|f| f.agents().iter().map(|a| a.id))
+        .collect();
+    ids.sort();
+    ids.dedup();
+    ids.retain(|&id| id != centre);
+    let n = frames.len();
+    let gaps: std::collections::BTreeMap<AgentId, std::ops::Range<usize>> = ids
+        .into_iter()
+        .filter_map(|id| {
+            let (dropped, a, b) = (
+                rng.random_bool(probability),
+                rng.random_range(0..=n),
+                rng.random_range(0..=n),
+            );
+            dropped.then(|| (id, a.min(b)..a.max(b)))
+        })
+        .collect();
+    let keep = |i: usize, id: AgentId| gaps.get(&id).is_none_or(|gap| !gap.contains(&i));
+    let kept = frames.iter().enumerate().map(|(i, frame)| {
+        let agents = frame
+            .agents()
+            .iter()
+            .copied()
+            .filter(|agent| keep(i, agent.id))
+            .collect();
+        Frame::new(agents, frame.lights().to_vec())
+    });
+    kept.collect()
+}
+
+fn prompts(
+    scenario: &Scenario,
+    config: &SampleConfig,
+    rng: &mut Rng,
+) -> Vec<Option<gump_scene::ScenarioTag>> {
+    if scenario.tags.is_empty() || rng.random_bool(config.prompt_dropout) {
+        return Vec::new();
+    }
+    let mut tags = scenario.tags.clone();
+    for i in (1..tags.len()).rev() {
+        tags.swap(i, rng.random_range(0..=i));
+    }
+    tags.into_iter().take(4).map(Some).collect()
+}
+
+fn draw_raster(window: &Window<'_>, spec: &RasterSpec, now: usize) -> Raster {
+    let scenario = window.scenario;
+    let index = window.start + now * window.stride;
+    let scene = SceneState {
+        map: &scenario.map,
+        // The route is the ego's; another centre has none.
+        route: scenario
+            .route
+            .as_ref()
+            .filter(|_| window.centre == scenario.ego),
+        history: &scenario.log[..=index],
+        ego: window.centre,
+        dt: scenario.dt,
+    };
+    rasterize(spec, &scene, window.world_from_scene)
+}
+
+/// Targets of every key, from the log and not from the presented (thinned, perturbed) tokens.
+fn targets(
+    slots: &[PlacedSlot],
+    window: &Window<'_>,
+    identities: &Identities,
+) -> (Vec<StateTarget>, Vec<TrajectoryTarget>) {
+    let mut states = Vec::new();
+    let mut trajectories = Vec::new();
+    for (i, placed) in slots.iter().enumerate() {
+        let (Slot::Key(key), Some(next)) = (placed.slot, slots.get(i + 1)) else {
+            continue;
+        };
+        let Slot::Value(value) = next.slot else {
+            continue;
+        };
+        let Some(id) = identities.agent(key.id) else {
+            continue;
+        };
+        let look = |offset: isize| {
+            let agent = window.frame(placed.frame, offset)?.agent(id)?;
+            Some(window.state(agent))
+        };
+        states.push(StateTarget {
+            key: i,
+            bins: state_bins(value, look),
+        });
+        if let Some(present) = look(0) {
+            let relative = |state: AgentState| {
+                let moved = state.pose.position - present.pose.position;
+                let (sin, cos) = state.pose.heading.sin_cos();
+                [moved.x as f32, moved.y as f32, sin as f32, cos as f32]
+            };
+            trajectories.push(TrajectoryTarget {
+                key: i,
+                past: std::array::from_fn(|m| look(-(m as isize) - 1).map(relative)),
+                future: std::array::from_fn(|m| look(m as isize + 1).map(relative)),
+            });
+        }
+    }
+    (states, trajectories)
+}
+
+/// The bins of a chunk: size, velocity and pose of the value itself, then three poses of the log.
+fn state_bins(
+    value: QuantizedState,
+    look: impl Fn(isize) -> Option<AgentState>,
+) -> [Option<u16>; STEPS.len()] {
+    let mut bins = [None; STEPS.len()];
+    for (step, field) in STEPS.iter().enumerate().take(7) {
+        bins[step] = Some(value.get(*field));
+    }
+    for pose in 1..CHUNK {
+        let Some(state) = look(pose as isize) else {
+            continue;
+        };
+        let (x, y) = (state.pose.position.x, state.pose.position.y);
+        // A pose beyond the window has no bin; the clamped one would be a lie.
+        if x.abs() <= Field::X.high() && y.abs() <= Field::Y.high() {
+            let first = 4 + 3 * pose;
+            bins[first] = Some(Field::X.quantize(x).bin);
+            bins[first + 1] = Some(Field::Y.quantize(y).bin);
+            bins[first + 2] = Some(Field::Heading.quantize(state.pose.heading).bin);
+        }
+    }
+    bins
+}
+
+/// At every control or value slot, what follows it (model.md 10.1).
+fn control_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
+    let mut targets = Vec::new();
+    for (slot, placed) in slots.iter().enumerate() {
+        if matches!(placed.slot, Slot::Key(_) | Slot::Prompt(_) | Slot::Pad) {
+            continue;
+        }
+        let successor = match slots.get(slot + 1).map(|next| next.slot) {
+            Some(Slot::Key(Key { id, .. })) => u32::from(id),
+            Some(Slot::Begin) => CONTROL_BEGIN,
+            Some(Slot::Newborn) => CONTROL_NEWBORN,
+            Some(Slot::LightsEnd) => CONTROL_LIGHTS_END,
+            _ => continue,
+        };
+        targets.push(ControlTarget { slot, successor });
+    }
+    targets
+}
+
+/// Replaces the last frame's values by what a surrogate might have said: off by a few bins.
+fn perturb_last_frame(slots: &mut [PlacedSlot], frames: &[TokenFrame], rng: &mut Rng) {
+    let last = frames.len() - 1;
+    let scale = rng.random_range(0.0..1.0);
+    for placed in slots.iter_mut().filter(|placed| placed.frame == last) {
+        if let Slot::Value(state) = &mut placed.slot {
+            *state = perturb(*state, scale, rng);
+        }
+    }
+}
+
+/// A pose off by up to a metre along and 0.4 m across the motion, growing with speed.
+fn perturb(state: QuantizedState, scale: f64, rng: &mut Rng) -> QuantizedState {
+    let (pose, velocity) = (state.pose(), state.velocity());
+    let reach = scale * (velocity.length() * 0.1).min(1.0);
+    let mut within = |bound: f64| bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0);
+    let offset = pose.rotate(gump_geometry::dvec2(within(reach), within(0.4 * reach)));
+    let mut moved = state;
+    moved.x = Field::X.quantize(pose.position.x + offset.x).bin;
+    moved.y = Field::Y.quantize(pose.position.y + offset.y).bin;
+    moved.heading = Field::Heading
+        .quantize(pose.heading + within(0.1 * reach))
+        .bin;
+    moved
+}
+
+/// Blanks whole frames (never the first, which everything builds on) and forgets their targets.
+fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
+    let blanked: Vec<bool> = (0..config.frames)
+        .map(|frame| rng.random_bool(config.frame_dropout) && frame > 0)
+        .collect();
+    let is_blank = |slot: usize| blanked[sample.slots[slot].frame.min(blanked.len() - 1)];
+    sample.states.retain(|target| !is_blank(target.key));
+    sample.trajectories.retain(|target| !is_blank(target.key));
+    sample.control.retain(|target| !is_blank(target.slot));
+    for placed in &mut sample.slots {
+        if blanked[placed.frame.min(blanked.len() - 1)] && !matches!(placed.slot, Slot::Prompt(_)) {
+            placed.slot = Slot::Pad;
+        }
+    }
+}
