@@ -13,8 +13,15 @@
 //! ```
 
 mod config;
+mod curve;
 mod family;
+mod layout;
+mod map;
+mod network;
+mod plan;
+mod record;
 mod scenario;
+mod traffic;
 
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;

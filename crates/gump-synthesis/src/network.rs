@@ -1,0 +1,209 @@
+//! Roads as traffic sees them: lanes with conflicts, crosswalks, signals, sidewalks, and paint.
+//!
+//! Everything is in the scene's own frame (centre at the origin); [`crate::map`] places it in the
+//! world. Building starts in [`Network::new`]; who may go when is decided in the traffic modules.
+
+mod build;
+mod conflict;
+mod furniture;
+mod leg;
+mod sidewalk;
+mod signal;
+
+pub(crate) use signal::Cycle;
+
+use gump_geometry::DVec2;
+use gump_scene::{AreaKind, LaneKind, RoadEdgeKind, RoadLineKind};
+
+use crate::curve::Track;
+use crate::plan::Control;
+
+/// Index into [`Network::lanes`].
+pub(crate) type LaneIdx = usize;
+
+/// The built network.
+#[derive(Debug, Default)]
+pub(crate) struct Network {
+    /// Lanes of roads first, then the connectors inside junctions.
+    pub(crate) lanes: Vec<NetworkLane>,
+    /// Junctions in the plan's order.
+    pub(crate) junctions: Vec<Junction>,
+    /// Crosswalks of all junctions.
+    pub(crate) crosswalks: Vec<Crosswalk>,
+    /// Where people walk.
+    pub(crate) walks: Vec<Walk>,
+    /// Number of points where walks meet.
+    pub(crate) n_walk_nodes: usize,
+    /// Middles of parking strips, in the direction of the lane beside them.
+    pub(crate) parking: Vec<Track>,
+    /// What is only drawn.
+    pub(crate) furniture: Furniture,
+}
+
+/// Curbs, paint and surfaces.
+#[derive(Debug, Default)]
+pub(crate) struct Furniture {
+    /// Borders of the road, which lies on their left.
+    pub(crate) edges: Vec<(RoadEdgeKind, Vec<DVec2>)>,
+    /// Painted lines.
+    pub(crate) lines: Vec<(RoadLineKind, Vec<DVec2>)>,
+    /// Areas other than crosswalks.
+    pub(crate) areas: Vec<(AreaKind, Vec<DVec2>)>,
+    /// Surfaces vehicles may be on.
+    pub(crate) drivable: Vec<Vec<DVec2>>,
+    /// Stop signs: where they stand and the connectors they rule.
+    pub(crate) stop_signs: Vec<(DVec2, Vec<LaneIdx>)>,
+}
+
+/// Which way a connector turns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Turn {
+    /// To the left.
+    Left,
+    /// On, within about 35 degrees.
+    Straight,
+    /// To the right.
+    Right,
+}
+
+/// A lane of a road, or a connector through a junction.
+#[derive(Debug)]
+pub(crate) struct NetworkLane {
+    /// Centre line.
+    pub(crate) track: Track,
+    /// Full width, metres.
+    pub(crate) width: f64,
+    /// Speed limit, metres per second.
+    pub(crate) speed_limit: f64,
+    /// Its use.
+    pub(crate) kind: LaneKind,
+    /// Lanes it leads to.
+    pub(crate) successors: Vec<LaneIdx>,
+    /// Lanes that lead here.
+    pub(crate) predecessors: Vec<LaneIdx>,
+    /// Neighbour of the same direction on the left.
+    pub(crate) left: Option<LaneIdx>,
+    /// Neighbour of the same direction on the right.
+    pub(crate) right: Option<LaneIdx>,
+    /// Starts at the border of the scene.
+    pub(crate) is_entry: bool,
+    /// Ends at the border of the scene.
+    pub(crate) is_exit: bool,
+    /// Set for connectors.
+    pub(crate) connector: Option<Connector>,
+    /// Highest speed at each sample of the track that its bends and those ahead on it allow,
+    /// metres per second.
+    pub(crate) bend_speeds: Vec<f64>,
+    /// Lanes of the same junction whose surface this one shares.
+    pub(crate) overlaps: Vec<Overlap>,
+}
+
+impl NetworkLane {
+    /// Length, metres.
+    pub(crate) fn length(&self) -> f64 {
+        self.track.length()
+    }
+
+    /// True for bicycle lanes.
+    pub(crate) fn is_bike_lane(&self) -> bool {
+        self.kind == LaneKind::BikeLane
+    }
+
+    /// Ends inside the scene without a successor: traffic must leave it sideways.
+    pub(crate) fn is_dead_end(&self) -> bool {
+        self.successors.is_empty() && !self.is_exit
+    }
+}
+
+/// What makes a lane a way through a junction. Vehicles wait for it at its start.
+#[derive(Debug)]
+pub(crate) struct Connector {
+    /// The junction.
+    pub(crate) junction: usize,
+    /// The leg it comes from.
+    pub(crate) from_leg: usize,
+    /// Which way.
+    pub(crate) turn: Turn,
+    /// Of two that conflict, the one of higher rank goes first; equal ranks in order of arrival.
+    pub(crate) rank: u8,
+    /// Vehicles stop before they enter.
+    pub(crate) must_stop: bool,
+    /// Signal group, if there are lights.
+    pub(crate) signal: Option<usize>,
+    /// Connectors that cross or join this one.
+    pub(crate) conflicts: Vec<Conflict>,
+    /// Crosswalks on the way.
+    pub(crate) crossings: Vec<Crossing>,
+    /// Largest curvature, radians per metre.
+    pub(crate) sharpest: f64,
+}
+
+/// A stretch of a connector that only one of two vehicles can use at a time.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Conflict {
+    /// The other connector.
+    pub(crate) other: LaneIdx,
+    /// From where to where on this connector, metres.
+    pub(crate) mine: (f64, f64),
+    /// From where to where on the other, metres.
+    pub(crate) theirs: (f64, f64),
+}
+
+/// Where a connector passes a crosswalk.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Crossing {
+    /// Index into [`Network::crosswalks`].
+    pub(crate) crosswalk: usize,
+    /// From where to where on the connector, metres.
+    pub(crate) along: (f64, f64),
+    /// From where to where on the crosswalk's walk, metres.
+    pub(crate) across: (f64, f64),
+}
+
+/// Where a lane shares its surface with another.
+#[derive(Debug)]
+pub(crate) struct Overlap {
+    /// The other lane.
+    pub(crate) other: LaneIdx,
+    /// Sample of this lane's track of the first entry of `at`.
+    pub(crate) first: usize,
+    /// Arc length on the other lane next to each sample; NaN where they are apart.
+    pub(crate) at: Vec<f64>,
+}
+
+/// A junction.
+#[derive(Debug)]
+pub(crate) struct Junction {
+    /// Its rule.
+    pub(crate) control: Control,
+    /// Light phases, if it has lights.
+    pub(crate) cycle: Option<Cycle>,
+    /// Its connectors.
+    pub(crate) connectors: Vec<LaneIdx>,
+}
+
+/// A marked crossing.
+#[derive(Debug)]
+pub(crate) struct Crosswalk {
+    /// The junction it belongs to.
+    pub(crate) junction: usize,
+    /// The leg it spans.
+    pub(crate) leg: usize,
+    /// Its corners.
+    pub(crate) ring: Vec<DVec2>,
+    /// The part of its walk that is on the road, metres.
+    pub(crate) on_road: (f64, f64),
+    /// Connectors that pass it: the connector and the place in its list of crossings.
+    pub(crate) passed_by: Vec<(LaneIdx, usize)>,
+}
+
+/// A line people walk along, both ways.
+#[derive(Debug)]
+pub(crate) struct Walk {
+    /// The line.
+    pub(crate) track: Track,
+    /// The nodes at its ends.
+    pub(crate) ends: [usize; 2],
+    /// Set if it crosses the road.
+    pub(crate) crosswalk: Option<usize>,
+}

@@ -1,0 +1,120 @@
+//! What a road network is built from: junctions, and roads with their cross-section.
+//!
+//! A plan is a drawing on a napkin; [`crate::network`] turns it into lanes. The plans of the road
+//! families are in [`crate::layout`].
+
+use crate::curve::Track;
+
+/// Metres between the outermost lane or parking strip and the curb.
+const GUTTER: f64 = 0.4;
+/// Width of a bicycle lane, metres.
+pub(crate) const BIKE_LANE_WIDTH: f64 = 1.8;
+/// Width of a strip of parked cars, metres.
+pub(crate) const PARKING_WIDTH: f64 = 2.4;
+
+/// Junctions and the roads that join them.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Plan {
+    /// Junctions; roads refer to them by index.
+    pub(crate) nodes: Vec<NodePlan>,
+    /// Roads between junctions and the border of the scene.
+    pub(crate) roads: Vec<RoadPlan>,
+}
+
+/// A place where roads meet.
+#[derive(Clone, Debug)]
+pub(crate) struct NodePlan {
+    /// Who goes first.
+    pub(crate) control: Control,
+    /// Whether every leg has a crosswalk.
+    pub(crate) crosswalks: bool,
+    /// Radius of the curb at the corners, metres.
+    pub(crate) corner_radius: f64,
+    /// Metres of every leg taken up by the junction even where no corner needs them.
+    pub(crate) min_setback: f64,
+}
+
+/// The rule of a junction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Control {
+    /// Nobody waits: lanes join or end without crossing.
+    Free,
+    /// Traffic lights.
+    Signals,
+    /// Everybody stops, first come first served.
+    AllWayStop,
+    /// Minor roads stop and give way.
+    MinorStop,
+    /// Minor roads give way without stopping.
+    MinorYield,
+}
+
+/// A road from end to end with its cross-section.
+#[derive(Clone, Debug)]
+pub(crate) struct RoadPlan {
+    /// The line between the directions, from the first end to the second.
+    pub(crate) reference: Track,
+    /// The junction at either end; `None` is the border of the scene.
+    pub(crate) ends: [Option<usize>; 2],
+    /// Lanes along the reference, right of it.
+    pub(crate) forward: usize,
+    /// Lanes against the reference, left of it.
+    pub(crate) backward: usize,
+    /// Width of a lane, metres.
+    pub(crate) lane_width: f64,
+    /// Width between the directions, metres.
+    pub(crate) median: f64,
+    /// Bicycle lanes beside the outermost lanes.
+    pub(crate) bike_lanes: bool,
+    /// Parking strips along the curbs.
+    pub(crate) parking: bool,
+    /// Sidewalks beyond the curbs.
+    pub(crate) sidewalks: bool,
+    /// Metres per second.
+    pub(crate) speed_limit: f64,
+    /// Has priority over roads that are not major.
+    pub(crate) major: bool,
+    /// A grade-separated road.
+    pub(crate) freeway: bool,
+}
+
+impl RoadPlan {
+    /// Lanes in the direction `forward` (or against it).
+    pub(crate) fn n_lanes(&self, forward: bool) -> usize {
+        if forward { self.forward } else { self.backward }
+    }
+
+    /// Distance of the centre of lane `k` (0 is innermost) from the reference, metres.
+    pub(crate) fn lane_offset(&self, k: usize) -> f64 {
+        self.median / 2.0 + self.lane_width * (k as f64 + 0.5)
+    }
+
+    /// Distance of the outer border of the outermost lane from the reference, metres.
+    pub(crate) fn lanes_half_width(&self, forward: bool) -> f64 {
+        self.median / 2.0 + self.lane_width * self.n_lanes(forward) as f64
+    }
+
+    /// Distance of the bicycle lane's centre from the reference, metres.
+    pub(crate) fn bike_offset(&self, forward: bool) -> f64 {
+        self.lanes_half_width(forward) + BIKE_LANE_WIDTH / 2.0
+    }
+
+    /// Distance of the middle of the parking strip from the reference, metres.
+    pub(crate) fn parking_offset(&self, forward: bool) -> f64 {
+        self.half_width(forward) - GUTTER - PARKING_WIDTH / 2.0
+    }
+
+    /// Distance of the curb from the reference on the side of one direction, metres.
+    pub(crate) fn half_width(&self, forward: bool) -> f64 {
+        let mut half = self.lanes_half_width(forward) + GUTTER;
+        if self.n_lanes(forward) > 0 {
+            half += if self.bike_lanes {
+                BIKE_LANE_WIDTH
+            } else {
+                0.0
+            };
+            half += if self.parking { PARKING_WIDTH } else { 0.0 };
+        }
+        half
+    }
+}

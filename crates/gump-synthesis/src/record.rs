@@ -1,0 +1,163 @@
+//! What was seen of running traffic, frame by frame and track by track.
+
+use std::collections::BTreeMap;
+
+use gump_geometry::{DVec2, OrientedBox, Pose, wrap_angle};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
+
+use crate::map::Placement;
+use crate::network::LaneIdx;
+use crate::traffic::{Body, Traffic};
+
+/// Snapshots of traffic; one more before the first frame and after the last, for velocities.
+#[derive(Debug)]
+pub(crate) struct Recording {
+    n_frames: usize,
+    tracks: BTreeMap<i64, Track>,
+    lights: Vec<Vec<(LaneIdx, LightState, DVec2)>>,
+}
+
+/// One body over all snapshots.
+#[derive(Debug)]
+pub(crate) struct Track {
+    /// The body as it was last seen.
+    pub(crate) body: Body,
+    poses: Vec<Option<Pose>>,
+    places: Vec<(LaneIdx, f64)>,
+}
+
+impl Recording {
+    /// Runs `traffic` on for `n_frames` frames and records them.
+    pub(crate) fn make(traffic: &mut Traffic<'_>, n_frames: usize) -> Self {
+        let mut recording = Self {
+            n_frames,
+            tracks: BTreeMap::new(),
+            lights: Vec::new(),
+        };
+        for snapshot in 0..n_frames + 2 {
+            if snapshot > 0 {
+                traffic.step();
+            }
+            if (1..=n_frames).contains(&snapshot) {
+                recording.lights.push(traffic.lights());
+            }
+            for body in traffic.bodies() {
+                let track = recording.tracks.entry(body.id).or_insert_with(|| Track {
+                    body,
+                    poses: vec![None; n_frames + 2],
+                    places: Vec::new(),
+                });
+                track.body = body;
+                track.poses[snapshot] = Some(body.pose);
+                if snapshot > 0 {
+                    track.places.extend(body.place);
+                }
+            }
+        }
+        recording
+    }
+
+    /// Number of frames, without the two extra snapshots.
+    pub(crate) fn n_frames(&self) -> usize {
+        self.n_frames
+    }
+
+    /// All tracks in the order of their ids.
+    pub(crate) fn tracks(&self) -> impl Iterator<Item = &Track> {
+        self.tracks.values()
+    }
+
+    /// Lights in a frame.
+    pub(crate) fn lights(&self, frame: usize) -> &[(LaneIdx, LightState, DVec2)] {
+        &self.lights[frame]
+    }
+
+    /// True if two boxes overlap in any frame, at least one of them a vehicle or bicycle.
+    pub(crate) fn has_overlaps(&self) -> bool {
+        (0..self.n_frames).any(|frame| {
+            let boxes: Vec<(AgentKind, bool, OrientedBox)> = self
+                .tracks()
+                .filter_map(|track| track.oriented_box(frame))
+                .collect();
+            boxes.iter().enumerate().any(|(i, a)| {
+                boxes[i + 1..].iter().any(|b| {
+                    let on_foot = |kind| kind == AgentKind::Pedestrian;
+                    let matters = !(on_foot(a.0) && on_foot(b.0)) && (a.1 || b.1);
+                    matters && a.2.overlaps(&b.2)
+                })
+            })
+        })
+    }
+}
+
+impl Track {
+    /// Where the box is in a frame.
+    pub(crate) fn pose(&self, frame: usize) -> Option<Pose> {
+        self.poses[frame + 1]
+    }
+
+    /// Present in every snapshot.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.poses.iter().all(Option::is_some)
+    }
+
+    /// Present for at least half of the frames after `now`.
+    pub(crate) fn lasts_after(&self, now: usize) -> bool {
+        let after = &self.poses[now + 2..];
+        2 * after.iter().flatten().count() >= after.len()
+    }
+
+    /// Metres between the first and the last place, as the crow flies.
+    pub(crate) fn distance_driven(&self) -> f64 {
+        let mut seen = self.poses.iter().flatten();
+        match (seen.next(), seen.next_back()) {
+            (Some(first), Some(last)) => first.position.distance(last.position),
+            _ => 0.0,
+        }
+    }
+
+    /// Lanes and arc lengths, frame by frame while present.
+    pub(crate) fn places(&self) -> &[(LaneIdx, f64)] {
+        &self.places
+    }
+
+    fn oriented_box(&self, frame: usize) -> Option<(AgentKind, bool, OrientedBox)> {
+        let shape = OrientedBox {
+            pose: self.pose(frame)?,
+            length: self.body.size[0],
+            width: self.body.size[1],
+        };
+        Some((self.body.kind, self.body.is_mobile, shape))
+    }
+
+    /// The agent in a frame, placed in the world.
+    pub(crate) fn agent(&self, frame: usize, placement: &Placement, dt: f64) -> Option<Agent> {
+        let pose = self.pose(frame)?;
+        let [length, width, height] = self.body.size;
+        let (before, after) = (self.poses[frame], self.poses[frame + 2]);
+        // Velocity is what the positions say, centred where both neighbours exist.
+        let velocity = match (before, after) {
+            (Some(a), Some(b)) => (b.position - a.position) / (2.0 * dt),
+            (Some(a), None) => (pose.position - a.position) / dt,
+            (None, Some(b)) => (b.position - pose.position) / dt,
+            (None, None) => DVec2::ZERO,
+        };
+        let world = placement.world_from_scene;
+        let state = AgentState {
+            pose: Pose {
+                position: world * pose.position,
+                heading: wrap_angle(world.heading + pose.heading),
+            },
+            velocity: world.rotate(velocity),
+        };
+        Some(Agent {
+            id: AgentId(self.body.id),
+            kind: self.body.kind,
+            length,
+            width,
+            height,
+            elevation: placement.elevation(pose.position) + height / 2.0,
+            state,
+        })
+    }
+}

@@ -1,0 +1,139 @@
+//! A small microscopic traffic simulation on a [`Network`]: vehicles, bicycles and people.
+//!
+//! Vehicles follow lane centres by arc length; where a body is in the plane follows from that.
+//! Who may enter a junction is settled by claims ([`right_of_way`]): a vehicle that has claimed a
+//! connector shares no part of it with another claim, which is why boxes do not overlap.
+
+mod demand;
+mod driver;
+mod lane_change;
+mod occupancy;
+mod people;
+mod right_of_way;
+mod vehicle;
+
+pub(crate) use demand::Demand;
+
+use gump_geometry::{DVec2, Pose};
+use gump_scene::{AgentKind, LightState, Rng};
+
+use crate::network::{LaneIdx, Network};
+use occupancy::Occupancy;
+use people::Person;
+use vehicle::Vehicle;
+
+/// What a body looks like and where it is, in the scene's frame.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Body {
+    /// Unique in the simulation.
+    pub(crate) id: i64,
+    /// What it is.
+    pub(crate) kind: AgentKind,
+    /// Length, width and height, metres.
+    pub(crate) size: [f64; 3],
+    /// Box centre and heading.
+    pub(crate) pose: Pose,
+    /// Moves in this simulation, as parked vehicles do not.
+    pub(crate) is_mobile: bool,
+    /// Lane of the centre and arc length on it, for vehicles in traffic.
+    pub(crate) place: Option<(LaneIdx, f64)>,
+}
+
+/// Traffic in progress.
+#[derive(Debug)]
+pub(crate) struct Traffic<'a> {
+    network: &'a Network,
+    demand: Demand,
+    rng: Rng,
+    dt: f64,
+    time: f64,
+    vehicles: Vec<Vehicle>,
+    parked: Vec<Body>,
+    people: Vec<Person>,
+    occupancy: Occupancy,
+    next_id: i64,
+}
+
+impl<'a> Traffic<'a> {
+    /// Puts the first vehicles and people on the network.
+    pub(crate) fn new(network: &'a Network, demand: Demand, dt: f64, rng: Rng) -> Self {
+        let mut traffic = Self {
+            network,
+            demand,
+            rng,
+            dt,
+            time: 0.0,
+            vehicles: Vec::new(),
+            parked: Vec::new(),
+            people: Vec::new(),
+            occupancy: Occupancy::new(network.lanes.len()),
+            next_id: 0,
+        };
+        traffic.populate();
+        traffic
+    }
+
+    /// Advances everything by one step.
+    pub(crate) fn step(&mut self) {
+        self.step_people();
+        self.occupancy.fill(self.network, &self.vehicles);
+        self.settle_claims();
+        self.choose_lanes();
+        let accelerations: Vec<f64> = (0..self.vehicles.len())
+            .map(|i| self.acceleration(i))
+            .collect();
+        for (vehicle, acceleration) in self.vehicles.iter_mut().zip(accelerations) {
+            vehicle.advance(self.network, acceleration, self.dt, &mut self.rng);
+        }
+        self.vehicles
+            .retain(|vehicle| !vehicle.has_left(self.network));
+        self.time += self.dt;
+        self.replenish();
+    }
+
+    /// Everything that has a body now.
+    pub(crate) fn bodies(&self) -> Vec<Body> {
+        let vehicles = self
+            .vehicles
+            .iter()
+            .map(|vehicle| vehicle.body(self.network));
+        let people = self.people.iter().map(Person::body);
+        vehicles
+            .chain(people)
+            .chain(self.parked.iter().copied())
+            .collect()
+    }
+
+    /// The lights now: connector, colour and where vehicles stop for it.
+    pub(crate) fn lights(&self) -> Vec<(LaneIdx, LightState, DVec2)> {
+        let controlled = self
+            .network
+            .lanes
+            .iter()
+            .enumerate()
+            .filter_map(|(i, lane)| {
+                let connector = lane.connector.as_ref()?;
+                let cycle = self.network.junctions[connector.junction].cycle.as_ref()?;
+                let state = cycle.state(connector.signal?, self.time);
+                Some((i, state, lane.track.pose_at(0.0).position))
+            });
+        controlled.collect()
+    }
+
+    /// The lanes a vehicle still has to drive, the present one first, and its id's path.
+    pub(crate) fn remaining_path(&self, id: i64) -> Option<Vec<LaneIdx>> {
+        let vehicle = self.vehicles.iter().find(|vehicle| vehicle.id == id)?;
+        Some(vehicle.path[vehicle.leg..].to_vec())
+    }
+
+    fn acceleration(&mut self, i: usize) -> f64 {
+        let vehicle = &self.vehicles[i];
+        let ahead = self.occupancy.leader(self.network, vehicle);
+        let stop = self.distance_to_stop(i);
+        let speed = vehicle.allowed_speed(self.network);
+        vehicle
+            .driver
+            .acceleration(vehicle.speed, speed, ahead, stop)
+            + vehicle.noise()
+    }
+}

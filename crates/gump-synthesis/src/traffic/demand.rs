@@ -1,0 +1,341 @@
+//! How many of what there are, where they appear and where they want to go.
+
+use gump_geometry::{Pose, wrap_angle};
+use gump_scene::{AgentKind, Rng};
+use rand::Rng as _;
+
+use super::driver::Driver;
+use super::people::Person;
+use super::vehicle::Vehicle;
+use super::{Body, Traffic};
+use crate::network::{LaneIdx, Turn};
+
+/// Longest path that is planned, in lanes.
+const LONGEST_PATH: usize = 40;
+/// Sideways metres that a long vehicle may sweep beside its centre line.
+const SWEEP: f64 = 0.55;
+
+/// How many of what a scene should hold.
+#[derive(Clone, Debug)]
+pub(crate) struct Demand {
+    /// Vehicles in motion (or in a queue).
+    pub(crate) moving: usize,
+    /// Parked vehicles, if there is where to park.
+    pub(crate) parked: usize,
+    /// People on foot.
+    pub(crate) people: usize,
+    /// Bicycles.
+    pub(crate) bicycles: usize,
+    /// Vehicles that want to enter, per second and entry lane.
+    pub(crate) arrivals: f64,
+}
+
+impl Traffic<'_> {
+    /// Fills the network once, before the first step.
+    pub(super) fn populate(&mut self) {
+        self.park();
+        for _ in 0..self.demand.people {
+            self.add_person(None);
+        }
+        let lanes: Vec<LaneIdx> = (0..self.network.lanes.len())
+            .filter(|&lane| self.network.lanes[lane].connector.is_none())
+            .filter(|&lane| self.network.lanes[lane].length() > 20.0)
+            .collect();
+        if lanes.is_empty() {
+            return;
+        }
+        for _ in 0..4 * self.demand.moving {
+            if self.count(AgentKind::Vehicle) >= self.demand.moving {
+                break;
+            }
+            let lane = lanes[self.rng.random_range(0..lanes.len())];
+            let length = self.network.lanes[lane].length();
+            let s = self.rng.random_range(6.0..length - 6.0);
+            self.try_add(AgentKind::Vehicle, lane, s);
+        }
+        for _ in 0..4 * self.demand.bicycles {
+            if self.count(AgentKind::Bicycle) >= self.demand.bicycles {
+                break;
+            }
+            let lane = lanes[self.rng.random_range(0..lanes.len())];
+            let length = self.network.lanes[lane].length();
+            let s = self.rng.random_range(4.0..length - 4.0);
+            self.try_add(AgentKind::Bicycle, lane, s);
+        }
+    }
+
+    /// Lets newcomers in at the border.
+    pub(super) fn replenish(&mut self) {
+        let entries = (0..self.network.lanes.len()).filter(|&l| self.network.lanes[l].is_entry);
+        for lane in entries.collect::<Vec<_>>() {
+            let arrives = self
+                .rng
+                .random_bool((self.demand.arrivals * self.dt).min(1.0));
+            if !arrives {
+                continue;
+            }
+            let bicycles = self.count(AgentKind::Bicycle) < self.demand.bicycles;
+            if bicycles && self.rng.random_bool(0.3) {
+                self.try_add(AgentKind::Bicycle, lane, 1.5);
+            } else if self.count(AgentKind::Vehicle) < self.demand.moving {
+                self.try_add(AgentKind::Vehicle, lane, 3.0);
+            }
+        }
+        if self.people.len() < self.demand.people && self.rng.random_bool(0.5 * self.dt) {
+            self.add_person(Some(()));
+        }
+    }
+
+    fn count(&self, kind: AgentKind) -> usize {
+        self.vehicles
+            .iter()
+            .filter(|vehicle| vehicle.kind == kind)
+            .count()
+    }
+
+    /// Adds a vehicle or bicycle at arc length `s` of a lane if it fits there.
+    fn try_add(&mut self, kind: AgentKind, lane: LaneIdx, s: f64) {
+        let network = self.network;
+        let l = &network.lanes[lane];
+        let suits = match kind {
+            AgentKind::Bicycle => {
+                l.is_bike_lane() || l.right.is_none() && !self.has_bike_lane(lane)
+            }
+            _ => !l.is_bike_lane() && !l.is_dead_end(),
+        };
+        let freeway = l.kind == gump_scene::LaneKind::Freeway;
+        if !suits || freeway && kind == AgentKind::Bicycle {
+            return;
+        }
+        let (size, driver) = self.draw_vehicle(kind);
+        let path = self.plan_path(lane, size[0]);
+        let sweep = |&lane: &LaneIdx| {
+            let sharpest = network.lanes[lane]
+                .connector
+                .as_ref()
+                .map_or(0.0, |c| c.sharpest);
+            size[0] * size[0] / 8.0 * sharpest
+        };
+        if size[0] > 7.0 && path.iter().any(|lane| sweep(lane) > SWEEP) {
+            return;
+        }
+        let s = s.max(size[0] / 2.0);
+        let id = self.next_id;
+        let mut vehicle = Vehicle::new(id, (kind, size, driver), path, s, 0.0, &mut self.rng);
+        let to_line = (l.length() - vehicle.front()).max(0.0);
+        let speed = vehicle
+            .allowed_speed(network)
+            .min((2.0 * 1.2 * to_line).sqrt());
+        // Queries need an up-to-date picture; newcomers are few.
+        self.occupancy.fill(network, &self.vehicles);
+        let mut speed = speed * self.rng.random_range(0.8..1.0);
+        for entry in self.occupancy.on(lane) {
+            let gap_ahead = entry.rear - vehicle.front();
+            let gap_behind = s - size[0] / 2.0 - entry.front;
+            let beyond = (entry.front + entry.rear) / 2.0 > s;
+            if beyond {
+                speed = speed.min(entry.speed + 0.4 * gap_ahead.max(0.0));
+            }
+            let follower = self.vehicles[entry.vehicle]
+                .driver
+                .wanted_gap(entry.speed, speed);
+            if beyond && gap_ahead < 4.0 + 0.8 * entry.speed
+                || !beyond && gap_behind < follower.max(4.0)
+            {
+                return;
+            }
+        }
+        vehicle.speed = speed;
+        if kind == AgentKind::Bicycle && !l.is_bike_lane() {
+            vehicle.settle(-(l.width / 2.0 - 0.55));
+        }
+        self.next_id += 1;
+        self.vehicles.push(vehicle);
+    }
+
+    /// True if the road of this lane has a lane of its own for bicycles.
+    fn has_bike_lane(&self, lane: LaneIdx) -> bool {
+        let start = self.network.lanes[lane].track.pose_at(0.0);
+        self.network.lanes.iter().any(|other| {
+            let local = start.inverse() * other.track.points()[0];
+            other.is_bike_lane()
+                && other.connector.is_none()
+                && local.x.abs() < 1.0
+                && local.y.abs() < 14.0
+        })
+    }
+
+    fn draw_vehicle(&mut self, kind: AgentKind) -> ([f64; 3], Driver) {
+        let rng = &mut self.rng;
+        if kind == AgentKind::Bicycle {
+            let size = [
+                rng.random_range(1.6..1.95),
+                rng.random_range(0.55..0.8),
+                rng.random_range(1.6..1.9),
+            ];
+            return (size, Driver::of_bicycle(rng));
+        }
+        let size = draw_size(rng);
+        let driver = if size[0] > 7.0 {
+            Driver::of_heavy_vehicle(rng)
+        } else {
+            Driver::of_car(rng)
+        };
+        (size, driver)
+    }
+
+    /// A random way from a lane to the border of the scene.
+    pub(super) fn plan_path(&mut self, lane: LaneIdx, length: f64) -> Vec<LaneIdx> {
+        let lanes = &self.network.lanes;
+        let mut path = vec![lane];
+        while path.len() < LONGEST_PATH {
+            let here = &lanes[path[path.len() - 1]];
+            let weight = |&next: &LaneIdx| {
+                let Some(connector) = &lanes[next].connector else {
+                    return 1.0;
+                };
+                let fits = length * length / 8.0 * connector.sharpest < SWEEP || length < 7.0;
+                let turn = match connector.turn {
+                    Turn::Straight => 0.55,
+                    Turn::Right => 0.25,
+                    Turn::Left => 0.25,
+                };
+                if fits { turn } else { 1e-6 }
+            };
+            let total: f64 = here.successors.iter().map(weight).sum();
+            if total <= 0.0 {
+                break;
+            }
+            let mut draw = self.rng.random_range(0.0..total);
+            let mut chosen = here.successors[0];
+            for next in &here.successors {
+                chosen = *next;
+                draw -= weight(next);
+                if draw < 0.0 {
+                    break;
+                }
+            }
+            path.push(chosen);
+        }
+        path
+    }
+
+    fn add_person(&mut self, at_border: Option<()>) {
+        let walks: Vec<usize> = (0..self.network.walks.len())
+            .filter(|&walk| self.network.walks[walk].crosswalk.is_none())
+            .collect();
+        if walks.is_empty() {
+            return;
+        }
+        let (walk, forward, progress) = if at_border.is_some() {
+            let outer = self.border_walks(&walks);
+            if outer.is_empty() {
+                return;
+            }
+            let (walk, forward) = outer[self.rng.random_range(0..outer.len())];
+            (walk, forward, 0.0)
+        } else {
+            let walk = walks[self.rng.random_range(0..walks.len())];
+            let length = self.network.walks[walk].track.length();
+            (
+                walk,
+                self.rng.random_bool(0.5),
+                self.rng.random_range(0.0..length),
+            )
+        };
+        let id = self.next_id;
+        self.next_id += 1;
+        let person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
+        self.people.push(person);
+    }
+
+    /// Walks with an end that no other walk has, entered there.
+    fn border_walks(&self, walks: &[usize]) -> Vec<(usize, bool)> {
+        let mut ends = vec![0; self.network.n_walk_nodes];
+        for end in self.network.walks.iter().flat_map(|walk| walk.ends) {
+            ends[end] += 1;
+        }
+        let both = |&walk: &usize| [(walk, true), (walk, false)];
+        walks
+            .iter()
+            .flat_map(both)
+            .filter(|&(walk, forward)| {
+                ends[self.network.walks[walk].ends[usize::from(!forward)]] == 1
+            })
+            .collect()
+    }
+
+    /// Fills parking strips, some of their places.
+    fn park(&mut self) {
+        let fill = self.rng.random_range(0.25..0.95);
+        let mut places = Vec::new();
+        for strip in &self.network.parking {
+            let mut s = 10.0;
+            while s < strip.length() - 12.0 {
+                if self.rng.random_bool(fill) {
+                    places.push((strip.pose_at(s), strip.curvature_at(s)));
+                }
+                s += self.rng.random_range(6.3..7.2);
+            }
+        }
+        while places.len() > self.demand.parked {
+            let drop = self.rng.random_range(0..places.len());
+            places.swap_remove(drop);
+        }
+        for (place, _) in places {
+            let mut size = draw_size(&mut self.rng);
+            size[0] = size[0].min(5.6);
+            size[1] = size[1].min(2.05);
+            let local = Pose::new(
+                self.rng.random_range(-0.15..0.15),
+                self.rng.random_range(-0.15..0.05),
+                self.rng.random_range(-0.025..0.025),
+            );
+            let pose = place * local;
+            let pose = Pose {
+                heading: wrap_angle(pose.heading),
+                ..pose
+            };
+            let id = self.next_id;
+            self.next_id += 1;
+            self.parked.push(Body {
+                id,
+                kind: AgentKind::Vehicle,
+                size,
+                pose,
+                is_mobile: false,
+                place: None,
+            });
+        }
+    }
+}
+
+/// Length, width and height of a vehicle, metres: mostly cars, some vans, few trucks and buses.
+fn draw_size(rng: &mut Rng) -> [f64; 3] {
+    match rng.random_range(0..100) {
+        0..=83 => {
+            let length = 4.1 + rng.random_range(0.0..0.7) + rng.random_range(0.0..0.75);
+            [
+                length,
+                rng.random_range(1.78..2.05),
+                rng.random_range(1.4..1.8),
+            ]
+        }
+        84..=94 => {
+            let length = rng.random_range(5.3..6.4);
+            [
+                length,
+                rng.random_range(1.95..2.2),
+                rng.random_range(1.8..2.6),
+            ]
+        }
+        _ => {
+            let length = rng.random_range(7.2..11.9);
+            [
+                length,
+                rng.random_range(2.3..2.55),
+                rng.random_range(2.7..3.4),
+            ]
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! How one driver follows, brakes and accelerates.
+
+use gump_scene::Rng;
+use rand::Rng as _;
+
+/// Strongest deceleration of any vehicle, m/s².
+pub(crate) const HARDEST_BRAKING: f64 = 7.0;
+
+/// What is in the way: the free gap to it and how fast it moves along the own path.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Leader {
+    /// Metres from front to rear.
+    pub(crate) gap: f64,
+    /// Metres per second.
+    pub(crate) speed: f64,
+}
+
+/// A driver's habits; they differ from driver to driver.
+#[derive(Clone, Debug)]
+pub(crate) struct Driver {
+    /// Desired speed as a multiple of the limit.
+    pub(crate) speed_factor: f64,
+    /// Cap on the desired speed, metres per second (bicycles, heavy vehicles).
+    pub(crate) top_speed: f64,
+    /// Seconds kept to the vehicle ahead.
+    pub(crate) headway: f64,
+    /// Metres kept to a standing vehicle.
+    pub(crate) standstill: f64,
+    /// Comfortable acceleration, m/s².
+    pub(crate) acceleration: f64,
+    /// Comfortable deceleration, m/s².
+    pub(crate) braking: f64,
+    /// Smallest time gap accepted when giving way, seconds.
+    pub(crate) gap_time: f64,
+    /// Stops for people who wait at a crosswalk without a light.
+    pub(crate) is_polite: bool,
+    /// Multiplies the speeds that are comfortable in bends.
+    pub(crate) bend_factor: f64,
+    /// Metres before a stop line at which the front comes to rest.
+    pub(crate) line_gap: f64,
+}
+
+impl Driver {
+    /// A car driver.
+    pub(crate) fn of_car(rng: &mut Rng) -> Self {
+        Self {
+            speed_factor: rng.random_range(0.82..1.12),
+            top_speed: 40.0,
+            headway: rng.random_range(0.9..1.9),
+            standstill: rng.random_range(1.6..3.2),
+            acceleration: rng.random_range(1.2..2.4),
+            braking: rng.random_range(1.6..2.6),
+            gap_time: rng.random_range(3.8..6.0),
+            is_polite: rng.random_bool(0.75),
+            bend_factor: rng.random_range(0.85..1.05),
+            line_gap: rng.random_range(0.3..1.6),
+        }
+    }
+
+    /// A driver of a bus or a truck.
+    pub(crate) fn of_heavy_vehicle(rng: &mut Rng) -> Self {
+        Self {
+            speed_factor: rng.random_range(0.8..0.98),
+            top_speed: 24.0,
+            acceleration: rng.random_range(0.8..1.2),
+            headway: rng.random_range(1.4..2.2),
+            ..Self::of_car(rng)
+        }
+    }
+
+    /// A cyclist.
+    pub(crate) fn of_bicycle(rng: &mut Rng) -> Self {
+        Self {
+            speed_factor: 1.0,
+            top_speed: rng.random_range(3.6..6.4),
+            headway: rng.random_range(0.8..1.3),
+            standstill: rng.random_range(1.0..1.8),
+            acceleration: rng.random_range(0.7..1.2),
+            braking: rng.random_range(1.5..2.2),
+            ..Self::of_car(rng)
+        }
+    }
+
+    /// Acceleration for a present and a desired speed, with perhaps something ahead and perhaps a
+    /// distance after which to stand, m/s².
+    ///
+    /// Source: the improved intelligent driver model of Treiber and Kesting, *Traffic Flow
+    /// Dynamics*, 2013, section 11.3.7.
+    pub(crate) fn acceleration(
+        &self,
+        speed: f64,
+        desired: f64,
+        leader: Option<Leader>,
+        stop: Option<f64>,
+    ) -> f64 {
+        let desired = desired.max(0.1);
+        let free = if speed <= desired {
+            self.acceleration * (1.0 - (speed / desired).powi(4))
+        } else {
+            let exponent = 4.0 * self.acceleration / self.braking;
+            -self.braking * (1.0 - (desired / speed).powf(exponent))
+        };
+        let standing = stop.map(|distance| Leader {
+            gap: distance + self.standstill,
+            speed: 0.0,
+        });
+        let mut chosen = free;
+        for leader in [leader, standing].into_iter().flatten() {
+            let z = self.wanted_gap(speed, leader.speed) / leader.gap.max(0.05);
+            let interaction = if z >= 1.0 {
+                free.min(0.0) + self.acceleration * (1.0 - z * z)
+            } else if speed <= desired && free > 1e-6 {
+                free * (1.0 - z.powf(2.0 * self.acceleration / free))
+            } else {
+                free
+            };
+            chosen = chosen.min(interaction);
+        }
+        chosen.clamp(-HARDEST_BRAKING, self.acceleration)
+    }
+
+    /// The gap this driver would keep, metres.
+    pub(crate) fn wanted_gap(&self, speed: f64, leader_speed: f64) -> f64 {
+        let closing = speed * (speed - leader_speed);
+        let dynamic = closing / (2.0 * (self.acceleration * self.braking).sqrt());
+        self.standstill + (speed * self.headway + dynamic).max(0.0)
+    }
+}

@@ -1,0 +1,249 @@
+//! People on foot: along sidewalks, around corners, and across the road when it is safe.
+
+use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
+use gump_scene::{AgentKind, Rng};
+use rand::Rng as _;
+
+use super::{Body, Traffic};
+use crate::network::Network;
+
+/// Metres ahead on the walk that a person steers to.
+const CARROT: f64 = 1.6;
+/// Fastest turn of a person, radians per second.
+const TURN_RATE: f64 = 1.6;
+/// Fastest change of walking speed, m/s².
+const CHANGE: f64 = 1.2;
+
+/// What a person at a crosswalk does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Activity {
+    /// Stands at the curb; `may_go` if lights do not forbid it.
+    Waits {
+        /// Lights permit crossing, or there are none.
+        may_go: bool,
+    },
+    /// Is on the road.
+    Crosses {
+        /// In the direction of the crosswalk's walk.
+        forward: bool,
+    },
+}
+
+/// A person on a walk.
+#[derive(Clone, Debug)]
+pub(crate) struct Person {
+    id: i64,
+    size: [f64; 3],
+    walk: usize,
+    forward: bool,
+    /// Metres along the walk from where the person entered it.
+    progress: f64,
+    /// Metres right of the walk's middle.
+    aside: f64,
+    pace: f64,
+    speed: f64,
+    pose: Pose,
+    activity: Option<Activity>,
+    gone: bool,
+}
+
+impl Person {
+    /// Somebody `progress` metres along a walk.
+    pub(crate) fn new(
+        id: i64,
+        network: &Network,
+        (walk, forward, progress): (usize, bool, f64),
+        rng: &mut Rng,
+    ) -> Self {
+        let pace = rng.random_range(0.9..1.7);
+        let aside = rng.random_range(0.1..0.9);
+        let track = &network.walks[walk].track;
+        let s = if forward {
+            progress
+        } else {
+            track.length() - progress
+        };
+        let on_walk = track.pose_at(s);
+        let heading = if forward {
+            on_walk.heading
+        } else {
+            wrap_angle(on_walk.heading + std::f64::consts::PI)
+        };
+        let position = on_walk.position - DVec2::from_angle(heading).perp() * aside;
+        Self {
+            id,
+            size: [
+                rng.random_range(0.55..0.95),
+                rng.random_range(0.55..0.9),
+                rng.random_range(1.5..1.9),
+            ],
+            walk,
+            forward,
+            progress,
+            aside,
+            pace,
+            speed: pace,
+            pose: Pose { position, heading },
+            activity: None,
+            gone: false,
+        }
+    }
+
+    /// The crosswalk the person is at, where along its walk, and what the person does there.
+    pub(crate) fn on_crosswalk(&self, network: &Network) -> Option<(usize, f64, Activity)> {
+        let walk = &network.walks[self.walk];
+        let length = walk.track.length();
+        let place = if self.forward {
+            self.progress
+        } else {
+            length - self.progress
+        };
+        Some((walk.crosswalk?, place, self.activity?))
+    }
+
+    /// True once the person has left the scene.
+    pub(crate) fn has_left(&self) -> bool {
+        self.gone
+    }
+
+    pub(crate) fn body(&self) -> Body {
+        Body {
+            id: self.id,
+            kind: AgentKind::Pedestrian,
+            size: self.size,
+            pose: self.pose,
+            is_mobile: true,
+            place: None,
+        }
+    }
+
+    fn ends(&self, network: &Network) -> [usize; 2] {
+        let [a, b] = network.walks[self.walk].ends;
+        if self.forward { [a, b] } else { [b, a] }
+    }
+
+    /// The point to walk to: ahead on the walk, a little to the right of its middle.
+    fn carrot(&self, network: &Network) -> DVec2 {
+        let track = &network.walks[self.walk].track;
+        let ahead = self.progress + CARROT;
+        let (s, sign) = if self.forward {
+            (ahead, 1.0)
+        } else {
+            (track.length() - ahead, -1.0)
+        };
+        let pose = track.pose_at(s);
+        pose.position - pose.direction().perp() * (self.aside * sign)
+    }
+
+    /// Walks on for `dt` seconds towards the carrot at up to `limit` metres per second.
+    fn advance(&mut self, network: &Network, limit: f64, dt: f64) {
+        let wanted = self.pace.min(limit);
+        self.speed += (wanted - self.speed).clamp(-2.0 * CHANGE * dt, CHANGE * dt);
+        self.speed = self.speed.max(0.0);
+        if self.speed < 0.02 {
+            return;
+        }
+        let to = self.carrot(network) - self.pose.position;
+        let turn = angle_difference(to.to_angle(), self.pose.heading);
+        // Turning on the spot would spin the box: the slower, the less it turns.
+        let most = TURN_RATE * dt * (self.speed / 0.6).min(1.0);
+        self.pose.heading = wrap_angle(self.pose.heading + (turn * 4.0 * dt).clamp(-most, most));
+        let step = self.pose.direction() * (self.speed * dt);
+        self.pose.position += step;
+        self.progress += step.dot(to.normalize_or_zero()).max(0.0);
+    }
+}
+
+impl Traffic<'_> {
+    /// Moves everybody on foot by one step.
+    pub(super) fn step_people(&mut self) {
+        for i in 0..self.people.len() {
+            let mut person = self.people[i].clone();
+            let limit = self.walking_limit(&mut person, i);
+            person.advance(self.network, limit, self.dt);
+            let length = self.network.walks[person.walk].track.length();
+            if person.progress >= length {
+                self.choose_walk(&mut person, length);
+            }
+            self.people[i] = person;
+        }
+        self.people.retain(|person| !person.has_left());
+    }
+
+    /// How fast the person may walk now; decides about stepping onto a crosswalk.
+    fn walking_limit(&self, person: &mut Person, i: usize) -> f64 {
+        let walk = &self.network.walks[person.walk];
+        if let Some(crosswalk) = walk.crosswalk {
+            let index = crosswalk;
+            let crosswalk = &self.network.crosswalks[crosswalk];
+            let near_curb = crosswalk
+                .on_road
+                .0
+                .min(walk.track.length() - crosswalk.on_road.1);
+            let waiting = !matches!(person.activity, Some(Activity::Crosses { .. }));
+            if waiting {
+                let width = crosswalk.on_road.1 - crosswalk.on_road.0;
+                let cycle = self.network.junctions[crosswalk.junction].cycle.as_ref();
+                let may_go = cycle.is_none_or(|cycle| {
+                    cycle.walk_time(crosswalk.leg, self.time) > 0.85 * width / person.pace
+                });
+                if may_go && self.is_free_of_claims(index) {
+                    person.activity = Some(Activity::Crosses {
+                        forward: person.forward,
+                    });
+                } else {
+                    person.activity = Some(Activity::Waits { may_go });
+                    let left = near_curb - 0.9 - person.progress;
+                    return if left < 0.05 {
+                        0.0
+                    } else {
+                        (2.0 * CHANGE * left).sqrt()
+                    };
+                }
+            }
+        } else {
+            person.activity = None;
+        }
+        self.limit_behind_others(person, i)
+    }
+
+    /// Slows behind somebody slower straight ahead.
+    fn limit_behind_others(&self, person: &Person, i: usize) -> f64 {
+        let mut limit = f64::INFINITY;
+        for (j, other) in self.people.iter().enumerate() {
+            let local = person.pose.inverse() * other.pose.position;
+            let same_way = angle_difference(other.pose.heading, person.pose.heading).abs() < 1.0;
+            if j != i && same_way && 0.0 < local.x && local.x < 2.0 && local.y.abs() < 0.7 {
+                limit = f64::min(limit, other.speed + 0.6 * (local.x - 1.1));
+            }
+        }
+        limit.max(0.0)
+    }
+
+    /// Chooses where to go on at the end of a walk.
+    fn choose_walk(&mut self, person: &mut Person, length: f64) {
+        let node = person.ends(self.network)[1];
+        let from = person.walk;
+        let choices: Vec<(usize, bool)> = self
+            .network
+            .walks
+            .iter()
+            .enumerate()
+            .filter(|(walk, _)| *walk != from)
+            .flat_map(|(walk, w)| {
+                [(walk, true, w.ends[0]), (walk, false, w.ends[1])]
+                    .into_iter()
+                    .filter(|(_, _, end)| *end == node)
+                    .map(|(walk, forward, _)| (walk, forward))
+            })
+            .collect();
+        if choices.is_empty() {
+            person.gone = true;
+            return;
+        }
+        let (walk, forward) = choices[self.rng.random_range(0..choices.len())];
+        (person.walk, person.forward) = (walk, forward);
+        person.progress -= length;
+        person.activity = None;
+    }
+}

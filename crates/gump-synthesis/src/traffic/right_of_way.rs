@@ -1,0 +1,290 @@
+//! Who may enter a junction, and where the others stop.
+//!
+//! A vehicle claims the connector it wants before it gets so near that it could no longer stop
+//! comfortably. It is refused while another claim, a person on a crosswalk, a light, a stop sign,
+//! traffic with priority or a full exit is in the way. Claims end when the rear is clear.
+
+use gump_scene::LightState;
+
+use super::Traffic;
+use super::people::Activity;
+use super::vehicle::Vehicle;
+use crate::network::{Connector, LaneIdx};
+use crate::plan::Control;
+
+/// Deceleration up to which a vehicle stops for yellow, m/s².
+const YELLOW_BRAKING: f64 = 3.0;
+/// Metres behind the last conflict at which a claim ends.
+const CLEAR: f64 = 1.0;
+/// Metres of pavement beside a vehicle's way that must be free of people.
+const PERSON_CLEARANCE: f64 = 0.9;
+
+impl Traffic<'_> {
+    /// Ends claims that are used up, then lets vehicles claim, those with priority first.
+    pub(super) fn settle_claims(&mut self) {
+        for i in 0..self.vehicles.len() {
+            self.end_claims(i);
+            self.note_waiting(i);
+        }
+        let mut order: Vec<(u8, f64, usize, usize)> = Vec::new();
+        for (i, vehicle) in self.vehicles.iter().enumerate() {
+            let Some(leg) = vehicle.next_connector(self.network) else {
+                continue;
+            };
+            let distance = vehicle.distance_to(self.network, leg);
+            let lane = vehicle.path[leg];
+            let rank = self.connector(lane).rank;
+            if distance < self.decision_distance(vehicle) && !vehicle.claims.contains(&lane) {
+                order.push((rank, distance, i, leg));
+            }
+        }
+        order.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
+        for (_, distance, i, leg) in order {
+            if self.may_claim(i, leg, distance) {
+                let lane = self.vehicles[i].path[leg];
+                self.vehicles[i].claims.push(lane);
+                self.vehicles[i].waiting_since = None;
+            }
+        }
+    }
+
+    /// Metres from the front to the line where vehicle `i` has to stop, if it has to.
+    pub(super) fn distance_to_stop(&self, i: usize) -> Option<f64> {
+        let vehicle = &self.vehicles[i];
+        let leg = vehicle.next_connector(self.network)?;
+        if vehicle.claims.contains(&vehicle.path[leg]) {
+            return None;
+        }
+        let distance = vehicle.distance_to(self.network, leg);
+        let near = distance < self.decision_distance(vehicle);
+        near.then(|| (distance - vehicle.driver.line_gap).max(0.0))
+    }
+
+    fn connector(&self, lane: LaneIdx) -> &Connector {
+        self.network.lanes[lane]
+            .connector
+            .as_ref()
+            .expect("only connectors are claimed")
+    }
+
+    /// Where a driver starts to react to a line at which to stop, metres.
+    fn decision_distance(&self, vehicle: &Vehicle) -> f64 {
+        vehicle.driver.wanted_gap(vehicle.speed, 0.0) + vehicle.driver.line_gap + 6.0
+    }
+
+    fn end_claims(&mut self, i: usize) {
+        let (network, time) = (self.network, self.time);
+        let vehicle = &self.vehicles[i];
+        let keep = |lane: &LaneIdx| {
+            let Some(rear) = vehicle.rear_on(network, *lane) else {
+                return false;
+            };
+            let connector = self.connector(*lane);
+            let distance = -(rear + vehicle.length());
+            if distance > 0.0 {
+                // Not yet over the line: a light that has changed may still stop it.
+                let state = self.light(connector, time);
+                let can_stop = self.can_stop(vehicle, distance);
+                return state == LightState::Green || !can_stop;
+            }
+            let conflicts = connector.conflicts.iter().map(|conflict| conflict.mine.1);
+            let crossings = connector.crossings.iter().map(|crossing| crossing.along.1);
+            let last = conflicts.chain(crossings).fold(0.0, f64::max);
+            rear <= last + CLEAR
+        };
+        let claims = vehicle.claims.iter().copied().filter(keep).collect();
+        self.vehicles[i].claims = claims;
+    }
+
+    fn can_stop(&self, vehicle: &Vehicle, distance: f64) -> bool {
+        let braking = vehicle.speed * vehicle.speed / (2.0 * distance.max(0.01));
+        braking < YELLOW_BRAKING
+    }
+
+    /// Remembers since when a vehicle stands at its line.
+    fn note_waiting(&mut self, i: usize) {
+        let vehicle = &self.vehicles[i];
+        let at_line = vehicle
+            .next_connector(self.network)
+            .is_some_and(|leg| vehicle.distance_to(self.network, leg) < 3.5);
+        let stands = at_line && vehicle.speed < 0.3;
+        if !at_line {
+            self.vehicles[i].waiting_since = None;
+        } else if stands && vehicle.waiting_since.is_none() {
+            self.vehicles[i].waiting_since = Some(self.time);
+        }
+    }
+
+    fn light(&self, connector: &Connector, time: f64) -> LightState {
+        let cycle = self.network.junctions[connector.junction].cycle.as_ref();
+        match (cycle, connector.signal) {
+            (Some(cycle), Some(group)) => cycle.state(group, time),
+            _ => LightState::Green,
+        }
+    }
+
+    fn may_claim(&self, i: usize, leg: usize, distance: f64) -> bool {
+        let vehicle = &self.vehicles[i];
+        let lane = vehicle.path[leg];
+        let connector = self.connector(lane);
+        let light = self.light(connector, self.time);
+        let goes = match light {
+            LightState::Green => true,
+            LightState::Yellow => !self.can_stop(vehicle, distance),
+            LightState::Red | LightState::Unknown => false,
+        };
+        let stopped = match (connector.must_stop, vehicle.waiting_since) {
+            (true, Some(since)) => self.time - since > 0.6,
+            (true, None) => false,
+            (false, _) => true,
+        };
+        goes && stopped
+            && self.is_first_in_line(vehicle, leg)
+            && self.is_unclaimed(i, lane, connector)
+            && self.has_priority(i, lane, connector, distance)
+            && self.is_free_of_people(vehicle, connector)
+            && self.has_room_beyond(i, leg)
+    }
+
+    /// True if nobody between the vehicle and the line is still undecided.
+    fn is_first_in_line(&self, vehicle: &Vehicle, leg: usize) -> bool {
+        vehicle.path[vehicle.leg..leg]
+            .iter()
+            .enumerate()
+            .all(|(n, &lane)| {
+                self.occupancy.on(lane).iter().all(|entry| {
+                    let ahead = n > 0 || entry.rear + entry.front > 2.0 * vehicle.s;
+                    let other = &self.vehicles[entry.vehicle];
+                    let undecided = other
+                        .next_connector(self.network)
+                        .is_some_and(|leg| !other.claims.contains(&other.path[leg]));
+                    entry.id == vehicle.id || !ahead || !undecided
+                })
+            })
+    }
+
+    /// True if no claim conflicts with this connector.
+    fn is_unclaimed(&self, i: usize, lane: LaneIdx, connector: &Connector) -> bool {
+        let clear = |(j, other): (usize, &Vehicle)| {
+            j == i
+                || other.claims.iter().all(|&claimed| {
+                    let conflict = connector.conflicts.iter().find(|c| c.other == claimed);
+                    let Some(conflict) = conflict.filter(|_| claimed != lane) else {
+                        return true;
+                    };
+                    let rear = other.rear_on(self.network, claimed);
+                    rear.is_none_or(|rear| rear > conflict.theirs.1)
+                })
+        };
+        self.vehicles.iter().enumerate().all(clear)
+    }
+
+    /// True if no traffic that goes first comes too soon.
+    fn has_priority(&self, i: usize, lane: LaneIdx, connector: &Connector, distance: f64) -> bool {
+        let vehicle = &self.vehicles[i];
+        let all_stop = self.network.junctions[connector.junction].control == Control::AllWayStop;
+        let yields_to = |other: &Vehicle| {
+            let Some(leg) = other.next_connector(self.network) else {
+                return false;
+            };
+            let theirs = other.path[leg];
+            let Some(conflict) = connector.conflicts.iter().find(|c| c.other == theirs) else {
+                return false;
+            };
+            let their = self.connector(theirs);
+            if all_stop {
+                // First come, first served.
+                return match (other.waiting_since, vehicle.waiting_since) {
+                    (Some(they), Some(me)) => they < me || (they == me && other.id < vehicle.id),
+                    _ => false,
+                };
+            }
+            if their.rank <= connector.rank || self.light(their, self.time) == LightState::Red {
+                return false;
+            }
+            let away = other.distance_to(self.network, leg) + conflict.theirs.0.max(0.0);
+            let arrival = away / other.speed.max(1.0);
+            // How long the own way to the far side of the conflict takes.
+            let mine =
+                (distance + conflict.mine.1 + vehicle.length()) / (0.5 * vehicle.speed + 4.0);
+            other.speed > 1.0 && arrival < vehicle.driver.gap_time.max(mine + 1.0)
+        };
+        let others = self.vehicles.iter().enumerate().filter(|(j, _)| *j != i);
+        let undecided = |other: &Vehicle| !other.claims.contains(&lane);
+        !others
+            .map(|(_, other)| other)
+            .any(|other| undecided(other) && yields_to(other))
+    }
+
+    /// True if nobody is, or is politely to be let, on the crosswalks on the way.
+    fn is_free_of_people(&self, vehicle: &Vehicle, connector: &Connector) -> bool {
+        connector.crossings.iter().all(|crossing| {
+            let signalled = connector.signal.is_some();
+            self.people
+                .iter()
+                .all(|person| match person.on_crosswalk(self.network) {
+                    Some((crosswalk, place, activity)) if crosswalk == crossing.crosswalk => {
+                        match activity {
+                            Activity::Crosses { forward } => {
+                                let (low, high) = crossing.across;
+                                if forward {
+                                    place > high + PERSON_CLEARANCE
+                                } else {
+                                    place < low - PERSON_CLEARANCE
+                                }
+                            }
+                            Activity::Waits { may_go } => {
+                                !(may_go && (signalled || vehicle.driver.is_polite))
+                            }
+                        }
+                    }
+                    _ => true,
+                })
+        })
+    }
+
+    /// True if the vehicle will not have to stop inside the junction.
+    fn has_room_beyond(&self, i: usize, leg: usize) -> bool {
+        let vehicle = &self.vehicles[i];
+        let Some(&exit) = vehicle.path.get(leg + 1) else {
+            return true;
+        };
+        let slow = self
+            .occupancy
+            .on(exit)
+            .iter()
+            .filter(|entry| entry.speed < 3.0);
+        let room = slow.map(|entry| entry.rear).fold(f64::INFINITY, f64::min);
+        let under_way: f64 = self
+            .vehicles
+            .iter()
+            .enumerate()
+            .filter(|(j, other)| {
+                let on_way = other
+                    .claims
+                    .iter()
+                    .any(|&claim| self.network.lanes[claim].successors.contains(&exit));
+                *j != i && on_way && !other.path[..=other.leg].contains(&exit)
+            })
+            .map(|(_, other)| other.length() + 2.5)
+            .sum();
+        room > under_way + vehicle.length() + 3.0
+    }
+
+    /// True if no vehicle with a claim is still to pass this crosswalk.
+    pub(super) fn is_free_of_claims(&self, crosswalk: usize) -> bool {
+        self.network.crosswalks[crosswalk]
+            .passed_by
+            .iter()
+            .all(|&(lane, place)| {
+                let past = self.connector(lane).crossings[place].along.1;
+                self.vehicles.iter().all(|vehicle| {
+                    let claimed = vehicle.claims.contains(&lane);
+                    let rear = vehicle.rear_on(self.network, lane);
+                    let on_it =
+                        rear.is_some_and(|rear| -vehicle.length() < rear && rear <= past + 0.5);
+                    !(on_it || claimed && rear.is_some_and(|rear| rear <= past + 0.5))
+                })
+            })
+    }
+}

@@ -1,0 +1,268 @@
+//! One vehicle or bicycle: where it is on its path and how it moves along and across it.
+
+use gump_geometry::{Pose, wrap_angle};
+use gump_scene::{AgentKind, Rng};
+use rand::Rng as _;
+
+use super::Body;
+use super::driver::Driver;
+use crate::curve::{smooth_step, smooth_step_slope};
+use crate::network::{LaneIdx, Network};
+
+/// Metres over which a lateral correction settles, divided by about four.
+const SETTLE: f64 = 9.0;
+/// Steepest change of acceleration when accelerating or easing off, m/s³.
+const JERK: f64 = 5.0;
+/// Steepest change of acceleration when braking hard, m/s³.
+const BRAKING_JERK: f64 = 30.0;
+
+/// A lane change in progress.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LaneChange {
+    /// The lane it came from.
+    pub(crate) from: LaneIdx,
+    /// Arc length on that lane minus arc length on the new one.
+    pub(crate) arc_shift: f64,
+    /// Metres left of the new lane where it began.
+    pub(crate) offset: f64,
+    /// Metres driven since.
+    pub(crate) driven: f64,
+    /// Metres the change takes.
+    pub(crate) length: f64,
+}
+
+/// A vehicle or bicycle in motion.
+#[derive(Clone, Debug)]
+pub(crate) struct Vehicle {
+    pub(crate) id: i64,
+    pub(crate) kind: AgentKind,
+    pub(crate) size: [f64; 3],
+    pub(crate) driver: Driver,
+    /// Lanes to drive, driven ones included.
+    pub(crate) path: Vec<LaneIdx>,
+    /// Index into `path` of the lane that the centre is on.
+    pub(crate) leg: usize,
+    /// Arc length of the centre on that lane, metres.
+    pub(crate) s: f64,
+    pub(crate) speed: f64,
+    pub(crate) acceleration: f64,
+    /// Metres left of the lane centre (of the new lane during a change), without the change.
+    pub(crate) lateral: f64,
+    slope: f64,
+    wander: f64,
+    wander_left: f64,
+    /// Where it wants to be in its lane apart from wandering, metres to the left.
+    pub(crate) keep: f64,
+    /// Added to `keep` while passing a bicycle.
+    pub(crate) evade: f64,
+    noise: f64,
+    /// Connectors it may use.
+    pub(crate) claims: Vec<LaneIdx>,
+    /// When it came to rest at the line it waits at.
+    pub(crate) waiting_since: Option<f64>,
+    pub(crate) change: Option<LaneChange>,
+    /// Seconds until it thinks of changing lanes again.
+    pub(crate) patience: f64,
+}
+
+impl Vehicle {
+    /// A vehicle at arc length `s` of the first lane of `path`.
+    pub(crate) fn new(
+        id: i64,
+        (kind, size, driver): (AgentKind, [f64; 3], Driver),
+        path: Vec<LaneIdx>,
+        s: f64,
+        speed: f64,
+        rng: &mut Rng,
+    ) -> Self {
+        Self {
+            id,
+            kind,
+            size,
+            driver,
+            path,
+            leg: 0,
+            s,
+            speed,
+            acceleration: 0.0,
+            lateral: 0.0,
+            slope: 0.0,
+            wander: 0.0,
+            wander_left: 0.0,
+            keep: rng.random_range(-0.12..0.12),
+            evade: 0.0,
+            noise: 0.0,
+            claims: Vec::new(),
+            waiting_since: None,
+            change: None,
+            patience: rng.random_range(1.0..12.0),
+        }
+    }
+
+    /// Puts it at its preferred place in the lane at once; for vehicles that appear.
+    pub(crate) fn settle(&mut self, keep: f64) {
+        self.keep = keep;
+        self.lateral = keep;
+    }
+
+    pub(crate) fn length(&self) -> f64 {
+        self.size[0]
+    }
+
+    pub(crate) fn width(&self) -> f64 {
+        self.size[1]
+    }
+
+    /// The lane that the centre is on.
+    pub(crate) fn lane(&self) -> LaneIdx {
+        self.path[self.leg]
+    }
+
+    /// Arc length of the front on the present lane; may exceed the lane.
+    pub(crate) fn front(&self) -> f64 {
+        self.s + self.length() / 2.0
+    }
+
+    /// Metres from the front to the start of lane `path[leg]`; negative once past it.
+    pub(crate) fn distance_to(&self, network: &Network, leg: usize) -> f64 {
+        let length = |leg: usize| network.lanes[self.path[leg]].length();
+        if leg >= self.leg {
+            (self.leg..leg).map(length).sum::<f64>() - self.front()
+        } else {
+            -(leg..self.leg).map(length).sum::<f64>() - self.front()
+        }
+    }
+
+    /// Arc length of the rear measured from the start of `lane`, which is on the path; before it
+    /// negative, after it more than its length.
+    pub(crate) fn rear_on(&self, network: &Network, lane: LaneIdx) -> Option<f64> {
+        // The last lanes driven suffice: claims are given up soon after a junction.
+        let nearby = self.leg.saturating_sub(3)..self.path.len();
+        let leg = nearby.into_iter().find(|&leg| self.path[leg] == lane)?;
+        Some(-self.distance_to(network, leg) - self.length())
+    }
+
+    /// The next connector at or ahead of the front, as an index into the path.
+    pub(crate) fn next_connector(&self, network: &Network) -> Option<usize> {
+        let is_connector = |leg: &usize| network.lanes[self.path[*leg]].connector.is_some();
+        let leg = (self.leg + 1..self.path.len()).find(is_connector)?;
+        (self.distance_to(network, leg) > 0.0).then_some(leg)
+    }
+
+    /// The speed that limit, bends and habit allow here, metres per second.
+    pub(crate) fn allowed_speed(&self, network: &Network) -> f64 {
+        let lane = &network.lanes[self.lane()];
+        let bend = |lane: LaneIdx, s: f64| {
+            let speeds = &network.lanes[lane].bend_speeds;
+            let sample = (s / network.lanes[lane].track.step()) as usize;
+            speeds[sample.min(speeds.len() - 1)] * self.driver.bend_factor
+        };
+        let mut allowed = (lane.speed_limit * self.driver.speed_factor)
+            .min(self.driver.top_speed)
+            .min(bend(self.lane(), self.s));
+        let mut ahead = lane.length() - self.s;
+        for &next in &self.path[(self.leg + 1).min(self.path.len())..] {
+            if ahead > 80.0 {
+                break;
+            }
+            let limit = network.lanes[next].speed_limit * self.driver.speed_factor;
+            let entry = bend(next, 0.0).min(limit);
+            allowed = allowed.min((entry * entry + 2.0 * 1.2 * ahead).sqrt());
+            ahead += network.lanes[next].length();
+        }
+        allowed
+    }
+
+    /// Small random acceleration, none near standstill, m/s².
+    pub(crate) fn noise(&self) -> f64 {
+        self.noise * ((self.speed - 1.0) / 4.0).clamp(0.0, 1.0)
+    }
+
+    /// Moves on for `dt` seconds with the wanted acceleration, as far as jerk permits.
+    pub(crate) fn advance(&mut self, network: &Network, wanted: f64, dt: f64, rng: &mut Rng) {
+        // An Ornstein-Uhlenbeck process with a time constant of two seconds.
+        let kick: f64 = rng.random_range(-1.0..1.0);
+        self.noise += -self.noise * dt / 2.0 + 0.28 * kick * dt.sqrt();
+        let down = if wanted < -3.0 {
+            BRAKING_JERK
+        } else {
+            2.0 * JERK
+        };
+        let (low, high) = (self.acceleration - down * dt, self.acceleration + JERK * dt);
+        self.acceleration = wanted.clamp(low, high);
+        let speed = (self.speed + self.acceleration * dt).max(0.0);
+        if speed == 0.0 {
+            self.acceleration = self.acceleration.max(0.0);
+        }
+        let driven = (self.speed + speed) / 2.0 * dt;
+        self.speed = speed;
+        self.patience -= dt;
+        self.drift(driven, rng);
+        let curvature = network.lanes[self.lane()].track.curvature_at(self.s);
+        // On the inside of a bend the lane centre passes faster than the vehicle drives.
+        self.s += driven / (1.0 - curvature * self.offset()).max(0.3);
+        while self.leg + 1 < self.path.len() && self.s >= network.lanes[self.lane()].length() {
+            self.s -= network.lanes[self.lane()].length();
+            self.leg += 1;
+        }
+    }
+
+    /// Sideways motion over `driven` metres: towards the preferred place, wandering a little.
+    fn drift(&mut self, driven: f64, rng: &mut Rng) {
+        self.wander_left -= driven;
+        if self.wander_left <= 0.0 {
+            self.wander_left = rng.random_range(15.0..45.0);
+            self.wander = rng.random_range(-0.16..0.16);
+        }
+        let target = self.keep + self.evade + self.wander;
+        let k = 4.0 / (SETTLE * 4.0);
+        let pull = k * k * (target - self.lateral) - 2.0 * k * self.slope;
+        self.slope += pull * driven;
+        self.lateral += self.slope * driven;
+        if let Some(change) = &mut self.change {
+            change.driven += driven;
+            if change.driven >= change.length {
+                self.change = None;
+            }
+        }
+    }
+
+    /// Metres left of the centre of the present lane, lane change included.
+    pub(crate) fn offset(&self) -> f64 {
+        let change = self.change.map_or(0.0, |change| {
+            change.offset * (1.0 - smooth_step(change.driven / change.length))
+        });
+        self.lateral + change
+    }
+
+    /// Where the box is now.
+    pub(crate) fn pose(&self, network: &Network) -> Pose {
+        let on_lane = network.lanes[self.lane()].track.pose_at(self.s);
+        let slope = self.slope
+            - self.change.map_or(0.0, |change| {
+                change.offset * smooth_step_slope(change.driven / change.length) / change.length
+            });
+        let left = on_lane.direction().perp();
+        Pose {
+            position: on_lane.position + left * self.offset(),
+            heading: wrap_angle(on_lane.heading + slope.atan()),
+        }
+    }
+
+    /// True once it has driven off its last lane.
+    pub(crate) fn has_left(&self, network: &Network) -> bool {
+        let lane = &network.lanes[self.lane()];
+        lane.is_exit && self.s >= lane.length() - 0.5
+    }
+
+    pub(crate) fn body(&self, network: &Network) -> Body {
+        Body {
+            id: self.id,
+            kind: self.kind,
+            size: self.size,
+            pose: self.pose(network),
+            is_mobile: true,
+            place: Some((self.lane(), self.s)),
+        }
+    }
+}
