@@ -8,6 +8,22 @@
 //! Start with [`open`], which recognises a file by its content, or [`find`], which reads one
 //! scenario by a name like `FILE#3` or `FILE#637f20cafde22ff8`.
 //!
+//! ```
+//! use gump_data::{find, open, womd};
+//!
+//! let text = "lane 1: 0,0 200,0\nego vehicle 0: 10,0 velocity 8,0";
+//! let scenario = gump_scene::fixture::scenario(text)?;
+//! let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("one.tfrecord");
+//! womd::write_scenarios(&path, [&scenario])?;
+//! for record in open(&path)? {
+//!     let record = record?;
+//!     println!("{}: {:?}", record.scenario.id, record.report.inferred);
+//! }
+//! assert_eq!(find(&format!("{}#fixture", path.display()))?.log.len(), 91);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
 //! # Terms
 //! * **record**: one scenario's bytes in a file; **place**: which record, at which byte.
 //! * **stated** is what a format says, **inferred** what a reader adds, **dropped** what a reader

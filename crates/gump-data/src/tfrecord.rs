@@ -199,3 +199,44 @@ fn read_full(stream: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     }
     Ok(filled)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_checksum_is_castagnoli_masked() {
+        // The published check value, and a checksum TensorFlow wrote into a file.
+        assert_eq!(crc32c::crc32c(b"123456789"), 0xe306_9283);
+        assert_eq!(masked_crc(&86_019_u64.to_le_bytes()), 3_905_923_129);
+    }
+
+    #[test]
+    fn records_come_back_with_their_places_plain_and_packed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut plain = Vec::new();
+        for payload in [&b"one"[..], b"", b"three"] {
+            write_record(&mut plain, payload).unwrap();
+        }
+        let mut packer = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        packer.write_all(&plain).unwrap();
+        let packed = packer.finish().unwrap();
+        for bytes in [plain, packed] {
+            let path = folder.path().join("file");
+            std::fs::write(&path, bytes).unwrap();
+            let records = TfRecordReader::open(path).unwrap();
+            let found: Vec<_> = records
+                .map(|record| {
+                    let payload = record.unwrap();
+                    (payload.bytes, payload.place.record, payload.place.offset)
+                })
+                .collect();
+            let expected = [
+                (b"one".to_vec(), 0, 0),
+                (b"".to_vec(), 1, 19),
+                (b"three".to_vec(), 2, 35),
+            ];
+            assert_eq!(found, expected);
+        }
+    }
+}

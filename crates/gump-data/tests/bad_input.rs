@@ -3,6 +3,7 @@
 mod common;
 
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use gump_data::tfrecord::{MAX_RECORD_BYTES, masked_crc, write_record};
@@ -105,6 +106,16 @@ fn a_truncated_record() {
         assert_eq!((place.record, place.offset), (1, first as u64));
         assert!(found < expected);
     }
+}
+
+#[test]
+fn a_truncated_gzip_file() {
+    let mut packer = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    packer.write_all(&bytes_of(&[message()])).unwrap();
+    let packed = packer.finish().unwrap();
+    let error = error_of(&packed[..packed.len() / 2]);
+    assert!(matches!(error, DataError::Io { .. }), "{error}");
+    assert!(matches!(error_of(&packed[..15]), DataError::Io { .. }));
 }
 
 #[test]

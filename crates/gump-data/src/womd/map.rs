@@ -215,3 +215,77 @@ fn edge_kind(kind: RoadEdgeType) -> RoadEdgeKind {
         RoadEdgeType::Median => RoadEdgeKind::Median,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn points(list: &[(f64, f64)]) -> Vec<proto::MapPoint> {
+        let point = |&(x, y): &(f64, f64)| proto::MapPoint {
+            x: Some(x),
+            y: Some(y),
+            z: Some(x + y),
+        };
+        list.iter().map(point).collect()
+    }
+
+    fn read(data: Option<FeatureData>) -> (MapParts, ReadReport) {
+        let feature = proto::MapFeature {
+            id: Some(5),
+            feature_data: data,
+        };
+        let mut report = ReadReport::default();
+        let parts = parts_from_proto(&[feature], &mut report).unwrap();
+        (parts, report)
+    }
+
+    #[test]
+    fn a_lane_keeps_what_is_stated() {
+        let neighbor = |id| proto::LaneNeighbor {
+            feature_id: Some(id),
+            ..proto::LaneNeighbor::default()
+        };
+        let (parts, report) = read(Some(FeatureData::Lane(proto::LaneCenter {
+            speed_limit_mph: Some(25.0),
+            r#type: Some(LaneType::BikeLane.into()),
+            interpolating: Some(true),
+            polyline: points(&[(0.0, 1.0), (5.0, 1.0)]),
+            left_neighbors: vec![neighbor(5), neighbor(8), neighbor(5)],
+            exit_lanes: vec![5, 6],
+            ..proto::LaneCenter::default()
+        })));
+        let lane = &parts.lanes[0];
+        assert_eq!(lane.speed_limit, Some(11.176));
+        assert_eq!((lane.kind, lane.width), (LaneKind::BikeLane, 1.5));
+        assert!(lane.in_intersection);
+        assert_eq!(lane.elevation, [1.0, 6.0]);
+        // A neighbour is listed once however many stretches it runs along.
+        assert_eq!(lane.left_neighbors, [LaneId(5), LaneId(8)]);
+        assert_eq!(report.dropped["neighbour that is not in the map"], 1);
+        assert_eq!(report.dropped["link to a lane that is not in the map"], 1);
+    }
+
+    #[test]
+    fn the_closing_point_of_an_outline_takes_its_height_with_it() {
+        let ring = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 0.0)];
+        let polygon = points(&ring);
+        let (parts, _) = read(Some(FeatureData::Driveway(proto::Outline { polygon })));
+        assert_eq!(parts.areas[0].kind, AreaKind::Driveway);
+        assert_eq!(parts.areas[0].elevation, [0.0, 4.0, 7.0]);
+    }
+
+    #[test]
+    fn features_without_shape_are_dropped_and_counted() {
+        let check = |data, reason| {
+            let (parts, report) = read(data);
+            assert!(parts.lanes.is_empty() && parts.areas.is_empty());
+            assert_eq!(report.dropped[reason], 1);
+        };
+        check(None, "map feature of an unknown type");
+        let lane = proto::LaneCenter::default();
+        check(Some(FeatureData::Lane(lane)), "lane without points");
+        let polygon = points(&[(0.0, 0.0), (1.0, 1.0)]);
+        let bump = FeatureData::SpeedBump(proto::Outline { polygon });
+        check(Some(bump), "outline of fewer than 3 points");
+    }
+}

@@ -236,3 +236,50 @@ fn light_state(state: SignalState) -> LightState {
         SignalState::ArrowGo | SignalState::Go => LightState::Green,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn signals_become_colours() {
+        let colours: Vec<_> = (0..=8)
+            .map(|state| light_state(SignalState::try_from(state).unwrap()))
+            .collect();
+        use LightState::{Green, Red, Unknown, Yellow};
+        let expected = [Unknown, Red, Yellow, Green, Red, Yellow, Green, Red, Yellow];
+        assert_eq!(colours, expected);
+    }
+
+    #[test]
+    fn the_last_signal_of_a_lane_counts_and_the_first_is_reported() {
+        let signal = |lane, state: SignalState| proto::TrafficSignalLaneState {
+            lane: Some(lane),
+            state: Some(state.into()),
+            stop_point: None,
+        };
+        let signals = [signal(5, SignalState::Stop), signal(5, SignalState::Go)];
+        let mut report = ReadReport::default();
+        let frame = Frame::new(Vec::new(), lights_from_proto(&signals, &mut report));
+        assert_eq!(frame.light(LaneId(5)).unwrap().state, LightState::Green);
+        assert_eq!(report.dropped["second signal of a lane in one step"], 1);
+    }
+
+    #[test]
+    fn unknown_enum_values_are_the_unknown_kind() {
+        let track = proto::Track {
+            object_type: Some(77),
+            ..proto::Track::default()
+        };
+        assert_eq!(kind(track.object_type()), AgentKind::Other);
+    }
+
+    #[test]
+    fn the_time_step_is_the_nominal_one() {
+        let drifting: Vec<f64> = (0..91).map(|i| f64::from(i) * 0.10024).collect();
+        assert_eq!(time_step(&drifting), Ok(0.1));
+        assert_eq!(time_step(&[0.0, 0.5, 1.0]), Ok(0.5));
+        assert!(time_step(&[0.0, 0.0, 0.0]).is_err());
+        assert!(time_step(&[1.0, 0.5, 0.0]).is_err());
+    }
+}
