@@ -1,0 +1,266 @@
+//! Line charts as SVG, in colours that can be read on light and dark ground alike.
+
+use plotters::coord::Shift;
+use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
+use plotters::prelude::*;
+
+use crate::VizError;
+
+/// A line chart.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Chart {
+    /// Words above the chart, perhaps none; also what errors call it.
+    pub title: String,
+    /// Name and unit of the horizontal axis.
+    pub x_label: String,
+    /// Name and unit of the vertical axis.
+    pub y_label: String,
+    /// Whether the horizontal axis is logarithmic; then points at x <= 0 are left out.
+    pub log_x: bool,
+    /// Whether the vertical axis is logarithmic; then points at y <= 0 are left out.
+    pub log_y: bool,
+    /// Whether to mark each point with a disc: for few points that were measured.
+    pub markers: bool,
+    /// The curves, in the order of the legend.
+    pub series: Vec<Series>,
+}
+
+/// One curve.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Series {
+    /// What the legend calls it; without a name it is not in the legend.
+    pub name: String,
+    /// Points from left to right; points that are not finite are left out.
+    pub points: Vec<(f64, f64)>,
+}
+
+/// Size of the drawing, pixels; SVG scales.
+const SIZE: (u32, u32) = (760, 400);
+
+/// Stands for "the colour of the text around"; plotters knows only fixed colours, so this one is
+/// replaced by `currentColor` when the drawing is done. No curve may use it.
+const TEXT: RGBColor = RGBColor(1, 2, 3);
+
+/// Curves in the order of Okabe and Ito, without their black and yellow, which vanish on dark or
+/// light ground.
+const CURVES: [RGBColor; 6] = [
+    RGBColor(0x2A, 0x8F, 0xD0),
+    RGBColor(0xE6, 0x9F, 0x00),
+    RGBColor(0x00, 0x9E, 0x73),
+    RGBColor(0xD5, 0x5E, 0x00),
+    RGBColor(0xCC, 0x79, 0xA7),
+    RGBColor(0x56, 0xB4, 0xE9),
+];
+
+impl Chart {
+    /// The chart as an SVG element; put inline into a page, it takes the page's text colour.
+    ///
+    /// # Errors
+    /// [`VizError::EmptyChart`] without a point to draw; [`VizError::Chart`] if the backend
+    /// refuses.
+    pub fn to_svg(&self) -> Result<String, VizError> {
+        let series: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| self.drawable(s)).collect();
+        let points = || series.iter().flatten();
+        let empty = || VizError::EmptyChart(self.title.clone());
+        let x = range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?;
+        let y = range(points().map(|p| p.1), self.log_y, 0.05).ok_or_else(empty)?;
+        let mut svg = String::new();
+        {
+            let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
+            let (x, y) = (x.0..x.1, y.0..y.1);
+            match (self.log_x, self.log_y) {
+                (false, false) => self.draw(&root, x, y, &series),
+                (true, false) => self.draw(&root, x.log_scale(), y, &series),
+                (false, true) => self.draw(&root, x, y.log_scale(), &series),
+                (true, true) => self.draw(&root, x.log_scale(), y.log_scale(), &series),
+            }
+            .and_then(|()| root.present())
+            .map_err(|error| VizError::Chart {
+                title: self.title.clone(),
+                reason: error.to_string(),
+            })?;
+        }
+        Ok(svg.replace("#010203", "currentColor"))
+    }
+
+    fn drawable(&self, series: &Series) -> Vec<(f64, f64)> {
+        let fits = |v: f64, is_log: bool| v.is_finite() && (!is_log || v > 0.0);
+        let points = series.points.iter().copied();
+        points
+            .filter(|&(x, y)| fits(x, self.log_x) && fits(y, self.log_y))
+            .collect()
+    }
+
+    fn draw<X, Y>(&self, root: &Area<'_>, x: X, y: Y, series: &[Vec<(f64, f64)>]) -> Drawn
+    where
+        X: AsRangedCoord<Value = f64>,
+        Y: AsRangedCoord<Value = f64>,
+        X::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
+        Y::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
+    {
+        let font = |size: u32| ("system-ui, sans-serif", size).into_font().color(&TEXT);
+        let mut builder = ChartBuilder::on(root);
+        builder
+            .margin(12)
+            .margin_right(24)
+            .x_label_area_size(46)
+            .y_label_area_size(64);
+        if !self.title.is_empty() {
+            builder.caption(&self.title, font(17));
+        }
+        let mut chart = builder.build_cartesian_2d(x, y)?;
+        chart
+            .configure_mesh()
+            .x_desc(self.x_label.as_str())
+            .y_desc(self.y_label.as_str())
+            .x_labels(8)
+            .y_labels(6)
+            .x_label_formatter(&|v| tick(*v))
+            .y_label_formatter(&|v| tick(*v))
+            .label_style(font(13))
+            .axis_desc_style(font(14))
+            .axis_style(TEXT.mix(0.45))
+            .bold_line_style(TEXT.mix(0.12))
+            .light_line_style(TEXT.mix(0.0))
+            .draw()?;
+        for (i, (points, named)) in series.iter().zip(&self.series).enumerate() {
+            let colour = CURVES[i % CURVES.len()];
+            let style = colour.stroke_width(2);
+            let line = chart.draw_series(LineSeries::new(points.iter().copied(), style))?;
+            if !named.name.is_empty() {
+                line.label(named.name.as_str())
+                    .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], style));
+            }
+            if self.markers || points.len() == 1 {
+                let discs = points.iter().map(|&p| Circle::new(p, 4, colour.filled()));
+                chart.draw_series(discs)?;
+            }
+        }
+        if self.series.iter().any(|s| !s.name.is_empty()) {
+            chart
+                .configure_series_labels()
+                .position(SeriesLabelPosition::UpperRight)
+                .label_font(font(13))
+                .margin(8)
+                .draw()?;
+        }
+        Ok(())
+    }
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
+
+/// The least and greatest value, widened by a share of their distance, and to some width in any
+/// case; `None` without values.
+fn range(values: impl Iterator<Item = f64>, is_log: bool, share: f64) -> Option<(f64, f64)> {
+    let to = |v: f64| if is_log { v.log10() } else { v };
+    let from = |v: f64| if is_log { 10f64.powf(v) } else { v };
+    let values: Vec<f64> = values.map(to).collect();
+    let low = values.iter().copied().reduce(f64::min)?;
+    let high = values.iter().copied().reduce(f64::max)?;
+    let margin = if high > low {
+        (high - low) * share
+    } else {
+        (high.abs() * 0.1).max(0.1)
+    };
+    Some((from(low - margin), from(high + margin)))
+}
+
+/// A number as short as it can be without lying: `0.25`, `1500`, `2M`, `3e-5`.
+fn tick(value: f64) -> String {
+    let size = value.abs();
+    if size == 0.0 || size < 1e-12 {
+        return "0".into();
+    }
+    if size >= 1e6 && size < 1e12 {
+        let (unit, name) = if size >= 1e9 { (1e9, "G") } else { (1e6, "M") };
+        return format!("{}{name}", trimmed(value / unit));
+    }
+    if !(1e-3..1e12).contains(&size) {
+        return format!("{value:.0e}");
+    }
+    trimmed(value)
+}
+
+fn trimmed(value: f64) -> String {
+    let text = format!("{value:.4}");
+    text.trim_end_matches('0').trim_end_matches('.').to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn losses() -> Chart {
+        let points =
+            |scale: f64| (1..=50).map(move |i| (f64::from(i) * 100.0, scale / f64::from(i)));
+        Chart {
+            title: "Loss & <friends>".into(),
+            x_label: "step".into(),
+            y_label: "loss, nats".into(),
+            series: vec![
+                Series {
+                    name: "training".into(),
+                    points: points(6.0).collect(),
+                },
+                Series {
+                    name: "validation".into(),
+                    points: points(7.0).chain([(f64::NAN, 1.0)]).collect(),
+                },
+            ],
+            ..Chart::default()
+        }
+    }
+
+    #[test]
+    fn a_chart_names_its_axes_and_curves() {
+        let svg = losses().to_svg().unwrap();
+        for text in [
+            "step",
+            "loss, nats",
+            "training",
+            "validation",
+            "&lt;friends&gt;",
+        ] {
+            assert!(svg.contains(text), "{text} is missing");
+        }
+        assert!(svg.matches("<polyline").count() >= 2);
+        assert!(svg.contains("currentColor") && !svg.contains("#010203"));
+        assert!(!svg.contains("NaN"));
+    }
+
+    #[test]
+    fn logarithmic_axes_leave_out_what_they_cannot_show() {
+        let mut chart = losses();
+        (chart.log_x, chart.log_y) = (true, true);
+        chart.series[0].points.push((-1.0, 0.0));
+        assert!(!chart.to_svg().unwrap().contains("NaN"));
+        chart.series.truncate(1);
+        chart.series[0].points = vec![(1.0, -1.0)];
+        let error = chart.to_svg().unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "chart \"Loss & <friends>\" has no point to draw"
+        );
+    }
+
+    #[test]
+    fn a_single_point_is_drawn() {
+        let mut chart = losses();
+        chart.series.truncate(1);
+        chart.series[0].points = vec![(3.0, 0.5)];
+        assert!(chart.to_svg().unwrap().contains("<circle"));
+    }
+
+    #[test]
+    fn ticks_are_short() {
+        let check = |value, expected: &str| assert_eq!(tick(value), expected);
+        check(0.0, "0");
+        check(0.25, "0.25");
+        check(-1500.0, "-1500");
+        check(2e6, "2M");
+        check(1.5e9, "1.5G");
+        check(2e-4, "2e-4");
+    }
+}

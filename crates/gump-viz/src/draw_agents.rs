@@ -1,0 +1,198 @@
+//! What moves: agents, their trails, and lights.
+//!
+//! Shapes of one colour are gathered into one path each, which keeps films fast.
+
+use gump_geometry::{DVec2, Pose, dvec2};
+use gump_scene::{Agent, AgentId, AgentKind, Frame, MapGraph};
+
+use crate::pen::{Pen, Shape};
+use crate::theme::{Colours, Rgb};
+
+/// In this order, so that what is rare and small ends up on top.
+const KINDS: [AgentKind; 4] = [
+    AgentKind::Other,
+    AgentKind::Vehicle,
+    AgentKind::Bicycle,
+    AgentKind::Pedestrian,
+];
+
+/// Boxes smaller than this are drawn as discs, pixels.
+const SMALLEST_BOX: f32 = 4.0;
+
+/// Draws the agents of a frame, the ego last and set off, with an opacity in [0, 1].
+pub(crate) fn draw_agents(
+    pen: &mut Pen<'_>,
+    frame: &Frame,
+    ego: AgentId,
+    colours: &Colours,
+    opacity: f32,
+) {
+    for kind in KINDS {
+        let is_shown = |a: &&Agent| a.kind == kind && a.id != ego && is_seen(pen, a);
+        let agents: Vec<&Agent> = frame.agents().iter().filter(is_shown).collect();
+        draw_boxes(pen, &agents, colours.kind(kind), colours, opacity);
+    }
+    draw_ego(pen, frame, ego, colours, opacity);
+}
+
+/// Draws the ego alone.
+pub(crate) fn draw_ego(
+    pen: &mut Pen<'_>,
+    frame: &Frame,
+    ego: AgentId,
+    colours: &Colours,
+    opacity: f32,
+) {
+    let Some(ego) = frame.agent(ego) else { return };
+    let mut halo = Shape::new(&pen.camera);
+    halo.disc(ego.state.pose.position, pen.px(ego.length * 0.85, 7.0));
+    pen.fill(halo, colours.ego, 0.22 * opacity);
+    draw_boxes(pen, &[ego], colours.ego, colours, opacity);
+}
+
+fn draw_boxes(pen: &mut Pen<'_>, agents: &[&Agent], colour: Rgb, colours: &Colours, opacity: f32) {
+    let mut bodies = Shape::new(&pen.camera);
+    let mut borders = Shape::new(&pen.camera);
+    let mut wedges = Shape::new(&pen.camera);
+    for agent in agents {
+        let pose = agent.state.pose;
+        let (length, width) = (pen.px(agent.length, 0.0), pen.px(agent.width, 0.0));
+        if length.max(width) < SMALLEST_BOX {
+            bodies.disc(pose.position, SMALLEST_BOX / 2.0);
+            borders.disc(pose.position, SMALLEST_BOX / 2.0);
+            continue;
+        }
+        let corners = agent.oriented_box().corners();
+        let radius = f64::from(length.min(width)) * 0.22;
+        bodies.rounded(&corners, radius);
+        borders.rounded(&corners, radius);
+        if length > 9.0 && width > 3.5 && agent.kind != AgentKind::Other {
+            wedges.ring(wedge(pose, agent.length, agent.width));
+        }
+    }
+    pen.fill(bodies, colour, opacity);
+    pen.fill(wedges, colours.wedge, 0.85 * opacity);
+    let width = pen.px(0.12, 0.6).min(1.5);
+    pen.stroke(borders, colours.outline, 0.8 * opacity, width);
+}
+
+/// A triangle at the front of a box that points where it heads.
+fn wedge(pose: Pose, length: f64, width: f64) -> [DVec2; 3] {
+    let nose = length / 2.0 - 0.14 * width;
+    let base = nose - 0.55 * width;
+    [
+        dvec2(nose, 0.0),
+        dvec2(base, 0.32 * width),
+        dvec2(base, -0.32 * width),
+    ]
+    .map(|point| pose * point)
+}
+
+/// Draws where agents have been, fading with age; `frames` are oldest first and end now.
+pub(crate) fn draw_past(
+    pen: &mut Pen<'_>,
+    frames: &[Frame],
+    ego: AgentId,
+    colours: &Colours,
+    opacity: f32,
+) {
+    /// Steps in which a trail fades.
+    const FADES: usize = 6;
+    let n = frames.len();
+    for step in 0..FADES {
+        let (from, to) = (step * (n - 1) / FADES, (step + 1) * (n - 1) / FADES);
+        let strength = (step + 1) as f32 / FADES as f32;
+        draw_trails(pen, &frames[from..=to], ego, colours, |_| {
+            0.6 * strength * opacity
+        });
+    }
+}
+
+/// Draws where agents go in each of several futures; every one starts from `now`.
+pub(crate) fn draw_trails_of_futures(
+    pen: &mut Pen<'_>,
+    now: &Frame,
+    futures: &[&[Frame]],
+    ego: AgentId,
+    colours: &Colours,
+) {
+    // Where all futures agree their lines add up to a solid one.
+    let opacity = (2.0 / (futures.len().max(1) as f32)).clamp(0.08, 0.75);
+    for future in futures {
+        let frames: Vec<&Frame> = std::iter::once(now).chain(future.iter()).collect();
+        draw_trails(pen, &frames, ego, colours, |is_ego| {
+            if is_ego {
+                (opacity * 1.6).min(0.9)
+            } else {
+                opacity
+            }
+        });
+    }
+}
+
+/// One line per agent through the frames, one stroke per kind.
+fn draw_trails<F: std::borrow::Borrow<Frame>>(
+    pen: &mut Pen<'_>,
+    frames: &[F],
+    ego: AgentId,
+    colours: &Colours,
+    opacity: impl Fn(bool) -> f32,
+) {
+    let Some((first, later)) = frames.split_first() else {
+        return;
+    };
+    let mut shapes = KINDS.map(|_| Shape::new(&pen.camera));
+    let mut of_ego = Shape::new(&pen.camera);
+    // Agents that appear on the way have no past here; their trail begins in a later call.
+    for agent in first
+        .borrow()
+        .agents()
+        .iter()
+        .filter(|a| is_seen_far(pen, a))
+    {
+        let positions = later
+            .iter()
+            .map_while(|frame| frame.borrow().agent(agent.id))
+            .map(|a| a.state.pose.position);
+        let line = std::iter::once(agent.state.pose.position).chain(positions);
+        if agent.id == ego {
+            of_ego.line(line);
+        } else if let Some(i) = KINDS.iter().position(|&kind| kind == agent.kind) {
+            shapes[i].line(line);
+        }
+    }
+    let width = pen.px(0.35, 1.2).min(3.0);
+    for (shape, kind) in shapes.into_iter().zip(KINDS) {
+        pen.stroke(shape, colours.kind(kind), opacity(false), width);
+    }
+    pen.stroke(of_ego, colours.ego, opacity(true), width * 1.4);
+}
+
+/// Draws each light as a dot where vehicles stop for it.
+pub(crate) fn draw_lights(pen: &mut Pen<'_>, frame: &Frame, map: &MapGraph, colours: &Colours) {
+    let radius = pen.px(0.75, 2.6).min(9.0);
+    for light in frame.lights() {
+        let start = || map.lane(light.lane).map(|lane| lane.centerline.points()[0]);
+        let Some(at) = light.stop_point.or_else(start) else {
+            continue;
+        };
+        if pen.camera.may_see(at, 2.0) {
+            let mut ring = Shape::new(&pen.camera);
+            ring.disc(at, radius * 1.4);
+            pen.fill(ring, colours.outline, 0.9);
+            let mut dot = Shape::new(&pen.camera);
+            dot.disc(at, radius);
+            pen.fill(dot, colours.light(light.state), 1.0);
+        }
+    }
+}
+
+fn is_seen(pen: &Pen<'_>, agent: &Agent) -> bool {
+    let radius = agent.length.hypot(agent.width) / 2.0;
+    pen.camera.may_see(agent.state.pose.position, radius + 2.0)
+}
+
+/// As [`is_seen`], for agents that may come into view within the frames of a trail.
+fn is_seen_far(pen: &Pen<'_>, agent: &Agent) -> bool {
+    pen.camera.may_see(agent.state.pose.position, 200.0)
+}

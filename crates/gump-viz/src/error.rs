@@ -1,0 +1,45 @@
+//! What can go wrong: compressing and writing.
+
+use std::io;
+use std::path::PathBuf;
+
+/// Why something could not be drawn to a file.
+#[derive(Debug, thiserror::Error)]
+pub enum VizError {
+    /// The file system refused.
+    #[error("could not write {path}", path = path.display())]
+    Write {
+        /// The reason.
+        source: io::Error,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A picture does not fit its format.
+    #[error("could not encode a PNG")]
+    Png(#[from] image::ImageError),
+    /// A film does not fit its format.
+    #[error("could not encode a GIF")]
+    Gif(#[from] gif::EncodingError),
+    /// A side of a picture or film is zero or beyond what its format can hold.
+    #[error("{width} x {height} px is not a size of a picture or film")]
+    Size {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+    /// A film of no futures has no frames.
+    #[error("a film needs at least one rollout")]
+    NothingToFilm,
+    /// No series has a finite point (for logarithmic axes: a positive one).
+    #[error("chart \"{0}\" has no point to draw")]
+    EmptyChart(String),
+    /// The chart backend refused.
+    #[error("could not draw chart \"{title}\": {reason}")]
+    Chart {
+        /// Title of the chart.
+        title: String,
+        /// What the backend says.
+        reason: String,
+    },
+}

@@ -1,0 +1,335 @@
+//! Films of futures, as animated GIFs.
+//!
+//! The road is drawn once; a frame draws only what moves, and stores only the pixels that differ
+//! from the frame before.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use gif::{DisposalMethod, Encoder, Frame as GifFrame, Repeat};
+use gump_scene::{Rollout, Scenario};
+use tiny_skia::Pixmap;
+
+use crate::draw_agents::{draw_agents, draw_lights, draw_past};
+use crate::draw_map::draw_backdrop;
+use crate::files::write_whole;
+use crate::indexed::{Palette, UNCHANGED};
+use crate::pen::{Pen, paint};
+use crate::picture::{draw_label, recent};
+use crate::theme::{Colours, mix};
+use crate::{Camera, Theme, VizError, lettering};
+
+/// What a film shows and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FilmSpec {
+    /// What one panel shows; fixed in the world.
+    pub camera: Camera,
+    /// On which ground.
+    pub theme: Theme,
+    /// Panels side by side, > 0; an overlay has one panel.
+    pub columns: usize,
+    /// Seconds of traffic between two frames, > 0.
+    pub frame_s: f64,
+    /// Seconds of traffic per second of film, > 0.
+    pub speed: f64,
+    /// How far trails reach back, seconds; 0 for none.
+    pub past_s: f64,
+}
+
+impl FilmSpec {
+    /// A light film in real time, five frames a second, two panels wide.
+    pub fn new(camera: Camera) -> Self {
+        Self {
+            camera,
+            theme: Theme::Light,
+            columns: 2,
+            frame_s: 0.2,
+            speed: 1.0,
+            past_s: 1.5,
+        }
+    }
+}
+
+/// A rollout and the words in the corner of its panel.
+#[derive(Clone, Debug)]
+pub struct Take<'a> {
+    /// What happens.
+    pub rollout: &'a Rollout,
+    /// What it is called; empty for no words.
+    pub label: String,
+}
+
+/// A finished film.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Film {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Number of frames.
+    pub n_frames: usize,
+    /// The bytes of a GIF file that repeats for ever.
+    pub gif: Vec<u8>,
+}
+
+/// A film of several rollouts side by side, row by row.
+///
+/// # Errors
+/// [`VizError::NothingToFilm`], or [`VizError::Size`] if the panels together are too large for a
+/// GIF (65 535 pixels a side) or empty.
+pub fn grid_film(takes: &[Take<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
+    let panels = takes.iter().map(|take| Panel {
+        rollouts: vec![take.rollout],
+        label: &take.label,
+        opacity: 1.0,
+    });
+    film(&panels.collect::<Vec<_>>(), spec)
+}
+
+/// A film of several rollouts over one another, each as faint as there are many: what all futures
+/// have in common is solid.
+///
+/// # Errors
+/// As [`grid_film`].
+pub fn overlay_film(rollouts: &[&Rollout], spec: &FilmSpec) -> Result<Film, VizError> {
+    if rollouts.is_empty() {
+        return Err(VizError::NothingToFilm);
+    }
+    let opacity = (2.0 / rollouts.len() as f32).clamp(0.12, 1.0);
+    let panel = Panel {
+        rollouts: rollouts.to_vec(),
+        label: "",
+        opacity,
+    };
+    film(&[panel], spec)
+}
+
+/// What really happened after the present, in the form in which futures come.
+pub fn log_as_rollout(scenario: &Scenario) -> Rollout {
+    let mut rollout = Rollout::begin(scenario.present());
+    for frame in scenario.future() {
+        rollout.push(frame.clone());
+    }
+    rollout
+}
+
+impl Film {
+    /// Writes the GIF file; a reader finds the old file or the new one, never half of one.
+    ///
+    /// # Errors
+    /// [`VizError::Write`] with the path.
+    pub fn save(&self, path: &Path) -> Result<(), VizError> {
+        write_whole(path, &self.gif)
+    }
+}
+
+/// One view of one or more rollouts drawn over one another.
+struct Panel<'a> {
+    rollouts: Vec<&'a Rollout>,
+    label: &'a str,
+    opacity: f32,
+}
+
+/// Pixels between panels.
+const GAP: usize = 2;
+/// Height of the line with the clock, pixels.
+const FOOTER: usize = 24;
+/// How long the last frame stays, hundredths of a second.
+const LAST_DELAY: u16 = 120;
+
+fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
+    let layout = Layout::new(panels.len(), spec)?;
+    let colours = spec.theme.colours();
+    let backdrops = backdrops(panels, spec, colours);
+    let mut palette = Palette::new(colours);
+    let duration = panels
+        .iter()
+        .flat_map(|panel| &panel.rollouts)
+        .map(|rollout| rollout.steps() as f64 * rollout.dt())
+        .fold(0.0, f64::max);
+    let n_frames = (duration / spec.frame_s + 1e-9).floor() as usize + 1;
+
+    let mut gif = Vec::new();
+    let (width, height) = layout.size_u16();
+    let mut encoder = Encoder::new(&mut gif, width, height, &palette.bytes())?;
+    encoder.set_repeat(Repeat::Infinite)?;
+    let gap_colour = palette.index(mix(colours.ground, colours.edge, 0.5));
+    let mut canvas = vec![gap_colour; layout.width * layout.height];
+    let mut shown: Option<Vec<u8>> = None;
+    for i in 0..n_frames {
+        let time = i as f64 * spec.frame_s;
+        for (number, (panel, backdrop)) in panels.iter().zip(&backdrops).enumerate() {
+            let mut pixmap = Pixmap::clone(backdrop);
+            draw_panel(&mut pixmap, panel, time, spec, colours);
+            let place = layout.panel(number);
+            palette.blit(&pixmap, &mut canvas, layout.width, place);
+        }
+        if let Some(footer) = draw_footer(layout.width, time, duration, colours) {
+            let place = (0, layout.height - FOOTER);
+            palette.blit(&footer, &mut canvas, layout.width, place);
+        }
+        let mut frame = difference(shown.as_deref(), &canvas, layout.width);
+        let delay = (spec.frame_s / spec.speed * 100.0)
+            .round()
+            .clamp(2.0, 6000.0) as u16;
+        frame.delay = if i + 1 == n_frames {
+            LAST_DELAY.max(delay)
+        } else {
+            delay
+        };
+        encoder.write_frame(&frame)?;
+        shown = Some(canvas.clone());
+    }
+    drop(encoder);
+    Ok(Film {
+        width: layout.width,
+        height: layout.height,
+        n_frames,
+        gif,
+    })
+}
+
+/// Where the panels are.
+struct Layout {
+    columns: usize,
+    panel: (usize, usize),
+    width: usize,
+    height: usize,
+}
+
+impl Layout {
+    fn new(n_panels: usize, spec: &FilmSpec) -> Result<Self, VizError> {
+        if n_panels == 0 {
+            return Err(VizError::NothingToFilm);
+        }
+        let columns = spec.columns.clamp(1, n_panels);
+        let rows = n_panels.div_ceil(columns);
+        let panel = (
+            spec.camera.width_px as usize,
+            spec.camera.height_px as usize,
+        );
+        let width = columns.saturating_mul(panel.0 + GAP) - GAP;
+        let height = rows.saturating_mul(panel.1 + GAP) + FOOTER;
+        let most = usize::from(u16::MAX);
+        if panel.0 == 0 || panel.1 == 0 || width > most || height > most {
+            return Err(VizError::Size { width, height });
+        }
+        Ok(Self {
+            columns,
+            panel,
+            width,
+            height,
+        })
+    }
+
+    fn size_u16(&self) -> (u16, u16) {
+        (self.width as u16, self.height as u16)
+    }
+
+    /// The top left corner of a panel.
+    fn panel(&self, number: usize) -> (usize, usize) {
+        let (row, column) = (number / self.columns, number % self.columns);
+        (column * (self.panel.0 + GAP), row * (self.panel.1 + GAP))
+    }
+}
+
+/// The road of each panel; panels that share map and route share the drawing.
+fn backdrops(panels: &[Panel<'_>], spec: &FilmSpec, colours: &Colours) -> Vec<Arc<Pixmap>> {
+    let mut drawn: Vec<Arc<Pixmap>> = Vec::with_capacity(panels.len());
+    for (i, panel) in panels.iter().enumerate() {
+        let scene = |panel: &Panel<'_>| panel.rollouts[0].at(0).route.map(Arc::as_ptr);
+        let same = |other: &Panel<'_>| {
+            Arc::ptr_eq(other.rollouts[0].map(), panel.rollouts[0].map())
+                && scene(other) == scene(panel)
+        };
+        let backdrop = match panels[..i].iter().position(same) {
+            Some(j) => Arc::clone(&drawn[j]),
+            None => {
+                let start = panel.rollouts[0].at(0);
+                Arc::new(draw_backdrop(start.map, start.route, spec.camera, colours))
+            }
+        };
+        drawn.push(backdrop);
+    }
+    drawn
+}
+
+fn draw_panel(
+    pixmap: &mut Pixmap,
+    panel: &Panel<'_>,
+    time: f64,
+    spec: &FilmSpec,
+    colours: &Colours,
+) {
+    let mut pen = Pen::new(pixmap, spec.camera);
+    for (i, rollout) in panel.rollouts.iter().enumerate() {
+        // A rollout that is over stays as it ended.
+        let step = ((time / rollout.dt()).round() as usize).min(rollout.steps());
+        let scene = rollout.at(step);
+        if i == 0 {
+            draw_lights(&mut pen, scene.now(), scene.map, colours);
+        }
+        let past = recent(scene.history, spec.past_s, scene.dt);
+        draw_past(&mut pen, past, scene.ego, colours, panel.opacity);
+        draw_agents(&mut pen, scene.now(), scene.ego, colours, panel.opacity);
+    }
+    draw_label(pixmap, panel.label, colours);
+}
+
+/// A clock and a bar that grows; `None` only for a film without width.
+fn draw_footer(width: usize, time: f64, duration: f64, colours: &Colours) -> Option<Pixmap> {
+    let mut pixmap = Pixmap::new(u32::try_from(width).ok()?, FOOTER as u32)?;
+    let [r, g, b] = colours.ground;
+    pixmap.fill(tiny_skia::Color::from_rgba8(r, g, b, 0xFF));
+    let label = format!("{time:.1} s");
+    lettering::write(&mut pixmap, &label, (8.0, 16.0), 8.0, colours.text);
+    let left = 16.0 + lettering::width("88.8 s", 8.0) as f32;
+    let track = width as f32 - left - 10.0;
+    let share = if duration > 0.0 {
+        (time / duration).min(1.0) as f32
+    } else {
+        1.0
+    };
+    for (length, colour) in [(track, colours.direction), (track * share, colours.ego)] {
+        if let Some(bar) = tiny_skia::Rect::from_xywh(left, 11.0, length, 3.0) {
+            let identity = tiny_skia::Transform::identity();
+            pixmap.fill_rect(bar, &paint(colour, 1.0), identity, None);
+        }
+    }
+    Some(pixmap)
+}
+
+/// The smallest frame that turns `shown` into `canvas`.
+fn difference(shown: Option<&[u8]>, canvas: &[u8], width: usize) -> GifFrame<'static> {
+    let height = canvas.len() / width;
+    let differs = |i: usize| shown.is_none_or(|shown| shown[i] != canvas[i]);
+    let (mut left, mut right, mut top, mut bottom) = (width, 0, height, 0);
+    for row in 0..height {
+        let cells = row * width..(row + 1) * width;
+        let Some(first) = cells.clone().find(|&i| differs(i)) else {
+            continue;
+        };
+        let last = cells.rev().find(|&i| differs(i)).unwrap_or(first);
+        (top, bottom) = (top.min(row), row + 1);
+        (left, right) = (left.min(first % width), right.max(last % width + 1));
+    }
+    if left >= right {
+        // Nothing moved: one pixel, unchanged, to carry the delay.
+        (left, right, top, bottom) = (0, 1, 0, 1);
+    }
+    let mut buffer = Vec::with_capacity((right - left) * (bottom - top));
+    for row in top..bottom {
+        let cells = row * width + left..row * width + right;
+        buffer.extend(cells.map(|i| if differs(i) { canvas[i] } else { UNCHANGED }));
+    }
+    GifFrame {
+        left: left as u16,
+        top: top as u16,
+        width: (right - left) as u16,
+        height: (bottom - top) as u16,
+        transparent: Some(UNCHANGED),
+        dispose: DisposalMethod::Keep,
+        buffer: buffer.into(),
+        ..GifFrame::default()
+    }
+}

@@ -1,0 +1,258 @@
+//! Still pictures.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use gump_raster::{Layer, Raster};
+use gump_scene::{Frame, SceneState};
+use image::{ExtendedColorType, ImageFormat};
+use tiny_skia::{Pixmap, Transform};
+
+use crate::draw_agents::{draw_agents, draw_lights, draw_past, draw_trails_of_futures};
+use crate::draw_map::draw_backdrop;
+use crate::files::write_whole;
+use crate::pen::{Pen, paint};
+use crate::theme::{Colours, Rgb, mix};
+use crate::{Camera, Theme, VizError, lettering};
+
+/// What a picture shows and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PictureSpec {
+    /// Which part of the world.
+    pub camera: Camera,
+    /// On which ground.
+    pub theme: Theme,
+    /// How far trails reach back, seconds; 0 for none.
+    pub past_s: f64,
+    /// Whether to draw a bar of a round number of metres, bottom left.
+    pub scale_bar: bool,
+    /// Whether to name the colours, bottom right.
+    pub legend: bool,
+    /// Words for the top left corner; empty for none.
+    pub label: String,
+}
+
+impl PictureSpec {
+    /// A light picture with two seconds of trails, a scale bar and no words.
+    pub fn new(camera: Camera) -> Self {
+        Self {
+            camera,
+            theme: Theme::Light,
+            past_s: 2.0,
+            scale_bar: true,
+            legend: false,
+            label: String::new(),
+        }
+    }
+
+    /// The same picture on another ground.
+    pub fn with_theme(self, theme: Theme) -> Self {
+        Self { theme, ..self }
+    }
+
+    /// The same picture with words in its corner.
+    pub fn with_label(self, label: impl Into<String>) -> Self {
+        Self {
+            label: label.into(),
+            ..self
+        }
+    }
+}
+
+/// Opaque pixels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Picture {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Red, green, blue and 255 for every pixel, row by row from the top left.
+    pub rgba: Vec<u8>,
+}
+
+/// Draws a scene as it is now, with trails of where its agents have been.
+///
+/// # Panics
+/// If the camera's size is zero or beyond memory.
+pub fn draw_scene(scene: &SceneState<'_>, spec: &PictureSpec) -> Picture {
+    draw_futures(scene, &[], spec)
+}
+
+/// Draws a scene as it is now, and a thin trail per agent and future: `Rollout::imagined` of some
+/// rollouts, or `Scenario::future` for what really happened.
+///
+/// # Panics
+/// If the camera's size is zero or beyond memory.
+pub fn draw_futures(scene: &SceneState<'_>, futures: &[&[Frame]], spec: &PictureSpec) -> Picture {
+    let colours = spec.theme.colours();
+    let mut pixmap = draw_backdrop(scene.map, scene.route, spec.camera, colours);
+    let mut pen = Pen::new(&mut pixmap, spec.camera);
+    draw_lights(&mut pen, scene.now(), scene.map, colours);
+    draw_trails_of_futures(&mut pen, scene.now(), futures, scene.ego, colours);
+    let past = recent(scene.history, spec.past_s, scene.dt);
+    draw_past(&mut pen, past, scene.ego, colours, 1.0);
+    draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
+    if spec.scale_bar {
+        draw_scale_bar(&mut pixmap, spec.camera.scale(), colours);
+    }
+    if spec.legend {
+        draw_legend(&mut pixmap, colours);
+    }
+    draw_label(&mut pixmap, &spec.label, colours);
+    Picture::from_pixmap(&pixmap)
+}
+
+/// Draws one layer of a raster, each value a square of `zoom` pixels: 0 is the ground, 1 the
+/// strongest blue, -1 the strongest orange; what a model sees.
+///
+/// Error: none; `None` if the raster lacks the layer.
+pub fn draw_raster_layer(
+    raster: &Raster,
+    layer: Layer,
+    zoom: usize,
+    theme: Theme,
+) -> Option<Picture> {
+    let plane = raster.get(layer)?;
+    let colours = theme.colours();
+    let colour = |value: f32| {
+        let ink = if value < 0.0 {
+            colours.ego
+        } else {
+            colours.vehicle
+        };
+        mix(colours.ground, ink, value.abs().min(1.0))
+    };
+    let side = raster.side_px * zoom;
+    let mut rgba = Vec::with_capacity(side * side * 4);
+    for row in 0..side {
+        for column in 0..side {
+            let [r, g, b] = colour(plane[row / zoom * raster.side_px + column / zoom]);
+            rgba.extend([r, g, b, 0xFF]);
+        }
+    }
+    Some(Picture {
+        width: side,
+        height: side,
+        rgba,
+    })
+}
+
+impl Picture {
+    pub(crate) fn from_pixmap(pixmap: &Pixmap) -> Self {
+        Self {
+            width: pixmap.width() as usize,
+            height: pixmap.height() as usize,
+            // Every drawing starts from an opaque ground, so nothing is left to un-multiply.
+            rgba: pixmap.data().to_vec(),
+        }
+    }
+
+    /// The bytes of a PNG file.
+    ///
+    /// # Errors
+    /// [`VizError::Png`] if the picture is empty or its size does not match its pixels.
+    pub fn to_png(&self) -> Result<Vec<u8>, VizError> {
+        let (Ok(width), Ok(height)) = (u32::try_from(self.width), u32::try_from(self.height))
+        else {
+            let (width, height) = (self.width, self.height);
+            return Err(VizError::Size { width, height });
+        };
+        let mut bytes = Cursor::new(Vec::new());
+        let colour = ExtendedColorType::Rgba8;
+        image::write_buffer_with_format(
+            &mut bytes,
+            &self.rgba,
+            width,
+            height,
+            colour,
+            ImageFormat::Png,
+        )?;
+        Ok(bytes.into_inner())
+    }
+
+    /// Writes a PNG file; a reader finds the old file or the new one, never half of one.
+    ///
+    /// # Errors
+    /// [`VizError::Write`] with the path, or as [`Self::to_png`].
+    pub fn save_png(&self, path: &Path) -> Result<(), VizError> {
+        write_whole(path, &self.to_png()?)
+    }
+}
+
+/// The frames of the last `seconds`, the present included.
+pub(crate) fn recent(history: &[Frame], seconds: f64, dt: f64) -> &[Frame] {
+    let n = (seconds / dt).round() as usize + 1;
+    &history[history.len().saturating_sub(n)..]
+}
+
+/// A bar whose length is a round number of metres near a sixth of the width.
+fn draw_scale_bar(pixmap: &mut Pixmap, scale: f64, colours: &Colours) {
+    let width = f64::from(pixmap.width());
+    let metres = round_length(width / 6.0 / scale);
+    let size = (width / 60.0).clamp(6.0, 11.0);
+    let (left, bottom) = (size * 1.2, f64::from(pixmap.height()) - size * 1.2);
+    let right = left + metres * scale;
+    let bar = (size / 5.0).max(1.5) as f32;
+    let mut rectangle = |x: f64, y: f64, w: f64, h: f64| {
+        if let Some(r) = tiny_skia::Rect::from_xywh(x as f32, y as f32, w as f32, h as f32) {
+            let ink = paint(colours.text, 1.0);
+            pixmap.fill_rect(r, &ink, Transform::identity(), None);
+        }
+    };
+    let thick = f64::from(bar);
+    rectangle(left, bottom - thick, right - left, thick);
+    rectangle(left, bottom - size * 0.6, thick * 0.7, size * 0.6);
+    rectangle(
+        right - thick * 0.7,
+        bottom - size * 0.6,
+        thick * 0.7,
+        size * 0.6,
+    );
+    let place = (right + size * 0.7, bottom);
+    lettering::write(pixmap, &format!("{metres} m"), place, size, colours.text);
+}
+
+/// The largest of 1, 2, 5, 10, 20, ... that does not exceed `metres`.
+fn round_length(metres: f64) -> f64 {
+    let magnitude = 10f64.powf(metres.log10().floor());
+    let digit = metres / magnitude;
+    let round = [5.0, 2.0, 1.0].into_iter().find(|&d| d <= digit);
+    magnitude * round.unwrap_or(1.0)
+}
+
+fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
+    let entries: [(&str, Rgb); 4] = [
+        ("ego", colours.ego),
+        ("vehicle", colours.vehicle),
+        ("pedestrian", colours.pedestrian),
+        ("bicycle", colours.bicycle),
+    ];
+    let size = (f64::from(pixmap.width()) / 60.0).clamp(6.0, 11.0);
+    let advance = |text: &str| lettering::width(text, size) + size * 3.0;
+    let total: f64 = entries.iter().map(|(text, _)| advance(text)).sum();
+    let mut x = f64::from(pixmap.width()) - total;
+    let baseline = f64::from(pixmap.height()) - size * 1.2;
+    for (text, colour) in entries {
+        let (left, top, side) = (x as f32, (baseline - size) as f32, size as f32);
+        if let Some(square) = tiny_skia::Rect::from_xywh(left, top, side, side) {
+            let ink = paint(colour, 1.0);
+            pixmap.fill_rect(square, &ink, Transform::identity(), None);
+        }
+        lettering::write(pixmap, text, (x + size * 1.5, baseline), size, colours.text);
+        x += advance(text);
+    }
+}
+
+/// Words in the top left corner, on a patch of ground so that they can be read over anything.
+pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
+    if label.is_empty() {
+        return;
+    }
+    let size = (f64::from(pixmap.width()) / 50.0).clamp(6.0, 12.0);
+    let (w, h) = (lettering::width(label, size) + size * 1.4, size * 2.4);
+    if let Some(patch) = tiny_skia::Rect::from_xywh(0.0, 0.0, w as f32, h as f32) {
+        let ink = paint(colours.ground, 0.8);
+        pixmap.fill_rect(patch, &ink, Transform::identity(), None);
+    }
+    lettering::write(pixmap, label, (size * 0.7, size * 1.7), size, colours.text);
+}
