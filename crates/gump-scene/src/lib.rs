@@ -38,7 +38,7 @@ mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use frame::{Frame, Light, LightState};
-pub use light_index::{MAX_LIGHTS, light_indices};
+pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind,
     RoadLine, RoadLineKind, StopSign,

@@ -2,7 +2,7 @@
 
 use gump_geometry::DVec2;
 
-use crate::{Light, SceneState};
+use crate::{Frame, Light, MapGraph, SceneState};
 
 /// Lights that have an index at most; indices run from 1 to this.
 ///
@@ -23,12 +23,21 @@ pub fn light_indices<'a>(
     centre: DVec2,
     radius: f64,
 ) -> Vec<(usize, &'a Light)> {
-    let mut lights: Vec<(f64, &Light)> = scene
-        .now()
+    light_indices_of(scene.map, scene.now(), centre, radius)
+}
+
+/// [`light_indices`] of any frame on its map.
+pub fn light_indices_of<'a>(
+    map: &MapGraph,
+    frame: &'a Frame,
+    centre: DVec2,
+    radius: f64,
+) -> Vec<(usize, &'a Light)> {
+    let mut lights: Vec<(f64, &Light)> = frame
         .lights()
         .iter()
         .filter_map(|light| {
-            let start = scene.map.lane(light.lane)?.centerline.points()[0];
+            let start = map.lane(light.lane)?.centerline.points()[0];
             let distance = start.distance(centre);
             (distance <= radius).then_some((distance, light))
         })
@@ -74,5 +83,12 @@ mod tests {
         check(100.0, &[(1, 2), (2, 3), (3, 1), (4, 4)]);
         check(50.0, &[(1, 2), (2, 3), (3, 1)]);
         check(5.0, &[]);
+        let other = Frame::new(Vec::new(), scenario.log[0].lights()[3..].to_vec());
+        let found = light_indices_of(&scenario.map, &other, dvec2(0.0, 0.0), 100.0);
+        let found: Vec<_> = found
+            .into_iter()
+            .map(|(i, light)| (i, light.lane.0))
+            .collect();
+        assert_eq!(found, [(1, 4)], "another frame numbers its own lights");
     }
 }
