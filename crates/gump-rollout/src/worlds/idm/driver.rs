@@ -7,15 +7,18 @@ use rand::Rng as _;
 use super::IdmConfig;
 use super::law::{gentle_speed, idm_acceleration};
 use super::obstacles::{Asker, Lead, Obstacle};
-use super::path::Path;
-use super::road::Road;
+use super::path::{Path, Stop};
+use super::road::{Road, STANDING};
 
-/// A vehicle that never exceeded this in the history is standing, metres per second.
-const STANDING: f64 = 0.3;
 /// A standing vehicle farther from the centre of its lane is parked, metres.
 const PARKED_OFFSET: f64 = 1.0;
-/// A stop line this far behind the front bumper has been passed, metres.
+/// A moving vehicle has passed a stop line this far behind its front bumper, metres; a standing one
+/// only when its centre is past it.
 const PASSED: f64 = 1.0;
+/// A vehicle that is slower than this at the start, metres per second, ...
+const WAITING: f64 = 1.0;
+/// ... waits for a light of unknown colour within this distance of its front bumper, metres.
+const WAITING_REACH: f64 = 15.0;
 /// A route farther away than this is not the one being driven, metres.
 const ROUTE_REACH: f64 = 5.0;
 /// Path prepared beyond what the driver looks at, so that it is seldom extended, metres.
@@ -121,6 +124,8 @@ pub(super) struct Follower {
     speed: f64,
     /// Desired speed where no limit is stated.
     own_speed: f64,
+    /// Up to here lights of unknown colour are what it waits for.
+    waits_until: f64,
     place: Placement,
     seed: Seed,
     n_choices: u64,
@@ -203,6 +208,11 @@ impl Follower {
             s,
             speed,
             own_speed: ground.config.target_velocity.max(speed),
+            waits_until: if speed < WAITING {
+                s + agent.length / 2.0 + WAITING_REACH
+            } else {
+                f64::NEG_INFINITY
+            },
             place,
             seed,
             n_choices: 0,
@@ -284,16 +294,22 @@ impl Follower {
     fn stop_line(&self, config: &IdmConfig, half_length: f64) -> Option<Lead> {
         let front = self.s + half_length;
         let stopping = self.speed * self.speed / (2.0 * config.max_deceleration);
-        let binds = |state, gap: f64| match state {
+        let passed = if self.speed < STANDING {
+            half_length
+        } else {
+            PASSED
+        };
+        let binds = |stop: &Stop, gap: f64| match stop.state {
             LightState::Red => true,
             LightState::Yellow => gap >= stopping,
-            LightState::Green | LightState::Unknown => false,
+            LightState::Unknown => stop.s <= self.waits_until,
+            LightState::Green => false,
         };
         self.path
             .stops()
             .iter()
-            .map(|stop| (stop.state, stop.s - front))
-            .filter(|&(state, gap)| gap > -PASSED && gap < config.look_ahead && binds(state, gap))
+            .map(|stop| (stop, stop.s - front))
+            .filter(|&(stop, gap)| gap > -passed && gap < config.look_ahead && binds(stop, gap))
             .map(|(_, gap)| gap)
             .min_by(f64::total_cmp)
             .map(|gap| Lead { gap, speed: 0.0 })

@@ -95,8 +95,8 @@ impl IdmConfig {
 ///   seed; the ego follows the scene's route. It keeps its place in the lane at first and comes to
 ///   the centre as it drives, so nothing jumps. Where the map ends it drives straight on.
 /// * It reacts to any agent whose box reaches into the strip it will sweep, to red lights, and to
-///   yellow ones it can stop for. **Lights keep their present colour.** It slows down for curves
-///   and speed limits.
+///   yellow ones it can stop for. At a light of unknown colour those wait that stand there now.
+///   **Lights keep their present colour.** It slows down for curves and speed limits.
 /// * A standing vehicle beside its lane is parked and stays. A moving one off every lane brakes
 ///   comfortably along its heading.
 /// * Pedestrians, bicycles and everything else keep their velocity.

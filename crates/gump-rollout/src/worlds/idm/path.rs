@@ -152,7 +152,7 @@ impl Path {
             return;
         };
         let state = lights[i].state;
-        if !matches!(state, LightState::Red | LightState::Yellow) {
+        if state == LightState::Green {
             return;
         }
         let marked = lights[i].stop_point.and_then(|point| {

@@ -12,6 +12,12 @@ const TOLERANCE: f64 = 0.05;
 const SPACING: f64 = 5.0;
 /// A vehicle is on a lane if it points along it within this, radians.
 const MAX_TURN: f64 = std::f64::consts::FRAC_PI_4;
+/// A vehicle slower than this is standing, metres per second.
+pub(super) const STANDING: f64 = 0.3;
+/// A moving vehicle this close to a lane's centre is on it or about to be, metres.
+const ENTERING: f64 = 3.0;
+/// Half the width of the widest lane, metres.
+const WIDEST: f64 = 4.0;
 /// What a radian off the lane's direction costs in metres off its centre when lanes are compared.
 const METRES_PER_RADIAN: f64 = 3.0;
 /// Lanes that fit this much worse than the best are still within reach, metres.
@@ -58,16 +64,20 @@ impl Road {
     /// best fit first, then others nearly as good.
     pub(super) fn lanes_of(&self, state: &AgentState) -> Vec<(LaneId, f64)> {
         let position = state.pose.position;
-        let widest = 4.0;
+        let reach = if state.speed() < STANDING {
+            1.5
+        } else {
+            ENTERING
+        };
         let mut fits: Vec<(f64, LaneId, f64)> = self
             .map
-            .lanes_near(position, widest)
+            .lanes_near(position, WIDEST)
             .filter(|(lane, _)| is_for_vehicles(lane))
             .filter_map(|(lane, _)| {
                 let foot = lane.centerline.project(position);
                 let direction = lane.centerline.pose_at(foot.arc_length).heading;
                 let turn = angle_difference(state.pose.heading, direction).abs();
-                let on_it = foot.distance <= lane.width.max(3.0) / 2.0 && turn < MAX_TURN;
+                let on_it = foot.distance <= reach.max(lane.width / 2.0) && turn < MAX_TURN;
                 let cost = foot.distance + METRES_PER_RADIAN * turn;
                 on_it.then_some((cost, lane.id, foot.lateral))
             })
