@@ -51,8 +51,8 @@ pub fn open(path: &Path) -> Result<Reader, DataError> {
 /// Opens a file, or all `*.tfrecord*` files of a directory in order of their names.
 ///
 /// # Errors
-/// [`DataError::Missing`], [`DataError::NoFiles`], and for the first file [`DataError::Empty`],
-/// [`DataError::UnknownFormat`] and [`DataError::Io`]; those of later files come from the reader.
+/// [`DataError::Missing`], [`DataError::NoFiles`], and for a single file [`DataError::Empty`],
+/// [`DataError::UnknownFormat`] and [`DataError::Io`]; of several files the reader tells them.
 pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError> {
     let mut files = if path.is_dir() {
         files_in(path)?
@@ -62,13 +62,19 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
     let Some(first) = files.pop_front() else {
         return Err(DataError::NoFiles { path: path.into() });
     };
-    let format = recognise(&first)?;
-    Ok(Reader {
-        source: Some((format.open)(&first, options)?),
-        format: format.name,
+    let mut reader = Reader {
+        source: Some(Box::new(NoRecords)),
+        format: "unknown",
+        unopened: None,
         files,
         options,
-    })
+    };
+    match reader.start(&first) {
+        // With more files to come, the first is one broken file among others.
+        Err(error) if !reader.files.is_empty() => reader.unopened = Some(error),
+        started => started?,
+    }
+    Ok(reader)
 }
 
 /// An iterator over the scenarios of a file or directory; holds one record at a time.
@@ -77,6 +83,8 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
 pub struct Reader {
     source: Option<BoxedSource>,
     format: &'static str,
+    /// Why the first of several files could not be opened, until it is told.
+    unopened: Option<DataError>,
     files: VecDeque<PathBuf>,
     options: ReadOptions,
 }
@@ -91,6 +99,9 @@ impl Reader {
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,
     ) -> Option<Result<ScenarioRecord, DataError>> {
+        if let Some(error) = self.unopened.take() {
+            return Some(Err(error));
+        }
         loop {
             let source = self.source.as_mut()?;
             if let Some(record) = source.next_wanted(wanted) {
@@ -98,19 +109,20 @@ impl Reader {
             }
             self.source = None;
             let file = self.files.pop_front()?;
-            let opened = recognise(&file).and_then(|format| {
-                self.format = format.name;
-                (format.open)(&file, self.options)
-            });
-            match opened {
-                Ok(source) => self.source = Some(source),
-                Err(error) => {
-                    // A source without records keeps the reader going with the files after it.
-                    self.source = Some(Box::new(NoRecords));
-                    return Some(Err(error));
-                }
+            if let Err(error) = self.start(&file) {
+                // A source without records keeps the reader going with the files after it.
+                self.source = Some(Box::new(NoRecords));
+                return Some(Err(error));
             }
         }
+    }
+
+    /// Makes `file` the one being read.
+    fn start(&mut self, file: &Path) -> Result<(), DataError> {
+        let format = recognise(file)?;
+        self.source = Some((format.open)(file, self.options)?);
+        self.format = format.name;
+        Ok(())
     }
 }
 

@@ -2,10 +2,11 @@
 
 mod common;
 
+use std::io::Write;
 use std::path::Path;
 
 use gump_data::womd::write_scenarios;
-use gump_data::{DataError, find, open};
+use gump_data::{DataError, find, open, write_atomically};
 use gump_scene::{Frame, MapGraph, Scenario};
 use tempfile::TempDir;
 
@@ -153,14 +154,11 @@ fn a_broken_file_in_a_directory_does_not_hide_the_next() {
     write_scenarios(&folder.path().join("b.tfrecord"), [named("b")]).unwrap();
     std::fs::write(folder.path().join("c.tfrecord"), "garbage").unwrap();
     write_scenarios(&folder.path().join("d.tfrecord"), [named("d")]).unwrap();
-    let read: Vec<bool> = open(&folder.path().join("b.tfrecord"))
-        .unwrap()
-        .map(|r| r.is_ok())
-        .collect();
-    assert_eq!(read, [true]);
-    std::fs::remove_file(folder.path().join("a.tfrecord")).unwrap();
-    let read: Vec<bool> = open(folder.path()).unwrap().map(|r| r.is_ok()).collect();
-    assert_eq!(read, [true, false, true]);
+    let reader = open(folder.path()).unwrap();
+    let read: Vec<bool> = reader.map(|record| record.is_ok()).collect();
+    assert_eq!(read, [false, true, false, true]);
+    let third = find(&format!("{}#3", folder.path().display())).unwrap();
+    assert_eq!(third.id, "d");
 }
 
 #[test]
@@ -172,4 +170,15 @@ fn nothing_appears_under_the_final_name_when_writing_fails() {
     let error = write_scenarios(&path, [common::crossing(), bad]).unwrap_err();
     assert!(matches!(error, DataError::Unwritable { .. }));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    std::fs::write(&path, "what was there before").unwrap();
+    let failed = write_atomically(&path, |file| {
+        file.write_all(b"half a fi").expect("the disk has room");
+        Err::<(), _>(DataError::Empty { path: path.clone() })
+    });
+    assert!(failed.is_err());
+    assert_eq!(
+        std::fs::read_to_string(&path).unwrap(),
+        "what was there before"
+    );
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
 }

@@ -357,4 +357,23 @@ mod tests {
             &[1],
         );
     }
+
+    #[test]
+    fn a_change_across_the_end_of_a_lane_goes_by_way_of_its_neighbour() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 20,0 next 3 left 2
+             lane 2: 0,3.5 20,3.5 next 4 right 1
+             lane 3: 20,0 90,0
+             lane 4: 20,3.5 90,3.5
+             ego vehicle 0: 10,0 velocity 5,0",
+        )
+        .unwrap();
+        let leg = |lane, change_at| Leg {
+            lane: LaneId(lane),
+            change_at,
+        };
+        let mut legs = vec![leg(1, None), leg(4, Some(7))];
+        bridge(&scenario.map, &mut legs);
+        assert_eq!(legs, [leg(1, None), leg(2, Some(7)), leg(4, None)]);
+    }
 }
