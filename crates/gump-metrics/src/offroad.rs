@@ -2,14 +2,16 @@
 
 use gump_scene::{Agent, AgentKind, SceneState};
 
-use crate::{DistanceToRoadEdge, Metric, Reduce};
+use crate::road_edge::is_beyond_road_edge;
+use crate::{Metric, Reduce};
 
 /// 1 if a corner of the vehicle's box is off the road, else 0; `None` for anything but vehicles
 /// and on maps that know no border.
 ///
 /// Where the map has road edges, a corner is off the road if it lies on the right of the nearest
-/// edge ([`DistanceToRoadEdge`] above 0; a corner on the edge is on the road). Where it has none,
-/// a corner is off the road if no drivable surface contains it.
+/// edge. It is on the road if it lies on the edge, and past the open end of an edge: a vehicle that
+/// drives out of the map has not left the road. ([`crate::DistanceToRoadEdge`] makes no such
+/// exception.) Where the map has none, a corner is off the road if no drivable surface contains it.
 #[derive(Clone, Copy, Debug)]
 pub struct OffRoad;
 
@@ -22,16 +24,17 @@ impl Metric for OffRoad {
         if agent.kind != AgentKind::Vehicle {
             return None;
         }
-        if let Some(distance) = DistanceToRoadEdge.at(scene, agent) {
-            return Some(f64::from(distance > 0.0));
-        }
-        if scene.map.drivable().is_empty() {
-            return None;
-        }
+        let map = scene.map;
         let mut corners = agent.oriented_box().corners().into_iter();
-        Some(f64::from(
-            corners.any(|corner| !scene.map.is_drivable(corner)),
-        ))
+        let off = if !map.road_edges().is_empty() {
+            let z = agent.elevation - agent.height / 2.0;
+            corners.any(|corner| is_beyond_road_edge(map, corner, z) == Some(true))
+        } else if !map.drivable().is_empty() {
+            corners.any(|corner| !map.is_drivable(corner))
+        } else {
+            return None;
+        };
+        Some(f64::from(off))
     }
 
     fn reduce(&self) -> Reduce {
@@ -60,6 +63,13 @@ mod tests {
         check(map, "vehicle 1: 20,-1.1 size 4,2", Some(1.0));
         // Turned, a corner reaches over the edge.
         check(map, "vehicle 1: 20,-0.5 size 4,2 heading 0.6", Some(1.0));
+    }
+
+    #[test]
+    fn driving_out_of_the_map_is_not_leaving_the_road() {
+        let map = "edge: 0,-2 100,-2\nedge: 100,2 0,2";
+        check(map, "vehicle 1: 120,-3 size 4,2", Some(0.0));
+        check(map, "vehicle 1: 90,-3 size 4,2", Some(1.0));
     }
 
     #[test]

@@ -10,6 +10,10 @@ use crate::{Metric, Reduce};
 ///
 /// Source: the Waymo Sim Agents Challenge since 2024.
 const Z_STRETCH: f64 = 3.0;
+/// An edge whose ends are closer than this is closed, metres.
+///
+/// Source: the Waymo Sim Agents Challenge.
+const CLOSED: f64 = 1.0;
 
 /// Signed distance from the agent's box to the nearest road edge, metres: negative on the road,
 /// positive off it; the corner that is farthest out counts. `None` on a map without road edges.
@@ -38,25 +42,42 @@ impl Metric for DistanceToRoadEdge {
 ///
 /// The nearest segment is chosen in space, the distance is measured in the plane. Beside a joint
 /// of two segments the sign follows whether the joint is convex, so that it is right on both sides
-/// of a corner. A point exactly on an edge has distance 0.
+/// of a corner. Past an open end the last segment is taken to go on. A point exactly on an edge has
+/// distance 0.
 ///
-/// Source: the rule of the Waymo Sim Agents Challenge (2024), in f64 and with closed edges always
-/// treated as closed.
+/// Source: the rule of the Waymo Sim Agents Challenge (2024), in f64 and with every edge whose
+/// ends nearly meet closed by the segment between them.
 pub fn signed_distance_to_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
+    let (distance, edge, segment) = nearest(map, point, z)?;
+    Some(distance * side(&Spot::new(map, edge, segment, point)))
+}
+
+/// True if `point` lies off the road: on the right of the nearest edge. False past the open end of
+/// an edge, where the map knows nothing of a border. `None` on a map without road edges.
+pub(crate) fn is_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<bool> {
+    let (distance, edge, segment) = nearest(map, point, z)?;
+    let spot = Spot::new(map, edge, segment, point);
+    Some(distance > 0.0 && side(&spot) > 0.0 && !spot.is_past_open_end())
+}
+
+/// The segment nearest in space as (distance in the plane, edge, segment).
+fn nearest(map: &MapGraph, point: DVec2, z: f64) -> Option<(f64, usize, usize)> {
     let mut best: Option<(f64, f64, usize, usize)> = None;
     for (edge, segment, distance) in map.nearest_road_edges(point) {
         // Segments come by distance in the plane, which the distance in space only exceeds.
         if best.is_some_and(|(least, ..)| distance > least) {
             break;
         }
+        let points = map.road_edges()[edge].line.points();
+        if points[segment] == points[segment + 1] {
+            continue;
+        }
         let in_space = distance.hypot(Z_STRETCH * rise(&map.road_edges()[edge], segment, point, z));
         if best.is_none_or(|(least, ..)| in_space < least) {
             best = Some((in_space, distance, edge, segment));
         }
     }
-    best.map(|(_, distance, edge, segment)| {
-        distance * side(map.road_edges()[edge].line.points(), segment, point)
-    })
+    best.map(|(_, distance, edge, segment)| (distance, edge, segment))
 }
 
 /// Height of `z` over the foot of `point` on a segment.
@@ -67,35 +88,87 @@ fn rise(edge: &RoadEdge, segment: usize, point: DVec2, z: f64) -> f64 {
     z - (from + t * (to - from))
 }
 
-/// -1 on the left, +1 on the right, 0 on the line itself.
-fn side(points: &[DVec2], segment: usize, point: DVec2) -> f64 {
-    let n = points.len() - 1;
-    let closed = points[0].distance_squared(points[n]) < 1.0;
-    let direction = |i: usize| points[i + 1] - points[i];
-    let right = |i: usize| -sign(cross(direction(i), point - points[i]));
-    let before = match segment {
-        0 => closed.then(|| n - 1),
-        i => Some(i - 1),
-    };
-    let after = match segment + 1 {
-        i if i == n => closed.then_some(0),
-        i => Some(i),
-    };
-    let (start, along) = (points[segment], direction(segment));
-    let t = (point - start).dot(along) / along.length_squared();
-    // A left turn is convex seen from the right: beside it a point is off the road if it is to the
-    // right of either segment, at a right turn only if it is to the right of both.
-    let at_joint = |a: usize, b: usize| {
-        if cross(direction(a), direction(b)) > 0.0 {
-            right(a).max(right(b))
-        } else {
-            right(a).min(right(b))
+/// A point beside one segment of an edge.
+struct Spot {
+    point: DVec2,
+    /// Fraction along the segment, below 0 or above 1 beside its ends.
+    t: f64,
+    segment: Line,
+    before: Option<Line>,
+    after: Option<Line>,
+}
+
+/// A start and a direction.
+#[derive(Clone, Copy)]
+struct Line {
+    start: DVec2,
+    direction: DVec2,
+}
+
+impl Line {
+    /// False for repeated points, which have no sides.
+    fn has_length(&self) -> bool {
+        self.direction != DVec2::ZERO
+    }
+}
+
+impl Spot {
+    fn new(map: &MapGraph, edge: usize, segment: usize, point: DVec2) -> Self {
+        let points = map.road_edges()[edge].line.points();
+        let n = points.len() - 1;
+        let between = |a: DVec2, b: DVec2| Line {
+            start: a,
+            direction: b - a,
+        };
+        let line = |i: usize| between(points[i], points[i + 1]);
+        // Ends that nearly meet close the edge, by a chord if they do not coincide: without it
+        // the end of a narrow island would be a joint that turns back on itself.
+        let gap = points[n].distance(points[0]);
+        let chord = (gap < CLOSED && gap > 1e-6).then(|| between(points[n], points[0]));
+        let wrap = |i: usize| if gap <= 1e-6 { Some(line(i)) } else { chord };
+        let own = line(segment);
+        Self {
+            point,
+            t: (point - own.start).dot(own.direction) / own.direction.length_squared(),
+            segment: own,
+            before: (0..segment)
+                .rev()
+                .map(line)
+                .find(Line::has_length)
+                .or_else(|| wrap(n - 1)),
+            after: (segment + 1..n)
+                .map(line)
+                .find(Line::has_length)
+                .or_else(|| wrap(0)),
         }
-    };
-    match (before, after) {
-        (Some(before), _) if t < 0.0 => at_joint(before, segment),
-        (_, Some(after)) if t > 1.0 => at_joint(segment, after),
-        _ => right(segment),
+    }
+
+    fn is_past_open_end(&self) -> bool {
+        (self.t < 0.0 && self.before.is_none()) || (self.t > 1.0 && self.after.is_none())
+    }
+
+    /// +1 right of the line, -1 left of it, 0 on it.
+    fn right_of(&self, line: Line) -> f64 {
+        -sign(cross(line.direction, self.point - line.start))
+    }
+
+    /// Beside the joint of two segments. At a left turn a point is off the road if it is to the
+    /// right of either, at a right turn only if it is to the right of both.
+    fn at_joint(&self, a: Line, b: Line) -> f64 {
+        if cross(a.direction, b.direction) > 0.0 {
+            self.right_of(a).max(self.right_of(b))
+        } else {
+            self.right_of(a).min(self.right_of(b))
+        }
+    }
+}
+
+/// -1 on the road, +1 off it, 0 on the edge itself.
+fn side(spot: &Spot) -> f64 {
+    match (spot.before, spot.after) {
+        (Some(before), _) if spot.t < 0.0 => spot.at_joint(before, spot.segment),
+        (_, Some(after)) if spot.t > 1.0 => spot.at_joint(spot.segment, after),
+        _ => spot.right_of(spot.segment),
     }
 }
 
@@ -159,6 +232,22 @@ mod tests {
         let island = "edge: 0,0 0,4 4,4 4,0 0,0";
         check(island, dvec2(-1.0, -1.0), Some(-(2f64.sqrt())));
         check(island, dvec2(2.0, 1.0), Some(1.0));
+    }
+
+    #[test]
+    fn a_narrow_island_ends_where_it_ends() {
+        // Its ends are 0.8 m apart; the road is all around.
+        let island = "edge: 0,0.8 10,0.8 10,0 0,0";
+        check(island, dvec2(-3.0, 4.8), Some(-5.0));
+        check(island, dvec2(-4.0, -3.0), Some(-5.0));
+        check(island, dvec2(5.0, 0.5), Some(0.3));
+    }
+
+    #[test]
+    fn repeated_points_change_nothing() {
+        let left = "edge: 0,0 10,0 10,0 10,10 10,10";
+        check(left, dvec2(11.0, -1.0), Some(2f64.sqrt()));
+        check(left, dvec2(9.0, 11.0), Some(-(2f64.sqrt())));
     }
 
     #[test]
