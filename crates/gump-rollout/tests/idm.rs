@@ -341,3 +341,62 @@ fn the_law_agrees_with_the_reference() {
         assert_abs_diff_eq!(found, expected, epsilon = 1e-6 * expected.abs().max(1.0));
     }
 }
+
+#[test]
+fn moving_and_turning_the_world_moves_nothing_else() {
+    let world_from_home = Pose::new(1000.0, -500.0, 0.7);
+    let at = |frame: Pose| {
+        let p = |x: f64, y: f64| {
+            let point = frame * dvec2(x, y);
+            format!("{:.9},{:.9}", point.x, point.y)
+        };
+        let v = |x: f64, y: f64| {
+            let velocity = frame.rotate(dvec2(x, y));
+            format!("{:.9},{:.9}", velocity.x, velocity.y)
+        };
+        let heading = |h: f64| h + frame.heading;
+        let lanes = [
+            format!("lane 1: {} {} next 2,3", p(0.0, 0.0), p(50.0, 0.0)),
+            format!(
+                "lane 2: {} {} {}",
+                p(50.0, 0.0),
+                p(70.0, 10.0),
+                p(80.0, 90.0)
+            ),
+            format!("lane 3: {} {}", p(50.0, 0.0), p(150.0, -40.0)),
+            format!("light 3 red: {}", p(60.0, -4.0)),
+        ];
+        let agents = [
+            format!(
+                "ego vehicle 0: {} heading {} velocity {}",
+                p(5.0, 0.5),
+                heading(0.1),
+                v(8.0, 0.0)
+            ),
+            format!(
+                "agent vehicle 1: {} heading {}",
+                p(30.0, -0.3),
+                heading(0.0)
+            ),
+            format!(
+                "agent pedestrian 2: {} velocity {}",
+                p(70.0, 6.0),
+                v(0.1, 0.5)
+            ),
+        ];
+        scene(&[lanes.join("\n"), agents.join("\n")].join("\n"))
+    };
+    let home = run_futures(&at(Pose::IDENTITY), 6, 10.0);
+    let moved = run_futures(&at(world_from_home), 6, 10.0);
+    for (a, b) in home.iter().zip(&moved) {
+        for id in 0..3 {
+            let (a, b) = (end(a, id).pose, end(b, id).pose);
+            let back = world_from_home.inverse() * b;
+            assert!(
+                back.position.distance(a.position) < 1e-3,
+                "{back:?} is not {a:?}"
+            );
+            assert!(angle_difference(back.heading, a.heading).abs() < 1e-3);
+        }
+    }
+}
