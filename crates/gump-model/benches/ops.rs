@@ -138,7 +138,12 @@ impl Block {
 fn rows(c: &mut Criterion) {
     let x = var(&[2048, 1536], 6.0);
     let (plain, x2) = (x.detach(), var(&[2048, 384], 2.0));
-    pair(c, "gelu_2048x1536", || ops::gelu(&plain), || plain.gelu_erf());
+    pair(
+        c,
+        "gelu_2048x1536",
+        || ops::gelu(&plain),
+        || plain.gelu_erf(),
+    );
     pair(
         c,
         "gelu_2048x1536_backward",
@@ -166,7 +171,11 @@ fn rows(c: &mut Criterion) {
     pair(
         c,
         "cross_entropy_512x2974_backward",
-        || learn(&ops::masked_cross_entropy(&logits, &targets, &weights, None)?),
+        || {
+            learn(&ops::masked_cross_entropy(
+                &logits, &targets, &weights, None,
+            )?)
+        },
         || learn(&cross_entropy(&logits, &targets, &weights)?),
     );
     let table = var(&[2974, 192], 1.0);
