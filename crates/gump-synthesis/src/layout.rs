@@ -97,6 +97,7 @@ fn roundabout(extent: f64, rng: &mut Rng) -> Plan {
         sidewalks: false,
         speed_limit: 8.5,
         major: true,
+        ring: true,
         ..spokes_style.clone()
     };
     let angles: Vec<f64> = (0..n_legs)
@@ -235,7 +236,7 @@ fn on_ramp(extent: f64, rng: &mut Rng) -> Plan {
     let aside = freeway.lane_offset(n) - freeway.lane_width / 2.0;
     let tip = Pose {
         position: at * dvec2(0.0, -aside),
-        heading: at.heading + PI - 0.2,
+        heading: at.heading + PI + 0.2,
     };
     let ramp_bend = rng.random_range(0.2..0.5);
     let mut back = bend(tip, reach - 30.0, &[(70.0, 35.0, ramp_bend)]);
@@ -256,7 +257,7 @@ fn on_ramp(extent: f64, rng: &mut Rng) -> Plan {
         min_setback,
     };
     Plan {
-        nodes: vec![node(6.0), node(14.0)],
+        nodes: vec![node(30.0), node(20.0)],
         roads: vec![
             piece(0.0, join, [None, Some(0)], n),
             piece(join, end, [Some(0), Some(1)], n + 1),
@@ -348,12 +349,14 @@ fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
         speed_limit: rng.random_range(speed),
         major,
         freeway: false,
+        ring: false,
     }
 }
 
 /// A road of this style from a junction outwards, straight at first, then perhaps bending.
 fn spoke(style: &RoadPlan, node: usize, start: Pose, length: f64, rng: &mut Rng) -> RoadPlan {
-    let mut bends = Vec::new();
+    // Hardly any road is quite straight; about half have a real bend.
+    let mut bends = vec![(length / 2.0, 0.45 * length, rng.random_range(-0.12..0.12))];
     if rng.random_bool(0.5) && length > 90.0 {
         let reach = rng.random_range(20.0..30.0);
         bends.push((45.0 + reach, reach, rng.random_range(-0.45..0.45)));

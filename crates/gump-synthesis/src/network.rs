@@ -89,6 +89,8 @@ pub(crate) struct NetworkLane {
     pub(crate) is_entry: bool,
     /// Ends at the border of the scene.
     pub(crate) is_exit: bool,
+    /// Part of the circle of a roundabout, connectors within it included.
+    pub(crate) in_ring: bool,
     /// Set for connectors.
     pub(crate) connector: Option<Connector>,
     /// Highest speed at each sample of the track that its bends and those ahead on it allow,

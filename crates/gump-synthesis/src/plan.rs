@@ -76,6 +76,8 @@ pub(crate) struct RoadPlan {
     pub(crate) major: bool,
     /// A grade-separated road.
     pub(crate) freeway: bool,
+    /// Part of the circle of a roundabout.
+    pub(crate) ring: bool,
 }
 
 impl RoadPlan {

@@ -250,3 +250,33 @@ fn frames(recording: &Recording, placement: &Placement, dt: f64) -> Vec<Frame> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn most_draws_are_kept() {
+        let config = SynthesisConfig::standard();
+        for family in RoadFamily::ALL {
+            let (mut overlapping, mut kept) = (0, 0);
+            let n = 40;
+            for k in 0..n {
+                let seed = Seed(99).fork(k);
+                let mut rng = seed.fork(0).rng();
+                let plan = draw_plan(family, config.extent_m, &mut rng);
+                let network = Network::new(&plan, &mut rng);
+                let demand = draw_demand(&config, &plan, &network, &mut rng);
+                let rng = seed.fork(1).rng();
+                let mut traffic = Traffic::new(&network, demand, config.dt, rng);
+                for _ in 0..250 {
+                    traffic.step();
+                }
+                let recording = Recording::make(&mut traffic, config.n_frames());
+                overlapping += usize::from(recording.has_overlaps());
+                kept += usize::from(draw_scenario(&config, family, seed, 0).is_some());
+            }
+            println!("{family}: {overlapping} overlapping, {kept} kept of {n}");
+        }
+    }
+}

@@ -2,6 +2,7 @@
 
 use gump_geometry::{angle_difference, wrap_angle};
 use gump_scene::{LaneKind, Rng};
+use rand::Rng as _;
 
 use crate::curve::{Track, connect};
 use crate::network::leg::{Leg, legs_of};
@@ -80,14 +81,33 @@ impl Network {
     fn add_junction(&mut self, plan: &Plan, node: usize, legs: &[Leg], rng: &mut Rng) {
         let control = plan.nodes[node].control;
         let first = self.lanes.len();
+        let mut left_only = vec![false; legs.len()];
         for (from, leg) in legs.iter().enumerate() {
-            for link in links(legs, from) {
-                let major = plan.roads[leg.road].major;
-                let road = &plan.roads[leg.road];
-                self.add_connector(road, node, control, major, (from, legs), link);
+            // Two lanes may be shared out either way; three always leave one to left turns.
+            let prefers = control == Control::Signals && rng.random_bool(0.6);
+            let links = links(legs, from, if prefers { 2 } else { 3 });
+            let turns_off = |link: &Link| {
+                let same_lane = |other: &&Link| other.from == link.from;
+                links
+                    .iter()
+                    .filter(same_lane)
+                    .all(|other| other.turn == Turn::Left)
+            };
+            // A single lane that can only turn left is the end of a road, not a lane for turning.
+            left_only[from] = leg.incoming.len() > 1 && links.iter().any(turns_off);
+            for link in &links {
+                let group = 2 * from + usize::from(left_only[from] && turns_off(link));
+                self.add_connector(
+                    &plan.roads[leg.road],
+                    (node, control),
+                    (from, legs),
+                    *link,
+                    group,
+                );
             }
         }
-        let cycle = (control == Control::Signals).then(|| signal::plan_cycle(legs, rng));
+        let cycle =
+            (control == Control::Signals).then(|| signal::plan_cycle(legs, &left_only, rng));
         self.junctions.push(Junction {
             control,
             cycle,
@@ -98,12 +118,12 @@ impl Network {
     fn add_connector(
         &mut self,
         road: &RoadPlan,
-        node: usize,
-        control: Control,
-        major: bool,
+        (node, control): (usize, Control),
         (from, legs): (usize, &[Leg]),
         link: Link,
+        group: usize,
     ) {
+        let major = road.major;
         let (a, b) = (&self.lanes[link.from], &self.lanes[link.to]);
         let start = a.track.pose_at(a.length());
         let end = b.track.pose_at(0.0);
@@ -128,8 +148,7 @@ impl Network {
             Control::MinorStop => !major,
             _ => false,
         };
-        let signal =
-            (control == Control::Signals).then(|| 2 * from + usize::from(link.turn == Turn::Left));
+        let signal = (control == Control::Signals).then_some(group);
         let connector = Connector {
             junction: node,
             from_leg: from,
@@ -157,6 +176,7 @@ impl Network {
             right: None,
             is_entry: false,
             is_exit: false,
+            in_ring: a.in_ring && b.in_ring,
             connector: Some(connector),
             overlaps: Vec::new(),
         };
@@ -175,8 +195,9 @@ struct Link {
     turn: Turn,
 }
 
-/// Which lanes of leg `from` lead where.
-fn links(legs: &[Leg], from: usize) -> Vec<Link> {
+/// Which lanes of leg `from` lead where; with `lanes_for_left` lanes or more the leftmost only turns
+/// left.
+fn links(legs: &[Leg], from: usize, lanes_for_left: usize) -> Vec<Link> {
     let leg = &legs[from];
     let inward = wrap_angle(leg.mouth.heading + std::f64::consts::PI);
     let ways: Vec<(usize, Turn, f64)> = (0..legs.len())
@@ -203,8 +224,10 @@ fn links(legs: &[Leg], from: usize) -> Vec<Link> {
             let target = match turn {
                 Turn::Left if leftmost => Some(0),
                 Turn::Right if rightmost => Some(m - 1),
-                // Three or more lanes give the leftmost to left turns; surplus lanes must turn.
-                Turn::Straight if n >= 3 && leftmost && has(Turn::Left) => None,
+                Turn::Straight if n >= lanes_for_left && leftmost && has(Turn::Left) => None,
+                // Lanes that do not go on beyond the junction must turn.
+                // A ramp joins on the outside.
+                Turn::Straight if leg.joins => Some(m - n.min(m) + k.min(m - 1)),
                 Turn::Straight if k < m => Some(k),
                 Turn::Straight if !(rightmost && has(Turn::Right)) => Some(m - 1),
                 _ => None,
@@ -251,6 +274,7 @@ fn road_lane(road: &RoadPlan, forward: bool, track: Track) -> NetworkLane {
         right: None,
         is_entry: first.is_none(),
         is_exit: last.is_none(),
+        in_ring: road.ring,
         connector: None,
         overlaps: Vec::new(),
     }

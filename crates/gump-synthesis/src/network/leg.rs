@@ -3,7 +3,7 @@
 use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 
 use crate::network::LaneIdx;
-use crate::plan::{NodePlan, Plan, RoadPlan};
+use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 
 /// Depth of a crosswalk along the road, metres.
 pub(crate) const CROSSWALK_DEPTH: f64 = 3.2;
@@ -29,6 +29,8 @@ pub(crate) struct Leg {
     pub(crate) left: f64,
     /// From the reference to the right curb (traffic away from it), metres.
     pub(crate) right: f64,
+    /// Joins the road beyond on its outside, as a ramp does.
+    pub(crate) joins: bool,
     /// Lanes towards the junction, innermost first.
     pub(crate) incoming: Vec<LaneIdx>,
     /// Lanes away from it, innermost first.
@@ -92,6 +94,7 @@ pub(crate) fn legs_of(plan: &Plan, node: usize) -> Vec<Leg> {
                 setback,
                 left: r.half_width(!at_start),
                 right: r.half_width(at_start),
+                joins: plan.nodes[node].control == Control::Free && !r.major,
                 incoming: Vec::new(),
                 outgoing: Vec::new(),
                 bike_in: None,
@@ -126,7 +129,7 @@ fn setbacks(plan: &Plan, node: &NodePlan, ends: &[(usize, bool)]) -> Vec<f64> {
             outward(road, at_start, (0.25 * road.reference.length()).min(15.0)).heading
         };
         let angle = angle_difference(heading(j), heading(i)).rem_euclid(std::f64::consts::TAU);
-        if !(0.1..2.6).contains(&angle) {
+        if node.control == Control::Free || !(0.1..2.6).contains(&angle) {
             continue;
         }
         // Left curb of leg i and right curb of leg j meet this far along either leg.
@@ -139,8 +142,14 @@ fn setbacks(plan: &Plan, node: &NodePlan, ends: &[(usize, bool)]) -> Vec<f64> {
         setbacks[j] = f64::max(setbacks[j], along(right, left).min(limit(b)));
     }
     if node.crosswalks {
+        let depth = if ends.len() == 2 {
+            // One crosswalk serves both legs; a little more keeps its sidewalks apart.
+            CROSSWALK_DEPTH / 2.0 + STOP_GAP + 0.7
+        } else {
+            CURB_GAP + CROSSWALK_DEPTH + STOP_GAP
+        };
         for setback in &mut setbacks {
-            *setback += CURB_GAP + CROSSWALK_DEPTH + STOP_GAP;
+            *setback += depth;
         }
     }
     setbacks

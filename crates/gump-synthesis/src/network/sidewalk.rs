@@ -54,7 +54,8 @@ impl Network {
                         crosswalk: None,
                     });
                 }
-                if plan.nodes[junction].crosswalks && plan.roads[leg.road].sidewalks {
+                let is_first = legs.len() > 2 || i == 0;
+                if plan.nodes[junction].crosswalks && plan.roads[leg.road].sidewalks && is_first {
                     self.lay_crosswalk(junction, i, leg, [side(leg, false), side(leg, true)]);
                 }
             }

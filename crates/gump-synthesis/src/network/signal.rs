@@ -83,8 +83,9 @@ impl Cycle {
     }
 }
 
-/// Phases for these legs: opposite legs share one, left turns sometimes go before the rest.
-pub(crate) fn plan_cycle(legs: &[Leg], rng: &mut Rng) -> Cycle {
+/// Phases for these legs: opposite legs share one, left turns with a lane of their own
+/// (`left_only`) mostly go before the rest.
+pub(crate) fn plan_cycle(legs: &[Leg], left_only: &[bool], rng: &mut Rng) -> Cycle {
     let mut phases = Vec::new();
     let mut seen = vec![false; legs.len()];
     for i in 0..legs.len() {
@@ -102,8 +103,8 @@ pub(crate) fn plan_cycle(legs: &[Leg], rng: &mut Rng) -> Cycle {
         let others = (0..legs.len()).filter(|leg| !axis.contains(leg)).collect();
         let left: Vec<usize> = axis.iter().map(|leg| 2 * leg + 1).collect();
         let through = axis.iter().map(|leg| 2 * leg);
-        let wide = axis.iter().any(|&leg| legs[leg].incoming.len() >= 2);
-        let protected = axis.len() == 2 && rng.random_bool(if wide { 0.7 } else { 0.2 });
+        let turning = axis.iter().any(|&leg| left_only[leg]);
+        let protected = turning && axis.len() == 2 && rng.random_bool(0.75);
         if protected {
             phases.push(Phase {
                 green: left.clone(),

@@ -116,7 +116,11 @@ impl Traffic<'_> {
                 .map_or(0.0, |c| c.sharpest);
             size[0] * size[0] / 8.0 * sharpest
         };
-        if size[0] > 7.0 && path.iter().any(|lane| sweep(lane) > SWEEP) {
+        // Long vehicles neither turn sharply nor change lanes.
+        let ends_dead = path
+            .last()
+            .is_some_and(|&lane| network.lanes[lane].is_dead_end());
+        if size[0] > 7.0 && (ends_dead || path.iter().any(|lane| sweep(lane) > SWEEP)) {
             return;
         }
         let s = s.max(size[0] / 2.0);

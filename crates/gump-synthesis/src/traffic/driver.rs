@@ -106,6 +106,10 @@ impl Driver {
         });
         let mut chosen = free;
         for leader in [leader, standing].into_iter().flatten() {
+            // The model only approaches its gap; people come to rest.
+            if leader.gap < self.standstill + 0.4 && speed < 0.5 && leader.speed < 0.3 {
+                return -1.5;
+            }
             let z = self.wanted_gap(speed, leader.speed) / leader.gap.max(0.05);
             let interaction = if z >= 1.0 {
                 free.min(0.0) + self.acceleration * (1.0 - z * z)

@@ -54,7 +54,7 @@ impl Traffic<'_> {
         let ends = !target.is_exit && !must;
         if target.is_bike_lane()
             || target.is_dead_end()
-            || vehicle.speed < 3.0
+            || vehicle.speed < 3.0 && !must
             || vehicle.s < vehicle.length() + 2.0
             || ends && left < length + ROOM_AFTER + 25.0
             || !vehicle.claims.is_empty() && !must

@@ -173,8 +173,9 @@ impl Occupancy {
         if let Some(&last) = vehicle.path.last()
             && network.lanes[last].is_dead_end()
             && start <= SIGHT
+            && vehicle.change.is_none()
         {
-            consider(start - 2.0, 0.0);
+            consider(start - 24.0, 0.0);
         }
         best
     }

@@ -57,7 +57,7 @@ impl Traffic<'_> {
         }
         let distance = vehicle.distance_to(self.network, leg);
         let near = distance < self.decision_distance(vehicle);
-        near.then(|| (distance - vehicle.driver.line_gap).max(0.0))
+        near.then_some(distance - vehicle.driver.line_gap)
     }
 
     fn connector(&self, lane: LaneIdx) -> &Connector {
@@ -97,8 +97,9 @@ impl Traffic<'_> {
     }
 
     fn can_stop(&self, vehicle: &Vehicle, distance: f64) -> bool {
-        let braking = vehicle.speed * vehicle.speed / (2.0 * distance.max(0.01));
-        braking < YELLOW_BRAKING
+        // Brakes do not bite at once.
+        let left = distance - 0.3 - 0.3 * vehicle.speed;
+        vehicle.speed * vehicle.speed < 2.0 * YELLOW_BRAKING * left.max(0.01)
     }
 
     /// Remembers since when a vehicle stands at its line.
@@ -144,6 +145,29 @@ impl Traffic<'_> {
             && self.has_priority(i, lane, connector, distance)
             && self.is_free_of_people(vehicle, connector)
             && self.has_room_beyond(i, leg)
+            && self.has_room_in_ring(i, leg)
+    }
+
+    /// True unless entering a roundabout that is as full as can still flow.
+    fn has_room_in_ring(&self, i: usize, leg: usize) -> bool {
+        let lanes = &self.network.lanes;
+        let vehicle = &self.vehicles[i];
+        let enters = vehicle
+            .path
+            .get(leg + 1)
+            .is_some_and(|&lane| lanes[lane].in_ring)
+            && !lanes[vehicle.lane()].in_ring;
+        let on_it = |other: &&Vehicle| {
+            lanes[other.lane()].in_ring
+                || other.claims.iter().any(|&claim| {
+                    lanes[claim]
+                        .successors
+                        .iter()
+                        .any(|&next| lanes[next].in_ring)
+                })
+        };
+        let capacity = lanes.iter().filter(|lane| lane.in_ring).count() / 2 + 1;
+        !enters || self.vehicles.iter().filter(on_it).count() < capacity
     }
 
     /// True if nobody between the vehicle and the line is still undecided.

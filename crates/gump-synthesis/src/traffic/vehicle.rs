@@ -9,8 +9,10 @@ use super::driver::Driver;
 use crate::curve::{smooth_step, smooth_step_slope};
 use crate::network::{LaneIdx, Network};
 
-/// Metres over which a lateral correction settles, divided by about four.
-const SETTLE: f64 = 9.0;
+/// Seconds in which drivers correct their place in the lane.
+const STEERING_TIME: f64 = 0.75;
+/// The same at low speed, metres.
+const STEERING_LENGTH: f64 = 5.0;
 /// Steepest change of acceleration when accelerating or easing off, m/s³.
 const JERK: f64 = 5.0;
 /// Steepest change of acceleration when braking hard, m/s³.
@@ -211,11 +213,12 @@ impl Vehicle {
     fn drift(&mut self, driven: f64, rng: &mut Rng) {
         self.wander_left -= driven;
         if self.wander_left <= 0.0 {
-            self.wander_left = rng.random_range(15.0..45.0);
-            self.wander = rng.random_range(-0.16..0.16);
+            // Steering is corrected every one to three seconds, on any road.
+            self.wander_left = rng.random_range(0.8..2.5) * self.speed.max(5.0);
+            self.wander = rng.random_range(-0.17..0.17);
         }
         let target = self.keep + self.evade + self.wander;
-        let k = 4.0 / (SETTLE * 4.0);
+        let k = 1.0 / (STEERING_TIME * self.speed).max(STEERING_LENGTH);
         let pull = k * k * (target - self.lateral) - 2.0 * k * self.slope;
         self.slope += pull * driven;
         self.lateral += self.slope * driven;
