@@ -1,0 +1,44 @@
+//! What can keep a planner from planning.
+
+use gump_geometry::DVec2;
+use gump_rollout::BoxError;
+use gump_scene::AgentId;
+
+/// Why there is no plan.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// Neither the route nor a lane passes near the ego in its direction.
+    #[error(
+        "the ego stands at ({:.1}, {:.1}) m, where neither the route nor a lane leads ahead",
+        position.x,
+        position.y
+    )]
+    NoLaneAhead {
+        /// Where the ego is, world frame, metres.
+        position: DVec2,
+    },
+    /// A state in the present frame is NaN or infinite.
+    #[error("agent {agent} has a state that is not a finite number")]
+    NotFinite {
+        /// The agent.
+        agent: AgentId,
+    },
+    /// A parameter outside its range.
+    #[error("the parameter {name} is {value}, expected {expected}")]
+    Parameter {
+        /// Which one.
+        name: &'static str,
+        /// What was given.
+        value: f64,
+        /// What is allowed.
+        expected: &'static str,
+    },
+    /// The world could not imagine the proposals.
+    #[error("the world \"{world}\" could not imagine the proposals: {source}")]
+    World {
+        /// Name of the world.
+        world: String,
+        /// What it reported.
+        source: BoxError,
+    },
+}

@@ -1,0 +1,125 @@
+//! Proposals: trajectories the ego might drive.
+//!
+//! Here is the trajectory and its interpolation; `propose` makes them, [`crate::Interactive`]
+//! judges them.
+
+use gump_geometry::{Pose, interpolate_angle};
+use gump_scene::AgentState;
+
+/// A trajectory of the ego and where it comes from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Proposal {
+    /// Where it comes from.
+    pub kind: ProposalKind,
+    /// Seconds between states, > 0.
+    pub dt: f64,
+    /// Box-centre states in the world frame; the first is `dt` ahead of now. Never empty.
+    pub states: Vec<AgentState>,
+}
+
+/// Where a proposal comes from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ProposalKind {
+    /// The Intelligent Driver Model along a line beside the centre of the way.
+    Idm {
+        /// Desired speed as a share of the limit, > 0.
+        speed_fraction: f64,
+        /// Metres to the left of the centre line.
+        lateral_offset: f64,
+    },
+    /// Braking straight ahead as hard as allowed.
+    EmergencyBrake,
+}
+
+impl Proposal {
+    /// The state `elapsed` seconds after `now`, between states by a cubic that meets positions and
+    /// velocities; past the last state at its velocity.
+    pub fn state_at(&self, now: &AgentState, elapsed: f64) -> AgentState {
+        let place = elapsed / self.dt;
+        // A sum of steps meets a state up to rounding; snap, so that states are met exactly.
+        let place = if (place - place.round()).abs() < 1e-9 {
+            place.round()
+        } else {
+            place
+        };
+        let before = place.floor().max(0.0) as usize;
+        let knot = |i: usize| match i.checked_sub(1) {
+            None => now,
+            Some(i) => &self.states[i],
+        };
+        if before >= self.states.len() {
+            let mut state = *knot(self.states.len());
+            let beyond = elapsed - self.states.len() as f64 * self.dt;
+            state.pose.position += state.velocity * beyond;
+            return state;
+        }
+        if place == before as f64 {
+            return *knot(before);
+        }
+        hermite(knot(before), knot(before + 1), self.dt, place.fract())
+    }
+
+    /// The same trajectory from `now` with a state every `dt` seconds, to its last state.
+    pub fn resampled(&self, now: &AgentState, dt: f64) -> Vec<AgentState> {
+        let n = (self.horizon() / dt).round().max(1.0) as usize;
+        (1..=n).map(|i| self.state_at(now, i as f64 * dt)).collect()
+    }
+
+    /// Seconds from now to the last state.
+    pub fn horizon(&self) -> f64 {
+        self.states.len() as f64 * self.dt
+    }
+}
+
+/// Between two states `dt` apart, by the cubic that meets both positions and velocities.
+fn hermite(from: &AgentState, to: &AgentState, dt: f64, t: f64) -> AgentState {
+    let (t2, t3) = (t * t, t * t * t);
+    let step = to.pose.position - from.pose.position;
+    let (v0, v1) = (from.velocity * dt, to.velocity * dt);
+    let position = from.pose.position
+        + step * (3.0 * t2 - 2.0 * t3)
+        + v0 * (t3 - 2.0 * t2 + t)
+        + v1 * (t3 - t2);
+    let moved =
+        step * (6.0 * t - 6.0 * t2) + v0 * (3.0 * t2 - 4.0 * t + 1.0) + v1 * (3.0 * t2 - 2.0 * t);
+    AgentState {
+        pose: Pose {
+            position,
+            heading: interpolate_angle(from.pose.heading, to.pose.heading, t),
+        },
+        velocity: moved / dt,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use approx::assert_abs_diff_eq;
+    use gump_geometry::dvec2;
+
+    #[test]
+    fn states_between_states_are_interpolated() {
+        let state = |x: f64, v: f64| AgentState {
+            pose: Pose::new(x, 0.0, 0.0),
+            velocity: dvec2(v, 0.0),
+        };
+        // Uniform acceleration of 2 m/s² from 3 m/s.
+        let proposal = Proposal {
+            kind: ProposalKind::EmergencyBrake,
+            dt: 0.5,
+            states: vec![state(1.75, 4.0), state(4.0, 5.0)],
+        };
+        let now = state(0.0, 3.0);
+        for (elapsed, x, v) in [
+            (0.2, 0.64, 3.4),
+            (0.5, 1.75, 4.0),
+            (0.1 + 0.2 + 0.6, 3.51, 4.8),
+            (1.4, 6.0, 5.0),
+        ] {
+            let found = proposal.state_at(&now, elapsed);
+            assert_abs_diff_eq!(found.pose.position.x, x, epsilon = 1e-12);
+            assert_abs_diff_eq!(found.velocity.x, v, epsilon = 1e-12);
+        }
+        assert_eq!(proposal.resampled(&now, 0.1).len(), 10);
+    }
+}
