@@ -1,7 +1,7 @@
 //! Token sequences as tensors: here padding is born, and nowhere else.
 
 use candle_core::{Device, Tensor};
-use gump_tokenizer::{Slot, TokenSequence};
+use gump_tokenizer::{Key, Slot, TokenSequence};
 
 use crate::embedding::{ROWS_PER_TOKEN, SineTables, Tables};
 use crate::mct::TokenBatch;
@@ -14,21 +14,29 @@ pub(crate) struct PlacedSlot {
     pub(crate) position: usize,
     /// Index of its frame, from 0 at the oldest.
     pub(crate) frame: usize,
+    /// The key before it, if it is a value.
+    pub(crate) key: Option<Key>,
 }
 
 /// The slots of a sequence with their places; prompts belong to frame 0.
 pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
     let mut frame = None;
+    let mut key = None;
     let slots = sequence.slots().into_iter().enumerate();
     slots
         .map(|(position, slot)| {
             if matches!(slot, Slot::Begin) {
                 frame = Some(frame.map_or(0, |frame: usize| frame + 1));
             }
+            let before = key.take();
+            if let Slot::Key(found) = slot {
+                key = Some(found);
+            }
             PlacedSlot {
                 slot,
                 position,
                 frame: frame.unwrap_or(0),
+                key: before,
             }
         })
         .collect()
@@ -53,13 +61,18 @@ pub(crate) fn pack(
     let mut features: Vec<f32> = Vec::new();
     for (row, sequence) in sequences.iter().enumerate() {
         for (column, placed) in sequence.iter().enumerate() {
-            rows.extend(tables.rows(&placed.slot, placed.position, placed.frame));
+            rows.extend(tables.rows(placed));
             if sines.append(&placed.slot, &mut features) {
                 positions.push((row * t + column) as u32);
             }
         }
         for position in sequence.len()..t {
-            rows.extend(tables.rows(&Slot::Pad, position, 0));
+            rows.extend(tables.rows(&PlacedSlot {
+                slot: Slot::Pad,
+                position,
+                frame: 0,
+                key: None,
+            }));
         }
     }
     let n = positions.len();

@@ -27,6 +27,9 @@ pub struct ModelConfig {
     pub trajectory_heads: Vec<usize>,
     /// How gated cross-attention is gated.
     pub gate: Gate,
+    /// True adds an object's id and class to its value token too (the paper: to its key alone), so
+    /// that finding an object's past takes one attention step instead of two.
+    pub value_carries_key: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
     /// True builds the decoder that reconstructs the raster from the visual features.
@@ -113,6 +116,7 @@ impl ModelConfig {
             gru_layers: 1,
             trajectory_heads: vec![3],
             gate: Gate::Flamingo,
+            value_carries_key: true,
             dropout: 0.0,
             reconstruction: true,
             visual: VisualConfig {
@@ -140,6 +144,7 @@ impl ModelConfig {
             gru_layers: 2,
             trajectory_heads: depths.to_vec(),
             gate: Gate::Flamingo,
+            value_carries_key: false,
             dropout: 0.1,
             reconstruction: true,
             visual: VisualConfig {

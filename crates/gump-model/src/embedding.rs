@@ -4,6 +4,8 @@
 //! are stacked into one, so that every token of every kind is the sum of a few of its rows; the
 //! gather and its backward pass are one operation.
 
+use crate::batch::PlacedSlot;
+use crate::config::ModelConfig;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
 use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TABLE_ROWS};
 
@@ -11,13 +13,14 @@ use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TAB
 const N_FRAMES: usize = 64;
 /// Rows for light indices, 0 unused.
 const N_LIGHT_INDICES: usize = 64;
-/// Most rows a token sums: seven fields, position, frame.
-pub(crate) const ROWS_PER_TOKEN: usize = 9;
+/// Most rows a token sums: seven fields, id, class, position, frame.
+pub(crate) const ROWS_PER_TOKEN: usize = 11;
 
 /// Where each table starts in the stack of tables.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tables {
     block_size: usize,
+    value_carries_key: bool,
 }
 
 impl Tables {
@@ -27,8 +30,11 @@ impl Tables {
     pub(crate) const FRAME: usize = Self::PROMPT + N_PROMPTS;
     pub(crate) const POSITION: usize = Self::FRAME + N_FRAMES;
 
-    pub(crate) fn new(block_size: usize) -> Self {
-        Self { block_size }
+    pub(crate) fn new(config: &ModelConfig) -> Self {
+        Self {
+            block_size: config.block_size,
+            value_carries_key: config.value_carries_key,
+        }
     }
 
     /// Rows of all tables together.
@@ -36,16 +42,15 @@ impl Tables {
         Self::POSITION + self.block_size
     }
 
-    /// The rows that `slot` sums, at `position` in the window and in its `frame`; unused entries
-    /// are `u32::MAX`.
-    pub(crate) fn rows(self, slot: &Slot, position: usize, frame: usize) -> [u32; ROWS_PER_TOKEN] {
+    /// The rows that a token sums; unused entries are `u32::MAX`.
+    pub(crate) fn rows(self, placed: &PlacedSlot) -> [u32; ROWS_PER_TOKEN] {
         let mut rows = [u32::MAX; ROWS_PER_TOKEN];
         let mut n = 0;
         let mut add = |row: usize| {
             rows[n] = row as u32;
             n += 1;
         };
-        match slot {
+        match &placed.slot {
             Slot::Prompt(tag) => add(Self::PROMPT + tag.map_or(N_PROMPTS - 1, |tag| tag.index())),
             Slot::Begin => add(gump_tokenizer::BEGIN as usize),
             Slot::LightsEnd => add(gump_tokenizer::LIGHTS_END as usize),
@@ -63,10 +68,14 @@ impl Tables {
                 for field in Field::ALL {
                     add(state.token(field) as usize);
                 }
+                if let Some(key) = placed.key.filter(|_| self.value_carries_key) {
+                    add(usize::from(key.id));
+                    add(Self::CLASS + gump_tokenizer::class_index(key.kind));
+                }
             }
         }
-        add(Self::POSITION + position.min(self.block_size - 1));
-        add(Self::FRAME + frame.min(N_FRAMES - 1));
+        add(Self::POSITION + placed.position.min(self.block_size - 1));
+        add(Self::FRAME + placed.frame.min(N_FRAMES - 1));
         rows
     }
 }

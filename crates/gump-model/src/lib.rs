@@ -32,6 +32,8 @@ mod sampling;
 #[cfg(test)]
 mod tests;
 pub mod train;
+#[cfg(test)]
+mod train_tests;
 mod trajectory;
 mod visual;
 pub mod world;

@@ -372,7 +372,7 @@ impl Mct {
         config: &ModelConfig,
     ) -> std::result::Result<Self, ModelError> {
         let c = config.width;
-        let tables = Tables::new(config.block_size);
+        let tables = Tables::new(config);
         Ok(Self {
             table: scope.get(
                 "tables",

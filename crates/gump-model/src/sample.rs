@@ -18,6 +18,12 @@ use crate::trajectory::{FUTURE, PAST, POSE};
 
 /// Seconds between token frames.
 pub(crate) const TOKEN_DT: f64 = 0.5;
+/// Frames of history a rollout starts from (paper: 3).
+const HISTORY: usize = 3;
+/// Frames a rollout may be away from its frame of reference: 8 s.
+const LONGEST_ROLLOUT: usize = 16;
+/// How far the centre may be from its own reference pose, metres; a rollout re-centres before.
+const CENTRE_REACH_M: f64 = 85.0;
 
 /// How samples are drawn from scenarios.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -27,6 +33,8 @@ pub struct SampleConfig {
     pub frames: usize,
     /// Samples keep at most this many agents, those nearest to the centre.
     pub max_agents: usize,
+    /// True takes any frame of the log as the present, not only the scenario's own.
+    pub any_present: bool,
     /// Probability that another vehicle than the ego is the centre (the paper re-centres too).
     pub other_centre: f64,
     /// Probability of moving and turning the frame of reference.
@@ -51,6 +59,7 @@ impl Default for SampleConfig {
         Self {
             frames: 5,
             max_agents: 48,
+            any_present: true,
             other_centre: 0.5,
             augment: 0.5,
             rotation: std::f64::consts::FRAC_PI_2,
@@ -69,6 +78,7 @@ impl SampleConfig {
         Self {
             frames,
             max_agents: 320,
+            any_present: false,
             other_centre: 0.0,
             augment: 0.0,
             agent_dropout: 0.0,
@@ -131,6 +141,8 @@ const CONTROL_LIGHTS_END: u32 = CONTROL_BEGIN + 2;
 struct Window<'a> {
     scenario: &'a Scenario,
     centre: AgentId,
+    /// Log index of the frame of reference, which the raster shows.
+    reference: usize,
     /// Log index of the first presented frame.
     start: usize,
     /// Log frames per token frame.
@@ -170,7 +182,6 @@ pub(crate) fn draw(
         .collect();
     let frames = drop_agents(frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
-    let now = config.frames.min(3) - 1;
     let identities = Identities::shuffled(&views, window.centre, window.world_from_scene, &mut rng);
     let encoded = tokenizer.encode(
         &scenario.map,
@@ -185,7 +196,7 @@ pub(crate) fn draw(
     let (states, trajectories) = targets(&slots, &window, &identities);
     let control = control_targets(&slots);
     let mut sample = Sample {
-        raster: draw_raster(&window, spec, now),
+        raster: draw_raster(&window, spec),
         slots: Vec::new(),
         states,
         control,
@@ -199,7 +210,10 @@ pub(crate) fn draw(
     Some(sample)
 }
 
-/// A centre agent and a run of frames in which it is present throughout.
+/// A frame of reference and a run of frames expressed in it.
+///
+/// The run starts up to [`LONGEST_ROLLOUT`] frames after the reference, because a rollout keeps the
+/// frame of reference (and the raster) of its start while its window slides on.
 fn choose_window<'a>(
     scenario: &'a Scenario,
     config: &SampleConfig,
@@ -207,31 +221,37 @@ fn choose_window<'a>(
 ) -> Option<Window<'a>> {
     let stride = (TOKEN_DT / scenario.dt).round().max(1.0) as usize;
     let span = (config.frames - 1) * stride;
-    let starts = scenario.log.len().checked_sub(span)?;
-    let mut start = rng.random_range(0..starts);
-    let present = |id: AgentId, start: usize| {
-        (0..config.frames).all(|i| scenario.log[start + i * stride].agent(id).is_some())
+    let lead = (config.frames.min(HISTORY) - 1) * stride;
+    let last_start = scenario.log.len().checked_sub(span + 1)?;
+    let reference = if config.any_present {
+        rng.random_range(lead.min(scenario.log.len() - 1)..=last_start + lead)
+    } else {
+        scenario.now
+    };
+    let first_start = reference.checked_sub(lead)?;
+    let latest = last_start.checked_sub(first_start)? / stride;
+    let start = first_start + stride * rng.random_range(0..=latest.min(LONGEST_ROLLOUT));
+    let at = |index: usize, id: AgentId| Some(scenario.log[index].agent(id)?.state.pose);
+    // The centre is there all the time and never leaves the window of tokens.
+    let stays = |id: AgentId| {
+        at(reference, id).is_some_and(|origin| {
+            (start..=start + span).step_by(stride).all(|index| {
+                at(index, id)
+                    .is_some_and(|pose| pose.position.distance(origin.position) < CENTRE_REACH_M)
+            })
+        })
     };
     let mut centre = scenario.ego;
-    if rng.random_bool(config.other_centre) {
-        let moving = |agent: &&Agent| {
-            agent.kind == AgentKind::Vehicle
-                && agent.state.speed() > 1.0
-                && present(agent.id, start)
-        };
-        let others: Vec<_> = scenario.log[start].agents().iter().filter(moving).collect();
+    if rng.random_bool(config.other_centre) || !stays(centre) {
+        let moves = |agent: &&Agent| agent.kind == AgentKind::Vehicle && stays(agent.id);
+        let others: Vec<_> = scenario.log[start].agents().iter().filter(moves).collect();
         if !others.is_empty() {
             centre = others[rng.random_range(0..others.len())].id;
         }
     }
-    if !present(centre, start) {
-        centre = scenario.ego;
-        start = (0..starts).find(|&start| present(centre, start))?;
+    if !stays(centre) {
+        return None;
     }
-    let now = scenario.log[start + (config.frames.min(3) - 1) * stride]
-        .agent(centre)?
-        .state
-        .pose;
     let augment = rng.random_bool(config.augment);
     let mut within = |bound: f64| {
         if augment && bound > 0.0 {
@@ -248,9 +268,10 @@ fn choose_window<'a>(
     Some(Window {
         scenario,
         centre,
+        reference,
         start,
         stride,
-        world_from_scene: now * shift,
+        world_from_scene: at(reference, centre)? * shift,
     })
 }
 
@@ -323,9 +344,8 @@ fn prompts(
     tags.into_iter().take(4).map(Some).collect()
 }
 
-fn draw_raster(window: &Window<'_>, spec: &RasterSpec, now: usize) -> Raster {
+fn draw_raster(window: &Window<'_>, spec: &RasterSpec) -> Raster {
     let scenario = window.scenario;
-    let index = window.start + now * window.stride;
     let scene = SceneState {
         map: &scenario.map,
         // The route is the ego's; another centre has none.
@@ -333,7 +353,7 @@ fn draw_raster(window: &Window<'_>, spec: &RasterSpec, now: usize) -> Raster {
             .route
             .as_ref()
             .filter(|_| window.centre == scenario.ego),
-        history: &scenario.log[..=index],
+        history: &scenario.log[..=window.reference],
         ego: window.centre,
         dt: scenario.dt,
     };

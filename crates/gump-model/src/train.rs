@@ -142,7 +142,6 @@ impl Source {
     fn samples(&self, step: usize) -> Vec<Sample> {
         let seed = self.seed.fork(step as u64);
         (0..self.batch)
-            .into_par_iter()
             .filter_map(|i| {
                 let seed = seed.fork(i as u64);
                 (0..64).find_map(|attempt| {
@@ -406,11 +405,13 @@ impl Trainer {
     }
 }
 
-/// Draws the samples of a step on the thread pool.
+/// Draws the samples of a step while the present one is computed.
+///
+/// On a thread of its own: a job of the pool could wait for ever behind the step that waits for it.
 fn prefetch(source: &Arc<Source>, step: usize) -> Receiver<Vec<Sample>> {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.
-    rayon::spawn(move || drop(sender.send(source.samples(step))));
+    std::thread::spawn(move || drop(sender.send(source.samples(step))));
     receiver
 }
