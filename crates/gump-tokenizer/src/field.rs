@@ -1,20 +1,32 @@
-//! The quantiser: what a number becomes in each field of a state.
+//! The quantiser: which bin and which token a number becomes in each field of a state.
+//!
+//! Grid points are the values of the bins, `low`, `low + step`, ..., `high - step`; a value goes to
+//! the nearest, half to even. What a whole state looks like is said in `state`.
+//!
+//! Source: the grids are the GUMP paper's (table of sub-vocabularies), with 200 bins per velocity
+//! component because the paper's range of 0..25 m/s cannot hold a velocity that has a sign. The
+//! released code lets the upper edge of every field spill into the next sub-vocabulary; here it is
+//! clamped, and headings wrap.
 
 use std::f64::consts::PI;
 use std::ops::Range;
 
+/// How far outside its range a value still counts as its end, in steps: what stands on the end of a
+/// grid may come back from the world frame with a rounding error.
+pub(crate) const SLACK: f64 = 1e-6;
+
 /// A field of an object's state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Field {
-    /// Forward in the scene frame, metres.
+    /// Box centre, forward in the scene frame, metres.
     X,
-    /// Left in the scene frame, metres.
+    /// Box centre, left in the scene frame, metres.
     Y,
     /// Heading in the scene frame, radians.
     Heading,
-    /// Velocity along x, metres per second.
+    /// Velocity along the scene frame's x, metres per second; the ego's is not subtracted.
     VelocityX,
-    /// Velocity along y, metres per second.
+    /// Velocity along the scene frame's y, metres per second.
     VelocityY,
     /// Box width, metres.
     Width,
@@ -22,17 +34,17 @@ pub enum Field {
     Length,
 }
 
-/// A bin, and whether the value lay outside the field's range.
+/// What quantising gives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Quantized {
     /// Index of the bin, below [`Field::n_bins`].
     pub bin: u16,
-    /// True if the value was beyond the grid by more than rounding.
+    /// True if the value lay outside the field's range; both ends and rounding errors are inside.
     pub clamped: bool,
 }
 
 impl Field {
-    /// All fields, in the order of a value token.
+    /// All fields, in the order of their sub-vocabularies.
     pub const ALL: [Self; 7] = [
         Self::X,
         Self::Y,
@@ -74,7 +86,7 @@ impl Field {
         }
     }
 
-    /// Distance between bins.
+    /// Distance between the values of neighbouring bins.
     pub fn step(self) -> f64 {
         (self.high() - self.low()) / self.n_bins() as f64
     }
@@ -97,36 +109,42 @@ impl Field {
         }
     }
 
-    /// All tokens of the field.
+    /// The sub-vocabulary: all tokens of the field.
     pub fn tokens(self) -> Range<u32> {
         self.first_token()..self.first_token() + self.n_bins() as u32
     }
 
-    /// Token of a bin.
+    /// Token of a bin; `bin` is below [`Self::n_bins`].
     pub fn token(self, bin: u16) -> u32 {
+        debug_assert!(
+            usize::from(bin) < self.n_bins(),
+            "{self:?} has no bin {bin}"
+        );
         self.first_token() + u32::from(bin)
     }
 
-    /// The nearest bin, half to even; headings wrap, everything else is clamped to the grid.
+    /// The nearest bin, half to even.
     ///
-    /// `value` must be finite: an absent state is absent, never NaN.
+    /// Headings wrap and are never clamped; everything else goes to the nearest end of the grid. In
+    /// the last half step of a range that does not wrap the error is up to a whole step, elsewhere
+    /// up to half of one. A value that is not a number has no bin: it gives the first, `clamped`.
     pub fn quantize(self, value: f64) -> Quantized {
         let n = self.n_bins() as f64;
         let bin = ((value - self.low()) / self.step()).round_ties_even();
         if self.is_circular() {
             return Quantized {
                 bin: bin.rem_euclid(n) as u16,
-                clamped: false,
+                clamped: !value.is_finite(),
             };
         }
+        let slack = SLACK * self.step();
         Quantized {
             bin: bin.clamp(0.0, n - 1.0) as u16,
-            // The upper edge itself belongs to the last bin; only what lies beyond is a loss.
-            clamped: value < self.low() || self.high() < value,
+            clamped: !(self.low() - slack..=self.high() + slack).contains(&value),
         }
     }
 
-    /// The value a bin stands for.
+    /// The value a bin stands for, in the field's unit.
     pub fn dequantize(self, bin: u16) -> f64 {
         self.low() + f64::from(bin) * self.step()
     }

@@ -1,164 +1,139 @@
-//! What may follow what; the one definition that constructor, parser and sampler share.
+//! What may follow what: the one definition that constructor, parser and sampler share.
 //!
 //! ```text
-//! prompt* (BEGIN light* LIGHTS_END (key value)* NEWBORN (key value)*)*
+//! sequence = prompt{0..4} frame* PAD*
+//! frame    = BEGIN light* LIGHTS_END (key value)+ NEWBORN (key value)*
 //! ```
 //!
-//! The ego comes first in every frame, others in the order of class and id; an id is used once per
-//! frame and never for two classes; the first frame has no newborn agents; light indices ascend.
+//! Beyond that shape:
+//! * prompts are one "none" or different tags;
+//! * the indices of a frame's lights ascend, and an index never denotes two places;
+//! * each of the two lists of agents is in canonical order, the ego heads the tracked ones;
+//! * whoever the frame before had is tracked or gone, whoever it had not is newborn; the first
+//!   frame has no newborn;
+//! * an id occurs once per frame and never denotes two classes;
+//! * every bin lies in its field's sub-vocabulary.
+//!
+//! Source: the frame layout of the GUMP paper and its released code, which emits BEGIN once per
+//! frame; order and identity rules are stricter than there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
+use std::ops::RangeInclusive;
 
-use gump_scene::AgentKind;
+use gump_scene::{AgentKind, ScenarioTag};
 
-use crate::{AGENT_KEYS, Key, MAX_LIGHTS, Slot};
+use crate::{
+    AGENT_KEYS, BEGIN, FIRST_LIGHT, Key, LIGHTS_END, MAX_LIGHTS, NEWBORN, PAD, Slot, TokenLight,
+};
 
-/// A place where a sequence breaks the grammar.
+/// Most prompts of a sequence.
+pub const MAX_PROMPTS: usize = 4;
+
+/// Why tokens make no scene.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("slot {position}: expected {expected}, found {found}")]
-pub struct GrammarError {
-    /// Index of the slot.
-    pub position: usize,
-    /// What could have stood there.
-    pub expected: String,
-    /// What stands there.
-    pub found: String,
+pub enum GrammarError {
+    /// A slot stands where it may not.
+    #[error("slot {position}: expected {expected}, found {found}")]
+    Unexpected {
+        /// Index of the slot in its sequence.
+        position: usize,
+        /// What could have stood there.
+        expected: String,
+        /// What stands there.
+        found: String,
+    },
+    /// A key that no agent has.
+    #[error("id {0} denotes no agent of the scene")]
+    UnknownId(u16),
+    /// A light index that no lane has.
+    #[error("light {0} denotes no lane of the scene")]
+    UnknownLight(u16),
 }
 
-/// Reads slots one by one and says what may come next.
+/// Reads slots one by one and knows what may come next.
 #[derive(Clone, Debug, Default)]
 pub struct Grammar {
     place: Place,
     position: usize,
-    frame: usize,
+    prompts: Vec<Option<ScenarioTag>>,
+    n_frames: usize,
     last_light: u16,
     last_key: Option<Key>,
-    /// Ids of the present frame, true for those a value has followed.
-    present: BTreeMap<u16, ()>,
-    previous: BTreeMap<u16, ()>,
+    present: BTreeSet<u16>,
+    previous: BTreeSet<u16>,
     kinds: BTreeMap<u16, AgentKind>,
+    lights: BTreeMap<u16, [u16; 3]>,
 }
 
+/// Which part of a sequence the next slot belongs to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Place {
     #[default]
-    Start,
+    Prompts,
     Lights,
     Tracked,
-    TrackedKey,
+    TrackedValue,
     Newborn,
-    NewbornKey,
-}
-
-/// Which slots may come next.
-#[derive(Clone, Debug, PartialEq, Eq, Default)]
-pub struct Allowed {
-    /// A prompt.
-    pub prompt: bool,
-    /// BEGIN; also true where the sequence may end.
-    pub begin: bool,
-    /// A light, of at least this index.
-    pub light_from: Option<u16>,
-    /// LIGHTS_END.
-    pub lights_end: bool,
-    /// Ids of keys.
-    pub keys: Vec<u16>,
-    /// A value.
-    pub value: bool,
-    /// NEWBORN.
-    pub newborn: bool,
-}
-
-impl fmt::Display for Allowed {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut names = Vec::new();
-        for (may, name) in [
-            (self.prompt, "a prompt"),
-            (self.begin, "BEGIN"),
-            (self.light_from.is_some(), "a light of a higher index"),
-            (self.lights_end, "LIGHTS_END"),
-            (self.value, "a value"),
-            (self.newborn, "NEWBORN"),
-        ] {
-            if may {
-                names.push(name.to_owned());
-            }
-        }
-        match self.keys.as_slice() {
-            [] => {}
-            [0] => names.push("the ego's key".into()),
-            keys => names.push(format!("one of {} keys", keys.len())),
-        }
-        f.write_str(&names.join(" or "))
-    }
+    NewbornValue,
+    Padding,
 }
 
 impl Grammar {
     /// What may come next.
-    pub fn allowed(&self) -> Allowed {
-        let none = Allowed::default();
-        match self.place {
-            Place::Start => Allowed {
-                prompt: true,
-                begin: true,
-                ..none
-            },
-            Place::Lights => Allowed {
-                light_from: (usize::from(self.last_light) < MAX_LIGHTS)
-                    .then_some(self.last_light + 1),
-                lights_end: true,
-                ..none
-            },
-            Place::TrackedKey | Place::NewbornKey => Allowed {
-                value: true,
-                ..none
-            },
-            Place::Tracked if self.present.is_empty() => Allowed {
-                keys: vec![0],
-                ..none
-            },
-            Place::Tracked => {
-                let known = |id: &u16| self.frame == 1 || self.previous.contains_key(id);
-                Allowed {
-                    keys: self.free(known),
-                    newborn: true,
-                    ..none
-                }
-            }
-            Place::Newborn => {
-                let unknown = |id: &u16| self.frame > 1 && !self.previous.contains_key(id);
-                Allowed {
-                    keys: self.free(unknown),
-                    begin: true,
-                    ..none
-                }
-            }
-        }
+    pub fn allowed(&self) -> Allowed<'_> {
+        Allowed { grammar: self }
     }
 
     /// Reads the next slot.
     ///
     /// # Errors
-    /// [`GrammarError`] if it may not stand here; the grammar is then unchanged.
+    /// [`GrammarError::Unexpected`] if it may not stand here; the grammar is then unchanged.
     pub fn advance(&mut self, slot: &Slot) -> Result<(), GrammarError> {
-        let next = self.after(slot).ok_or_else(|| self.error(slot.name()))?;
-        match *slot {
-            Slot::Begin => {
-                self.previous = std::mem::take(&mut self.present);
-                self.frame += 1;
-                (self.last_light, self.last_key) = (0, None);
+        if !self.allowed().slot(slot) {
+            let found = match slot {
+                Slot::Key(key) => format!("the key of {key}"),
+                Slot::Value(state) => format!("the value {state}"),
+                other => other.to_string(),
+            };
+            return Err(self.unexpected(found));
+        }
+        self.place = match *slot {
+            Slot::Prompt(prompt) => {
+                self.prompts.push(prompt);
+                Place::Prompts
             }
-            Slot::Light(light) => self.last_light = light.index,
+            Slot::Begin => {
+                self.n_frames += 1;
+                self.previous = std::mem::take(&mut self.present);
+                (self.last_light, self.last_key) = (0, None);
+                Place::Lights
+            }
+            Slot::Light(light) => {
+                self.last_light = light.index;
+                self.lights.insert(light.index, light.place());
+                Place::Lights
+            }
+            Slot::LightsEnd => Place::Tracked,
             Slot::Key(key) => {
                 self.last_key = Some(key);
-                self.present.insert(key.id, ());
+                self.present.insert(key.id);
                 self.kinds.insert(key.id, key.kind);
+                match self.place {
+                    Place::Tracked => Place::TrackedValue,
+                    _ => Place::NewbornValue,
+                }
             }
-            Slot::Newborn => self.last_key = None,
-            _ => {}
-        }
-        self.place = next;
+            Slot::Value(_) => match self.place {
+                Place::TrackedValue => Place::Tracked,
+                _ => Place::Newborn,
+            },
+            Slot::Newborn => {
+                self.last_key = None;
+                Place::Newborn
+            }
+            Slot::Pad => Place::Padding,
+        };
         self.position += 1;
         Ok(())
     }
@@ -166,75 +141,178 @@ impl Grammar {
     /// Ends the sequence.
     ///
     /// # Errors
-    /// [`GrammarError`] if the last frame is not complete.
+    /// [`GrammarError::Unexpected`] if the last frame is not complete.
     pub fn finish(&self) -> Result<(), GrammarError> {
-        match self.place {
-            Place::Start | Place::Newborn => Ok(()),
-            _ => Err(self.error("the end".into())),
+        if self.allowed().end() {
+            Ok(())
+        } else {
+            Err(self.unexpected("the end".into()))
         }
     }
 
-    /// The state after `slot`, `None` if it may not stand here.
-    fn after(&self, slot: &Slot) -> Option<Place> {
-        match (self.place, slot) {
-            (Place::Start, Slot::Prompt(_)) => Some(Place::Start),
-            (Place::Start | Place::Newborn, Slot::Begin) => Some(Place::Lights),
-            (Place::Lights, Slot::Light(light)) => {
-                let in_order =
-                    self.last_light < light.index && usize::from(light.index) <= MAX_LIGHTS;
-                in_order.then_some(Place::Lights)
-            }
-            (Place::Lights, Slot::LightsEnd) => Some(Place::Tracked),
-            (Place::Tracked, Slot::Key(key)) => {
-                self.may_be_tracked(*key).then_some(Place::TrackedKey)
-            }
-            (Place::Newborn, Slot::Key(key)) => {
-                self.may_be_newborn(*key).then_some(Place::NewbornKey)
-            }
-            (Place::TrackedKey, Slot::Value(_)) => Some(Place::Tracked),
-            (Place::NewbornKey, Slot::Value(_)) => Some(Place::Newborn),
-            (Place::Tracked, Slot::Newborn) => (!self.present.is_empty()).then_some(Place::Newborn),
-            _ => None,
-        }
+    /// Number of slots read.
+    pub fn position(&self) -> usize {
+        self.position
     }
 
-    fn may_be_tracked(&self, key: Key) -> bool {
-        let known = self.frame == 1 || self.previous.contains_key(&key.id);
-        let ego_first = self.present.is_empty() == (key.id == 0);
-        // The ego may return to a window it was never in before: it is always tracked.
-        ego_first && (known || key.id == 0) && self.fits(key)
-    }
-
-    fn may_be_newborn(&self, key: Key) -> bool {
-        self.frame > 1 && key.id != 0 && !self.previous.contains_key(&key.id) && self.fits(key)
-    }
-
-    /// In canonical order, once per frame, of the class it always had.
-    fn fits(&self, key: Key) -> bool {
-        key.kind != AgentKind::Other
-            && u32::from(key.id) <= *AGENT_KEYS.end()
-            && !self.present.contains_key(&key.id)
-            && self.kinds.get(&key.id).is_none_or(|&kind| kind == key.kind)
-            && self.last_key.is_none_or(|last| last.order() < key.order())
-    }
-
-    /// Ids of which some key could come next.
-    fn free(&self, may: impl Fn(&u16) -> bool) -> Vec<u16> {
-        let ids = (*AGENT_KEYS.start() as u16)..=(*AGENT_KEYS.end() as u16);
-        let possible = |id: &u16| {
-            let kinds = AgentKind::MOVING.into_iter();
-            kinds
-                .map(|kind| Key { id: *id, kind })
-                .any(|key| self.fits(key))
-        };
-        ids.filter(|id| may(id) && possible(id)).collect()
-    }
-
-    fn error(&self, found: String) -> GrammarError {
-        GrammarError {
+    fn unexpected(&self, found: String) -> GrammarError {
+        GrammarError::Unexpected {
             position: self.position,
             expected: self.allowed().to_string(),
             found,
         }
+    }
+}
+
+/// Which slots may come next; the mask of a sampler.
+#[derive(Clone, Copy, Debug)]
+pub struct Allowed<'a> {
+    grammar: &'a Grammar,
+}
+
+impl Allowed<'_> {
+    /// True if exactly this slot may come next.
+    pub fn slot(&self, slot: &Slot) -> bool {
+        match slot {
+            Slot::Prompt(prompt) => self.prompt(*prompt),
+            Slot::Begin => self.begin(),
+            Slot::Light(light) => self.light(light),
+            Slot::LightsEnd => self.lights_end(),
+            Slot::Key(key) => self.key(*key),
+            Slot::Value(state) => self.value() && state.is_valid(),
+            Slot::Newborn => self.newborn(),
+            Slot::Pad => self.end(),
+        }
+    }
+
+    /// True if this prompt may come next.
+    pub fn prompt(&self, prompt: Option<ScenarioTag>) -> bool {
+        let before = &self.grammar.prompts;
+        let fits = match prompt {
+            None => before.is_empty(),
+            Some(_) => !before.contains(&None) && !before.contains(&prompt),
+        };
+        self.grammar.place == Place::Prompts && before.len() < MAX_PROMPTS && fits
+    }
+
+    /// True if a frame may begin.
+    pub fn begin(&self) -> bool {
+        matches!(self.grammar.place, Place::Prompts | Place::Newborn)
+    }
+
+    /// The indices a light may have next; empty where none may come.
+    pub fn light_indices(&self) -> RangeInclusive<u16> {
+        let first = match self.grammar.place {
+            Place::Lights => self.grammar.last_light + 1,
+            _ => MAX_LIGHTS as u16 + 1,
+        };
+        first..=MAX_LIGHTS as u16
+    }
+
+    /// True if this light may come next.
+    pub fn light(&self, light: &TokenLight) -> bool {
+        let known = self.grammar.lights.get(&light.index);
+        self.light_indices().contains(&light.index)
+            && light.is_valid()
+            && known.is_none_or(|place| *place == light.place())
+    }
+
+    /// True if the lights may end.
+    pub fn lights_end(&self) -> bool {
+        self.grammar.place == Place::Lights
+    }
+
+    /// True if this key may come next.
+    pub fn key(&self, key: Key) -> bool {
+        let grammar = self.grammar;
+        let belongs = match grammar.place {
+            Place::Tracked if grammar.present.is_empty() => key.is_ego(),
+            Place::Tracked => grammar.n_frames == 1 || grammar.previous.contains(&key.id),
+            Place::Newborn => grammar.n_frames > 1 && !grammar.previous.contains(&key.id),
+            _ => false,
+        };
+        let in_order = grammar.last_key.is_none_or(|last| last < key);
+        let known = grammar.kinds.get(&key.id);
+        belongs
+            && in_order
+            && !grammar.present.contains(&key.id)
+            && (key.is_ego() || AGENT_KEYS.contains(&u32::from(key.id)))
+            && known.map_or(key.kind != AgentKind::Other, |kind| *kind == key.kind)
+    }
+
+    /// All keys that may come next, in canonical order.
+    pub fn keys(&self) -> impl Iterator<Item = Key> + '_ {
+        let of_kind = |kind| (0..=*AGENT_KEYS.end() as u16).map(move |id| Key { id, kind });
+        let keys = AgentKind::MOVING.into_iter().flat_map(of_kind);
+        keys.filter(|key| self.key(*key))
+    }
+
+    /// True if a value may come next; it then must.
+    pub fn value(&self) -> bool {
+        matches!(
+            self.grammar.place,
+            Place::TrackedValue | Place::NewbornValue
+        )
+    }
+
+    /// True if the tracked agents may end.
+    pub fn newborn(&self) -> bool {
+        self.grammar.place == Place::Tracked && !self.grammar.present.is_empty()
+    }
+
+    /// True if the sequence may end here, or be padded.
+    pub fn end(&self) -> bool {
+        self.begin() || self.grammar.place == Place::Padding
+    }
+
+    /// The tokens of all single-token slots that may come next, ascending; none before a value,
+    /// whose tokens are those of its fields. Prompts have a table of their own.
+    pub fn tokens(&self) -> Vec<u32> {
+        let ids: BTreeSet<u16> = self.keys().map(|key| key.id).collect();
+        let mut tokens: Vec<u32> = ids.into_iter().map(u32::from).collect();
+        if !self.light_indices().is_empty() {
+            tokens.extend(FIRST_LIGHT..FIRST_LIGHT + 4);
+        }
+        let marks = [
+            (self.begin(), BEGIN),
+            (self.newborn(), NEWBORN),
+            (self.lights_end(), LIGHTS_END),
+            (self.end(), PAD),
+        ];
+        tokens.extend(marks.into_iter().filter(|(may, _)| *may).map(|(_, t)| t));
+        tokens
+    }
+}
+
+/// What may come next in words, for messages.
+impl fmt::Display for Allowed<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut words: Vec<String> = Vec::new();
+        if self.grammar.place == Place::Prompts {
+            words.push("a prompt".into());
+        }
+        let lights = self.light_indices();
+        if !lights.is_empty() {
+            words.push(format!("a light of {}..={}", lights.start(), lights.end()));
+        }
+        let mut keys = self.keys();
+        match (keys.next(), keys.count()) {
+            (None, _) => {}
+            (Some(key), _) if key.is_ego() => words.push("the ego's key".into()),
+            (Some(key), 0) => words.push(format!("the key of {key}")),
+            (Some(key), more) => words.push(format!("the key of {key} or {more} others")),
+        }
+        for (may, word) in [
+            (self.value(), "a value"),
+            (self.lights_end(), "LIGHTS_END"),
+            (self.newborn(), "NEWBORN"),
+            (self.begin(), "BEGIN"),
+            (self.end(), "PAD or the end"),
+        ] {
+            if may {
+                words.push(word.into());
+            }
+        }
+        f.write_str(&words.join(" or "))
     }
 }

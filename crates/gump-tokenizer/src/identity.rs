@@ -1,32 +1,43 @@
-//! Which agent has which key.
+//! Which agent has which key id.
+//!
+//! An id is one agent's alone as long as any frame of the window holds it: it is never handed on
+//! when its owner leaves. Classes are not kept here; the canonical order within a frame is the
+//! grammar's.
 
 use std::collections::BTreeMap;
 
 use gump_geometry::Pose;
 use gump_scene::{AgentId, AgentKind, Frame, Rng};
-use rand::Rng as _;
+use rand::seq::SliceRandom;
 
-use crate::{AGENT_KEYS, class_index};
+use crate::AGENT_KEYS;
 
-/// A one-to-one map between agents and key ids, never reused within a window.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+/// A one-to-one map between agents and key ids; the ego is 0.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identities {
     keys: BTreeMap<AgentId, u16>,
     agents: BTreeMap<u16, AgentId>,
+    /// Above every agent seen, so that a newborn agent can never be taken for a recorded one.
+    next_agent: i64,
 }
 
 impl Identities {
-    /// Ids by rank, as inference uses them: 0 for the ego, then by class and by distance from the
-    /// centre where the agent was last seen. Of more than 320 agents the farthest have none.
+    /// Ids by rank, for inference: the same scene always has the same ids.
+    ///
+    /// Every moving agent of `frames` (oldest first) has one: by class, then by distance from the
+    /// centre where the agent was last seen, then by agent id; a class is the first one seen. Of more than 320 agents the farthest
+    /// have none.
     pub fn ranked(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Self {
-        let mut identities = Self::of_ego(ego);
-        for agent in ranked(frames, ego, world_from_scene) {
-            identities.insert(agent, identities.agents.len() as u16);
-        }
-        identities
+        Self::with_ids(
+            frames,
+            ego,
+            world_from_scene,
+            AGENT_KEYS.map(|id| id as u16),
+        )
     }
 
-    /// Ids drawn without replacement, as training uses them, so that every id is learned.
+    /// Ids drawn at random from 1..=320 without replacement, for training: ids by rank would leave
+    /// the high ones untrained. Who has an id is decided as in [`Self::ranked`].
     pub fn shuffled(
         frames: &[&Frame],
         ego: AgentId,
@@ -34,14 +45,8 @@ impl Identities {
         rng: &mut Rng,
     ) -> Self {
         let mut ids: Vec<u16> = AGENT_KEYS.map(|id| id as u16).collect();
-        for i in (1..ids.len()).rev() {
-            ids.swap(i, rng.random_range(0..=i));
-        }
-        let mut identities = Self::of_ego(ego);
-        for (agent, id) in ranked(frames, ego, world_from_scene).into_iter().zip(ids) {
-            identities.insert(agent, id);
-        }
-        identities
+        ids.shuffle(rng);
+        Self::with_ids(frames, ego, world_from_scene, ids)
     }
 
     /// The id of an agent.
@@ -54,43 +59,68 @@ impl Identities {
         self.agents.get(&id).copied()
     }
 
-    /// Gives a newborn agent the lowest id above all in use, or the lowest that is free; `None` if
-    /// all are taken. An agent that has an id keeps it.
+    /// Gives an agent the lowest free id; `None` if all are taken. An agent that has one keeps it.
+    ///
+    /// Ids given one after the other ascend, as the canonical order within a class wants.
     pub fn allocate(&mut self, agent: AgentId) -> Option<u16> {
         if let Some(id) = self.key(agent) {
             return Some(id);
         }
-        let last = *AGENT_KEYS.end() as u16;
-        let above = self.agents.keys().next_back().map_or(1, |id| id + 1);
-        let id = if above <= last {
-            above
-        } else {
-            (1..=last).find(|id| !self.agents.contains_key(id))?
-        };
+        let mut ids = AGENT_KEYS.map(|id| id as u16);
+        let id = ids.find(|id| !self.agents.contains_key(id))?;
         self.insert(agent, id);
         Some(id)
     }
 
-    /// (id, agent) in the order of ids.
+    /// A new agent that no frame has had, with the lowest free id; `None` if all are taken.
+    pub fn newborn(&mut self) -> Option<(u16, AgentId)> {
+        let agent = AgentId(self.next_agent);
+        self.allocate(agent).map(|id| (id, agent))
+    }
+
+    /// Frees the ids for which `keep` is false. They must occur in no frame that is still read.
+    pub fn retain(&mut self, keep: impl Fn(u16) -> bool) {
+        self.agents.retain(|id, _| *id == 0 || keep(*id));
+        self.keys.retain(|_, id| *id == 0 || keep(*id));
+    }
+
+    /// (id, agent) in the order of ids, the ego first.
     pub fn iter(&self) -> impl Iterator<Item = (u16, AgentId)> + '_ {
         self.agents.iter().map(|(&id, &agent)| (id, agent))
     }
 
-    fn of_ego(ego: AgentId) -> Self {
-        let mut identities = Self::default();
+    fn with_ids(
+        frames: &[&Frame],
+        ego: AgentId,
+        world_from_scene: Pose,
+        ids: impl IntoIterator<Item = u16>,
+    ) -> Self {
+        // Static things count too: a newborn agent may not be taken for one of them either.
+        let seen = frames.iter().flat_map(|frame| frame.agents());
+        let highest = seen.map(|agent| agent.id.0).max();
+        let mut identities = Self {
+            keys: BTreeMap::new(),
+            agents: BTreeMap::new(),
+            next_agent: highest.map_or(0, |id| id.saturating_add(1)),
+        };
         identities.insert(ego, 0);
+        for (agent, id) in rank(frames, ego, world_from_scene).into_iter().zip(ids) {
+            identities.insert(agent, id);
+        }
         identities
     }
 
     fn insert(&mut self, agent: AgentId, id: u16) {
         self.keys.insert(agent, id);
         self.agents.insert(id, agent);
+        self.next_agent = self.next_agent.max(agent.0.saturating_add(1));
     }
 }
 
-/// All moving agents of the window but the ego, at most 320, the nearest; by class, then distance.
-fn ranked(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Vec<AgentId> {
-    let mut seen: BTreeMap<AgentId, (f64, AgentKind)> = BTreeMap::new();
+/// All moving agents but the ego, at most as many as there are ids, in the order of
+/// [`Identities::ranked`].
+fn rank(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Vec<AgentId> {
+    let mut last_seen: BTreeMap<AgentId, (f64, AgentKind)> = BTreeMap::new();
     for agent in frames.iter().flat_map(|frame| frame.agents()) {
         if agent.id != ego && agent.kind != AgentKind::Other {
             let distance = agent
@@ -98,13 +128,14 @@ fn ranked(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Vec<AgentI
                 .pose
                 .position
                 .distance(world_from_scene.position);
-            seen.insert(agent.id, (distance, agent.kind));
+            let entry = last_seen.entry(agent.id).or_insert((distance, agent.kind));
+            entry.0 = distance;
         }
     }
-    let mut all: Vec<(AgentId, f64, AgentKind)> =
-        seen.into_iter().map(|(id, (d, k))| (id, d, k)).collect();
-    all.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
-    all.truncate(*AGENT_KEYS.end() as usize);
-    all.sort_by_key(|(_, _, kind)| class_index(*kind));
-    all.into_iter().map(|(id, ..)| id).collect()
+    let mut ranked: Vec<_> = last_seen.into_iter().collect();
+    // Both sorts are stable, so ties keep the order of agent ids.
+    ranked.sort_by(|(_, a), (_, b)| a.0.total_cmp(&b.0));
+    ranked.truncate(*AGENT_KEYS.end() as usize);
+    ranked.sort_by_key(|(_, (_, kind))| *kind);
+    ranked.into_iter().map(|(agent, _)| agent).collect()
 }

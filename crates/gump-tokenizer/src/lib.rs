@@ -1,29 +1,60 @@
 //! A scene as tokens and back, with its grammar.
 //!
-//! A frame is BEGIN, its lights, LIGHTS_END, then pairs of key (who) and value (in which state) for
-//! the agents that were there before, NEWBORN, and pairs for those that were not. States are
-//! quantised by [`Field`]; [`Tokenizer`] encodes, [`Grammar`] says what may follow what,
-//! [`TokenSequence`] is grammatical once built.
+//! A scene is a few frames half a second apart. Each frame is BEGIN, its traffic lights,
+//! LIGHTS_END, a key (who) and a value (in which state) for every agent the frame before had too,
+//! NEWBORN, and pairs for those it had not. States lie on fixed grids in the frame of one pose.
+//!
+//! Nothing here knows a tensor: embedding slots is the model's work, and so is drawing the map.
+//! Start with [`Tokenizer`], then [`TokenSequence`]; [`Field`] is the arithmetic and [`Grammar`]
+//! the one place that says what may follow what.
 //!
 //! # Terms
-//! * **slot**: one position of a sequence. **token**: an index of the vocabulary; a value slot is
-//!   the sum of seven tokens, one per field.
-//! * **scene frame**: the pose everything is expressed in, fixed for a window, usually the ego's.
+//! * **slot**: one position of a sequence. **Token**: an index into the vocabulary; most slots are
+//!   one token, a value slot is seven, one per **field**.
+//! * **key**: the slot that addresses an agent by id and class; its **value** follows it.
+//! * **tracked**: present in the frame before as well. **Newborn**: not present there, be it for
+//!   the first time or again. In the first frame everything is tracked.
+//! * **canonical order**: the ego, then by class, then by id.
+//! * **scene frame**: the pose that all states of a window are relative to, usually the ego's now;
+//!   x forward, y left. It stands still while the ego moves.
+//!
+//! ```
+//! use gump_tokenizer::{Identities, Tokenizer, TokenizerConfig};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "ego vehicle 0: 10,0 velocity 8,0
+//!      agent pedestrian 7: 30,4 velocity 0,-1",
+//! ).unwrap();
+//! let scene = scenario.present();
+//! let frames = scene.strided_history(5, 3);
+//! let world_from_scene = scene.ego_now().state.pose;
+//! let identities = Identities::ranked(&frames, scene.ego, world_from_scene);
+//! let tokenizer = Tokenizer::new(TokenizerConfig::default());
+//! let encoded = tokenizer.encode(scene.map, &frames, scene.ego, world_from_scene, &identities);
+//! assert_eq!(encoded.sequence.frames().len(), 3);
+//! assert_eq!(encoded.sequence.len(), 3 * (3 + 2 * 2));
+//! println!("{}", encoded.sequence);
+//! ```
 
 mod field;
 mod frame;
 mod grammar;
 mod identity;
+mod lights;
 mod sequence;
 mod state;
+mod text;
 mod tokenizer;
 mod vocabulary;
 
+#[cfg(test)]
+mod tests;
+
 pub use field::{Field, Quantized};
 pub use frame::{Key, TokenAgent, TokenFrame, TokenLight};
-pub use grammar::{Allowed, Grammar, GrammarError};
+pub use grammar::{Allowed, Grammar, GrammarError, MAX_PROMPTS};
 pub use identity::Identities;
-pub use sequence::{Slot, TokenSequence};
+pub use sequence::{Overflow, Slot, TokenSequence};
 pub use state::QuantizedState;
 pub use tokenizer::{EncodeReport, Encoded, Tokenizer, TokenizerConfig};
 pub use vocabulary::{

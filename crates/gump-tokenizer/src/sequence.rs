@@ -1,12 +1,12 @@
-//! A grammatical sequence of frames.
-
-use std::fmt;
+//! A grammatical sequence of frames: building, reading, cutting.
+//!
+//! What is grammatical is said in `grammar`; how a scene becomes a sequence, in `tokenizer`.
 
 use gump_scene::ScenarioTag;
 
 use crate::{
-    Field, Grammar, GrammarError, Key, QuantizedState, TokenAgent, TokenFrame, TokenLight,
-    class_index,
+    BEGIN, Grammar, GrammarError, Key, LIGHTS_END, NEWBORN, PAD, QuantizedState, TokenAgent,
+    TokenFrame, TokenLight, light_token,
 };
 
 /// One position of a sequence.
@@ -31,26 +31,37 @@ pub enum Slot {
 }
 
 impl Slot {
-    /// A word for messages.
-    pub(crate) fn name(&self) -> String {
+    /// The slot's token: that of an id, a light state or a mark. `None` for prompts, which have a
+    /// table of their own, and values, which have a token per field.
+    pub fn token(&self) -> Option<u32> {
         match self {
-            Self::Prompt(_) => "a prompt".into(),
-            Self::Begin => "BEGIN".into(),
-            Self::Light(light) => format!("light {}", light.index),
-            Self::LightsEnd => "LIGHTS_END".into(),
-            Self::Key(key) => format!("the key of {} {}", key.kind.name(), key.id),
-            Self::Value(_) => "a value".into(),
-            Self::Newborn => "NEWBORN".into(),
-            Self::Pad => "PAD".into(),
+            Self::Prompt(_) | Self::Value(_) => None,
+            Self::Begin => Some(BEGIN),
+            Self::Light(light) => Some(light_token(light.state)),
+            Self::LightsEnd => Some(LIGHTS_END),
+            Self::Key(key) => Some(u32::from(key.id)),
+            Self::Newborn => Some(NEWBORN),
+            Self::Pad => Some(PAD),
         }
     }
 }
 
-/// Prompts and frames that obey the [`Grammar`].
+/// Prompts and frames that obey the [`Grammar`], oldest frame first.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct TokenSequence {
     prompts: Vec<Option<ScenarioTag>>,
     frames: Vec<TokenFrame>,
+}
+
+/// What [`TokenSequence::fit`] had to leave out.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub struct Overflow {
+    /// Oldest whole frames.
+    pub frames: usize,
+    /// Agents of the last frame, the farthest from the ego first.
+    pub agents: Vec<Key>,
+    /// Lights of the last frame, by index, the farthest from the centre first.
+    pub lights: Vec<u16>,
 }
 
 impl TokenSequence {
@@ -63,15 +74,11 @@ impl TokenSequence {
         frames: Vec<TokenFrame>,
     ) -> Result<Self, GrammarError> {
         let sequence = Self { prompts, frames };
-        let mut grammar = Grammar::default();
-        for slot in sequence.slots() {
-            grammar.advance(&slot)?;
-        }
-        grammar.finish()?;
+        read(&sequence.slots())?.finish()?;
         Ok(sequence)
     }
 
-    /// Reads slots back into frames.
+    /// Reads slots back into frames; PAD may follow the last.
     ///
     /// # Errors
     /// [`GrammarError`] at the first slot that may not stand where it does.
@@ -83,18 +90,16 @@ impl TokenSequence {
         for slot in slots {
             grammar.advance(slot)?;
             match (*slot, sequence.frames.last_mut()) {
-                (Slot::Prompt(tag), _) => sequence.prompts.push(tag),
+                (Slot::Prompt(prompt), _) => sequence.prompts.push(prompt),
                 (Slot::Begin, _) => {
-                    sequence.frames.push(TokenFrame::default());
                     newborn = false;
+                    sequence.frames.push(TokenFrame::default());
                 }
                 (Slot::Light(light), Some(frame)) => frame.lights.push(light),
                 (Slot::Key(found), _) => key = Some(found),
                 (Slot::Newborn, _) => newborn = true,
                 (Slot::Value(state), Some(frame)) => {
-                    let key = key
-                        .take()
-                        .expect("the grammar puts a key before every value");
+                    let key = key.expect("the grammar puts a key before every value");
                     let agents = if newborn {
                         &mut frame.newborn
                     } else {
@@ -109,6 +114,14 @@ impl TokenSequence {
         Ok(sequence)
     }
 
+    /// The same frames after other prompts.
+    ///
+    /// # Errors
+    /// [`GrammarError`] if these prompts do not go together.
+    pub fn with_prompts(self, prompts: Vec<Option<ScenarioTag>>) -> Result<Self, GrammarError> {
+        Self::new(prompts, self.frames)
+    }
+
     /// The frames, oldest first.
     pub fn frames(&self) -> &[TokenFrame] {
         &self.frames
@@ -121,9 +134,9 @@ impl TokenSequence {
 
     /// The sequence position by position.
     pub fn slots(&self) -> Vec<Slot> {
-        let mut slots: Vec<Slot> = self.prompts.iter().copied().map(Slot::Prompt).collect();
-        slots.reserve(self.len() - slots.len());
         let pair = |agent: &TokenAgent| [Slot::Key(agent.key), Slot::Value(agent.state)];
+        let mut slots = Vec::with_capacity(self.len());
+        slots.extend(self.prompts.iter().copied().map(Slot::Prompt));
         for frame in &self.frames {
             slots.push(Slot::Begin);
             slots.extend(frame.lights.iter().copied().map(Slot::Light));
@@ -137,7 +150,8 @@ impl TokenSequence {
 
     /// Number of slots.
     pub fn len(&self) -> usize {
-        self.prompts.len() + self.frames.iter().map(TokenFrame::len_slots).sum::<usize>()
+        let frames = self.frames.iter().map(TokenFrame::len_slots);
+        self.prompts.len() + frames.sum::<usize>()
     }
 
     /// True if there is neither prompt nor frame.
@@ -147,22 +161,26 @@ impl TokenSequence {
 
     /// Index of each frame's BEGIN.
     pub fn frame_starts(&self) -> Vec<usize> {
-        let mut start = self.prompts.len();
-        let starts = self.frames.iter().map(|frame| {
-            let this = start;
-            start += frame.len_slots();
-            this
-        });
-        starts.collect()
+        let start = |next: &mut usize, frame: &TokenFrame| {
+            let start = *next;
+            *next += frame.len_slots();
+            Some(start)
+        };
+        self.frames.iter().scan(self.prompts.len(), start).collect()
     }
 
-    /// The last `n` frames; who was newborn in the first of them counts as tracked now.
-    pub fn tail(&self, n: usize) -> Self {
-        let mut frames = self.frames[self.frames.len().saturating_sub(n)..].to_vec();
+    /// The grammar after the last slot, for whoever continues the sequence.
+    pub fn grammar(&self) -> Grammar {
+        read(&self.slots()).expect("a sequence in hand is grammatical")
+    }
+
+    /// The prompts and the last `n_frames` frames; who was newborn in the first of them is now
+    /// tracked.
+    pub fn tail(&self, n_frames: usize) -> Self {
+        let first = self.frames.len().saturating_sub(n_frames);
+        let mut frames = self.frames[first..].to_vec();
         if let Some(first) = frames.first_mut() {
-            let newborn = std::mem::take(&mut first.newborn);
-            first.tracked.extend(newborn);
-            first.tracked.sort_by_key(|agent| agent.key.order());
+            *first = std::mem::take(first).into_first();
         }
         Self {
             prompts: self.prompts.clone(),
@@ -170,76 +188,67 @@ impl TokenSequence {
         }
     }
 
-    /// The longest run of last frames that takes at most `block_size` slots, and who had to be left
-    /// out: if the last frame alone is too long, the agents farthest from the ego.
-    pub fn fit(&self, block_size: usize) -> (Self, Vec<Key>) {
-        for n in (1..=self.frames.len()).rev() {
-            let tail = self.tail(n);
-            if tail.len() <= block_size {
-                return (tail, Vec::new());
-            }
+    /// The most of the sequence that takes at most `block_size` slots, and what is left out.
+    ///
+    /// The oldest whole frames go first. If the last frame alone is too long, it loses the agents
+    /// farthest from the ego, then its last lights; a frame is never cut. Prompts stay.
+    ///
+    /// # Panics
+    /// If not even the prompts and a frame of the ego alone (5 slots) fit: such a block is of no
+    /// use.
+    pub fn fit(&self, block_size: usize) -> (Self, Overflow) {
+        let lengths: Vec<usize> = self.frames.iter().map(TokenFrame::len_slots).collect();
+        let mut length = self.len();
+        let mut overflow = Overflow::default();
+        while block_size < length && overflow.frames + 1 < lengths.len() {
+            length -= lengths[overflow.frames];
+            overflow.frames += 1;
         }
-        let mut tail = self.tail(1);
-        let over = tail.len().saturating_sub(block_size).div_ceil(2);
-        let Some(frame) = tail.frames.first_mut() else {
-            return (tail, Vec::new());
-        };
-        let Some(ego) = frame.tracked.first().copied() else {
-            return (tail, Vec::new());
-        };
-        let distance = |agent: &TokenAgent| {
-            agent
-                .state
-                .pose()
-                .position
-                .distance(ego.state.pose().position)
-        };
-        let mut far: Vec<TokenAgent> = frame.tracked[1..].to_vec();
-        far.sort_by(|a, b| {
-            distance(b)
-                .total_cmp(&distance(a))
-                .then(a.key.id.cmp(&b.key.id))
-        });
-        let left_out: Vec<Key> = far.iter().take(over).map(|agent| agent.key).collect();
-        frame.tracked.retain(|agent| !left_out.contains(&agent.key));
-        (tail, left_out)
+        let mut fitted = self.tail(self.frames.len() - overflow.frames);
+        let excess = fitted.len().saturating_sub(block_size);
+        if excess > 0 {
+            let last = fitted.frames.first_mut();
+            (overflow.agents, overflow.lights) =
+                last.map(|f| shorten(f, excess)).unwrap_or_default();
+        }
+        let length = fitted.len();
+        assert!(
+            length <= block_size,
+            "a block of {block_size} cannot hold {length} slots"
+        );
+        (fitted, overflow)
     }
 }
 
-/// Readable: one frame per line, values as numbers.
-impl fmt::Display for TokenSequence {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for prompt in &self.prompts {
-            writeln!(f, "PROMPT {}", prompt.map_or("none", ScenarioTag::name))?;
-        }
-        for frame in &self.frames {
-            write!(f, "BEGIN")?;
-            for light in &frame.lights {
-                let (x, y) = (Field::X.dequantize(light.x), Field::Y.dequantize(light.y));
-                write!(f, " L{}({:?} {x:.1} {y:.1})", light.index, light.state)?;
-            }
-            write!(f, " LIGHTS_END")?;
-            frame
-                .tracked
-                .iter()
-                .try_for_each(|agent| write_agent(f, agent))?;
-            write!(f, " NEWBORN")?;
-            frame
-                .newborn
-                .iter()
-                .try_for_each(|agent| write_agent(f, agent))?;
-            writeln!(f)?;
-        }
-        Ok(())
-    }
+/// Reads slots from the start.
+fn read(slots: &[Slot]) -> Result<Grammar, GrammarError> {
+    let mut grammar = Grammar::default();
+    slots.iter().try_for_each(|slot| grammar.advance(slot))?;
+    Ok(grammar)
 }
 
-fn write_agent(f: &mut fmt::Formatter<'_>, agent: &TokenAgent) -> fmt::Result {
-    let class = ['v', 'p', 'b'][class_index(agent.key.kind)];
-    let [x, y, heading, vx, vy, width, length] = agent.state.values();
-    write!(
-        f,
-        " {class}{}({x:.1} {y:.1} {heading:.2} {vx:.2} {vy:.2} {width:.1}x{length:.1})",
-        agent.key.id
+/// Takes agents, then lights, out of a lone frame until it is at least `excess` slots shorter.
+fn shorten(frame: &mut TokenFrame, excess: usize) -> (Vec<Key>, Vec<u16>) {
+    let position = |agent: &TokenAgent| agent.state.pose().position;
+    let Some(ego) = frame.tracked.first().map(position) else {
+        return Default::default();
+    };
+    let mut far: Vec<(f64, Key)> = frame.tracked[1..]
+        .iter()
+        .map(|agent| (position(agent).distance(ego), agent.key))
+        .collect();
+    far.sort_by(|a, b| b.0.total_cmp(&a.0).then(b.1.cmp(&a.1)));
+    let agents: Vec<Key> = far
+        .into_iter()
+        .take(excess.div_ceil(2))
+        .map(|(_, key)| key)
+        .collect();
+    frame.tracked.retain(|agent| !agents.contains(&agent.key));
+    let n_lights = excess.saturating_sub(2 * agents.len());
+    let kept = frame.lights.len().saturating_sub(n_lights);
+    let lights = frame.lights.split_off(kept);
+    (
+        agents,
+        lights.iter().rev().map(|light| light.index).collect(),
     )
 }

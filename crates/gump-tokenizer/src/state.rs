@@ -1,29 +1,36 @@
-//! An agent's state in bins.
+//! An agent's state on the grid: seven bins, one per [`Field`].
+//!
+//! This is the one form in which a state enters the model and comes out of it; its numbers are
+//! always those of the bins.
 
 use gump_geometry::{DVec2, Pose, dvec2};
 use gump_scene::AgentState;
 
 use crate::Field;
 
-/// The bins of the seven fields of a value token.
+/// The bins of a value slot. Quantising the values of the bins gives the same bins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Hash)]
-#[allow(
-    missing_docs,
-    reason = "each field is the bin of the Field it is named after"
-)]
 pub struct QuantizedState {
+    /// Bin of [`Field::X`], below 1000.
     pub x: u16,
+    /// Bin of [`Field::Y`], below 1000.
     pub y: u16,
+    /// Bin of [`Field::Heading`], below 200.
     pub heading: u16,
+    /// Bin of [`Field::VelocityX`], below 200.
     pub velocity_x: u16,
+    /// Bin of [`Field::VelocityY`], below 200.
     pub velocity_y: u16,
+    /// Bin of [`Field::Width`], below 14.
     pub width: u16,
+    /// Bin of [`Field::Length`], below 30.
     pub length: u16,
 }
 
 impl QuantizedState {
-    /// Quantises a state given in the scene frame, with the box size in metres; also counts the
-    /// fields that had to be clamped.
+    /// Quantises a state and a box; also names the fields whose value lay outside their range.
+    ///
+    /// Units: `state` in the scene frame; `length` and `width` in metres.
     pub fn new(state: &AgentState, length: f64, width: f64) -> (Self, Vec<Field>) {
         let values = [
             state.pose.position.x,
@@ -77,7 +84,7 @@ impl QuantizedState {
         field.token(self.get(field))
     }
 
-    /// What the bins stand for, in the order of [`Field::ALL`].
+    /// What the bins stand for, in the order of [`Field::ALL`] and in its units.
     pub fn values(&self) -> [f64; 7] {
         Field::ALL.map(|field| field.dequantize(self.get(field)))
     }
@@ -92,5 +99,20 @@ impl QuantizedState {
     pub fn velocity(&self) -> DVec2 {
         let [_, _, _, x, y, ..] = self.values();
         dvec2(x, y)
+    }
+
+    /// Pose and velocity, scene frame.
+    pub fn to_agent_state(&self) -> AgentState {
+        AgentState {
+            pose: self.pose(),
+            velocity: self.velocity(),
+        }
+    }
+
+    /// True if every bin exists, so that every token lies in its field's sub-vocabulary.
+    pub fn is_valid(&self) -> bool {
+        Field::ALL
+            .into_iter()
+            .all(|field| usize::from(self.get(field)) < field.n_bins())
     }
 }

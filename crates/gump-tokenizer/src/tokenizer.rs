@@ -1,25 +1,37 @@
-//! Scenes to tokens.
+//! Scenes to tokens and back.
+//!
+//! Who has which id is decided before, in `identity`; what is grammatical, in `grammar`.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use gump_geometry::Pose;
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, LaneId, LightState, MapGraph};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, LaneId, Light, MapGraph};
 
+use crate::field::SLACK;
+use crate::lights::Lights;
 use crate::{
-    Field, Identities, Key, MAX_LIGHTS, QuantizedState, TokenAgent, TokenFrame, TokenLight,
-    TokenSequence,
+    AGENT_KEYS, Field, GrammarError, Identities, Key, MAX_LIGHTS, QuantizedState, TokenAgent,
+    TokenFrame, TokenSequence,
 };
 
 /// What becomes a token.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TokenizerConfig {
-    /// Agents beyond this along either axis have no tokens, metres (paper: 100).
+    /// An agent farther than this from the scene's origin along either axis has no token in that
+    /// frame; metres, at most the grid's 100. Source: the paper's window of ±100 m.
     pub position_range_m: f64,
-    /// The same for pedestrians, metres (released code: 40; the paper has no such rule).
+    /// The same for pedestrians, metres. The released code has 40, a rule the paper does not have;
+    /// the default is no rule.
     pub pedestrian_range_m: f64,
-    /// Lights whose lane starts within this distance of the centre have tokens, metres (released
-    /// code: 50).
+    /// Most agents of a frame besides the ego, 0..=320, nearest to the scene's origin first.
+    /// Source: the released code has 320 ids.
+    pub max_agents: usize,
+    /// Lights have tokens if their lane starts within this distance of the scene's origin, metres.
+    /// Source: 50 in the released code.
     pub light_radius_m: f64,
+    /// Most lights, 0..=63, nearest first. Source: 64 in the released code, 0 being "no light".
+    pub max_lights: usize,
 }
 
 impl Default for TokenizerConfig {
@@ -27,47 +39,59 @@ impl Default for TokenizerConfig {
         Self {
             position_range_m: 100.0,
             pedestrian_range_m: 100.0,
+            max_agents: *AGENT_KEYS.end() as usize,
             light_radius_m: 50.0,
+            max_lights: MAX_LIGHTS,
         }
     }
 }
 
-/// Turns scenes into [`TokenSequence`]s.
+/// Turns scenes into [`TokenSequence`]s and token frames into frames.
 #[derive(Clone, Debug, Default)]
 pub struct Tokenizer {
     config: TokenizerConfig,
 }
 
-/// A sequence and what could not be said exactly.
+/// A sequence, what its light indices mean, and what could not be said exactly.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Encoded {
-    /// The tokens.
+    /// The tokens, without prompts.
     pub sequence: TokenSequence,
+    /// The lane that each light controls; light index 1 first.
+    pub lights: Vec<LaneId>,
     /// What was lost.
     pub report: EncodeReport,
 }
 
-/// What an encoding lost.
+/// What an encoding lost. An agent-frame is one agent in one frame.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct EncodeReport {
-    /// States per field whose value was beyond the grid.
+    /// Which of the given frames were encoded: the last run that has the ego throughout.
+    pub frames: Range<usize>,
+    /// Values per field that lay outside its range and went to its nearest end.
     pub clamped: BTreeMap<Field, usize>,
-    /// Agent-frames outside the position range.
+    /// Agent-frames left out for being outside the position range.
     pub out_of_range: usize,
-    /// Agent-frames of agents that have no id.
+    /// Agent-frames left out for want of an id, or beyond the most agents of a frame.
     pub over_capacity: usize,
-    /// Lights beyond the 63rd.
+    /// Agent-frames left out because a number of theirs is NaN or infinite.
+    pub not_finite: usize,
+    /// Lights left out beyond the most lights.
     pub lights_over_capacity: usize,
 }
 
 impl Tokenizer {
-    /// A tokenizer.
+    /// A tokenizer that follows `config`.
     pub fn new(config: TokenizerConfig) -> Self {
         Self { config }
     }
 
-    /// Encodes frames half a second apart, oldest first, in the frame of reference
-    /// `world_from_scene`. Frames without the ego are left out from the oldest on.
+    /// What it follows.
+    pub fn config(&self) -> &TokenizerConfig {
+        &self.config
+    }
+
+    /// Encodes frames whose last is the present; see [`Self::encode_around`].
     pub fn encode(
         &self,
         map: &MapGraph,
@@ -76,131 +100,214 @@ impl Tokenizer {
         world_from_scene: Pose,
         identities: &Identities,
     ) -> Encoded {
-        let mut report = EncodeReport::default();
-        let first = frames
-            .iter()
-            .rposition(|frame| frame.agent(ego).is_none())
-            .map_or(0, |i| i + 1);
-        let frames = &frames[first..];
-        let lights = self.light_places(map, frames, world_from_scene, &mut report);
+        let now = frames.len().saturating_sub(1);
+        self.encode_around(map, frames, now, ego, world_from_scene, identities)
+    }
+
+    /// Encodes frames half a second apart, oldest first; `now` is the index of the present one.
+    ///
+    /// The present frame numbers the lights, as the raster of that frame does; lights only other
+    /// frames have come after. Of the frames, those from the last gap in the ego's track on are
+    /// encoded; the ego itself is never left out, its values are clamped and counted instead.
+    /// Agents of [`AgentKind::Other`] are no tokens, an ego of that kind is a vehicle. An agent
+    /// keeps the kind it first has.
+    ///
+    /// # Panics
+    /// If `identities` were not made for this ego.
+    pub fn encode_around(
+        &self,
+        map: &MapGraph,
+        frames: &[&Frame],
+        now: usize,
+        ego: AgentId,
+        world_from_scene: Pose,
+        identities: &Identities,
+    ) -> Encoded {
+        assert_eq!(identities.agent(0), Some(ego), "id 0 is the ego's");
+        let range = last_run(frames, ego);
+        let lights = Lights::number(
+            map,
+            frames,
+            now,
+            world_from_scene,
+            self.config.light_radius_m,
+            self.config.max_lights.min(MAX_LIGHTS),
+        );
+        let frames = &frames[range.clone()];
+        let mut report = EncodeReport {
+            frames: range,
+            lights_over_capacity: lights.n_over,
+            ..EncodeReport::default()
+        };
+        let mut kinds = BTreeMap::new();
         let mut encoded: Vec<TokenFrame> = Vec::with_capacity(frames.len());
         for frame in frames {
-            let mut agents: Vec<TokenAgent> = frame
-                .agents()
-                .iter()
-                .filter_map(|agent| {
-                    self.agent(agent, ego, world_from_scene, identities, &mut report)
-                })
-                .collect();
-            agents.sort_by_key(|agent| agent.key.order());
+            let view = View {
+                ego,
+                world_from_scene,
+                identities,
+            };
+            let agents = self.agents(frame, &view, &mut kinds, &mut report);
             let before = encoded.last();
-            let (tracked, newborn) = agents.into_iter().partition(|agent: &TokenAgent| {
+            let (tracked, newborn) = agents.into_iter().partition(|agent| {
                 before.is_none_or(|before| before.agents().any(|old| old.key == agent.key))
             });
-            let lights = lights.iter().map(|(lane, light)| {
-                let state = frame
-                    .light(*lane)
-                    .map_or(LightState::Unknown, |light| light.state);
-                TokenLight { state, ..*light }
-            });
             encoded.push(TokenFrame {
-                lights: lights.collect(),
+                lights: lights.tokens(frame),
                 tracked,
                 newborn,
             });
         }
-        let sequence =
-            TokenSequence::new(Vec::new(), encoded).expect("the encoder obeys the grammar");
-        Encoded { sequence, report }
+        let sequence = TokenSequence::new(Vec::new(), encoded);
+        Encoded {
+            sequence: sequence.expect("the encoder obeys the grammar"),
+            lights: lights.lanes,
+            report,
+        }
     }
 
-    fn agent(
-        &self,
-        agent: &Agent,
-        ego: AgentId,
-        world_from_scene: Pose,
-        identities: &Identities,
-        report: &mut EncodeReport,
-    ) -> Option<TokenAgent> {
-        if agent.kind == AgentKind::Other && agent.id != ego {
-            return None;
-        }
-        let state = in_scene(agent.state, world_from_scene);
-        let range = match agent.kind {
-            AgentKind::Pedestrian => self.config.pedestrian_range_m,
-            _ => self.config.position_range_m,
-        };
-        if agent.id != ego && state.pose.position.abs().max_element() > range {
-            report.out_of_range += 1;
-            return None;
-        }
-        let Some(id) = identities.key(agent.id) else {
-            report.over_capacity += 1;
-            return None;
-        };
-        // An ego of no predicted kind is treated as the vehicle it most likely is.
-        let kind = if agent.kind == AgentKind::Other {
-            AgentKind::Vehicle
-        } else {
-            agent.kind
-        };
-        let (state, clamped) = QuantizedState::new(&state, agent.length, agent.width);
-        for field in clamped {
-            *report.clamped.entry(field).or_default() += 1;
-        }
-        Some(TokenAgent {
-            key: Key { id, kind },
-            state,
-        })
-    }
-
-    /// Lights of the window by distance of their lane's start, with their fixed index and place.
-    fn light_places(
+    /// The frame that tokens describe: the agents and lights they name and no others.
+    ///
+    /// An agent that `previous` has keeps its kind, size, height and elevation. Any other takes
+    /// kind and size from its tokens (at least half a step, so that a box has an extent) and the
+    /// elevation of the map; its height is not known: 0. Whatever has no token, such as static
+    /// things, is the caller's to carry over.
+    ///
+    /// # Errors
+    /// [`GrammarError::UnknownId`] and [`GrammarError::UnknownLight`] for what `identities` or
+    /// `lights` (as in [`Encoded::lights`]) do not have.
+    pub fn decode(
         &self,
         map: &MapGraph,
-        frames: &[&Frame],
+        frame: &TokenFrame,
+        previous: &Frame,
         world_from_scene: Pose,
+        identities: &Identities,
+        lights: &[LaneId],
+    ) -> Result<Frame, GrammarError> {
+        let agents = frame.agents().map(|token| {
+            let id = identities.agent(token.key.id);
+            let id = id.ok_or(GrammarError::UnknownId(token.key.id))?;
+            let state = in_frame(token.state.to_agent_state(), world_from_scene);
+            let known = previous.agent(id).map(|agent| agent.with_state(state));
+            Ok(known.unwrap_or_else(|| newborn(id, token, state, map)))
+        });
+        let agents = agents.collect::<Result<Vec<_>, _>>()?;
+        let lights = frame.lights.iter().map(|token| {
+            let lane = lights.get(usize::from(token.index).wrapping_sub(1));
+            let lane = *lane.ok_or(GrammarError::UnknownLight(token.index))?;
+            Ok(Light {
+                lane,
+                state: token.state,
+                stop_point: previous.light(lane).and_then(|light| light.stop_point),
+            })
+        });
+        Ok(Frame::new(agents, lights.collect::<Result<Vec<_>, _>>()?))
+    }
+
+    /// The agents of a frame that become tokens, in canonical order.
+    fn agents(
+        &self,
+        frame: &Frame,
+        view: &View<'_>,
+        kinds: &mut BTreeMap<AgentId, AgentKind>,
         report: &mut EncodeReport,
-    ) -> Vec<(LaneId, TokenLight)> {
-        let scene_from_world = world_from_scene.inverse();
-        let mut lanes: Vec<LaneId> = frames
-            .iter()
-            .flat_map(|frame| frame.lights().iter().map(|light| light.lane))
-            .collect();
-        lanes.sort();
-        lanes.dedup();
-        let mut places: Vec<(f64, LaneId, Pose)> = lanes
-            .into_iter()
-            .filter_map(|id| {
-                let start = map.lane(id)?.centerline.pose_at(0.0);
-                let distance = start.position.distance(world_from_scene.position);
-                (distance <= self.config.light_radius_m)
-                    .then(|| (distance, id, scene_from_world * start))
-            })
-            .collect();
-        places.sort_by(|a, b| a.0.total_cmp(&b.0));
-        report.lights_over_capacity += places.len().saturating_sub(MAX_LIGHTS);
-        let numbered = places.into_iter().take(MAX_LIGHTS).enumerate();
-        numbered
-            .map(|(i, (_, lane, pose))| {
-                let light = TokenLight {
-                    index: i as u16 + 1,
-                    x: Field::X.quantize(pose.position.x).bin,
-                    y: Field::Y.quantize(pose.position.y).bin,
-                    heading: Field::Heading.quantize(pose.heading).bin,
-                    state: LightState::Unknown,
-                };
-                (lane, light)
-            })
-            .collect()
+    ) -> Vec<TokenAgent> {
+        let mut agents: Vec<(f64, TokenAgent)> = Vec::new();
+        for agent in frame.agents() {
+            let is_ego = agent.id == view.ego;
+            let kind = match agent.kind {
+                AgentKind::Other if is_ego => AgentKind::Vehicle,
+                AgentKind::Other => continue,
+                moving => moving,
+            };
+            if !is_usable(agent) {
+                report.not_finite += 1;
+                continue;
+            }
+            let state = in_frame(agent.state, view.world_from_scene.inverse());
+            if !is_ego && state.pose.position.abs().max_element() > self.range(kind) {
+                report.out_of_range += 1;
+                continue;
+            }
+            let Some(id) = view.identities.key(agent.id) else {
+                report.over_capacity += 1;
+                continue;
+            };
+            let kind = *kinds.entry(agent.id).or_insert(kind);
+            let (quantized, clamped) = QuantizedState::new(&state, agent.length, agent.width);
+            for field in clamped {
+                *report.clamped.entry(field).or_default() += 1;
+            }
+            let distance = if is_ego {
+                -1.0
+            } else {
+                state.pose.position.length()
+            };
+            let key = Key { id, kind };
+            agents.push((
+                distance,
+                TokenAgent {
+                    key,
+                    state: quantized,
+                },
+            ));
+        }
+        agents.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.key.cmp(&b.1.key)));
+        report.over_capacity += agents.len().saturating_sub(self.config.max_agents + 1);
+        agents.truncate(self.config.max_agents + 1);
+        let mut agents: Vec<TokenAgent> = agents.into_iter().map(|(_, agent)| agent).collect();
+        agents.sort_by_key(|agent| agent.key);
+        agents
+    }
+
+    fn range(&self, kind: AgentKind) -> f64 {
+        // What a token puts on the edge must not fall off it on its way through the world frame.
+        let slack = SLACK * Field::X.step();
+        match kind {
+            AgentKind::Pedestrian => self.config.pedestrian_range_m + slack,
+            _ => self.config.position_range_m + slack,
+        }
     }
 }
 
-/// A world state in the scene frame.
-fn in_scene(state: AgentState, world_from_scene: Pose) -> AgentState {
-    let scene_from_world = world_from_scene.inverse();
+/// Whose view the tokens take.
+struct View<'a> {
+    ego: AgentId,
+    world_from_scene: Pose,
+    identities: &'a Identities,
+}
+
+/// The last run of frames in which the ego is present.
+fn last_run(frames: &[&Frame], ego: AgentId) -> Range<usize> {
+    let has_ego = |frame: &&Frame| frame.agent(ego).is_some_and(is_usable);
+    let end = frames.iter().rposition(has_ego).map_or(0, |last| last + 1);
+    let gap = frames[..end].iter().rposition(|frame| !has_ego(frame));
+    gap.map_or(0, |gap| gap + 1)..end
+}
+
+fn is_usable(agent: &Agent) -> bool {
+    agent.state.is_finite() && agent.length.is_finite() && agent.width.is_finite()
+}
+
+/// A state in another frame of reference.
+fn in_frame(state: AgentState, target_from_source: Pose) -> AgentState {
     AgentState {
-        pose: scene_from_world * state.pose,
-        velocity: scene_from_world.rotate(state.velocity),
+        pose: target_from_source * state.pose,
+        velocity: target_from_source.rotate(state.velocity),
+    }
+}
+
+/// An agent of which only the tokens are known; `state` in the world frame.
+fn newborn(id: AgentId, token: &TokenAgent, state: AgentState, map: &MapGraph) -> Agent {
+    let [.., width, length] = token.state.values();
+    Agent {
+        id,
+        kind: token.key.kind,
+        length: length.max(Field::Length.step() / 2.0),
+        width: width.max(Field::Width.step() / 2.0),
+        height: 0.0,
+        elevation: map.elevation_at(state.pose.position).unwrap_or(0.0),
+        state,
     }
 }

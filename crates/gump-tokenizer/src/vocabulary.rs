@@ -1,4 +1,9 @@
-//! The vocabulary: which token means what (model.md 2.2, the paper's grid).
+//! The vocabulary: which token means what. The tokens of state fields are in [`Field`].
+//!
+//! 1 ego key, 320 agent keys, 4 light states, 2874 field values and 3 marks make 2972 tokens, the
+//! size the GUMP paper states; PAD comes on top. Classes and prompts have tables of their own.
+//!
+//! [`Field`]: crate::Field
 
 use std::ops::RangeInclusive;
 
@@ -10,7 +15,7 @@ pub const EGO_KEY: u32 = 0;
 pub const AGENT_KEYS: RangeInclusive<u32> = 1..=320;
 /// First of the four light states: green, yellow, red, unknown.
 pub const FIRST_LIGHT: u32 = 321;
-/// Begins a frame.
+/// Begins a frame; the paper's BOS.
 pub const BEGIN: u32 = 2969;
 /// Begins the newborn agents of a frame.
 pub const NEWBORN: u32 = 2970;
@@ -20,16 +25,16 @@ pub const LIGHTS_END: u32 = 2971;
 pub const PAD: u32 = 2972;
 /// Tokens without PAD.
 pub const VOCABULARY_SIZE: u32 = 2972;
-/// Rows of a token table.
+/// Rows of a token table, PAD included.
 pub const TABLE_ROWS: u32 = 2973;
 /// Classes of agents, in a table of their own.
-pub const N_CLASSES: usize = 3;
-/// Most lights of a frame.
+pub const N_CLASSES: usize = AgentKind::MOVING.len();
+/// Most lights of a frame; light indices run from 1 to this.
 pub const MAX_LIGHTS: usize = gump_scene::MAX_LIGHTS;
-/// Prompts, in a table of their own: the tags and "none".
+/// Prompts, in a table of their own: the scenario tags, then "none".
 pub const N_PROMPTS: usize = ScenarioTag::COUNT + 1;
 
-/// Row of a kind in the class table.
+/// Row of a kind in the class table: vehicle 0, pedestrian 1, bicycle 2.
 ///
 /// # Panics
 /// For [`AgentKind::Other`], which is drawn but never tokenized.
@@ -41,6 +46,8 @@ pub fn class_index(kind: AgentKind) -> usize {
 }
 
 /// Token of a light's state.
+///
+/// Source: the order of nuPlan's enumeration, which the released code follows.
 pub fn light_token(state: LightState) -> u32 {
     FIRST_LIGHT
         + match state {
