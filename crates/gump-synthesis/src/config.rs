@@ -40,7 +40,7 @@ impl SynthesisConfig {
             warmup_s: 25.0,
             density: 1.0,
             extent_m: 120.0,
-            vehicles: 10..=50,
+            vehicles: 12..=60,
             pedestrians: 0..=14,
             bicycles: 0..=5,
             family: None,

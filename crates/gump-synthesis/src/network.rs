@@ -7,12 +7,13 @@ mod build;
 mod conflict;
 mod furniture;
 mod leg;
+mod lot;
 mod sidewalk;
 mod signal;
 
 pub(crate) use signal::Cycle;
 
-use gump_geometry::DVec2;
+use gump_geometry::{DVec2, Pose};
 use gump_scene::{AreaKind, LaneKind, RoadEdgeKind, RoadLineKind};
 
 use crate::curve::Track;
@@ -36,6 +37,8 @@ pub(crate) struct Network {
     pub(crate) n_walk_nodes: usize,
     /// Middles of parking strips, in the direction of the lane beside them.
     pub(crate) parking: Vec<Track>,
+    /// Places of parking lots, as a car would stand in them.
+    pub(crate) lot_places: Vec<Pose>,
     /// What is only drawn.
     pub(crate) furniture: Furniture,
 }

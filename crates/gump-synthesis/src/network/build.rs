@@ -17,7 +17,7 @@ const COMFORTABLE_BRAKING: f64 = 1.3;
 const STRAIGHT: f64 = 0.62;
 
 impl Network {
-    /// Builds everything in the plan; `rng` decides on light phases.
+    /// Builds everything in the plan; `rng` decides on light phases, turning lanes and parking lots.
     pub(crate) fn new(plan: &Plan, rng: &mut Rng) -> Self {
         let mut network = Self::default();
         let mut legs: Vec<Vec<Leg>> = (0..plan.nodes.len()).map(|n| legs_of(plan, n)).collect();
@@ -39,6 +39,8 @@ impl Network {
         network.furnish(plan, &legs, &trimmed);
         network.lay_walks(plan, &legs, &trimmed);
         network.find_crossings();
+        let n_lots = rng.random_range(0..=4);
+        network.lay_lots(plan, &trimmed, n_lots, rng);
         network
     }
 

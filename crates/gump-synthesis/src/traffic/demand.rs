@@ -269,7 +269,7 @@ impl Traffic<'_> {
             .collect()
     }
 
-    /// Fills parking strips, some of their places.
+    /// Parks vehicles along the curbs and in the lots, in some of the places.
     fn park(&mut self) {
         let fill = self.rng.random_range(0.25..0.95);
         let mut places = Vec::new();
@@ -277,16 +277,21 @@ impl Traffic<'_> {
             let mut s = 10.0;
             while s < strip.length() - 12.0 {
                 if self.rng.random_bool(fill) {
-                    places.push((strip.pose_at(s), strip.curvature_at(s)));
+                    places.push(strip.pose_at(s));
                 }
                 s += self.rng.random_range(6.3..7.2);
+            }
+        }
+        for &place in &self.network.lot_places {
+            if self.rng.random_bool(fill) {
+                places.push(place);
             }
         }
         while places.len() > self.demand.parked {
             let drop = self.rng.random_range(0..places.len());
             places.swap_remove(drop);
         }
-        for (place, _) in places {
+        for place in places {
             let mut size = draw_size(&mut self.rng);
             size[0] = size[0].min(5.6);
             size[1] = size[1].min(2.05);
@@ -317,16 +322,16 @@ impl Traffic<'_> {
 /// Length, width and height of a vehicle, metres: mostly cars, some vans, few trucks and buses.
 fn draw_size(rng: &mut Rng) -> [f64; 3] {
     match rng.random_range(0..100) {
-        0..=83 => {
-            let length = 4.1 + rng.random_range(0.0..0.7) + rng.random_range(0.0..0.75);
+        0..=86 => {
+            let length = 4.0 + rng.random_range(0.0..0.55) + rng.random_range(0.0..0.7);
             [
                 length,
-                rng.random_range(1.78..2.05),
+                rng.random_range(1.75..2.05),
                 rng.random_range(1.4..1.8),
             ]
         }
-        84..=94 => {
-            let length = rng.random_range(5.3..6.4);
+        87..=96 => {
+            let length = rng.random_range(5.2..6.3);
             [
                 length,
                 rng.random_range(1.95..2.2),

@@ -1,0 +1,109 @@
+//! Parking lots beside the road: rows of places at right angles to it.
+
+use gump_geometry::{DVec2, Polygon, Pose, wrap_angle};
+use gump_scene::{AreaKind, Rng};
+use rand::Rng as _;
+
+use crate::curve::Track;
+use crate::network::Network;
+use crate::plan::Plan;
+
+/// From the curb to the near end of the places: sidewalk, strip of green, aisle; metres.
+const SET_BACK: f64 = 7.0;
+/// Depth of a place, metres.
+const DEPTH: f64 = 5.6;
+/// Metres that a lot keeps from everything else.
+const CLEARANCE: f64 = 1.5;
+
+impl Network {
+    /// Lays out up to `n` lots where there is room between the roads.
+    pub(crate) fn lay_lots(&mut self, plan: &Plan, trimmed: &[Track], n: usize, rng: &mut Rng) {
+        let roads: Vec<Polygon> = self
+            .furniture
+            .drivable
+            .iter()
+            .filter_map(|ring| Polygon::new(ring.clone()))
+            .collect();
+        let mut lots: Vec<Polygon> = Vec::new();
+        for _ in 0..3 * n {
+            let road = rng.random_range(0..plan.roads.len());
+            let left = rng.random_bool(0.5);
+            let (r, track) = (&plan.roads[road], &trimmed[road]);
+            let n_places = rng.random_range(5..14);
+            let spacing = rng.random_range(2.7..3.1);
+            let half = spacing * f64::from(n_places) / 2.0;
+            if lots.len() == n || r.freeway || r.ring || track.length() < 2.0 * half + 12.0 {
+                continue;
+            }
+            let s = rng.random_range(half + 4.0..track.length() - half - 4.0);
+            let along = track.pose_at(s);
+            let side = if left { 1.0 } else { -1.0 };
+            // A frame on the curb whose +y points away from the road.
+            let curb = Pose {
+                position: along * DVec2::new(0.0, side * r.half_width(!left)),
+                heading: if left {
+                    along.heading
+                } else {
+                    wrap_angle(along.heading + std::f64::consts::PI)
+                },
+            };
+            let corner = |x: f64, y: f64| curb * DVec2::new(x, y);
+            let far = SET_BACK + DEPTH + 0.5;
+            let ring = vec![
+                corner(-half, 0.4),
+                corner(half, 0.4),
+                corner(half, far),
+                corner(-half, far),
+            ];
+            let places = [
+                corner(-half, SET_BACK - 1.5),
+                corner(half, SET_BACK - 1.5),
+                ring[2],
+                ring[3],
+            ];
+            let Some(ground) = Polygon::new(places.to_vec()) else {
+                continue;
+            };
+            if roads
+                .iter()
+                .chain(&lots)
+                .any(|other| is_near(&ground, other))
+                || self.is_on_walk(&ground)
+            {
+                continue;
+            }
+            for k in 0..n_places {
+                let x = (f64::from(k) + 0.5) * spacing - half;
+                let nose_in = if rng.random_bool(0.8) { 0.5 } else { -0.5 };
+                let heading = wrap_angle(curb.heading + nose_in * std::f64::consts::PI);
+                self.lot_places.push(Pose {
+                    position: corner(x, SET_BACK + DEPTH / 2.0),
+                    heading,
+                });
+            }
+            self.furniture
+                .areas
+                .push((AreaKind::Driveway, ring.clone()));
+            self.furniture.drivable.push(ring);
+            lots.push(ground);
+        }
+    }
+
+    fn is_on_walk(&self, ground: &Polygon) -> bool {
+        self.walks
+            .iter()
+            .flat_map(|walk| walk.track.points())
+            .any(|point| ground.signed_distance(*point) < CLEARANCE)
+    }
+}
+
+/// True if the borders of two polygons come closer than the clearance, or one contains the other.
+fn is_near(a: &Polygon, b: &Polygon) -> bool {
+    let close = |a: &Polygon, b: &Polygon| {
+        a.edges().any(|(from, to)| {
+            let n = (from.distance(to) / 2.0).ceil().max(1.0) as usize;
+            (0..=n).any(|i| b.signed_distance(from.lerp(to, i as f64 / n as f64)) < CLEARANCE)
+        })
+    };
+    close(a, b) || close(b, a)
+}
