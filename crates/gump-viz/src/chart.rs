@@ -1,6 +1,7 @@
 //! Line charts as SVG, in colours that can be read on light and dark ground alike.
 
 use plotters::coord::Shift;
+use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 
@@ -67,12 +68,16 @@ impl Chart {
         let mut svg = String::new();
         {
             let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-            let (x, y) = (x.0..x.1, y.0..y.1);
+            let logarithmic = |(low, high): (f64, f64)| {
+                (low..high)
+                    .log_scale()
+                    .with_key_points(log_ticks(low, high))
+            };
             match (self.log_x, self.log_y) {
-                (false, false) => self.draw(&root, x, y, &series),
-                (true, false) => self.draw(&root, x.log_scale(), y, &series),
-                (false, true) => self.draw(&root, x, y.log_scale(), &series),
-                (true, true) => self.draw(&root, x.log_scale(), y.log_scale(), &series),
+                (false, false) => self.draw(&root, x.0..x.1, y.0..y.1, &series),
+                (true, false) => self.draw(&root, logarithmic(x), y.0..y.1, &series),
+                (false, true) => self.draw(&root, x.0..x.1, logarithmic(y), &series),
+                (true, true) => self.draw(&root, logarithmic(x), logarithmic(y), &series),
             }
             .and_then(|()| root.present())
             .map_err(|error| VizError::Chart {
@@ -98,15 +103,20 @@ impl Chart {
         X::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
         Y::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
     {
-        let font = |size: u32| ("system-ui, sans-serif", size).into_font().color(&TEXT);
+        // The backend writes 1/1.24 of the size it is given.
+        let font = |px: f64| {
+            ("system-ui, sans-serif", px * 1.24)
+                .into_font()
+                .color(&TEXT)
+        };
         let mut builder = ChartBuilder::on(root);
         builder
             .margin(12)
             .margin_right(24)
-            .x_label_area_size(46)
-            .y_label_area_size(64);
+            .x_label_area_size(52)
+            .y_label_area_size(72);
         if !self.title.is_empty() {
-            builder.caption(&self.title, font(17));
+            builder.caption(&self.title, font(16.0));
         }
         let mut chart = builder.build_cartesian_2d(x, y)?;
         chart
@@ -117,8 +127,8 @@ impl Chart {
             .y_labels(6)
             .x_label_formatter(&|v| tick(*v))
             .y_label_formatter(&|v| tick(*v))
-            .label_style(font(13))
-            .axis_desc_style(font(14))
+            .label_style(font(13.0))
+            .axis_desc_style(font(13.5))
             .axis_style(TEXT.mix(0.45))
             .bold_line_style(TEXT.mix(0.12))
             .light_line_style(TEXT.mix(0.0))
@@ -140,7 +150,7 @@ impl Chart {
             chart
                 .configure_series_labels()
                 .position(SeriesLabelPosition::UpperRight)
-                .label_font(font(13))
+                .label_font(font(13.0))
                 .margin(8)
                 .draw()?;
         }
@@ -167,13 +177,35 @@ fn range(values: impl Iterator<Item = f64>, is_log: bool, share: f64) -> Option<
     Some((from(low - margin), from(high + margin)))
 }
 
+/// At least three numbers between two positive ones, as round as that allows.
+fn log_ticks(low: f64, high: f64) -> Vec<f64> {
+    let decades = low.log10().floor() as i32..=high.log10().ceil() as i32;
+    let rounds: [&[f64]; 3] = [
+        &[1.0],
+        &[1.0, 2.0, 5.0],
+        &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0],
+    ];
+    for digits in rounds {
+        let all = decades
+            .clone()
+            .flat_map(|decade| digits.iter().map(move |d| d * 10f64.powi(decade)));
+        let ticks: Vec<f64> = all.filter(|tick| (low..=high).contains(tick)).collect();
+        if ticks.len() >= 3 {
+            return ticks;
+        }
+    }
+    (0..4)
+        .map(|i| low + (high - low) * f64::from(i) / 3.0)
+        .collect()
+}
+
 /// A number as short as it can be without lying: `0.25`, `1500`, `2M`, `3e-5`.
 fn tick(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 || size < 1e-12 {
         return "0".into();
     }
-    if size >= 1e6 && size < 1e12 {
+    if (1e6..1e12).contains(&size) {
         let (unit, name) = if size >= 1e9 { (1e9, "G") } else { (1e6, "M") };
         return format!("{}{name}", trimmed(value / unit));
     }
@@ -251,6 +283,14 @@ mod tests {
         chart.series.truncate(1);
         chart.series[0].points = vec![(3.0, 0.5)];
         assert!(chart.to_svg().unwrap().contains("<circle"));
+    }
+
+    #[test]
+    fn logarithmic_ticks_are_round() {
+        assert_eq!(log_ticks(1e3, 1e8), [1e3, 1e4, 1e5, 1e6, 1e7, 1e8]);
+        assert_eq!(log_ticks(1.2, 30.0), [2.0, 5.0, 10.0, 20.0]);
+        assert_eq!(log_ticks(1.2, 3.0), [1.5, 2.0, 3.0]);
+        assert_eq!(log_ticks(1.0, 1.3).len(), 4);
     }
 
     #[test]

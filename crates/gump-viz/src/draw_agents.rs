@@ -2,7 +2,7 @@
 //!
 //! Shapes of one colour are gathered into one path each, which keeps films fast.
 
-use gump_geometry::{DVec2, Pose, dvec2};
+use gump_geometry::{DVec2, OrientedBox, Pose, dvec2};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, MapGraph};
 
 use crate::pen::{Pen, Shape};
@@ -18,6 +18,10 @@ const KINDS: [AgentKind; 4] = [
 
 /// Boxes smaller than this are drawn as discs, pixels.
 const SMALLEST_BOX: f32 = 4.0;
+
+/// Boxes narrower than this have neither border nor round corners, pixels: nobody would see them,
+/// and they are half the cost of a film.
+const FINE: f32 = 5.0;
 
 /// Draws the agents of a frame, the ego last and set off, with an opacity in [0, 1].
 pub(crate) fn draw_agents(
@@ -35,18 +39,18 @@ pub(crate) fn draw_agents(
     draw_ego(pen, frame, ego, colours, opacity);
 }
 
-/// Draws the ego alone.
-pub(crate) fn draw_ego(
-    pen: &mut Pen<'_>,
-    frame: &Frame,
-    ego: AgentId,
-    colours: &Colours,
-    opacity: f32,
-) {
+/// Draws the ego with a halo.
+fn draw_ego(pen: &mut Pen<'_>, frame: &Frame, ego: AgentId, colours: &Colours, opacity: f32) {
     let Some(ego) = frame.agent(ego) else { return };
     let mut halo = Shape::new(&pen.camera);
-    halo.disc(ego.state.pose.position, pen.px(ego.length * 0.85, 7.0));
-    pen.fill(halo, colours.ego, 0.22 * opacity);
+    let margin = f64::from(pen.px(1.1, 2.5)) / pen.camera.scale();
+    let around = OrientedBox {
+        length: ego.length + 2.0 * margin,
+        width: ego.width + 2.0 * margin,
+        ..ego.oriented_box()
+    };
+    halo.rounded(&around.corners(), f64::from(pen.px(margin * 1.4, 3.0)));
+    pen.fill(halo, colours.ego, 0.3 * opacity);
     draw_boxes(pen, &[ego], colours.ego, colours, opacity);
 }
 
@@ -57,23 +61,33 @@ fn draw_boxes(pen: &mut Pen<'_>, agents: &[&Agent], colour: Rgb, colours: &Colou
     for agent in agents {
         let pose = agent.state.pose;
         let (length, width) = (pen.px(agent.length, 0.0), pen.px(agent.width, 0.0));
-        if length.max(width) < SMALLEST_BOX {
-            bodies.disc(pose.position, SMALLEST_BOX / 2.0);
-            borders.disc(pose.position, SMALLEST_BOX / 2.0);
+        if agent.kind == AgentKind::Pedestrian || length.max(width) < SMALLEST_BOX {
+            let radius = (length.min(width) / 2.0).max(SMALLEST_BOX / 2.0);
+            bodies.disc(pose.position, radius);
+            if radius >= FINE / 2.0 {
+                borders.disc(pose.position, radius);
+            }
             continue;
         }
         let corners = agent.oriented_box().corners();
-        let radius = f64::from(length.min(width)) * 0.22;
-        bodies.rounded(&corners, radius);
-        borders.rounded(&corners, radius);
-        if length > 9.0 && width > 3.5 && agent.kind != AgentKind::Other {
+        if width < FINE {
+            bodies.ring(corners);
+        } else {
+            let radius = f64::from(length.min(width)) * 0.22;
+            bodies.rounded(&corners, radius);
+            borders.rounded(&corners, radius);
+        }
+        if length > 12.0 && width > 6.0 && agent.kind != AgentKind::Other {
             wedges.ring(wedge(pose, agent.length, agent.width));
         }
     }
     pen.fill(bodies, colour, opacity);
-    pen.fill(wedges, colours.wedge, 0.85 * opacity);
-    let width = pen.px(0.12, 0.6).min(1.5);
-    pen.stroke(borders, colours.outline, 0.8 * opacity, width);
+    // Ghosts of many futures are a cloud; details of each would only be noise.
+    if opacity > 0.5 {
+        pen.fill(wedges, colours.wedge, 0.85 * opacity);
+        let width = pen.px(0.12, 0.6).min(1.5);
+        pen.stroke(borders, colours.outline, 0.8 * opacity, width);
+    }
 }
 
 /// A triangle at the front of a box that points where it heads.
@@ -88,23 +102,22 @@ fn wedge(pose: Pose, length: f64, width: f64) -> [DVec2; 3] {
     .map(|point| pose * point)
 }
 
-/// Draws where agents have been, fading with age; `frames` are oldest first and end now.
+/// Draws where agents have been, fading with age in `n_fades` steps; `frames` are oldest first and
+/// end now.
 pub(crate) fn draw_past(
     pen: &mut Pen<'_>,
     frames: &[Frame],
     ego: AgentId,
     colours: &Colours,
-    opacity: f32,
+    n_fades: usize,
 ) {
-    /// Steps in which a trail fades.
-    const FADES: usize = 6;
-    let n = frames.len();
-    for step in 0..FADES {
-        let (from, to) = (step * (n - 1) / FADES, (step + 1) * (n - 1) / FADES);
-        let strength = (step + 1) as f32 / FADES as f32;
-        draw_trails(pen, &frames[from..=to], ego, colours, |_| {
-            0.6 * strength * opacity
-        });
+    let last = frames.len().saturating_sub(1);
+    for step in 0..n_fades {
+        let (from, to) = (step * last / n_fades, (step + 1) * last / n_fades);
+        let opacity = 0.6 * (step + 1) as f32 / n_fades as f32;
+        if from < to {
+            draw_trails(pen, &frames[from..=to], ego, colours, |_| opacity);
+        }
     }
 }
 
@@ -161,16 +174,16 @@ fn draw_trails<F: std::borrow::Borrow<Frame>>(
             shapes[i].line(line);
         }
     }
-    let width = pen.px(0.35, 1.2).min(3.0);
+    let width = pen.px(0.35, 1.0).min(3.0);
     for (shape, kind) in shapes.into_iter().zip(KINDS) {
-        pen.stroke(shape, colours.kind(kind), opacity(false), width);
+        pen.trail(shape, colours.kind(kind), opacity(false), width);
     }
-    pen.stroke(of_ego, colours.ego, opacity(true), width * 1.4);
+    pen.trail(of_ego, colours.ego, opacity(true), width * 1.3);
 }
 
 /// Draws each light as a dot where vehicles stop for it.
 pub(crate) fn draw_lights(pen: &mut Pen<'_>, frame: &Frame, map: &MapGraph, colours: &Colours) {
-    let radius = pen.px(0.75, 2.6).min(9.0);
+    let radius = pen.px(0.55, 1.5).min(8.0);
     for light in frame.lights() {
         let start = || map.lane(light.lane).map(|lane| lane.centerline.points()[0]);
         let Some(at) = light.stop_point.or_else(start) else {

@@ -14,8 +14,8 @@ use crate::draw_agents::{draw_agents, draw_lights, draw_past};
 use crate::draw_map::draw_backdrop;
 use crate::files::write_whole;
 use crate::indexed::{Palette, UNCHANGED};
-use crate::pen::{Pen, paint};
-use crate::picture::{draw_label, recent};
+use crate::pen::Pen;
+use crate::picture::{draw_label, draw_rectangle, recent};
 use crate::theme::{Colours, mix};
 use crate::{Camera, Theme, VizError, lettering};
 
@@ -32,7 +32,7 @@ pub struct FilmSpec {
     pub frame_s: f64,
     /// Seconds of traffic per second of film, > 0.
     pub speed: f64,
-    /// How far trails reach back, seconds; 0 for none.
+    /// How far trails reach back, seconds; 0 for none. Overlays have none.
     pub past_s: f64,
 }
 
@@ -269,8 +269,10 @@ fn draw_panel(
         if i == 0 {
             draw_lights(&mut pen, scene.now(), scene.map, colours);
         }
-        let past = recent(scene.history, spec.past_s, scene.dt);
-        draw_past(&mut pen, past, scene.ego, colours, panel.opacity);
+        if panel.rollouts.len() == 1 {
+            let past = recent(scene.history, spec.past_s, scene.dt);
+            draw_past(&mut pen, past, scene.ego, colours, 3);
+        }
         draw_agents(&mut pen, scene.now(), scene.ego, colours, panel.opacity);
     }
     draw_label(pixmap, panel.label, colours);
@@ -283,18 +285,15 @@ fn draw_footer(width: usize, time: f64, duration: f64, colours: &Colours) -> Opt
     pixmap.fill(tiny_skia::Color::from_rgba8(r, g, b, 0xFF));
     let label = format!("{time:.1} s");
     lettering::write(&mut pixmap, &label, (8.0, 16.0), 8.0, colours.text);
-    let left = 16.0 + lettering::width("88.8 s", 8.0) as f32;
-    let track = width as f32 - left - 10.0;
+    let left = 16.0 + lettering::width("88.8 s", 8.0);
+    let track = width as f64 - left - 10.0;
     let share = if duration > 0.0 {
-        (time / duration).min(1.0) as f32
+        (time / duration).min(1.0)
     } else {
         1.0
     };
     for (length, colour) in [(track, colours.direction), (track * share, colours.ego)] {
-        if let Some(bar) = tiny_skia::Rect::from_xywh(left, 11.0, length, 3.0) {
-            let identity = tiny_skia::Transform::identity();
-            pixmap.fill_rect(bar, &paint(colour, 1.0), identity, None);
-        }
+        draw_rectangle(&mut pixmap, (left, 11.0), (length, 3.0), colour, 1.0);
     }
     Some(pixmap)
 }
@@ -331,5 +330,31 @@ fn difference(shown: Option<&[u8]>, canvas: &[u8], width: usize) -> GifFrame<'st
         dispose: DisposalMethod::Keep,
         buffer: buffer.into(),
         ..GifFrame::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_holds_only_what_changed() {
+        let shown = [1, 2, 3, 4, 5, 6];
+        let first = difference(None, &shown, 3);
+        assert_eq!(
+            (first.width, first.height, &first.buffer[..]),
+            (3, 2, &shown[..])
+        );
+        let still = difference(Some(&shown), &shown, 3);
+        assert_eq!(
+            (still.width, still.height, &still.buffer[..]),
+            (1, 1, &[UNCHANGED][..])
+        );
+        let moved = difference(Some(&shown), &[1, 9, 3, 4, 5, 8], 3);
+        assert_eq!(
+            (moved.left, moved.top, moved.width, moved.height),
+            (1, 0, 2, 2)
+        );
+        assert_eq!(moved.buffer[..], [9, UNCHANGED, UNCHANGED, 8]);
     }
 }

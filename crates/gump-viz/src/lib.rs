@@ -43,6 +43,9 @@ mod pen;
 mod picture;
 mod theme;
 
+#[cfg(test)]
+mod tests;
+
 pub use camera::Camera;
 pub use chart::{Chart, Series};
 pub use error::VizError;

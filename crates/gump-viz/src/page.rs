@@ -222,7 +222,9 @@ impl Section {
     /// # Errors
     /// As [`Chart::to_svg`].
     pub fn chart(&mut self, chart: &Chart, caption: &str) -> Result<&mut Self, VizError> {
+        // Inside HTML the namespace is known, and nothing here looks like an address.
         let svg = chart.to_svg()?;
+        let svg = svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1);
         Ok(self.add(format_args!("{}", figure(&svg, caption))))
     }
 

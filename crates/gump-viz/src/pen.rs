@@ -66,13 +66,32 @@ impl<'a> Pen<'a> {
 
     /// Strokes a path.
     pub(crate) fn stroke(&mut self, path: Shape, colour: Rgb, opacity: f32, width_px: f32) {
-        self.stroke_path(path.finish(), colour, opacity, width_px, None);
+        self.stroke_path(
+            path.finish(),
+            colour,
+            opacity,
+            width_px,
+            LineCap::Round,
+            None,
+        );
+    }
+
+    /// Strokes a path with blunt ends, so that translucent pieces can follow one another.
+    pub(crate) fn trail(&mut self, path: Shape, colour: Rgb, opacity: f32, width_px: f32) {
+        self.stroke_path(
+            path.finish(),
+            colour,
+            opacity,
+            width_px,
+            LineCap::Butt,
+            None,
+        );
     }
 
     /// Strokes a path with dashes and gaps of these lengths, pixels.
     pub(crate) fn dash(&mut self, path: Shape, colour: Rgb, width_px: f32, dash: [f32; 2]) {
         let dash = StrokeDash::new(dash.to_vec(), 0.0);
-        self.stroke_path(path.finish(), colour, 1.0, width_px, dash);
+        self.stroke_path(path.finish(), colour, 1.0, width_px, LineCap::Butt, dash);
     }
 
     fn stroke_path(
@@ -81,15 +100,12 @@ impl<'a> Pen<'a> {
         colour: Rgb,
         opacity: f32,
         width: f32,
+        line_cap: LineCap,
         dash: Option<StrokeDash>,
     ) {
         let stroke = Stroke {
             width,
-            line_cap: if dash.is_some() {
-                LineCap::Butt
-            } else {
-                LineCap::Round
-            },
+            line_cap,
             line_join: LineJoin::Round,
             dash,
             ..Stroke::default()

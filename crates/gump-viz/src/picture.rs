@@ -90,7 +90,7 @@ pub fn draw_futures(scene: &SceneState<'_>, futures: &[&[Frame]], spec: &Picture
     draw_lights(&mut pen, scene.now(), scene.map, colours);
     draw_trails_of_futures(&mut pen, scene.now(), futures, scene.ego, colours);
     let past = recent(scene.history, spec.past_s, scene.dt);
-    draw_past(&mut pen, past, scene.ego, colours, 1.0);
+    draw_past(&mut pen, past, scene.ego, colours, 8);
     draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
     if spec.scale_bar {
         draw_scale_bar(&mut pixmap, spec.camera.scale(), colours);
@@ -150,9 +150,16 @@ impl Picture {
     /// The bytes of a PNG file.
     ///
     /// # Errors
-    /// [`VizError::Png`] if the picture is empty or its size does not match its pixels.
+    /// [`VizError::Size`] if the picture is empty or its size does not match its pixels;
+    /// [`VizError::Png`] if the encoder refuses.
     pub fn to_png(&self) -> Result<Vec<u8>, VizError> {
-        let (Ok(width), Ok(height)) = (u32::try_from(self.width), u32::try_from(self.height))
+        let matches = self
+            .width
+            .checked_mul(self.height)
+            .and_then(|n| n.checked_mul(4))
+            == Some(self.rgba.len());
+        let size = (u32::try_from(self.width), u32::try_from(self.height));
+        let (Ok(width), Ok(height), true) = (size.0, size.1, matches && !self.rgba.is_empty())
         else {
             let (width, height) = (self.width, self.height);
             return Err(VizError::Size { width, height });
@@ -189,27 +196,32 @@ pub(crate) fn recent(history: &[Frame], seconds: f64, dt: f64) -> &[Frame] {
 fn draw_scale_bar(pixmap: &mut Pixmap, scale: f64, colours: &Colours) {
     let width = f64::from(pixmap.width());
     let metres = round_length(width / 6.0 / scale);
+    let label = format!("{metres} m");
     let size = (width / 60.0).clamp(6.0, 11.0);
     let (left, bottom) = (size * 1.2, f64::from(pixmap.height()) - size * 1.2);
-    let right = left + metres * scale;
-    let bar = (size / 5.0).max(1.5) as f32;
-    let mut rectangle = |x: f64, y: f64, w: f64, h: f64| {
-        if let Some(r) = tiny_skia::Rect::from_xywh(x as f32, y as f32, w as f32, h as f32) {
-            let ink = paint(colours.text, 1.0);
-            pixmap.fill_rect(r, &ink, Transform::identity(), None);
-        }
-    };
-    let thick = f64::from(bar);
-    rectangle(left, bottom - thick, right - left, thick);
-    rectangle(left, bottom - size * 0.6, thick * 0.7, size * 0.6);
-    rectangle(
-        right - thick * 0.7,
-        bottom - size * 0.6,
-        thick * 0.7,
-        size * 0.6,
+    let (length, thick) = (metres * scale, (size / 5.0).max(1.5));
+    let words = left + length + size * 0.7;
+    let right = words + lettering::width(&label, size) + size;
+    draw_patch(
+        pixmap,
+        (0.0, bottom - size * 1.9),
+        (right, size * 4.0),
+        colours,
     );
-    let place = (right + size * 0.7, bottom);
-    lettering::write(pixmap, &format!("{metres} m"), place, size, colours.text);
+    let tick = size * 0.6;
+    for (x, y, w, h) in [
+        (left, bottom - thick, length, thick),
+        (left, bottom - tick, thick * 0.7, tick),
+        (
+            left + length - thick * 0.7,
+            bottom - tick,
+            thick * 0.7,
+            tick,
+        ),
+    ] {
+        draw_rectangle(pixmap, (x, y), (w, h), colours.text, 1.0);
+    }
+    lettering::write(pixmap, &label, (words, bottom), size, colours.text);
 }
 
 /// The largest of 1, 2, 5, 10, 20, ... that does not exceed `metres`.
@@ -230,29 +242,44 @@ fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
     let size = (f64::from(pixmap.width()) / 60.0).clamp(6.0, 11.0);
     let advance = |text: &str| lettering::width(text, size) + size * 3.0;
     let total: f64 = entries.iter().map(|(text, _)| advance(text)).sum();
-    let mut x = f64::from(pixmap.width()) - total;
-    let baseline = f64::from(pixmap.height()) - size * 1.2;
+    let (right, bottom) = (f64::from(pixmap.width()), f64::from(pixmap.height()));
+    let (mut x, baseline) = (right - total, bottom - size * 1.2);
+    let patch = (total + size, size * 4.0);
+    draw_patch(pixmap, (x - size, baseline - size * 1.9), patch, colours);
     for (text, colour) in entries {
-        let (left, top, side) = (x as f32, (baseline - size) as f32, size as f32);
-        if let Some(square) = tiny_skia::Rect::from_xywh(left, top, side, side) {
-            let ink = paint(colour, 1.0);
-            pixmap.fill_rect(square, &ink, Transform::identity(), None);
-        }
+        draw_rectangle(pixmap, (x, baseline - size), (size, size), colour, 1.0);
         lettering::write(pixmap, text, (x + size * 1.5, baseline), size, colours.text);
         x += advance(text);
     }
 }
 
-/// Words in the top left corner, on a patch of ground so that they can be read over anything.
+/// Words in the top left corner.
 pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
     if label.is_empty() {
         return;
     }
     let size = (f64::from(pixmap.width()) / 50.0).clamp(6.0, 12.0);
-    let (w, h) = (lettering::width(label, size) + size * 1.4, size * 2.4);
-    if let Some(patch) = tiny_skia::Rect::from_xywh(0.0, 0.0, w as f32, h as f32) {
-        let ink = paint(colours.ground, 0.8);
-        pixmap.fill_rect(patch, &ink, Transform::identity(), None);
-    }
+    let patch = (lettering::width(label, size) + size * 1.4, size * 2.4);
+    draw_patch(pixmap, (0.0, 0.0), patch, colours);
     lettering::write(pixmap, label, (size * 0.7, size * 1.7), size, colours.text);
+}
+
+/// A piece of ground under words, so that they can be read over anything.
+fn draw_patch(pixmap: &mut Pixmap, corner: (f64, f64), size: (f64, f64), colours: &Colours) {
+    draw_rectangle(pixmap, corner, size, colours.ground, 0.8);
+}
+
+/// Fills a rectangle given by its top left corner and size in pixels.
+pub(crate) fn draw_rectangle(
+    pixmap: &mut Pixmap,
+    (x, y): (f64, f64),
+    (width, height): (f64, f64),
+    colour: Rgb,
+    opacity: f32,
+) {
+    let [x, y, width, height] = [x, y, width, height].map(|v| v as f32);
+    if let Some(rectangle) = tiny_skia::Rect::from_xywh(x, y, width, height) {
+        let ink = paint(colour, opacity);
+        pixmap.fill_rect(rectangle, &ink, Transform::identity(), None);
+    }
 }
