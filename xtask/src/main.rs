@@ -1,2 +1,34 @@
-//! The driver.
-fn main() {}
+//! The driver: `cargo xtask <verb>`.
+//!
+//! One file per verb under `verbs/`, each a thin layer over the crates: it reads its arguments,
+//! shows progress, calls crates and fills a report. What every verb shares is in [`run`] (output
+//! folder, seed, threads, phases), [`report`] (`report.json` and the table on the terminal),
+//! [`config`] (TOML files as flags) and [`progress`]. Start with [`cli`].
+#![allow(
+    clippy::disallowed_methods,
+    reason = "the driver measures phases and stamps reports; layers 0-3 may not"
+)]
+
+mod checks;
+mod cli;
+mod config;
+mod machine;
+mod progress;
+mod report;
+mod run;
+mod table;
+mod verbs;
+
+use std::process::ExitCode;
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() -> ExitCode {
+    run::catch_interrupts();
+    let arguments = std::env::args_os().collect();
+    match cli::parse(arguments).and_then(cli::Cli::execute) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => cli::explain(&error),
+    }
+}

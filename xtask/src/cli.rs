@@ -1,0 +1,101 @@
+//! From the command line to a verb, and from an error to an exit status.
+//!
+//! The words are a contract with the scripts of users. A verb is offered once it works, not before.
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use clap::{CommandFactory, Parser, Subcommand};
+
+use crate::config;
+use crate::run::Run;
+use crate::verbs::{ci, data, tidy};
+
+/// The generative world model for driving: every pipeline as a verb.
+#[derive(Debug, Parser)]
+#[command(
+    name = "cargo xtask",
+    bin_name = "cargo xtask",
+    args_override_self = true
+)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Look into scenario files, check them, make new ones.
+    #[command(subcommand)]
+    Data(data::Verb),
+    /// Everything CI runs: format, lints, tests, docs, layers, house rules.
+    Ci(ci::Args),
+    /// Check the house rules of the repository.
+    Tidy(tidy::Args),
+}
+
+/// The arguments are wrong: exit status 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct WrongArguments(pub(crate) String);
+
+/// Parses the command line, after a `--config` file has been turned into flags before it.
+///
+/// Error: clap's own, or [`WrongArguments`] for a config file that does not fit the verb.
+pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Cli> {
+    let arguments = config::splice(&Cli::command(), arguments)?;
+    Ok(Cli::try_parse_from(arguments)?)
+}
+
+impl Cli {
+    /// Does what was asked.
+    pub(crate) fn execute(self) -> anyhow::Result<()> {
+        match self.verb {
+            Verb::Data(data::Verb::Inspect(args)) => {
+                Run::of("data inspect", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Data(data::Verb::Verify(args)) => {
+                Run::of("data verify", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Data(data::Verb::Synthesize(args)) => {
+                Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
+            Verb::Tidy(args) => {
+                Run::of("tidy", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+        }
+    }
+}
+
+/// Prints an error as one sentence and chooses the exit status.
+pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
+    if let Some(error) = error.downcast_ref::<clap::Error>() {
+        // Help and version are "errors" with status 0 that belong on stdout; clap knows.
+        let printed = error.print();
+        return if printed.is_ok() && !error.use_stderr() {
+            ExitCode::SUCCESS
+        } else {
+            ExitCode::from(2)
+        };
+    }
+    eprintln!("error: {error:#}");
+    ExitCode::from(if error.is::<WrongArguments>() { 2 } else { 1 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn a_verb_that_does_not_exist_is_refused() {
+        let arguments = ["xtask", "fly"].map(OsString::from).to_vec();
+        let error = parse(arguments).unwrap_err();
+        assert!(error.is::<clap::Error>(), "{error}");
+    }
+}

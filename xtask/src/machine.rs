@@ -1,0 +1,104 @@
+//! What the work ran on, and how much memory it took.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde::Serialize;
+
+/// The machine as a report names it.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct Machine {
+    /// Model name of the processor; "unknown" where the system does not tell.
+    pub(crate) cpu: String,
+    /// Threads the system grants this process.
+    pub(crate) cores: usize,
+    /// Main memory, GB; null where the system does not tell.
+    pub(crate) memory_gb: Option<f64>,
+    /// Where tensors live.
+    pub(crate) device: String,
+    /// Operating system and architecture.
+    pub(crate) system: String,
+}
+
+impl Machine {
+    /// Asks the system.
+    pub(crate) fn here(device: &str) -> Self {
+        let kib = field("/proc/meminfo", "MemTotal").and_then(|text| kibibytes(&text));
+        Self {
+            cpu: field("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".into()),
+            cores: cores(),
+            memory_gb: kib.map(|kib| (kib * 1024.0 / 1e8).round() / 10.0),
+            device: device.into(),
+            system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+        }
+    }
+}
+
+/// Threads the system grants this process, at least 1.
+pub(crate) fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}
+
+/// The most main memory this process has held, MB; `None` where the system does not tell.
+pub(crate) fn peak_rss_mb() -> Option<f64> {
+    let kib = kibibytes(&field("/proc/self/status", "VmHWM")?)?;
+    Some((kib * 1024.0 / 1e5).round() / 10.0)
+}
+
+/// The commit the checkout is at, with `-modified` if files differ from it; "unknown" without git.
+pub(crate) fn commit() -> String {
+    let git = |arguments: &[&str]| {
+        let output = Command::new("git")
+            .arg("-C")
+            .arg(repository())
+            .args(arguments)
+            .output()
+            .ok()?;
+        let text = String::from_utf8(output.stdout).ok()?;
+        output.status.success().then(|| text.trim().to_owned())
+    };
+    let Some(commit) = git(&["rev-parse", "HEAD"]) else {
+        return "unknown".into();
+    };
+    match git(&["status", "--porcelain", "--untracked-files=no"]) {
+        Some(changes) if !changes.is_empty() => format!("{commit}-modified"),
+        _ => commit,
+    }
+}
+
+/// The root of the checkout this driver belongs to.
+pub(crate) fn repository() -> PathBuf {
+    let manifest = std::env::var_os("CARGO_MANIFEST_DIR")
+        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")), PathBuf::from);
+    manifest.parent().unwrap_or(Path::new(".")).to_owned()
+}
+
+/// The first `name: value` of a proc file.
+fn field(path: &str, name: &str) -> Option<String> {
+    let text = std::fs::read_to_string(path).ok()?;
+    text.lines()
+        .filter_map(|line| line.split_once(':'))
+        .find(|(key, _)| key.trim() == name)
+        .map(|(_, value)| value.trim().to_owned())
+}
+
+fn kibibytes(text: &str) -> Option<f64> {
+    text.strip_suffix("kB")?.trim().parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn linux_tells_memory() {
+        assert!(peak_rss_mb().unwrap() > 0.5);
+        assert!(Machine::here("cpu").memory_gb.unwrap() > 0.1);
+    }
+
+    #[test]
+    fn the_repository_holds_this_file() {
+        assert!(repository().join("xtask/src/machine.rs").is_file());
+    }
+}

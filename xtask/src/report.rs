@@ -1,0 +1,89 @@
+//! `report.json`: what was asked, on what machine, how long it took, what came out.
+
+use std::io::Write as _;
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use crate::machine::{self, Machine};
+use crate::table;
+
+/// The report of one run, in the order in which it is written.
+#[derive(Debug, Serialize)]
+pub(crate) struct Report {
+    /// The verb, for instance "data inspect".
+    pub(crate) verb: String,
+    /// The command line as given.
+    pub(crate) args: Vec<String>,
+    /// Commit of the checkout.
+    pub(crate) commit: String,
+    /// Where all randomness comes from.
+    pub(crate) seed: u64,
+    /// Every setting with the value it had, wherever it came from.
+    pub(crate) config: Value,
+    /// What it ran on.
+    pub(crate) machine: Machine,
+    /// Wall seconds per phase in order, then the total.
+    pub(crate) seconds: Map<String, Value>,
+    /// The most main memory held, MB; null where the system does not tell.
+    pub(crate) peak_rss_mb: Option<f64>,
+    /// What came out; the same for the same seed and machine, clocks aside.
+    pub(crate) results: Map<String, Value>,
+    /// The sentence it failed with.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) error: Option<String>,
+}
+
+impl Report {
+    /// An empty report on this machine and command line.
+    pub(crate) fn begin(verb: &str, seed: u64, config: Value, device: &str) -> Self {
+        let args = std::env::args_os().skip(1);
+        Self {
+            verb: verb.into(),
+            args: args
+                .map(|word| word.to_string_lossy().into_owned())
+                .collect(),
+            commit: machine::commit(),
+            seed,
+            config,
+            machine: Machine::here(device),
+            seconds: Map::new(),
+            peak_rss_mb: None,
+            results: Map::new(),
+            error: None,
+        }
+    }
+
+    /// Adds seconds to a phase.
+    pub(crate) fn add_seconds(&mut self, phase: &str, elapsed: Duration) {
+        let before = self.seconds.get(phase).and_then(Value::as_f64);
+        let seconds = before.unwrap_or(0.0) + elapsed.as_secs_f64();
+        self.seconds
+            .insert(phase.into(), ((seconds * 1e4).round() / 1e4).into());
+    }
+
+    /// Writes it as `path`, whole or not at all.
+    pub(crate) fn write(&mut self, path: &Path) -> anyhow::Result<()> {
+        self.peak_rss_mb = machine::peak_rss_mb();
+        let mut text = serde_json::to_string_pretty(self)?;
+        text.push('\n');
+        gump_data::write_atomically(path, |file| {
+            file.write_all(text.as_bytes())
+                .with_context(|| format!("cannot write {}", path.display()))
+        })
+    }
+
+    /// The results and times as the terminal shows them.
+    pub(crate) fn text(&self) -> String {
+        let results = table::text(&Value::Object(self.results.clone()));
+        let seconds = self.seconds.iter().map(|(phase, seconds)| {
+            let seconds = seconds.as_f64().unwrap_or_default();
+            format!("{phase} {seconds:.2}")
+        });
+        let seconds: Vec<_> = seconds.collect();
+        format!("{results}\nseconds: {}\n", seconds.join(", "))
+    }
+}

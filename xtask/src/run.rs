@@ -1,0 +1,193 @@
+//! One run of a verb: its output folder, seed, threads, phases and results.
+
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use anyhow::Context as _;
+use gump_scene::Seed;
+use serde::Serialize;
+
+use crate::cli::WrongArguments;
+use crate::machine;
+use crate::progress::Progress;
+use crate::report::Report;
+
+/// Flags that every verb has.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Common {
+    /// Folder for the results [default: out/<verb>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Where all randomness comes from [default: 0]
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Flags from a file; those on the command line win
+    #[arg(long, value_name = "FILE.toml")]
+    pub(crate) config: Option<PathBuf>,
+    /// Threads to use [default: all cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
+    /// Where tensors live
+    #[arg(long, value_enum, default_value_t = Device::Cpu)]
+    device: Device,
+    /// No progress and no table, errors only
+    #[arg(long)]
+    quiet: bool,
+}
+
+/// Where tensors live.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Device {
+    /// Main memory, all threads.
+    Cpu,
+    /// The first NVIDIA GPU.
+    Cuda,
+}
+
+impl Device {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Cuda => "cuda",
+        }
+    }
+}
+
+/// A run in progress.
+pub(crate) struct Run {
+    out: PathBuf,
+    seed: Seed,
+    quiet: bool,
+    threads: usize,
+    report: Report,
+    began: Instant,
+}
+
+impl Run {
+    /// Begins a run: creates the output folder.
+    ///
+    /// `settings` are the verb's arguments, which become the report's `config`.
+    pub(crate) fn of(
+        verb: &str,
+        common: &Common,
+        settings: &impl Serialize,
+    ) -> anyhow::Result<Self> {
+        if common.device == Device::Cuda {
+            let why = "--device cuda needs a build with CUDA, this one has none";
+            return Err(WrongArguments(why.into()).into());
+        }
+        let out = match &common.out {
+            Some(out) => out.clone(),
+            None => Path::new("out").join(verb.replace(' ', "-")),
+        };
+        std::fs::create_dir_all(&out)
+            .with_context(|| format!("cannot create the folder {}", out.display()))?;
+        let config = serde_json::to_value(settings)?;
+        let seed = common.seed.unwrap_or_default();
+        Ok(Self {
+            seed: Seed(seed),
+            quiet: common.quiet,
+            threads: common
+                .threads
+                .map_or_else(machine::cores, NonZeroUsize::get),
+            report: Report::begin(verb, seed, config, common.device.name()),
+            began: Instant::now(),
+            out,
+        })
+    }
+
+    /// Does the work on the asked number of threads, then writes and shows the report, of failed
+    /// work too.
+    pub(crate) fn execute(
+        mut self,
+        work: impl FnOnce(&mut Self) -> anyhow::Result<()> + Send,
+    ) -> anyhow::Result<()> {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(self.threads)
+            .build()
+            .context("cannot start the worker threads")?;
+        let done = pool.install(|| work(&mut self));
+        self.report.add_seconds("total", self.began.elapsed());
+        self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
+        let path = self.out.join("report.json");
+        let written = self.report.write(&path);
+        let has_something_to_tell = done.is_ok() || !self.report.results.is_empty();
+        if !self.quiet && has_something_to_tell {
+            println!("{}report: {}", self.report.text(), path.display());
+        }
+        done.and(written)
+    }
+
+    /// Runs one phase and notes how long it took.
+    pub(crate) fn phase<T>(
+        &mut self,
+        name: &str,
+        work: impl FnOnce(&mut Self) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        let began = Instant::now();
+        let done = work(self);
+        self.report.add_seconds(name, began.elapsed());
+        done
+    }
+
+    /// Begins a progress bar of `total` units.
+    pub(crate) fn progress(&self, what: &str, total: u64, unit: &'static str) -> Progress {
+        Progress::begin(self.quiet, what, total, unit)
+    }
+
+    /// Tells the reader something that is no result.
+    pub(crate) fn say(&self, line: &str) {
+        if !self.quiet {
+            println!("{line}");
+        }
+    }
+
+    /// Adds a result; keys keep the order in which they come.
+    pub(crate) fn result(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
+        let value = serde_json::to_value(value)
+            .with_context(|| format!("the result {key} cannot be written as JSON"))?;
+        self.report.results.insert(key.into(), value);
+        Ok(())
+    }
+
+    /// A path in the output folder.
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.out.join(name)
+    }
+
+    /// Where all randomness comes from.
+    pub(crate) fn seed(&self) -> Seed {
+        self.seed
+    }
+}
+
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// True once Ctrl-C was pressed; long work ends soon after and leaves a state it can resume from.
+pub(crate) fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}
+
+/// Ends work that has nothing to resume.
+///
+/// Error: after Ctrl-C.
+pub(crate) fn stop_if_interrupted() -> anyhow::Result<()> {
+    anyhow::ensure!(!interrupted(), "stopped by Ctrl-C");
+    Ok(())
+}
+
+/// Makes the first Ctrl-C a request and the second an end.
+pub(crate) fn catch_interrupts() {
+    let caught = ctrlc::set_handler(|| {
+        if INTERRUPTED.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("\nstopping soon; press Ctrl-C again to stop now");
+    });
+    if caught.is_err() {
+        eprintln!("warning: Ctrl-C cannot be caught and stops at once");
+    }
+}

@@ -1,0 +1,91 @@
+//! `data inspect`: what is in a file, as numbers and as a picture.
+
+use std::path::Path;
+
+use anyhow::Context as _;
+use gump_data::{ReadOptions, ReadReport, Summary, find, inspect};
+use gump_scene::Scenario;
+use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
+use serde::Serialize;
+
+use crate::run::{Common, Run};
+
+/// Arguments of `data inspect`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID; a path without # means everything in it
+    #[arg(value_name = "S")]
+    scenario: String,
+    /// Draw the scenario (the first one of a file) to picture.png
+    #[arg(long)]
+    picture: bool,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let whole = Path::new(&self.scenario);
+        let one = self.scenario.contains('#') && !whole.exists();
+        let summary = run.phase("inspect", |_| {
+            if one {
+                summary_of_one(&self.scenario)
+            } else {
+                Ok(inspect(whole, ReadOptions::ALL)?)
+            }
+        })?;
+        let n_unreadable = summary.unreadable.len();
+        let first_problem = summary.unreadable.first().cloned();
+        if let serde_json::Value::Object(fields) = serde_json::to_value(&summary)? {
+            for (key, value) in fields {
+                run.result(&key, value)?;
+            }
+        }
+        if summary.scenarios == 0
+            && let Some(problem) = first_problem
+        {
+            anyhow::bail!(
+                "none of {n_unreadable} records can be read, the first because: {problem}"
+            );
+        }
+        if self.picture {
+            run.phase("picture", |run| {
+                let scenario = find(&self.scenario)?;
+                let path = run.path("picture.png");
+                picture(&scenario)
+                    .save_png(&path)
+                    .with_context(|| format!("cannot draw scenario {}", scenario.id))?;
+                run.say(&format!("picture: {}", path.display()));
+                Ok(())
+            })?;
+        }
+        Ok(())
+    }
+}
+
+/// The scene now with what is past and what is to come.
+pub(crate) fn picture(scenario: &Scenario) -> Picture {
+    let scene = scenario.present();
+    let camera = Camera::on_ego(&scene, 120.0, 1200, 1200);
+    let spec = PictureSpec {
+        legend: true,
+        ..PictureSpec::new(camera).with_label(scenario.id.as_str())
+    };
+    draw_futures(&scene, &[scenario.future()], &spec)
+}
+
+fn summary_of_one(name: &str) -> anyhow::Result<Summary> {
+    let wanted = find(name)?;
+    let path = name.rsplit_once('#').map_or(name, |(path, _)| path);
+    let mut reader = gump_data::open(Path::new(path))?;
+    let mut summary = Summary {
+        format: reader.format().into(),
+        ..Summary::default()
+    };
+    // The reader knows what it left out of the record; the scenario alone does not.
+    let record = reader.find_map(|record| record.ok().filter(|r| r.scenario.id == wanted.id));
+    let report = record.map_or_else(ReadReport::default, |record| record.report);
+    summary.add(&wanted, &report);
+    Ok(summary)
+}

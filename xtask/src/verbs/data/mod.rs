@@ -1,0 +1,16 @@
+//! `data`: look into scenario files, check them, make new ones.
+
+mod inspect;
+mod synthesize;
+mod verify;
+
+/// What to do with data.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Verb {
+    /// What is in a file or directory
+    Inspect(inspect::Args),
+    /// Check every record; exit status 1 if anything is broken
+    Verify(verify::Args),
+    /// Make up scenarios that are free of any recording's licence
+    Synthesize(synthesize::Args),
+}

@@ -1,0 +1,5 @@
+//! One file per verb: arguments, then what the verb does, by calling crates.
+
+pub(crate) mod ci;
+pub(crate) mod data;
+pub(crate) mod tidy;
