@@ -82,23 +82,91 @@ impl Forecast {
 }
 
 impl Obstacle {
+    /// Places the agent's box on the way as it will be in `seconds` at constant velocity.
+    ///
+    /// The whole box is taken in the frame of its centre's foot: on a way that winds, corners of
+    /// one box would be projected to different bends.
     fn new(agent: &Agent, path: &PathAhead, seconds: f64) -> Self {
         let mut footprint = agent.oriented_box();
         footprint.pose.position += agent.state.velocity * seconds;
         let (center, lateral) = path.project(footprint.pose.position);
+        let foot = path.pose_at(center);
+        let across = foot.direction().perp();
         let mut obstacle = Self {
             rear: center,
-            speed: agent.state.velocity.dot(path.pose_at(center).direction()),
+            speed: agent.state.velocity.dot(foot.direction()),
             center,
             right: lateral,
             left: lateral,
         };
         for corner in footprint.corners() {
-            let (s, lateral) = path.project(corner);
-            obstacle.rear = obstacle.rear.min(s);
-            obstacle.right = obstacle.right.min(lateral);
-            obstacle.left = obstacle.left.max(lateral);
+            let arm = corner - footprint.pose.position;
+            obstacle.rear = obstacle.rear.min(center + arm.dot(foot.direction()));
+            obstacle.right = obstacle.right.min(lateral + arm.dot(across));
+            obstacle.left = obstacle.left.max(lateral + arm.dot(across));
         }
         obstacle
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_scene::fixture;
+
+    /// How far ahead the rears are of those in the way of an ego that keeps to the middle.
+    fn check(text: &str, decision: usize, expected: &[f64]) {
+        let scenario = fixture::scenario(text).unwrap();
+        let scene = scenario.present();
+        let path = PathAhead::find(scene, 150.0).unwrap();
+        let forecast = Forecast::new(scene, &path, 41, 0.1, 80.0);
+        let strip = Strip {
+            s: path.ego_s,
+            half_width: 1.0,
+            lateral: &|_| 0.0,
+        };
+        let ahead = forecast.ahead(decision, &strip);
+        let rears: Vec<f64> = ahead.map(|o| o.rear - path.ego_s).collect();
+        assert_eq!(rears.len(), expected.len(), "{text}");
+        for (found, expected) in rears.iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-6, "{found}, not {expected}");
+        }
+    }
+
+    #[test]
+    fn boxes_in_the_strip_are_in_the_way() {
+        let street = "lane 1: 0,0 200,0\nego vehicle 0: 10,0 velocity 5,0\n";
+        for (other, expected) in [
+            ("vehicle 1: 30,0 size 4,2", Some(18.0)),
+            ("vehicle 1: 30,2.1 size 4,2", Some(18.0)),
+            ("vehicle 1: 30,2.3 size 4,2", None),
+            (
+                "vehicle 1: 30,2.3 size 4,2 heading 1.5707963267948966",
+                Some(19.0),
+            ),
+            ("vehicle 1: 5,0 size 4,2", None),
+        ] {
+            let expected: Vec<f64> = expected.into_iter().collect();
+            check(&format!("{street} agent {other}"), 0, &expected);
+        }
+        let walker = format!("{street} agent pedestrian 1: 30,-5 velocity 0,1 size 1,1");
+        check(&walker, 0, &[]);
+        check(&walker, 40, &[19.5]);
+    }
+
+    #[test]
+    fn a_box_between_two_bends_of_the_way_is_on_one_of_them() {
+        // The way comes back 6 m beside itself; the parked truck stands between both.
+        let bends = "lane 1: 0,0 40,0 40,6 0,6\nego vehicle 0: 5,0 velocity 5,0\n";
+        check(
+            &format!("{bends} agent vehicle 1: 20,2.9 size 8,2.4"),
+            0,
+            &[],
+        );
+        check(
+            &format!("{bends} agent vehicle 1: 20,2 size 8,2.4"),
+            0,
+            &[11.0],
+        );
     }
 }

@@ -179,28 +179,36 @@ fn nearest_lane<'a>(scene: SceneState<'a>, ego: Pose) -> Option<(&'a Lane, Foot)
         .filter(|(_, foot)| foot.distance < REACH)
 }
 
-/// Appends lanes until the line is `length` metres long or the map ends.
+/// Appends the rest of the last lane and then its successors until the line is `length` metres long
+/// or the map ends.
 fn extend(scene: SceneState<'_>, points: &mut Vec<DVec2>, lanes: &mut Vec<LaneId>, length: f64) {
     let mut reached: f64 = points.windows(2).map(|p| p[0].distance(p[1])).sum();
-    // Bounded, because a ring of lanes without length would never reach ahead.
-    for _ in 0..1000 {
-        if reached >= length {
-            return;
-        }
-        let Some(&last) = lanes.last() else { return };
-        let Some(next) = scene
-            .map
-            .successors(last)
-            .filter(|lane| lane.kind != LaneKind::BikeLane)
-            .min_by(|a, b| winding(a).total_cmp(&winding(b)))
-        else {
-            return;
-        };
-        for &point in next.centerline.points() {
+    let mut append = |points: &mut Vec<DVec2>, more: &[DVec2]| {
+        for &point in more {
             let end = points.last().copied().unwrap_or(point);
             reached += end.distance(point);
             points.push(point);
         }
+        reached >= length
+    };
+    // A route may end in the middle of its last lane.
+    let rest = lanes.last().and_then(|&id| {
+        let center = &scene.map.lane(id)?.centerline;
+        let foot = center.project(*points.last()?);
+        (foot.distance < REACH).then(|| &center.points()[foot.segment + 1..])
+    });
+    let mut done = append(points, rest.unwrap_or_default());
+    // Bounded, because a ring of lanes without length would never reach ahead.
+    for _ in 0..1000 {
+        let next = lanes.last().and_then(|&last| {
+            let next = scene.map.successors(last);
+            next.filter(|lane| lane.kind != LaneKind::BikeLane)
+                .min_by(|a, b| winding(a).total_cmp(&winding(b)))
+        });
+        let (false, Some(next)) = (done, next) else {
+            return;
+        };
+        done = append(points, next.centerline.points());
         lanes.push(next.id);
     }
 }
@@ -259,6 +267,20 @@ mod tests {
             40.0,
         );
         assert_eq!(path.lanes, [LaneId(1), LaneId(3)]);
+    }
+
+    #[test]
+    fn a_route_that_ends_within_a_lane_keeps_to_it() {
+        let text = "lane 1: 0,0 50,0 50,50 next 2\n lane 2: 50,50 50,90\n route 1
+            ego vehicle 0: 5,0 velocity 8,0";
+        let mut scenario = fixture::scenario(text).unwrap();
+        let path = Polyline::new(vec![dvec2(0.0, 0.0), dvec2(20.0, 0.0)]).unwrap();
+        let lanes = vec![LaneId(1)];
+        scenario.route = Some(std::sync::Arc::new(Route { lanes, path }));
+        let found = PathAhead::find(scenario.present(), 100.0).unwrap();
+        assert_eq!(found.lanes, [LaneId(1), LaneId(2)]);
+        assert_abs_diff_eq!(found.pose_at(30.0).position.x, 30.0, epsilon = 1e-9);
+        assert_eq!(found.line.length(), 140.0);
     }
 
     #[test]
