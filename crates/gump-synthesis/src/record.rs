@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use gump_geometry::{DVec2, OrientedBox, Pose, wrap_angle};
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
+use gump_scene::{Agent, AgentId, AgentState, LightState};
 
 use crate::map::Placement;
 use crate::network::LaneIdx;
@@ -72,19 +72,20 @@ impl Recording {
         &self.lights[frame]
     }
 
-    /// True if two boxes overlap in any frame, at least one of them a vehicle or bicycle.
+    /// True if two boxes overlap in any frame.
     pub(crate) fn has_overlaps(&self) -> bool {
         (0..self.n_frames).any(|frame| {
-            let boxes: Vec<(AgentKind, bool, OrientedBox)> = self
+            let boxes: Vec<(bool, OrientedBox)> = self
                 .tracks()
                 .filter_map(|track| track.oriented_box(frame))
                 .collect();
             boxes.iter().enumerate().any(|(i, a)| {
-                boxes[i + 1..].iter().any(|b| {
-                    let on_foot = |kind| kind == AgentKind::Pedestrian;
-                    let matters = !(on_foot(a.0) && on_foot(b.0)) && (a.1 || b.1);
-                    matters && a.2.overlaps(&b.2)
-                })
+                // Parked vehicles keep apart by construction.
+                let matters = |b: &&(bool, OrientedBox)| a.0 || b.0;
+                boxes[i + 1..]
+                    .iter()
+                    .filter(matters)
+                    .any(|b| a.1.overlaps(&b.1))
             })
         })
     }
@@ -121,13 +122,14 @@ impl Track {
         &self.places
     }
 
-    fn oriented_box(&self, frame: usize) -> Option<(AgentKind, bool, OrientedBox)> {
+    /// The box in a frame, and whether it is of something that moves.
+    fn oriented_box(&self, frame: usize) -> Option<(bool, OrientedBox)> {
         let shape = OrientedBox {
             pose: self.pose(frame)?,
             length: self.body.size[0],
             width: self.body.size[1],
         };
-        Some((self.body.kind, self.body.is_mobile, shape))
+        Some((self.body.is_mobile, shape))
     }
 
     /// The agent in a frame, placed in the world.

@@ -160,7 +160,7 @@ impl Occupancy {
             }
         }
         if let Some(change) = vehicle.change
-            && change.driven < 0.6 * change.length
+            && change.driven < 0.8 * change.length
         {
             let s = vehicle.s + change.arc_shift;
             for entry in &self.entries[change.from] {

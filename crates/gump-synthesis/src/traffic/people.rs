@@ -56,7 +56,8 @@ impl Person {
         rng: &mut Rng,
     ) -> Self {
         let pace = rng.random_range(0.9..1.7);
-        let aside = rng.random_range(0.1..0.9);
+        // Right of the middle, so that people who meet pass each other.
+        let aside = rng.random_range(0.5..1.1);
         let track = &network.walks[walk].track;
         let s = if forward {
             progress
@@ -135,15 +136,16 @@ impl Person {
         pose.position - pose.direction().perp() * (self.aside * sign)
     }
 
-    /// Walks on for `dt` seconds towards the carrot at up to `limit` metres per second.
-    fn advance(&mut self, network: &Network, limit: f64, dt: f64) {
+    /// Walks on for `dt` seconds towards the carrot, moved by `push`, at up to `limit` metres per
+    /// second.
+    fn advance(&mut self, network: &Network, limit: f64, push: DVec2, dt: f64) {
         let wanted = self.pace.min(limit);
         self.speed += (wanted - self.speed).clamp(-2.0 * CHANGE * dt, CHANGE * dt);
         self.speed = self.speed.max(0.0);
         if self.speed < 0.02 {
             return;
         }
-        let to = self.carrot(network) - self.pose.position;
+        let to = self.carrot(network) + push - self.pose.position;
         let turn = angle_difference(to.to_angle(), self.pose.heading);
         // Turning on the spot would spin the box: the slower, the less it turns.
         let most = TURN_RATE * dt * (self.speed / 0.6).min(1.0);
@@ -160,7 +162,8 @@ impl Traffic<'_> {
         for i in 0..self.people.len() {
             let mut person = self.people[i].clone();
             let limit = self.walking_limit(&mut person, i);
-            person.advance(self.network, limit, self.dt);
+            let push = self.push_from_others(&person, i);
+            person.advance(self.network, limit, push, self.dt);
             let length = self.network.walks[person.walk].track.length();
             if person.progress >= length {
                 self.choose_walk(&mut person, length);
@@ -207,17 +210,37 @@ impl Traffic<'_> {
         self.limit_behind_others(person, i)
     }
 
-    /// Slows behind somebody slower straight ahead.
+    /// Slows behind somebody slower ahead; of two who meet, the one who came first goes first.
     fn limit_behind_others(&self, person: &Person, i: usize) -> f64 {
         let mut limit = f64::INFINITY;
         for (j, other) in self.people.iter().enumerate() {
             let local = person.pose.inverse() * other.pose.position;
-            let same_way = angle_difference(other.pose.heading, person.pose.heading).abs() < 1.0;
-            if j != i && same_way && 0.0 < local.x && local.x < 2.0 && local.y.abs() < 0.7 {
-                limit = f64::min(limit, other.speed + 0.6 * (local.x - 1.1));
+            let turn = angle_difference(other.pose.heading, person.pose.heading).abs();
+            if j == i || local.x <= 0.0 || local.x > 2.2 || local.y.abs() > 0.85 {
+                continue;
+            }
+            let theirs = other.speed * turn.cos();
+            if turn < 1.0 || turn < 2.2 && j < i || other.speed < 0.1 {
+                limit = f64::min(limit, theirs.max(0.0) + 0.8 * (local.x - 1.15));
             }
         }
         limit.max(0.0)
+    }
+
+    /// How far, in metres, people near by move the point that a person steers to.
+    fn push_from_others(&self, person: &Person, i: usize) -> DVec2 {
+        let away = |(j, other): (usize, &Person)| {
+            let gap = person.pose.position - other.pose.position;
+            let distance = gap.length();
+            if j == i || distance > 1.8 || distance < 1e-3 {
+                return DVec2::ZERO;
+            }
+            // Sideways only: slowing down is decided elsewhere.
+            let left = person.pose.direction().perp();
+            let side = if gap.dot(left) >= 0.0 { 1.0 } else { -1.0 };
+            left * (side * 0.8 * (1.8 - distance))
+        };
+        self.people.iter().enumerate().map(away).sum()
     }
 
     /// Chooses where to go on at the end of a walk.
