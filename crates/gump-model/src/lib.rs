@@ -38,6 +38,8 @@ mod trajectory;
 mod visual;
 pub mod world;
 
+/// Where tensors live, so that users need not name the tensor library.
+pub use candle_core::Device;
 pub use config::ModelConfig;
 pub use error::ModelError;
 pub use loss::{LossConfig, LossParts};
