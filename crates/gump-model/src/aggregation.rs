@@ -27,6 +27,13 @@ impl Ring {
         self.chunks.push((frame, chunk));
     }
 
+    /// Expresses all chunks in another frame of reference.
+    pub(crate) fn transform(&mut self, new_from_old: Pose) {
+        for pose in self.chunks.iter_mut().flat_map(|(_, chunk)| chunk) {
+            *pose = new_from_old * *pose;
+        }
+    }
+
     /// Forgets everything, as an agent that was driven from outside must.
     pub(crate) fn clear(&mut self) {
         self.chunks.clear();

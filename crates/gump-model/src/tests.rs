@@ -364,6 +364,38 @@ fn everyone_stays_for_the_whole_future() {
 }
 
 #[test]
+fn a_long_drive_never_reaches_the_edge_of_the_window() {
+    // A leader 20 m ahead of a driven ego: both go 300 m, three times the window's reach.
+    let scenario = fixture::scenario(
+        "lane 1: -50,0 400,0
+         ego vehicle 0: 0,0 velocity 20,0
+         agent vehicle 1: 20,0 velocity 20,0
+         agent vehicle 2: 150,4 size 5,2",
+    )
+    .unwrap();
+    let world = TransformerWorld::new(network(), SamplingConfig::default());
+    let start = Start {
+        scene: scenario.present(),
+        n_futures: 2,
+        seed: Seed(5),
+    };
+    let mut session = world.open(&[start]).unwrap();
+    let mut told = scenario.present().ego_now().state;
+    for step in 0..30 {
+        told.pose.position.x = 10.0 * f64::from(step + 1);
+        let frames = session.step(Some(&[told; 2])).unwrap();
+        for frame in &frames {
+            assert_eq!(frame.agents().len(), 3);
+            assert_eq!(frame.agent(AgentId(0)).unwrap().state, told);
+        }
+    }
+    // The window came to the parked car: it is a token now, and moves as the network says.
+    let frames = session.step(Some(&[told; 2])).unwrap();
+    let parked = |i: usize| frames[i].agent(AgentId(2)).unwrap().state;
+    assert_ne!(parked(0), parked(1));
+}
+
+#[test]
 fn a_slot_can_be_reused() {
     let world = TransformerWorld::new(network(), SamplingConfig::default());
     let (first, second) = (

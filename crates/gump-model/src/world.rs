@@ -8,13 +8,15 @@
 //! Agents outside the token window, of no predicted kind, or beyond the vocabulary move on with
 //! constant velocity, so that every agent that is there now stays for the whole future.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use candle_core::Tensor;
 use gump_geometry::Pose;
 use gump_raster::rasterize;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
-use gump_scene::{Agent, AgentId, AgentState, Frame, Light, SceneState, Seed};
+use gump_scene::{Agent, AgentId, AgentState, Frame, MapGraph, Route, SceneState, Seed};
 use gump_tokenizer::{
     Identities, QuantizedState, Slot, TokenAgent, TokenFrame, TokenSequence, Tokenizer,
     TokenizerConfig,
@@ -34,6 +36,9 @@ use crate::sampling::{
 
 /// An agent whose surrogate leaves this range gets no tokens any more (released code), metres.
 const KEEP_RANGE_M: f64 = 96.0;
+/// An ego farther than this from the origin of its scene gets a new scene around it, metres. Training
+/// shows windows up to 85 m away.
+const RECENTRE_M: f64 = 60.0;
 /// How far a sampled position may lie from its surrogate (released code), metres.
 const GUARD_M: f64 = 5.0;
 
@@ -88,18 +93,44 @@ impl TransformerWorld {
             .map_or(0, |i| i + 1);
         let frames = &frames[first..];
         let identities = Identities::ranked(frames, scene.ego, world_from_scene);
-        let encoded =
-            self.tokenizer
-                .encode(scene.map, frames, scene.ego, world_from_scene, &identities);
+        let recent = frames.iter().copied().cloned().collect();
+        let map = Arc::clone(scene.map);
+        let route = scene.route.map(Arc::clone);
+        self.scene_of(map, route, recent, scene.ego, identities)
+    }
+
+    /// What a window of frames half a second apart shows, in the frame of the ego in its last.
+    fn scene_of(
+        &self,
+        map: Arc<MapGraph>,
+        route: Option<Arc<Route>>,
+        recent: Vec<Frame>,
+        ego: AgentId,
+        identities: Identities,
+    ) -> Result<Scene, ModelError> {
+        let view = SceneState {
+            map: &map,
+            route: route.as_ref(),
+            history: &recent,
+            ego,
+            dt: TOKEN_DT,
+        };
+        let world_from_scene = view.ego_now().state.pose;
+        let frames: Vec<&Frame> = recent.iter().collect();
+        let encoded = self
+            .tokenizer
+            .encode(&map, &frames, ego, world_from_scene, &identities);
         let (sequence, _) = encoded.sequence.fit(self.network.config().block_size / 2);
-        let raster = rasterize(self.network.raster_spec(), &scene, world_from_scene);
+        let raster = rasterize(self.network.raster_spec(), &view, world_from_scene);
         Ok(Scene {
             world_from_scene,
-            ego: scene.ego,
+            ego,
             identities,
             memory: self.network.look(std::slice::from_ref(&raster))?,
             history: sequence.frames().to_vec(),
-            now: scene.now().clone(),
+            recent,
+            map,
+            route,
         })
     }
 
@@ -121,8 +152,8 @@ impl TransformerWorld {
                 seed: seed.fork(k as u64),
                 frames: shared.history.clone(),
                 index: last,
-                rings: std::collections::BTreeMap::new(),
-                now: shared.now.clone(),
+                rings: BTreeMap::new(),
+                recent: shared.recent.clone(),
             };
             for (id, bins) in rings {
                 future.rings.entry(id).or_default().push(last, poses(&bins));
@@ -232,7 +263,10 @@ struct Scene {
     identities: Identities,
     memory: VisualMemory,
     history: Vec<TokenFrame>,
-    now: Frame,
+    /// The same frames in world coordinates; the last is the present.
+    recent: Vec<Frame>,
+    map: Arc<MapGraph>,
+    route: Option<Arc<Route>>,
 }
 
 /// One future in progress.
@@ -243,8 +277,9 @@ struct Future {
     frames: Vec<TokenFrame>,
     /// Number of the last frame.
     index: usize,
-    rings: std::collections::BTreeMap<u16, Ring>,
-    now: Frame,
+    rings: BTreeMap<u16, Ring>,
+    /// The same frames in world coordinates; the last is the present.
+    recent: Vec<Frame>,
 }
 
 struct TransformerSession<'a> {
@@ -269,6 +304,7 @@ impl Session for TransformerSession<'_> {
             );
             return Err(ModelError::Scene(what).into());
         }
+        self.recentre()?;
         let windows: Vec<Window> = self
             .futures
             .iter()
@@ -293,28 +329,55 @@ impl Session for TransformerSession<'_> {
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
-        let index = self.futures[future].scene;
-        let shared = self
-            .futures
-            .iter()
-            .enumerate()
-            .any(|(i, other)| i != future && other.scene == index);
-        let index = if shared { self.scenes.len() } else { index };
+        let index = self.scenes.len();
         let scene = self.world.scene(start.scene)?;
         let mut fresh = self.world.futures(index, &scene, 1, start.seed)?;
-        if shared {
-            self.scenes.push(scene);
-        } else {
-            self.scenes[index] = scene;
-        }
-        if let Some(fresh) = fresh.pop() {
-            self.futures[future] = fresh;
-        }
+        self.scenes.push(scene);
+        self.futures[future] = fresh.pop().expect("one future was asked for");
+        self.forget_unused_scenes();
         Ok(())
     }
 }
 
 impl TransformerSession<'_> {
+    /// Gives every future whose ego nears the edge of its window a scene around the ego's present,
+    /// map and tokens alike; such a future shares its visual memory with no other any more.
+    fn recentre(&mut self) -> Result<(), ModelError> {
+        for i in 0..self.futures.len() {
+            if self.futures[i].ego_reach() < RECENTRE_M {
+                continue;
+            }
+            let from = &self.scenes[self.futures[i].scene];
+            let to = self.world.scene_of(
+                Arc::clone(&from.map),
+                from.route.clone(),
+                self.futures[i].recent.clone(),
+                from.ego,
+                from.identities.clone(),
+            )?;
+            self.futures[i].enter(self.scenes.len(), from, &to);
+            self.scenes.push(to);
+        }
+        self.forget_unused_scenes();
+        Ok(())
+    }
+
+    /// Drops scenes that no future is in.
+    fn forget_unused_scenes(&mut self) {
+        let used = |scene: usize| self.futures.iter().any(|future| future.scene == scene);
+        let mut places = Vec::with_capacity(self.scenes.len());
+        let mut n = 0;
+        for scene in 0..self.scenes.len() {
+            places.push(used(scene).then_some(n));
+            n += usize::from(used(scene));
+        }
+        let mut kept = places.iter().map(Option::is_some);
+        self.scenes.retain(|_| kept.next().unwrap_or(false));
+        for future in &mut self.futures {
+            future.scene = places[future.scene].expect("the scene of a future is in use");
+        }
+    }
+
     /// The window of one future: its history and the next frame with provisional states.
     fn window(&self, future: &Future, ego: Option<AgentState>) -> Window {
         let scene = &self.scenes[future.scene];
@@ -431,7 +494,7 @@ impl Future {
     ) -> Frame {
         self.index += 1;
         let mut next = window.next;
-        let mut moved = std::collections::BTreeMap::new();
+        let mut moved = BTreeMap::new();
         for ((agent, request), bins) in next.tracked.iter_mut().zip(&window.requests).zip(decoded) {
             let id = agent.key.id;
             let driven = id == 0 && ego.is_some();
@@ -448,28 +511,42 @@ impl Future {
             };
             moved.insert(id, if driven { ego.unwrap_or(state) } else { state });
         }
-        let agents = self.now.agents().iter().map(|agent| {
+        let now = self.recent.last().expect("a future has a present");
+        let agents = now.agents().iter().map(|agent| {
             let token = scene.identities.key(agent.id).and_then(|id| moved.get(&id));
             let driven = ego.filter(|_| agent.id == scene.ego);
             agent.with_state(driven.or(token.copied()).unwrap_or_else(|| drift(agent)))
         });
-        let lights: Vec<Light> = self.now.lights().to_vec();
-        self.now = Frame::new(agents.collect(), lights);
+        // Lights keep the colour they were seen in.
+        let frame = Frame::new(agents.collect(), now.lights().to_vec());
+        self.recent.push(frame.clone());
         self.frames.push(next);
-        let n = self.frames.len();
+        let history = sampling.history.max(1);
+        self.recent
+            .drain(..self.recent.len().saturating_sub(history));
         self.frames
-            .drain(..n.saturating_sub(sampling.history.max(1)));
+            .drain(..self.frames.len().saturating_sub(history));
         self.rings.retain(|id, _| moved.contains_key(id));
-        make_first(&mut self.frames);
-        self.now.clone()
+        // In the first frame of a window nobody is newborn: who was, counts as tracked.
+        let first = std::mem::take(&mut self.frames[0]);
+        self.frames[0] = first.into_first();
+        frame
     }
-}
 
-/// In the first frame of a window nobody is newborn: what the window no longer shows cannot be.
-fn make_first(frames: &mut [TokenFrame]) {
-    if let Some(first) = frames.first_mut() {
-        first.tracked.append(&mut first.newborn);
-        first.tracked.sort_by_key(|agent| agent.key.order());
+    /// How far the ego is from the origin of its scene frame along either axis, metres.
+    fn ego_reach(&self) -> f64 {
+        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        ego.map_or(0.0, |ego| ego.state.pose().position.abs().max_element())
+    }
+
+    /// Moves into another scene of the same traffic: tokens and chunks are expressed in its frame.
+    fn enter(&mut self, index: usize, from: &Scene, to: &Scene) {
+        let to_from_from = to.world_from_scene.inverse() * from.world_from_scene;
+        self.scene = index;
+        self.frames = to.history.clone();
+        self.rings
+            .values_mut()
+            .for_each(|ring| ring.transform(to_from_from));
     }
 }
 
