@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ci, data, tidy};
+use crate::verbs::{ci, data, simulate, tidy};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -28,6 +28,8 @@ enum Verb {
     /// Look into scenario files, check them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
+    /// Imagine how a recorded scene goes on, many times over.
+    Simulate(simulate::Args),
     /// Everything CI runs: format, lints, tests, docs, layers, house rules.
     Ci(ci::Args),
     /// Check the house rules of the repository.
@@ -59,6 +61,9 @@ impl Cli {
             }
             Verb::Data(data::Verb::Synthesize(args)) => {
                 Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Simulate(args) => {
+                Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {

@@ -12,12 +12,15 @@
 mod checks;
 mod cli;
 mod config;
+mod futures;
+mod imagine;
 mod machine;
 mod progress;
 mod report;
 mod run;
 mod table;
 mod verbs;
+mod worlds;
 
 use std::process::ExitCode;
 

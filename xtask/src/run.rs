@@ -158,6 +158,11 @@ impl Run {
         self.out.join(name)
     }
 
+    /// The output folder.
+    pub(crate) fn out(&self) -> &Path {
+        &self.out
+    }
+
     /// Where all randomness comes from.
     pub(crate) fn seed(&self) -> Seed {
         self.seed

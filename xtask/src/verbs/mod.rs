@@ -2,4 +2,5 @@
 
 pub(crate) mod ci;
 pub(crate) mod data;
+pub(crate) mod simulate;
 pub(crate) mod tidy;

@@ -1,0 +1,205 @@
+//! Futures as files: an array for analysis, the challenge's message, pictures and a film.
+
+use std::io::Write as _;
+use std::path::Path;
+
+use anyhow::Context as _;
+use gump_scene::{Agent, AgentId, Rollout, Scenario};
+use gump_viz::{
+    Camera, Film, FilmSpec, Picture, PictureSpec, Take, draw_futures, grid_film, log_as_rollout,
+};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+/// Futures shown side by side in a film, the log not counted.
+const FILMED: usize = 3;
+
+/// SHA-256 over x, y, heading and the two velocities of every agent of every frame, as
+/// little-endian f32: futures, then steps, then agents by id.
+pub(crate) fn digest(rollouts: &[Rollout]) -> String {
+    let mut hash = Sha256::new();
+    for frame in rollouts.iter().flat_map(Rollout::imagined) {
+        for number in frame.agents().iter().flat_map(numbers) {
+            hash.update((number as f32).to_le_bytes());
+        }
+    }
+    hash.finalize()
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
+fn numbers(agent: &Agent) -> [f64; 5] {
+    let pose = agent.state.pose;
+    let velocity = agent.state.velocity;
+    [
+        pose.position.x,
+        pose.position.y,
+        pose.heading,
+        velocity.x,
+        velocity.y,
+    ]
+}
+
+/// Writes `futures.npy`, shape [future, step, agent, number], and `futures.json`, which says what
+/// the rows are.
+///
+/// Numbers are x, y, heading, vx, vy in the world frame as f64; an absent agent is NaN.
+pub(crate) fn save_array(
+    folder: &Path,
+    scenario: &Scenario,
+    rollouts: &[Rollout],
+) -> anyhow::Result<()> {
+    let agents = agents(rollouts);
+    let steps = rollouts.first().map_or(0, Rollout::steps);
+    let shape = [rollouts.len(), steps, agents.len(), 5];
+    let path = folder.join("futures.npy");
+    gump_data::write_atomically(&path, |file| {
+        let mut write = |bytes: &[u8]| {
+            file.write_all(bytes)
+                .with_context(|| format!("cannot write {}", path.display()))
+        };
+        write(&npy_header(shape))?;
+        for frame in rollouts.iter().flat_map(Rollout::imagined) {
+            for agent in &agents {
+                let numbers = frame.agent(agent.id).map_or([f64::NAN; 5], numbers);
+                for number in numbers {
+                    write(&number.to_le_bytes())?;
+                }
+            }
+        }
+        anyhow::Ok(())
+    })?;
+    let index = json!({
+        "scenario": scenario.id,
+        "axes": ["future", "step", "agent", "number"],
+        "shape": shape,
+        "numbers": ["x", "y", "heading", "vx", "vy"],
+        "dt": scenario.dt,
+        "ego": scenario.ego.0,
+        "agents": agents.iter().map(|agent| json!({
+            "id": agent.id.0,
+            "class": agent.kind.name(),
+            "length": agent.length,
+            "width": agent.width,
+        })).collect::<Vec<_>>(),
+    });
+    let path = folder.join("futures.json");
+    gump_data::write_atomically(&path, |file| {
+        serde_json::to_writer_pretty(file, &index)
+            .with_context(|| format!("cannot write {}", path.display()))
+    })
+}
+
+/// Every agent of any frame, by id, as it is first seen.
+fn agents(rollouts: &[Rollout]) -> Vec<Agent> {
+    let frames = rollouts
+        .iter()
+        .flat_map(|rollout| std::iter::once(rollout.start()).chain(rollout.imagined()));
+    let mut agents: std::collections::BTreeMap<AgentId, Agent> = std::collections::BTreeMap::new();
+    for agent in frames.flat_map(|frame| frame.agents()) {
+        agents.entry(agent.id).or_insert(*agent);
+    }
+    agents.into_values().collect()
+}
+
+/// Version 1.0 of NumPy's format: magic, version, length, a Python dictionary, padding to 64.
+fn npy_header(shape: [usize; 4]) -> Vec<u8> {
+    let [a, b, c, d] = shape;
+    let mut text =
+        format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({a}, {b}, {c}, {d}), }}");
+    let unpadded = 10 + text.len() + 1;
+    text.push_str(&" ".repeat(unpadded.next_multiple_of(64) - unpadded));
+    text.push('\n');
+    let mut header = b"\x93NUMPY\x01\x00".to_vec();
+    header.extend((text.len() as u16).to_le_bytes());
+    header.extend(text.as_bytes());
+    header
+}
+
+/// The scene now, with a trail for every agent and future.
+pub(crate) fn picture(scenario: &Scenario, rollouts: &[Rollout], label: &str) -> Picture {
+    let scene = scenario.present();
+    let spec = PictureSpec {
+        legend: true,
+        ..PictureSpec::new(Camera::on_ego(&scene, 120.0, 1000, 1000)).with_label(label)
+    };
+    let futures: Vec<_> = rollouts.iter().map(Rollout::imagined).collect();
+    draw_futures(&scene, &futures, &spec)
+}
+
+/// What happened, as far as it is known, beside a few futures.
+pub(crate) fn film(scenario: &Scenario, rollouts: &[Rollout]) -> anyhow::Result<Film> {
+    let log = log_as_rollout(scenario);
+    let known = (log.steps() > 0).then_some(Take {
+        rollout: &log,
+        label: "log".into(),
+    });
+    let imagined = rollouts
+        .iter()
+        .take(FILMED)
+        .enumerate()
+        .map(|(k, rollout)| Take {
+            rollout,
+            label: format!("future {}", k + 1),
+        });
+    let takes: Vec<_> = known.into_iter().chain(imagined).collect();
+    let scene = scenario.present();
+    let camera = Camera::on_ego(&scene, 90.0, 400, 400);
+    let spec = FilmSpec {
+        columns: takes.len().min(2),
+        ..FilmSpec::new(camera)
+    };
+    Ok(grid_film(&takes, &spec)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rollouts() -> (Scenario, Vec<Rollout>) {
+        let scenario = gump_scene::fixture::scenario(
+            "ego vehicle 0: 0,0 velocity 5,0\nagent pedestrian 3: 9,9\nhistory 1 future 2 dt 0.1",
+        )
+        .unwrap();
+        let log = log_as_rollout(&scenario);
+        (scenario, vec![log; 2])
+    }
+
+    #[test]
+    fn the_digest_is_that_of_the_bytes_it_names() {
+        let (_, rollouts) = rollouts();
+        let mut bytes = Vec::new();
+        for rollout in &rollouts {
+            for frame in rollout.imagined() {
+                for a in frame.agents() {
+                    let (p, v) = (a.state.pose, a.state.velocity);
+                    for x in [p.position.x, p.position.y, p.heading, v.x, v.y] {
+                        bytes.extend((x as f32).to_le_bytes());
+                    }
+                }
+            }
+        }
+        assert_eq!(bytes.len(), 2 * 20 * 2 * 5 * 4);
+        let expected: String = Sha256::digest(&bytes)
+            .iter()
+            .map(|b| format!("{b:02x}"))
+            .collect();
+        assert_eq!(digest(&rollouts), expected);
+    }
+
+    #[test]
+    fn the_array_has_the_shape_it_states() {
+        let (scenario, rollouts) = rollouts();
+        let folder = tempfile::tempdir().unwrap();
+        save_array(folder.path(), &scenario, &rollouts).unwrap();
+        let bytes = std::fs::read(folder.path().join("futures.npy")).unwrap();
+        let header = npy_header([2, 20, 2, 5]);
+        assert_eq!(header.len() % 64, 0);
+        assert!(bytes.starts_with(&header));
+        assert_eq!(bytes.len(), header.len() + 2 * 20 * 2 * 5 * 8);
+        // The ego after one step of 0.1 s at 5 m/s.
+        let x = f64::from_le_bytes(bytes[header.len()..][..8].try_into().unwrap());
+        assert!((x - 0.5).abs() < 1e-9, "{x}");
+    }
+}

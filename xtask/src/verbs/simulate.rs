@@ -1,0 +1,132 @@
+//! `simulate`: futures of a recorded scene, in any world.
+
+use std::num::NonZeroUsize;
+
+use anyhow::Context as _;
+use gump_data::{find, submission};
+use gump_metrics::{Part, Summary, summarize};
+use gump_scene::{Rollout, Scenario};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::cli::WrongArguments;
+use crate::futures;
+use crate::imagine::{Imagined, imagine};
+use crate::run::{Common, Run};
+use crate::worlds::{Sampling, World, WorldName};
+
+/// Arguments of `simulate`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID
+    #[arg(long, value_name = "S")]
+    scenario: String,
+    /// log, idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W")]
+    world: WorldName,
+    /// How many futures
+    #[arg(long, value_name = "N", default_value = "32")]
+    futures: NonZeroUsize,
+    /// How far to imagine
+    #[arg(long, value_name = "S", default_value_t = 8.0)]
+    seconds: f64,
+    /// Also write the futures in this format
+    #[arg(long, value_enum)]
+    format: Option<Format>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Format {
+    /// A `ScenarioRollouts` message of the Waymo Sim Agents Challenge, rollouts.binproto
+    Waymo,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        if !(self.seconds > 0.0 && self.seconds <= 3600.0) {
+            let found = self.seconds;
+            let wrong =
+                format!("--seconds: expected a number above 0 and at most 3600, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
+        let sampling = self.sampling.resolve()?;
+        let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
+        let world = run.phase("load", |_| World::build(&self.world, &scenario, &sampling))?;
+        let imagined = run.phase("imagine", |run| {
+            let (n, seed) = (self.futures.get(), run.seed());
+            imagine(run, &world, scenario.present(), n, self.seconds, seed)
+                .with_context(|| format!("cannot simulate {}", self.scenario))
+        })?;
+        let summary = run.phase("score", |_| {
+            Ok(summarize(&imagined.rollouts, Some(&scenario)))
+        })?;
+        run.phase("write", |run| {
+            self.write(run, &scenario, &imagined.rollouts)
+        })?;
+        self.tell(run, &scenario, &imagined, &summary)
+    }
+
+    fn write(&self, run: &Run, scenario: &Scenario, rollouts: &[Rollout]) -> anyhow::Result<()> {
+        futures::save_array(run.out(), scenario, rollouts)?;
+        if let Some(Format::Waymo) = self.format {
+            submission::write_rollouts(&run.path("rollouts.binproto"), &scenario.id, rollouts)?;
+        }
+        let label = format!("{} in the world {}", scenario.id, self.world);
+        futures::picture(scenario, rollouts, &label).save_png(&run.path("picture.png"))?;
+        futures::film(scenario, rollouts)?.save(&run.path("film.gif"))?;
+        Ok(())
+    }
+
+    fn tell(
+        &self,
+        run: &mut Run,
+        scenario: &Scenario,
+        imagined: &Imagined,
+        summary: &Summary,
+    ) -> anyhow::Result<()> {
+        let total = summary.total();
+        let rollouts = &imagined.rollouts;
+        run.result("scenario", &scenario.id)?;
+        run.result("world", &self.world)?;
+        run.result("futures", rollouts.len())?;
+        run.result("steps", rollouts.first().map_or(0, Rollout::steps))?;
+        run.result("agents", scenario.present().now().agents().len())?;
+        run.result("frames_per_second", imagined.frames_per_second())?;
+        run.result("passes_per_frame", imagined.passes_per_frame)?;
+        run.result("collision_rate", total.collision_rate())?;
+        run.result("offroad_rate", total.offroad_rate())?;
+        run.result("digest", futures::digest(rollouts))?;
+        run.result("by_class", by_class(summary))
+    }
+}
+
+/// The rows of a summary, all classes together last.
+pub(crate) fn by_class(summary: &Summary) -> Vec<Value> {
+    let mut rows: Vec<_> = summary
+        .by_kind
+        .iter()
+        .map(|(kind, part)| row(kind.name(), part, summary.futures))
+        .collect();
+    rows.push(row("all", &summary.total(), summary.futures));
+    rows
+}
+
+fn row(class: &str, part: &Part, n_futures: usize) -> Value {
+    json!({
+        "class": class,
+        "agents": part.agents / n_futures.max(1),
+        "collision_rate": part.collision_rate(),
+        "offroad_rate": part.offroad_rate(),
+        "ade": part.ade(),
+        "min_ade": part.min_ade(),
+        "fde": part.fde(),
+        "min_fde": part.min_fde(),
+    })
+}

@@ -1,0 +1,207 @@
+//! Worlds by name: `log`, `idm`, `constant-velocity` and `model:WEIGHTS`.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use gump_model::world::TransformerWorld;
+use gump_model::{CacheMode, Device, Mode, SamplingConfig, checkpoint};
+use gump_rollout::WorldModel;
+use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
+use gump_scene::Scenario;
+use serde::{Serialize, Serializer};
+
+use crate::cli::WrongArguments;
+
+/// Which world imagines.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum WorldName {
+    /// What really happened: an oracle.
+    Log,
+    /// Rule-driven traffic that reacts.
+    Idm,
+    /// Everyone goes straight on.
+    ConstantVelocity,
+    /// A trained network.
+    Model(PathBuf),
+}
+
+impl FromStr for WorldName {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "log" => Ok(Self::Log),
+            "idm" => Ok(Self::Idm),
+            "constant-velocity" => Ok(Self::ConstantVelocity),
+            _ => match name.strip_prefix("model:") {
+                Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
+                _ => Err("expected log, idm, constant-velocity or model:WEIGHTS".into()),
+            },
+        }
+    }
+}
+
+impl fmt::Display for WorldName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Log => f.write_str("log"),
+            Self::Idm => f.write_str("idm"),
+            Self::ConstantVelocity => f.write_str("constant-velocity"),
+            Self::Model(path) => write!(f, "model:{}", path.display()),
+        }
+    }
+}
+
+impl Serialize for WorldName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// A world that is ready to imagine.
+pub(crate) enum World {
+    /// One that follows rules.
+    Rule(Box<dyn WorldModel>),
+    /// A trained network.
+    Learned(Box<TransformerWorld>),
+}
+
+impl World {
+    /// Builds the world; only `log` looks at more than the present of the scenario.
+    ///
+    /// Error: weights that cannot be read or do not fit.
+    pub(crate) fn build(
+        name: &WorldName,
+        scenario: &Scenario,
+        sampling: &SamplingConfig,
+    ) -> anyhow::Result<Self> {
+        Ok(match name {
+            WorldName::Log => Self::Rule(Box::new(LogReplay::new(scenario))),
+            WorldName::Idm => Self::Rule(Box::new(Idm::default())),
+            WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
+            WorldName::Model(path) => {
+                let network = checkpoint::load(path, &Device::Cpu)?;
+                Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))
+            }
+        })
+    }
+
+    /// What imagines.
+    pub(crate) fn model(&self) -> &dyn WorldModel {
+        match self {
+            Self::Rule(world) => &**world,
+            Self::Learned(world) => &**world,
+        }
+    }
+
+    /// Transformer passes made so far; rules make none.
+    pub(crate) fn passes(&self) -> u64 {
+        match self {
+            Self::Rule(_) => 0,
+            Self::Learned(world) => world.passes(),
+        }
+    }
+}
+
+/// How a learned world decodes.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Sampling {
+    /// Decode all agents of a frame at once, or one after another
+    #[arg(long, value_enum, default_value_t = ModeName::PartialAr)]
+    mode: ModeName,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) draw: Draw,
+}
+
+/// How a learned world decodes, whatever the order.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Draw {
+    /// What is kept between the passes of a frame
+    #[arg(long, value_enum, default_value_t = CacheName::Window)]
+    cache: CacheName,
+    /// Divides the logits; above 1 is bolder [default: 1.1]
+    #[arg(long, value_name = "X")]
+    temperature: Option<f64>,
+    /// Bins that may be drawn per field [default: 40]
+    #[arg(long, value_name = "N")]
+    top_k: Option<usize>,
+    /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 1.2]
+    #[arg(long, value_name = "X")]
+    decay: Option<f64>,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum ModeName {
+    PartialAr,
+    FullAr,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum CacheName {
+    None,
+    Window,
+}
+
+impl Sampling {
+    /// The model's form of the flags.
+    ///
+    /// Error: [`WrongArguments`] for a number out of its range.
+    pub(crate) fn resolve(&self) -> anyhow::Result<SamplingConfig> {
+        self.draw.resolve(match self.mode {
+            ModeName::PartialAr => Mode::PartialAr,
+            ModeName::FullAr => Mode::FullAr,
+        })
+    }
+}
+
+impl Draw {
+    /// The model's form of the flags.
+    ///
+    /// Error: [`WrongArguments`] for a number out of its range.
+    pub(crate) fn resolve(&self, mode: Mode) -> anyhow::Result<SamplingConfig> {
+        let default = SamplingConfig::default();
+        let config = SamplingConfig {
+            mode,
+            cache: match self.cache {
+                CacheName::None => CacheMode::None,
+                CacheName::Window => CacheMode::Window,
+            },
+            temperature: self.temperature.unwrap_or(default.temperature),
+            top_k: self.top_k.unwrap_or(default.top_k),
+            decay: self.decay.unwrap_or(default.decay),
+            ..default
+        };
+        let wrong = if !(config.temperature > 0.0 && config.temperature.is_finite()) {
+            format!(
+                "--temperature: expected a number above 0, found {}",
+                config.temperature
+            )
+        } else if config.top_k == 0 {
+            "--top-k: expected at least 1, found 0".into()
+        } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
+            format!("--decay: expected 0 or more, found {}", config.decay)
+        } else {
+            return Ok(config);
+        };
+        Err(WrongArguments(wrong).into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_read_as_they_are_written() {
+        for name in ["log", "idm", "constant-velocity", "model:a/b.safetensors"] {
+            assert_eq!(name.parse::<WorldName>().unwrap().to_string(), name);
+        }
+        for name in ["", "model:", "model", "IDM"] {
+            assert!(name.parse::<WorldName>().is_err(), "{name}");
+        }
+    }
+}
