@@ -229,7 +229,7 @@ fn quintic(start: Pose, end: Pose, curvatures: [f64; 2]) -> Vec<DVec2> {
     let turn = angle_difference(end.heading, start.heading).abs();
     // An arc is longer than its chord; with this the quintic follows it to millimetres.
     let scale = if turn > 1e-3 {
-        scale * (turn / 2.0) / (turn / 2.0).sin().max(0.2)
+        scale * (turn / 2.0) / (turn / 2.0).sin()
     } else {
         scale
     };
@@ -353,13 +353,14 @@ mod tests {
             (Pose::new(14.0, 10.0, FRAC_PI_2), 0.25),
             (Pose::new(12.0, -12.0, -FRAC_PI_2), 0.2),
             (Pose::new(30.0, 2.0, 0.0), 0.02),
+            (Pose::new(40.0, 3.4, 0.02), 0.02),
             (Pose::new(25.0, 5.0, 0.4), 0.1),
         ] {
             let track = Track::through(&connect(start, end, [0.0; 2], 40.0));
             let last = track.pose_at(track.length());
             assert!(last.position.distance(end.position) < 1e-6);
             assert!(angle_difference(last.heading, end.heading).abs() < 0.02);
-            assert!(track.pose_at(0.0).heading.abs() < 0.02);
+            assert!(track.pose_at(0.0).heading.abs() < 0.02 && track.points()[1].y.abs() < 0.02);
             let worst = track
                 .curvatures()
                 .iter()

@@ -230,3 +230,25 @@ fn threads_change_nothing() {
         assert_eq!(one.map.lanes(), three.map.lanes());
     }
 }
+
+#[test]
+fn unusual_requests_are_met() {
+    let standard = SynthesisConfig::standard();
+    for family in RoadFamily::ALL {
+        for (density, dt, extent_m) in [(0.1, 0.1, 120.0), (3.0, 0.1, 90.0), (1.0, 0.2, 160.0)] {
+            let config = SynthesisConfig {
+                density,
+                dt,
+                extent_m,
+                history_s: 2.0,
+                family: Some(family),
+                ..standard.clone()
+            };
+            for scene in synthesize_many(&config, Seed(3), 3) {
+                scene.validate().unwrap();
+                assert_eq!(scene.now, (2.0 / dt).round() as usize);
+                assert!(scene.id.starts_with(family.name()));
+            }
+        }
+    }
+}

@@ -231,6 +231,8 @@ fn links(legs: &[Leg], from: usize, lanes_for_left: usize) -> Vec<Link> {
                 // A ramp joins on the outside.
                 Turn::Straight if leg.joins => Some(m - n.min(m) + k.min(m - 1)),
                 Turn::Straight if k < m => Some(k),
+                // On open road a lane that does not go on ends: traffic changes lanes before.
+                Turn::Straight if legs.iter().all(|leg| leg.is_open) => None,
                 Turn::Straight if !(rightmost && has(Turn::Right)) => Some(m - 1),
                 _ => None,
             };

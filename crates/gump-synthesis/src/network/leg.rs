@@ -29,6 +29,8 @@ pub(crate) struct Leg {
     pub(crate) left: f64,
     /// From the reference to the right curb (traffic away from it), metres.
     pub(crate) right: f64,
+    /// Nobody waits where it ends.
+    pub(crate) is_open: bool,
     /// Joins the road beyond on its outside, as a ramp does.
     pub(crate) joins: bool,
     /// Lanes towards the junction, innermost first.
@@ -94,6 +96,7 @@ pub(crate) fn legs_of(plan: &Plan, node: usize) -> Vec<Leg> {
                 setback,
                 left: r.half_width(!at_start),
                 right: r.half_width(at_start),
+                is_open: plan.nodes[node].control == Control::Free,
                 joins: plan.nodes[node].control == Control::Free && !r.major,
                 incoming: Vec::new(),
                 outgoing: Vec::new(),

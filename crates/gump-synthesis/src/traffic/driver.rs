@@ -130,3 +130,50 @@ impl Driver {
         self.standstill + (speed * self.headway + dynamic).max(0.0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_scene::Seed;
+
+    /// Drives towards something that stands `distance` metres ahead; what is left when it rests.
+    fn approach(driver: &Driver, speed: f64, distance: f64) -> (f64, f64) {
+        let (mut gap, mut speed, mut hardest) = (distance, speed, 0.0);
+        for _ in 0..600 {
+            let leader = Leader { gap, speed: 0.0 };
+            let acceleration = driver.acceleration(speed, 15.0, Some(leader), None);
+            hardest = f64::min(hardest, acceleration);
+            let next = (speed + acceleration * 0.1).max(0.0);
+            gap -= (speed + next) / 2.0 * 0.1;
+            speed = next;
+        }
+        (gap, hardest)
+    }
+
+    #[test]
+    fn drivers_come_to_rest_before_what_stands_ahead() {
+        let mut rng = Seed(1).rng();
+        for _ in 0..50 {
+            for driver in [
+                Driver::of_car(&mut rng),
+                Driver::of_heavy_vehicle(&mut rng),
+                Driver::of_bicycle(&mut rng),
+            ] {
+                let (gap, hardest) = approach(&driver, 12.0, 80.0);
+                assert!(gap > 0.8 && gap < driver.standstill + 1.0, "{gap} m left");
+                assert!(hardest > -5.0, "{hardest} m/s2");
+            }
+        }
+    }
+
+    #[test]
+    fn an_open_road_is_driven_at_the_desired_speed() {
+        let driver = Driver::of_car(&mut Seed(2).rng());
+        let mut speed = 0.0;
+        for _ in 0..600 {
+            speed += driver.acceleration(speed, 10.0, None, None) * 0.1;
+        }
+        assert!((speed - 10.0).abs() < 0.1);
+        assert!(driver.acceleration(14.0, 10.0, None, None) < -0.5);
+    }
+}

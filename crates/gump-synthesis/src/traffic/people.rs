@@ -232,7 +232,7 @@ impl Traffic<'_> {
         let away = |(j, other): (usize, &Person)| {
             let gap = person.pose.position - other.pose.position;
             let distance = gap.length();
-            if j == i || distance > 1.8 || distance < 1e-3 {
+            if j == i || !(1e-3..=1.8).contains(&distance) {
                 return DVec2::ZERO;
             }
             // Sideways only: slowing down is decided elsewhere.
