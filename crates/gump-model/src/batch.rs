@@ -1,7 +1,9 @@
 //! Token sequences as tensors: here padding is born, and nowhere else.
 
+use std::collections::BTreeMap;
+
 use candle_core::{Device, Tensor};
-use gump_tokenizer::{Key, Slot, TokenSequence};
+use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
 
 use crate::embedding::{ROWS_PER_TOKEN, SineTables, Tables};
 use crate::mct::TokenBatch;
@@ -16,12 +18,15 @@ pub(crate) struct PlacedSlot {
     pub(crate) frame: usize,
     /// The key before it, if it is a value.
     pub(crate) key: Option<Key>,
+    /// What its object was last seen as in the window, if it is a key.
+    pub(crate) last: Option<QuantizedState>,
 }
 
 /// The slots of a sequence with their places; prompts belong to frame 0.
 pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
     let mut frame = None;
-    let mut key = None;
+    let mut key: Option<Key> = None;
+    let mut seen: BTreeMap<u16, QuantizedState> = BTreeMap::new();
     let slots = sequence.slots().into_iter().enumerate();
     slots
         .map(|(position, slot)| {
@@ -29,14 +34,23 @@ pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
                 frame = Some(frame.map_or(0, |frame: usize| frame + 1));
             }
             let before = key.take();
-            if let Slot::Key(found) = slot {
-                key = Some(found);
+            let mut last = None;
+            match (slot, before) {
+                (Slot::Key(found), _) => {
+                    key = Some(found);
+                    last = seen.get(&found.id).copied();
+                }
+                (Slot::Value(state), Some(key)) => {
+                    seen.insert(key.id, state);
+                }
+                _ => {}
             }
             PlacedSlot {
                 slot,
                 position,
                 frame: frame.unwrap_or(0),
                 key: before,
+                last,
             }
         })
         .collect()
@@ -62,7 +76,7 @@ pub(crate) fn pack(
     for (row, sequence) in sequences.iter().enumerate() {
         for (column, placed) in sequence.iter().enumerate() {
             rows.extend(tables.rows(placed));
-            if sines.append(&placed.slot, &mut features) {
+            if sines.append(placed, &mut features) {
                 positions.push((row * t + column) as u32);
             }
         }
@@ -72,6 +86,7 @@ pub(crate) fn pack(
                 position,
                 frame: 0,
                 key: None,
+                last: None,
             }));
         }
     }

@@ -27,9 +27,13 @@ pub struct ModelConfig {
     pub trajectory_heads: Vec<usize>,
     /// How gated cross-attention is gated.
     pub gate: Gate,
-    /// True adds an object's id and class to its value token too (the paper: to its key alone), so
-    /// that finding an object's past takes one attention step instead of two.
-    pub value_carries_key: bool,
+    /// True lets the two tokens of an object share what they know: the value carries the key's id
+    /// and class, and the key carries the object's last value in the window (the paper: neither),
+    /// so that an object finds its own past without learning to search for it.
+    pub pairs_share: bool,
+    /// True adds to every bin's row of the decoder's tables a learned map of the bin's sines (the
+    /// paper: free rows), so that what is learned of one bin holds for its neighbours.
+    pub smooth_bins: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
     /// True builds the decoder that reconstructs the raster from the visual features.
@@ -116,7 +120,8 @@ impl ModelConfig {
             gru_layers: 1,
             trajectory_heads: vec![3],
             gate: Gate::Flamingo,
-            value_carries_key: true,
+            pairs_share: true,
+            smooth_bins: true,
             dropout: 0.0,
             reconstruction: true,
             visual: VisualConfig {
@@ -144,7 +149,8 @@ impl ModelConfig {
             gru_layers: 2,
             trajectory_heads: depths.to_vec(),
             gate: Gate::Flamingo,
-            value_carries_key: false,
+            pairs_share: false,
+            smooth_bins: false,
             dropout: 0.1,
             reconstruction: true,
             visual: VisualConfig {

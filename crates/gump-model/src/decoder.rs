@@ -5,7 +5,7 @@
 //!
 //! Shapes: `K` keys, `C` width, `N` bins of a field.
 
-use candle_core::{Result, Tensor};
+use candle_core::{Device, Result, Tensor};
 use gump_tokenizer::Field;
 
 use crate::ModelError;
@@ -43,6 +43,84 @@ pub(crate) struct StateDecoder {
     layers: Vec<GruLayer>,
     slots: Tensor,
     head: Linear,
+    smooth: Option<SmoothBins>,
+}
+
+/// What is added to the rows of a field's bins, on the way in and on the way out: a learned map of
+/// the bin's sines.
+#[derive(Debug)]
+struct SmoothBins {
+    /// Per field in vocabulary order, [bins, 2k].
+    sines: Vec<Tensor>,
+    input: Vec<Linear>,
+    output: Vec<Linear>,
+}
+
+/// Fields in the order of their tokens, without gaps from the first x to the last length.
+const VOCABULARY_ORDER: [Field; 7] = [
+    Field::X,
+    Field::Y,
+    Field::Heading,
+    Field::VelocityX,
+    Field::VelocityY,
+    Field::Width,
+    Field::Length,
+];
+
+impl SmoothBins {
+    fn new(
+        mut scope: Scope<'_>,
+        width: usize,
+        device: &Device,
+    ) -> std::result::Result<Self, ModelError> {
+        let k = width / (2 * Field::ALL.len());
+        let mut map = |name: String| {
+            Linear::with(
+                &mut scope,
+                &name,
+                2 * k,
+                width,
+                Init::Normal(TABLE_DEVIATION),
+                None,
+            )
+        };
+        let mut smooth = Self {
+            sines: Vec::new(),
+            input: Vec::new(),
+            output: Vec::new(),
+        };
+        for (i, field) in VOCABULARY_ORDER.into_iter().enumerate() {
+            let sines = crate::embedding::field_sines(field, k);
+            smooth
+                .sines
+                .push(Tensor::from_vec(sines, (field.n_bins(), 2 * k), device)?);
+            smooth.input.push(map(format!("input.{i}"))?);
+            smooth.output.push(map(format!("output.{i}"))?);
+        }
+        Ok(smooth)
+    }
+
+    /// `table` [TABLE_ROWS, C] with the fields' rows raised.
+    fn raise(&self, table: &Tensor) -> Result<Tensor> {
+        let first = VOCABULARY_ORDER[0].first_token() as usize;
+        let mut parts = vec![table.narrow(0, 0, first)?];
+        for ((field, sines), map) in VOCABULARY_ORDER.iter().zip(&self.sines).zip(&self.input) {
+            let rows = table.narrow(0, field.first_token() as usize, field.n_bins())?;
+            parts.push((rows + map.forward(sines)?)?);
+        }
+        let end = gump_tokenizer::BEGIN as usize;
+        parts.push(table.narrow(0, end, table.dim(0)? - end)?);
+        Tensor::cat(&parts, 0)
+    }
+
+    /// Rows of the output matrix for a field, [bins, C].
+    fn output(&self, rows: &Tensor, field: Field) -> Result<Tensor> {
+        let i = VOCABULARY_ORDER
+            .iter()
+            .position(|&f| f == field)
+            .expect("every field is in order");
+        rows + self.output[i].forward(&self.sines[i])?
+    }
 }
 
 #[derive(Debug)]
@@ -55,8 +133,14 @@ impl StateDecoder {
     pub(crate) fn new(
         mut scope: Scope<'_>,
         config: &ModelConfig,
+        device: &Device,
     ) -> std::result::Result<Self, ModelError> {
         let c = config.width;
+        let smooth = if config.smooth_bins {
+            Some(SmoothBins::new(scope.part("smooth"), c, device)?)
+        } else {
+            None
+        };
         let layer = |i: usize, scope: &mut Scope<'_>| {
             let mut scope = scope.part(format!("gru.{i}"));
             Ok::<_, ModelError>(GruLayer {
@@ -79,6 +163,7 @@ impl StateDecoder {
             })
         };
         Ok(Self {
+            smooth,
             layers: (0..config.gru_layers)
                 .map(|i| layer(i, &mut scope))
                 .collect::<std::result::Result<_, _>>()?,
@@ -92,6 +177,14 @@ impl StateDecoder {
                 None,
             )?,
         })
+    }
+
+    /// The rows by which tokens enter the decoder, [TABLE_ROWS, C], from those of the transformer.
+    pub(crate) fn input_table(&self, table: &Tensor) -> Result<Tensor> {
+        match &self.smooth {
+            Some(smooth) => smooth.raise(table),
+            None => table.contiguous(),
+        }
     }
 
     /// Outputs of all steps with the true tokens as input.
@@ -160,6 +253,10 @@ impl StateDecoder {
             .head
             .weight()
             .narrow(0, field.first_token() as usize, field.n_bins())?;
+        let rows = match &self.smooth {
+            Some(smooth) => smooth.output(&rows, field)?,
+            None => rows,
+        };
         ops::linear(output, &rows, None)
     }
 

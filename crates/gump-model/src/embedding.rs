@@ -13,14 +13,14 @@ use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TAB
 const N_FRAMES: usize = 64;
 /// Rows for light indices, 0 unused.
 const N_LIGHT_INDICES: usize = 64;
-/// Most rows a token sums: seven fields, id, class, position, frame.
-pub(crate) const ROWS_PER_TOKEN: usize = 11;
+/// Most rows a token sums: seven fields, id, class, the mark of a key, position, frame.
+pub(crate) const ROWS_PER_TOKEN: usize = 12;
 
 /// Where each table starts in the stack of tables.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tables {
     block_size: usize,
-    value_carries_key: bool,
+    pairs_share: bool,
 }
 
 impl Tables {
@@ -28,12 +28,13 @@ impl Tables {
     pub(crate) const LIGHT_INDEX: usize = Self::CLASS + N_CLASSES;
     pub(crate) const PROMPT: usize = Self::LIGHT_INDEX + N_LIGHT_INDICES;
     pub(crate) const FRAME: usize = Self::PROMPT + N_PROMPTS;
-    pub(crate) const POSITION: usize = Self::FRAME + N_FRAMES;
+    pub(crate) const KEY_MARK: usize = Self::FRAME + N_FRAMES;
+    pub(crate) const POSITION: usize = Self::KEY_MARK + 1;
 
     pub(crate) fn new(config: &ModelConfig) -> Self {
         Self {
             block_size: config.block_size,
-            value_carries_key: config.value_carries_key,
+            pairs_share: config.pairs_share,
         }
     }
 
@@ -63,12 +64,20 @@ impl Tables {
             Slot::Key(key) => {
                 add(usize::from(key.id));
                 add(Self::CLASS + gump_tokenizer::class_index(key.kind));
+                if self.pairs_share {
+                    add(Self::KEY_MARK);
+                    if let Some(last) = placed.last {
+                        for field in Field::ALL {
+                            add(last.token(field) as usize);
+                        }
+                    }
+                }
             }
             Slot::Value(state) => {
                 for field in Field::ALL {
                     add(state.token(field) as usize);
                 }
-                if let Some(key) = placed.key.filter(|_| self.value_carries_key) {
+                if let Some(key) = placed.key.filter(|_| self.pairs_share) {
                     add(usize::from(key.id));
                     add(Self::CLASS + gump_tokenizer::class_index(key.kind));
                 }
@@ -88,27 +97,25 @@ impl Tables {
 #[derive(Debug)]
 pub(crate) struct SineTables {
     width: usize,
+    pairs_share: bool,
     /// Per field, [bins, 2k].
     fields: Vec<Vec<f32>>,
 }
 
 impl SineTables {
-    pub(crate) fn new(width: usize) -> Self {
+    pub(crate) fn new(config: &ModelConfig) -> Self {
+        let width = config.width;
         let k = width / (2 * Field::ALL.len());
-        let table = |field: Field| {
-            let bins = 0..field.n_bins() as u16;
-            bins.flat_map(|bin| sines(field, field.dequantize(bin), k))
-                .collect()
-        };
         Self {
             width,
-            fields: Field::ALL.into_iter().map(table).collect(),
+            pairs_share: config.pairs_share,
+            fields: Field::ALL.map(|field| field_sines(field, k)).to_vec(),
         }
     }
 
-    /// Appends the features of `slot` to `out` if it has coordinates.
-    pub(crate) fn append(&self, slot: &Slot, out: &mut Vec<f32>) -> bool {
-        let (state, n_fields) = match slot {
+    /// Appends the features of a token to `out` if it has coordinates.
+    pub(crate) fn append(&self, placed: &PlacedSlot, out: &mut Vec<f32>) -> bool {
+        let (state, n_fields) = match &placed.slot {
             Slot::Value(state) => (*state, Field::ALL.len()),
             Slot::Light(light) => {
                 let (x, y, heading) = (light.x, light.y, light.heading);
@@ -122,6 +129,10 @@ impl SineTables {
                     3,
                 )
             }
+            Slot::Key(_) if self.pairs_share => match placed.last {
+                Some(last) => (last, Field::ALL.len()),
+                None => return false,
+            },
             _ => return false,
         };
         let end = out.len() + self.width;
@@ -141,6 +152,13 @@ pub(crate) fn sine_of_point(x: f64, y: f64, width: usize) -> Vec<f32> {
     features.extend(sines(Field::Y, y, k));
     features.resize(width, 0.0);
     features
+}
+
+/// Sine features of all bins of a field, [bins, 2k].
+pub(crate) fn field_sines(field: Field, k: usize) -> Vec<f32> {
+    let bins = 0..field.n_bins() as u16;
+    bins.flat_map(|bin| sines(field, field.dequantize(bin), k))
+        .collect()
 }
 
 /// `k` sines, then `k` cosines.

@@ -187,9 +187,11 @@ fn state_loss(
         .flat_map(|step| targets.iter().map(move |target| target.token(step)))
         .collect();
     let tokens = Tensor::from_vec(tokens, (STEPS.len(), k), device)?;
-    let outputs = network
-        .decoder
-        .teacher_forced(&network.mct.token_table()?, &hidden, &tokens)?;
+    let outputs = network.decoder.teacher_forced(
+        &network.decoder.input_table(&network.mct.token_table()?)?,
+        &hidden,
+        &tokens,
+    )?;
 
     let counts: Vec<usize> = (0..STEPS.len())
         .map(|step| targets.iter().filter(|t| t.bins[step].is_some()).count())

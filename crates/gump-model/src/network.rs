@@ -45,7 +45,7 @@ impl Network {
         let device = parameters.device().clone();
         let mut root = parameters.root();
         let mct = Mct::new(root.part("mct"), &config)?;
-        let decoder = StateDecoder::new(root.part("decoder"), &config)?;
+        let decoder = StateDecoder::new(root.part("decoder"), &config, &device)?;
         let visual = Visual::new(root.part("visual"), &config, &device)?;
         let trajectory_heads = (0..config.trajectory_heads.len())
             .map(|i| TrajectoryHead::new(root.part(format!("trajectory.{i}")), config.width))
@@ -55,7 +55,7 @@ impl Network {
                 "the checkpoint's tensor \"{name}\" has no place in it"
             )));
         }
-        let sines = SineTables::new(config.width);
+        let sines = SineTables::new(&config);
         Ok(Self {
             config,
             raster_spec,

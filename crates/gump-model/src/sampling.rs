@@ -144,7 +144,7 @@ pub(crate) fn sample_states(
     requests: &[Request],
     config: &SamplingConfig,
 ) -> Result<Vec<Bins>, ModelError> {
-    let table = network.mct.token_table()?.contiguous()?;
+    let table = network.decoder.input_table(&network.mct.token_table()?)?;
     let mut states = network.decoder.begin(hidden);
     let mut bins = vec![[0; STEPS.len()]; requests.len()];
     let mut previous: Option<Tensor> = None;

@@ -191,7 +191,10 @@ fn the_cache_is_exact() {
 #[test]
 fn the_decoder_says_the_same_forced_and_free() {
     let network = network();
-    let table = network.mct.token_table().unwrap();
+    let table = network
+        .decoder
+        .input_table(&network.mct.token_table().unwrap())
+        .unwrap();
     let hidden = Tensor::from_vec(
         (0..3 * 32).map(|i| (i as f32).sin()).collect(),
         (3, 32),
@@ -431,8 +434,11 @@ fn check_parameters(name: &str, c: usize, layers: usize, channels: usize, resnet
     );
     // One gate more per block than the released code: the feed-forward is gated too.
     assert_eq!(count("mct.cross."), layers / 3 * (12 * c * c + 4 * c + 2));
-    // 2048 positions, 2973 tokens, 3 classes, 64 light indices, 74 prompts, 64 frames.
-    assert_eq!(count("mct.tables"), (2048 + 2973 + 3 + 64 + 74 + 64) * c);
+    // 2048 positions, 2973 tokens, 3 classes, 64 light indices, 74 prompts, 64 frames, 1 mark.
+    assert_eq!(
+        count("mct.tables"),
+        (2048 + 2973 + 3 + 64 + 74 + 64 + 1) * c
+    );
     assert_eq!(count("mct.sine_"), 4 * c * c + 7 * c);
     assert_eq!(count("decoder.gru."), 2 * (6 * c * c + 6 * c));
     assert_eq!(
