@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ci, data, simulate, tidy};
+use crate::verbs::{ablate, ci, data, simulate, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -28,8 +28,13 @@ enum Verb {
     /// Look into scenario files, check them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
+    /// Train a world model.
+    Train(train::Args),
     /// Imagine how a recorded scene goes on, many times over.
     Simulate(simulate::Args),
+    /// Leave a part out or swap it, and measure what it did.
+    #[command(subcommand)]
+    Ablate(ablate::Verb),
     /// Everything CI runs: format, lints, tests, docs, layers, house rules.
     Ci(ci::Args),
     /// Check the house rules of the repository.
@@ -62,8 +67,14 @@ impl Cli {
             Verb::Data(data::Verb::Synthesize(args)) => {
                 Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Train(args) => {
+                Run::of("train", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Simulate(args) => {
                 Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Ablate(ablate::Verb::Nar(args)) => {
+                Run::of("ablate nar", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {

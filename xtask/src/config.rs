@@ -1,7 +1,8 @@
 //! `--config FILE.toml`: flags from a file.
 //!
 //! Every scalar key at the top of the file is a long flag of the verb, so clap checks its value
-//! and a flag on the command line overrides it. Tables belong to the verb itself.
+//! and a flag on the command line overrides it. Tables belong to the verb itself, which reads them
+//! with [`tables`] and checks them with [`check_keys`].
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -28,6 +29,29 @@ pub(crate) fn splice(
     let flags = flags(path, &read(path)?, verb)?;
     arguments.splice(n_words..n_words, flags);
     Ok(arguments)
+}
+
+/// The tables of a config file, without the keys that are flags.
+pub(crate) fn tables(path: &Path) -> anyhow::Result<Table> {
+    let mut table = read(path)?;
+    table.retain(|_, value| value.is_table());
+    Ok(table)
+}
+
+/// Refuses keys of `given` that `known` does not have, at any depth.
+///
+/// Error: [`WrongArguments`] with the nearest known key.
+pub(crate) fn check_keys(path: &Path, given: &Table, known: &Table) -> anyhow::Result<()> {
+    for (key, value) in given {
+        match (value, known.get(key)) {
+            (_, None) => {
+                return Err(unknown_key(path, key, known.keys().map(String::as_str)));
+            }
+            (Value::Table(given), Some(Value::Table(known))) => check_keys(path, given, known)?,
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// The value after `--config`, if it is there.
@@ -180,6 +204,17 @@ mod tests {
     fn broken_toml_names_the_line() {
         let error = spliced("futures = 8\ntop_k = = 3").unwrap_err();
         assert!(error.contains("line 2"), "{error}");
+    }
+
+    #[test]
+    fn tables_are_checked_at_depth() {
+        let known: Table = "[model]\nlayers = 1\nwidth = 2".parse().unwrap();
+        let given: Table = "[model]\nlayer = 1".parse().unwrap();
+        let error = check_keys(Path::new("c.toml"), &given, &known).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "c.toml: unknown key layer; did you mean layers?"
+        );
     }
 
     #[test]

@@ -11,9 +11,6 @@ use gump_viz::{
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
-/// Futures shown side by side in a film, the log not counted.
-const FILMED: usize = 3;
-
 /// SHA-256 over x, y, heading and the two velocities of every agent of every frame, as
 /// little-endian f32: futures, then steps, then agents by id.
 pub(crate) fn digest(rollouts: &[Rollout]) -> String {
@@ -128,29 +125,36 @@ pub(crate) fn picture(scenario: &Scenario, rollouts: &[Rollout], label: &str) ->
     draw_futures(&scene, &futures, &spec)
 }
 
-/// What happened, as far as it is known, beside a few futures.
-pub(crate) fn film(scenario: &Scenario, rollouts: &[Rollout]) -> anyhow::Result<Film> {
+/// What happened, as far as it is known, beside futures with their names.
+pub(crate) fn film(scenario: &Scenario, futures: &[(&str, &Rollout)]) -> anyhow::Result<Film> {
     let log = log_as_rollout(scenario);
-    let known = (log.steps() > 0).then_some(Take {
-        rollout: &log,
-        label: "log".into(),
-    });
-    let imagined = rollouts
-        .iter()
-        .take(FILMED)
-        .enumerate()
-        .map(|(k, rollout)| Take {
+    let known = (log.steps() > 0).then_some(("log", &log));
+    let takes: Vec<_> = known
+        .into_iter()
+        .chain(futures.iter().copied())
+        .map(|(label, rollout)| Take {
             rollout,
-            label: format!("future {}", k + 1),
-        });
-    let takes: Vec<_> = known.into_iter().chain(imagined).collect();
+            label: label.into(),
+        })
+        .collect();
     let scene = scenario.present();
-    let camera = Camera::on_ego(&scene, 90.0, 400, 400);
     let spec = FilmSpec {
-        columns: takes.len().min(2),
-        ..FilmSpec::new(camera)
+        columns: if takes.len() == 4 {
+            2
+        } else {
+            takes.len().min(3)
+        },
+        ..FilmSpec::new(Camera::on_ego(&scene, 90.0, 400, 400))
     };
     Ok(grid_film(&takes, &spec)?)
+}
+
+/// The first few futures with their numbers, for a film.
+pub(crate) fn first_few(rollouts: &[Rollout]) -> Vec<(&'static str, &Rollout)> {
+    ["future 1", "future 2", "future 3"]
+        .into_iter()
+        .zip(rollouts)
+        .collect()
 }
 
 #[cfg(test)]

@@ -12,12 +12,15 @@
 mod checks;
 mod cli;
 mod config;
+mod dataset;
 mod futures;
 mod imagine;
+mod losses;
 mod machine;
 mod progress;
 mod report;
 mod run;
+mod shipped;
 mod table;
 mod verbs;
 mod worlds;

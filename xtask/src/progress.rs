@@ -28,13 +28,18 @@ struct Lines {
 }
 
 impl Progress {
-    /// Begins work of `total` units, for instance "frames".
+    /// Begins work of `total` units, for instance "frames"; 0 if nobody knows how many.
     pub(crate) fn begin(quiet: bool, what: &str, total: u64, unit: &'static str) -> Self {
         Self(if quiet {
             Form::Silent
         } else if std::io::stderr().is_terminal() {
             let template =
                 format!("{{msg}} {{bar:30}} {{pos}}/{{len}} {unit}, {{per_sec}}, {{eta}} left");
+            let template = if total == 0 {
+                format!("{{msg}} {{pos}} {unit}, {{per_sec}}")
+            } else {
+                template
+            };
             let style = ProgressStyle::with_template(&template)
                 .expect("the template of the progress bar is well formed");
             let bar = ProgressBar::new(total).with_style(style);
@@ -69,6 +74,20 @@ impl Progress {
             }
         }
     }
+
+    /// Changes the words in front.
+    pub(crate) fn message(&self, what: &str) {
+        match &self.0 {
+            Form::Silent => {}
+            Form::Bar(bar) => bar.set_message(what.to_owned()),
+            Form::Lines(lines) => {
+                let mut lines = lines
+                    .lock()
+                    .unwrap_or_else(std::sync::PoisonError::into_inner);
+                what.clone_into(&mut lines.what);
+            }
+        }
+    }
 }
 
 impl Drop for Progress {
@@ -89,6 +108,9 @@ impl Lines {
             ..
         } = self;
         let rate = *done as f64 / elapsed.as_secs_f64().max(1e-9);
+        if *total == 0 {
+            return format!("{what}: {done} {unit}, {rate:.1}/s");
+        }
         let left = total.saturating_sub(*done) as f64 / rate.max(1e-9);
         format!("{what}: {done}/{total} {unit}, {rate:.1}/s, {left:.0} s left")
     }

@@ -1,5 +1,6 @@
 //! One run of a verb: its output folder, seed, threads, phases and results.
 
+use std::io::Write as _;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,7 +23,7 @@ pub(crate) struct Common {
     out: Option<PathBuf>,
     /// Where all randomness comes from [default: 0]
     #[arg(long, value_name = "N")]
-    seed: Option<u64>,
+    pub(crate) seed: Option<u64>,
     /// Flags from a file; those on the command line win
     #[arg(long, value_name = "FILE.toml")]
     pub(crate) config: Option<PathBuf>,
@@ -103,20 +104,22 @@ impl Run {
     /// work too.
     pub(crate) fn execute(
         mut self,
-        work: impl FnOnce(&mut Self) -> anyhow::Result<()> + Send,
+        work: impl FnOnce(&mut Self) -> anyhow::Result<()>,
     ) -> anyhow::Result<()> {
-        let pool = rayon::ThreadPoolBuilder::new()
+        // The global pool, and the work outside of it: a worker that waits for work which its own
+        // pool is to do would wait for ever on a pool of one thread.
+        rayon::ThreadPoolBuilder::new()
             .num_threads(self.threads)
-            .build()
+            .build_global()
             .context("cannot start the worker threads")?;
-        let done = pool.install(|| work(&mut self));
+        let done = work(&mut self);
         self.report.add_seconds("total", self.began.elapsed());
         self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
         let path = self.out.join("report.json");
         let written = self.report.write(&path);
         let has_something_to_tell = done.is_ok() || !self.report.results.is_empty();
         if !self.quiet && has_something_to_tell {
-            println!("{}report: {}", self.report.text(), path.display());
+            print_line(&format!("{}report: {}", self.report.text(), path.display()));
         }
         done.and(written)
     }
@@ -141,7 +144,7 @@ impl Run {
     /// Tells the reader something that is no result.
     pub(crate) fn say(&self, line: &str) {
         if !self.quiet {
-            println!("{line}");
+            print_line(line);
         }
     }
 
@@ -150,6 +153,22 @@ impl Run {
         let value = serde_json::to_value(value)
             .with_context(|| format!("the result {key} cannot be written as JSON"))?;
         self.report.results.insert(key.into(), value);
+        Ok(())
+    }
+
+    /// Takes the seed from elsewhere, where `--seed` is not given.
+    pub(crate) fn reseed(&mut self, seed: u64) {
+        self.seed = Seed(seed);
+        self.report.seed = seed;
+    }
+
+    /// Replaces a setting of the report by what it was resolved to.
+    pub(crate) fn setting(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
+        let value = serde_json::to_value(value)
+            .with_context(|| format!("the setting {key} cannot be written as JSON"))?;
+        if let serde_json::Value::Object(settings) = &mut self.report.config {
+            settings.insert(key.into(), value);
+        }
         Ok(())
     }
 
@@ -167,6 +186,11 @@ impl Run {
     pub(crate) fn seed(&self) -> Seed {
         self.seed
     }
+}
+
+/// Prints a line; whether anybody still listens is not the work's business.
+fn print_line(line: &str) {
+    let _ = writeln!(std::io::stdout(), "{line}");
 }
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);

@@ -1,6 +1,8 @@
 //! One file per verb: arguments, then what the verb does, by calling crates.
 
+pub(crate) mod ablate;
 pub(crate) mod ci;
 pub(crate) mod data;
 pub(crate) mod simulate;
 pub(crate) mod tidy;
+pub(crate) mod train;

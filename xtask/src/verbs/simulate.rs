@@ -80,7 +80,7 @@ impl Args {
         }
         let label = format!("{} in the world {}", scenario.id, self.world);
         futures::picture(scenario, rollouts, &label).save_png(&run.path("picture.png"))?;
-        futures::film(scenario, rollouts)?.save(&run.path("film.gif"))?;
+        futures::film(scenario, &futures::first_few(rollouts))?.save(&run.path("film.gif"))?;
         Ok(())
     }
 

@@ -25,7 +25,7 @@ pub(crate) struct Args {
     /// Multiplies the number of agents, 0.1 to 3
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     density: f64,
-    /// The kind of road, for instance "roundabout" [default: all kinds]
+    /// The kind of road, for instance "roundabout" [default: any]
     #[arg(long, value_name = "NAME", value_parser = road_family)]
     #[serde(serialize_with = "as_name")]
     family: Option<RoadFamily>,

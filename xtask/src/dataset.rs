@@ -1,0 +1,188 @@
+//! Data sets with splits: a folder with a `manifest.toml`, or any path for a set without.
+
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use gump_scene::Scenario;
+use serde::Deserialize;
+
+use crate::progress::Progress;
+use crate::run::stop_if_interrupted;
+
+/// `manifest.toml`: what a data set consists of, where it is from and who may use it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[cfg_attr(
+    not(test),
+    expect(
+        dead_code,
+        reason = "people and tests read the fields that training does not"
+    )
+)]
+pub(crate) struct Manifest {
+    pub(crate) name: String,
+    /// An SPDX expression.
+    pub(crate) licence: String,
+    /// How the files came about.
+    pub(crate) provenance: String,
+    #[serde(rename = "file")]
+    pub(crate) files: Vec<ManifestFile>,
+}
+
+/// A file of a data set.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[cfg_attr(
+    not(test),
+    expect(
+        dead_code,
+        reason = "people and tests read the fields that training does not"
+    )
+)]
+pub(crate) struct ManifestFile {
+    /// Path from the manifest.
+    pub(crate) path: PathBuf,
+    pub(crate) scenes: usize,
+    /// Lower-case hexadecimal.
+    pub(crate) sha256: String,
+    /// Which of its scenes are for what.
+    pub(crate) split: Splits,
+}
+
+/// Indices of the scenes of each split: the first, and the one after the last.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Splits {
+    pub(crate) train: [usize; 2],
+    pub(crate) validation: [usize; 2],
+    pub(crate) test: [usize; 2],
+}
+
+/// What scenes are for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Split {
+    Train,
+    Validation,
+    Test,
+}
+
+/// Scenes of one file or folder.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Part {
+    pub(crate) path: PathBuf,
+    /// Indices of the scenes.
+    pub(crate) scenes: Range<usize>,
+}
+
+impl Part {
+    /// All scenes.
+    pub(crate) fn whole(path: &Path) -> Self {
+        Self {
+            path: path.to_owned(),
+            scenes: 0..usize::MAX,
+        }
+    }
+}
+
+impl Manifest {
+    /// Reads the manifest of a folder; `None` if it has none.
+    ///
+    /// Error: a manifest that cannot be read or understood.
+    pub(crate) fn of(folder: &Path) -> anyhow::Result<Option<Self>> {
+        let path = folder.join("manifest.toml");
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        let manifest: Self = toml::from_str(&text)
+            .map_err(|error| anyhow::anyhow!("{}: {}", path.display(), error.message()))?;
+        Ok(Some(manifest))
+    }
+}
+
+/// Where the scenes of a split are; without a manifest, all of a path is for training.
+///
+/// Error: a manifest that cannot be read.
+pub(crate) fn parts(data: &Path, split: Split) -> anyhow::Result<Vec<Part>> {
+    let Some(manifest) = Manifest::of(data)? else {
+        return Ok(match split {
+            Split::Train => vec![Part::whole(data)],
+            Split::Validation | Split::Test => Vec::new(),
+        });
+    };
+    let parts = manifest.files.iter().map(|file| {
+        let [start, end] = match split {
+            Split::Train => file.split.train,
+            Split::Validation => file.split.validation,
+            Split::Test => file.split.test,
+        };
+        Part {
+            path: data.join(&file.path),
+            scenes: start..end,
+        }
+    });
+    Ok(parts.filter(|part| !part.scenes.is_empty()).collect())
+}
+
+/// Reads the scenarios of the parts.
+///
+/// Error: the first record that cannot be read, or Ctrl-C.
+pub(crate) fn read(parts: &[Part], progress: &Progress) -> anyhow::Result<Vec<Scenario>> {
+    let mut scenarios = Vec::new();
+    for part in parts {
+        let records = gump_data::open(&part.path)?;
+        let Range { start, end } = part.scenes;
+        for record in records.take(end).skip(start) {
+            stop_if_interrupted()?;
+            scenarios.push(record?.scenario);
+            progress.advance(1);
+        }
+    }
+    Ok(scenarios)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::machine::repository;
+    use sha2::{Digest, Sha256};
+
+    #[test]
+    fn the_mini_set_is_as_its_manifest_says() {
+        let folder = repository().join("datasets/mini");
+        let manifest = Manifest::of(&folder).unwrap().unwrap();
+        assert_eq!(manifest.name, "mini");
+        assert!(manifest.provenance.contains("cargo xtask data synthesize"));
+        assert_eq!(manifest.licence, "Apache-2.0");
+        let silent = Progress::begin(true, "", 0, "");
+        for file in &manifest.files {
+            let path = folder.join(&file.path);
+            let digest = Sha256::digest(std::fs::read(&path).unwrap());
+            let digest: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(digest, file.sha256, "{}", path.display());
+            let all = read(&[Part::whole(&path)], &silent).unwrap();
+            assert_eq!(all.len(), file.scenes);
+        }
+        let of = |split| {
+            let scenes = read(&parts(&folder, split).unwrap(), &silent).unwrap();
+            scenes.into_iter().map(|scene| scene.id).collect::<Vec<_>>()
+        };
+        let [train, validation, test] = [Split::Train, Split::Validation, Split::Test].map(of);
+        assert_eq!((train.len(), validation.len(), test.len()), (16, 4, 4));
+        assert!(
+            train
+                .iter()
+                .all(|id| !validation.contains(id) && !test.contains(id))
+        );
+    }
+
+    #[test]
+    fn a_path_without_a_manifest_is_all_for_training() {
+        let folder = tempfile::tempdir().unwrap();
+        let whole = Part::whole(folder.path());
+        assert_eq!(parts(folder.path(), Split::Train).unwrap(), [whole]);
+        assert!(parts(folder.path(), Split::Validation).unwrap().is_empty());
+    }
+}

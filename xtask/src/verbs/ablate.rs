@@ -1,0 +1,173 @@
+//! `ablate`: the paper's ablations, one table and one picture each.
+
+use std::num::NonZeroUsize;
+
+use gump_data::find;
+use gump_metrics::{Part, summarize};
+use gump_model::Mode;
+use gump_scene::{Rollout, Scenario};
+use gump_viz::Picture;
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+
+use crate::futures;
+use crate::imagine::{Imagined, imagine};
+use crate::run::{Common, Run};
+use crate::shipped;
+use crate::worlds::{Draw, World, WorldName};
+
+/// Which ablation.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Verb {
+    /// Decoding one agent after another (full-AR) against all at once (partial-AR)
+    Nar(Args),
+}
+
+/// Arguments of `ablate nar`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID [default: a shipped one]
+    #[arg(long, value_name = "S")]
+    scenario: Option<String>,
+    /// model:WEIGHTS [default: the shipped weights]
+    #[arg(long, value_name = "W")]
+    world: Option<WorldName>,
+    /// How many futures
+    #[arg(long, value_name = "N", default_value = "8")]
+    futures: NonZeroUsize,
+    /// How far to imagine
+    #[arg(long, value_name = "S", default_value_t = 8.0)]
+    seconds: f64,
+    #[command(flatten)]
+    #[serde(flatten)]
+    draw: Draw,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let name = match &self.scenario {
+            Some(name) => name.clone(),
+            None => shipped::scenario()?,
+        };
+        let scenario = run.phase("read", |_| Ok(find(&name)?))?;
+        run.setting("scenario", &name)?;
+        let full = self.imagine(run, &scenario, Mode::FullAr, "full-AR")?;
+        let partial = self.imagine(run, &scenario, Mode::PartialAr, "partial-AR")?;
+        let [full_part, partial_part] = [&full, &partial]
+            .map(|imagined| summarize(&imagined.rollouts, Some(&scenario)).total());
+        let ratio = partial.frames_per_second() / full.frames_per_second();
+        run.result(
+            "rows",
+            [
+                row("full-AR", &full, &full_part),
+                row("partial-AR", &partial, &partial_part),
+            ],
+        )?;
+        run.result("ratio", ratio)?;
+        run.result("difference", difference(&partial_part, &full_part))?;
+        let pictures = [
+            ("full-AR", &full.rollouts),
+            ("partial-AR", &partial.rollouts),
+        ];
+        run.phase("write", |run| {
+            let picture = beside(
+                &pictures.map(|(name, rollouts)| futures::picture(&scenario, rollouts, name)),
+            );
+            picture.save_png(&run.path("picture.png"))?;
+            let firsts: Vec<(&str, &Rollout)> = pictures
+                .iter()
+                .filter_map(|(name, rollouts)| Some((*name, rollouts.first()?)))
+                .collect();
+            futures::film(&scenario, &firsts)?.save(&run.path("film.gif"))?;
+            Ok(())
+        })
+    }
+
+    fn imagine(
+        &self,
+        run: &mut Run,
+        scenario: &Scenario,
+        mode: Mode,
+        phase: &str,
+    ) -> anyhow::Result<Imagined> {
+        let world = self.world.clone().unwrap_or_else(shipped::world);
+        anyhow::ensure!(
+            matches!(world, WorldName::Model(_)),
+            "--world: expected model:WEIGHTS, since rules decode nothing, found {world}"
+        );
+        let world = World::build(&world, scenario, &self.draw.resolve(mode)?)?;
+        run.phase(phase, |run| {
+            let (n, seed) = (self.futures.get(), run.seed());
+            imagine(run, &world, scenario.present(), n, self.seconds, seed)
+        })
+    }
+}
+
+type Rate = fn(&Part) -> Option<f64>;
+
+/// What is compared.
+const RATES: [(&str, Rate); 6] = [
+    ("collision_rate", Part::collision_rate),
+    ("offroad_rate", Part::offroad_rate),
+    ("ade", Part::ade),
+    ("min_ade", Part::min_ade),
+    ("fde", Part::fde),
+    ("min_fde", Part::min_fde),
+];
+
+fn row(mode: &str, imagined: &Imagined, part: &Part) -> Value {
+    let mut row = Map::new();
+    row.insert("mode".into(), json!(mode));
+    row.insert(
+        "frames_per_second".into(),
+        json!(imagined.frames_per_second()),
+    );
+    row.insert("passes_per_frame".into(), json!(imagined.passes_per_frame));
+    for (name, rate) in RATES {
+        row.insert(name.into(), json!(rate(part)));
+    }
+    Value::Object(row)
+}
+
+/// Partial-AR less full-AR.
+fn difference(partial: &Part, full: &Part) -> Value {
+    let of = |rate: Rate| Some(rate(partial)? - rate(full)?);
+    let differences = RATES.map(|(name, rate)| (name.to_owned(), json!(of(rate))));
+    Value::Object(differences.into_iter().collect())
+}
+
+/// Two pictures of one size, side by side.
+fn beside(pictures: &[Picture; 2]) -> Picture {
+    let [left, right] = pictures;
+    let row = |picture: &Picture, row: usize| {
+        let bytes = picture.width * 4;
+        picture.rgba[row * bytes..][..bytes].to_vec()
+    };
+    let rows = (0..left.height.min(right.height)).flat_map(|y| [row(left, y), row(right, y)]);
+    Picture {
+        width: left.width + right.width,
+        height: left.height.min(right.height),
+        rgba: rows.flatten().collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_stand_side_by_side() {
+        let picture = |value: u8| Picture {
+            width: 2,
+            height: 3,
+            rgba: vec![value; 24],
+        };
+        let both = beside(&[picture(1), picture(2)]);
+        assert_eq!((both.width, both.height), (4, 3));
+        let row: Vec<u8> = [vec![1; 8], vec![2; 8]].concat();
+        assert_eq!(both.rgba, row.repeat(3));
+    }
+}
