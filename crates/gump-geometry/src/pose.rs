@@ -67,7 +67,7 @@ impl Mul<DVec2> for Pose {
     type Output = DVec2;
 
     fn mul(self, point: DVec2) -> DVec2 {
-        self.position + self.rotate(point)
+        self.rotate(point) + self.position
     }
 }
 

@@ -348,3 +348,74 @@ fn pose_tensors<'a, const N: usize>(
         Tensor::from_vec(shares, (a, N), device)?,
     ))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn target(future: [Option<[f32; POSE]>; FUTURE]) -> TrajectoryTarget {
+        TrajectoryTarget {
+            key: 0,
+            past: [None; PAST],
+            future,
+        }
+    }
+
+    /// The loss of one agent whose modes all predict standing still, and its gradient on the
+    /// future.
+    fn check(target: &TrajectoryTarget) -> (f32, Vec<f32>) {
+        let device = Device::Cpu;
+        let future =
+            candle_core::Var::zeros((1, MODES, FUTURE, POSE), candle_core::DType::F32, &device)
+                .unwrap();
+        let predicted = Trajectories {
+            past: Tensor::zeros((1, PAST, POSE), candle_core::DType::F32, &device).unwrap(),
+            future: future.as_tensor().clone(),
+            modes: Tensor::zeros((1, MODES), candle_core::DType::F32, &device).unwrap(),
+        };
+        let loss = trajectory_loss(&predicted, &[(0, target)], 1.0, &device).unwrap();
+        let gradient = loss
+            .backward()
+            .unwrap()
+            .get(&future)
+            .unwrap()
+            .flatten_all()
+            .unwrap();
+        (loss.to_scalar().unwrap(), gradient.to_vec1().unwrap())
+    }
+
+    #[test]
+    fn equal_modes_cost_ln_6_and_masked_steps_nothing() {
+        let (loss, gradient) = check(&target([None; FUTURE]));
+        assert!((loss - 6f32.ln()).abs() < 1e-5, "{loss}");
+        assert!(gradient.iter().all(|&g| g == 0.0));
+    }
+
+    #[test]
+    fn only_the_winning_mode_and_valid_steps_learn() {
+        let mut future = [None; FUTURE];
+        future[3] = Some([3.0, 4.0, 0.6, 0.8]);
+        let (loss, gradient) = check(&target(future));
+        // One valid step, 5 m and 0.6 + 0.8 in sine and cosine off: its share is one.
+        assert!(
+            (loss - (6f32.ln() + 5.0 + 2.0 * 1.4)).abs() < 1e-4,
+            "{loss}"
+        );
+        let moved: Vec<usize> = (0..gradient.len())
+            .filter(|&i| gradient[i] != 0.0)
+            .collect();
+        assert_eq!(moved, [12, 13, 14, 15]);
+    }
+
+    #[test]
+    fn the_first_part_that_is_not_a_number_is_named() {
+        let mut parts = LossParts {
+            fields: vec![0.5; STEPS.len()],
+            ..LossParts::default()
+        };
+        assert_eq!(parts.first_not_finite(), None);
+        parts.total = f64::NAN;
+        parts.fields[4] = f64::INFINITY;
+        assert_eq!(parts.first_not_finite().unwrap(), "step 4 X");
+    }
+}

@@ -3,6 +3,8 @@
 //! Augmentation moves and turns the *pose* everything is expressed in, before anything is drawn or
 //! tokenized, so that map and agents cannot fall out of register.
 
+use std::collections::BTreeMap;
+
 use gump_geometry::Pose;
 use gump_raster::{Raster, RasterSpec, rasterize};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario, SceneState, Seed};
@@ -180,7 +182,7 @@ pub(crate) fn draw(
     let frames: Vec<Frame> = (0..config.frames)
         .filter_map(|i| Some(thin(window.frame(i, 0)?, &window, config)))
         .collect();
-    let frames = drop_agents(frames, window.centre, config.agent_dropout, &mut rng);
+    let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
     let identities = Identities::shuffled(&views, window.centre, window.world_from_scene, &mut rng);
     let encoded = tokenizer.encode(
@@ -296,7 +298,7 @@ fn thin(frame: &Frame, window: &Window<'_>, config: &SampleConfig) -> Frame {
 }
 
 /// Removes whole tracks for a random part of the window, which makes births and disappearances.
-fn drop_agents(frames: Vec<Frame>, centre: AgentId, probability: f64, rng: &mut Rng) -> Vec<Frame> {
+fn drop_agents(frames: &[Frame], centre: AgentId, probability: f64, rng: &mut Rng) -> Vec<Frame> {
     let mut ids: Vec<AgentId> = frames
         .iter()
         .flat_map(|f| f.agents().iter().map(|a| a.id))
@@ -305,7 +307,7 @@ fn drop_agents(frames: Vec<Frame>, centre: AgentId, probability: f64, rng: &mut 
     ids.dedup();
     ids.retain(|&id| id != centre);
     let n = frames.len();
-    let gaps: std::collections::BTreeMap<AgentId, std::ops::Range<usize>> = ids
+    let gaps: BTreeMap<AgentId, std::ops::Range<usize>> = ids
         .into_iter()
         .filter_map(|id| {
             let (dropped, a, b) = (

@@ -93,7 +93,8 @@ impl Scenario {
                 if !a.state.is_finite() || !a.elevation.is_finite() {
                     return Err(ScenarioError::NotFinite { agent: a.id, frame });
                 }
-                if !(a.length > 0.0 && a.width > 0.0) || !(a.length + a.width).is_finite() {
+                let is_size = |extent: f64| extent > 0.0 && extent.is_finite();
+                if !(is_size(a.length) && is_size(a.width)) {
                     let (length, width) = (a.length, a.width);
                     return Err(ScenarioError::Size {
                         agent: a.id,
