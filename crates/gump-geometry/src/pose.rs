@@ -66,6 +66,10 @@ impl Pose {
 impl Mul<DVec2> for Pose {
     type Output = DVec2;
 
+    #[allow(
+        clippy::suspicious_arithmetic_impl,
+        reason = "a rigid transform applied to a point turns it and then moves it"
+    )]
     fn mul(self, point: DVec2) -> DVec2 {
         self.rotate(point) + self.position
     }
