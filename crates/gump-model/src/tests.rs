@@ -399,6 +399,24 @@ fn a_long_drive_never_reaches_the_edge_of_the_window() {
 }
 
 #[test]
+fn who_drives_into_the_window_is_imagined_from_then_on() {
+    let scenario = fixture::scenario(
+        "lane 1: -200,0 200,0
+         ego vehicle 0: 0,0
+         agent vehicle 1: 104,4 velocity -12,0",
+    )
+    .unwrap();
+    let (frames, _) = imagine(SamplingConfig::default(), &scenario, 2, 4, None);
+    let x = |step: usize, future: usize| {
+        let frame: &Frame = &frames[step][future];
+        frame.agent(AgentId(1)).unwrap().state.pose.position.x
+    };
+    // 104 - 6 - 6 m = 92 m: inside, and still on its straight line; the futures part after that.
+    assert_eq!((x(0, 0), x(1, 0)), (98.0, 92.0));
+    assert_ne!(x(2, 0), x(2, 1));
+}
+
+#[test]
 fn a_slot_can_be_reused() {
     let world = TransformerWorld::new(network(), SamplingConfig::default());
     let (first, second) = (

@@ -6,9 +6,10 @@
 //! bookkeeping around it.
 //!
 //! Agents outside the token window, of no predicted kind, or beyond the vocabulary move on with
-//! constant velocity, so that every agent that is there now stays for the whole future.
+//! constant velocity, so that every agent that is there now stays for the whole future; one that
+//! comes into the window is the network's from then on.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,9 +17,9 @@ use candle_core::Tensor;
 use gump_geometry::Pose;
 use gump_raster::rasterize;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
-use gump_scene::{Agent, AgentId, AgentState, Frame, MapGraph, Route, SceneState, Seed};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, MapGraph, Route, SceneState, Seed};
 use gump_tokenizer::{
-    Identities, QuantizedState, Slot, TokenAgent, TokenFrame, TokenSequence, Tokenizer,
+    Identities, Key, QuantizedState, Slot, TokenAgent, TokenFrame, TokenSequence, Tokenizer,
     TokenizerConfig,
 };
 
@@ -443,17 +444,47 @@ fn forced_fields(state: &QuantizedState, driven: bool) -> [Option<u16>; STEPS.le
 impl Scene {
     /// A world state in tokens, with the size of `like`.
     fn quantize(&self, state: AgentState, like: QuantizedState) -> QuantizedState {
-        let scene_from_world = self.world_from_scene.inverse();
-        let local = AgentState {
-            pose: scene_from_world * state.pose,
-            velocity: scene_from_world.rotate(state.velocity),
-        };
-        let (quantized, _) = QuantizedState::new(&local, 1.0, 1.0);
+        let (quantized, _) = QuantizedState::new(&self.local(state), 1.0, 1.0);
         QuantizedState {
             width: like.width,
             length: like.length,
             ..quantized
         }
+    }
+
+    /// A world state in the scene frame.
+    fn local(&self, state: AgentState) -> AgentState {
+        let scene_from_world = self.world_from_scene.inverse();
+        AgentState {
+            pose: scene_from_world * state.pose,
+            velocity: scene_from_world.rotate(state.velocity),
+        }
+    }
+
+    /// Agents of `frame` inside the window that `tokens` does not know yet: they drifted in.
+    fn arrivals(&self, frame: &Frame, tokens: &TokenFrame) -> Vec<TokenAgent> {
+        let known: BTreeSet<u16> = tokens.agents().map(|agent| agent.key.id).collect();
+        let mut arrivals: Vec<TokenAgent> = frame
+            .agents()
+            .iter()
+            .filter(|agent| agent.kind != AgentKind::Other)
+            .filter_map(|agent| {
+                let id = self
+                    .identities
+                    .key(agent.id)
+                    .filter(|id| !known.contains(id))?;
+                let local = self.local(agent.state);
+                let inside = local.pose.position.abs().max_element() < KEEP_RANGE_M;
+                let (state, _) = QuantizedState::new(&local, agent.length, agent.width);
+                let kind = agent.kind;
+                inside.then_some(TokenAgent {
+                    key: Key { id, kind },
+                    state,
+                })
+            })
+            .collect();
+        arrivals.sort_by_key(|agent| agent.key.order());
+        arrivals
     }
 }
 
@@ -519,6 +550,7 @@ impl Future {
         });
         // Lights keep the colour they were seen in.
         let frame = Frame::new(agents.collect(), now.lights().to_vec());
+        next.newborn = scene.arrivals(&frame, &next);
         self.recent.push(frame.clone());
         self.frames.push(next);
         let history = sampling.history.max(1);
