@@ -489,3 +489,124 @@ fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_scene::fixture;
+    use gump_tokenizer::TokenizerConfig;
+
+    fn scenario() -> Scenario {
+        fixture::scenario(
+            "lane 1: -100,0 100,0
+             light 1 red: 60,0
+             ego vehicle 0: 0,0 velocity 8,0
+             agent vehicle 1: 20,0 velocity 5,0
+             agent pedestrian 7: 30,3 velocity 0,-1",
+        )
+        .unwrap()
+    }
+
+    fn sample(config: &SampleConfig, seed: u64) -> Sample {
+        let spec = RasterSpec::full(16, 12.0);
+        let tokenizer = Tokenizer::new(TokenizerConfig::default());
+        (0..64)
+            .find_map(|i| draw(&scenario(), &spec, &tokenizer, config, Seed(seed).fork(i)))
+            .expect("a sample can be drawn")
+    }
+
+    #[test]
+    fn every_control_target_is_the_successor() {
+        let sample = sample(&SampleConfig::plain(4), 1);
+        let expected = |slot: Slot| match slot {
+            Slot::Key(key) => u32::from(key.id),
+            Slot::Begin => CONTROL_BEGIN,
+            Slot::Newborn => CONTROL_NEWBORN,
+            Slot::LightsEnd => CONTROL_LIGHTS_END,
+            other => panic!("{other:?} is no successor"),
+        };
+        for target in &sample.control {
+            assert_eq!(
+                target.successor,
+                expected(sample.slots[target.slot + 1].slot)
+            );
+        }
+        // Every value but the very last, every mark: LIGHTS_END, NEWBORN, the light before LIGHTS_END.
+        let values = sample
+            .slots
+            .iter()
+            .filter(|p| matches!(p.slot, Slot::Value(_)))
+            .count();
+        assert_eq!(sample.control.len(), values + 4 * 3 - 1);
+    }
+
+    #[test]
+    fn targets_are_the_log_and_missing_frames_are_ignored() {
+        let sample = sample(&SampleConfig::plain(4), 1);
+        for target in &sample.states {
+            let (Slot::Key(_), Slot::Value(state)) = (
+                sample.slots[target.key].slot,
+                sample.slots[target.key + 1].slot,
+            ) else {
+                panic!("a target stands at a key");
+            };
+            for (step, field) in STEPS.iter().enumerate().take(7) {
+                assert_eq!(target.bins[step], Some(state.get(*field)));
+            }
+        }
+        assert!(sample.states.iter().any(|target| target.bins[15].is_some()));
+        assert_eq!(sample.states[0].token(0), Field::Width.token(4));
+    }
+
+    #[test]
+    fn one_seed_one_sample() {
+        let config = SampleConfig::default();
+        let (a, b) = (sample(&config, 3), sample(&config, 3));
+        assert_eq!(format!("{:?}", a.slots), format!("{:?}", b.slots));
+        assert_eq!(a.raster, b.raster);
+        assert_ne!(
+            format!("{:?}", a.slots),
+            format!("{:?}", sample(&config, 4).slots)
+        );
+    }
+
+    #[test]
+    fn perturbed_values_keep_true_targets() {
+        let config = SampleConfig {
+            surrogate_noise: 1.0,
+            ..SampleConfig::plain(4)
+        };
+        let differs = |seed| {
+            let sample = sample(&config, seed);
+            sample
+                .states
+                .iter()
+                .any(|target| match sample.slots[target.key + 1].slot {
+                    Slot::Value(state) => target.bins[4] != Some(state.x),
+                    _ => false,
+                })
+        };
+        assert!((0..8).any(differs));
+    }
+
+    #[test]
+    fn blanked_frames_have_no_targets() {
+        let config = SampleConfig {
+            frame_dropout: 1.0,
+            ..SampleConfig::plain(4)
+        };
+        let sample = sample(&config, 2);
+        assert!(
+            sample
+                .states
+                .iter()
+                .all(|target| sample.slots[target.key].frame == 0)
+        );
+        assert!(
+            sample
+                .slots
+                .iter()
+                .all(|p| p.frame == 0 || matches!(p.slot, Slot::Pad))
+        );
+    }
+}

@@ -5,11 +5,13 @@ use gump_rollout::{Start, WorldModel};
 use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
 use gump_tokenizer::{Identities, Slot, Tokenizer, TokenizerConfig};
 
+use crate::aggregation::Ring;
 use crate::batch::{PlacedSlot, pack, place};
 use crate::config::{Gate, ModelConfig, VisualConfig};
+use crate::decode::{Passes, Window, decode};
 use crate::decoder::STEPS;
 use crate::mct::{Cache, VisualMemory};
-use crate::sampling::{CacheMode, Mode, SamplingConfig};
+use crate::sampling::{CacheMode, Mode, Request, SamplingConfig, poses, settled_state};
 use crate::world::TransformerWorld;
 use crate::{ModelError, Network};
 
@@ -439,6 +441,63 @@ fn a_slot_can_be_reused() {
         .step(None)
         .unwrap();
     assert_eq!(frames[1], alone[0]);
+}
+
+/// The next frame of the scenario as a window, with surrogates that stand still.
+fn window(scenario: &Scenario) -> Window {
+    let history = match gump_tokenizer::TokenSequence::parse(
+        &slots(scenario)
+            .iter()
+            .map(|placed| placed.slot)
+            .collect::<Vec<_>>(),
+    ) {
+        Ok(sequence) => sequence.frames().to_vec(),
+        Err(error) => panic!("{error}"),
+    };
+    let next = history[history.len() - 1].clone();
+    let request = |(i, _)| Request {
+        forced: [None; STEPS.len()],
+        stream: Seed(i as u64),
+        near: None,
+        ring: Ring::default(),
+        frame: 3,
+    };
+    let requests = next.tracked.iter().enumerate().map(request).collect();
+    Window {
+        scene: 0,
+        history,
+        next,
+        requests,
+    }
+}
+
+#[test]
+fn surrogates_that_are_right_give_full_autoregression() {
+    let (network, scenario) = (network(), scenario());
+    let memory = memory(&network, &scenario);
+    let count = std::sync::atomic::AtomicU64::new(0);
+    let run = |mode, window: &Window| {
+        let sampling = SamplingConfig {
+            mode,
+            temperature: 0.0,
+            decay: 0.0,
+            ..SamplingConfig::default()
+        };
+        decode(
+            &Passes::new(&network, &sampling, &[&memory], &count),
+            std::slice::from_ref(window),
+        )
+        .unwrap()
+        .remove(0)
+    };
+    let mut window = window(&scenario);
+    let full = run(Mode::FullAr, &window);
+    let guessed = run(Mode::PartialAr, &window);
+    assert_eq!(full[0], guessed[0], "the first object sees no surrogate");
+    for (agent, bins) in window.next.tracked.iter_mut().zip(&full) {
+        agent.state = settled_state(bins, poses(bins)[0]);
+    }
+    assert_eq!(run(Mode::PartialAr, &window), full);
 }
 
 /// Component formulas of the specification, section 5.7, for a published size.
