@@ -94,7 +94,11 @@ pub(crate) fn decode(
     passes: &Passes<'_>,
     windows: &[Window],
 ) -> Result<Vec<Vec<Bins>>, ModelError> {
-    let placed: Vec<Vec<PlacedSlot>> = windows.iter().map(presented).collect::<Result<_, _>>()?;
+    let block_size = passes.network.config().block_size;
+    let placed: Vec<Vec<PlacedSlot>> = windows
+        .iter()
+        .map(|window| presented(window, block_size))
+        .collect::<Result<_, _>>()?;
     // One pass for all: shorter windows are padded at their end. One by one, the end grows, so only
     // windows of one layout may go together.
     let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
@@ -128,9 +132,20 @@ pub(crate) fn decode(
     Ok(decoded)
 }
 
-/// The slots of a window, up to the last provisional value.
-fn presented(window: &Window) -> Result<Vec<PlacedSlot>, ModelError> {
-    let mut frames = window.history.clone();
+/// The slots of a window, up to the last provisional value. The oldest frames give way, whole, if
+/// all together would be longer than `block_size`.
+fn presented(window: &Window, block_size: usize) -> Result<Vec<PlacedSlot>, ModelError> {
+    let mut room = block_size.saturating_sub(window.next.len_slots());
+    let newest = window.history.iter().rev();
+    let n = newest
+        .take_while(|frame| {
+            let fits = frame.len_slots() <= room;
+            room = room.saturating_sub(frame.len_slots());
+            fits
+        })
+        .count();
+    let mut frames = window.history[window.history.len() - n.max(1)..].to_vec();
+    frames[0] = std::mem::take(&mut frames[0]).into_first();
     frames.push(window.next.clone());
     let sequence = TokenSequence::new(Vec::new(), frames)
         .map_err(|error| ModelError::Scene(error.to_string()))?;

@@ -401,6 +401,27 @@ fn a_long_drive_never_reaches_the_edge_of_the_window() {
 }
 
 #[test]
+fn a_crowd_of_500_is_imagined_whole() {
+    let mut text = String::from("lane 1: -100,0 100,0\nego vehicle 0: 0,0 velocity 5,0\n");
+    for i in 1..500 {
+        text += &format!(
+            "agent pedestrian {i}: {},{}\n",
+            -90 + 7 * (i % 25),
+            -90 + 8 * (i / 25)
+        );
+    }
+    // More than the vocabulary has ids and more than the test network's block holds.
+    let scenario = fixture::scenario(&text).unwrap();
+    let (frames, _) = imagine(SamplingConfig::default(), &scenario, 1, 3, None);
+    assert!(
+        frames
+            .iter()
+            .flatten()
+            .all(|frame| frame.agents().len() == 500)
+    );
+}
+
+#[test]
 fn who_drives_into_the_window_is_imagined_from_then_on() {
     let scenario = fixture::scenario(
         "lane 1: -200,0 200,0

@@ -79,6 +79,11 @@ impl TransformerWorld {
         &self.sampling
     }
 
+    /// Slots a frame may take, so that it and the one before it fit the block.
+    fn longest_frame(&self) -> usize {
+        self.network.config().block_size / 2
+    }
+
     fn scene(&self, scene: SceneState<'_>) -> Result<Scene, ModelError> {
         let world_from_scene = scene.ego_now().state.pose;
         let stride = (TOKEN_DT / scene.dt).round().max(1.0) as usize;
@@ -121,7 +126,7 @@ impl TransformerWorld {
         let encoded = self
             .tokenizer
             .encode(&map, &frames, ego, world_from_scene, &identities);
-        let (sequence, _) = encoded.sequence.fit(self.network.config().block_size / 2);
+        let (sequence, _) = encoded.sequence.fit(self.longest_frame());
         let raster = rasterize(self.network.raster_spec(), &view, world_from_scene);
         Ok(Scene {
             world_from_scene,
@@ -324,7 +329,7 @@ impl Session for TransformerSession<'_> {
         for (i, (window, bins)) in windows.into_iter().zip(decoded).enumerate() {
             let scene = &self.scenes[self.futures[i].scene];
             let ego = ego.map(|states| states[i]);
-            frames.push(self.futures[i].commit(window, &bins, scene, &self.world.sampling, ego));
+            frames.push(self.futures[i].commit(window, &bins, scene, self.world, ego));
         }
         Ok(frames)
     }
@@ -461,8 +466,9 @@ impl Scene {
         }
     }
 
-    /// Agents of `frame` inside the window that `tokens` does not know yet: they drifted in.
-    fn arrivals(&self, frame: &Frame, tokens: &TokenFrame) -> Vec<TokenAgent> {
+    /// Agents of `frame` inside the window that `tokens` does not know yet, because they drifted in;
+    /// as many as fit a frame of `longest` slots.
+    fn arrivals(&self, frame: &Frame, tokens: &TokenFrame, longest: usize) -> Vec<TokenAgent> {
         let known: BTreeSet<u16> = tokens.agents().map(|agent| agent.key.id).collect();
         let mut arrivals: Vec<TokenAgent> = frame
             .agents()
@@ -484,6 +490,7 @@ impl Scene {
             })
             .collect();
         arrivals.sort_by_key(|agent| agent.key.order());
+        arrivals.truncate(longest.saturating_sub(tokens.len_slots()) / 2);
         arrivals
     }
 }
@@ -520,9 +527,10 @@ impl Future {
         window: Window,
         decoded: &[Bins],
         scene: &Scene,
-        sampling: &SamplingConfig,
+        world: &TransformerWorld,
         ego: Option<AgentState>,
     ) -> Frame {
+        let sampling = &world.sampling;
         self.index += 1;
         let mut next = window.next;
         let mut moved = BTreeMap::new();
@@ -550,7 +558,7 @@ impl Future {
         });
         // Lights keep the colour they were seen in.
         let frame = Frame::new(agents.collect(), now.lights().to_vec());
-        next.newborn = scene.arrivals(&frame, &next);
+        next.newborn = scene.arrivals(&frame, &next, world.longest_frame());
         self.recent.push(frame.clone());
         self.frames.push(next);
         let history = sampling.history.max(1);
