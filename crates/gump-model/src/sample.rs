@@ -52,6 +52,9 @@ pub struct SampleConfig {
     /// Probability that the last frame's values are seen perturbed, as partial-AR decoding sees
     /// surrogates; the targets stay true.
     pub surrogate_noise: f64,
+    /// True draws the ids of each sample at random, so that every id is learned; false ranks them as
+    /// inference does.
+    pub shuffle_ids: bool,
     /// Probability of leaving out the prompts.
     pub prompt_dropout: f64,
 }
@@ -69,6 +72,7 @@ impl Default for SampleConfig {
             agent_dropout: 0.1,
             frame_dropout: 0.1,
             surrogate_noise: 0.5,
+            shuffle_ids: true,
             prompt_dropout: 0.5,
         }
     }
@@ -86,6 +90,7 @@ impl SampleConfig {
             agent_dropout: 0.0,
             frame_dropout: 0.0,
             surrogate_noise: 0.0,
+            shuffle_ids: false,
             prompt_dropout: 1.0,
             ..Self::default()
         }
@@ -184,7 +189,12 @@ pub(crate) fn draw(
         .collect();
     let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
-    let identities = Identities::shuffled(&views, window.centre, window.world_from_scene, &mut rng);
+    let (centre, pose) = (window.centre, window.world_from_scene);
+    let identities = if config.shuffle_ids {
+        Identities::shuffled(&views, centre, pose, &mut rng)
+    } else {
+        Identities::ranked(&views, centre, pose)
+    };
     let encoded = tokenizer.encode(
         &scenario.map,
         &views,
