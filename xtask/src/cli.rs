@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ablate, ci, data, simulate, tidy, train};
+use crate::verbs::{ablate, ci, data, demo, simulate, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -25,6 +25,8 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    /// Start here: one scene through everything, offline, and a page to look at.
+    Demo(demo::Args),
     /// Look into scenario files, check them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
@@ -58,6 +60,9 @@ impl Cli {
     /// Does what was asked.
     pub(crate) fn execute(self) -> anyhow::Result<()> {
         match self.verb {
+            Verb::Demo(args) => {
+                Run::of("demo", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Data(data::Verb::Inspect(args)) => {
                 Run::of("data inspect", &args.common, &args)?.execute(|run| args.execute(run))
             }

@@ -87,7 +87,7 @@ fn cell(value: &Value) -> String {
 }
 
 /// Four significant digits, never an exponent for everyday numbers.
-fn decimal(x: f64) -> String {
+pub(crate) fn decimal(x: f64) -> String {
     let magnitude = x.abs();
     if x == 0.0 {
         "0".into()

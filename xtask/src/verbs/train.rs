@@ -45,6 +45,9 @@ pub(crate) struct Args {
     /// Samples per step
     #[arg(long, value_name = "N")]
     batch: Option<usize>,
+    /// Stop after this step, to go on with --resume
+    #[arg(long, value_name = "N")]
+    stop_at: Option<usize>,
     /// Go on with the run in --out, with the configuration it began with
     #[arg(long)]
     resume: bool,
@@ -78,7 +81,8 @@ impl Args {
         let resumed_at = trainer.steps_done();
         let began = Instant::now();
         let trained = run.phase("train", |run| {
-            learn(run, &mut trainer, &mut losses, &validation)
+            let stop_at = self.stop_at.unwrap_or(usize::MAX);
+            learn(run, &mut trainer, &mut losses, &validation, stop_at)
         });
         // A failed step changes nothing, so what was learned before it is worth keeping.
         run.phase("write", |run| write(run, &trainer, &losses))?;
@@ -162,19 +166,20 @@ fn known_keys() -> anyhow::Result<Table> {
     Ok(known)
 }
 
-/// Steps until the run is done or Ctrl-C.
+/// Steps until the run is done, it is to stop, or Ctrl-C.
 fn learn(
     run: &Run,
     trainer: &mut Trainer,
     losses: &mut Losses,
     validation: &[Scenario],
+    stop_at: usize,
 ) -> anyhow::Result<()> {
     let total = trainer.config().steps;
     let progress = run.progress("training", total as u64, "steps");
     progress.advance(trainer.steps_done() as u64);
     let validate_every = (total / VALIDATIONS).max(1);
     let mut saved = Instant::now();
-    while trainer.steps_done() < total {
+    while trainer.steps_done() < total.min(stop_at) {
         let step = trainer.steps_done();
         anyhow::ensure!(
             !run::interrupted(),

@@ -4,6 +4,8 @@ mod inspect;
 mod synthesize;
 mod verify;
 
+pub(crate) use inspect::picture;
+
 /// What to do with data.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {

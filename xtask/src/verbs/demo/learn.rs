@@ -1,0 +1,113 @@
+//! What the network is, and a few steps of learning.
+
+use gump_model::{Device, TrainConfig, Trainer, checkpoint};
+use gump_viz::{Chart, Series};
+use serde_json::{Value, json};
+
+use super::Demo;
+use crate::dataset::{self, Split};
+use crate::run::{Run, stop_if_interrupted};
+use crate::shipped;
+
+/// Steps a new network takes: enough to see the loss fall, few enough for a demo.
+const STEPS: usize = 24;
+/// Samples per step.
+const BATCH: usize = 2;
+/// Scenarios the loss is measured on, none of them trained on.
+const VALIDATED: usize = 4;
+
+/// Parts of the network by the names of their parameters.
+const PARTS: [(&str, &str); 4] = [
+    (
+        "mct",
+        "transformer: embeddings, self-attention, attention to the map",
+    ),
+    ("decoder", "decoder: from a hidden vector to a state"),
+    ("visual", "visual encoder and reconstruction"),
+    ("trajectory", "trajectory head"),
+];
+
+pub(super) fn network(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
+    let network = checkpoint::load(&shipped::weights(), &Device::Cpu)?;
+    let config = network.config();
+    let parameters = network.parameters();
+    let rows: Vec<_> = PARTS
+        .iter()
+        .map(|(prefix, what)| {
+            let n = parameters.count_under(prefix);
+            vec![(*what).to_owned(), n.to_string()]
+        })
+        .collect();
+    demo.page
+        .section("The network")
+        .prose(&format!(
+            "{} parameters: {} blocks of width {} with {} heads, a context of {} tokens.",
+            parameters.count(),
+            config.layers,
+            config.width,
+            config.heads,
+            config.block_size,
+        ))
+        .table(&["part", "parameters"], &rows);
+    Ok(json!({ "parameters": parameters.count(), "weights": shipped::weights() }))
+}
+
+pub(super) fn train(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
+    let progress = run.progress("training", STEPS as u64, "steps");
+    let read = |split| dataset::read(&dataset::parts(&shipped::data(), split)?, &progress);
+    let (scenarios, validation) = (read(Split::Train)?, read(Split::Validation)?);
+    drop(progress);
+    let shipped = checkpoint::load(&shipped::weights(), &Device::Cpu)?;
+    let model = shipped.config().clone();
+    let mut config = TrainConfig {
+        steps: STEPS,
+        batch: BATCH,
+        seed: run.seed().0,
+        ..TrainConfig::default()
+    };
+    config.optimizer.learning_rate = 2e-3;
+    config.optimizer.warmup = 4;
+    let of_shipped = Trainer::continuing(shipped, config.clone(), scenarios.clone())?
+        .validate(&validation, VALIDATED)?
+        .total;
+    let mut trainer = Trainer::new(model, config, scenarios, &Device::Cpu)?;
+    let before = trainer.validate(&validation, VALIDATED)?.total;
+    let mut curve = Series {
+        name: "loss".into(),
+        points: Vec::new(),
+    };
+    let progress = run.progress("training", STEPS as u64, "steps");
+    while trainer.steps_done() < STEPS {
+        stop_if_interrupted()?;
+        let report = trainer.step()?;
+        progress.advance(1);
+        curve.points.push((report.step as f64, report.loss.total));
+    }
+    drop(progress);
+    let after = trainer.validate(&validation, VALIDATED)?.total;
+    let chart = Chart {
+        x_label: "step".into(),
+        y_label: "loss, nats".into(),
+        series: vec![curve],
+        ..Chart::default()
+    };
+    let row = |what: &str, loss: f64| vec![what.to_owned(), format!("{loss:.3}")];
+    demo.page
+        .section("Learning")
+        .prose(&format!(
+            "A new network of the same shape, {STEPS} steps of {BATCH} samples: how much it has \
+             still to learn is the distance to the shipped one."
+        ))
+        .chart(&chart, "Loss on the samples of each step.")?
+        .table(
+            &["network", "loss on scenes not trained on, nats"],
+            &[
+                row("new, before the first step", before),
+                row(&format!("new, after {STEPS} steps"), after),
+                row("shipped", of_shipped),
+            ],
+        );
+    Ok(
+        json!({ "steps": STEPS, "loss_before": before, "loss_after": after, "loss_shipped": of_shipped }),
+    )
+}

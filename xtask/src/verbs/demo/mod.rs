@@ -1,0 +1,99 @@
+//! `demo`: the whole road on what the repository ships, and a page that shows it.
+//!
+//! The stages are in [`look`] (what a scenario is), [`learn`] (what the network is) and
+//! [`imagine`] (what comes of it); this file puts them in a row.
+
+mod imagine;
+mod learn;
+mod look;
+
+use gump_data::find;
+use gump_model::SamplingConfig;
+use gump_scene::Scenario;
+use gump_viz::Page;
+use serde::Serialize;
+use serde_json::Value;
+
+use crate::machine;
+use crate::run::{Common, Run};
+use crate::shipped;
+
+/// Arguments of `demo`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID [default: a shipped one]
+    #[arg(long, value_name = "S")]
+    scenario: Option<String>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What the stages share.
+struct Demo {
+    scenario: Scenario,
+    sampling: SamplingConfig,
+    page: Page,
+}
+
+/// A stage: its name in the report, what it is doing, and the doing.
+type Stage = (
+    &'static str,
+    &'static str,
+    fn(&mut Demo, &mut Run) -> anyhow::Result<Value>,
+);
+
+const STAGES: [Stage; 9] = [
+    ("read", "reading the scenario", look::read),
+    ("picture", "drawing it", look::picture),
+    ("raster", "drawing what the network sees", look::raster),
+    ("tokens", "writing it as tokens", look::tokens),
+    ("network", "opening the shipped network", learn::network),
+    ("train", "training a new one for a few steps", learn::train),
+    (
+        "imagine",
+        "imagining futures in every world",
+        imagine::worlds,
+    ),
+    ("plan", "planning inside the learned world", imagine::plan),
+    ("page", "writing the page", page),
+];
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        shipped::check_weights()?;
+        let name = match &self.scenario {
+            Some(name) => name.clone(),
+            None => shipped::scenario()?,
+        };
+        run.setting("scenario", &name)?;
+        let mut demo = Demo {
+            scenario: find(&name)?,
+            sampling: SamplingConfig::default(),
+            page: Page::new("gump: one scene, many futures"),
+        };
+        demo.page.lede(format!(
+            "Everything below was made from the scenario {} in {name} by one command, offline.",
+            demo.scenario.id
+        ));
+        for (number, (name, doing, stage)) in STAGES.into_iter().enumerate() {
+            run.say(&format!("{} of {}: {doing}", number + 1, STAGES.len()));
+            let block = run.phase(name, |run| stage(&mut demo, run))?;
+            run.result(name, block)?;
+        }
+        Ok(())
+    }
+}
+
+fn page(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
+    let path = run.path("index.html");
+    demo.page.footer(format!(
+        "cargo xtask demo, seed {}, commit {}, on {}.",
+        run.seed().0,
+        machine::commit(),
+        machine::Machine::here("cpu").cpu,
+    ));
+    demo.page.save(&path)?;
+    run.say(&format!("open {}", path.display()));
+    Ok(serde_json::json!({ "file": path }))
+}

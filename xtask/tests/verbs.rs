@@ -1,0 +1,480 @@
+//! Every verb from the outside: exit status, sentences, files, and the report that scripts rely on.
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use gump_model::checkpoint::{self, Precision};
+use gump_model::{Device, ModelConfig, Network};
+use gump_scene::Seed;
+use serde_json::Value;
+
+/// A folder for one test, and the driver in it.
+struct Workplace {
+    folder: tempfile::TempDir,
+}
+
+impl Workplace {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        Self { folder }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Runs the driver with space-separated words.
+    fn run(&self, words: &str) -> Output {
+        Command::new(env!("CARGO_BIN_EXE_xtask"))
+            .args(words.split(' '))
+            .current_dir(self.folder.path())
+            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
+            .output()
+            .unwrap()
+    }
+
+    /// Runs a verb that succeeds and returns its report.
+    fn report(&self, words: &str) -> Value {
+        let output = self.run(&format!("{words} --out out"));
+        assert!(output.status.success(), "{words}: {}", stderr(&output));
+        read_report(&self.path("out"))
+    }
+
+    /// Checks the exit status and that the error is one sentence with these parts.
+    fn fails(&self, words: &str, status: i32, parts: &[&str]) {
+        let output = self.run(words);
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(status), "{words}: {error}");
+        assert!(!error.contains("panicked"), "{words}: {error}");
+        for part in parts {
+            assert!(error.contains(part), "{words}: expected {part} in: {error}");
+        }
+    }
+
+    /// A small recorded scene on a file.
+    fn scene(&self) -> &'static str {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 0,0 50,0 150,0 speed 15 width 3.5
+             edge: -50,-2 150,-2
+             edge: 150,2 -50,2
+             ego vehicle 0: 0,0 velocity 8,0
+             agent vehicle 1: 20,0 velocity 6,0
+             agent pedestrian 2: 30,4",
+        )
+        .unwrap();
+        gump_data::womd::write_scenarios(&self.path("scene.tfrecord"), [scenario]).unwrap();
+        "scene.tfrecord"
+    }
+
+    /// Weights of a very small network that has learned nothing.
+    fn weights(&self) -> &'static str {
+        let mut config = ModelConfig::tiny();
+        (config.width, config.layers, config.heads) = (32, 1, 2);
+        config.trajectory_heads = vec![0];
+        config.reconstruction = false;
+        let network = Network::random(config, Seed(0), &Device::Cpu).unwrap();
+        checkpoint::save(&network, &self.path("w.safetensors"), Precision::Half).unwrap();
+        "w.safetensors"
+    }
+
+    /// Names in the output folder, sorted.
+    fn files(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.path("out")).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.collect();
+        names.sort();
+        names
+    }
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn read_report(folder: &Path) -> Value {
+    serde_json::from_str(&fs::read_to_string(folder.join("report.json")).unwrap()).unwrap()
+}
+
+fn mini() -> String {
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/mini/procedural.tfrecord.gz");
+    path.display().to_string()
+}
+
+#[test]
+fn wrong_arguments_exit_with_2() {
+    let place = Workplace::new();
+    for words in [
+        "",
+        "fly",
+        "simulate",
+        "data inspect",
+        "simulate --scenario s --world nowhere",
+        "simulate --scenario s --world idm --futures 0",
+        "simulate --scenario s --world idm --seconds 0",
+        "simulate --scenario s --world idm --temperature 0",
+        "simulate --scenario s --world idm --device cuda",
+        "data synthesize --scenes 1 --family cul-de-sac",
+        "tidy --seed many",
+    ] {
+        place.fails(words, 2, &[]);
+    }
+}
+
+#[test]
+fn unknown_keys_of_a_config_file_are_refused_with_the_nearest() {
+    let place = Workplace::new();
+    fs::write(place.path("c.toml"), "futurs = 3\n").unwrap();
+    let words = "simulate --scenario s --world idm --config c.toml";
+    place.fails(words, 2, &["c.toml", "futurs", "did you mean futures?"]);
+    fs::write(place.path("c.toml"), "[train.optimizer]\nwarm_up = 3\n").unwrap();
+    let words = "train --data s --config c.toml";
+    place.fails(words, 2, &["c.toml", "warm_up", "did you mean warmup?"]);
+    fs::write(place.path("c.toml"), "model = \"huge\"\n").unwrap();
+    place.fails(words, 2, &["huge", "tiny"]);
+}
+
+#[test]
+fn flags_override_the_config_file() {
+    let place = Workplace::new();
+    let scene = place.scene();
+    let file = format!("scenario = \"{scene}\"\nworld = \"idm\"\nfutures = 3\nseconds = 1\n");
+    fs::write(place.path("c.toml"), file).unwrap();
+    let report = place.report("simulate --config c.toml --futures 2");
+    assert_eq!(report["results"]["futures"], 2);
+    assert_eq!(report["results"]["steps"], 10);
+    assert_eq!(report["config"]["world"], "idm");
+}
+
+#[test]
+fn a_report_says_what_was_done() {
+    let place = Workplace::new();
+    let report = place.report("data synthesize --scenes 2 --seed 7");
+    let keys: Vec<_> = report
+        .as_object()
+        .unwrap()
+        .keys()
+        .map(String::as_str)
+        .collect();
+    let expected = [
+        "verb",
+        "args",
+        "commit",
+        "seed",
+        "config",
+        "machine",
+        "seconds",
+        "peak_rss_mb",
+        "results",
+    ];
+    assert_eq!(keys, expected);
+    assert_eq!(report["verb"], "data synthesize");
+    assert_eq!(report["seed"], 7);
+    assert_eq!(report["args"][3], "2");
+    assert!(report["seconds"]["total"].as_f64().unwrap() > 0.0);
+    for key in ["cpu", "cores", "memory_gb", "device"] {
+        assert!(report["machine"].get(key).is_some(), "{key}");
+    }
+}
+
+#[test]
+fn bad_input_is_one_sentence_and_exit_1() {
+    let place = Workplace::new();
+    let check = |words: &str, parts: &[&str]| {
+        place.fails(words, 1, parts);
+        let error = stderr(&place.run(words));
+        assert_eq!(error.trim().lines().count(), 1, "{words}: {error}");
+    };
+    check("data inspect nothing", &["nothing"]);
+    check("data verify nothing", &["nothing"]);
+    check("simulate --scenario nothing --world idm", &["nothing"]);
+    fs::write(place.path("empty"), "").unwrap();
+    check("data inspect empty", &["empty"]);
+    fs::write(place.path("text"), "once upon a time there was a car").unwrap();
+    check("data inspect text", &["text", "once"]);
+    let scene = place.scene();
+    check(&format!("data inspect {scene}#other"), &[scene, "other"]);
+    let words = format!("simulate --scenario {scene} --world model:text");
+    check(&words, &["text"]);
+    check("train --data empty", &["empty"]);
+}
+
+#[test]
+fn inspect_counts_and_draws() {
+    let place = Workplace::new();
+    let scene = place.scene();
+    let results = &place.report(&format!("data inspect {scene} --picture"))["results"];
+    assert_eq!(results["scenarios"], 1);
+    assert_eq!(results["agents_now"]["vehicle"], 2);
+    assert_eq!(results["agents_now"]["pedestrian"], 1);
+    let png = fs::read(place.path("out/picture.png")).unwrap();
+    assert!(png.starts_with(b"\x89PNG"));
+    let one = &place.report(&format!("data inspect {}#3", mini()))["results"];
+    assert_eq!(one["scenarios"], 1);
+    assert!(
+        one["inferred"]
+            .as_object()
+            .is_some_and(|counts| !counts.is_empty())
+    );
+}
+
+#[test]
+fn verify_tells_sound_from_broken() {
+    let place = Workplace::new();
+    let results = &place.report(&format!("data verify {}", mini()))["results"];
+    assert_eq!(
+        (&results["scenarios"], &results["broken"]),
+        (&24.into(), &0.into())
+    );
+
+    let scene = place.scene();
+    let mut bytes = fs::read(place.path(scene)).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0xFF;
+    fs::write(place.path("damaged"), bytes).unwrap();
+    place.fails(
+        "data verify damaged --out out",
+        1,
+        &["broken", "1 findings"],
+    );
+    let report = read_report(&place.path("out"));
+    assert_eq!(report["results"]["broken"], 1);
+    assert!(report["error"].as_str().unwrap().contains("broken"));
+}
+
+#[test]
+fn synthesized_scenes_are_sound_and_depend_on_the_seed_alone() {
+    let place = Workplace::new();
+    let bytes = |words: &str| {
+        place.report(&format!("data synthesize --scenes 3 --shards 2 {words}"));
+        assert_eq!(
+            place.files(),
+            [
+                "report.json",
+                "scenes-00000-of-00002.tfrecord.gz",
+                "scenes-00001-of-00002.tfrecord.gz",
+            ]
+        );
+        fs::read(place.path("out/scenes-00000-of-00002.tfrecord.gz")).unwrap()
+    };
+    let first = bytes("--seed 5 --threads 1");
+    assert_eq!(first, bytes("--seed 5 --threads 2"));
+    assert_ne!(first, bytes("--seed 6"));
+    let results = &place.report("data verify out")["results"];
+    assert_eq!(
+        (&results["scenarios"], &results["broken"]),
+        (&3.into(), &0.into())
+    );
+}
+
+#[test]
+fn simulate_writes_futures_in_every_world() {
+    let place = Workplace::new();
+    let (scene, weights) = (place.scene(), place.weights());
+    for world in [
+        "idm",
+        "constant-velocity",
+        "log",
+        &format!("model:{weights}"),
+    ] {
+        let words = format!(
+            "simulate --scenario {scene} --world {world} --futures 2 --seconds 2 --format waymo"
+        );
+        let results = &place.report(&words)["results"];
+        let counts = ["futures", "steps", "agents"].map(|key| results[key].as_u64().unwrap());
+        assert_eq!(counts, [2, 20, 3], "{world}");
+        for key in [
+            "frames_per_second",
+            "passes_per_frame",
+            "collision_rate",
+            "offroad_rate",
+        ] {
+            assert!(
+                results[key].is_number(),
+                "{world}: {key} is {}",
+                results[key]
+            );
+        }
+        assert_eq!(results["digest"].as_str().unwrap().len(), 64);
+        let files = [
+            "film.gif",
+            "futures.json",
+            "futures.npy",
+            "picture.png",
+            "report.json",
+            "rollouts.binproto",
+        ];
+        assert_eq!(place.files(), files, "{world}");
+        let path = place.path("out/rollouts.binproto");
+        let message = &gump_data::submission::read_rollouts(&path).unwrap()[0];
+        assert_eq!(message.joint_scenes.len(), 2);
+        let trajectories = &message.joint_scenes[1].simulated_trajectories;
+        assert_eq!(
+            (trajectories.len(), trajectories[0].center_x.len()),
+            (3, 20)
+        );
+    }
+}
+
+#[test]
+fn the_same_seed_imagines_the_same_on_any_number_of_threads() {
+    let place = Workplace::new();
+    let (scene, weights) = (place.scene(), place.weights());
+    for world in ["idm", &format!("model:{weights}")] {
+        let digest = |rest: &str| {
+            let words = "simulate --futures 3 --seconds 2 --scenario";
+            let report = place.report(&format!("{words} {scene} --world {world} {rest}"));
+            report["results"]["digest"].as_str().unwrap().to_owned()
+        };
+        let first = digest("--seed 3 --threads 1");
+        assert_eq!(first, digest("--seed 3 --threads 1"), "{world}");
+        assert_eq!(first, digest("--seed 3 --threads 2"), "{world}");
+        if world != "idm" {
+            assert_ne!(first, digest("--seed 4"), "{world}");
+        }
+    }
+}
+
+#[test]
+fn the_logged_future_changes_no_rollout() {
+    let place = Workplace::new();
+    let weights = place.weights();
+    // The same past and present; in one of them the other car brakes hard from now on.
+    let told = gump_scene::fixture::scenario(
+        "lane 1: -50,0 150,0 speed 15
+         ego vehicle 0: 0,0 velocity 8,0
+         agent vehicle 1: 20,0 velocity 6,0",
+    )
+    .unwrap();
+    let mut other = told.clone();
+    let present = other.log[other.now].clone();
+    for frame in &mut other.log[told.now + 1..] {
+        *frame = present.clone();
+    }
+    for (name, scenario) in [("told", &told), ("other", &other)] {
+        gump_data::womd::write_scenarios(&place.path(name), [scenario]).unwrap();
+    }
+    for world in ["idm", "constant-velocity", &format!("model:{weights}")] {
+        let digest = |name: &str| {
+            let words = "simulate --futures 2 --seconds 2 --scenario";
+            let report = place.report(&format!("{words} {name} --world {world}"));
+            report["results"]["digest"].clone()
+        };
+        assert_eq!(digest("told"), digest("other"), "{world}");
+    }
+}
+
+#[test]
+fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
+    let place = Workplace::new();
+    let scene = place.scene();
+    let config = "[model]\nwidth = 32\nlayers = 1\nheads = 2\nblock_size = 512\ngru_layers = 1\n\
+                  trajectory_heads = [0]\ngate = \"flamingo\"\npairs_share = true\n\
+                  smooth_bins = true\ndropout = 0.0\nreconstruction = false\n\
+                  [model.visual]\nencoder = \"compact\"\nside_px = 64\nmetres_per_px = 2.0\n\
+                  layers = [\"road_lines\", \"road_edge\"]\n\
+                  [train]\nsteps = 6\nbatch = 2\n";
+    fs::write(place.path("c.toml"), config).unwrap();
+    let train = |rest: &str| {
+        let words = format!("train --data {scene} --validation {scene} --config c.toml{rest}");
+        place.report(&words)["results"].clone()
+    };
+    let whole = train("");
+    for key in [
+        "parameters",
+        "tokens_per_second",
+        "loss_first",
+        "loss_last",
+        "validation_loss",
+    ] {
+        assert!(whole[key].is_number(), "{key}: {}", whole[key]);
+    }
+    assert_eq!(whole["resumed"], false);
+    assert_eq!(whole["steps"], 6);
+    let names = [
+        "checkpoint.safetensors",
+        "losses.csv",
+        "losses.svg",
+        "report.json",
+        "weights.safetensors",
+    ];
+    assert_eq!(place.files(), names);
+    let losses = fs::read_to_string(place.path("out/losses.csv")).unwrap();
+    assert_eq!(losses.lines().count(), 7);
+
+    let first_half = train(" --stop-at 3");
+    assert_eq!(first_half["steps"], 3);
+    let resumed = train(" --resume");
+    assert_eq!(resumed["resumed"], true);
+    for key in ["steps", "loss_first", "loss_last", "validation_loss"] {
+        assert_eq!(resumed[key], whole[key], "{key}");
+    }
+    let again = fs::read_to_string(place.path("out/losses.csv")).unwrap();
+    assert_eq!(again, losses);
+    let words = format!("train --data {scene} --out out --resume --steps 9");
+    place.fails(&words, 2, &["--steps 9", "began with 6"]);
+}
+
+#[test]
+fn ablate_nar_compares_the_two_ways_of_decoding() {
+    let place = Workplace::new();
+    let (scene, weights) = (place.scene(), place.weights());
+    let words = "ablate nar --futures 2 --seconds 1 --scenario";
+    let results = &place.report(&format!("{words} {scene} --world model:{weights}"))["results"];
+    let rows = results["rows"].as_array().unwrap();
+    let modes: Vec<_> = rows
+        .iter()
+        .map(|row| row["mode"].as_str().unwrap())
+        .collect();
+    assert_eq!(modes, ["full-AR", "partial-AR"]);
+    assert_eq!(rows[1]["passes_per_frame"], 1.0);
+    assert!(rows[0]["passes_per_frame"].as_f64().unwrap() > 1.0);
+    let rate = |row: &Value| row["frames_per_second"].as_f64().unwrap();
+    let ratio = results["ratio"].as_f64().unwrap();
+    assert!((ratio - rate(&rows[1]) / rate(&rows[0])).abs() < 1e-9);
+    assert!(results["difference"]["ade"].is_number());
+    assert!(place.files().contains(&"picture.png".to_owned()));
+    place.fails(
+        &format!("{words} {scene} --world idm"),
+        1,
+        &["model:WEIGHTS"],
+    );
+}
+
+#[test]
+fn demo_tells_its_stages_or_what_is_missing() {
+    let place = Workplace::new();
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    if !repository
+        .join("datasets/weights/gump-tiny.safetensors")
+        .is_file()
+    {
+        place.fails("demo", 1, &["gump-tiny.safetensors", "cargo xtask train"]);
+        return;
+    }
+    if std::env::var_os("RUN_SLOW_TESTS").is_none() {
+        eprintln!("skipped: the demo takes a minute, set RUN_SLOW_TESTS to run it");
+        return;
+    }
+    let report = place.report("demo");
+    let results = report["results"].as_object().unwrap();
+    let stages: Vec<_> = results.keys().map(String::as_str).collect();
+    let expected = [
+        "read", "picture", "raster", "tokens", "network", "train", "imagine", "plan", "page",
+    ];
+    assert_eq!(stages, expected);
+    for stage in expected {
+        assert!(report["seconds"][stage].is_number(), "{stage}");
+    }
+    let page = fs::read_to_string(place.path("out/index.html")).unwrap();
+    assert!(page.contains("data:image/gif;base64,") && !page.contains("src=\"http"));
+}
+
+#[test]
+fn tidy_finds_nothing() {
+    let place = Workplace::new();
+    let results = &place.report("tidy")["results"];
+    assert_eq!(results["problems"], 0);
+}
