@@ -401,6 +401,26 @@ fn a_long_drive_never_reaches_the_edge_of_the_window() {
 }
 
 #[test]
+fn traffic_may_come_and_go_at_the_edge() {
+    let mut text = String::from("lane 1: -200,0 200,0\nego vehicle 0: 0,0\n");
+    for i in 1..60 {
+        let (x, velocity) = (90.0 + 0.2 * f64::from(i), 4.0 * f64::from(i % 5 - 2));
+        text += &format!(
+            "agent vehicle {i}: {x},{} velocity {velocity},0\n",
+            3 * (i % 30) - 45
+        );
+    }
+    let scenario = fixture::scenario(&text).unwrap();
+    let (frames, _) = imagine(SamplingConfig::default(), &scenario, 4, 12, None);
+    assert!(
+        frames
+            .iter()
+            .flatten()
+            .all(|frame| frame.agents().len() == 60)
+    );
+}
+
+#[test]
 fn a_crowd_of_500_is_imagined_whole() {
     let mut text = String::from("lane 1: -100,0 100,0\nego vehicle 0: 0,0 velocity 5,0\n");
     for i in 1..500 {

@@ -466,10 +466,20 @@ impl Scene {
         }
     }
 
-    /// Agents of `frame` inside the window that `tokens` does not know yet, because they drifted in;
-    /// as many as fit a frame of `longest` slots.
-    fn arrivals(&self, frame: &Frame, tokens: &TokenFrame, longest: usize) -> Vec<TokenAgent> {
-        let known: BTreeSet<u16> = tokens.agents().map(|agent| agent.key.id).collect();
+    /// Agents of `frame` inside the window that neither `tokens` nor the frame before knows, because
+    /// they drifted in; as many as fit a frame of `longest` slots. One that has just left waits a
+    /// frame before it can be newborn.
+    fn arrivals(
+        &self,
+        frame: &Frame,
+        tokens: &TokenFrame,
+        before: Option<&TokenFrame>,
+        longest: usize,
+    ) -> Vec<TokenAgent> {
+        let present = tokens
+            .agents()
+            .chain(before.into_iter().flat_map(TokenFrame::agents));
+        let known: BTreeSet<u16> = present.map(|agent| agent.key.id).collect();
         let mut arrivals: Vec<TokenAgent> = frame
             .agents()
             .iter()
@@ -558,7 +568,7 @@ impl Future {
         });
         // Lights keep the colour they were seen in.
         let frame = Frame::new(agents.collect(), now.lights().to_vec());
-        next.newborn = scene.arrivals(&frame, &next, world.longest_frame());
+        next.newborn = scene.arrivals(&frame, &next, self.frames.last(), world.longest_frame());
         self.recent.push(frame.clone());
         self.frames.push(next);
         let history = sampling.history.max(1);
