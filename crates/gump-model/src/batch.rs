@@ -3,10 +3,12 @@
 use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
+use gump_geometry::DVec2;
 use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
 
+use crate::config::ModelConfig;
 use crate::embedding::{ROWS_PER_TOKEN, SineTables, Tables};
-use crate::mct::TokenBatch;
+use crate::mct::{PLACES, TokenBatch};
 
 /// A slot and where it stands in the presented window.
 #[derive(Clone, Copy, Debug)]
@@ -56,45 +58,119 @@ pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
         .collect()
 }
 
-/// Packs sequences side by side; shorter ones are padded at the end, where causality hides it.
-pub(crate) fn pack(
-    sequences: &[&[PlacedSlot]],
+/// How tokens become the rows of a batch, for one network.
+#[derive(Debug)]
+pub(crate) struct Packer {
     tables: Tables,
-    sines: &SineTables,
+    sines: SineTables,
     width: usize,
-    device: &Device,
-) -> candle_core::Result<TokenBatch> {
-    let t = sequences
-        .iter()
-        .map(|sequence| sequence.len())
-        .max()
-        .unwrap_or(0);
-    let b = sequences.len();
-    let mut rows: Vec<u32> = Vec::with_capacity(b * t * ROWS_PER_TOKEN);
-    let mut positions: Vec<u32> = Vec::new();
-    let mut features: Vec<f32> = Vec::new();
-    for (row, sequence) in sequences.iter().enumerate() {
-        for (column, placed) in sequence.iter().enumerate() {
-            rows.extend(tables.rows(placed));
-            if sines.append(placed, &mut features) {
-                positions.push((row * t + column) as u32);
-            }
-        }
-        for position in sequence.len()..t {
-            rows.extend(tables.rows(&PlacedSlot {
-                slot: Slot::Pad,
-                position,
-                frame: 0,
-                key: None,
-                last: None,
-            }));
+    local_map: bool,
+    visual_side: usize,
+    cell_m: f64,
+}
+
+impl Packer {
+    pub(crate) fn new(config: &ModelConfig) -> Self {
+        Self {
+            tables: Tables::new(config),
+            sines: SineTables::new(config),
+            width: config.width,
+            local_map: config.local_map,
+            visual_side: config.visual_side(),
+            cell_m: config.visual.metres_per_px * config.visual.encoder.stride() as f64,
         }
     }
-    let n = positions.len();
-    Ok(TokenBatch {
-        rows: Tensor::from_vec(rows, (b * t, ROWS_PER_TOKEN), device)?,
-        sine_positions: Tensor::from_vec(positions, n, device)?,
-        sines: Tensor::from_vec(features, (n, width), device)?,
-        shape: (b, t),
-    })
+
+    /// Packs sequences side by side; shorter ones are padded at the end, where causality hides it.
+    pub(crate) fn pack(
+        &self,
+        sequences: &[&[PlacedSlot]],
+        device: &Device,
+    ) -> candle_core::Result<TokenBatch> {
+        let t = sequences
+            .iter()
+            .map(|sequence| sequence.len())
+            .max()
+            .unwrap_or(0);
+        let b = sequences.len();
+        let mut rows: Vec<u32> = Vec::with_capacity(b * t * ROWS_PER_TOKEN);
+        let mut sine_positions: Vec<u32> = Vec::new();
+        let mut features: Vec<f32> = Vec::new();
+        let mut lookers: Vec<u32> = Vec::new();
+        let mut looker_rows: Vec<u32> = Vec::new();
+        let mut places: [Vec<u32>; PLACES.len()] = Default::default();
+        for (row, sequence) in sequences.iter().enumerate() {
+            for (column, placed) in sequence.iter().enumerate() {
+                let flat = (row * t + column) as u32;
+                rows.extend(self.tables.rows(placed));
+                if self.sines.append(placed, &mut features) {
+                    sine_positions.push(flat);
+                }
+                if let (true, Slot::Key(_), Some(last)) = (self.local_map, placed.slot, placed.last)
+                {
+                    lookers.push(flat);
+                    looker_rows.push(row as u32);
+                    for (cells, seconds) in places.iter_mut().zip(PLACES) {
+                        cells.push(self.cell(last.pose().position + last.velocity() * seconds));
+                    }
+                }
+            }
+            for position in sequence.len()..t {
+                rows.extend(self.tables.rows(&padding(position)));
+            }
+        }
+        let (n, k) = (sine_positions.len(), lookers.len());
+        Ok(TokenBatch {
+            rows: Tensor::from_vec(rows, (b * t, ROWS_PER_TOKEN), device)?,
+            sine_positions: Tensor::from_vec(sine_positions, n, device)?,
+            sines: Tensor::from_vec(features, (n, self.width), device)?,
+            lookers: Tensor::from_vec(lookers, k, device)?,
+            places,
+            looker_rows,
+            shape: (b, t),
+        })
+    }
+
+    /// The visual token that covers a point of the scene frame, or the nearest one.
+    fn cell(&self, point: DVec2) -> u32 {
+        let half = self.visual_side as f64 / 2.0;
+        let index = |along: f64| {
+            (half - along / self.cell_m)
+                .floor()
+                .clamp(0.0, self.visual_side as f64 - 1.0) as u32
+        };
+        index(point.x) * self.visual_side as u32 + index(point.y)
+    }
+}
+
+fn padding(position: usize) -> PlacedSlot {
+    PlacedSlot {
+        slot: Slot::Pad,
+        position,
+        frame: 0,
+        key: None,
+        last: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_geometry::dvec2;
+
+    #[test]
+    fn cells_are_numbered_as_visual_tokens_are() {
+        let packer = Packer::new(&ModelConfig::tiny());
+        assert_eq!((packer.visual_side, packer.cell_m), (26, 8.0));
+        // Row 0 is ahead, column 0 is left; the centre is the corner of four cells.
+        for (point, cell) in [
+            (dvec2(103.0, 103.0), 0),
+            (dvec2(103.0, -103.0), 25),
+            (dvec2(1.0, 1.0), 12 * 26 + 12),
+            (dvec2(-1.0, -1.0), 13 * 26 + 13),
+            (dvec2(-500.0, 1.0), 25 * 26 + 12),
+        ] {
+            assert_eq!(packer.cell(point), cell, "{point}");
+        }
+    }
 }

@@ -34,6 +34,9 @@ pub struct ModelConfig {
     /// True adds to every bin's row of the decoder's tables a learned map of the bin's sines (the
     /// paper: free rows), so that what is learned of one bin holds for its neighbours.
     pub smooth_bins: bool,
+    /// True lets an object's key see the visual features under the object, and one and two seconds
+    /// ahead of it, directly (the paper: through cross-attention alone); needs `pairs_share`.
+    pub local_map: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
     /// True builds the decoder that reconstructs the raster from the visual features.
@@ -122,6 +125,7 @@ impl ModelConfig {
             gate: Gate::Flamingo,
             pairs_share: true,
             smooth_bins: true,
+            local_map: true,
             dropout: 0.0,
             reconstruction: true,
             visual: VisualConfig {
@@ -151,6 +155,7 @@ impl ModelConfig {
             gate: Gate::Flamingo,
             pairs_share: false,
             smooth_bins: false,
+            local_map: false,
             dropout: 0.1,
             reconstruction: true,
             visual: VisualConfig {

@@ -10,7 +10,7 @@ use candle_core::Tensor;
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 
 use crate::ModelError;
-use crate::batch::{PlacedSlot, pack, place};
+use crate::batch::{PlacedSlot, place};
 use crate::mct::{Cache, VisualMemory};
 use crate::network::Network;
 use crate::sampling::{
@@ -63,13 +63,7 @@ impl<'a> Passes<'a> {
     ) -> Result<Tensor, ModelError> {
         self.count.fetch_add(1, Ordering::Relaxed);
         let network = self.network;
-        let batch = pack(
-            slots,
-            network.mct.tables(),
-            network.sines(),
-            network.config().width,
-            network.device(),
-        )?;
+        let batch = network.pack(slots)?;
         Ok(network.mct.forward(&batch, memory, cache, None)?.hidden)
     }
 

@@ -8,7 +8,6 @@ use candle_core::{D, Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
-use crate::batch::pack;
 use crate::decoder::STEPS;
 use crate::mct::Dropout;
 use crate::network::Network;
@@ -107,13 +106,7 @@ pub(crate) fn loss(
         .iter()
         .map(|sample| sample.slots.as_slice())
         .collect();
-    let batch = pack(
-        &sequences,
-        network.mct.tables(),
-        network.sines(),
-        width,
-        device,
-    )?;
+    let batch = network.pack(&sequences)?;
     let (b, t) = batch.shape;
     let passed = network.mct.forward(&batch, &memory, None, dropout)?;
     let flat = passed.hidden.reshape((b * t, width))?;

@@ -286,6 +286,8 @@ impl CrossBlock {
 /// `[S, M, C]`; computed once and shared by all futures of the scene.
 #[derive(Clone, Debug)]
 pub(crate) struct VisualMemory {
+    /// The visual tokens themselves, for looking up what lies under an object.
+    visual: Tensor,
     key_values: Vec<(Tensor, Tensor)>,
 }
 
@@ -306,6 +308,7 @@ impl VisualMemory {
             ))
         });
         Ok(Self {
+            visual: join(&|part| part.visual.clone())?,
             key_values: key_values.collect::<Result<_>>()?,
         })
     }
@@ -343,7 +346,6 @@ pub(crate) struct Features {
 #[derive(Debug)]
 pub(crate) struct Mct {
     table: Tensor,
-    tables: Tables,
     sine_in: Linear,
     sine_norm: LayerNorm,
     sine_out: Linear,
@@ -351,6 +353,8 @@ pub(crate) struct Mct {
     cross: Vec<CrossBlock>,
     norm: LayerNorm,
     levels: Vec<usize>,
+    /// One map per place an object looks at, if it does.
+    local: Vec<Linear>,
 }
 
 /// Tokens ready to embed: `B` sequences of `T` tokens each.
@@ -362,9 +366,18 @@ pub(crate) struct TokenBatch {
     pub(crate) sine_positions: Tensor,
     /// Their sine features, [N, C].
     pub(crate) sines: Tensor,
+    /// Flat indices of the keys that look at the map under their object, [K].
+    pub(crate) lookers: Tensor,
+    /// Per place they look at, the visual token there, counted within a scene, [K] each.
+    pub(crate) places: [Vec<u32>; PLACES.len()],
+    /// Row of the batch each of them stands in, [K].
+    pub(crate) looker_rows: Vec<u32>,
     /// (B, T)
     pub(crate) shape: (usize, usize),
 }
+
+/// Where an object looks: seconds ahead on its present course.
+pub(crate) const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
 
 impl Mct {
     pub(crate) fn new(
@@ -373,13 +386,25 @@ impl Mct {
     ) -> std::result::Result<Self, ModelError> {
         let c = config.width;
         let tables = Tables::new(config);
+        let n_places = if config.local_map { PLACES.len() } else { 0 };
+        let local = (0..n_places)
+            .map(|i| {
+                Linear::with(
+                    &mut scope,
+                    &format!("local.{i}"),
+                    c,
+                    c,
+                    Init::Constant(0.0),
+                    None,
+                )
+            })
+            .collect::<std::result::Result<_, _>>()?;
         Ok(Self {
             table: scope.get(
                 "tables",
                 (tables.n_rows(), c),
                 Init::Normal(TABLE_DEVIATION),
             )?,
-            tables,
             sine_in: Linear::new(&mut scope, "sine_in", c, 2 * c)?,
             sine_norm: LayerNorm::new(&mut scope, "sine_norm", 2 * c)?,
             sine_out: Linear::new(&mut scope, "sine_out", 2 * c, c)?,
@@ -392,12 +417,8 @@ impl Mct {
                 .collect::<std::result::Result<_, _>>()?,
             norm: LayerNorm::new(&mut scope, "norm", c)?,
             levels: config.trajectory_heads.clone(),
+            local,
         })
-    }
-
-    /// Where the tables lie in their stack.
-    pub(crate) fn tables(&self) -> Tables {
-        self.tables
     }
 
     /// The rows of the token table, [TABLE_ROWS, C], which the decoder reads too.
@@ -418,8 +439,29 @@ impl Mct {
     pub(crate) fn remember(&self, visual: &Tensor) -> Result<VisualMemory> {
         let key_values = self.cross.iter().map(|cross| cross.remember(visual));
         Ok(VisualMemory {
+            visual: visual.clone(),
             key_values: key_values.collect::<Result<_>>()?,
         })
+    }
+
+    /// What lies under and ahead of every object that looks, [K, C].
+    fn look_around(&self, batch: &TokenBatch, memory: &VisualMemory) -> Result<Tensor> {
+        let (scenes, m, c) = memory.visual.dims3()?;
+        let flat = memory.visual.reshape((scenes * m, c))?;
+        let sharing = (batch.shape.0 / scenes) as u32;
+        let mut seen: Option<Tensor> = None;
+        for (map, cells) in self.local.iter().zip(&batch.places) {
+            let rows = batch.looker_rows.iter().zip(cells);
+            let rows: Vec<u32> = rows
+                .map(|(row, cell)| row / sharing * m as u32 + cell)
+                .collect();
+            let place = map.forward(&flat.index_select(&Tensor::new(rows, flat.device())?, 0)?)?;
+            seen = Some(match seen {
+                Some(seen) => (seen + place)?,
+                None => place,
+            });
+        }
+        seen.ok_or_else(|| candle_core::Error::Msg("no place to look at".into()))
     }
 
     /// One pass over `batch`, after the tokens in `cache` if there is one; the cache then holds
@@ -435,6 +477,9 @@ impl Mct {
         let mut x = embedding_sum(&self.table, &batch.rows)?; // [B * T, C]
         if batch.sines.dim(0)? > 0 {
             x = x.index_add(&batch.sine_positions, &self.embed_sine(&batch.sines)?, 0)?;
+        }
+        if !batch.looker_rows.is_empty() {
+            x = x.index_add(&batch.lookers, &self.look_around(batch, visual)?, 0)?;
         }
         let mut x = drop_out(x.reshape((b, t, ()))?, dropout)?; // [B, T, C]
         let mut levels = Vec::with_capacity(self.levels.len());

@@ -5,10 +5,10 @@ use gump_raster::{Raster, RasterSpec};
 use gump_scene::Seed;
 
 use crate::ModelError;
+use crate::batch::{Packer, PlacedSlot};
 use crate::config::ModelConfig;
 use crate::decoder::StateDecoder;
-use crate::embedding::SineTables;
-use crate::mct::{Mct, VisualMemory};
+use crate::mct::{Mct, TokenBatch, VisualMemory};
 use crate::parameters::Parameters;
 use crate::trajectory::TrajectoryHead;
 use crate::visual::Visual;
@@ -19,7 +19,7 @@ pub struct Network {
     config: ModelConfig,
     raster_spec: RasterSpec,
     parameters: Parameters,
-    sines: SineTables,
+    packer: Packer,
     pub(crate) mct: Mct,
     pub(crate) decoder: StateDecoder,
     pub(crate) visual: Visual,
@@ -55,12 +55,12 @@ impl Network {
                 "the checkpoint's tensor \"{name}\" has no place in it"
             )));
         }
-        let sines = SineTables::new(&config);
+        let packer = Packer::new(&config);
         Ok(Self {
             config,
             raster_spec,
             parameters,
-            sines,
+            packer,
             mct,
             decoder,
             visual,
@@ -88,9 +88,9 @@ impl Network {
         self.parameters.device()
     }
 
-    /// Sine features of the vocabulary.
-    pub(crate) fn sines(&self) -> &SineTables {
-        &self.sines
+    /// Sequences of slots as a batch.
+    pub(crate) fn pack(&self, sequences: &[&[PlacedSlot]]) -> Result<TokenBatch, ModelError> {
+        Ok(self.packer.pack(sequences, self.device())?)
     }
 
     /// Rasters of several scenes as one tensor, [S, P, side, side].

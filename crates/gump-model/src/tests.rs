@@ -6,7 +6,7 @@ use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
 use gump_tokenizer::{Identities, Slot, Tokenizer, TokenizerConfig};
 
 use crate::aggregation::Ring;
-use crate::batch::{PlacedSlot, pack, place};
+use crate::batch::{PlacedSlot, place};
 use crate::config::{Gate, ModelConfig, VisualConfig};
 use crate::decode::{Passes, Window, decode};
 use crate::decoder::STEPS;
@@ -75,14 +75,7 @@ fn hidden(
     sequences: &[&[PlacedSlot]],
     memory: &VisualMemory,
 ) -> Vec<Vec<Vec<f32>>> {
-    let batch = pack(
-        sequences,
-        network.mct.tables(),
-        network.sines(),
-        network.config().width,
-        network.device(),
-    )
-    .unwrap();
+    let batch = network.pack(sequences).unwrap();
     network
         .mct
         .forward(&batch, memory, None, None)
@@ -171,14 +164,7 @@ fn the_cache_is_exact() {
     let mut cache = Cache::new(network.config().layers);
     let mut pieces = Vec::new();
     for piece in [&slots[..11], &slots[11..12], &slots[12..]] {
-        let batch = pack(
-            &[piece],
-            network.mct.tables(),
-            network.sines(),
-            32,
-            network.device(),
-        )
-        .unwrap();
+        let batch = network.pack(&[piece]).unwrap();
         let rows = network
             .mct
             .forward(&batch, &memory, Some(&mut cache), None)

@@ -25,7 +25,7 @@ use gump_tokenizer::{
 
 use crate::ModelError;
 use crate::aggregation::Ring;
-use crate::batch::{pack, place};
+use crate::batch::place;
 use crate::decode::{Passes, Window, decode};
 use crate::decoder::STEPS;
 use crate::mct::VisualMemory;
@@ -192,13 +192,7 @@ impl TransformerWorld {
                 _ => None,
             })
             .collect();
-        let batch = pack(
-            &[&slots],
-            network.mct.tables(),
-            network.sines(),
-            network.config().width,
-            network.device(),
-        )?;
+        let batch = network.pack(&[&slots])?;
         let features = network.mct.forward(&batch, &scene.memory, None, None)?;
         self.passes.fetch_add(1, Ordering::Relaxed);
         let rows: Vec<u32> = (0..n)
