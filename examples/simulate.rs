@@ -1,52 +1,59 @@
-//! Futures of a scene in a reactive or a learned world, as a film.
+//! Futures of a scene in a learned world, as a film.
 //!
-//! `cargo run -p examples --example simulate [PATH#INDEX [WEIGHTS]]` writes `out/simulate.gif`.
+//! `cargo run -p examples --example simulate -- WEIGHTS [FILE#INDEX]` writes `out/simulate.gif`.
+//! Weights are what `cargo xtask train` writes, or the shipped ones in `datasets/weights`.
 
 use std::path::Path;
 
 use anyhow::Context as _;
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
-use gump_rollout::{SimulateConfig, Start, WorldModel, simulate, worlds::Idm};
+use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::Seed;
-use gump_viz::{Camera, FilmSpec, Take, grid_film};
+use gump_viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
-    "/../datasets/mini/procedural.tfrecord.gz"
+    "/../datasets/mini/procedural.tfrecord.gz#22"
 );
 
 fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
+    let weights = arguments.next().context("expected a file of weights")?;
     let scenario = gump_data::find(&arguments.next().unwrap_or_else(|| SHIPPED.into()))?;
+    let scene = scenario.present();
 
-    // Rules and networks stand behind one trait; nothing below knows which it is.
-    let world: Box<dyn WorldModel> = match arguments.next() {
-        None => Box::new(Idm::default()),
-        Some(weights) => {
-            let network = checkpoint::load(Path::new(&weights), &Device::Cpu)?;
-            Box::new(TransformerWorld::new(network, SamplingConfig::default()))
-        }
-    };
+    // A file of weights holds its configuration and needs nothing else. From here on the network
+    // is a world like any other: whatever takes `&dyn WorldModel` takes it.
+    let network = checkpoint::load(Path::new(&weights), &Device::Cpu)?;
+    let world = TransformerWorld::new(network, SamplingConfig::default());
     let start = Start {
-        scene: scenario.present(),
-        n_futures: 4,
+        scene,
+        n_futures: 3,
         seed: Seed(0),
     };
-    let rollouts = simulate(&*world, &[start], None, &SimulateConfig::default())
-        .map_err(|error| anyhow::anyhow!(error))?;
+    let futures = simulate(&world, &[start], None, &SimulateConfig::default())
+        .map_err(anyhow::Error::from_boxed)?;
 
-    let takes: Vec<_> = rollouts
-        .iter()
-        .enumerate()
-        .map(|(k, rollout)| Take {
-            rollout,
-            label: format!("{}, future {}", world.name(), k + 1),
-        })
-        .collect();
-    let camera = Camera::on_ego(&scenario.present(), 90.0, 400, 400);
-    std::fs::create_dir_all("out").context("cannot create the folder out")?;
-    let path = Path::new("out/simulate.gif");
-    grid_film(&takes, &FilmSpec::new(camera))?.save(path)?;
-    println!("{}: open {}", scenario.id, path.display());
+    // The log, in the form in which futures come, and the futures beside it.
+    let log = log_as_rollout(&scenario);
+    let mut takes = vec![Take {
+        rollout: &log,
+        label: "log".into(),
+    }];
+    takes.extend(futures.iter().enumerate().map(|(k, rollout)| Take {
+        rollout,
+        label: format!("future {}", k + 1),
+    }));
+    let spec = FilmSpec {
+        columns: 2,
+        ..FilmSpec::new(Camera::on_ego(&scene, 90.0, 400, 400))
+    };
+    std::fs::create_dir_all("out")?;
+    grid_film(&takes, &spec)?.save(Path::new("out/simulate.gif"))?;
+    println!(
+        "{}: {} passes of the transformer, open out/simulate.gif",
+        scenario.id,
+        world.passes()
+    );
     Ok(())
 }
