@@ -18,13 +18,9 @@ fn main() -> anyhow::Result<()> {
     let scene = scenario.present();
 
     // The planner makes proposals, drives each through the world, where others answer it, and
-    // takes the best. It keeps all of them, so that a choice can be explained.
+    // takes the best over four futures. It keeps all of them, so that a choice can be explained.
     let world = Idm::default();
-    let config = InteractiveConfig {
-        n_futures: 1, // the futures of this world are all alike
-        ..InteractiveConfig::default()
-    };
-    let mut planner = Interactive::new(&world, config)?;
+    let mut planner = Interactive::new(&world, InteractiveConfig::default())?;
     let plan = planner.plan(&scene)?;
     for (i, candidate) in plan.candidates.iter().enumerate() {
         let mark = if i == plan.chosen { '>' } else { ' ' };
