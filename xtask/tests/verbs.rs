@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gump_model::checkpoint::{self, Precision};
-use gump_model::{Device, ModelConfig, Network};
+use gump_model::train::ModelChoice;
+use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
 use gump_scene::Seed;
 use serde_json::Value;
 
@@ -70,11 +71,7 @@ impl Workplace {
 
     /// Weights of a very small network that has learned nothing.
     fn weights(&self) -> &'static str {
-        let mut config = ModelConfig::tiny();
-        (config.width, config.layers, config.heads) = (32, 1, 2);
-        config.trajectory_heads = vec![0];
-        config.reconstruction = false;
-        let network = Network::random(config, Seed(0), &Device::Cpu).unwrap();
+        let network = Network::random(very_small(), Seed(0), &Device::Cpu).unwrap();
         checkpoint::save(&network, &self.path("w.safetensors"), Precision::Half).unwrap();
         "w.safetensors"
     }
@@ -86,6 +83,18 @@ impl Workplace {
         let mut names: Vec<_> = names.collect();
         names.sort();
         names
+    }
+}
+
+/// The shape of a network that is quick to build.
+fn very_small() -> ModelConfig {
+    ModelConfig {
+        width: 32,
+        layers: 1,
+        heads: 2,
+        trajectory_heads: vec![0],
+        reconstruction: false,
+        ..ModelConfig::tiny()
     }
 }
 
@@ -370,12 +379,18 @@ fn the_logged_future_changes_no_rollout() {
 fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
     let place = Workplace::new();
     let scene = place.scene();
-    let config = "[model]\nwidth = 32\nlayers = 1\nheads = 2\nblock_size = 512\ngru_layers = 1\n\
-                  trajectory_heads = [0]\ngate = \"flamingo\"\npairs_share = true\n\
-                  smooth_bins = true\ndropout = 0.0\nreconstruction = false\n\
-                  [model.visual]\nencoder = \"compact\"\nside_px = 64\nmetres_per_px = 2.0\n\
-                  layers = [\"road_lines\", \"road_edge\"]\n\
-                  [train]\nsteps = 6\nbatch = 2\n";
+    let mut model = very_small();
+    model.visual.side_px = 64;
+    model.visual.metres_per_px = 2.0;
+    let config = RunConfig {
+        model: ModelChoice::Config(Box::new(model)),
+        train: TrainConfig {
+            steps: 6,
+            batch: 2,
+            ..TrainConfig::default()
+        },
+    };
+    let config = toml::to_string(&config).unwrap();
     fs::write(place.path("c.toml"), config).unwrap();
     let train = |rest: &str| {
         let words = format!("train --data {scene} --validation {scene} --config c.toml{rest}");
