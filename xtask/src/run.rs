@@ -18,7 +18,7 @@ use crate::report::Report;
 /// Flags that every verb has.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Common {
-    /// Folder for the results [default: out/<verb>]
+    /// Folder for the results [default: out/VERB]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Where all randomness comes from [default: 0]
