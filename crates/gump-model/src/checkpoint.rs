@@ -167,9 +167,9 @@ pub(crate) fn read(path: &Path) -> Result<Archive, ModelError> {
         what,
         path: path.to_owned(),
     };
-    let io = |source| ModelError::Io {
+    let io = |cause| ModelError::Io {
         action: "reading weights",
-        source,
+        cause,
         path: path.to_owned(),
     };
     let bytes = fs::read(path).map_err(io)?;
@@ -235,12 +235,12 @@ fn write_beside(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
         file.sync_all()?;
         fs::rename(&beside, path)
     };
-    attempt().map_err(|source| {
+    attempt().map_err(|cause| {
         // Best effort: the error that matters is the first one.
         let _ = fs::remove_file(&beside);
         ModelError::Io {
             action: "writing weights",
-            source,
+            cause,
             path: path.to_owned(),
         }
     })

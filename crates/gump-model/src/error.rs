@@ -36,12 +36,12 @@ pub enum ModelError {
         path: PathBuf,
     },
     /// A file could not be read or written.
-    #[error("{action}: {source}: {path}")]
+    #[error("{action}: {cause}: {path}")]
     Io {
         /// What was being done.
         action: &'static str,
         /// The system's word.
-        source: std::io::Error,
+        cause: std::io::Error,
         /// The file.
         path: PathBuf,
     },
