@@ -113,7 +113,7 @@ impl ModelConfig {
         }
     }
 
-    /// The size that trains on two CPU cores: 2.8 million parameters.
+    /// The size that trains on two CPU cores: 3.0 million parameters.
     pub fn tiny() -> Self {
         Self {
             width: 128,
