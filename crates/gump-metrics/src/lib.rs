@@ -26,6 +26,8 @@ mod comfort;
 mod displacement;
 pub mod kinematics;
 mod metric;
+pub mod mmd;
+pub mod motion;
 mod offroad;
 mod progress;
 mod red_light;

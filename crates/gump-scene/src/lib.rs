@@ -7,7 +7,8 @@
 //! * **track**: one agent over time. **Frame**: all agents and lights at one instant.
 //! * **scenario**: recorded traffic, its future included. **Rollout**: imagined traffic.
 //! * **scene state**: what an actor may see, the past and the present, never the future.
-//! * **future**: one of several rollouts of the same scene.
+//! * **future**: one of several rollouts of the same scene. **Prediction**: a few paths of one
+//!   agent, or of some together, each with a confidence.
 //! * **lane**, **route**: the road as a directed graph, and the ego's way through it.
 //!
 //! Conventions: SI units, radians counter-clockwise from +x, world frame in f64, an agent's pose
@@ -29,6 +30,7 @@ pub mod fixture;
 mod frame;
 mod light_index;
 mod map;
+mod prediction;
 mod rollout;
 mod route;
 mod scenario;
@@ -43,6 +45,7 @@ pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind,
     RoadLine, RoadLineKind, StopSign,
 };
+pub use prediction::{PredictedMode, Prediction};
 pub use rollout::Rollout;
 pub use route::Route;
 pub use scenario::{Scenario, ScenarioError};
