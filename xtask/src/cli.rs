@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ablate, ci, data, demo, simulate, tidy, train};
+use crate::verbs::{ablate, ci, data, demo, evaluate, simulate, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -34,6 +34,9 @@ enum Verb {
     Train(train::Args),
     /// Imagine how a recorded scene goes on, many times over.
     Simulate(simulate::Args),
+    /// Measure on the benchmarks of the field.
+    #[command(subcommand)]
+    Evaluate(evaluate::Verb),
     /// Leave a part out or swap it, and measure what it did.
     #[command(subcommand)]
     Ablate(ablate::Verb),
@@ -77,6 +80,9 @@ impl Cli {
             }
             Verb::Simulate(args) => {
                 Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Evaluate(evaluate::Verb::Merge(args)) => {
+                Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ablate(ablate::Verb::Nar(args)) => {
                 Run::of("ablate nar", &args.common, &args)?.execute(|run| args.execute(run))

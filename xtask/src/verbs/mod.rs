@@ -4,6 +4,7 @@ pub(crate) mod ablate;
 pub(crate) mod ci;
 pub(crate) mod data;
 pub(crate) mod demo;
+pub(crate) mod evaluate;
 pub(crate) mod simulate;
 pub(crate) mod tidy;
 pub(crate) mod train;

@@ -1,0 +1,40 @@
+//! `evaluate merge`: the shards of one evaluation as one.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::ledger;
+use crate::run::{Common, Run};
+
+/// How the report of a benchmark is made from the folders of its shards.
+type Tell = fn(&mut Run, &[PathBuf]) -> anyhow::Result<()>;
+
+/// Benchmarks that can be sharded, by the name in their ledgers.
+const BENCHMARKS: &[(&str, Tell)] = &[];
+
+/// Arguments of `evaluate merge`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// Output folders of all shards, in any order
+    #[arg(value_name = "DIR", required = true)]
+    folders: Vec<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let benchmark = ledger::header(&self.folders[0])?.benchmark;
+        let Some((_, tell)) = BENCHMARKS.iter().find(|(name, _)| *name == benchmark) else {
+            let known: Vec<_> = BENCHMARKS.iter().map(|(name, _)| *name).collect();
+            anyhow::bail!(
+                "expected shards of {}, found {benchmark}: {}",
+                known.join(", "),
+                self.folders[0].display()
+            );
+        };
+        tell(run, &self.folders)
+    }
+}
