@@ -30,6 +30,13 @@ pub enum Precision {
     Full,
 }
 
+/// Before the names of the optimiser's moments.
+pub(crate) const OPTIMIZER: &str = "optimizer.";
+/// Before the names of the weights that drove the scenes of closed-loop training.
+pub(crate) const DRIVER: &str = "driver.";
+/// What a run's checkpoint holds beside the weights.
+const PREFIXES: [&str; 2] = [OPTIMIZER, DRIVER];
+
 /// Tensors and header entries of a file.
 #[derive(Debug)]
 pub(crate) struct Archive {
@@ -66,7 +73,7 @@ pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
     let tensors = archive
         .tensors
         .into_iter()
-        .filter(|(name, _)| !name.starts_with("optimizer."))
+        .filter(|(name, _)| !PREFIXES.iter().any(|prefix| name.starts_with(prefix)))
         .collect();
     Network::build(config, Parameters::loaded(tensors, device)).map_err(|error| match error {
         ModelError::Io { .. } | ModelError::Checkpoint { .. } => error,
@@ -78,6 +85,18 @@ pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
 }
 
 impl Archive {
+    /// Takes out the tensors whose names start with `prefix`, without it.
+    pub(crate) fn take(&mut self, prefix: &str) -> BTreeMap<String, Tensor> {
+        let all = std::mem::take(&mut self.tensors);
+        let (taken, rest) = all
+            .into_iter()
+            .partition(|(name, _)| name.starts_with(prefix));
+        self.tensors = rest;
+        let taken: BTreeMap<String, Tensor> = taken;
+        let bare = |(name, tensor): (String, Tensor)| (name[prefix.len()..].to_owned(), tensor);
+        taken.into_iter().map(bare).collect()
+    }
+
     /// The configuration in the header.
     pub(crate) fn config(&self) -> Result<ModelConfig, ModelError> {
         let text = self.entry("config")?;

@@ -16,6 +16,7 @@
 mod aggregation;
 mod batch;
 pub mod checkpoint;
+mod closed_loop;
 pub mod config;
 mod decode;
 mod decoder;
@@ -40,6 +41,7 @@ pub mod world;
 
 /// Where tensors live, so that users need not name the tensor library.
 pub use candle_core::Device;
+pub use closed_loop::ClosedLoopConfig;
 pub use config::ModelConfig;
 pub use error::ModelError;
 pub use loss::{LossConfig, LossParts};

@@ -91,7 +91,7 @@ impl AdamW {
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.trainable() {
             let mut moment = |kind: &str| {
-                let name = format!("optimizer.{kind}.{name}");
+                let name = format!("{kind}.{name}");
                 let tensor = take(&name)?;
                 if tensor.shape() != var.shape() {
                     let (expected, found) = (var.dims().to_vec(), tensor.dims().to_vec());

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::Pose;
+use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_raster::{Raster, RasterSpec, rasterize};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario, SceneState, Seed};
 use gump_tokenizer::{
@@ -15,15 +15,16 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
 use crate::batch::{PlacedSlot, place};
+use crate::closed_loop::Drive;
 use crate::decoder::{CHUNK, CONTROL_KEYS, STEPS};
 use crate::trajectory::{FUTURE, PAST, POSE};
 
 /// Seconds between token frames.
 pub(crate) const TOKEN_DT: f64 = 0.5;
 /// Frames of history a rollout starts from (paper: 3).
-const HISTORY: usize = 3;
+pub(crate) const HISTORY: usize = 3;
 /// Frames a rollout may be away from its frame of reference: 8 s.
-const LONGEST_ROLLOUT: usize = 16;
+pub(crate) const LONGEST_ROLLOUT: usize = 16;
 /// How far the centre may be from its own reference pose, metres; a rollout re-centres before.
 const CENTRE_REACH_M: f64 = 85.0;
 
@@ -144,9 +145,19 @@ const CONTROL_BEGIN: u32 = CONTROL_KEYS as u32;
 const CONTROL_NEWBORN: u32 = CONTROL_BEGIN + 1;
 const CONTROL_LIGHTS_END: u32 = CONTROL_BEGIN + 2;
 
-/// The log frames a sample is drawn from.
+/// A drive to present in place of the log, and how fast it is to come back to it.
+#[derive(Clone, Copy)]
+pub(crate) struct Driven<'a> {
+    pub(crate) drive: &'a Drive,
+    /// Share of the distance from the log that may be left after a frame.
+    pub(crate) slack: f64,
+}
+
+/// The frames a sample is drawn from.
 struct Window<'a> {
     scenario: &'a Scenario,
+    /// What is presented in place of the log.
+    driven: Option<Driven<'a>>,
     centre: AgentId,
     /// Log index of the frame of reference, which the raster shows.
     reference: usize,
@@ -158,10 +169,51 @@ struct Window<'a> {
 }
 
 impl Window<'_> {
-    /// The log `offset` token frames after presented frame `frame`.
-    fn frame(&self, frame: usize, offset: isize) -> Option<&Frame> {
+    /// Log index `offset` token frames after presented frame `frame`.
+    fn index(&self, frame: usize, offset: isize) -> Option<usize> {
         let index = self.start as isize + (frame as isize + offset) * self.stride as isize;
-        self.scenario.log.get(usize::try_from(index).ok()?)
+        usize::try_from(index).ok()
+    }
+
+    /// What is presented `offset` token frames after presented frame `frame`.
+    fn seen(&self, frame: usize, offset: isize) -> Option<&Frame> {
+        let index = self.index(frame, offset)?;
+        let driven = self.driven.and_then(|driven| driven.drive.frame(index));
+        driven.or_else(|| self.scenario.log.get(index))
+    }
+
+    /// Where `id` should be `ahead` frames after presented frame `frame` plus `offset`, in scene
+    /// coordinates: the log, plus what is left by then of the agent's distance from it.
+    fn expected(
+        &self,
+        frame: usize,
+        offset: isize,
+        ahead: usize,
+        id: AgentId,
+    ) -> Option<AgentState> {
+        let log = |ahead: usize| {
+            let index = self.index(frame, offset + ahead as isize)?;
+            self.scenario.log.get(index)?.agent(id)
+        };
+        let mut agent = *log(ahead)?;
+        let seen = self.seen(frame, offset).and_then(|frame| frame.agent(id));
+        if let (Some(driven), Some(seen), Some(logged)) = (self.driven, seen, log(0)) {
+            let left = driven.slack.powi(ahead as i32);
+            let (pose, logged) = (seen.state.pose, logged.state.pose);
+            agent.state.pose.position += (pose.position - logged.position) * left;
+            agent.state.pose.heading = wrap_angle(
+                agent.state.pose.heading + angle_difference(pose.heading, logged.heading) * left,
+            );
+        }
+        Some(self.state(&agent))
+    }
+
+    /// The value that should stand where `seen` stands: itself, unless the agent was driven.
+    fn truth(&self, seen: QuantizedState, frame: usize, id: AgentId) -> QuantizedState {
+        match self.driven.and(self.expected(frame, -1, 1, id)) {
+            Some(state) => seen.with_motion(&state),
+            None => seen,
+        }
     }
 
     /// An agent in scene coordinates.
@@ -174,18 +226,25 @@ impl Window<'_> {
     }
 }
 
-/// Draws a sample; `None` if the scenario is too short for one.
+/// Log frames per token frame.
+pub(crate) fn stride_of(dt: f64) -> usize {
+    (TOKEN_DT / dt).round().max(1.0) as usize
+}
+
+/// Draws a sample, from a drive of the scenario if there is one; `None` if the scenario is too
+/// short for one.
 pub(crate) fn draw(
     scenario: &Scenario,
+    driven: Option<Driven<'_>>,
     spec: &RasterSpec,
     tokenizer: &Tokenizer,
     config: &SampleConfig,
     seed: Seed,
 ) -> Option<Sample> {
     let mut rng = seed.rng();
-    let window = choose_window(scenario, config, &mut rng)?;
+    let window = choose_window(scenario, driven, config, &mut rng)?;
     let frames: Vec<Frame> = (0..config.frames)
-        .filter_map(|i| Some(thin(window.frame(i, 0)?, &window, config)))
+        .filter_map(|i| Some(thin(window.seen(i, 0)?, &window, config)))
         .collect();
     let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
@@ -228,14 +287,20 @@ pub(crate) fn draw(
 /// frame of reference (and the raster) of its start while its window slides on.
 fn choose_window<'a>(
     scenario: &'a Scenario,
+    driven: Option<Driven<'a>>,
     config: &SampleConfig,
     rng: &mut Rng,
 ) -> Option<Window<'a>> {
-    let stride = (TOKEN_DT / scenario.dt).round().max(1.0) as usize;
+    let stride = stride_of(scenario.dt);
     let span = (config.frames - 1) * stride;
     let lead = (config.frames.min(HISTORY) - 1) * stride;
-    let last_start = scenario.log.len().checked_sub(span + 1)?;
-    let reference = if config.any_present {
+    let end = driven.map_or(scenario.log.len(), |Driven { drive, .. }| {
+        drive.present + drive.frames.len() * stride + 1
+    });
+    let last_start = end.checked_sub(span + 1)?;
+    let reference = if let Some(driven) = driven {
+        driven.drive.present
+    } else if config.any_present {
         rng.random_range(lead.min(scenario.log.len() - 1)..=last_start + lead)
     } else {
         scenario.now
@@ -243,7 +308,11 @@ fn choose_window<'a>(
     let first_start = reference.checked_sub(lead)?;
     let latest = last_start.checked_sub(first_start)? / stride;
     let start = first_start + stride * rng.random_range(0..=latest.min(LONGEST_ROLLOUT));
-    let at = |index: usize, id: AgentId| Some(scenario.log[index].agent(id)?.state.pose);
+    let seen = |index: usize| {
+        let drive = driven.and_then(|driven| driven.drive.frame(index));
+        drive.unwrap_or(&scenario.log[index])
+    };
+    let at = |index: usize, id: AgentId| Some(seen(index).agent(id)?.state.pose);
     // The centre is there all the time and never leaves the window of tokens.
     let stays = |id: AgentId| {
         at(reference, id).is_some_and(|origin| {
@@ -256,7 +325,7 @@ fn choose_window<'a>(
     let mut centre = scenario.ego;
     if rng.random_bool(config.other_centre) || !stays(centre) {
         let moves = |agent: &&Agent| agent.kind == AgentKind::Vehicle && stays(agent.id);
-        let others: Vec<_> = scenario.log[start].agents().iter().filter(moves).collect();
+        let others: Vec<_> = seen(start).agents().iter().filter(moves).collect();
         if !others.is_empty() {
             centre = others[rng.random_range(0..others.len())].id;
         }
@@ -279,6 +348,7 @@ fn choose_window<'a>(
     );
     Some(Window {
         scenario,
+        driven,
         centre,
         reference,
         start,
@@ -390,15 +460,18 @@ fn targets(
         let Some(id) = identities.agent(key.id) else {
             continue;
         };
-        let look = |offset: isize| {
-            let agent = window.frame(placed.frame, offset)?.agent(id)?;
-            Some(window.state(agent))
-        };
+        let frame = placed.frame;
         states.push(StateTarget {
             key: i,
-            bins: state_bins(value, look),
+            bins: state_bins(window.truth(value, frame, id), |pose| {
+                window.expected(frame, -1, pose + 1, id)
+            }),
         });
-        if let Some(present) = look(0) {
+        let seen = |offset: isize| {
+            let agent = window.seen(frame, offset)?.agent(id)?;
+            Some(window.state(agent))
+        };
+        if let Some(present) = seen(0) {
             let relative = |state: AgentState| {
                 let moved = state.pose.position - present.pose.position;
                 let (sin, cos) = state.pose.heading.sin_cos();
@@ -406,8 +479,8 @@ fn targets(
             };
             trajectories.push(TrajectoryTarget {
                 key: i,
-                past: std::array::from_fn(|m| look(-(m as isize) - 1).map(relative)),
-                future: std::array::from_fn(|m| look(m as isize + 1).map(relative)),
+                past: std::array::from_fn(|m| seen(-(m as isize) - 1).map(relative)),
+                future: std::array::from_fn(|m| window.expected(frame, 0, m + 1, id).map(relative)),
             });
         }
     }
@@ -417,14 +490,14 @@ fn targets(
 /// The bins of a chunk: size, velocity and pose of the value itself, then three poses of the log.
 fn state_bins(
     value: QuantizedState,
-    look: impl Fn(isize) -> Option<AgentState>,
+    look: impl Fn(usize) -> Option<AgentState>,
 ) -> [Option<u16>; STEPS.len()] {
     let mut bins = [None; STEPS.len()];
     for (step, field) in STEPS.iter().enumerate().take(7) {
         bins[step] = Some(value.get(*field));
     }
     for pose in 1..CHUNK {
-        let Some(state) = look(pose as isize) else {
+        let Some(state) = look(pose) else {
             continue;
         };
         let (x, y) = (state.pose.position.x, state.pose.position.y);
@@ -521,7 +594,16 @@ mod tests {
         let spec = RasterSpec::full(16, 12.0);
         let tokenizer = Tokenizer::new(TokenizerConfig::default());
         (0..64)
-            .find_map(|i| draw(&scenario(), &spec, &tokenizer, config, Seed(seed).fork(i)))
+            .find_map(|i| {
+                draw(
+                    &scenario(),
+                    None,
+                    &spec,
+                    &tokenizer,
+                    config,
+                    Seed(seed).fork(i),
+                )
+            })
             .expect("a sample can be drawn")
     }
 
@@ -597,6 +679,62 @@ mod tests {
                 })
         };
         assert!((0..8).any(differs));
+    }
+
+    #[test]
+    fn a_drive_is_shown_and_the_way_back_is_asked_for() {
+        let scenario = scenario();
+        let stride = stride_of(scenario.dt);
+        let present = (HISTORY - 1) * stride;
+        let off = gump_geometry::dvec2(0.0, 2.0);
+        let driven = |index: usize| {
+            let agents = scenario.log[index].agents().iter().map(|agent| {
+                let mut state = agent.state;
+                state.pose.position += off;
+                agent.with_state(state)
+            });
+            Frame::new(agents.collect(), Vec::new())
+        };
+        let drive = Drive {
+            scenario: 0,
+            present,
+            stride,
+            frames: (1..=4).map(|i| driven(present + i * stride)).collect(),
+        };
+        let spec = RasterSpec::full(16, 12.0);
+        let tokenizer = Tokenizer::new(TokenizerConfig::default());
+        let way = Driven {
+            drive: &drive,
+            slack: 0.5,
+        };
+        let config = SampleConfig::plain(4);
+        let sample = (0..64).find_map(|i| {
+            let seed = Seed(i);
+            draw(&scenario, Some(way), &spec, &tokenizer, &config, seed)
+                // The last two of four frames are driven ones.
+                .filter(|sample| sample.states.len() == 12)
+        });
+        let sample = sample.expect("a sample can be drawn");
+        let of_last_agent = |frame: usize| {
+            let states = sample.states.iter();
+            states
+                .filter(|target| sample.slots[target.key].frame == frame)
+                .map(|target| (target, sample.slots[target.key + 1].slot))
+                .next_back()
+                .expect("every frame has agents")
+        };
+        let lateral = |bin: Option<u16>| Field::Y.dequantize(bin.expect("a bin is asked for"));
+        let frames = sample.slots.last().expect("slots").frame;
+        let (target, Slot::Value(seen)) = of_last_agent(frames) else {
+            panic!("a target stands at a key");
+        };
+        // Half of the two metres are left after one frame, a quarter after two.
+        let asked = [target.bins[5], target.bins[8]].map(lateral);
+        let back = seen.pose().position.y - asked[0];
+        assert!((back - 1.0).abs() < 0.25, "{back}");
+        // The pedestrian itself walks half a metre to the right in a frame.
+        let then = asked[0] - asked[1];
+        assert!((then - 1.0).abs() < 0.25, "{then}");
     }
 
     #[test]

@@ -12,18 +12,20 @@ use candle_core::{Device, Tensor};
 use gump_raster::RasterSpec;
 use gump_scene::{Scenario, Seed};
 use gump_tokenizer::{Tokenizer, TokenizerConfig};
+use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
 use crate::checkpoint::{self, Precision};
+use crate::closed_loop::{self, ClosedLoopConfig, Drive};
 use crate::config::ModelConfig;
 use crate::loss::{LossConfig, LossParts, loss};
 use crate::mct::Dropout;
 use crate::network::Network;
 use crate::optimizer::{AdamW, OptimizerConfig};
 use crate::parameters::Parameters;
-use crate::sample::{Sample, SampleConfig, draw};
+use crate::sample::{Driven, Sample, SampleConfig, draw};
 
 /// How to train.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,6 +43,10 @@ pub struct TrainConfig {
     pub loss: LossConfig,
     /// How.
     pub optimizer: OptimizerConfig,
+    /// Learning from scenes the network drove itself before the first step; for a run that
+    /// continues a network, because one that knows nothing drives nowhere.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub closed_loop: Option<ClosedLoopConfig>,
 }
 
 impl Default for TrainConfig {
@@ -52,6 +58,7 @@ impl Default for TrainConfig {
             sample: SampleConfig::default(),
             loss: LossConfig::default(),
             optimizer: OptimizerConfig::default(),
+            closed_loop: None,
         }
     }
 }
@@ -122,6 +129,8 @@ pub struct Trainer {
     optimizer: AdamW,
     config: TrainConfig,
     step: usize,
+    /// The weights that drove, for a resumed run to drive the same; empty without closed loop.
+    drivers: BTreeMap<String, Tensor>,
     source: Arc<Source>,
     /// Samples of the next step, being drawn while the present one is computed.
     next: Receiver<Vec<Sample>>,
@@ -130,6 +139,9 @@ pub struct Trainer {
 /// Where samples come from; shared with the threads that draw them.
 struct Source {
     scenarios: Vec<Scenario>,
+    /// Scenes as the network drove them.
+    drives: Vec<Drive>,
+    closed_loop: ClosedLoopConfig,
     spec: RasterSpec,
     tokenizer: Tokenizer,
     config: SampleConfig,
@@ -146,10 +158,18 @@ impl Source {
                 let seed = seed.fork(i as u64);
                 (0..64).find_map(|attempt| {
                     let seed = seed.fork(attempt);
+                    let pick = |n: usize| (seed.fork(0).0 % n as u64) as usize;
+                    let is_driven = !self.drives.is_empty()
+                        && seed.fork(2).rng().random_bool(self.closed_loop.share);
+                    let driven = is_driven.then(|| Driven {
+                        drive: &self.drives[pick(self.drives.len())],
+                        slack: self.closed_loop.slack,
+                    });
                     let scenario =
-                        &self.scenarios[(seed.fork(0).0 % self.scenarios.len() as u64) as usize];
+                        driven.map_or_else(|| pick(self.scenarios.len()), |d| d.drive.scenario);
                     draw(
-                        scenario,
+                        &self.scenarios[scenario],
+                        driven,
                         &self.spec,
                         &self.tokenizer,
                         &self.config,
@@ -186,7 +206,11 @@ impl Trainer {
         scenarios: Vec<Scenario>,
     ) -> Result<Self, ModelError> {
         let optimizer = AdamW::new(network.parameters())?;
-        Self::assemble(network, optimizer, config, 0, scenarios)
+        let drivers = match config.closed_loop {
+            Some(_) => copies(&network)?,
+            None => BTreeMap::new(),
+        };
+        Self::assemble(network, optimizer, config, 0, drivers, scenarios)
     }
 
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
@@ -210,24 +234,17 @@ impl Trainer {
             serde_json::from_str(archive.entry("train")?).map_err(|error| {
                 archive.error(format!("its training configuration is not valid ({error})"))
             })?;
-        let names: Vec<String> = archive
-            .tensors
-            .keys()
-            .filter(|name| !name.starts_with("optimizer."))
-            .cloned()
-            .collect();
-        let weights = names
-            .into_iter()
-            .filter_map(|name| archive.tensors.remove(&name).map(|tensor| (name, tensor)))
-            .collect();
+        let drivers = archive.take(checkpoint::DRIVER);
+        let mut moments = archive.take(checkpoint::OPTIMIZER);
+        let weights = archive.tensors;
         let network = Network::build(model, Parameters::loaded(weights, device))?;
         let optimizer = AdamW::restore(network.parameters(), step, |name| {
-            let tensor = archive.tensors.remove(name);
+            let tensor = moments.remove(name);
             tensor.ok_or_else(|| ModelError::MissingTensor {
                 name: name.to_owned(),
             })
         })?;
-        Self::assemble(network, optimizer, config, step, scenarios)
+        Self::assemble(network, optimizer, config, step, drivers, scenarios)
     }
 
     fn assemble(
@@ -235,6 +252,7 @@ impl Trainer {
         optimizer: AdamW,
         config: TrainConfig,
         step: usize,
+        drivers: BTreeMap<String, Tensor>,
         scenarios: Vec<Scenario>,
     ) -> Result<Self, ModelError> {
         if scenarios.is_empty() || config.batch == 0 {
@@ -242,7 +260,18 @@ impl Trainer {
                 frames: config.sample.frames,
             });
         }
+        let drives = match &config.closed_loop {
+            Some(closed_loop) => {
+                let weights = Parameters::loaded(drivers.clone(), network.device());
+                let driver = Network::build(network.config().clone(), weights)?;
+                let seed = Seed(config.seed).fork(3);
+                closed_loop::drive(driver, &scenarios, closed_loop, seed)?
+            }
+            None => Vec::new(),
+        };
         let source = Arc::new(Source {
+            drives,
+            closed_loop: config.closed_loop.clone().unwrap_or_default(),
             scenarios,
             spec: network.raster_spec().clone(),
             tokenizer: Tokenizer::new(TokenizerConfig::default()),
@@ -256,6 +285,7 @@ impl Trainer {
             optimizer,
             config,
             step,
+            drivers,
             source,
             next,
         })
@@ -326,6 +356,7 @@ impl Trainer {
             .filter_map(|(i, scenario)| {
                 draw(
                     scenario,
+                    None,
                     &source.spec,
                     &source.tokenizer,
                     &config,
@@ -376,6 +407,10 @@ impl Trainer {
                 .state()
                 .map(|(name, tensor)| (name, tensor.clone())),
         );
+        let drivers = self.drivers.iter();
+        tensors.extend(
+            drivers.map(|(name, tensor)| (format!("{}{name}", checkpoint::DRIVER), tensor.clone())),
+        );
         let mut header = checkpoint::header(self.network.config())?;
         let config =
             serde_json::to_string(&self.config).map_err(|e| ModelError::Config(e.to_string()))?;
@@ -403,6 +438,13 @@ impl Trainer {
     pub fn into_network(self) -> Network {
         self.network
     }
+}
+
+/// The weights as they are now, whatever becomes of them.
+fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, ModelError> {
+    let all = network.parameters().all();
+    all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
+        .collect()
 }
 
 /// Draws the samples of a step while the present one is computed.

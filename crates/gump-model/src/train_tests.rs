@@ -4,6 +4,7 @@ use candle_core::Device;
 use gump_rollout::{Start, WorldModel};
 use gump_scene::{Scenario, Seed, fixture};
 
+use crate::closed_loop::ClosedLoopConfig;
 use crate::config::{ModelConfig, VisualConfig};
 use crate::sample::SampleConfig;
 use crate::sampling::{Mode, SamplingConfig};
@@ -92,6 +93,31 @@ fn a_resumed_run_is_the_unbroken_run() {
         assert!(bits(a) == bits(b), "{name}");
     }
     // The same file serves as weights.
+    checkpoint::load(&path, &Device::Cpu).unwrap();
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn a_resumed_run_drives_the_same_scenes() {
+    let path = std::env::temp_dir().join(format!("gump-driven-{}.safetensors", std::process::id()));
+    let network = trainer(1, 2.0).into_network();
+    let mut config = config(4);
+    config.closed_loop = Some(ClosedLoopConfig {
+        drives: 2,
+        candidates: 2,
+        share: 0.9,
+        ..ClosedLoopConfig::default()
+    });
+    let mut run = Trainer::continuing(network, config, vec![scenario(4.0)]).unwrap();
+    run.step().unwrap();
+    run.save(&path).unwrap();
+    let mut resumed = Trainer::resume(&path, vec![scenario(4.0)], &Device::Cpu).unwrap();
+    for _ in 0..3 {
+        assert_eq!(
+            run.step().unwrap().loss.total,
+            resumed.step().unwrap().loss.total
+        );
+    }
     checkpoint::load(&path, &Device::Cpu).unwrap();
     std::fs::remove_file(path).unwrap();
 }

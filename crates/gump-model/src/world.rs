@@ -443,12 +443,7 @@ fn forced_fields(state: &QuantizedState, driven: bool) -> [Option<u16>; STEPS.le
 impl Scene {
     /// A world state in tokens, with the size of `like`.
     fn quantize(&self, state: AgentState, like: QuantizedState) -> QuantizedState {
-        let (quantized, _) = QuantizedState::new(&self.local(state), 1.0, 1.0);
-        QuantizedState {
-            width: like.width,
-            length: like.length,
-            ..quantized
-        }
+        like.with_motion(&self.local(state))
     }
 
     /// A world state in the scene frame.

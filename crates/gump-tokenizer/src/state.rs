@@ -53,6 +53,17 @@ impl QuantizedState {
         (quantized, clamped)
     }
 
+    /// The same box with the pose and velocity of `state`, scene frame; values beyond the range go
+    /// into the outermost bins.
+    pub fn with_motion(self, state: &AgentState) -> Self {
+        let (moved, _) = Self::new(state, 1.0, 1.0);
+        Self {
+            width: self.width,
+            length: self.length,
+            ..moved
+        }
+    }
+
     /// The bin of a field.
     pub fn get(&self, field: Field) -> u16 {
         match field {

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::train::StepReport;
-use gump_model::{Device, LossParts, ModelConfig, RunConfig, TrainConfig, Trainer};
+use gump_model::{
+    ClosedLoopConfig, Device, LossParts, ModelConfig, RunConfig, TrainConfig, Trainer,
+};
 use gump_scene::Scenario;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
@@ -36,6 +38,9 @@ pub(crate) struct Args {
     /// Scenarios to validate on [default: the manifest's]
     #[arg(long, value_name = "PATH")]
     validation: Option<PathBuf>,
+    /// Weights to go on from, with a fresh optimiser and schedule
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["resume", "model"])]
+    from: Option<PathBuf>,
     /// The size of the model: tiny, small, base or medium [default: tiny]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
@@ -67,6 +72,11 @@ impl Args {
             self.check_resumed(trainer.config())?;
             losses = Losses::read(&run.path("losses.csv"), trainer.steps_done())?;
             trainer
+        } else if let Some(weights) = &self.from {
+            let network = checkpoint::load(weights, &Device::Cpu)?;
+            run.phase("drive", |_| {
+                Trainer::continuing(network, config.train.clone(), training)
+            })?
         } else {
             Trainer::new(
                 config.model()?,
@@ -159,10 +169,11 @@ impl Args {
 fn known_keys() -> anyhow::Result<Table> {
     let mut known = Table::new();
     known.insert("model".into(), Table::try_from(ModelConfig::tiny())?.into());
-    known.insert(
-        "train".into(),
-        Table::try_from(TrainConfig::default())?.into(),
-    );
+    let train = TrainConfig {
+        closed_loop: Some(ClosedLoopConfig::default()),
+        ..TrainConfig::default()
+    };
+    known.insert("train".into(), Table::try_from(train)?.into());
     Ok(known)
 }
 
