@@ -75,7 +75,8 @@ impl Args {
         } else if let Some(weights) = &self.from {
             let network = checkpoint::load(weights, &Device::Cpu)?;
             run.phase("drive", |_| {
-                Trainer::continuing(network, config.train.clone(), training)
+                let trainer = Trainer::continuing(network, config.train.clone(), training);
+                trainer.map_err(anyhow::Error::from)
             })?
         } else {
             Trainer::new(
