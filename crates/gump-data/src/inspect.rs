@@ -115,6 +115,7 @@ impl Summary {
         for area in map.areas() {
             count(area_name(area.kind), 1);
         }
+        count("roadblock", map.roadblocks().len());
         count("road line", map.road_lines().len());
         count("road edge", map.road_edges().len());
         count("stop sign", map.stop_signs().len());
@@ -161,6 +162,9 @@ fn area_name(kind: AreaKind) -> &'static str {
         AreaKind::SpeedBump => "speed bump",
         AreaKind::Driveway => "driveway",
         AreaKind::StopLine => "stop line",
+        AreaKind::TurnStop => "turn stop",
         AreaKind::Intersection => "intersection area",
+        AreaKind::Walkway => "walkway",
+        AreaKind::Carpark => "car park",
     }
 }

@@ -165,7 +165,11 @@ fn overlapping_starts(scenario: &Scenario, suspect: &mut impl FnMut(&'static str
 /// fastest sprint ever run (12.4 m/s) for pedestrians, a fast descent for bicycles.
 fn top_speed(kind: AgentKind) -> f64 {
     match kind {
-        AgentKind::Vehicle | AgentKind::Other => 80.0,
+        AgentKind::Vehicle
+        | AgentKind::TrafficCone
+        | AgentKind::Barrier
+        | AgentKind::Sign
+        | AgentKind::Other => 80.0,
         AgentKind::Pedestrian => 12.5,
         AgentKind::Bicycle => 30.0,
     }

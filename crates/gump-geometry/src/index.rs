@@ -1,8 +1,8 @@
-//! Nearest-neighbour look-up over points and segments, by an R-tree.
+//! Look-up of points, segments and boxes by place, by an R-tree.
 
 use glam::DVec2;
-use rstar::primitives::{GeomWithData, Line};
-use rstar::{PointDistance, RTree};
+use rstar::primitives::{GeomWithData, Line, Rectangle};
+use rstar::{AABB, PointDistance, RTree};
 
 /// Points with an index each, for k-nearest queries.
 #[derive(Clone, Debug, Default)]
@@ -78,6 +78,49 @@ impl<T: Copy> SegmentIndex<T> {
     }
 }
 
+/// Axis-aligned boxes with a payload each, to find the few polygons worth an exact test.
+#[derive(Clone, Debug)]
+pub struct BoxIndex<T> {
+    tree: RTree<GeomWithData<Rectangle<[f64; 2]>, T>>,
+}
+
+impl<T: Copy> BoxIndex<T> {
+    /// Builds the index from (minimum corner, maximum corner, payload).
+    pub fn new(boxes: impl IntoIterator<Item = (DVec2, DVec2, T)>) -> Self {
+        let entries = boxes.into_iter().map(|(min, max, data)| {
+            let corners = Rectangle::from_corners(min.to_array(), max.to_array());
+            GeomWithData::new(corners, data)
+        });
+        Self {
+            tree: RTree::bulk_load(entries.collect()),
+        }
+    }
+
+    /// Payloads of the boxes that share a point with the box from `min` to `max`, in no promised
+    /// order; a query of one point is `intersecting(p, p)`.
+    pub fn intersecting(&self, min: DVec2, max: DVec2) -> impl Iterator<Item = T> + '_ {
+        let envelope = AABB::from_corners(min.to_array(), max.to_array());
+        self.tree
+            .locate_in_envelope_intersecting(envelope)
+            .map(|entry| entry.data)
+    }
+
+    /// All boxes as (payload, distance in metres, 0 inside), nearest first, lazily.
+    pub fn nearest(&self, point: DVec2) -> impl Iterator<Item = (T, f64)> + '_ {
+        self.tree
+            .nearest_neighbor_iter_with_distance_2(point.to_array())
+            .map(|(entry, d2)| (entry.data, d2.sqrt()))
+    }
+}
+
+impl<T> Default for BoxIndex<T> {
+    fn default() -> Self {
+        Self {
+            tree: RTree::new_with_params(),
+        }
+    }
+}
+
 impl<T> Default for SegmentIndex<T> {
     fn default() -> Self {
         Self {
@@ -96,6 +139,23 @@ mod tests {
         let index = PointIndex::new([dvec2(5.0, 0.0), dvec2(1.0, 0.0), dvec2(3.0, 0.0)]);
         let found: Vec<_> = index.nearest(DVec2::ZERO, 2).collect();
         assert_eq!(found, [(1, 1.0), (2, 3.0)]);
+    }
+
+    #[test]
+    fn boxes_are_found_by_touch_and_by_distance() {
+        let first = (dvec2(0.0, 0.0), dvec2(2.0, 2.0), 1);
+        let second = (dvec2(2.0, 0.0), dvec2(4.0, 2.0), 2);
+        let index = BoxIndex::new([first, second]);
+        let at = |p: DVec2| {
+            let mut found: Vec<_> = index.intersecting(p, p).collect();
+            found.sort_unstable();
+            found
+        };
+        assert_eq!(at(dvec2(1.0, 1.0)), [1]);
+        assert_eq!(at(dvec2(2.0, 1.0)), [1, 2]);
+        assert!(at(dvec2(5.0, 1.0)).is_empty());
+        let nearest: Vec<_> = index.nearest(dvec2(7.0, 6.0)).collect();
+        assert_eq!(nearest[0], (2, 5.0));
     }
 
     #[test]

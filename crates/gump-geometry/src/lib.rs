@@ -21,7 +21,7 @@ mod pose;
 
 pub use distance::{cross, distance_to_segment, project_on_segment, segments_intersect};
 pub use fill::{Canvas, fill_disc, fill_polygon, stroke_polyline};
-pub use index::{PointIndex, SegmentIndex};
+pub use index::{BoxIndex, PointIndex, SegmentIndex};
 pub use oriented_box::OrientedBox;
 pub use polygon::Polygon;
 pub use polyline::{Polyline, Projection};

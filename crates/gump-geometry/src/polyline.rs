@@ -2,7 +2,7 @@
 
 use glam::DVec2;
 
-use crate::{Pose, project_on_segment};
+use crate::{Polygon, Pose, project_on_segment};
 
 /// A directed line through at least one point, measured by arc length.
 ///
@@ -150,6 +150,17 @@ impl Polyline {
         Self::new(points).expect("as many points as before")
     }
 
+    /// The strip from `width / 2` metres left of the line to `width / 2` right of it, with flat
+    /// ends; `None` for a line without length.
+    pub fn ribbon(&self, width: f64) -> Option<Polygon> {
+        if self.length() == 0.0 {
+            return None;
+        }
+        let mut ring = self.offset(-width / 2.0).points;
+        ring.extend(self.offset(width / 2.0).points.into_iter().rev());
+        Polygon::new(ring)
+    }
+
     /// Index of a segment of non-zero length that contains arc length `s`, or the nearest such.
     fn segment_at(&self, s: f64) -> Option<usize> {
         let has_length = |i: &usize| self.arc_lengths[i + 1] > self.arc_lengths[*i];
@@ -219,5 +230,13 @@ mod tests {
         assert_eq!(samples.points().len(), 5);
         assert_eq!(*samples.points().last().unwrap(), dvec2(10.0, 5.0));
         assert_eq!(corner().offset(1.0).points()[0], dvec2(0.0, 1.0));
+    }
+
+    #[test]
+    fn a_ribbon_has_flat_ends() {
+        let line = Polyline::new(vec![dvec2(0.0, 0.0), dvec2(5.0, 0.0)]).unwrap();
+        let ribbon = line.ribbon(2.0).unwrap();
+        assert_eq!(ribbon.signed_area(), 10.0);
+        assert!(ribbon.contains(dvec2(4.9, 0.9)) && !ribbon.contains(dvec2(5.1, 0.0)));
     }
 }

@@ -110,7 +110,7 @@ impl Summary {
 
 /// Collisions, off-road driving and, given the log, displacements of all futures of one scenario.
 ///
-/// Agents that are present at the start count, except those of [`AgentKind::Other`], which are
+/// Agents that are present at the start count, except those of [`AgentKind::STATIC`], which are
 /// obstacles only. What was wrong at the start is not held against anyone: overlaps of pairs that
 /// overlapped then, vehicles that stood off the road then.
 ///
@@ -142,7 +142,7 @@ pub fn summarize(rollouts: &[Rollout], scenario: Option<&Scenario>) -> Summary {
 }
 
 fn evaluated(agents: &[Agent]) -> impl Iterator<Item = &Agent> {
-    agents.iter().filter(|agent| agent.kind != AgentKind::Other)
+    agents.iter().filter(|agent| agent.kind.is_moving())
 }
 
 fn one_future(rollout: &Rollout) -> Summary {

@@ -17,7 +17,7 @@ use candle_core::Tensor;
 use gump_geometry::Pose;
 use gump_raster::rasterize;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, MapGraph, Route, SceneState, Seed};
+use gump_scene::{Agent, AgentId, AgentState, Frame, MapGraph, Route, SceneState, Seed};
 use gump_tokenizer::{
     Identities, Key, QuantizedState, Slot, TokenAgent, TokenFrame, TokenSequence, Tokenizer,
     TokenizerConfig,
@@ -472,7 +472,7 @@ impl Scene {
         let mut arrivals: Vec<TokenAgent> = frame
             .agents()
             .iter()
-            .filter(|agent| agent.kind != AgentKind::Other)
+            .filter(|agent| agent.kind.is_moving())
             .filter_map(|agent| {
                 let id = self
                     .identities

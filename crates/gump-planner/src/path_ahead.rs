@@ -96,6 +96,7 @@ impl PathAhead {
     pub(crate) fn into_route(self) -> Route {
         Route {
             lanes: self.lanes,
+            roadblocks: Vec::new(),
             path: self.line,
         }
     }
@@ -276,7 +277,11 @@ mod tests {
         let mut scenario = fixture::scenario(text).unwrap();
         let path = Polyline::new(vec![dvec2(0.0, 0.0), dvec2(20.0, 0.0)]).unwrap();
         let lanes = vec![LaneId(1)];
-        scenario.route = Some(std::sync::Arc::new(Route { lanes, path }));
+        scenario.route = Some(std::sync::Arc::new(Route {
+            lanes,
+            roadblocks: Vec::new(),
+            path,
+        }));
         let found = PathAhead::find(scenario.present(), 100.0).unwrap();
         assert_eq!(found.lanes, [LaneId(1), LaneId(2)]);
         assert_abs_diff_eq!(found.pose_at(30.0).position.x, 30.0, epsilon = 1e-9);

@@ -5,8 +5,7 @@ use std::sync::Arc;
 
 use gump_geometry::{DVec2, DVec3, Polyline, Pose, dvec2};
 use gump_scene::{
-    AgentId, Area, AreaKind, LaneId, MapGraph, MapParts, Route, Scenario, StopSign, fixture,
-    light_indices,
+    AgentId, Area, AreaKind, LaneId, MapGraph, Route, Scenario, StopSign, fixture, light_indices,
 };
 use proptest::prelude::*;
 
@@ -73,18 +72,12 @@ fn town(world_from_town: Pose) -> Scenario {
 
 /// Adds what the text form of scenes has no words for: a speed bump, stop lines, an intersection.
 fn with_more(map: &MapGraph, world_from_town: Pose) -> Arc<MapGraph> {
-    let mut parts = parts(map);
+    let mut parts = map.parts().clone();
     let mut area = |kind, id, low: DVec2, high: DVec2| {
         let corners = [low, dvec2(high.x, low.y), high, dvec2(low.x, high.y)];
         let ring = corners.map(|corner| world_from_town * corner).to_vec();
         let polygon = gump_geometry::Polygon::new(ring).unwrap();
-        let elevation = vec![0.0; 4];
-        parts.areas.push(Area {
-            id,
-            kind,
-            polygon,
-            elevation,
-        });
+        parts.areas.push(Area::new(id, kind, polygon));
     };
     area(AreaKind::SpeedBump, 10, dvec2(-8.3, -4.2), dvec2(-7.4, 4.3));
     area(AreaKind::StopLine, 11, dvec2(5.1, 0.6), dvec2(5.9, 4.4));
@@ -103,17 +96,6 @@ fn with_more(map: &MapGraph, world_from_town: Pose) -> Arc<MapGraph> {
         lanes,
     });
     Arc::new(MapGraph::new(parts).unwrap())
-}
-
-fn parts(map: &MapGraph) -> MapParts {
-    MapParts {
-        lanes: map.lanes().to_vec(),
-        road_lines: map.road_lines().to_vec(),
-        road_edges: map.road_edges().to_vec(),
-        areas: map.areas().to_vec(),
-        stop_signs: map.stop_signs().to_vec(),
-        drivable: map.drivable().to_vec(),
-    }
 }
 
 /// One character per pixel: `.` for 0, `#` for 1, the first decimal otherwise; `a` to `j` are
@@ -190,7 +172,11 @@ fn a_route_off_the_map_is_drawn_as_its_path() {
     let mut scenario = town(Pose::IDENTITY);
     let path = Polyline::new(vec![dvec2(-9.0, 7.5), dvec2(9.0, 7.5)]).unwrap();
     let lanes = vec![LaneId(404)];
-    scenario.route = Some(Arc::new(Route { lanes, path }));
+    scenario.route = Some(Arc::new(Route {
+        lanes,
+        roadblocks: Vec::new(),
+        path,
+    }));
     let spec = RasterSpec::new(20, 1.0, vec![Layer::Route]);
     let raster = rasterize(&spec, &scenario.present(), Pose::IDENTITY);
     assert_eq!(raster.data.iter().sum::<f32>(), 19.0);

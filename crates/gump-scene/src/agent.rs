@@ -15,6 +15,9 @@ impl fmt::Display for AgentId {
 }
 
 /// What an agent is.
+///
+/// Only the kinds of [`AgentKind::MOVING`] are predicted; the others are drawn, never tokenized.
+/// Formats that do not tell cones, barriers and signs apart say [`AgentKind::Other`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum AgentKind {
     /// Cars, trucks, buses, motorcycles.
@@ -23,7 +26,13 @@ pub enum AgentKind {
     Pedestrian,
     /// Bicycles with their riders.
     Bicycle,
-    /// Anything else that occupies space: cones, barriers, unknown things. Drawn, never tokenized.
+    /// Traffic cones.
+    TrafficCone,
+    /// Barriers.
+    Barrier,
+    /// Signs of construction zones.
+    Sign,
+    /// Anything else that occupies space.
     Other,
 }
 
@@ -31,14 +40,25 @@ impl AgentKind {
     /// The kinds a model predicts, in class order.
     pub const MOVING: [Self; 3] = [Self::Vehicle, Self::Pedestrian, Self::Bicycle];
 
+    /// The kinds that only stand in the way.
+    pub const STATIC: [Self; 4] = [Self::TrafficCone, Self::Barrier, Self::Sign, Self::Other];
+
     /// The lower-case English name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Vehicle => "vehicle",
             Self::Pedestrian => "pedestrian",
             Self::Bicycle => "bicycle",
+            Self::TrafficCone => "traffic_cone",
+            Self::Barrier => "barrier",
+            Self::Sign => "sign",
             Self::Other => "other",
         }
+    }
+
+    /// True for the kinds that move by themselves, whether they stand still or not.
+    pub fn is_moving(self) -> bool {
+        Self::MOVING.contains(&self)
     }
 }
 

@@ -103,14 +103,9 @@ impl Draft {
             }
             ["crosswalk"] => {
                 let polygon = Polygon::new(points(body)?).ok_or("fewer than 3 points")?;
-                let elevation = vec![0.0; polygon.ring().len()];
                 let id = 2_000_000 + self.parts.areas.len() as i64;
-                self.parts.areas.push(Area {
-                    id,
-                    kind: AreaKind::Crosswalk,
-                    polygon,
-                    elevation,
-                });
+                let area = Area::new(id, AreaKind::Crosswalk, polygon);
+                self.parts.areas.push(area);
             }
             ["drivable"] => {
                 self.parts
@@ -147,17 +142,13 @@ impl Draft {
         let centerline = polyline(&points(body)?)?;
         let elevation = vec![0.0; centerline.points().len()];
         let mut lane = Lane {
-            id,
             kind: LaneKind::SurfaceStreet,
-            centerline,
-            elevation,
             width: option(body, "width")?.map_or(Ok(3.5), number)?,
             speed_limit: option(body, "speed")?.map(number).transpose()?,
-            in_intersection: false,
-            predecessors: Vec::new(),
             successors: option(body, "next")?.map_or(Ok(Vec::new()), ids)?,
             left_neighbors: option(body, "left")?.map_or(Ok(Vec::new()), ids)?,
             right_neighbors: option(body, "right")?.map_or(Ok(Vec::new()), ids)?,
+            ..Lane::new(id, centerline, elevation)
         };
         lane.successors.dedup();
         self.parts.lanes.push(lane);
@@ -169,6 +160,7 @@ impl Draft {
             "vehicle" => (AgentKind::Vehicle, dvec2(4.8, 2.0)),
             "pedestrian" => (AgentKind::Pedestrian, dvec2(0.8, 0.8)),
             "bicycle" => (AgentKind::Bicycle, dvec2(1.8, 0.7)),
+            "cone" => (AgentKind::TrafficCone, dvec2(0.4, 0.4)),
             "other" => (AgentKind::Other, dvec2(0.5, 0.5)),
             unknown => return Err(format!("unknown kind {unknown}")),
         };
@@ -230,6 +222,7 @@ impl Draft {
         let route = Polyline::new(path).map(|path| {
             Arc::new(Route {
                 lanes: self.route,
+                roadblocks: Vec::new(),
                 path,
             })
         });

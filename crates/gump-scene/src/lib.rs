@@ -10,9 +10,10 @@
 //! * **future**: one of several rollouts of the same scene. **Prediction**: a few paths of one
 //!   agent, or of some together, each with a confidence.
 //! * **lane**, **route**: the road as a directed graph, and the ego's way through it.
+//! * **roadblock**: lanes side by side in one direction, or their links through an intersection.
 //!
 //! Conventions: SI units, radians counter-clockwise from +x, world frame in f64, an agent's pose
-//! is its **box centre**. An absent agent is absent: there are no validity masks here.
+//! is its **box centre** ([`EgoState`] alone speaks of the rear axle). An absent agent is absent: there are no validity masks here.
 //!
 //! ```
 //! let scenario = gump_scene::fixture::scenario(
@@ -26,10 +27,12 @@
 //! ```
 
 mod agent;
+mod ego_state;
 pub mod fixture;
 mod frame;
 mod light_index;
 mod map;
+mod map_graph;
 mod prediction;
 mod rollout;
 mod route;
@@ -39,12 +42,14 @@ mod seed;
 mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
+pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
-    Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind,
-    RoadLine, RoadLineKind, StopSign,
+    Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
+    RoadLineKind, Roadblock, RoadblockId, StopSign,
 };
+pub use map_graph::MapGraph;
 pub use prediction::{PredictedMode, Prediction};
 pub use rollout::Rollout;
 pub use route::Route;

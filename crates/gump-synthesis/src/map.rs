@@ -91,10 +91,8 @@ pub(crate) fn build_map(network: &Network, placement: &Placement) -> Result<MapG
     for (kind, ring) in crosswalks.chain(areas) {
         let (polygon, elevation) = placement.polygon(ring);
         parts.areas.push(Area {
-            id: id(),
-            kind,
-            polygon,
             elevation,
+            ..Area::new(id(), kind, polygon)
         });
     }
     for (position, lanes) in &network.furniture.stop_signs {
@@ -119,10 +117,7 @@ fn map_lane(network: &Network, i: LaneIdx, lane: &NetworkLane, placement: &Place
         neighbors.map(lane_id).collect()
     };
     Lane {
-        id: lane_id(i),
         kind: lane.kind,
-        centerline,
-        elevation,
         width: lane.width,
         speed_limit: Some(lane.speed_limit),
         in_intersection: lane.connector.as_ref().is_some_and(|connector| {
@@ -132,5 +127,6 @@ fn map_lane(network: &Network, i: LaneIdx, lane: &NetworkLane, placement: &Place
         successors: ids(&lane.successors),
         left_neighbors: beside(|lane| lane.left),
         right_neighbors: beside(|lane| lane.right),
+        ..Lane::new(lane_id(i), centerline, elevation)
     }
 }

@@ -221,6 +221,7 @@ fn route(network: &Network, ego: &Track, traffic: &Traffic<'_>, placement: &Plac
         .collect();
     Route {
         lanes: runs.iter().map(|run| lane_id(run.0)).collect(),
+        roadblocks: Vec::new(),
         path: Polyline::new(placed).expect("the ego has been somewhere"),
     }
 }

@@ -13,7 +13,7 @@ use crate::{Field, QuantizedState};
 pub struct Key {
     /// 0 for the ego, 1..=320 for others; one agent's alone within a window.
     pub id: u16,
-    /// Vehicle, pedestrian or bicycle, never [`AgentKind::Other`].
+    /// Vehicle, pedestrian or bicycle: one of [`AgentKind::MOVING`].
     pub kind: AgentKind,
 }
 

@@ -237,7 +237,7 @@ impl Allowed<'_> {
             && in_order
             && !grammar.present.contains(&key.id)
             && (key.is_ego() || AGENT_KEYS.contains(&u32::from(key.id)))
-            && known.map_or(key.kind != AgentKind::Other, |kind| *kind == key.kind)
+            && known.map_or(key.kind.is_moving(), |kind| *kind == key.kind)
     }
 
     /// All keys that may come next, in canonical order.

@@ -122,7 +122,7 @@ impl Identities {
 fn rank(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Vec<AgentId> {
     let mut last_seen: BTreeMap<AgentId, (f64, AgentKind)> = BTreeMap::new();
     for agent in frames.iter().flat_map(|frame| frame.agents()) {
-        if agent.id != ego && agent.kind != AgentKind::Other {
+        if agent.id != ego && agent.kind.is_moving() {
             let distance = agent
                 .state
                 .pose

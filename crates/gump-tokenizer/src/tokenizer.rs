@@ -109,7 +109,7 @@ impl Tokenizer {
     /// The present frame numbers the lights, as the raster of that frame does; lights only other
     /// frames have come after. Of the frames, those from the last gap in the ego's track on are
     /// encoded; the ego itself is never left out, its values are clamped and counted instead.
-    /// Agents of [`AgentKind::Other`] are no tokens, an ego of that kind is a vehicle. An agent
+    /// Agents of kinds that do not move are no tokens, an ego of such a kind is a vehicle. An agent
     /// keeps the kind it first has.
     ///
     /// # Panics
@@ -217,9 +217,9 @@ impl Tokenizer {
         for agent in frame.agents() {
             let is_ego = agent.id == view.ego;
             let kind = match agent.kind {
-                AgentKind::Other if is_ego => AgentKind::Vehicle,
-                AgentKind::Other => continue,
-                moving => moving,
+                moving if moving.is_moving() => moving,
+                _ if is_ego => AgentKind::Vehicle,
+                _ => continue,
             };
             if !is_usable(agent) {
                 report.not_finite += 1;

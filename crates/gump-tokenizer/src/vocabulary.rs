@@ -37,7 +37,7 @@ pub const N_PROMPTS: usize = ScenarioTag::COUNT + 1;
 /// Row of a kind in the class table: vehicle 0, pedestrian 1, bicycle 2.
 ///
 /// # Panics
-/// For [`AgentKind::Other`], which is drawn but never tokenized.
+/// For the kinds of [`AgentKind::STATIC`], which are drawn but never tokenized.
 pub fn class_index(kind: AgentKind) -> usize {
     AgentKind::MOVING
         .iter()

@@ -9,8 +9,11 @@ use crate::pen::{Pen, Shape};
 use crate::theme::{Colours, Rgb};
 
 /// In this order, so that what is rare and small ends up on top.
-const KINDS: [AgentKind; 4] = [
+const KINDS: [AgentKind; 7] = [
     AgentKind::Other,
+    AgentKind::Barrier,
+    AgentKind::Sign,
+    AgentKind::TrafficCone,
     AgentKind::Vehicle,
     AgentKind::Bicycle,
     AgentKind::Pedestrian,
@@ -77,7 +80,7 @@ fn draw_boxes(pen: &mut Pen<'_>, agents: &[&Agent], colour: Rgb, colours: &Colou
             bodies.rounded(&corners, radius);
             borders.rounded(&corners, radius);
         }
-        if length > 12.0 && width > 6.0 && agent.kind != AgentKind::Other {
+        if length > 12.0 && width > 6.0 && agent.kind.is_moving() {
             wedges.ring(wedge(pose, agent.length, agent.width));
         }
     }

@@ -47,8 +47,10 @@ fn draw_surfaces(pen: &mut Pen<'_>, map: &MapGraph, colours: &Colours) {
         draw_ribbon(pen, lane, colours.road);
     }
     for area in map.areas() {
-        if matches!(area.kind, AreaKind::Intersection | AreaKind::Driveway)
-            && sees(&pen.camera, &area.polygon)
+        if matches!(
+            area.kind,
+            AreaKind::Intersection | AreaKind::Driveway | AreaKind::Carpark
+        ) && sees(&pen.camera, &area.polygon)
         {
             let mut shape = Shape::new(&pen.camera);
             shape.ring(area.polygon.ring().iter().copied());
@@ -90,8 +92,9 @@ fn draw_areas(pen: &mut Pen<'_>, map: &MapGraph, colours: &Colours) {
         match area.kind {
             AreaKind::Crosswalk => draw_zebra(pen, &area.polygon, shape, colours),
             AreaKind::SpeedBump => pen.fill(shape, colours.yellow_line, 0.5),
-            AreaKind::StopLine => pen.fill(shape, colours.white_line, 0.7),
-            AreaKind::Driveway | AreaKind::Intersection => {}
+            AreaKind::StopLine | AreaKind::TurnStop => pen.fill(shape, colours.white_line, 0.7),
+            AreaKind::Driveway | AreaKind::Intersection | AreaKind::Walkway | AreaKind::Carpark => {
+            }
         }
     }
 }

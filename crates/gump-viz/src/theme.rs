@@ -100,7 +100,9 @@ impl Colours {
             AgentKind::Vehicle => self.vehicle,
             AgentKind::Pedestrian => self.pedestrian,
             AgentKind::Bicycle => self.bicycle,
-            AgentKind::Other => self.other,
+            AgentKind::TrafficCone | AgentKind::Barrier | AgentKind::Sign | AgentKind::Other => {
+                self.other
+            }
         }
     }
 

@@ -36,7 +36,11 @@ pub(super) fn infer(scenario: &Scenario) -> Option<Route> {
     bridge(map, &mut legs);
     let path = path(map, &legs, &samples)?;
     let lanes = legs.iter().map(|leg| leg.lane).collect();
-    Some(Route { lanes, path })
+    Some(Route {
+        lanes,
+        roadblocks: Vec::new(),
+        path,
+    })
 }
 
 /// Poses every [`SPACING`] metres along the ego's log, and which of them is at the present.

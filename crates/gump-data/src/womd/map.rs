@@ -116,10 +116,7 @@ fn lane_from_proto(id: i64, lane: &proto::LaneCenter, report: &mut ReadReport) -
     let (centerline, elevation) = shape(&lane.polyline, "lane without points", report)?;
     let kind = lane_kind(lane.r#type());
     Some(Lane {
-        id: LaneId(id),
         kind,
-        centerline,
-        elevation,
         width: infer::default_width(kind),
         speed_limit: Some(lane.speed_limit_mph() * METERS_PER_SECOND_IN_MPH)
             .filter(|&limit| limit > 0.0 && limit.is_finite()),
@@ -128,6 +125,7 @@ fn lane_from_proto(id: i64, lane: &proto::LaneCenter, report: &mut ReadReport) -
         successors: ids(lane.exit_lanes.iter().copied()),
         left_neighbors: ids(lane.left_neighbors.iter().map(|n| n.feature_id())),
         right_neighbors: ids(lane.right_neighbors.iter().map(|n| n.feature_id())),
+        ..Lane::new(LaneId(id), centerline, elevation)
     })
 }
 
@@ -163,10 +161,8 @@ fn area(
     // The polygon may have dropped a closing point.
     let corners = &outline.polygon[..polygon.ring().len()];
     Some(Area {
-        id,
-        kind,
         elevation: corners.iter().map(|p| p.z()).collect(),
-        polygon,
+        ..Area::new(id, kind, polygon)
     })
 }
 

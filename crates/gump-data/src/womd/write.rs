@@ -162,7 +162,9 @@ fn object_type(kind: AgentKind) -> ObjectType {
         AgentKind::Vehicle => ObjectType::Vehicle,
         AgentKind::Pedestrian => ObjectType::Pedestrian,
         AgentKind::Bicycle => ObjectType::Cyclist,
-        AgentKind::Other => ObjectType::Other,
+        AgentKind::TrafficCone | AgentKind::Barrier | AgentKind::Sign | AgentKind::Other => {
+            ObjectType::Other
+        }
     }
 }
 

@@ -102,7 +102,11 @@ fn area_data(area: &Area) -> Option<FeatureData> {
         AreaKind::Crosswalk => Some(FeatureData::Crosswalk(outline)),
         AreaKind::SpeedBump => Some(FeatureData::SpeedBump(outline)),
         AreaKind::Driveway => Some(FeatureData::Driveway(outline)),
-        AreaKind::StopLine | AreaKind::Intersection => None,
+        AreaKind::StopLine
+        | AreaKind::TurnStop
+        | AreaKind::Intersection
+        | AreaKind::Walkway
+        | AreaKind::Carpark => None,
     }
 }
 

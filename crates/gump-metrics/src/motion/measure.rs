@@ -87,7 +87,7 @@ impl<'a> Measured<'a> {
     /// The kind of agent it counts for: the rarest among those predicted together.
     pub(crate) fn kind(&self) -> Option<AgentKind> {
         let rank = |kind: &AgentKind| match kind {
-            AgentKind::Other => 0,
+            AgentKind::TrafficCone | AgentKind::Barrier | AgentKind::Sign | AgentKind::Other => 0,
             AgentKind::Vehicle => 1,
             AgentKind::Pedestrian => 2,
             AgentKind::Bicycle => 3,

@@ -1,6 +1,6 @@
 //! Agents as boxes.
 
-use gump_scene::{AgentKind, SceneState};
+use gump_scene::SceneState;
 
 use super::Plane;
 
@@ -17,7 +17,7 @@ pub(crate) fn draw_agents(plane: &mut Plane<'_>, scene: &SceneState<'_>) {
 
 pub(crate) fn draw_static_agents(plane: &mut Plane<'_>, scene: &SceneState<'_>) {
     for agent in scene.now().agents() {
-        if agent.kind == AgentKind::Other && agent.id != scene.ego {
+        if !agent.kind.is_moving() && agent.id != scene.ego {
             plane.oriented_box(&agent.oriented_box(), 1.0);
         }
     }
@@ -36,7 +36,7 @@ pub(crate) fn draw_history(plane: &mut Plane<'_>, scene: &SceneState<'_>) {
 /// Paints the moving agents, `age` frames ago, without the ego.
 fn draw_frame(plane: &mut Plane<'_>, scene: &SceneState<'_>, age: usize, value: f32) {
     for agent in scene.history[scene.history.len() - 1 - age].agents() {
-        if agent.kind != AgentKind::Other && agent.id != scene.ego {
+        if agent.kind.is_moving() && agent.id != scene.ego {
             plane.oriented_box(&agent.oriented_box(), value);
         }
     }
