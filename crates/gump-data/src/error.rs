@@ -103,6 +103,22 @@ pub enum DataError {
         /// Where.
         place: Place,
     },
+    /// An XML file is not well formed, or does not say what it should.
+    #[error("{problem}: at byte {offset} of {}", path.display())]
+    Xml {
+        /// What is wrong.
+        problem: String,
+        /// Where, bytes from the start of the (uncompressed) content.
+        offset: u64,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A SUMO recording has no network beside it.
+    #[error("expected a network (net.xml) beside the recording, found none: {}", path.display())]
+    NoNetwork {
+        /// The recording.
+        path: PathBuf,
+    },
     /// A record is not the message it should be.
     #[error("expected a {message} message: {source}: {place}")]
     Proto {

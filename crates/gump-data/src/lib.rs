@@ -38,6 +38,7 @@ mod open;
 mod record;
 mod stream;
 pub mod submission;
+pub mod sumo;
 pub mod tfrecord;
 mod verify;
 pub mod womd;

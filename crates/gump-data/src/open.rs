@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use gump_scene::Scenario;
 
 use crate::stream::{self, io_error};
-use crate::{DataError, ReadOptions, ScenarioRecord, womd};
+use crate::{DataError, ReadOptions, ScenarioRecord, sumo, womd};
 
 /// A format that content can be recognised as. A new format is one line in [`FORMATS`].
 pub(crate) struct Format {
@@ -34,7 +34,7 @@ pub(crate) trait Source: Send {
     ) -> Option<Result<ScenarioRecord, DataError>>;
 }
 
-const FORMATS: [Format; 1] = [womd::FORMAT];
+const FORMATS: [Format; 2] = [womd::FORMAT, sumo::FORMAT];
 
 /// How much of the content a recogniser sees.
 const HEAD_BYTES: u64 = 4096;

@@ -140,7 +140,7 @@ const DEAD_LINKS: [&str; 2] = [
 ];
 
 /// Boxes may interpenetrate this much before it counts, metres: the precision of annotation.
-const OVERLAP_TOLERANCE: f64 = 0.1;
+pub(crate) const OVERLAP_TOLERANCE: f64 = 0.1;
 
 fn overlapping_starts(scenario: &Scenario, suspect: &mut impl FnMut(&'static str, String)) {
     let agents = scenario.present().now().agents();

@@ -58,7 +58,7 @@ pub(crate) fn route(scenario: &mut Scenario, options: ReadOptions, report: &mut 
 /// included, in order.
 ///
 /// Source: Douglas and Peucker 1973.
-fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
+pub(crate) fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
     let last = points.len().saturating_sub(1);
     let mut kept = vec![0];
     let mut spans = vec![(0, last)];
