@@ -11,8 +11,8 @@ use gump_scene::{
     RoadLineKind, StopSign,
 };
 
-use super::network::{Edge, EdgeFunction, Junction, Network, NetworkLane};
-use super::surfaces::{Beyond, Surfaces, strip};
+use super::network::{Connection, Edge, EdgeFunction, Junction, Network, NetworkLane};
+use super::surfaces::{Beyond, Surfaces};
 use crate::ReadReport;
 
 /// Metres between points of lines at most: what looks at points only must find some.
@@ -81,6 +81,7 @@ impl Roads {
         let near = Near::new(path, radius);
         let all = &self.parts;
         MapParts {
+            roadblocks: Vec::new(),
             lanes: pick(&all.lanes, |lane| near.touches(lane.centerline.points())),
             road_lines: all
                 .road_lines
@@ -199,8 +200,7 @@ impl<'a> Draft<'a> {
                 Vec::new()
             };
             match edge.function {
-                EdgeFunction::WalkingArea => report.drop("walking area", 1),
-                EdgeFunction::Crossing => {}
+                EdgeFunction::WalkingArea | EdgeFunction::Crossing => {}
                 _ => report.drop(
                     "lane for people or rails only",
                     edge.lanes.len() - lanes.len(),
@@ -231,6 +231,8 @@ impl<'a> Draft<'a> {
 
     fn lanes(&self, network: &Network) -> Vec<Lane> {
         let by_name = network.lanes();
+        let signalized = network.connections.iter().filter(|c| c.signal.is_some());
+        let lit: BTreeSet<&str> = signalized.map(controlled_lane).collect();
         let mut lanes = Vec::new();
         for (edge, of_edge) in &self.kept {
             for (i, lane) in of_edge.iter().enumerate() {
@@ -247,18 +249,17 @@ impl<'a> Draft<'a> {
                     names.map(|name| self.ids[name]).collect()
                 };
                 lanes.push(Lane {
-                    id: self.ids[lane.id.as_str()],
                     kind: lane_kind(edge, lane),
-                    centerline,
-                    elevation,
                     width: lane.width,
                     speed_limit: Some(self.speed_limit(edge, lane, &by_name)),
                     in_intersection: edge.function == EdgeFunction::Internal
                         && self.crossroads.contains(junction_of(&edge.id)),
+                    has_lights: Some(lit.contains(lane.id.as_str())),
                     predecessors: links(&self.predecessors),
                     successors: links(&self.successors),
                     left_neighbors: ids(of_edge[i + 1..].iter().filter(beside).collect()),
                     right_neighbors: ids(of_edge[..i].iter().rev().filter(beside).collect()),
+                    ..Lane::new(self.ids[lane.id.as_str()], centerline, elevation)
                 });
             }
         }
@@ -295,7 +296,7 @@ impl<'a> Draft<'a> {
         for (edge, lanes) in &self.kept {
             for (i, lane) in lanes.iter().enumerate() {
                 let line = plan_line(&lane.shape);
-                let Some(polygon) = strip(&line, lane.width) else {
+                let Some(polygon) = line.ribbon(lane.width) else {
                     continue;
                 };
                 let own = polygons.len();
@@ -429,21 +430,22 @@ impl<'a> Draft<'a> {
         let mut id = 1_000_000;
         let mut add = |kind, polygon: Polygon| {
             id += 1;
-            let elevation = vec![0.0; polygon.ring().len()];
-            parts.areas.push(Area {
-                id,
-                kind,
-                polygon,
-                elevation,
-            });
+            parts.areas.push(Area::new(id, kind, polygon));
         };
         let crossings = network
             .edges
             .iter()
             .filter(|e| e.function == EdgeFunction::Crossing);
         for lane in crossings.flat_map(|edge| &edge.lanes) {
-            if let Some(polygon) = strip(&plan_line(&lane.shape), lane.width) {
+            if let Some(polygon) = plan_line(&lane.shape).ribbon(lane.width) {
                 add(AreaKind::Crosswalk, polygon);
+            }
+        }
+        let walked = |e: &&Edge| e.function == EdgeFunction::WalkingArea;
+        for lane in network.edges.iter().filter(walked).flat_map(|e| &e.lanes) {
+            // The shape of a walking area is its border.
+            if let Some(polygon) = Polygon::new(plan_line(&lane.shape).points().to_vec()) {
+                add(AreaKind::Walkway, polygon);
             }
         }
         for junction in &network.junctions {
@@ -485,7 +487,7 @@ impl<'a> Draft<'a> {
             let Some(signal) = &connection.signal else {
                 continue;
             };
-            let lane = connection.via.as_deref().unwrap_or(&connection.from);
+            let lane = controlled_lane(connection);
             let stop = by_name
                 .get(&*connection.from)
                 .and_then(|lane| lane.shape.last());
@@ -496,6 +498,11 @@ impl<'a> Draft<'a> {
         }
         signals
     }
+}
+
+/// The lane that a connection's signal controls.
+fn controlled_lane(connection: &Connection) -> &str {
+    connection.via.as_deref().unwrap_or(&connection.from)
 }
 
 /// Junctions where roads of at least three directions meet; others only join two roads.

@@ -4,12 +4,8 @@
 //! found without clipping polygons: a candidate line is cut into short pieces, and a piece belongs
 //! to the border if the ground just beyond it belongs to no surface.
 
-use std::collections::BTreeMap;
+use gump_geometry::{BoxIndex, DVec2, Polygon, Polyline};
 
-use gump_geometry::{DVec2, Polygon, Polyline};
-
-/// Metres between the cells of the look-up.
-const CELL: f64 = 25.0;
 /// Length of the pieces a line is cut into, metres: how finely a border is known.
 const PIECE: f64 = 0.5;
 /// How far beyond a line the ground is asked about, metres: gaps narrower than this between
@@ -22,7 +18,7 @@ const SHORTEST: f64 = 1.0;
 #[derive(Debug)]
 pub(super) struct Surfaces {
     polygons: Vec<Polygon>,
-    cells: BTreeMap<(i64, i64), Vec<usize>>,
+    boxes: BoxIndex<usize>,
 }
 
 /// What lies beyond a stretch of a line, to the right of its direction.
@@ -36,17 +32,12 @@ pub(super) enum Beyond {
 
 impl Surfaces {
     pub(super) fn new(polygons: Vec<Polygon>) -> Self {
-        let mut cells: BTreeMap<(i64, i64), Vec<usize>> = BTreeMap::new();
-        for (i, polygon) in polygons.iter().enumerate() {
+        let boxes = polygons.iter().enumerate().map(|(i, polygon)| {
             let (min, max) = polygon.bounds();
-            let ((x0, y0), (x1, y1)) = (cell(min), cell(max));
-            for x in x0..=x1 {
-                for y in y0..=y1 {
-                    cells.entry((x, y)).or_default().push(i);
-                }
-            }
-        }
-        Self { polygons, cells }
+            (min, max, i)
+        });
+        let boxes = BoxIndex::new(boxes);
+        Self { polygons, boxes }
     }
 
     /// The stretches of `line` by what lies beyond its right side, where `own` does not count.
@@ -75,27 +66,10 @@ impl Surfaces {
     }
 
     fn at(&self, point: DVec2, own: usize) -> Beyond {
-        let near = self.cells.get(&cell(point)).map_or(&[][..], Vec::as_slice);
-        let hit = near
-            .iter()
-            .find(|&&i| i != own && self.polygons[i].contains(point));
-        hit.map_or(Beyond::Nothing, |&i| Beyond::Surface(i))
+        let near = self.boxes.intersecting(point, point);
+        let hits = near.filter(|&i| i != own && self.polygons[i].contains(point));
+        hits.min().map_or(Beyond::Nothing, Beyond::Surface)
     }
-}
-
-fn cell(point: DVec2) -> (i64, i64) {
-    let index = (point / CELL).floor();
-    (index.x as i64, index.y as i64)
-}
-
-/// The strip of `width` metres along a line; `None` for a line without length.
-pub(super) fn strip(line: &Polyline, width: f64) -> Option<Polygon> {
-    if line.length() <= 0.0 {
-        return None;
-    }
-    let mut ring = line.offset(-width / 2.0).points().to_vec();
-    ring.extend(line.offset(width / 2.0).points().iter().rev());
-    Polygon::new(ring)
 }
 
 #[cfg(test)]
@@ -107,7 +81,7 @@ mod tests {
     fn the_border_is_where_nothing_lies_beyond() {
         let line = |y: f64| Polyline::new(vec![dvec2(0.0, y), dvec2(100.0, y)]).unwrap();
         let half = Polyline::new(vec![dvec2(40.0, -3.5), dvec2(100.0, -3.5)]).unwrap();
-        let strips = vec![strip(&line(0.0), 3.5).unwrap(), strip(&half, 3.5).unwrap()];
+        let strips = vec![line(0.0).ribbon(3.5).unwrap(), half.ribbon(3.5).unwrap()];
         let surfaces = Surfaces::new(strips);
         let found = surfaces.stretches(&line(-1.75), 0);
         let kinds: Vec<_> = found.iter().map(|(beyond, _)| *beyond).collect();
