@@ -30,11 +30,19 @@ impl OrientedBox {
 
     /// True if the interiors intersect; touching boxes do not overlap.
     pub fn overlaps(&self, other: &Self) -> bool {
+        self.is_near(other) && self.separation(other) < 0.0
+    }
+
+    /// True if the boxes share a point; touching boxes do, unless corner to corner along their
+    /// diagonals.
+    pub fn touches(&self, other: &Self) -> bool {
+        self.is_near(other) && self.separation(other) <= 0.0
+    }
+
+    /// True if the circles around the boxes overlap.
+    fn is_near(&self, other: &Self) -> bool {
         let reach = (self.length.hypot(self.width) + other.length.hypot(other.width)) / 2.0;
-        if self.pose.position.distance_squared(other.pose.position) >= reach * reach {
-            return false;
-        }
-        self.separation(other) < 0.0
+        self.pose.position.distance_squared(other.pose.position) < reach * reach
     }
 
     /// Signed distance in metres: the gap between the boxes, or minus the smallest translation
@@ -109,6 +117,8 @@ mod tests {
     #[test]
     fn touching_is_not_overlapping() {
         assert!(!car(0.0, 0.0, 0.0).overlaps(&car(4.0, 0.0, 0.0)));
+        assert!(car(0.0, 0.0, 0.0).touches(&car(4.0, 0.0, 0.0)));
+        assert!(!car(0.0, 0.0, 0.0).touches(&car(4.01, 0.0, 0.0)));
         assert!(car(0.0, 0.0, 0.0).overlaps(&car(3.99, 0.0, 0.0)));
     }
 

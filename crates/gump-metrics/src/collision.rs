@@ -7,7 +7,8 @@ use crate::{Metric, Reduce};
 /// 1 if the agent's box overlaps that of any other agent now, else 0.
 ///
 /// Boxes that only touch do not overlap. Whose fault it is does not matter, nor how long it has
-/// lasted; [`crate::summarize`] leaves out overlaps that were there at the start.
+/// lasted; [`crate::summarize`] leaves out overlaps that were there at the start and
+/// [`crate::nuplan`] tells collisions apart (and counts touching, as its reference does).
 #[derive(Clone, Copy, Debug)]
 pub struct Collision;
 

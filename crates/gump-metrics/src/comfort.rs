@@ -7,8 +7,8 @@ use crate::{Metric, Reduce, kinematics};
 /// 1 if any comfort bound is broken now, else 0.
 ///
 /// Bounds that cannot be computed yet do not count; `None` if not even an acceleration can.
-/// Differences are taken frame by frame, so frames from noisy tracks break bounds that the smoothed
-/// trajectories of nuPlan's metric keep.
+/// Differences are taken frame by frame, so frames from noisy tracks break bounds that the same
+/// drive keeps when it is smoothed; [`crate::nuplan::ComfortSeries`] does that for finished drives.
 ///
 /// Source: the bounds of nuPlan's comfort metric, see [`ComfortBounds`].
 #[derive(Clone, Copy, Debug)]
@@ -29,11 +29,41 @@ pub struct ComfortBounds {
     pub yaw_acceleration: f64,
     /// Jerk along the heading, metres per second cubed.
     pub longitudinal_jerk: f64,
-    /// Magnitude of the jerk, metres per second cubed.
+    /// Change of the magnitude of the acceleration, metres per second cubed.
     pub jerk: f64,
 }
 
+/// What those inside feel at one instant; `None` where it is not known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Felt {
+    /// Along the heading, metres per second squared.
+    pub longitudinal_acceleration: f64,
+    /// Across the heading, metres per second squared.
+    pub lateral_acceleration: f64,
+    /// Radians per second.
+    pub yaw_rate: Option<f64>,
+    /// Radians per second squared.
+    pub yaw_acceleration: Option<f64>,
+    /// Along the heading, metres per second cubed.
+    pub longitudinal_jerk: Option<f64>,
+    /// Change of the magnitude of the acceleration, metres per second cubed.
+    pub jerk: Option<f64>,
+}
+
 impl ComfortBounds {
+    /// True if every known value lies inside its bounds, the bounds themselves excluded.
+    pub fn allow(&self, felt: &Felt) -> bool {
+        let within = |value: Option<f64>, bound: f64| value.is_none_or(|v| v.abs() < bound);
+        let along = felt.longitudinal_acceleration;
+        self.min_acceleration < along
+            && along < self.max_acceleration
+            && within(Some(felt.lateral_acceleration), self.lateral_acceleration)
+            && within(felt.yaw_rate, self.yaw_rate)
+            && within(felt.yaw_acceleration, self.yaw_acceleration)
+            && within(felt.longitudinal_jerk, self.longitudinal_jerk)
+            && within(felt.jerk, self.jerk)
+    }
+
     /// The values of nuPlan's comfort metric.
     pub const NUPLAN: Self = Self {
         min_acceleration: -4.05,
@@ -52,23 +82,17 @@ impl Metric for Discomfort {
     }
 
     fn at(&self, scene: &SceneState<'_>, agent: &Agent) -> Option<f64> {
-        let bounds = ComfortBounds::NUPLAN;
         let forward = agent.state.pose.direction();
         let acceleration = kinematics::acceleration(scene, agent.id)?;
-        let along = acceleration.dot(forward);
-        let mut broken = !(bounds.min_acceleration..=bounds.max_acceleration).contains(&along)
-            || acceleration.dot(forward.perp()).abs() > bounds.lateral_acceleration;
-        if let Some(rate) = kinematics::yaw_rate(scene, agent.id) {
-            broken |= rate.abs() > bounds.yaw_rate;
-        }
-        if let Some(yaw_acceleration) = kinematics::yaw_acceleration(scene, agent.id) {
-            broken |= yaw_acceleration.abs() > bounds.yaw_acceleration;
-        }
-        if let Some(jerk) = kinematics::jerk(scene, agent.id) {
-            broken |=
-                jerk.length() > bounds.jerk || jerk.dot(forward).abs() > bounds.longitudinal_jerk;
-        }
-        Some(f64::from(broken))
+        let felt = Felt {
+            longitudinal_acceleration: acceleration.dot(forward),
+            lateral_acceleration: acceleration.dot(forward.perp()),
+            yaw_rate: kinematics::yaw_rate(scene, agent.id),
+            yaw_acceleration: kinematics::yaw_acceleration(scene, agent.id),
+            longitudinal_jerk: kinematics::jerk(scene, agent.id).map(|jerk| jerk.dot(forward)),
+            jerk: kinematics::acceleration_change(scene, agent.id),
+        };
+        Some(f64::from(!ComfortBounds::NUPLAN.allow(&felt)))
     }
 
     fn reduce(&self) -> Reduce {
@@ -136,7 +160,7 @@ mod tests {
 
     #[test]
     fn jerk_is_bounded() {
-        // Along the heading 2.0 + 2.0 and 2.4 + 1.9, across it 4.1 + 4.1 and 4.3 + 4.3.
+        // Along the heading 2.0 + 2.0 and 2.4 + 1.9; magnitude, across the heading, 8.2 and 8.4.
         check(
             1.0,
             [(0.0, 5.0, 0.0), (0.0, 3.0, 0.0), (0.0, 5.0, 0.0)],
@@ -148,13 +172,13 @@ mod tests {
             1.0,
         );
         check(
-            1.0,
-            [(0.0, 0.0, 0.0), (0.0, 0.0, -4.1), (0.0, 0.0, 0.0)],
+            0.5,
+            [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 2.05)],
             0.0,
         );
         check(
-            1.0,
-            [(0.0, 0.0, 0.0), (0.0, 0.0, -4.3), (0.0, 0.0, 0.0)],
+            0.5,
+            [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 2.1)],
             1.0,
         );
     }

@@ -20,6 +20,12 @@ pub fn jerk(scene: &SceneState<'_>, agent: AgentId) -> Option<DVec2> {
     Some((c - 2.0 * b + a) / (scene.dt * scene.dt))
 }
 
+/// Change of the magnitude of the acceleration now, metres per second cubed.
+pub fn acceleration_change(scene: &SceneState<'_>, agent: AgentId) -> Option<f64> {
+    let [a, b, c] = latest(scene, agent)?.map(|agent| agent.state.velocity);
+    Some(((c - b).length() - (b - a).length()) / (scene.dt * scene.dt))
+}
+
 /// Yaw rate now, radians per second, positive to the left.
 pub fn yaw_rate(scene: &SceneState<'_>, agent: AgentId) -> Option<f64> {
     let [before, now] = latest(scene, agent)?.map(|agent| agent.state.pose.heading);
@@ -125,6 +131,7 @@ mod tests {
         let turn = std::f64::consts::TAU - 6.1;
         assert_eq!(acceleration(&scene, id), Some(dvec2(0.0, 2.0)));
         assert_eq!(jerk(&scene, id), Some(dvec2(-4.0, 4.0)));
+        assert_eq!(acceleration_change(&scene, id), Some(0.0));
         assert_abs_diff_eq!(yaw_rate(&scene, id).unwrap(), 0.2, epsilon = 1e-12);
         let expected = (0.1 - turn) / 0.25;
         assert_abs_diff_eq!(

@@ -1,17 +1,13 @@
 //! Leaving the road.
 
-use gump_scene::{Agent, AgentKind, SceneState};
+use gump_geometry::DVec2;
+use gump_scene::{Agent, AgentKind, MapGraph, SceneState};
 
-use crate::road_edge::is_beyond_road_edge;
+use crate::road_edge::metres_beyond_road_edge;
 use crate::{Metric, Reduce};
 
 /// 1 if a corner of the vehicle's box is off the road, else 0; `None` for anything but vehicles
-/// and on maps that know no border.
-///
-/// Where the map has road edges, a corner is off the road if it lies on the right of the nearest
-/// edge. It is on the road if it lies on the edge, and past the open end of an edge: a vehicle that
-/// drives out of the map has not left the road. ([`crate::DistanceToRoadEdge`] makes no such
-/// exception.) Where the map has none, a corner is off the road if no drivable surface contains it.
+/// and on maps that know no border. See [`metres_off_road`].
 #[derive(Clone, Copy, Debug)]
 pub struct OffRoad;
 
@@ -24,21 +20,35 @@ impl Metric for OffRoad {
         if agent.kind != AgentKind::Vehicle {
             return None;
         }
-        let map = scene.map;
-        let mut corners = agent.oriented_box().corners().into_iter();
-        let off = if !map.road_edges().is_empty() {
-            let z = agent.elevation - agent.height / 2.0;
-            corners.any(|corner| is_beyond_road_edge(map, corner, z) == Some(true))
-        } else if !map.drivable().is_empty() {
-            corners.any(|corner| !map.is_drivable(corner))
-        } else {
-            return None;
-        };
+        let z = agent.elevation - agent.height / 2.0;
+        let mut off = false;
+        for corner in agent.oriented_box().corners() {
+            off |= metres_off_road(scene.map, corner, z)? > 0.0;
+        }
         Some(f64::from(off))
     }
 
     fn reduce(&self) -> Reduce {
         Reduce::Any
+    }
+}
+
+/// How far `point` at height `z` lies outside the road, metres, 0 on it; `None` on maps that know
+/// no border.
+///
+/// Where the map has road edges, a point is off the road if it lies on the right of the nearest
+/// edge. It is on the road if it lies on the edge, and past the open end of an edge: a vehicle that
+/// drives out of the map has not left the road. ([`crate::DistanceToRoadEdge`] makes no such
+/// exception.) Where the map has none, a point is off the road if no drivable surface contains it.
+pub fn metres_off_road(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
+    if !map.road_edges().is_empty() {
+        metres_beyond_road_edge(map, point, z)
+    } else if map.drivable().is_empty() {
+        None
+    } else if map.is_drivable(point) {
+        Some(0.0)
+    } else {
+        map.drivable_distance(point)
     }
 }
 

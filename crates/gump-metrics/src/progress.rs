@@ -1,5 +1,6 @@
 //! Getting ahead on the route.
 
+use gump_geometry::{DVec2, Polyline};
 use gump_scene::{Agent, SceneState};
 
 use crate::{Metric, Reduce};
@@ -7,7 +8,7 @@ use crate::{Metric, Reduce};
 /// Metres along the route since the previous frame; negative when driving back.
 ///
 /// Only the ego has a route: `None` for others, without a route and in the first frame. A step
-/// counts at most the distance the ego moved, so that a route which crosses itself adds nothing.
+/// counts at most the distance the ego moved.
 #[derive(Clone, Copy, Debug)]
 pub struct Progress;
 
@@ -24,14 +25,20 @@ impl Metric for Progress {
         let before = scene.history.len().checked_sub(2)?;
         let before = scene.history[before].agent(agent.id)?.state.pose.position;
         let now = agent.state.pose.position;
-        let gained = path.project(now).arc_length - path.project(before).arc_length;
-        let moved = before.distance(now);
-        Some(gained.clamp(-moved, moved))
+        Some(gained(path, before, now))
     }
 
     fn reduce(&self) -> Reduce {
         Reduce::Sum
     }
+}
+
+/// Metres gained along a path by moving from one point to another, at most the distance moved, so
+/// that a path which crosses itself adds nothing.
+pub(crate) fn gained(path: &Polyline, before: DVec2, now: DVec2) -> f64 {
+    let gained = path.project(now).arc_length - path.project(before).arc_length;
+    let moved = before.distance(now);
+    gained.clamp(-moved, moved)
 }
 
 #[cfg(test)]

@@ -52,12 +52,13 @@ pub fn signed_distance_to_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Opt
     Some(distance * side(&Spot::new(map, edge, segment, point)))
 }
 
-/// True if `point` lies off the road: on the right of the nearest edge. False past the open end of
-/// an edge, where the map knows nothing of a border. `None` on a map without road edges.
-pub(crate) fn is_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<bool> {
+/// How far `point` lies on the right of the nearest edge, off the road, metres, else 0. 0 past the
+/// open end of an edge, where the map knows nothing of a border. `None` on a map without road edges.
+pub(crate) fn metres_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
     let (distance, edge, segment) = nearest(map, point, z)?;
     let spot = Spot::new(map, edge, segment, point);
-    Some(distance > 0.0 && side(&spot) > 0.0 && !spot.is_past_open_end())
+    let beyond = side(&spot) > 0.0 && !spot.is_past_open_end();
+    Some(if beyond { distance } else { 0.0 })
 }
 
 /// The segment nearest in space as (distance in the plane, edge, segment).

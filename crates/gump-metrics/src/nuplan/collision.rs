@@ -1,0 +1,149 @@
+//! Collisions of the ego: of which kind, whose fault, how bad.
+
+use std::collections::BTreeSet;
+
+use gump_geometry::{OrientedBox, Pose};
+use gump_scene::{Agent, AgentId, AgentKind};
+
+use super::bearing::is_behind;
+use super::history::{Drive, speed};
+
+/// Below this speed one stands, metres per second.
+///
+/// Source: nuplan-devkit.
+const STANDING: f64 = 0.05;
+
+/// How the ego met something; the first that holds, in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum CollisionKind {
+    /// The ego stood.
+    StoppedEgo,
+    /// The other stood, or never moves.
+    StoppedTrack,
+    /// The other came from behind.
+    ActiveRear,
+    /// The ego's front bumper hit it.
+    ActiveFront,
+    /// From the side.
+    ActiveLateral,
+}
+
+/// The first contact with one agent; later contacts with the same do not count.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CollisionEvent {
+    /// Index of the sample.
+    pub sample: usize,
+    /// Time of the sample, microseconds.
+    pub time_us: i64,
+    /// The other.
+    pub agent: AgentId,
+    /// What the other is.
+    pub agent_kind: AgentKind,
+    /// How they met.
+    pub kind: CollisionKind,
+    /// True if the ego is to blame.
+    pub at_fault: bool,
+    /// Half the relative speed, metres per second.
+    pub energy: f64,
+}
+
+/// All first contacts of a drive and their score.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Collisions {
+    /// 1 if none is the ego's fault, 0.5 for one with an object, else 0.
+    pub score: f64,
+    /// First contacts in order of time, within a sample by id.
+    pub events: Vec<CollisionEvent>,
+}
+
+impl Collisions {
+    /// Those that are the ego's fault.
+    pub fn at_fault(&self) -> impl Iterator<Item = &CollisionEvent> {
+        self.events.iter().filter(|event| event.at_fault)
+    }
+
+    /// How many are the ego's fault, with agents for which `counts`.
+    pub fn n_at_fault(&self, counts: impl Fn(AgentKind) -> bool) -> usize {
+        self.at_fault().filter(|e| counts(e.agent_kind)).count()
+    }
+}
+
+/// Finds the collisions of a drive.
+///
+/// `in_one_lane` says of each sample whether the ego is within a lane or within connected ones;
+/// elsewhere the side of the ego is its own fault too.
+///
+/// Source: nuPlan's `no_ego_at_fault_collisions`; per group the score is `1 - n / (allowed + 1)`,
+/// at least 0, with one collision allowed with objects and none with road users.
+pub fn collisions(drive: &Drive<'_>, in_one_lane: &[bool]) -> Collisions {
+    let mut hit = BTreeSet::new();
+    let mut events = Vec::new();
+    for (i, sample) in drive.samples.iter().enumerate() {
+        let footprint = drive.footprint(sample);
+        for agent in drive.others(sample) {
+            let known = hit.contains(&agent.id);
+            if known || !footprint.touches(&agent.oriented_box()) {
+                continue;
+            }
+            hit.insert(agent.id);
+            let ego = &sample.ego;
+            let kind = classify(&footprint, ego.rear_axle, ego.speed(), agent);
+            let turn = ego.rear_axle.heading - agent.state.pose.heading;
+            let (own, its) = (ego.speed(), speed(agent));
+            let squared = own * own + its * its - 2.0 * own * its * turn.cos();
+            events.push(CollisionEvent {
+                sample: i,
+                time_us: ego.time_us,
+                agent: agent.id,
+                agent_kind: agent.kind,
+                kind,
+                at_fault: kind.is_at_fault(in_one_lane[i]),
+                energy: 0.5 * squared.max(0.0).sqrt(),
+            });
+        }
+    }
+    let mut found = Collisions { score: 1.0, events };
+    let factor = |n: usize, allowed: f64| (1.0 - n as f64 / (allowed + 1.0)).max(0.0);
+    let is_vru = |kind| matches!(kind, AgentKind::Pedestrian | AgentKind::Bicycle);
+    let is_vehicle = |kind| kind == AgentKind::Vehicle;
+    let is_object = |kind| !AgentKind::MOVING.contains(&kind);
+    found.score = factor(found.n_at_fault(is_vru), 0.0)
+        * factor(found.n_at_fault(is_vehicle), 0.0)
+        * factor(found.n_at_fault(is_object), 1.0);
+    found
+}
+
+/// How the ego, with this box, rear axle and speed, met an agent that it touches.
+pub fn classify(
+    footprint: &OrientedBox,
+    rear_axle: Pose,
+    ego_speed: f64,
+    agent: &Agent,
+) -> CollisionKind {
+    let [front_left, .., front_right] = footprint.corners();
+    if ego_speed <= STANDING {
+        CollisionKind::StoppedEgo
+    } else if speed(agent) <= STANDING {
+        CollisionKind::StoppedTrack
+    } else if is_behind(rear_axle, agent.state.pose.position) {
+        CollisionKind::ActiveRear
+    } else if agent
+        .oriented_box()
+        .intersects_segment(front_left, front_right)
+    {
+        CollisionKind::ActiveFront
+    } else {
+        CollisionKind::ActiveLateral
+    }
+}
+
+impl CollisionKind {
+    /// Whether the ego is to blame; from the side only where it was not within one lane.
+    pub fn is_at_fault(self, in_one_lane: bool) -> bool {
+        match self {
+            Self::StoppedTrack | Self::ActiveFront => true,
+            Self::ActiveLateral => !in_one_lane,
+            Self::StoppedEgo | Self::ActiveRear => false,
+        }
+    }
+}
