@@ -12,19 +12,23 @@
 //! * **lateral**: signed metres to the left (+) or right (-) of a polyline's direction.
 
 mod distance;
+mod fast;
 mod fill;
 mod index;
 mod oriented_box;
 mod polygon;
 mod polyline;
 mod pose;
+mod quad;
 
 pub use distance::{cross, distance_to_segment, project_on_segment, segments_intersect};
+pub use fast::{LineIndex, PolygonIndex};
 pub use fill::{Canvas, fill_disc, fill_polygon, stroke_polyline};
 pub use index::{BoxIndex, PointIndex, SegmentIndex};
 pub use oriented_box::OrientedBox;
 pub use polygon::Polygon;
 pub use polyline::{Polyline, Projection};
 pub use pose::{Pose, angle_difference, interpolate_angle, wrap_angle};
+pub use quad::{Quad, joint, widen};
 
 pub use glam::{DVec2, DVec3, dvec2, dvec3};

@@ -1,5 +1,7 @@
 //! Directed polylines with arc length: lane centres, road edges, paths to follow.
 
+use std::ops::Range;
+
 use glam::DVec2;
 
 use crate::{Polygon, Pose, project_on_segment};
@@ -84,13 +86,20 @@ impl Polyline {
 
     /// The nearest point of the line to `point`; on ties the first.
     pub fn project(&self, point: DVec2) -> Projection {
+        self.project_within(0..self.points.len(), point)
+    }
+
+    /// [`Polyline::project`] on some of the segments only.
+    pub(crate) fn project_within(&self, segments: Range<usize>, point: DVec2) -> Projection {
         let mut best = Projection {
             segment: 0,
             arc_length: 0.0,
             lateral: point.distance(self.points[0]),
             distance: f64::INFINITY,
         };
-        for (segment, (a, b)) in self.segments().enumerate() {
+        let last = segments.end.min(self.points.len() - 1);
+        for segment in segments.start..last {
+            let (a, b) = (self.points[segment], self.points[segment + 1]);
             let t = project_on_segment(point, a, b);
             let distance = point.distance(a.lerp(b, t));
             if distance < best.distance {

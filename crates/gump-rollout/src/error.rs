@@ -54,6 +54,25 @@ pub enum RolloutError {
         /// Seconds between them.
         dt: f64,
     },
+    /// A trajectory too short to be followed.
+    #[error("a trajectory needs at least two states, got {0}")]
+    TooFewStates(usize),
+    /// A trajectory that does not go forward in time.
+    #[error("state {state} of a trajectory is not later than the one before")]
+    TimeOrder {
+        /// Index of the state.
+        state: usize,
+    },
+    /// A time that a trajectory does not cover.
+    #[error("a trajectory from {start_us} to {end_us} µs says nothing of {time_us} µs")]
+    OutsideTrajectory {
+        /// The time asked for, microseconds.
+        time_us: i64,
+        /// Time of the first state, microseconds.
+        start_us: i64,
+        /// Time of the last state, microseconds.
+        end_us: i64,
+    },
     /// A command or a state that is not a number.
     #[error("{who} gave a value that is not a finite number")]
     NotFinite {
@@ -67,6 +86,22 @@ pub enum RolloutError {
         future: usize,
         /// Futures in the session.
         n: usize,
+    },
+    /// A recording that cannot be driven through.
+    #[error("the recording {0}")]
+    Recording(String),
+    /// A plan that no car drives.
+    #[error("the planner asks for {0:.1} m/s, expected less than 50")]
+    Speed(f64),
+    /// Someone failed in the middle of a closed loop.
+    #[error("iteration {iteration}: {who}: {what}")]
+    Loop {
+        /// Iterations driven by then.
+        iteration: usize,
+        /// Who failed.
+        who: String,
+        /// What it reported.
+        what: String,
     },
     /// A scene that a replay does not recognise.
     #[error("the scene shows no moment of the replayed log \"{0}\"")]

@@ -5,8 +5,10 @@
 mod constant_velocity;
 mod idm;
 mod independent;
+mod nuplan_idm;
 mod replay;
 
 pub use constant_velocity::ConstantVelocity;
 pub use idm::{Idm, IdmConfig, idm_acceleration};
+pub use nuplan_idm::{NuplanIdm, NuplanIdmConfig};
 pub use replay::LogReplay;

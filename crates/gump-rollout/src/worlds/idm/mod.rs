@@ -67,7 +67,7 @@ impl Default for IdmConfig {
 }
 
 impl IdmConfig {
-    fn check(&self) -> Result<(), RolloutError> {
+    pub(super) fn check(&self) -> Result<(), RolloutError> {
         let fields = [
             ("target_velocity", self.target_velocity),
             ("min_gap", self.min_gap),

@@ -1,0 +1,237 @@
+//! Convex quadrilaterals: boxes, stretches of a road, the joints between them.
+//!
+//! Distances and intersections of anything wider than a line are put together from these.
+
+use glam::DVec2;
+
+use crate::{OrientedBox, Polygon, distance_to_segment, segments_intersect};
+
+/// Four corners of a convex shape, in either direction; corners may coincide.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Quad {
+    corners: [DVec2; 4],
+    min: DVec2,
+    max: DVec2,
+}
+
+impl Quad {
+    /// Takes the corners in order.
+    pub fn new(corners: [DVec2; 4]) -> Self {
+        let [a, b, c, d] = corners;
+        Self {
+            corners,
+            min: a.min(b).min(c.min(d)),
+            max: a.max(b).max(c.max(d)),
+        }
+    }
+
+    /// The corners in order.
+    pub fn corners(&self) -> &[DVec2; 4] {
+        &self.corners
+    }
+
+    /// The corners of the axis-aligned bounding box, (min, max).
+    pub fn bounds(&self) -> (DVec2, DVec2) {
+        (self.min, self.max)
+    }
+
+    /// Mean of the corners.
+    pub fn center(&self) -> DVec2 {
+        self.corners.iter().copied().sum::<DVec2>() / 4.0
+    }
+
+    /// True if the shapes share a point; touching counts.
+    pub fn intersects(&self, other: &Self) -> bool {
+        self.bounds_intersect(other) && !self.is_separated(other) && !other.is_separated(self)
+    }
+
+    /// True if the shapes share a point; touching counts.
+    pub fn intersects_polygon(&self, polygon: &Polygon) -> bool {
+        let (min, max) = polygon.bounds();
+        if self.min.cmpgt(max).any() || self.max.cmplt(min).any() {
+            return false;
+        }
+        self.corners.iter().any(|&corner| polygon.contains(corner))
+            || polygon.ring().iter().any(|&point| self.contains(point))
+            || polygon
+                .edges()
+                .any(|(a, b)| self.edges().any(|(c, d)| segments_intersect(a, b, c, d)))
+    }
+
+    /// True if `point` is inside or on the border.
+    pub fn contains(&self, point: DVec2) -> bool {
+        let side = |(a, b): (DVec2, DVec2)| (b - a).perp_dot(point - a);
+        self.edges().map(side).all(|side| side >= 0.0) || self.edges().map(side).all(|side| side <= 0.0)
+    }
+
+    /// Distance in metres, 0 if the shapes intersect.
+    pub fn distance(&self, other: &Self) -> f64 {
+        if self.intersects(other) {
+            return 0.0;
+        }
+        let one_way = |from: &Self, to: &Self| {
+            let corners = from.corners.iter();
+            corners
+                .flat_map(|&p| to.edges().map(move |(a, b)| distance_to_segment(p, a, b)))
+                .fold(f64::INFINITY, f64::min)
+        };
+        one_way(self, other).min(one_way(other, self))
+    }
+
+    /// Distance in metres, 0 if the shapes intersect.
+    pub fn distance_to_polygon(&self, polygon: &Polygon) -> f64 {
+        if self.intersects_polygon(polygon) {
+            return 0.0;
+        }
+        let mut least = f64::INFINITY;
+        for (a, b) in polygon.edges() {
+            for (c, d) in self.edges() {
+                least = least
+                    .min(distance_to_segment(c, a, b))
+                    .min(distance_to_segment(a, c, d));
+            }
+        }
+        least
+    }
+
+    /// A lower bound of [`Quad::distance`], metres: the gap between the bounding boxes.
+    pub fn gap_at_least(&self, other: &Self) -> f64 {
+        let gap = (other.min - self.max).max(self.min - other.max);
+        gap.max(DVec2::ZERO).length()
+    }
+
+    fn bounds_intersect(&self, other: &Self) -> bool {
+        self.min.cmple(other.max).all() && other.min.cmple(self.max).all()
+    }
+
+    /// True if an edge of this shape has all of `other` strictly on its outer side.
+    fn is_separated(&self, other: &Self) -> bool {
+        self.edges().any(|(a, b)| {
+            let normal = (b - a).perp();
+            let side = |p: &DVec2| normal.dot(*p - a);
+            let range = |corners: &[DVec2; 4]| {
+                let [p, q, r, s] = [0, 1, 2, 3].map(|i| side(&corners[i]));
+                (p.min(q).min(r.min(s)), p.max(q).max(r.max(s)))
+            };
+            let ((low, high), (other_low, other_high)) =
+                (range(&self.corners), range(&other.corners));
+            normal != DVec2::ZERO && (other_low > high || other_high < low)
+        })
+    }
+
+    fn edges(&self) -> impl Iterator<Item = (DVec2, DVec2)> + '_ {
+        (0..4).map(|i| (self.corners[i], self.corners[(i + 1) % 4]))
+    }
+}
+
+impl From<&OrientedBox> for Quad {
+    fn from(value: &OrientedBox) -> Self {
+        Self::new(value.corners())
+    }
+}
+
+/// The pieces of a line made `2 * half_width` wide: a rectangle per segment, and at every bend the
+/// joint that closes its outer side.
+///
+/// The ends are cut off square at the first and the last point; `overhang` metres are added to
+/// both. Segments without length give no piece.
+pub fn widen(points: &[DVec2], half_width: f64, overhang: f64) -> Vec<Quad> {
+    let mut pieces = Vec::with_capacity(2 * points.len());
+    let mut before: Option<DVec2> = None;
+    let last = points.len().saturating_sub(2);
+    for (i, pair) in points.windows(2).enumerate() {
+        let Some(along) = (pair[1] - pair[0]).try_normalize() else {
+            continue;
+        };
+        let side = along.perp() * half_width;
+        if let Some(joint) = before.and_then(|before| joint(pair[0], before, side)) {
+            pieces.push(joint);
+        }
+        let start = pair[0] - along * if before.is_none() { overhang } else { 0.0 };
+        let end = pair[1] + along * if i == last { overhang } else { 0.0 };
+        pieces.push(Quad::new([start + side, end + side, end - side, start - side]));
+        before = Some(side);
+    }
+    pieces
+}
+
+/// What lies between two rectangles that meet at `point` on the outer side of the bend.
+///
+/// `before` and `after` point from the line to the left borders. The arc is approximated by its
+/// middle: 2 mm at a bend of 20 degrees and a half width of 1 m.
+pub fn joint(point: DVec2, before: DVec2, after: DVec2) -> Option<Quad> {
+    let turn = before.perp_dot(after);
+    if turn.abs() <= 1e-9 * before.length_squared() {
+        return None;
+    }
+    // Turning left opens the right side.
+    let sign = if turn > 0.0 { -1.0 } else { 1.0 };
+    let (from, to) = (before * sign, after * sign);
+    let middle = (from + to).try_normalize()? * before.length();
+    Some(Quad::new([point, point + from, point + middle, point + to]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Pose;
+    use approx::assert_abs_diff_eq;
+    use glam::dvec2;
+
+    fn car(x: f64, y: f64, heading: f64) -> OrientedBox {
+        OrientedBox {
+            pose: Pose::new(x, y, heading),
+            length: 4.0,
+            width: 2.0,
+        }
+    }
+
+    #[test]
+    fn boxes_as_quads_agree_with_boxes() {
+        let mut seen = [false; 2];
+        for i in 0..400 {
+            let f = f64::from(i);
+            let other = car((f * 0.7).sin() * 5.0, (f * 1.3).cos() * 4.0, f * 0.37);
+            let own = car(0.0, 0.0, 0.3);
+            let expected = own.signed_distance(&other).max(0.0);
+            let found = Quad::from(&own).distance(&Quad::from(&other));
+            assert_abs_diff_eq!(found, expected, epsilon = 1e-9);
+            seen[usize::from(found > 0.0)] = true;
+            assert!(Quad::from(&own).gap_at_least(&Quad::from(&other)) <= found + 1e-12);
+        }
+        assert_eq!(seen, [true, true]);
+    }
+
+    #[test]
+    fn touching_is_intersecting() {
+        let (a, b) = (Quad::from(&car(0.0, 0.0, 0.0)), Quad::from(&car(4.0, 0.0, 0.0)));
+        assert!(a.intersects(&b) && a.contains(dvec2(2.0, 1.0)));
+        assert!(!a.intersects(&Quad::from(&car(4.0 + 1e-9, 0.0, 0.0))));
+    }
+
+    #[test]
+    fn polygons_are_met_inside_outside_and_around() {
+        let ring = |s: f64| vec![dvec2(-s, -s), dvec2(s, -s), dvec2(s, s), dvec2(-s, s)];
+        let check = |size: f64, x: f64, distance: f64| {
+            let polygon = Polygon::new(ring(size)).unwrap();
+            let quad = Quad::from(&car(x, 0.0, 0.0));
+            assert_abs_diff_eq!(quad.distance_to_polygon(&polygon), distance);
+            assert_eq!(quad.intersects_polygon(&polygon), distance == 0.0);
+        };
+        check(10.0, 0.0, 0.0);
+        check(0.1, 0.0, 0.0);
+        check(10.0, 11.0, 0.0);
+        check(10.0, 15.0, 3.0);
+    }
+
+    #[test]
+    fn a_wide_line_is_closed_on_the_outside_of_its_bends() {
+        let points = [dvec2(0.0, 0.0), dvec2(10.0, 0.0), dvec2(10.0, 10.0)];
+        let inside = |p: DVec2, overhang: f64| {
+            widen(&points, 1.0, overhang).iter().any(|piece| piece.contains(p))
+        };
+        assert!(inside(dvec2(10.6, -0.6), 0.0) && !inside(dvec2(10.9, -0.9), 0.0));
+        assert!(!inside(dvec2(-0.5, 0.0), 0.0) && inside(dvec2(-0.5, 0.0), 1.0));
+        assert!(!inside(dvec2(10.0, 10.5), 0.0) && inside(dvec2(10.0, 10.5), 1.0));
+    }
+}

@@ -1,0 +1,71 @@
+//! From a plan to the ego's next state.
+
+use gump_scene::EgoState;
+
+use super::Recording;
+use crate::RolloutError;
+use crate::dynamics::{LqrTracker, Trajectory, propagate};
+
+/// A tracked speed beyond which a plan is nonsense, metres per second.
+const IMPOSSIBLE_SPEED: f64 = 50.0;
+
+/// How the ego follows what is planned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tracking {
+    /// As a car: the LQR tracker steers the kinematic bicycle.
+    TwoStage,
+    /// It is where the plan says.
+    Perfect,
+    /// It is where it was in the log, whatever is planned: open loop.
+    Log,
+}
+
+/// A way of tracking and what it keeps between steps.
+#[derive(Clone, Debug)]
+pub struct Controller {
+    tracking: Tracking,
+    lqr: LqrTracker,
+}
+
+impl Controller {
+    /// A controller at rest.
+    pub fn new(tracking: Tracking) -> Self {
+        Self {
+            tracking,
+            lqr: LqrTracker::default(),
+        }
+    }
+
+    /// The ego one iteration later.
+    ///
+    /// # Errors
+    /// [`RolloutError::OutsideTrajectory`] for a plan that does not reach the next iteration,
+    /// [`RolloutError::NotFinite`] if the motion explodes, [`RolloutError::Speed`] for a plan
+    /// faster than 50 m/s.
+    pub fn advance(
+        &mut self,
+        recording: &Recording,
+        iteration: usize,
+        ego: &EgoState,
+        plan: &Trajectory,
+    ) -> Result<EgoState, RolloutError> {
+        let logged = recording.ego_at(iteration + 1);
+        let next = match self.tracking {
+            Tracking::Log => *logged,
+            Tracking::Perfect => plan.at(logged.time_us)?,
+            Tracking::TwoStage => {
+                plan.pose_at(logged.time_us)?;
+                let wheel_base = recording.vehicle().wheel_base;
+                let controls = self.lqr.track(ego, plan, wheel_base)?;
+                propagate(ego, &controls, wheel_base, logged.time_us)
+            }
+        };
+        if !next.is_finite() {
+            return Err(RolloutError::NotFinite { who: "the planner" });
+        }
+        if self.tracking == Tracking::Perfect && next.speed() >= IMPOSSIBLE_SPEED {
+            return Err(RolloutError::Speed(next.speed()));
+        }
+        Ok(next)
+    }
+}

@@ -1,0 +1,146 @@
+//! The closed loop: a driver plans, a controller moves the ego, traffic answers, again and again.
+//!
+//! [`drive`] is the loop, over a [`Recording`]. A [`Driver`] is what is tested, [`Traffic`] whom it
+//! meets, a [`Controller`] what turns its plan into motion. Nothing here scores.
+//!
+//! [`crate::simulate`] is the other loop: many futures of a scene at once, box centres, no vehicle.
+//! This one follows nuPlan's: one future, the ego a car with a rear axle, clocks as recorded.
+
+mod controller;
+mod driver;
+mod recording;
+mod traffic;
+
+pub use controller::{Controller, Tracking};
+pub use driver::{Driver, Mission, Moment};
+pub use recording::Recording;
+pub use traffic::{Imagined, Others, Replayed, Step, Traffic};
+
+use gump_scene::{EgoState, Frame, Rollout, SceneState};
+
+use crate::RolloutError;
+use crate::dynamics::Trajectory;
+
+/// What a closed loop leaves behind: one entry per executed iteration.
+#[derive(Clone, Debug)]
+pub struct Driven {
+    /// The traffic, ego included; imagined frame `i` is iteration `i + 1`.
+    pub rollout: Rollout,
+    /// The ego, from iteration 0 on.
+    pub ego: Vec<EgoState>,
+    /// What the driver planned at each iteration; empty unless asked for.
+    pub plans: Vec<Trajectory>,
+}
+
+/// How a loop is run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DriveConfig {
+    /// What turns plans into motion.
+    pub tracking: Tracking,
+    /// Seconds at most, > 0; a recording may be shorter.
+    pub seconds: f64,
+    /// Whether plans are kept; they take a hundred times the memory of the rest.
+    pub keep_plans: bool,
+}
+
+impl Default for DriveConfig {
+    /// 15 s with nuPlan's two-stage controller, as in its closed-loop challenges.
+    fn default() -> Self {
+        Self {
+            tracking: Tracking::TwoStage,
+            seconds: 15.0,
+            keep_plans: false,
+        }
+    }
+}
+
+/// Drives through a recording from its present on.
+///
+/// With `n` recorded frames to drive through there are `n - 1` iterations: after the last plan
+/// nothing moves any more. Collisions do not end the loop.
+///
+/// Traffic sees the ego as it is at the iteration that ends, not the one that begins.
+///
+/// # Errors
+/// [`RolloutError::Recording`] for a recording too short to drive through, [`RolloutError::Loop`]
+/// with the iteration for whatever driver, controller or traffic report.
+///
+/// Source: the simulation loop of nuplan-devkit.
+pub fn drive(
+    recording: &Recording,
+    traffic: &mut dyn Traffic,
+    driver: &mut dyn Driver,
+    config: &DriveConfig,
+) -> Result<Driven, RolloutError> {
+    let n = recording.n_iterations(config.seconds)?;
+    let failed = |iteration: usize, who: &str| {
+        let who = who.to_owned();
+        move |error: crate::BoxError| RolloutError::Loop {
+            iteration,
+            who,
+            what: error.to_string(),
+        }
+    };
+    let first = traffic.begin(recording).map_err(failed(0, traffic.name()))?;
+    let mut ego = *recording.ego_at(0);
+    let mut rollout = begin(recording, &ego, first);
+    driver
+        .start(&recording.mission())
+        .map_err(failed(0, driver.name()))?;
+    let mut states: Vec<EgoState> = recording.past().to_vec();
+    let n_past = states.len();
+    let mut plans = Vec::new();
+    let mut controller = Controller::new(config.tracking);
+    for iteration in 0..n {
+        let moment = Moment {
+            iteration,
+            scene: rollout.last(),
+            ego: &ego,
+            past: &states,
+        };
+        let plan = driver.drive(&moment).map_err(failed(iteration, driver.name()))?;
+        states.push(ego);
+        if iteration + 1 < n {
+            let next = controller
+                .advance(recording, iteration, &ego, &plan)
+                .map_err(|error| failed(iteration, driver.name())(error.into()))?;
+            let step = Step {
+                recording,
+                iteration,
+                ego: &ego,
+                next: &next,
+                plan: &plan,
+                scene: rollout.last(),
+            };
+            let others = traffic.advance(&step).map_err(failed(iteration, traffic.name()))?;
+            rollout.push(frame(recording, &next, others));
+            ego = next;
+        }
+        if config.keep_plans {
+            plans.push(plan);
+        }
+    }
+    states.drain(..n_past);
+    Ok(Driven {
+        rollout,
+        ego: states,
+        plans,
+    })
+}
+
+/// The recorded past with the first frame as traffic has it.
+fn begin(recording: &Recording, ego: &EgoState, first: Others) -> Rollout {
+    let scenario = recording.scenario();
+    let mut history = scenario.log[..scenario.now].to_vec();
+    history.push(frame(recording, ego, first));
+    Rollout::begin(SceneState {
+        history: &history,
+        ..scenario.present()
+    })
+}
+
+fn frame(recording: &Recording, ego: &EgoState, others: Others) -> Frame {
+    let mut agents = others.agents;
+    agents.push(recording.ego_agent(ego));
+    Frame::new(agents, others.lights)
+}

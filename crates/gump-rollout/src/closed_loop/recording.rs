@@ -1,0 +1,185 @@
+//! What a closed loop starts from: a scenario with its ego as a vehicle.
+
+use gump_geometry::{Pose, angle_difference};
+use gump_scene::{Agent, EgoState, Scenario, VehicleParameters};
+
+use super::Mission;
+use crate::RolloutError;
+
+/// A recorded drive: traffic, and the ego at its rear axle in every frame.
+#[derive(Clone, Debug)]
+pub struct Recording {
+    scenario: Scenario,
+    ego: Vec<EgoState>,
+    vehicle: VehicleParameters,
+    goal: Option<Pose>,
+}
+
+impl Recording {
+    /// Takes a scenario with the ego's states as recorded, one per frame of the log.
+    ///
+    /// # Errors
+    /// [`RolloutError::Recording`] if there are more or fewer states than frames, or a clock that
+    /// stands still or runs backwards; [`RolloutError::NotFinite`] for a state that is not a number.
+    pub fn new(
+        scenario: Scenario,
+        ego: Vec<EgoState>,
+        vehicle: VehicleParameters,
+        goal: Option<Pose>,
+    ) -> Result<Self, RolloutError> {
+        let wrong = |what: String| Err(RolloutError::Recording(what));
+        if ego.len() != scenario.log.len() {
+            let (frames, states) = (scenario.log.len(), ego.len());
+            return wrong(format!("has {frames} frames but {states} states of the ego"));
+        }
+        if let Some(i) = ego.windows(2).position(|p| p[1].time_us <= p[0].time_us) {
+            return wrong(format!("frame {} is not later than the one before", i + 1));
+        }
+        if !ego.iter().all(EgoState::is_finite) {
+            return Err(RolloutError::NotFinite { who: "the recording" });
+        }
+        Ok(Self {
+            scenario,
+            ego,
+            vehicle,
+            goal,
+        })
+    }
+
+    /// Works the vehicle out of a scenario that only has box centres: proportions of nuPlan's car,
+    /// accelerations from differences.
+    ///
+    /// The log is cut after the last frame that has the ego, and before the present at the last one
+    /// that lacks it.
+    ///
+    /// # Errors
+    /// [`RolloutError::Recording`] if the ego is absent in the present.
+    pub fn of_boxes(mut scenario: Scenario) -> Result<Self, RolloutError> {
+        let id = scenario.ego;
+        let Some(car) = scenario.log[scenario.now].agent(id).copied() else {
+            return Err(RolloutError::Recording(format!("lacks its ego (agent {id}) now")));
+        };
+        let has_ego = |frame: &gump_scene::Frame| frame.agent(id).is_some();
+        let before = scenario.log[..scenario.now].iter().rev().take_while(|f| has_ego(f)).count();
+        let after = scenario.log[scenario.now..].iter().take_while(|f| has_ego(f)).count();
+        scenario.log.truncate(scenario.now + after);
+        scenario.log.drain(..scenario.now - before);
+        scenario.now = before;
+        let vehicle = vehicle_like(&car);
+        let ego = ego_states(&scenario, &vehicle);
+        let goal = ego.last().map(|state| state.rear_axle);
+        Self::new(scenario, ego, vehicle, goal)
+    }
+
+    /// The recorded traffic.
+    pub fn scenario(&self) -> &Scenario {
+        &self.scenario
+    }
+
+    /// The ego's extents.
+    pub fn vehicle(&self) -> &VehicleParameters {
+        &self.vehicle
+    }
+
+    /// The recorded ego from the present on.
+    pub fn expert(&self) -> &[EgoState] {
+        &self.ego[self.scenario.now..]
+    }
+
+    /// The recorded ego before the present, oldest first.
+    pub fn past(&self) -> &[EgoState] {
+        &self.ego[..self.scenario.now]
+    }
+
+    /// The recorded ego `iteration` frames after the present.
+    ///
+    /// # Panics
+    /// If the recording is shorter.
+    pub fn ego_at(&self, iteration: usize) -> &EgoState {
+        &self.expert()[iteration]
+    }
+
+    /// What a driver is told.
+    pub fn mission(&self) -> Mission<'_> {
+        Mission {
+            map: &self.scenario.map,
+            route: self.scenario.route.as_ref(),
+            goal: self.goal,
+            vehicle: self.vehicle,
+        }
+    }
+
+    /// Iterations of a loop of at most `seconds`.
+    ///
+    /// # Errors
+    /// [`RolloutError::Recording`] if fewer than two are left,
+    /// [`RolloutError::Duration`] for a duration that is not a positive number.
+    pub fn n_iterations(&self, seconds: f64) -> Result<usize, RolloutError> {
+        if !(seconds > 0.0 && seconds.is_finite()) {
+            return Err(RolloutError::Duration(seconds));
+        }
+        let asked = (seconds / self.scenario.dt).round() as usize;
+        let n = asked.min(self.scenario.future().len());
+        if n < 2 {
+            let frames = self.scenario.future().len();
+            let what = format!("has {frames} frames after the present, expected two or more");
+            return Err(RolloutError::Recording(what));
+        }
+        Ok(n)
+    }
+
+    /// The ego as others see it.
+    pub fn ego_agent(&self, state: &EgoState) -> Agent {
+        let present = &self.scenario.log[self.scenario.now];
+        let agent = present.agent(self.scenario.ego).expect("the ego is present now");
+        agent.with_state(state.agent_state(&self.vehicle))
+    }
+}
+
+/// A vehicle of the agent's size with the proportions of nuPlan's.
+fn vehicle_like(agent: &Agent) -> VehicleParameters {
+    let car = VehicleParameters::PACIFICA;
+    let scale = agent.length / car.length();
+    VehicleParameters {
+        width: agent.width,
+        front_length: car.front_length * scale,
+        rear_length: car.rear_length * scale,
+        wheel_base: car.wheel_base * scale,
+        center_of_gravity: car.center_of_gravity * scale,
+        height: agent.height,
+    }
+}
+
+fn ego_states(scenario: &Scenario, vehicle: &VehicleParameters) -> Vec<EgoState> {
+    let centers: Vec<_> = scenario
+        .log
+        .iter()
+        .filter_map(|frame| frame.agent(scenario.ego))
+        .map(|agent| agent.state)
+        .collect();
+    let n = centers.len();
+    let speed_at = |i: usize| centers[i].velocity.dot(centers[i].pose.direction());
+    (0..n)
+        .map(|i| {
+            // One-sided at the ends; nothing at all for a single frame.
+            let (a, b) = (i.saturating_sub(1), (i + 1).min(n - 1));
+            let elapsed = ((b - a) as f64 * scenario.dt).max(scenario.dt);
+            let turned = angle_difference(centers[b].pose.heading, centers[a].pose.heading);
+            let yaw_rate = turned / elapsed;
+            let speed = speed_at(i);
+            EgoState {
+                time_us: (i as f64 * scenario.dt * 1e6).round() as i64,
+                rear_axle: vehicle.rear_axle_of(centers[i].pose),
+                velocity: gump_geometry::dvec2(speed, 0.0),
+                acceleration: gump_geometry::dvec2((speed_at(b) - speed_at(a)) / elapsed, 0.0),
+                steering_angle: if speed.abs() > 0.5 {
+                    (yaw_rate * vehicle.wheel_base / speed).atan().clamp(-1.0, 1.0)
+                } else {
+                    0.0
+                },
+                yaw_rate,
+                ..EgoState::default()
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,242 @@
+//! One vehicle of nuPlan's reactive traffic.
+
+use std::collections::VecDeque;
+
+use gump_geometry::{OrientedBox, Polygon, Pose, Quad};
+use gump_scene::{Agent, AgentState, Lane, LaneId, LightState, MapGraph};
+
+use super::corridor::{Corridor, Footprint};
+use super::{Scene, in_intersection};
+use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
+use crate::worlds::idm_acceleration;
+
+/// Lanes of the way that a vehicle remembers.
+const REMEMBERED_LANES: usize = 5;
+
+/// A vehicle on its path.
+#[derive(Debug)]
+pub(super) struct Vehicle {
+    agent: Agent,
+    lanes: VecDeque<LaneId>,
+    corridor: Corridor,
+    /// Arc length of the box centre on the path, metres.
+    progress: f64,
+    speed: f64,
+    target_speed: f64,
+    /// The box and, once it has moved, where it will be in 1.5 s.
+    footprint: Footprint,
+}
+
+/// What is ahead, in terms of the path.
+#[derive(Clone, Copy)]
+struct Lead {
+    gap: f64,
+    speed: f64,
+}
+
+impl Vehicle {
+    /// Places the vehicle on the centre of the lane it is on; `None` if it is on none.
+    ///
+    /// Where lanes overlap the one whose direction is nearest is taken; directions are compared as
+    /// plain numbers, as nuPlan does. `target` is the desired speed of the vehicle before, and of
+    /// this one if its lane states no limit.
+    pub(super) fn snapped(agent: &Agent, map: &MapGraph, target: &mut f64) -> Option<Self> {
+        let center = agent.state.pose.position;
+        let lanes: Vec<&Lane> = map.lanes_containing(center).collect();
+        let on_lane = lanes.iter().any(|lane| !lane.in_intersection);
+        if !on_lane && !in_intersection(map, center) {
+            return None;
+        }
+        let (lane, s, pose) = lanes
+            .into_iter()
+            .filter(|lane| lane.in_intersection != on_lane)
+            .map(|lane| {
+                let (s, pose) = nearest_on_baseline(lane, center);
+                (lane, s, pose)
+            })
+            .min_by(|a, b| {
+                let off = |pose: &Pose| (pose.heading - agent.state.pose.heading).abs();
+                off(&a.2).total_cmp(&off(&b.2))
+            })?;
+        if let Some(limit) = lane.speed_limit {
+            *target = limit;
+        }
+        let path = Path::without_last(&baseline(lane))?;
+        let placed = OrientedBox {
+            pose,
+            ..agent.oriented_box()
+        };
+        let mut vehicle = Self {
+            agent: *agent,
+            lanes: VecDeque::from([lane.id]),
+            corridor: Corridor::new(path, agent.width / 2.0),
+            progress: s,
+            speed: agent.state.speed(),
+            target_speed: *target,
+            footprint: Footprint::new(vec![Quad::from(&placed)]),
+        };
+        vehicle.place(pose);
+        Some(vehicle)
+    }
+
+    pub(super) fn agent(&self) -> Agent {
+        self.agent
+    }
+
+    pub(super) fn pose(&self) -> Pose {
+        self.agent.state.pose
+    }
+
+    pub(super) fn oriented_box(&self) -> OrientedBox {
+        self.agent.oriented_box()
+    }
+
+    /// Moves for `dt` seconds; `others` as they are by now.
+    pub(super) fn step<'a>(
+        &mut self,
+        scene: &Scene<'_>,
+        others: impl Iterator<Item = &'a Self>,
+        dt: f64,
+        scratch: &mut Vec<Quad>,
+    ) {
+        self.extend(scene);
+        let lead = self.lead(scene, others, scratch);
+        let last = self.lanes.back().and_then(|&id| scene.map.lane(id));
+        if let Some(limit) = last.and_then(|lane| lane.speed_limit).filter(|&l| l > 0.0) {
+            self.target_speed = limit;
+        }
+        let law = &scene.config.law;
+        let acceleration =
+            idm_acceleration(law, self.speed, self.target_speed, lead.gap, lead.speed)
+                .clamp(-law.max_deceleration, law.max_acceleration);
+        self.progress += self.speed * dt;
+        self.speed = (self.speed + acceleration * dt).max(0.0);
+        self.place(self.corridor.path().pose_at(self.progress));
+        self.sweep(law.headway);
+    }
+
+    fn place(&mut self, pose: Pose) {
+        self.agent.state = AgentState {
+            pose,
+            velocity: pose.direction() * self.speed,
+        };
+    }
+
+    /// Renews the footprint: the box and the road it covers within the headway.
+    fn sweep(&mut self, headway: f64) {
+        let half = self.agent.length / 2.0;
+        let own = Quad::from(&self.agent.oriented_box());
+        self.footprint.pieces.clear();
+        self.footprint.pieces.push(own);
+        let (from, to) = (self.progress - half, self.progress + half + self.speed * headway);
+        self.corridor.pieces(from, to, &mut self.footprint.pieces);
+        self.footprint.measure();
+    }
+
+    /// Adds lanes while the way ahead is short; where none may be entered it ends.
+    fn extend(&mut self, scene: &Scene<'_>) {
+        let config = scene.config;
+        let needed = config.minimum_path_length + self.target_speed * config.law.headway;
+        // Bounded, because a ring of lanes without length would never reach ahead.
+        for _ in 0..1000 {
+            if self.corridor.path().length() - self.progress >= needed {
+                return;
+            }
+            let Some(next) = self.lanes.back().and_then(|&last| straightest(scene, last)) else {
+                return;
+            };
+            let mut poses = self.corridor.path().poses_from(self.progress);
+            poses.extend(baseline(next));
+            let Some(path) = Path::without_last(&poses) else {
+                return;
+            };
+            self.corridor = Corridor::new(path, self.agent.width / 2.0);
+            self.progress = 0.0;
+            self.lanes.push_back(next.id);
+            if self.lanes.len() > REMEMBERED_LANES {
+                self.lanes.pop_front();
+            }
+        }
+    }
+
+    /// The nearest of all that reaches into the way ahead; its end, where nothing does.
+    fn lead<'a>(
+        &self,
+        scene: &Scene<'_>,
+        others: impl Iterator<Item = &'a Self>,
+        scratch: &mut Vec<Quad>,
+    ) -> Lead {
+        let bounds = self.corridor.bounds_from(self.progress);
+        scratch.clear();
+        let mut nearest: Option<(f64, f64)> = None;
+        let mut consider = |distance: f64, speed: f64| {
+            if nearest.is_none_or(|(least, _)| distance < least) {
+                nearest = Some((distance, speed));
+            }
+        };
+        let mut is_ahead = |footprint: &Footprint| {
+            if !footprint.is_within(bounds) {
+                return false;
+            }
+            if scratch.is_empty() {
+                self.corridor.pieces(self.progress, f64::INFINITY, scratch);
+            }
+            footprint.intersects(scratch)
+        };
+        let along = |heading: f64| (heading - self.pose().heading).cos();
+        for fixed in &scene.fixed {
+            if is_ahead(&fixed.footprint) {
+                let distance = self.footprint.distance(&fixed.footprint);
+                consider(distance, fixed.speed * along(fixed.heading));
+            }
+        }
+        for other in others {
+            if is_ahead(&other.footprint) {
+                let distance = self.footprint.distance(&other.footprint);
+                consider(distance, other.speed * along(other.pose().heading));
+            }
+        }
+        for line in self.lanes.iter().flat_map(|&lane| scene.red_stop_lines(lane)) {
+            if self.reaches(line, bounds) {
+                consider(self.footprint.distance_to_polygon(line), 0.0);
+            }
+        }
+        match nearest {
+            Some((gap, speed)) => Lead { gap, speed },
+            None => Lead {
+                gap: self.corridor.path().length() - self.progress - self.agent.length / 2.0,
+                speed: 0.0,
+            },
+        }
+    }
+
+    fn reaches(&self, polygon: &Polygon, bounds: (gump_geometry::DVec2, gump_geometry::DVec2)) -> bool {
+        let (min, max) = polygon.bounds();
+        if min.cmpgt(bounds.1).any() || max.cmplt(bounds.0).any() {
+            return false;
+        }
+        let mut pieces = Vec::new();
+        self.corridor.pieces(self.progress, f64::INFINITY, &mut pieces);
+        pieces.iter().any(|piece| piece.intersects_polygon(polygon))
+    }
+}
+
+/// The lane after `last` that turns least where it starts, among those that may be entered.
+///
+/// A lane ruled by lights may be entered on green alone, another one unless its light is red.
+fn straightest<'m>(scene: &Scene<'m>, last: LaneId) -> Option<&'m Lane> {
+    let mut best: Option<(f64, &Lane)> = None;
+    for lane in scene.map.successors(last) {
+        let state = scene.frame.light(lane.id).map(|light| light.state);
+        let open = if lane.has_lights == Some(true) {
+            state == Some(LightState::Green)
+        } else {
+            state != Some(LightState::Red)
+        };
+        let turn = curvature_at_start(lane).abs();
+        if open && best.is_none_or(|(least, _)| turn < least) {
+            best = Some((turn, lane));
+        }
+    }
+    best.map(|(_, lane)| lane)
+}

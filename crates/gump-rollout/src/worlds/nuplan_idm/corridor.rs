@@ -1,0 +1,222 @@
+//! The strip of road that a vehicle is going to sweep, cut into convex pieces.
+
+use gump_geometry::{DVec2, Polygon, Pose, Quad, joint};
+
+use crate::Path;
+
+/// A path made as wide as a vehicle. Pieces are cut once per path, not once per step.
+#[derive(Clone, Debug)]
+pub(super) struct Corridor {
+    path: Path,
+    half_width: f64,
+    /// The rectangle of each segment.
+    stretches: Vec<Quad>,
+    /// What closes the bend at the start of each segment.
+    joints: Vec<Option<Quad>>,
+    /// Bounds of all that follows the start of each segment.
+    bounds: Vec<(DVec2, DVec2)>,
+}
+
+impl Corridor {
+    pub(super) fn new(path: Path, half_width: f64) -> Self {
+        let points = path.line().points();
+        let sides: Vec<DVec2> = points
+            .windows(2)
+            .map(|pair| (pair[1] - pair[0]).normalize_or_zero().perp() * half_width)
+            .collect();
+        let stretches: Vec<Quad> = points
+            .windows(2)
+            .zip(&sides)
+            .map(|(pair, &side)| stretch(pair[0], pair[1], side))
+            .collect();
+        let joints = (0..sides.len())
+            .map(|i| joint(points[i], *sides.get(i.checked_sub(1)?)?, sides[i]))
+            .collect();
+        let mut bounds = Vec::with_capacity(stretches.len());
+        let mut all = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        // Joints stay within half a width of their point, so this margin covers them.
+        let margin = DVec2::splat(half_width);
+        for pair in points.windows(2).rev() {
+            for point in pair {
+                all = (all.0.min(*point - margin), all.1.max(*point + margin));
+            }
+            bounds.push(all);
+        }
+        bounds.reverse();
+        Self {
+            path,
+            half_width,
+            stretches,
+            joints,
+            bounds,
+        }
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bounds of the corridor from arc length `s` on.
+    pub(super) fn bounds_from(&self, s: f64) -> (DVec2, DVec2) {
+        self.bounds[self.segment(s)]
+    }
+
+    /// The pieces between two arc lengths, with flat ends, appended to `pieces`; both are clamped
+    /// to the path.
+    pub(super) fn pieces(&self, from: f64, to: f64, pieces: &mut Vec<Quad>) {
+        let length = self.path.length();
+        let (from, to) = (from.clamp(0.0, length), to.clamp(0.0, length));
+        if from >= to {
+            return;
+        }
+        let (first, last) = (self.segment(from), self.segment(to));
+        let points = self.path.line().points();
+        let arc = self.path.line().arc_lengths();
+        for i in first..=last {
+            let whole = from <= arc[i] && arc[i + 1] <= to;
+            if i > first {
+                pieces.extend(self.joints[i]);
+            }
+            if whole {
+                pieces.push(self.stretches[i]);
+                continue;
+            }
+            let along = points[i + 1] - points[i];
+            let step = arc[i + 1] - arc[i];
+            let place = |s: f64| points[i] + along * ((s - arc[i]) / step).clamp(0.0, 1.0);
+            let (start, end) = (place(from), place(to));
+            if start != end {
+                let side = along.perp() * (self.half_width / step);
+                pieces.push(stretch(start, end, side));
+            }
+        }
+    }
+
+    /// Index of the segment that holds arc length `s`.
+    fn segment(&self, s: f64) -> usize {
+        let arc = self.path.line().arc_lengths();
+        arc.partition_point(|&a| a <= s)
+            .saturating_sub(1)
+            .min(self.stretches.len() - 1)
+    }
+}
+
+fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
+    Quad::new([start + side, end + side, end - side, start - side])
+}
+
+/// What a body covers: convex pieces with common bounds.
+#[derive(Clone, Debug)]
+pub(super) struct Footprint {
+    pub(super) pieces: Vec<Quad>,
+    min: DVec2,
+    max: DVec2,
+}
+
+impl Footprint {
+    pub(super) fn new(pieces: Vec<Quad>) -> Self {
+        let mut footprint = Self {
+            pieces,
+            min: DVec2::INFINITY,
+            max: DVec2::NEG_INFINITY,
+        };
+        footprint.measure();
+        footprint
+    }
+
+    /// Recomputes the bounds after the pieces were changed.
+    pub(super) fn measure(&mut self) {
+        (self.min, self.max) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        for piece in &self.pieces {
+            let (min, max) = piece.bounds();
+            (self.min, self.max) = (self.min.min(min), self.max.max(max));
+        }
+    }
+
+    pub(super) fn is_within(&self, (min, max): (DVec2, DVec2)) -> bool {
+        self.min.cmple(max).all() && min.cmple(self.max).all()
+    }
+
+    pub(super) fn intersects(&self, pieces: &[Quad]) -> bool {
+        let touches = |piece: &Quad| self.pieces.iter().any(|own| own.intersects(piece));
+        pieces.iter().any(touches)
+    }
+
+    /// Metres between two footprints, 0 if they intersect.
+    pub(super) fn distance(&self, other: &Self) -> f64 {
+        let mut least = f64::INFINITY;
+        for own in &self.pieces {
+            for piece in &other.pieces {
+                if own.gap_at_least(piece) < least {
+                    least = least.min(own.distance(piece));
+                }
+            }
+        }
+        least
+    }
+
+    pub(super) fn distance_to_polygon(&self, polygon: &Polygon) -> f64 {
+        let distances = self.pieces.iter().map(|own| own.distance_to_polygon(polygon));
+        distances.fold(f64::INFINITY, f64::min)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use approx::assert_abs_diff_eq;
+    use gump_geometry::{dvec2, widen};
+
+    fn bend() -> Corridor {
+        let poses: Vec<Pose> = (0..=16)
+            .map(|i| {
+                let a = f64::from(i) * 0.1;
+                Pose::new(20.0 * a.sin(), 20.0 * (1.0 - a.cos()), a)
+            })
+            .collect();
+        Corridor::new(Path::through(&poses).unwrap(), 1.0)
+    }
+
+    #[test]
+    fn pieces_are_those_of_the_widened_line() {
+        let corridor = bend();
+        let mut pieces = Vec::new();
+        corridor.pieces(0.0, f64::INFINITY, &mut pieces);
+        let expected = widen(corridor.path().line().points(), 1.0, 0.0);
+        assert_eq!(pieces.len(), expected.len());
+        for (found, expected) in pieces.iter().zip(&expected) {
+            assert_abs_diff_eq!(found.distance(expected), 0.0);
+            assert_abs_diff_eq!(found.center().distance(expected.center()), 0.0, epsilon = 1e-9);
+        }
+        let bounds = corridor.bounds_from(0.0);
+        assert!(Footprint::new(pieces).is_within(bounds));
+    }
+
+    #[test]
+    fn ends_are_cut_where_asked() {
+        let poses = [Pose::new(0.0, 0.0, 0.0), Pose::new(10.0, 0.0, 0.0), Pose::new(30.0, 0.0, 0.0)];
+        let corridor = Corridor::new(Path::through(&poses).unwrap(), 1.0);
+        let check = |from: f64, to: f64, expected: Option<(f64, f64)>| {
+            let mut pieces = Vec::new();
+            corridor.pieces(from, to, &mut pieces);
+            let footprint = Footprint::new(pieces);
+            let found = (!footprint.pieces.is_empty()).then_some((footprint.min.x, footprint.max.x));
+            assert_eq!(found, expected);
+        };
+        check(2.0, 8.0, Some((2.0, 8.0)));
+        check(2.0, 18.0, Some((2.0, 18.0)));
+        check(10.0, 18.0, Some((10.0, 18.0)));
+        check(-5.0, 99.0, Some((0.0, 30.0)));
+        check(30.0, 35.0, None);
+    }
+
+    #[test]
+    fn footprints_measure_their_gap() {
+        let at = |x: f64| {
+            Footprint::new(widen(&[dvec2(x, 0.0), dvec2(x + 2.0, 0.0), dvec2(x + 4.0, 0.0)], 1.0, 0.0))
+        };
+        assert_eq!(at(0.0).distance(&at(7.0)), 3.0);
+        assert_eq!(at(0.0).distance(&at(4.0)), 0.0);
+        assert!(at(0.0).intersects(&at(4.0).pieces) && !at(0.0).intersects(&at(4.5).pieces));
+    }
+}

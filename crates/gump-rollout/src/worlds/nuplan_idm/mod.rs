@@ -1,0 +1,208 @@
+//! nuPlan's reactive traffic: vehicles of the first frame on the lane graph, everything else as
+//! recorded.
+//!
+//! Here are the parameters and the traffic as a whole; `agent` is one vehicle, `corridor` the strip
+//! it sweeps. [`super::Idm`] is the other world with the same car-following law
+//! ([`super::idm_acceleration`]): it sees no log, lets pedestrians move on and everyone decides at
+//! once. This one is nuPlan's environment with all its particulars, for scores that compare:
+//!
+//! * Vehicles are snapped to the centre of their lane; those on no lane, and those that would then
+//!   touch something, are left out, and so are bicycles and vehicles that appear later.
+//! * Pedestrians and static things are replayed from the log, and so are the lights.
+//! * Vehicles move one after another, each seeing where those before it have gone.
+//! * Who is ever farther than 100 m from the ego is gone for good.
+
+mod agent;
+mod corridor;
+
+use std::sync::Arc;
+
+use gump_geometry::{OrientedBox, Polygon, Quad};
+use gump_scene::{Agent, AgentKind, AreaKind, Frame, LightState, MapGraph};
+
+use super::IdmConfig;
+use crate::closed_loop::{Others, Recording, Step, Traffic};
+use crate::{BoxError, RolloutError};
+use agent::Vehicle;
+use corridor::Footprint;
+
+/// Parameters of nuPlan's reactive agents.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NuplanIdmConfig {
+    /// The car-following law; of its limits only the two accelerations are used.
+    pub law: IdmConfig,
+    /// A vehicle extends its way when less than this is left, and 1.5 s of driving, metres.
+    pub minimum_path_length: f64,
+    /// Vehicles farther from the ego are gone, metres.
+    pub radius: f64,
+}
+
+impl Default for NuplanIdmConfig {
+    /// The values of the closed-loop reactive challenge.
+    fn default() -> Self {
+        Self {
+            law: IdmConfig {
+                target_velocity: 10.0,
+                min_gap: 1.0,
+                headway: 1.5,
+                max_acceleration: 1.0,
+                max_deceleration: 2.0,
+                exponent: 4.0,
+                ..IdmConfig::default()
+            },
+            minimum_path_length: 20.0,
+            radius: 100.0,
+        }
+    }
+}
+
+/// nuPlan's reactive traffic, see the module.
+///
+/// Source: the IDM agents of nuplan-devkit; agrees with its recorded simulations.
+#[derive(Debug, Default)]
+pub struct NuplanIdm {
+    config: NuplanIdmConfig,
+    map: Arc<MapGraph>,
+    vehicles: Vec<Vehicle>,
+}
+
+impl NuplanIdm {
+    /// Traffic with these parameters.
+    ///
+    /// # Errors
+    /// [`RolloutError::Parameter`] for a parameter that is not a positive number.
+    pub fn new(config: NuplanIdmConfig) -> Result<Self, RolloutError> {
+        config.law.check()?;
+        for (name, value) in [
+            ("minimum_path_length", config.minimum_path_length),
+            ("radius", config.radius),
+        ] {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(RolloutError::Parameter { name, value });
+            }
+        }
+        Ok(Self {
+            config,
+            ..Self::default()
+        })
+    }
+
+    /// Vehicles that are still there.
+    pub fn n_vehicles(&self) -> usize {
+        self.vehicles.len()
+    }
+
+    /// The vehicles, then everything of `logged` that is replayed.
+    fn others(&self, logged: &Frame) -> Others {
+        let replayed = logged.agents().iter().filter(|agent| is_replayed(agent));
+        Others {
+            agents: self.vehicles.iter().map(Vehicle::agent).chain(replayed.copied()).collect(),
+            lights: logged.lights().to_vec(),
+        }
+    }
+}
+
+impl Traffic for NuplanIdm {
+    fn name(&self) -> &str {
+        "idm"
+    }
+
+    fn begin(&mut self, recording: &Recording) -> Result<Others, BoxError> {
+        let scenario = recording.scenario();
+        let now = &scenario.log[scenario.now];
+        self.map = Arc::clone(&scenario.map);
+        self.vehicles.clear();
+        let ego = recording.vehicle().footprint(recording.ego_at(0).rear_axle);
+        let mut taken: Vec<Quad> = vec![Quad::from(&ego)];
+        let replayed = now.agents().iter().filter(|agent| is_replayed(agent));
+        taken.extend(replayed.map(|agent| Quad::from(&agent.oriented_box())));
+        // A vehicle on a lane without a limit aims for the speed of the one before it: nuPlan
+        // overwrites the default in its loop.
+        let mut target = self.config.law.target_velocity;
+        for agent in now.agents() {
+            if agent.kind != AgentKind::Vehicle || agent.id == scenario.ego {
+                continue;
+            }
+            let Some(vehicle) = Vehicle::snapped(agent, &self.map, &mut target) else {
+                continue;
+            };
+            let quad = Quad::from(&vehicle.oriented_box());
+            if !taken.iter().any(|other| other.intersects(&quad)) {
+                taken.push(quad);
+                self.vehicles.push(vehicle);
+            }
+        }
+        Ok(self.others(now))
+    }
+
+    fn advance(&mut self, step: &Step<'_>) -> Result<Others, BoxError> {
+        let logged = step.logged();
+        let ego = step.recording.vehicle().footprint(step.ego.rear_axle);
+        let radius = self.config.radius;
+        self.vehicles.retain(|vehicle| {
+            let away = vehicle.pose().position.distance(ego.pose.position);
+            away <= radius
+        });
+        let scene = Scene {
+            config: &self.config,
+            map: &self.map,
+            frame: logged,
+            fixed: fixed_obstacles(&ego, step.ego.speed(), logged),
+        };
+        let mut scratch = Vec::new();
+        for i in 0..self.vehicles.len() {
+            let (before, rest) = self.vehicles.split_at_mut(i);
+            let (vehicle, after) = rest.split_first_mut().expect("vehicle i exists");
+            let others = before.iter().chain(after.iter());
+            vehicle.step(&scene, others, step.dt(), &mut scratch);
+        }
+        Ok(self.others(logged))
+    }
+}
+
+/// What a vehicle decides by, besides the other vehicles.
+struct Scene<'a> {
+    config: &'a NuplanIdmConfig,
+    map: &'a MapGraph,
+    frame: &'a Frame,
+    /// The ego first, then what is replayed.
+    fixed: Vec<Obstacle>,
+}
+
+impl Scene<'_> {
+    /// Stop-line polygons of a lane whose light is red.
+    fn red_stop_lines(&self, lane: gump_scene::LaneId) -> impl Iterator<Item = &Polygon> {
+        let is_red = self.frame.light(lane).is_some_and(|l| l.state == LightState::Red);
+        let lines = is_red.then(|| self.map.stop_lines(lane));
+        lines.into_iter().flatten().map(|area| &area.polygon)
+    }
+}
+
+/// Something that no vehicle of this world steers.
+struct Obstacle {
+    footprint: Footprint,
+    heading: f64,
+    speed: f64,
+}
+
+/// Speeds of replayed things count as 0, as in nuPlan.
+fn fixed_obstacles(ego: &OrientedBox, ego_speed: f64, frame: &Frame) -> Vec<Obstacle> {
+    let obstacle = |shape: &OrientedBox, speed: f64| Obstacle {
+        footprint: Footprint::new(vec![Quad::from(shape)]),
+        heading: shape.pose.heading,
+        speed,
+    };
+    let replayed = frame.agents().iter().filter(|agent| is_replayed(agent));
+    let replayed = replayed.map(|agent| obstacle(&agent.oriented_box(), 0.0));
+    std::iter::once(obstacle(ego, ego_speed)).chain(replayed).collect()
+}
+
+/// True for what nuPlan replays in its reactive traffic: everyone on foot and everything static.
+fn is_replayed(agent: &Agent) -> bool {
+    !matches!(agent.kind, AgentKind::Vehicle | AgentKind::Bicycle)
+}
+
+/// True if the point lies in an intersection of the map.
+fn in_intersection(map: &MapGraph, point: gump_geometry::DVec2) -> bool {
+    map.areas_containing(point, AreaKind::Intersection).next().is_some()
+}
