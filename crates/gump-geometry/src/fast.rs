@@ -23,7 +23,9 @@ impl LineIndex {
         let bounds = |from: usize| {
             let chunk = &points[from..(from + CHUNK + 1).min(points.len())];
             let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-            chunk.iter().fold(none, |(min, max), &p| (min.min(p), max.max(p)))
+            chunk
+                .iter()
+                .fold(none, |(min, max), &p| (min.min(p), max.max(p)))
         };
         Self {
             chunks: (0..n_segments).step_by(CHUNK).map(bounds).collect(),
@@ -33,7 +35,10 @@ impl LineIndex {
     /// What [`Polyline::project`] answers for the line this was made of.
     pub fn project(&self, line: &Polyline, point: DVec2) -> Projection {
         let gap = |&(min, max): &(DVec2, DVec2)| {
-            (min - point).max(point - max).max(DVec2::ZERO).length_squared()
+            (min - point)
+                .max(point - max)
+                .max(DVec2::ZERO)
+                .length_squared()
         };
         let within = |chunk: usize| chunk * CHUNK..(chunk + 1) * CHUNK;
         let Some(nearest) = (0..self.chunks.len())

@@ -61,7 +61,8 @@ impl Quad {
     /// True if `point` is inside or on the border.
     pub fn contains(&self, point: DVec2) -> bool {
         let side = |(a, b): (DVec2, DVec2)| (b - a).perp_dot(point - a);
-        self.edges().map(side).all(|side| side >= 0.0) || self.edges().map(side).all(|side| side <= 0.0)
+        self.edges().map(side).all(|side| side >= 0.0)
+            || self.edges().map(side).all(|side| side <= 0.0)
     }
 
     /// Distance in metres, 0 if the shapes intersect.
@@ -149,7 +150,12 @@ pub fn widen(points: &[DVec2], half_width: f64, overhang: f64) -> Vec<Quad> {
         }
         let start = pair[0] - along * if before.is_none() { overhang } else { 0.0 };
         let end = pair[1] + along * if i == last { overhang } else { 0.0 };
-        pieces.push(Quad::new([start + side, end + side, end - side, start - side]));
+        pieces.push(Quad::new([
+            start + side,
+            end + side,
+            end - side,
+            start - side,
+        ]));
         before = Some(side);
     }
     pieces
@@ -204,7 +210,10 @@ mod tests {
 
     #[test]
     fn touching_is_intersecting() {
-        let (a, b) = (Quad::from(&car(0.0, 0.0, 0.0)), Quad::from(&car(4.0, 0.0, 0.0)));
+        let (a, b) = (
+            Quad::from(&car(0.0, 0.0, 0.0)),
+            Quad::from(&car(4.0, 0.0, 0.0)),
+        );
         assert!(a.intersects(&b) && a.contains(dvec2(2.0, 1.0)));
         assert!(!a.intersects(&Quad::from(&car(4.0 + 1e-9, 0.0, 0.0))));
     }
@@ -228,7 +237,9 @@ mod tests {
     fn a_wide_line_is_closed_on_the_outside_of_its_bends() {
         let points = [dvec2(0.0, 0.0), dvec2(10.0, 0.0), dvec2(10.0, 10.0)];
         let inside = |p: DVec2, overhang: f64| {
-            widen(&points, 1.0, overhang).iter().any(|piece| piece.contains(p))
+            widen(&points, 1.0, overhang)
+                .iter()
+                .any(|piece| piece.contains(p))
         };
         assert!(inside(dvec2(10.6, -0.6), 0.0) && !inside(dvec2(10.9, -0.9), 0.0));
         assert!(!inside(dvec2(-0.5, 0.0), 0.0) && inside(dvec2(-0.5, 0.0), 1.0));

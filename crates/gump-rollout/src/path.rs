@@ -188,7 +188,13 @@ mod tests {
     use serde_json::Value;
 
     fn rows(value: &Value) -> Vec<Vec<f64>> {
-        let row = |v: &Value| v.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
+        let row = |v: &Value| {
+            v.as_array()
+                .unwrap()
+                .iter()
+                .map(|x| x.as_f64().unwrap())
+                .collect()
+        };
         value.as_array().unwrap().iter().map(row).collect()
     }
 
@@ -217,7 +223,11 @@ mod tests {
         for row in rows(&golden["samples"]) {
             check(path.pose_at(row[0]), &row);
         }
-        for (key, from) in [("trim_10_20", 10.0), ("trim_upto_7_5", 7.5), ("trim_at_end", 1e3)] {
+        for (key, from) in [
+            ("trim_10_20", 10.0),
+            ("trim_upto_7_5", 7.5),
+            ("trim_at_end", 1e3),
+        ] {
             let expected = rows(&golden[key]);
             let found = path.poses_from(from);
             // The path is never cut at its far end here.
@@ -246,7 +256,10 @@ mod tests {
         let corner = lane("lane 1: 0,0 10,0 10,10\nego vehicle 0: 0,0");
         let (s, pose) = nearest_on_baseline(&corner, dvec2(9.75, 1.0));
         assert_eq!((s, pose.position.x), (11.0, 10.0));
-        assert_eq!(nearest_on_baseline(&corner, dvec2(9.75, 0.0)).1.heading, 0.25f64.atan2(0.25));
+        assert_eq!(
+            nearest_on_baseline(&corner, dvec2(9.75, 0.0)).1.heading,
+            0.25f64.atan2(0.25)
+        );
         let end = nearest_on_baseline(&corner, dvec2(10.0, 12.0)).1;
         assert_abs_diff_eq!(end.heading, std::f64::consts::FRAC_PI_2, epsilon = 1e-12);
     }

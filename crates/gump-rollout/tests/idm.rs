@@ -4,7 +4,7 @@
 
 use approx::assert_abs_diff_eq;
 use gump_geometry::{Pose, angle_difference, dvec2};
-use gump_rollout::worlds::{Idm, IdmConfig, idm_acceleration};
+use gump_rollout::worlds::{Idm, IdmConfig, idm_acceleration, idm_euler_step};
 use gump_rollout::{RolloutError, SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Agent, AgentId, AgentState, Frame, Rollout, Scenario, Seed, fixture};
 
@@ -303,42 +303,88 @@ fn parameters_are_checked() {
     assert_eq!(Idm::new(config).unwrap_err(), expected);
 }
 
+fn golden() -> serde_json::Value {
+    serde_json::from_str(include_str!("data/idm.json")).unwrap()
+}
+
+fn numbers(value: &serde_json::Value) -> Vec<f64> {
+    let list = value.as_array().unwrap().iter();
+    list.map(|v| v.as_f64().unwrap()).collect()
+}
+
+fn law(params: &[f64]) -> IdmConfig {
+    IdmConfig {
+        target_velocity: params[0],
+        min_gap: params[1],
+        headway: params[2],
+        max_acceleration: params[3],
+        max_deceleration: params[4],
+        ..IdmConfig::default()
+    }
+}
+
+fn check_step(config: &IdmConfig, state: (f64, f64), lead: &[f64], dt: f64, expected: &[f64]) {
+    let (gap, target) = (lead[0] - state.0 - lead[2], config.target_velocity);
+    let found = idm_euler_step(config, state, target, gap, lead[1], dt);
+    assert_abs_diff_eq!(found.0, expected[0], epsilon = 1e-9);
+    assert_abs_diff_eq!(found.1, expected[1], epsilon = 1e-9);
+}
+
 #[test]
 fn the_law_agrees_with_the_reference() {
-    let file = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../../../shared/golden/nuplan/idm.json"
-    );
-    let Ok(text) = std::fs::read_to_string(file) else {
-        eprintln!("SKIPPED: {file} is not here");
-        return;
-    };
-    let golden: serde_json::Value = serde_json::from_str(&text).unwrap();
-    let numbers = |value: &serde_json::Value| -> Vec<f64> {
-        value
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|v| v.as_f64().unwrap())
-            .collect()
-    };
-    let steps = golden["steps"].as_array().unwrap();
-    assert!(!steps.is_empty());
+    let steps = golden()["steps"].as_array().unwrap().clone();
+    assert_eq!(steps.len(), 40);
     for step in steps {
         let params = numbers(&step["params"]);
-        let config = IdmConfig {
-            target_velocity: params[0],
-            min_gap: params[1],
-            headway: params[2],
-            max_acceleration: params[3],
-            max_deceleration: params[4],
-            ..IdmConfig::default()
-        };
+        let config = law(&params);
         let (agent, lead) = (numbers(&step["agent"]), numbers(&step["lead"]));
         let gap = lead[0] - agent[0] - lead[2];
         let found = idm_acceleration(&config, agent[1], params[0], gap, lead[1]);
         let expected = numbers(&step["model"])[1];
         assert_abs_diff_eq!(found, expected, epsilon = 1e-6 * expected.abs().max(1.0));
+        let dt = step["dt"].as_f64().unwrap();
+        let state = (agent[0], agent[1]);
+        check_step(&config, state, &lead, dt, &numbers(&step["euler"]));
+    }
+}
+
+#[test]
+fn following_for_fifteen_seconds_agrees_with_the_reference() {
+    let golden = &golden()["follow_rollout"];
+    let number = |key: &str| golden[key].as_f64().unwrap();
+    let config = law(&numbers(&golden["params"]));
+    let (mut state, mut lead) = ((0.0, number("v0")), number("lead_gap0"));
+    let dt = number("dt");
+    for row in golden["out"].as_array().unwrap() {
+        let gap = lead - state.0;
+        let target = config.target_velocity;
+        state = idm_euler_step(&config, state, target, gap, number("lead_v"), dt);
+        lead += number("lead_v") * dt;
+        let expected = numbers(row);
+        assert_abs_diff_eq!(state.0, expected[0], epsilon = 1e-6);
+        assert_abs_diff_eq!(state.1, expected[1], epsilon = 1e-6);
+    }
+}
+
+#[test]
+fn the_planners_exponent_agrees_with_the_reference() {
+    for batch in golden()["batch_idm_pdm"].as_array().unwrap() {
+        let limit = batch["speed_limit"].as_f64().unwrap_or(15.0);
+        for i in 0..5 {
+            let config = IdmConfig {
+                target_velocity: limit * 0.2 * (i + 1) as f64,
+                min_gap: 1.0,
+                headway: 1.5,
+                max_acceleration: 1.5,
+                max_deceleration: 3.0,
+                exponent: 10.0,
+                ..IdmConfig::default()
+            };
+            let row = |key: &str| numbers(&batch[key][i]);
+            let state = (row("prev")[0], row("prev")[1]);
+            check_step(&config, state, &row("lead"), 0.1, &row("out"));
+            check_step(&config, state, &[0.0; 3], 0.1, &row("zero_lead_out"));
+        }
     }
 }
 

@@ -86,12 +86,20 @@ fn the_tracked_vehicle_agrees_step_by_step() {
             ];
             for (field, (found, expected)) in found.iter().zip(&state[1..]).enumerate() {
                 let off = (found - expected).abs();
-                assert!(off < 1e-7, "{} step {i} field {field}: off by {off}", run["kind"]);
+                assert!(
+                    off < 1e-7,
+                    "{} step {i} field {field}: off by {off}",
+                    run["kind"]
+                );
             }
             n_steps += 1;
         }
         let profile = tracker.profile();
-        check_profile(&profile.speeds, &run["velocity_profile"], &run["acceleration_profile"]);
+        check_profile(
+            &profile.speeds,
+            &run["velocity_profile"],
+            &run["acceleration_profile"],
+        );
         check_profile(
             &profile.curvatures,
             &run["curvature_profile"],

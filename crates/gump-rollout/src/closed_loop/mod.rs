@@ -81,7 +81,9 @@ pub fn drive(
             what: error.to_string(),
         }
     };
-    let first = traffic.begin(recording).map_err(failed(0, traffic.name()))?;
+    let first = traffic
+        .begin(recording)
+        .map_err(failed(0, traffic.name()))?;
     let mut ego = *recording.ego_at(0);
     let mut rollout = begin(recording, &ego, first);
     driver
@@ -98,7 +100,9 @@ pub fn drive(
             ego: &ego,
             past: &states,
         };
-        let plan = driver.drive(&moment).map_err(failed(iteration, driver.name()))?;
+        let plan = driver
+            .drive(&moment)
+            .map_err(failed(iteration, driver.name()))?;
         states.push(ego);
         if iteration + 1 < n {
             let next = controller
@@ -112,7 +116,9 @@ pub fn drive(
                 plan: &plan,
                 scene: rollout.last(),
             };
-            let others = traffic.advance(&step).map_err(failed(iteration, traffic.name()))?;
+            let others = traffic
+                .advance(&step)
+                .map_err(failed(iteration, traffic.name()))?;
             rollout.push(frame(recording, &next, others));
             ego = next;
         }

@@ -30,13 +30,17 @@ impl Recording {
         let wrong = |what: String| Err(RolloutError::Recording(what));
         if ego.len() != scenario.log.len() {
             let (frames, states) = (scenario.log.len(), ego.len());
-            return wrong(format!("has {frames} frames but {states} states of the ego"));
+            return wrong(format!(
+                "has {frames} frames but {states} states of the ego"
+            ));
         }
         if let Some(i) = ego.windows(2).position(|p| p[1].time_us <= p[0].time_us) {
             return wrong(format!("frame {} is not later than the one before", i + 1));
         }
         if !ego.iter().all(EgoState::is_finite) {
-            return Err(RolloutError::NotFinite { who: "the recording" });
+            return Err(RolloutError::NotFinite {
+                who: "the recording",
+            });
         }
         Ok(Self {
             scenario,
@@ -57,11 +61,20 @@ impl Recording {
     pub fn of_boxes(mut scenario: Scenario) -> Result<Self, RolloutError> {
         let id = scenario.ego;
         let Some(car) = scenario.log[scenario.now].agent(id).copied() else {
-            return Err(RolloutError::Recording(format!("lacks its ego (agent {id}) now")));
+            return Err(RolloutError::Recording(format!(
+                "lacks its ego (agent {id}) now"
+            )));
         };
         let has_ego = |frame: &gump_scene::Frame| frame.agent(id).is_some();
-        let before = scenario.log[..scenario.now].iter().rev().take_while(|f| has_ego(f)).count();
-        let after = scenario.log[scenario.now..].iter().take_while(|f| has_ego(f)).count();
+        let before = scenario.log[..scenario.now]
+            .iter()
+            .rev()
+            .take_while(|f| has_ego(f))
+            .count();
+        let after = scenario.log[scenario.now..]
+            .iter()
+            .take_while(|f| has_ego(f))
+            .count();
         scenario.log.truncate(scenario.now + after);
         scenario.log.drain(..scenario.now - before);
         scenario.now = before;
@@ -131,7 +144,9 @@ impl Recording {
     /// The ego as others see it.
     pub fn ego_agent(&self, state: &EgoState) -> Agent {
         let present = &self.scenario.log[self.scenario.now];
-        let agent = present.agent(self.scenario.ego).expect("the ego is present now");
+        let agent = present
+            .agent(self.scenario.ego)
+            .expect("the ego is present now");
         agent.with_state(state.agent_state(&self.vehicle))
     }
 }
@@ -173,7 +188,9 @@ fn ego_states(scenario: &Scenario, vehicle: &VehicleParameters) -> Vec<EgoState>
                 velocity: gump_geometry::dvec2(speed, 0.0),
                 acceleration: gump_geometry::dvec2((speed_at(b) - speed_at(a)) / elapsed, 0.0),
                 steering_angle: if speed.abs() > 0.5 {
-                    (yaw_rate * vehicle.wheel_base / speed).atan().clamp(-1.0, 1.0)
+                    (yaw_rate * vehicle.wheel_base / speed)
+                        .atan()
+                        .clamp(-1.0, 1.0)
                 } else {
                     0.0
                 },

@@ -159,7 +159,12 @@ fn advance(mut session: Box<dyn Session + '_>, ego: &AgentState) -> Result<Frame
     let found = frames.len();
     frames.into_iter().next().ok_or_else(|| {
         let (who, expected) = ("the world", 1);
-        crate::RolloutError::Count { who, expected, found }.into()
+        crate::RolloutError::Count {
+            who,
+            expected,
+            found,
+        }
+        .into()
     })
 }
 

@@ -63,7 +63,11 @@ impl ProfileFit {
     /// If the reference has another number of poses.
     pub fn fit(&mut self, poses: &[Pose], profile: &mut Profile) {
         let n = self.n();
-        assert_eq!(poses.len(), n + 1, "a reference has one pose more than displacements");
+        assert_eq!(
+            poses.len(),
+            n + 1,
+            "a reference has one pose more than displacements"
+        );
         profile.speeds.clear();
         profile.speeds.extend(poses.windows(2).map(|pair| {
             let moved = pair[1].position - pair[0].position;
@@ -231,7 +235,11 @@ mod tests {
         let poses: Vec<Pose> = (0..=20)
             .map(|i| {
                 let angle = speed * curvature * dt * f64::from(i);
-                Pose::new(angle.sin() / curvature, (1.0 - angle.cos()) / curvature, angle)
+                Pose::new(
+                    angle.sin() / curvature,
+                    (1.0 - angle.cos()) / curvature,
+                    angle,
+                )
             })
             .collect();
         let mut profile = Profile::default();

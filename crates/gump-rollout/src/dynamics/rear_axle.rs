@@ -30,12 +30,7 @@ pub struct Controls {
 /// first-order lags. The speed may fall below zero.
 ///
 /// Source: nuPlan's kinematic bicycle model (agrees with its goldens to rounding).
-pub fn propagate(
-    state: &EgoState,
-    controls: &Controls,
-    wheel_base: f64,
-    time_us: i64,
-) -> EgoState {
+pub fn propagate(state: &EgoState, controls: &Controls, wheel_base: f64, time_us: i64) -> EgoState {
     let dt = (time_us - state.time_us) as f64 * 1e-6;
     propagate_by(state, controls, wheel_base, dt, time_us)
 }
@@ -53,11 +48,9 @@ pub fn propagate_by(
     let acceleration = state.acceleration.x
         + dt / (dt + ACCELERATION_LAG) * (controls.acceleration - state.acceleration.x);
     let steering_rate = controls.steering_rate * dt / (dt + STEERING_LAG);
-    let heading =
-        wrap_angle(pose.heading + speed * state.steering_angle.tan() / wheel_base * dt);
+    let heading = wrap_angle(pose.heading + speed * state.steering_angle.tan() / wheel_base * dt);
     let next_speed = speed + acceleration * dt;
-    let steering =
-        (state.steering_angle + steering_rate * dt).clamp(-MAX_STEERING, MAX_STEERING);
+    let steering = (state.steering_angle + steering_rate * dt).clamp(-MAX_STEERING, MAX_STEERING);
     let yaw_rate = next_speed * steering.tan() / wheel_base;
     EgoState {
         time_us,

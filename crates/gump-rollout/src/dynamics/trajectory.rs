@@ -74,7 +74,9 @@ impl Trajectory {
     /// As [`Trajectory::at`].
     pub fn pose_at(&self, time_us: i64) -> Result<Pose, RolloutError> {
         let (i, t) = self.locate(time_us)?;
-        Ok(self.states[i].rear_axle.interpolate(self.states[i + 1].rear_axle, t))
+        Ok(self.states[i]
+            .rear_axle
+            .interpolate(self.states[i + 1].rear_axle, t))
     }
 
     /// The segment that holds a time and the fraction along it.
@@ -87,7 +89,9 @@ impl Trajectory {
                 end_us,
             });
         }
-        let after = self.states.partition_point(|state| state.time_us <= time_us);
+        let after = self
+            .states
+            .partition_point(|state| state.time_us <= time_us);
         let i = (after - 1).min(self.states.len() - 2);
         let (a, b) = (self.states[i].time_us, self.states[i + 1].time_us);
         Ok((i, (time_us - a) as f64 / (b - a) as f64))

@@ -23,6 +23,23 @@ pub fn idm_acceleration(
     config.max_acceleration * (1.0 - free - interaction * interaction)
 }
 
+/// Progress and speed after one forward Euler step of `dt` seconds behind a lead `gap` metres
+/// ahead, the acceleration limited to what the law calls comfortable; the speed may turn negative.
+///
+/// Source: the policy of nuPlan's reactive agents and planners, and PDM's with another exponent.
+pub fn idm_euler_step(
+    config: &IdmConfig,
+    (progress, speed): (f64, f64),
+    desired_speed: f64,
+    gap: f64,
+    lead_speed: f64,
+    dt: f64,
+) -> (f64, f64) {
+    let acceleration = idm_acceleration(config, speed, desired_speed, gap, lead_speed)
+        .clamp(-config.max_deceleration, config.max_acceleration);
+    (progress + speed * dt, speed + acceleration * dt)
+}
+
 /// The gap the driver would like to keep, metres.
 pub(super) fn desired_gap(config: &IdmConfig, speed: f64, lead_speed: f64) -> f64 {
     config.min_gap

@@ -13,7 +13,7 @@ mod path;
 mod road;
 mod traffic;
 
-pub use law::idm_acceleration;
+pub use law::{idm_acceleration, idm_euler_step};
 
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -8,7 +8,7 @@ use gump_scene::{Agent, AgentState, Lane, LaneId, LightState, MapGraph};
 use super::corridor::{Corridor, Footprint};
 use super::{Scene, in_intersection};
 use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
-use crate::worlds::idm_acceleration;
+use crate::worlds::idm_euler_step;
 
 /// Lanes of the way that a vehicle remembers.
 const REMEMBERED_LANES: usize = 5;
@@ -106,11 +106,10 @@ impl Vehicle {
             self.target_speed = limit;
         }
         let law = &scene.config.law;
-        let acceleration =
-            idm_acceleration(law, self.speed, self.target_speed, lead.gap, lead.speed)
-                .clamp(-law.max_deceleration, law.max_acceleration);
-        self.progress += self.speed * dt;
-        self.speed = (self.speed + acceleration * dt).max(0.0);
+        let now = (self.progress, self.speed);
+        let (progress, speed) =
+            idm_euler_step(law, now, self.target_speed, lead.gap, lead.speed, dt);
+        (self.progress, self.speed) = (progress, speed.max(0.0));
         self.place(self.corridor.path().pose_at(self.progress));
         self.sweep(law.headway);
     }
@@ -128,7 +127,10 @@ impl Vehicle {
         let own = Quad::from(&self.agent.oriented_box());
         self.footprint.pieces.clear();
         self.footprint.pieces.push(own);
-        let (from, to) = (self.progress - half, self.progress + half + self.speed * headway);
+        let (from, to) = (
+            self.progress - half,
+            self.progress + half + self.speed * headway,
+        );
         self.corridor.pieces(from, to, &mut self.footprint.pieces);
         self.footprint.measure();
     }
@@ -196,7 +198,11 @@ impl Vehicle {
                 consider(distance, other.speed * along(other.pose().heading));
             }
         }
-        for line in self.lanes.iter().flat_map(|&lane| scene.red_stop_lines(lane)) {
+        for line in self
+            .lanes
+            .iter()
+            .flat_map(|&lane| scene.red_stop_lines(lane))
+        {
             if self.reaches(line, bounds) {
                 consider(self.footprint.distance_to_polygon(line), 0.0);
             }
@@ -210,13 +216,18 @@ impl Vehicle {
         }
     }
 
-    fn reaches(&self, polygon: &Polygon, bounds: (gump_geometry::DVec2, gump_geometry::DVec2)) -> bool {
+    fn reaches(
+        &self,
+        polygon: &Polygon,
+        bounds: (gump_geometry::DVec2, gump_geometry::DVec2),
+    ) -> bool {
         let (min, max) = polygon.bounds();
         if min.cmpgt(bounds.1).any() || max.cmplt(bounds.0).any() {
             return false;
         }
         let mut pieces = Vec::new();
-        self.corridor.pieces(self.progress, f64::INFINITY, &mut pieces);
+        self.corridor
+            .pieces(self.progress, f64::INFINITY, &mut pieces);
         pieces.iter().any(|piece| piece.intersects_polygon(polygon))
     }
 }

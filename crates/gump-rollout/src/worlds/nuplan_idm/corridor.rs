@@ -1,6 +1,6 @@
 //! The strip of road that a vehicle is going to sweep, cut into convex pieces.
 
-use gump_geometry::{DVec2, Polygon, Pose, Quad, joint};
+use gump_geometry::{DVec2, Polygon, Quad, joint};
 
 use crate::Path;
 
@@ -156,7 +156,10 @@ impl Footprint {
     }
 
     pub(super) fn distance_to_polygon(&self, polygon: &Polygon) -> f64 {
-        let distances = self.pieces.iter().map(|own| own.distance_to_polygon(polygon));
+        let distances = self
+            .pieces
+            .iter()
+            .map(|own| own.distance_to_polygon(polygon));
         distances.fold(f64::INFINITY, f64::min)
     }
 }
@@ -165,7 +168,7 @@ impl Footprint {
 mod tests {
     use super::*;
     use approx::assert_abs_diff_eq;
-    use gump_geometry::{dvec2, widen};
+    use gump_geometry::{Pose, dvec2, widen};
 
     fn bend() -> Corridor {
         let poses: Vec<Pose> = (0..=16)
@@ -186,7 +189,11 @@ mod tests {
         assert_eq!(pieces.len(), expected.len());
         for (found, expected) in pieces.iter().zip(&expected) {
             assert_abs_diff_eq!(found.distance(expected), 0.0);
-            assert_abs_diff_eq!(found.center().distance(expected.center()), 0.0, epsilon = 1e-9);
+            assert_abs_diff_eq!(
+                found.center().distance(expected.center()),
+                0.0,
+                epsilon = 1e-9
+            );
         }
         let bounds = corridor.bounds_from(0.0);
         assert!(Footprint::new(pieces).is_within(bounds));
@@ -194,13 +201,18 @@ mod tests {
 
     #[test]
     fn ends_are_cut_where_asked() {
-        let poses = [Pose::new(0.0, 0.0, 0.0), Pose::new(10.0, 0.0, 0.0), Pose::new(30.0, 0.0, 0.0)];
+        let poses = [
+            Pose::new(0.0, 0.0, 0.0),
+            Pose::new(10.0, 0.0, 0.0),
+            Pose::new(30.0, 0.0, 0.0),
+        ];
         let corridor = Corridor::new(Path::through(&poses).unwrap(), 1.0);
         let check = |from: f64, to: f64, expected: Option<(f64, f64)>| {
             let mut pieces = Vec::new();
             corridor.pieces(from, to, &mut pieces);
             let footprint = Footprint::new(pieces);
-            let found = (!footprint.pieces.is_empty()).then_some((footprint.min.x, footprint.max.x));
+            let found =
+                (!footprint.pieces.is_empty()).then_some((footprint.min.x, footprint.max.x));
             assert_eq!(found, expected);
         };
         check(2.0, 8.0, Some((2.0, 8.0)));
@@ -213,7 +225,11 @@ mod tests {
     #[test]
     fn footprints_measure_their_gap() {
         let at = |x: f64| {
-            Footprint::new(widen(&[dvec2(x, 0.0), dvec2(x + 2.0, 0.0), dvec2(x + 4.0, 0.0)], 1.0, 0.0))
+            Footprint::new(widen(
+                &[dvec2(x, 0.0), dvec2(x + 2.0, 0.0), dvec2(x + 4.0, 0.0)],
+                1.0,
+                0.0,
+            ))
         };
         assert_eq!(at(0.0).distance(&at(7.0)), 3.0);
         assert_eq!(at(0.0).distance(&at(4.0)), 0.0);

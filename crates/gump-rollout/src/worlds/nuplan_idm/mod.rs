@@ -96,7 +96,12 @@ impl NuplanIdm {
     fn others(&self, logged: &Frame) -> Others {
         let replayed = logged.agents().iter().filter(|agent| is_replayed(agent));
         Others {
-            agents: self.vehicles.iter().map(Vehicle::agent).chain(replayed.copied()).collect(),
+            agents: self
+                .vehicles
+                .iter()
+                .map(Vehicle::agent)
+                .chain(replayed.copied())
+                .collect(),
             lights: logged.lights().to_vec(),
         }
     }
@@ -172,7 +177,10 @@ struct Scene<'a> {
 impl Scene<'_> {
     /// Stop-line polygons of a lane whose light is red.
     fn red_stop_lines(&self, lane: gump_scene::LaneId) -> impl Iterator<Item = &Polygon> {
-        let is_red = self.frame.light(lane).is_some_and(|l| l.state == LightState::Red);
+        let is_red = self
+            .frame
+            .light(lane)
+            .is_some_and(|l| l.state == LightState::Red);
         let lines = is_red.then(|| self.map.stop_lines(lane));
         lines.into_iter().flatten().map(|area| &area.polygon)
     }
@@ -194,7 +202,9 @@ fn fixed_obstacles(ego: &OrientedBox, ego_speed: f64, frame: &Frame) -> Vec<Obst
     };
     let replayed = frame.agents().iter().filter(|agent| is_replayed(agent));
     let replayed = replayed.map(|agent| obstacle(&agent.oriented_box(), 0.0));
-    std::iter::once(obstacle(ego, ego_speed)).chain(replayed).collect()
+    std::iter::once(obstacle(ego, ego_speed))
+        .chain(replayed)
+        .collect()
 }
 
 /// True for what nuPlan replays in its reactive traffic: everyone on foot and everything static.
@@ -204,5 +214,7 @@ fn is_replayed(agent: &Agent) -> bool {
 
 /// True if the point lies in an intersection of the map.
 fn in_intersection(map: &MapGraph, point: gump_geometry::DVec2) -> bool {
-    map.areas_containing(point, AreaKind::Intersection).next().is_some()
+    map.areas_containing(point, AreaKind::Intersection)
+        .next()
+        .is_some()
 }
