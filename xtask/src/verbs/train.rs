@@ -39,7 +39,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     validation: Option<PathBuf>,
     /// Weights to go on from, with a fresh optimiser and schedule
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["resume", "model"])]
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// The size of the model: tiny, small, base or medium [default: tiny]
     #[arg(long, value_name = "NAME")]
@@ -74,6 +74,13 @@ impl Args {
             trainer
         } else if let Some(weights) = &self.from {
             let network = checkpoint::load(weights, &Device::Cpu)?;
+            if *network.config() != config.model()? {
+                let wrong = format!(
+                    "{} holds another model than the configuration",
+                    weights.display()
+                );
+                return Err(WrongArguments(wrong).into());
+            }
             run.phase("drive", |_| {
                 let trainer = Trainer::continuing(network, config.train.clone(), training);
                 trainer.map_err(anyhow::Error::from)
