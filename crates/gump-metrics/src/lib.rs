@@ -21,6 +21,7 @@
 //! assert_eq!(summarize(&[rollout], Some(&scenario)).total().collision_rate(), Some(1.0));
 //! ```
 
+mod bootstrap;
 mod collision;
 mod comfort;
 mod displacement;
@@ -35,7 +36,9 @@ mod red_light;
 mod reward;
 mod road_edge;
 mod summary;
+pub mod wosac;
 
+pub use bootstrap::{Interval, interval};
 pub use collision::{Collision, overlapping};
 pub use comfort::{ComfortBounds, Discomfort, Felt};
 pub use displacement::{Displacement, average_displacement};

@@ -1,0 +1,130 @@
+//! What lowered a score: which component, which agent, when.
+
+use gump_scene::{AgentId, AgentKind};
+
+use super::config::Component;
+use super::reference::Evaluation;
+
+/// What one agent costs in one component.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Blame {
+    /// The component.
+    pub component: Component,
+    /// The agent.
+    pub agent: AgentId,
+    /// What it is.
+    pub kind: AgentKind,
+    /// Its part in what the meta metric lacks: the weight that the component does not earn, split
+    /// by log-likelihood. The costs of all agents and components and the meta metric make up the
+    /// sum of the weights.
+    pub cost: f64,
+    /// Geometric mean of the likelihoods of its logged values, 0 to 1.
+    pub likelihood: f64,
+    /// The scored step that is least likely, from 0; of an indication the first at which it holds,
+    /// in the log or, if never there, in any rollout. `None` if it holds nowhere.
+    pub step: Option<usize>,
+    /// The logged value at that step, in the unit of the component; of an indication whether it
+    /// ever holds, as 0 or 1.
+    pub logged: f64,
+    /// The mean of the rollouts at that step; of an indication the share in which it ever holds.
+    pub imagined: f64,
+}
+
+impl Evaluation<'_> {
+    /// What each agent costs in each component, dearest first; what costs nothing is left out.
+    pub fn explain(&self) -> Vec<Blame> {
+        let config = self.reference.config;
+        let mut blames: Vec<Blame> = config
+            .components()
+            .flat_map(|(component, feature)| {
+                let weight = f64::from(feature.weight);
+                self.blames(component).into_iter().map(move |blame| Blame {
+                    cost: blame.cost * weight,
+                    ..blame
+                })
+            })
+            .filter(|blame| blame.cost > 0.0)
+            .collect();
+        blames.sort_by(|a, b| b.cost.total_cmp(&a.cost));
+        blames
+    }
+
+    /// Costs in terms of the component's own likelihood.
+    fn blames(&self, component: Component) -> Vec<Blame> {
+        let features = self.reference.features();
+        let found = &self.log_likelihoods[&component];
+        let (n_steps, mask) = if component.is_indication() {
+            (1, vec![true; found.len()])
+        } else {
+            (features.n_steps, self.reference.mask(component))
+        };
+        let counted = mask.iter().filter(|&&counts| counts).count() as f64;
+        let sum_over = |agents: std::ops::Range<usize>| {
+            let steps = agents.start * n_steps..agents.end * n_steps;
+            let values = steps.clone().filter(|&i| mask[i]);
+            let n = values.clone().count() as f64;
+            (values.map(|i| f64::from(found[i])).sum::<f64>(), n)
+        };
+        let (total, _) = sum_over(0..features.agents.len());
+        let likelihood = (total / counted).exp();
+        (0..features.agents.len())
+            .filter_map(|agent| {
+                let (own, n) = sum_over(agent..agent + 1);
+                if n == 0.0 {
+                    return None;
+                }
+                let (step, logged, imagined) = if component.is_indication() {
+                    self.when_indicated(component, agent)
+                } else {
+                    let steps = (agent * n_steps..(agent + 1) * n_steps).filter(|&i| mask[i]);
+                    let worst = steps.min_by(|&a, &b| found[a].total_cmp(&found[b]))?;
+                    let imagined = self.imagined.iter().map(|f| f.values(component)[worst]);
+                    let logged = features.values(component)[worst];
+                    (Some(worst % n_steps), f64::from(logged), mean(imagined))
+                };
+                Some(Blame {
+                    component,
+                    agent: features.agents[agent],
+                    kind: features.kinds[agent],
+                    cost: if own == 0.0 {
+                        0.0
+                    } else {
+                        (1.0 - likelihood) * own / total
+                    },
+                    likelihood: (own / n).exp(),
+                    step,
+                    logged,
+                    imagined,
+                })
+            })
+            .collect()
+    }
+
+    /// When an indication first holds, whether it does in the log, and in which share of rollouts.
+    fn when_indicated(&self, component: Component, agent: usize) -> (Option<usize>, f64, f64) {
+        let vehicles_only = component == Component::TrafficLightViolation;
+        let first = |features| {
+            let holds = self.reference.indicated(features, component, vehicles_only);
+            let n_steps = holds.len() / self.reference.features().agents.len();
+            holds[agent * n_steps..][..n_steps]
+                .iter()
+                .position(|&holds| holds)
+        };
+        let logged = first(self.reference.features());
+        let imagined: Vec<_> = self.imagined.iter().map(first).collect();
+        let step = logged.or_else(|| imagined.iter().flatten().min().copied());
+        let share = mean(
+            imagined
+                .iter()
+                .map(|step| f32::from(u8::from(step.is_some()))),
+        );
+        (step, f64::from(u8::from(logged.is_some())), share)
+    }
+}
+
+/// The mean of those that are numbers.
+fn mean(values: impl Iterator<Item = f32>) -> f64 {
+    let values = values.filter(|value| !value.is_nan());
+    let (sum, n) = values.fold((0.0, 0.0), |(sum, n), v| (sum + f64::from(v), n + 1.0));
+    sum / n
+}

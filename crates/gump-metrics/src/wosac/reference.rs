@@ -1,0 +1,303 @@
+//! Comparing rollouts with the log.
+
+use std::collections::BTreeMap;
+
+use gump_scene::{AgentId, AgentKind};
+use rayon::prelude::*;
+
+use super::WosacError;
+use super::assemble::{self, Traffic};
+use super::config::{Algorithm, Component, Config, Mode};
+use super::estimate::{Shape, log_likelihoods};
+use super::features::{Features, Surroundings, measure};
+use super::input::{Log, N_HISTORY, Rollouts, Track};
+use super::kinematics::{Differences, validity};
+use super::lights::Lights;
+use super::road_edge::RoadEdges;
+use super::scores::{Scores, rounded};
+
+/// What rollouts of `log` score under `config`.
+///
+/// # Errors
+/// Those of [`Reference::new`] and [`Reference::evaluate`].
+pub fn score(log: &Log, rollouts: &Rollouts, config: &Config) -> Result<Scores, WosacError> {
+    Ok(Reference::new(log, config)?.evaluate(rollouts)?.scores)
+}
+
+/// A log prepared for comparing any number of worlds with it.
+pub struct Reference<'a> {
+    pub(crate) config: &'a Config,
+    scenario: &'a str,
+    simulated: Vec<&'a Track>,
+    scored: Vec<usize>,
+    surroundings: Surroundings,
+    features: Features,
+    /// Logged validity of the scored agents, `[agent, step]`; of their speeds, accelerations.
+    valid: Vec<bool>,
+    speed_valid: Vec<bool>,
+    acceleration_valid: Vec<bool>,
+}
+
+impl<'a> Reference<'a> {
+    /// Checks and measures a log.
+    ///
+    /// # Errors
+    /// A log that the metric is not defined on: tracks of other lengths, roles without a track,
+    /// scored agents that are absent at the present step, a map without road edges, numbers that
+    /// are none.
+    pub fn new(log: &'a Log, config: &'a Config) -> Result<Self, WosacError> {
+        let (simulated, scored) = assemble::roles(log, config.mode)?;
+        let surroundings = Surroundings {
+            edges: RoadEdges::new(&log.road_edges, config.algorithm),
+            lights: config
+                .traffic_light_violation
+                .and_then(|_| Lights::new(log)),
+        };
+        let ids: Vec<AgentId> = scored.iter().map(|&i| simulated[i].id).collect();
+        let first = first_step(config.mode);
+        let traffic = Traffic::logged(&simulated, config);
+        let algorithm = config.algorithm;
+        let features = measure(&traffic, &ids, &scored, first, &surroundings, algorithm);
+        let mut reference = Self {
+            config,
+            scenario: &log.scenario,
+            valid: Vec::new(),
+            speed_valid: Vec::new(),
+            acceleration_valid: Vec::new(),
+            simulated,
+            scored,
+            surroundings,
+            features,
+        };
+        for &agent in &reference.scored {
+            let states = &reference.simulated[agent].states[first..];
+            let valid: Vec<bool> = states.iter().map(|state| state.valid).collect();
+            let (speed, acceleration) = validity(&valid, Differences::from(algorithm));
+            reference.valid.extend(valid);
+            reference.speed_valid.extend(speed);
+            reference.acceleration_valid.extend(acceleration);
+        }
+        Ok(reference)
+    }
+
+    /// Features of the log.
+    pub fn features(&self) -> &Features {
+        &self.features
+    }
+
+    /// Agents that every rollout must have.
+    pub fn simulated(&self) -> impl Iterator<Item = AgentId> {
+        self.simulated.iter().map(|track| track.id)
+    }
+
+    /// Compares rollouts with the log, in parallel over rollouts; the number of threads changes
+    /// nothing.
+    ///
+    /// # Errors
+    /// Rollouts that do not fit: another scenario, no rollouts, agents missing, unknown or twice,
+    /// wrong lengths, numbers that are none.
+    pub fn evaluate(&self, rollouts: &Rollouts) -> Result<Evaluation<'_>, WosacError> {
+        let mode = self.config.mode;
+        assemble::check_rollouts(self.scenario, &self.simulated, rollouts, mode)?;
+        let ids = &self.features.agents;
+        let measured = rollouts.futures.par_iter().map(|future| {
+            let traffic = Traffic::imagined(&self.simulated, future, mode);
+            let features = measure(
+                &traffic,
+                ids,
+                &self.scored,
+                first_step(mode),
+                &self.surroundings,
+                self.config.algorithm,
+            );
+            (features, self.displacements(&traffic))
+        });
+        let (imagined, displacements) = measured.unzip();
+        Ok(Evaluation::new(
+            self,
+            imagined,
+            displacements,
+            rollouts.copies,
+        ))
+    }
+
+    /// Mean distance of each scored agent from its log, metres.
+    fn displacements(&self, traffic: &Traffic) -> Vec<f32> {
+        let of = |&agent: &usize| {
+            let (mut sum, mut n) = (0.0f32, 0.0f32);
+            let pairs = traffic
+                .states(agent)
+                .iter()
+                .zip(&self.simulated[agent].states);
+            for (state, logged) in pairs.filter(|(_, logged)| logged.valid) {
+                let off: [f32; 3] = std::array::from_fn(|i| state.position[i] - logged.position[i]);
+                sum += (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]).sqrt();
+                n += 1.0;
+            }
+            sum / n
+        };
+        self.scored.iter().map(of).collect()
+    }
+
+    /// Which logged values of a component count, `[agent, step]`.
+    pub(crate) fn mask(&self, component: Component) -> Vec<bool> {
+        let n_steps = self.features.n_steps;
+        let kinds = &self.features.kinds;
+        let vehicles = || {
+            let valid = self.valid.iter().enumerate();
+            valid.map(|(i, &valid)| valid && kinds[i / n_steps] == AgentKind::Vehicle)
+        };
+        match component {
+            Component::LinearSpeed | Component::AngularSpeed => self.speed_valid.clone(),
+            Component::LinearAcceleration | Component::AngularAcceleration => {
+                self.acceleration_valid.clone()
+            }
+            Component::TimeToCollision if self.config.algorithm == Algorithm::V2025 => {
+                vehicles().collect()
+            }
+            _ => self.valid.clone(),
+        }
+    }
+
+    /// At which steps an indication of these features counts, `[agent, step]`.
+    pub(crate) fn indicated(
+        &self,
+        features: &Features,
+        component: Component,
+        vehicles_only: bool,
+    ) -> Vec<bool> {
+        let everything = self.config.algorithm == Algorithm::V2023V0;
+        let mut holds = features.holds(component);
+        for (i, holds) in holds.iter_mut().enumerate() {
+            let kind = features.kinds[i / features.n_steps];
+            *holds &= everything || self.valid[i];
+            *holds &= !vehicles_only || kind == AgentKind::Vehicle;
+        }
+        holds
+    }
+
+    /// Whether each scored agent ever has an indication, as 0 or 1.
+    pub(crate) fn ever(
+        &self,
+        features: &Features,
+        component: Component,
+        vehicles_only: bool,
+    ) -> Vec<f32> {
+        let indicated = self.indicated(features, component, vehicles_only);
+        let agents = indicated.chunks(features.n_steps);
+        agents
+            .map(|steps| f32::from(u8::from(steps.contains(&true))))
+            .collect()
+    }
+}
+
+/// The first scored step.
+fn first_step(mode: Mode) -> usize {
+    match mode {
+        Mode::SimAgents => N_HISTORY,
+        Mode::Generation => 0,
+    }
+}
+
+/// What comparing rollouts with a log found.
+pub struct Evaluation<'a> {
+    /// The scores.
+    pub scores: Scores,
+    /// Features of each rollout; equal ones once.
+    pub imagined: Vec<Features>,
+    /// Mean distance of each scored agent from its log, metres, `[rollout][agent]`; see
+    /// [`Scores::ade`].
+    pub displacements: Vec<Vec<f32>>,
+    pub(crate) reference: &'a Reference<'a>,
+    pub(crate) log_likelihoods: BTreeMap<Component, Vec<f32>>,
+}
+
+impl<'a> Evaluation<'a> {
+    fn new(
+        reference: &'a Reference<'a>,
+        imagined: Vec<Features>,
+        displacements: Vec<Vec<f32>>,
+        copies: usize,
+    ) -> Self {
+        let config = reference.config;
+        let log = &reference.features;
+        let mut likelihoods = BTreeMap::new();
+        for (component, feature) in config.components() {
+            let shape = |steps| Shape {
+                agents: log.agents.len(),
+                steps,
+            };
+            let found = if component.is_indication() {
+                let vehicles_only = component == Component::TrafficLightViolation;
+                let ever = |f: &Features| reference.ever(f, component, vehicles_only);
+                let imagined: Vec<_> = imagined.iter().map(ever).collect();
+                let imagined: Vec<_> = imagined.iter().map(Vec::as_slice).collect();
+                log_likelihoods(feature, &ever(log), &imagined, copies, shape(1))
+            } else {
+                let imagined: Vec<_> = imagined.iter().map(|f| f.values(component)).collect();
+                let values = log.values(component);
+                log_likelihoods(feature, values, &imagined, copies, shape(log.n_steps))
+            };
+            likelihoods.insert(component, found);
+        }
+        let components = likelihoods.iter().map(|(&component, found)| {
+            let mask = (!component.is_indication()).then(|| reference.mask(component));
+            (component, rounded(geometric_mean(found, mask.as_deref())))
+        });
+        let mut scores = Scores::of_components(config, components.collect());
+        if config.mode == Mode::SimAgents {
+            let means: Vec<f64> = displacements.iter().map(|agents| mean(agents)).collect();
+            scores.ade = rounded(means.iter().sum::<f64>() / means.len() as f64);
+            scores.min_ade = rounded(means.iter().copied().fold(f64::INFINITY, f64::min));
+        }
+        let rate = |component| {
+            let of = |f| mean(&reference.ever(f, component, false));
+            rounded(imagined.iter().map(of).sum::<f64>() / imagined.len() as f64)
+        };
+        scores.collision_rate = rate(Component::Collision);
+        scores.offroad_rate = rate(Component::Offroad);
+        scores.traffic_light_violation_rate = config
+            .traffic_light_violation
+            .map(|_| rate(Component::TrafficLightViolation));
+        Self {
+            scores,
+            imagined,
+            displacements,
+            reference,
+            log_likelihoods: likelihoods,
+        }
+    }
+
+    /// Log-likelihood of every logged value of a component before validity is looked at, `[agent,
+    /// step]`, of indications `[agent]`; `None` if the year does not score it.
+    pub fn log_likelihoods(&self, component: Component) -> Option<&[f32]> {
+        self.log_likelihoods.get(&component).map(Vec::as_slice)
+    }
+
+    /// Whether each scored agent ever has an indication: in the log, and in each rollout (equal
+    /// ones once). Empty for other components.
+    pub fn indications(&self, component: Component) -> (Vec<bool>, Vec<Vec<bool>>) {
+        let vehicles_only = component == Component::TrafficLightViolation;
+        let ever = |features: &Features| {
+            let ever = self.reference.ever(features, component, vehicles_only);
+            ever.into_iter().map(|ever| ever > 0.0).collect::<Vec<_>>()
+        };
+        let imagined = self.imagined.iter().map(ever).collect();
+        (ever(self.reference.features()), imagined)
+    }
+}
+
+/// Exponential of the mean of the values that count; NaN if none does.
+fn geometric_mean(log_likelihoods: &[f32], mask: Option<&[bool]>) -> f64 {
+    let counts = |i: usize| mask.is_none_or(|mask| mask[i]);
+    let values = log_likelihoods.iter().enumerate();
+    let values = values.filter(|(i, _)| counts(*i));
+    let (sum, n) = values.fold((0.0, 0.0), |(sum, n), (_, &v)| {
+        (sum + f64::from(v), n + 1.0)
+    });
+    (sum / n).exp()
+}
+
+fn mean(values: &[f32]) -> f64 {
+    values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len() as f64
+}
