@@ -129,6 +129,16 @@ pub enum DataError {
         /// Where.
         place: Place,
     },
+    /// A message holds something that cannot be in it.
+    #[error("expected {expected}, found {found}: {place}")]
+    Field {
+        /// What can be there.
+        expected: &'static str,
+        /// What is there.
+        found: String,
+        /// Where.
+        place: Place,
+    },
     /// A record can be decoded but is not a usable scenario.
     #[error("scenario {id}: {problem}: {place}")]
     Scenario {
@@ -248,6 +258,9 @@ pub enum Problem {
     /// Imagined futures do not fit their scenario.
     #[error("{0}")]
     Rollouts(String),
+    /// A message of predictions is inconsistent.
+    #[error("{0}")]
+    Predictions(String),
     /// The map is inconsistent.
     #[error(transparent)]
     Map(#[from] MapError),

@@ -1,6 +1,12 @@
-//! Rollouts as the Waymo sim agents challenge exchanges them: `ScenarioRollouts` messages.
+//! What the Waymo challenges exchange: rollouts of the sim agents challenge (here), the archive
+//! they are submitted in ([`ArchiveWriter`]), predictions of the motion challenge
+//! ([`read_predictions`]).
 //!
 //! Start with [`write_rollouts`] and [`read_rollouts`]; [`submission_problems`] knows the rules.
+
+mod archive;
+mod motion;
+mod shard;
 
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
@@ -15,6 +21,14 @@ use crate::womd::proto::{
     JointScene, ScenarioRollouts, SimAgentsChallengeSubmission, SimulatedTrajectory,
 };
 use crate::{DataError, Place, Problem, write_atomically};
+
+pub use archive::{
+    ArchiveWriter, ExpectedScenarios, SubmissionCheck, check_archive, metadata_problems,
+};
+pub use motion::{
+    N_POSITIONS, prediction_problems, predictions_from_proto, predictions_to_proto,
+    read_predictions, write_predictions,
+};
 
 /// Futures the challenge asks for, per scenario.
 pub const N_FUTURES: usize = 32;
@@ -145,10 +159,12 @@ pub fn rollouts_from_proto(
         );
         return Err(Problem::Rollouts(problem));
     }
+    let present = present_agents(scenario);
     let futures = message.joint_scenes.iter().enumerate();
     futures
         .map(|(k, scene)| {
-            if let Some(problem) = scene_problems(scene, scenario).into_iter().next() {
+            let problems = scene_problems(scene, &present);
+            if let Some(problem) = problems.into_iter().next() {
                 return Err(Problem::Rollouts(format!("future {k}: {problem}")));
             }
             Ok(rollout(scene, scenario))
@@ -194,12 +210,25 @@ pub fn submission_problems(message: &ScenarioRollouts, scenario: &Scenario) -> V
             scenario.id
         ));
     }
+    problems.extend(rollouts_problems(message, &present_agents(scenario)));
+    problems
+}
+
+/// The agents that must be simulated: all that are present now.
+fn present_agents(scenario: &Scenario) -> BTreeSet<AgentId> {
+    let present = scenario.present().now().agents();
+    present.iter().map(|agent| agent.id).collect()
+}
+
+/// What is wrong with the futures of a scenario in which these agents are present now.
+fn rollouts_problems(message: &ScenarioRollouts, present: &BTreeSet<AgentId>) -> Vec<String> {
+    let mut problems = Vec::new();
     let n_futures = message.joint_scenes.len();
     if n_futures != N_FUTURES {
         problems.push(format!("expected {N_FUTURES} futures, found {n_futures}"));
     }
     for (k, scene) in message.joint_scenes.iter().enumerate() {
-        let mut found = scene_problems(scene, scenario);
+        let mut found = scene_problems(scene, present);
         for t in &scene.simulated_trajectories {
             let (id, n) = (t.object_id(), t.center_x.len());
             if n != N_STEPS {
@@ -211,9 +240,8 @@ pub fn submission_problems(message: &ScenarioRollouts, scenario: &Scenario) -> V
     problems
 }
 
-fn scene_problems(scene: &JointScene, scenario: &Scenario) -> Vec<String> {
+fn scene_problems(scene: &JointScene, present: &BTreeSet<AgentId>) -> Vec<String> {
     let mut problems = Vec::new();
-    let present = scenario.present().now();
     let n_steps = scene
         .simulated_trajectories
         .first()
@@ -221,7 +249,7 @@ fn scene_problems(scene: &JointScene, scenario: &Scenario) -> Vec<String> {
     let mut seen = BTreeSet::new();
     for t in &scene.simulated_trajectories {
         let id = AgentId(t.object_id().into());
-        if present.agent(id).is_none() {
+        if !present.contains(&id) {
             problems.push(format!("agent {id} is not present in the scenario"));
         }
         if !seen.insert(id) {
@@ -241,7 +269,7 @@ fn scene_problems(scene: &JointScene, scenario: &Scenario) -> Vec<String> {
             problems.push(format!("agent {id} has a state that is not a number"));
         }
     }
-    let missing = present.agents().iter().filter(|a| !seen.contains(&a.id));
-    problems.extend(missing.map(|a| format!("agent {} is missing", a.id)));
+    let missing = present.difference(&seen);
+    problems.extend(missing.map(|id| format!("agent {id} is missing")));
     problems
 }

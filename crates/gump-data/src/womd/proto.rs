@@ -4,6 +4,8 @@
 //! Fields are named as in the schema. Optional fields keep proto2's meaning: absent is `None`.
 //! Repeated numbers are read packed and unpacked alike; each is written as the schema says.
 
+pub mod motion;
+
 /// A recorded scenario of the motion dataset.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are Waymo's")]
