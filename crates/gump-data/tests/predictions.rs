@@ -1,7 +1,6 @@
 //! Predictions survive the trip through Waymo's message, and the challenge's rules are enforced.
 //!
 //! The files under `golden` were written by the official messages for made-up scenarios.
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod common;
 
