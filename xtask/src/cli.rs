@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ablate, ci, data, demo, evaluate, simulate, tidy, train};
+use crate::verbs::{ablate, ci, data, demo, evaluate, simulate, submit, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -37,6 +37,9 @@ enum Verb {
     /// Measure on the benchmarks of the field.
     #[command(subcommand)]
     Evaluate(evaluate::Verb),
+    /// Pack results for a challenge, checked against its rules.
+    #[command(subcommand)]
+    Submit(submit::Verb),
     /// Leave a part out or swap it, and measure what it did.
     #[command(subcommand)]
     Ablate(ablate::Verb),
@@ -81,8 +84,14 @@ impl Cli {
             Verb::Simulate(args) => {
                 Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Evaluate(evaluate::Verb::Motion(args)) => {
+                Run::of("evaluate motion", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Evaluate(evaluate::Verb::Merge(args)) => {
                 Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Submit(submit::Verb::Wosac(args)) => {
+                Run::of("submit wosac", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ablate(ablate::Verb::Nar(args)) => {
                 Run::of("ablate nar", &args.common, &args)?.execute(|run| args.execute(run))

@@ -19,6 +19,7 @@ mod losses;
 mod machine;
 mod progress;
 mod report;
+mod rollout_files;
 mod run;
 mod shipped;
 mod table;

@@ -104,6 +104,36 @@ impl World {
     }
 }
 
+/// One world for many scenarios: loaded once, but for the log, which is another world in every
+/// scenario.
+pub(crate) struct Worlds<'a> {
+    name: &'a WorldName,
+    sampling: SamplingConfig,
+    loaded: Option<World>,
+}
+
+impl<'a> Worlds<'a> {
+    /// Names a world; nothing is loaded yet.
+    pub(crate) fn new(name: &'a WorldName, sampling: SamplingConfig) -> Self {
+        Self {
+            name,
+            sampling,
+            loaded: None,
+        }
+    }
+
+    /// The world for a scenario.
+    ///
+    /// Error: as [`World::build`].
+    pub(crate) fn of(&mut self, scenario: &Scenario) -> anyhow::Result<&World> {
+        let world = match self.loaded.take() {
+            Some(world) if *self.name != WorldName::Log => world,
+            _ => World::build(self.name, scenario, &self.sampling)?,
+        };
+        Ok(self.loaded.insert(world))
+    }
+}
+
 /// How a learned world decodes.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Sampling {

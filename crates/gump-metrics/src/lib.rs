@@ -38,7 +38,7 @@ mod road_edge;
 mod summary;
 pub mod wosac;
 
-pub use bootstrap::{Interval, interval};
+pub use bootstrap::{Interval, interval, intervals};
 pub use collision::{Collision, overlapping};
 pub use comfort::{ComfortBounds, Discomfort, Felt};
 pub use displacement::{Displacement, average_displacement};

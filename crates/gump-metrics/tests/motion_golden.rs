@@ -105,7 +105,8 @@ fn measure(scenario: &Scenario, prediction: &Prediction) -> MotionTally {
     let mut alone = scenario.clone();
     alone.targets.clone_from(&prediction.agents);
     let config = MotionConfig::challenge();
-    evaluate_predictions(&alone, std::slice::from_ref(prediction), &config).unwrap()
+    let prediction = std::slice::from_ref(prediction);
+    MotionTally::of(&evaluate_predictions(&alone, prediction, &config).unwrap())
 }
 
 fn check_mean(name: &str, found: Option<f64>, expected: &Value) {
@@ -215,7 +216,7 @@ fn scenarios_merge_in_any_order() {
         .map(|set| {
             let scenario = scenario(&golden, set["scenario"].as_str().unwrap());
             let predictions: Vec<_> = list(&set["predictions"]).iter().map(prediction).collect();
-            evaluate_predictions(&scenario, &predictions, &config).unwrap()
+            MotionTally::of(&evaluate_predictions(&scenario, &predictions, &config).unwrap())
         })
         .collect();
     let merged = |tallies: &mut dyn Iterator<Item = &MotionTally>| {
@@ -271,7 +272,7 @@ fn what_does_not_fit_is_named() {
     );
     check(
         &|s, p| {
-            s.targets.push(AgentId(4711));
+            s.targets[1] = AgentId(4711);
             p[1].agents[0] = AgentId(4711);
         },
         MotionProblem::NeverPresent(AgentId(4711)),

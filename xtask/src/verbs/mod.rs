@@ -6,5 +6,6 @@ pub(crate) mod data;
 pub(crate) mod demo;
 pub(crate) mod evaluate;
 pub(crate) mod simulate;
+pub(crate) mod submit;
 pub(crate) mod tidy;
 pub(crate) mod train;

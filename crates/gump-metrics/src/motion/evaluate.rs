@@ -1,18 +1,61 @@
 //! From the predictions of one scenario to measurements, after a look at whether they fit.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use gump_geometry::DVec2;
-use gump_scene::{AgentId, Prediction, Scenario};
+use gump_scene::{AgentId, AgentKind, Prediction, Scenario};
 
-use super::config::MotionConfig;
+use super::config::{Horizon, MotionConfig};
 use super::error::{MotionError, MotionProblem};
-use super::measure::{Measured, kind_of};
-use super::precision::PrecisionSamples;
+use super::measure::Measured;
 use super::shape::Shape;
-use super::tally::{MotionCell, MotionTally};
 
-/// Measures the predictions of one scenario against its log.
+/// What one prediction got.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PredictionScore {
+    /// Whose prediction it is.
+    pub agents: Vec<AgentId>,
+    /// The kind of agent it counts for: the rarest among those predicted together.
+    pub kind: AgentKind,
+    /// The shape it counts for; `None` if no agent is recorded now and later.
+    pub shape: Option<Shape>,
+    /// In the order of [`MotionConfig::horizons`].
+    pub horizons: Vec<HorizonScore>,
+}
+
+/// What one prediction got at one horizon. `None` where nothing was recorded to compare with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HorizonScore {
+    /// Average displacement of the best mode, metres.
+    pub min_ade: Option<f64>,
+    /// Displacement of the best mode at the horizon, metres.
+    pub min_fde: Option<f64>,
+    /// True if the most confident mode has run into another agent by then.
+    pub overlaps: bool,
+    /// Every mode that counts, in the order of the forecaster.
+    pub modes: Vec<ModeScore>,
+}
+
+/// What one mode got at one horizon.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ModeScore {
+    /// As the forecaster gave it.
+    pub confidence: f64,
+    /// True if it is what happened; `None` if nobody knows.
+    pub matches: Option<bool>,
+}
+
+impl HorizonScore {
+    /// True if no mode is what happened; `None` if nobody knows of any.
+    pub fn missed(&self) -> Option<bool> {
+        let known = self.modes.iter().filter_map(|mode| mode.matches);
+        known.fold(None, |missed, matches| {
+            Some(missed.unwrap_or(true) && !matches)
+        })
+    }
+}
+
+/// Measures the predictions of one scenario against its log; the scores are in their order.
 ///
 /// The agents predicted must be exactly the scenario's targets, alone or together. Modes beyond
 /// [`MotionConfig::max_modes`] are ignored, even if one of them is the best.
@@ -26,63 +69,39 @@ pub fn evaluate_predictions(
     scenario: &Scenario,
     predictions: &[Prediction],
     config: &MotionConfig,
-) -> Result<MotionTally, MotionError> {
-    let stride = check(scenario, predictions, config).map_err(|problem| MotionError {
+) -> Result<Vec<PredictionScore>, MotionError> {
+    let scores = check(scenario, predictions, config).and_then(|stride| {
+        let score = |prediction| {
+            score(&Measured {
+                scenario,
+                prediction,
+                config,
+                stride,
+            })
+        };
+        predictions.iter().map(score).collect()
+    });
+    scores.map_err(|problem| MotionError {
         scenario: scenario.id.clone(),
         problem,
-    })?;
-    let mut tally = MotionTally::default();
-    for prediction in predictions {
-        let measured = Measured {
-            scenario,
-            prediction,
-            config,
-            stride,
-        };
-        add(&mut tally, &measured);
-    }
-    Ok(tally)
+    })
 }
 
-fn add(tally: &mut MotionTally, measured: &Measured<'_>) {
-    let Some(kind) = measured.kind() else {
-        return;
-    };
-    let shape = measured.shape();
+fn score(measured: &Measured<'_>) -> Result<PredictionScore, MotionProblem> {
+    let agents = measured.prediction.agents.clone();
     let first_overlap = measured.first_overlap();
-    for (h, horizon) in measured.config.horizons.iter().enumerate() {
-        let cell = tally.cells.entry((kind, h)).or_default();
-        if let Some(error) = measured.min_ade(horizon) {
-            cell.min_ade.add(error);
-        }
-        if let Some(error) = measured.min_fde(horizon) {
-            cell.min_fde.add(error);
-        }
-        let overlaps = first_overlap.is_some_and(|step| step <= horizon.step);
-        cell.overlap_rate.add(f64::from(overlaps));
-        let matches = measured.matches(horizon);
-        let known: Vec<bool> = matches.iter().copied().flatten().collect();
-        if !known.is_empty() {
-            let missed = !known.contains(&true);
-            cell.miss_rate.add(f64::from(missed));
-        }
-        if let Some(shape) = shape {
-            let modes = measured.modes().iter().map(|mode| mode.confidence);
-            let modes: Vec<_> = modes.zip(matches).collect();
-            let MotionCell {
-                precision,
-                soft_precision,
-                ..
-            } = cell;
-            let of_shape = |by_shape: &mut BTreeMap<Shape, PrecisionSamples>,
-                            later_matches_count| {
-                let samples = by_shape.entry(shape).or_default();
-                samples.add(&modes, later_matches_count);
-            };
-            of_shape(precision, true);
-            of_shape(soft_precision, false);
-        }
-    }
+    let at = |horizon: &Horizon| HorizonScore {
+        min_ade: measured.min_ade(horizon),
+        min_fde: measured.min_fde(horizon),
+        overlaps: first_overlap.is_some_and(|step| step <= horizon.step),
+        modes: measured.modes(horizon),
+    };
+    Ok(PredictionScore {
+        kind: measured.kind()?,
+        shape: measured.shape(),
+        horizons: measured.config.horizons.iter().map(at).collect(),
+        agents,
+    })
 }
 
 /// The recorded frames between positions of a path, if everything fits.
@@ -105,9 +124,6 @@ fn check(
             }
             if !scenario.targets.contains(&agent) {
                 return Err(MotionProblem::Unexpected(agent));
-            }
-            if kind_of(scenario, agent).is_none() {
-                return Err(MotionProblem::NeverPresent(agent));
             }
         }
     }

@@ -6,7 +6,8 @@ use gump_geometry::{DVec2, OrientedBox, Pose};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, PredictedMode, Prediction, Scenario};
 
 use super::config::{Horizon, MotionConfig};
-use super::precision::Match;
+use super::error::MotionProblem;
+use super::evaluate::ModeScore;
 use super::shape::{Shape, shape};
 
 /// A prediction and the recording it is measured against; both fit, see `check`.
@@ -20,7 +21,7 @@ pub(crate) struct Measured<'a> {
 
 impl<'a> Measured<'a> {
     /// The modes that count.
-    pub(crate) fn modes(&self) -> &'a [PredictedMode] {
+    fn counted(&self) -> &'a [PredictedMode] {
         let modes = &self.prediction.modes;
         &modes[..modes.len().min(self.config.max_modes)]
     }
@@ -43,15 +44,18 @@ impl<'a> Measured<'a> {
         self.least(|agent, path| self.distance(agent, path, horizon.step))
     }
 
-    /// Whether each mode that counts is what happened, at a horizon.
-    pub(crate) fn matches(&self, horizon: &Horizon) -> Vec<Match> {
+    /// Every mode that counts, and whether it is what happened at a horizon.
+    pub(crate) fn modes(&self, horizon: &Horizon) -> Vec<ModeScore> {
         let of_mode = |mode: &PredictedMode| {
             let paths = self.paths(mode);
             let matches = paths.map(|(agent, path)| self.is_match(agent, path, horizon));
             let all: Option<Vec<bool>> = matches.collect();
-            Some(all?.into_iter().all(|is_match| is_match))
+            ModeScore {
+                confidence: mode.confidence,
+                matches: all.map(|all| all.into_iter().all(|is_match| is_match)),
+            }
         };
-        self.modes().iter().map(of_mode).collect()
+        self.counted().iter().map(of_mode).collect()
     }
 
     /// The first step at which the most confident mode runs into the recorded box of another
@@ -85,16 +89,22 @@ impl<'a> Measured<'a> {
     }
 
     /// The kind of agent it counts for: the rarest among those predicted together.
-    pub(crate) fn kind(&self) -> Option<AgentKind> {
-        let rank = |kind: &AgentKind| match kind {
-            AgentKind::TrafficCone | AgentKind::Barrier | AgentKind::Sign | AgentKind::Other => 0,
-            AgentKind::Vehicle => 1,
-            AgentKind::Pedestrian => 2,
-            AgentKind::Bicycle => 3,
-        };
-        let agents = self.prediction.agents.iter();
-        let kinds = agents.filter_map(|&agent| kind_of(self.scenario, agent));
-        kinds.max_by_key(rank)
+    ///
+    /// Error: an agent that is in no frame.
+    pub(crate) fn kind(&self) -> Result<AgentKind, MotionProblem> {
+        let mut rarest = AgentKind::Other;
+        for &agent in &self.prediction.agents {
+            let recorded = self
+                .scenario
+                .log
+                .iter()
+                .find_map(|frame| frame.agent(agent));
+            let kind = recorded.ok_or(MotionProblem::NeverPresent(agent))?.kind;
+            if rarity(kind) > rarity(rarest) {
+                rarest = kind;
+            }
+        }
+        Ok(rarest)
     }
 
     /// The shape it counts for; `None` if no agent has one.
@@ -112,13 +122,13 @@ impl<'a> Measured<'a> {
             let sum: Option<f64> = self.paths(mode).map(|(a, path)| one(a, path)).sum();
             Some(sum? / n)
         };
-        self.modes()
+        self.counted()
             .iter()
             .filter_map(of_mode)
             .min_by(f64::total_cmp)
     }
 
-    fn is_match(&self, agent: AgentId, path: &[DVec2], horizon: &Horizon) -> Match {
+    fn is_match(&self, agent: AgentId, path: &[DVec2], horizon: &Horizon) -> Option<bool> {
         let logged = self.recorded(agent, horizon.step)?.state.pose;
         let error = DVec2::from_angle(-logged.heading).rotate(path[horizon.step] - logged.position);
         // Who is absent now counts as standing.
@@ -142,7 +152,7 @@ impl<'a> Measured<'a> {
             }
         };
         let mut best: Option<&PredictedMode> = None;
-        for mode in self.modes() {
+        for mode in self.counted() {
             if best.is_none_or(|best| value(mode) > value(best)) {
                 best = Some(mode);
             }
@@ -173,10 +183,9 @@ impl<'a> Measured<'a> {
     }
 }
 
-/// What an agent is, by the first frame it is in.
-pub(crate) fn kind_of(scenario: &Scenario, agent: AgentId) -> Option<AgentKind> {
-    let found = scenario.log.iter().find_map(|frame| frame.agent(agent));
-    found.map(|agent| agent.kind)
+/// Vehicles, pedestrians and bicycles in this order, after everything else.
+fn rarity(kind: AgentKind) -> Option<usize> {
+    AgentKind::MOVING.iter().position(|&moving| moving == kind)
 }
 
 /// The direction of a path at a position: that of the segment at either end, the mean direction

@@ -1,13 +1,13 @@
 //! Motion prediction as the Waymo challenge measures it: distances of the best mode, misses,
 //! overlaps and mean average precision, by kind of agent at 3, 5 and 8 s.
 //!
-//! Start with [`evaluate_predictions`], which measures the predictions of one scenario; merge the
-//! tallies of many and ask for [`MotionTally::rows`]. [`forecast`] makes predictions of a world's
+//! Start with [`evaluate_predictions`], which measures the predictions of one scenario; add the
+//! scores of many to a [`MotionTally`] and ask for its [`rows`](MotionTally::rows). [`forecast`] makes predictions of a world's
 //! futures. Files are the business of `gump-data`.
 //!
 //! ```
 //! use gump_geometry::dvec2;
-//! use gump_metrics::motion::{MotionConfig, evaluate_predictions};
+//! use gump_metrics::motion::{MotionConfig, MotionTally, evaluate_predictions};
 //! use gump_scene::{PredictedMode, Prediction};
 //!
 //! let mut scenario = gump_scene::fixture::scenario(
@@ -19,8 +19,8 @@
 //! let mode = PredictedMode { confidence: 1.0, paths: vec![path] };
 //! let prediction = Prediction { agents: vec![scenario.ego], modes: vec![mode] };
 //! let config = MotionConfig::challenge();
-//! let tally = evaluate_predictions(&scenario, &[prediction], &config)?;
-//! let rows = tally.rows(&config);
+//! let scores = evaluate_predictions(&scenario, &[prediction], &config)?;
+//! let rows = MotionTally::of(&scores).rows(&config);
 //! assert!((rows[0].min_ade.unwrap() - 1.0).abs() < 1e-9);
 //! // At 3 s a vehicle at 5 m/s may be 0.69 m beside its path, at 8 s 2.06 m.
 //! assert_eq!((rows[0].miss_rate, rows[2].miss_rate), (Some(1.0), Some(0.0)));
@@ -39,7 +39,7 @@ mod tally;
 
 pub use config::{Horizon, MotionConfig, ShapeRules, SpeedScale};
 pub use error::{MotionError, MotionProblem};
-pub use evaluate::evaluate_predictions;
+pub use evaluate::{HorizonScore, ModeScore, PredictionScore, evaluate_predictions};
 pub use forecast::forecast;
 pub use mean::Mean;
 pub use precision::{PrecisionSamples, Sample};

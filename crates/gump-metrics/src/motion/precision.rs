@@ -2,6 +2,8 @@
 
 use std::cmp::Ordering;
 
+use super::evaluate::ModeScore;
+
 /// Modes of many predictions of one shape, each with its confidence and whether it is a hit.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PrecisionSamples {
@@ -18,20 +20,19 @@ pub struct Sample {
     pub hit: bool,
 }
 
-/// Whether a mode is what happened; `None` if nobody knows.
-pub(crate) type Match = Option<bool>;
-
 impl PrecisionSamples {
     /// Adds the modes of one prediction, given with their matches. Of several matches the most
     /// confident is the hit; `later_matches_count` says whether the others are false alarms
     /// (mAP) or forgiven (soft mAP).
     ///
     /// Modes whose match is unknown are left out; a prediction of such modes only is not counted.
-    pub(crate) fn add(&mut self, modes: &[(f64, Match)], later_matches_count: bool) {
-        let mut known: Vec<Sample> = modes
-            .iter()
-            .filter_map(|&(confidence, matched)| matched.map(|hit| Sample { confidence, hit }))
-            .collect();
+    pub(crate) fn add(&mut self, modes: &[ModeScore], later_matches_count: bool) {
+        let known = modes.iter().filter_map(|mode| {
+            let hit = mode.matches?;
+            let confidence = mode.confidence;
+            Some(Sample { confidence, hit })
+        });
+        let mut known: Vec<Sample> = known.collect();
         if known.is_empty() {
             return;
         }
@@ -101,10 +102,18 @@ mod tests {
     use super::*;
     use approx::assert_abs_diff_eq;
 
-    fn samples(predictions: &[&[(f64, Match)]], later_matches_count: bool) -> PrecisionSamples {
+    fn samples(
+        predictions: &[&[(f64, Option<bool>)]],
+        later_matches_count: bool,
+    ) -> PrecisionSamples {
         let mut samples = PrecisionSamples::default();
         for modes in predictions {
-            samples.add(modes, later_matches_count);
+            let mode = |&(confidence, matches): &(f64, Option<bool>)| ModeScore {
+                confidence,
+                matches,
+            };
+            let modes: Vec<_> = modes.iter().map(mode).collect();
+            samples.add(&modes, later_matches_count);
         }
         samples
     }

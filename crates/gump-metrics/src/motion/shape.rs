@@ -30,6 +30,18 @@ pub enum Shape {
 }
 
 impl Shape {
+    /// Every shape, in ascending order of priority.
+    pub const ALL: [Self; 8] = [
+        Self::Stationary,
+        Self::Straight,
+        Self::StraightRight,
+        Self::StraightLeft,
+        Self::RightTurn,
+        Self::LeftTurn,
+        Self::LeftUTurn,
+        Self::RightUTurn,
+    ];
+
     /// The lower-case English name.
     pub fn name(self) -> &'static str {
         match self {

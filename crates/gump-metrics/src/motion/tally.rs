@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use gump_scene::AgentKind;
 
 use super::config::MotionConfig;
+use super::evaluate::{HorizonScore, PredictionScore};
 use super::mean::Mean;
 use super::precision::PrecisionSamples;
 use super::shape::Shape;
@@ -61,6 +62,21 @@ pub struct MotionRow {
 }
 
 impl MotionTally {
+    /// The scores of some predictions as one tally.
+    pub fn of<'a>(scores: impl IntoIterator<Item = &'a PredictionScore>) -> Self {
+        let mut tally = Self::default();
+        scores.into_iter().for_each(|score| tally.add(score));
+        tally
+    }
+
+    /// Adds the score of one prediction.
+    pub fn add(&mut self, score: &PredictionScore) {
+        for (h, horizon) in score.horizons.iter().enumerate() {
+            let cell = self.cells.entry((score.kind, h)).or_default();
+            cell.add(score.shape, horizon);
+        }
+    }
+
     /// Adds the measurements of another tally.
     pub fn merge(&mut self, other: &Self) {
         for (key, cell) in &other.cells {
@@ -120,6 +136,20 @@ impl MotionTally {
 }
 
 impl MotionCell {
+    fn add(&mut self, shape: Option<Shape>, score: &HorizonScore) {
+        let missed = score.missed().map(f64::from);
+        score.min_ade.into_iter().for_each(|x| self.min_ade.add(x));
+        score.min_fde.into_iter().for_each(|x| self.min_fde.add(x));
+        missed.into_iter().for_each(|x| self.miss_rate.add(x));
+        self.overlap_rate.add(f64::from(score.overlaps));
+        if let Some(shape) = shape {
+            let samples = self.precision.entry(shape).or_default();
+            samples.add(&score.modes, true);
+            let samples = self.soft_precision.entry(shape).or_default();
+            samples.add(&score.modes, false);
+        }
+    }
+
     /// Adds the measurements of another cell.
     pub fn merge(&mut self, other: &Self) {
         self.min_ade.merge(&other.min_ade);

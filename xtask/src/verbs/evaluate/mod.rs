@@ -4,15 +4,16 @@
 //! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of [`merge::BENCHMARKS`].
 
-#[allow(dead_code, reason = "the first benchmark that shards follows")]
 mod ledger;
 mod merge;
-#[allow(dead_code, reason = "the first benchmark that shards follows")]
+pub(crate) mod motion;
 mod shard;
 
 /// Which benchmark.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
+    /// Motion prediction: distances, misses, overlaps and mAP at 3, 5 and 8 s
+    Motion(motion::Args),
     /// Put the shards of one evaluation together
     Merge(merge::Args),
 }

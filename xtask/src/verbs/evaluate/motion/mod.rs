@@ -1,0 +1,221 @@
+//! `evaluate motion`: motion prediction as the Waymo challenge measures it, of predictions in a
+//! file or of a world's futures.
+
+mod scores;
+mod source;
+mod tell;
+
+use std::collections::BTreeSet;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+
+use gump_data::{ReadOptions, open_with};
+use gump_metrics::motion::{
+    MotionConfig, PredictionScore, ShapeRules, evaluate_predictions, forecast,
+};
+use gump_scene::{Prediction, Scenario};
+use serde::{Deserialize, Serialize};
+
+use self::scores::Scores;
+use self::source::Predictions;
+use super::ledger::{Entry, Header, Ledger};
+use super::shard::Shard;
+use crate::imagine::imagine;
+use crate::run::{self, Common, Run};
+use crate::worlds::{Sampling, WorldName, Worlds};
+
+pub(crate) use self::tell::tell_merged;
+
+/// Name of the benchmark in ledgers.
+pub(crate) const NAME: &str = "motion";
+
+/// Arguments of `evaluate motion`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// Scenarios with their futures: a file or a folder
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    #[command(flatten)]
+    #[serde(flatten)]
+    source: Source,
+    /// Futures of the world that are condensed to the six modes of a prediction
+    #[arg(long, value_name = "N", default_value = "32")]
+    futures: NonZeroUsize,
+    /// Which definition of path shapes mAP is averaged over
+    #[arg(long, value_enum, default_value_t = Shapes::Current)]
+    shapes: Shapes,
+    /// Only every N-th scenario from the K-th; see `evaluate merge`
+    #[arg(long, value_name = "K/N", default_value = "1/1")]
+    shard: Shard,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What is measured.
+#[derive(Debug, Serialize, clap::Args)]
+#[group(required = true, multiple = false)]
+struct Source {
+    /// A `MotionChallengeSubmission` or `ScenarioRollouts` message, or a folder of such files
+    #[arg(long, value_name = "PATH")]
+    rollouts: Option<PathBuf>,
+    /// log, idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W")]
+    world: Option<WorldName>,
+}
+
+/// Which definition of path shapes.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Shapes {
+    /// Since March 2024.
+    Current,
+    /// Leaderboards of 2021 to 2023.
+    #[value(name = "until-2023")]
+    #[serde(rename = "until-2023")]
+    Until2023,
+}
+
+impl Shapes {
+    fn config(self) -> MotionConfig {
+        MotionConfig {
+            shapes: match self {
+                Self::Current => ShapeRules::Current,
+                Self::Until2023 => ShapeRules::Until2023,
+            },
+            ..MotionConfig::challenge()
+        }
+    }
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let config = self.shapes.config();
+        let mut forecaster = run.phase("load", |_| self.forecaster())?;
+        let header = self.header(run)?;
+        let mut ledger = Ledger::open(run.out(), &header)?;
+        let mut ids = BTreeSet::new();
+        let progress = run.progress("measuring", 0, "scenarios");
+        for (index, record) in self.open()?.enumerate() {
+            run::stop_if_interrupted()?;
+            let mut scenario = run.phase("read", |_| Ok(record?.scenario))?;
+            ids.insert(scenario.id.clone());
+            if !self.shard.holds(index) || ledger.has(index) {
+                continue;
+            }
+            let absent = forecaster.drop_absent(&mut scenario);
+            let predictions = run.phase("predict", |run| {
+                forecaster.predict(run, &scenario, &config, index)
+            })?;
+            let scores: Vec<PredictionScore> = run.phase("score", |_| {
+                Ok(evaluate_predictions(&scenario, &predictions, &config)?)
+            })?;
+            let scores = Scores::new(&scores, absent);
+            let id = scenario.id;
+            ledger.enter(Entry { index, id, scores })?;
+            progress.advance(1);
+        }
+        drop(progress);
+        forecaster.check_all_used(&ids)?;
+        let entries = ledger.close()?;
+        tell::tell(run, &entries, &config)
+    }
+
+    fn open(&self) -> anyhow::Result<gump_data::Reader> {
+        // Only worlds look at the map.
+        let options = match self.source.world {
+            Some(_) => ReadOptions::ALL,
+            None => ReadOptions::STATED,
+        };
+        Ok(open_with(&self.scenarios, options)?)
+    }
+
+    fn forecaster(&self) -> anyhow::Result<Forecaster<'_>> {
+        Ok(match (&self.source.rollouts, &self.source.world) {
+            (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
+            (None, Some(name)) => Forecaster::World {
+                worlds: Worlds::new(name, self.sampling.resolve()?),
+                n_futures: self.futures.get(),
+            },
+            (None, None) => anyhow::bail!("expected --rollouts or --world"),
+        })
+    }
+
+    /// Everything that the scores of a scenario depend on.
+    fn header(&self, run: &Run) -> anyhow::Result<Header> {
+        let mut settings = toml::Table::new();
+        let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
+        set("scenarios", self.scenarios.display().to_string().into());
+        set("shapes", toml::Value::try_from(self.shapes)?);
+        set("seed", i64::try_from(run.seed().0)?.into());
+        if let Some(path) = &self.source.rollouts {
+            set("rollouts", path.display().to_string().into());
+        }
+        if let Some(world) = &self.source.world {
+            set("world", world.to_string().into());
+            set("futures", i64::try_from(self.futures.get())?.into());
+            set("sampling", toml::Value::try_from(&self.sampling)?);
+        }
+        Ok(Header {
+            benchmark: NAME.into(),
+            shard: self.shard,
+            settings,
+        })
+    }
+}
+
+/// Where predictions come from.
+enum Forecaster<'a> {
+    /// A file.
+    File(Predictions, &'a Path),
+    /// Futures of a world.
+    World {
+        worlds: Worlds<'a>,
+        n_futures: usize,
+    },
+}
+
+impl Forecaster<'_> {
+    /// Leaves out targets that nobody can imagine because they are absent now; how many.
+    ///
+    /// A file is held to all targets, as the challenge holds it.
+    fn drop_absent(&self, scenario: &mut Scenario) -> usize {
+        let before = scenario.targets.len();
+        if let Self::World { .. } = self {
+            let now = &scenario.log[scenario.now];
+            scenario.targets.retain(|&id| now.agent(id).is_some());
+        }
+        before - scenario.targets.len()
+    }
+
+    fn predict(
+        &mut self,
+        run: &Run,
+        scenario: &Scenario,
+        config: &MotionConfig,
+        index: usize,
+    ) -> anyhow::Result<Vec<Prediction>> {
+        match self {
+            Self::File(predictions, path) => predictions.of(scenario, config, path),
+            Self::World { .. } if scenario.targets.is_empty() => Ok(Vec::new()),
+            Self::World { worlds, n_futures } => {
+                let seconds = config.n_steps as f64 * config.step_seconds;
+                let seed = run.seed().fork(index as u64);
+                let (world, scene) = (worlds.of(scenario)?, scenario.present());
+                let imagined = imagine(run, world, scene, *n_futures, seconds, seed)?;
+                Ok(forecast(scenario, &imagined.rollouts, config)?)
+            }
+        }
+    }
+
+    /// Refuses predictions of scenarios that are not there.
+    fn check_all_used(&self, ids: &BTreeSet<String>) -> anyhow::Result<()> {
+        match self {
+            Self::File(predictions, path) => predictions.check_all_known(ids, path),
+            Self::World { .. } => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! Scores of the predictions of one scenario as they are kept in a ledger.
+
+use gump_metrics::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
+use gump_scene::{AgentId, AgentKind};
+use serde::{Deserialize, Serialize};
+
+/// What one scenario got.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Scores {
+    /// Targets that could not be predicted because they were absent.
+    pub(super) absent: usize,
+    /// Every prediction.
+    #[serde(default)]
+    predictions: Vec<Line>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Line {
+    agents: Vec<i64>,
+    class: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    shape: Option<String>,
+    horizons: Vec<AtHorizon>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct AtHorizon {
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    min_ade: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    min_fde: Option<f64>,
+    overlaps: bool,
+    confidences: Vec<f64>,
+    /// A letter per mode: y if it is what happened, n if not, ? if nobody knows.
+    matches: String,
+}
+
+impl Scores {
+    pub(super) fn new(scores: &[PredictionScore], absent: usize) -> Self {
+        let line = |score: &PredictionScore| Line {
+            agents: score.agents.iter().map(|agent| agent.0).collect(),
+            class: score.kind.name().into(),
+            shape: score.shape.map(|shape| shape.name().into()),
+            horizons: score.horizons.iter().map(at_horizon).collect(),
+        };
+        Self {
+            absent,
+            predictions: scores.iter().map(line).collect(),
+        }
+    }
+
+    /// The scores they were made of.
+    ///
+    /// Error: words that are no class, shape or match.
+    pub(super) fn scores(&self) -> anyhow::Result<Vec<PredictionScore>> {
+        self.predictions.iter().map(Line::score).collect()
+    }
+}
+
+fn at_horizon(score: &HorizonScore) -> AtHorizon {
+    let letter = |mode: &ModeScore| match mode.matches {
+        Some(true) => 'y',
+        Some(false) => 'n',
+        None => '?',
+    };
+    AtHorizon {
+        min_ade: score.min_ade,
+        min_fde: score.min_fde,
+        overlaps: score.overlaps,
+        confidences: score.modes.iter().map(|mode| mode.confidence).collect(),
+        matches: score.modes.iter().map(letter).collect(),
+    }
+}
+
+impl Line {
+    fn score(&self) -> anyhow::Result<PredictionScore> {
+        let unknown = |what: &str, word: &str| anyhow::anyhow!("{word} is no {what}");
+        let mut kinds = AgentKind::MOVING.into_iter().chain(AgentKind::STATIC);
+        let kind = kinds.find(|kind| kind.name() == self.class);
+        let shape = self.shape.as_deref().map(|name| {
+            let mut shapes = Shape::ALL.into_iter();
+            let found = shapes.find(|shape| shape.name() == name);
+            found.ok_or_else(|| unknown("shape", name))
+        });
+        Ok(PredictionScore {
+            agents: self.agents.iter().copied().map(AgentId).collect(),
+            kind: kind.ok_or_else(|| unknown("class", &self.class))?,
+            shape: shape.transpose()?,
+            horizons: self
+                .horizons
+                .iter()
+                .map(AtHorizon::score)
+                .collect::<anyhow::Result<_>>()?,
+        })
+    }
+}
+
+impl AtHorizon {
+    fn score(&self) -> anyhow::Result<HorizonScore> {
+        let (n, found) = (self.confidences.len(), self.matches.len());
+        anyhow::ensure!(n == found, "expected {n} matches, found {found}");
+        let mode = |(&confidence, letter)| {
+            let matches = match letter {
+                'y' => Some(true),
+                'n' => Some(false),
+                '?' => None,
+                other => anyhow::bail!("{other} is no match"),
+            };
+            Ok(ModeScore {
+                confidence,
+                matches,
+            })
+        };
+        let modes = self.confidences.iter().zip(self.matches.chars()).map(mode);
+        Ok(HorizonScore {
+            min_ade: self.min_ade,
+            min_fde: self.min_fde,
+            overlaps: self.overlaps,
+            modes: modes.collect::<anyhow::Result<_>>()?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scores_survive_the_ledger_to_the_bit() {
+        let mode = |confidence: f64, matches| ModeScore {
+            confidence,
+            matches,
+        };
+        let scores = [PredictionScore {
+            agents: vec![AgentId(7), AgentId(-3)],
+            kind: AgentKind::Bicycle,
+            shape: Some(Shape::LeftUTurn),
+            horizons: vec![
+                HorizonScore {
+                    min_ade: Some(0.1 + 0.2),
+                    min_fde: None,
+                    overlaps: true,
+                    modes: vec![mode(1.0 / 3.0, Some(true)), mode(0.0, None)],
+                },
+                HorizonScore {
+                    min_ade: None,
+                    min_fde: None,
+                    overlaps: false,
+                    modes: vec![mode(-1e-30, Some(false))],
+                },
+            ],
+        }];
+        let kept = Scores::new(&scores, 2);
+        let text = toml::to_string(&kept).unwrap();
+        let read: Scores = toml::from_str(&text).unwrap();
+        assert_eq!(read, kept);
+        assert_eq!(read.scores().unwrap(), scores);
+        for (from, to) in [("y?", "yz"), ("bicycle", "tram"), ("left-u-turn", "loop")] {
+            let broken: Scores = toml::from_str(&text.replace(from, to)).unwrap();
+            assert!(broken.scores().is_err(), "{to}");
+        }
+        let nothing = Scores::new(&[], 0);
+        let text = toml::to_string(&nothing).unwrap();
+        assert_eq!(toml::from_str::<Scores>(&text).unwrap(), nothing);
+    }
+}

@@ -1,0 +1,240 @@
+//! `submit wosac`: the archive for the Waymo Sim Agents Challenge, packed and checked.
+
+use std::path::{Path, PathBuf};
+
+use gump_data::submission::{
+    ArchiveWriter, ExpectedScenarios, N_FUTURES, N_STEPS, SubmissionCheck, check_archive,
+    metadata_problems, read_rollouts, rollouts_to_proto,
+};
+use gump_data::womd::proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
+use gump_data::{ReadOptions, open_with};
+use serde::Serialize;
+
+use crate::cli::WrongArguments;
+use crate::imagine::imagine;
+use crate::rollout_files;
+use crate::run::{self, Common, Run};
+use crate::worlds::{Sampling, WorldName, Worlds};
+
+/// Name of the archive in the output folder.
+const ARCHIVE: &str = "submission.tar.gz";
+
+/// Arguments of `submit wosac`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// Every scenario of the split that is submitted to: a file or a folder
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    #[command(flatten)]
+    #[serde(flatten)]
+    source: Source,
+    #[command(flatten)]
+    #[serde(flatten)]
+    maker: Maker,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What is submitted.
+#[derive(Debug, Serialize, clap::Args)]
+#[group(required = true, multiple = false)]
+struct Source {
+    /// A file of `ScenarioRollouts`, or a folder of such files
+    #[arg(long, value_name = "PATH")]
+    rollouts: Option<PathBuf>,
+    /// Imagine them: idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W")]
+    world: Option<WorldName>,
+    /// Pack nothing: check this archive
+    #[arg(long, value_name = "FILE")]
+    archive: Option<PathBuf>,
+}
+
+/// Who made it and how; the server asks for it.
+#[derive(Debug, Serialize, clap::Args)]
+struct Maker {
+    /// E-mail address of the account at waymo.com/open
+    #[arg(long, value_name = "EMAIL", default_value = "")]
+    account: String,
+    /// Name of the method, short and unique
+    #[arg(long, value_name = "NAME", default_value = "")]
+    method: String,
+    /// Names with commas between
+    #[arg(long, value_name = "NAMES", default_value = "")]
+    authors: String,
+    /// Where they work
+    #[arg(long, value_name = "TEXT")]
+    affiliation: Option<String>,
+    /// The method in a few words
+    #[arg(long, value_name = "TEXT")]
+    description: Option<String>,
+    /// Where the method is described
+    #[arg(long, value_name = "URL")]
+    method_link: Option<String>,
+    /// The number of parameters of the model with a suffix, like 200K
+    #[arg(long, value_name = "N", default_value = "")]
+    parameters: String,
+    /// The method uses lidar data
+    #[arg(long)]
+    uses_lidar_data: bool,
+    /// The method uses camera data
+    #[arg(long)]
+    uses_camera_data: bool,
+    /// Public models it was pretrained with, with commas between
+    #[arg(long, value_name = "NAMES", default_value = "")]
+    public_models: String,
+    /// The futures were imagined in closed loop at 10 Hz, as the rules demand
+    #[arg(long)]
+    complies_with_closed_loop: bool,
+}
+
+impl Maker {
+    fn metadata(&self) -> SimAgentsChallengeSubmission {
+        let public_model_names = names(&self.public_models);
+        SimAgentsChallengeSubmission {
+            scenario_rollouts: Vec::new(),
+            submission_type: Some(SubmissionType::SimAgentsSubmission.into()),
+            account_name: Some(self.account.clone()),
+            unique_method_name: Some(self.method.clone()),
+            authors: names(&self.authors),
+            affiliation: self.affiliation.clone(),
+            description: self.description.clone(),
+            method_link: self.method_link.clone(),
+            uses_lidar_data: Some(self.uses_lidar_data),
+            uses_camera_data: Some(self.uses_camera_data),
+            uses_public_model_pretraining: Some(!public_model_names.is_empty()),
+            num_model_parameters: Some(self.parameters.clone()),
+            public_model_names,
+            acknowledge_complies_with_closed_loop_requirement: Some(self.complies_with_closed_loop),
+        }
+    }
+}
+
+fn names(text: &str) -> Vec<String> {
+    let names = text.split(',').map(str::trim);
+    names
+        .filter(|name| !name.is_empty())
+        .map(Into::into)
+        .collect()
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let metadata = self.maker.metadata();
+        if self.source.archive.is_none() {
+            let problems = metadata_problems(&metadata);
+            if !problems.is_empty() {
+                return Err(WrongArguments(problems.join("; ")).into());
+            }
+        }
+        let expected = run.phase("index", |run| self.expected(run))?;
+        run.result("expected_scenarios", expected.len())?;
+        if let Some(archive) = &self.source.archive {
+            return run.phase("check", |run| check(run, archive, &expected));
+        }
+        let path = run.path(ARCHIVE);
+        let mut packer = Packer {
+            archive: ArchiveWriter::create(&path, metadata),
+            check: SubmissionCheck::default(),
+            expected: &expected,
+        };
+        run.phase("pack", |run| self.pack(run, &mut packer))?;
+        packer.check.finish(&expected);
+        if packer.check.n_problems > 0 {
+            return tell(run, &packer.check);
+        }
+        let shards = run.phase("write", |_| Ok(packer.archive.finish()?))?;
+        run.result("files", [ARCHIVE])?;
+        run.result("shards", shards)?;
+        run.phase("check", |run| check(run, &path, &expected))
+    }
+
+    /// Who must be simulated in which scenario.
+    fn expected(&self, run: &Run) -> anyhow::Result<ExpectedScenarios> {
+        let progress = run.progress("reading", 0, "scenarios");
+        let mut expected = ExpectedScenarios::default();
+        for record in open_with(&self.scenarios, ReadOptions::STATED)? {
+            run::stop_if_interrupted()?;
+            expected.add(&record?.scenario);
+            progress.advance(1);
+        }
+        Ok(expected)
+    }
+
+    fn pack(&self, run: &Run, packer: &mut Packer<'_>) -> anyhow::Result<()> {
+        if let Some(path) = &self.source.rollouts {
+            for file in rollout_files::files(path)? {
+                for rollouts in read_rollouts(&file)? {
+                    run::stop_if_interrupted()?;
+                    packer.add(&rollouts)?;
+                }
+            }
+        }
+        if let Some(world) = &self.source.world {
+            let mut worlds = Worlds::new(world, self.sampling.resolve()?);
+            let scenarios = open_with(&self.scenarios, ReadOptions::ALL)?;
+            for (index, record) in scenarios.enumerate() {
+                let scenario = record?.scenario;
+                let seed = run.seed().fork(index as u64);
+                let seconds = N_STEPS as f64 * scenario.dt;
+                let (world, scene) = (worlds.of(&scenario)?, scenario.present());
+                let imagined = imagine(run, world, scene, N_FUTURES, seconds, seed)?;
+                let (rollouts, _) = rollouts_to_proto(&scenario.id, &imagined.rollouts)?;
+                packer.add(&rollouts)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An archive in the making; broken futures are told, not packed.
+struct Packer<'a> {
+    archive: ArchiveWriter,
+    check: SubmissionCheck,
+    expected: &'a ExpectedScenarios,
+}
+
+impl Packer<'_> {
+    fn add(&mut self, rollouts: &ScenarioRollouts) -> anyhow::Result<()> {
+        if self.check.add(rollouts, self.expected) {
+            self.archive.add(rollouts)?;
+        }
+        Ok(())
+    }
+}
+
+fn check(run: &mut Run, archive: &Path, expected: &ExpectedScenarios) -> anyhow::Result<()> {
+    let found = check_archive(archive, expected)?;
+    tell(run, &found)
+}
+
+/// Reports what was found.
+///
+/// Error: if anything was.
+fn tell(run: &mut Run, found: &SubmissionCheck) -> anyhow::Result<()> {
+    run.result("scenarios", found.scenarios)?;
+    run.result("n_problems", found.n_problems)?;
+    run.result("problems", &found.problems)?;
+    match found.problems.first() {
+        Some(first) => anyhow::bail!(
+            "the submission breaks the challenge's rules in {} ways, the first: {first}",
+            found.n_problems
+        ),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_told_apart_by_commas() {
+        assert_eq!(names(" A. B, C ,,"), ["A. B", "C"]);
+        assert!(names("").is_empty());
+    }
+}

@@ -1,0 +1,423 @@
+//! Motion prediction and submissions from the outside: official numbers, shards, broken input.
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use gump_data::submission::{
+    N_FUTURES, predictions_to_proto, read_predictions, rollouts_to_proto, write_predictions,
+    write_rollouts,
+};
+use gump_data::tfrecord::{TfRecordReader, write_record};
+use gump_data::womd::proto::motion::{MotionChallengeSubmission, PredictionKind};
+use gump_data::womd::proto::{
+    self, FeatureData, MapFeature, RequiredPrediction, SimAgentsChallengeSubmission,
+};
+use gump_metrics::logged;
+use gump_scene::{PredictedMode, Prediction, Scenario};
+use prost::Message;
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// The reference prints f32 results with nine digits.
+const TOLERANCE: f64 = 1e-6;
+
+fn run(folder: &TempDir, words: &str) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_xtask"))
+        .args(words.split(' '))
+        .current_dir(folder.path())
+        .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The results of a run that succeeds.
+fn results(folder: &TempDir, words: &str, out: &str) -> Value {
+    let output = run(folder, &format!("{words} --quiet --out {out}"));
+    assert!(output.status.success(), "{words}: {}", stderr(&output));
+    report(folder, out)
+}
+
+fn report(folder: &TempDir, out: &str) -> Value {
+    let path = folder.path().join(out).join("report.json");
+    let mut report: Value = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+    report["results"].take()
+}
+
+fn fails(folder: &TempDir, words: &str, status: i32, part: &str) {
+    let output = run(folder, &format!("{words} --quiet --out failed"));
+    let error = stderr(&output);
+    assert_eq!(output.status.code(), Some(status), "{words}: {error}");
+    assert!(error.contains(part), "{words}: expected {part} in: {error}");
+}
+
+fn mini() -> String {
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let path = repository.join("datasets/mini/procedural.tfrecord.gz");
+    path.display().to_string()
+}
+
+fn shared(name: &str) -> Option<PathBuf> {
+    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared")).join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!("SKIPPED: the file {name} is not beside the repository");
+    None
+}
+
+/// The scenarios of the official numbers as one file: those without a map get one, since every
+/// scenario has a map and the measurements never look at it; what a joint prediction is of becomes
+/// what is to be predicted.
+fn official_scenarios(path: &Path, submission: &MotionChallengeSubmission) -> Option<()> {
+    let names = [
+        "golden/wosac/inputs/scenario_synm00000000001.tfrecord",
+        "golden/wosac/inputs/scenario_syn0000000000001.tfrecord",
+        "data/waymo/scenario_a.tfrecord",
+        "data/waymo/scenario_b.tfrecord",
+    ];
+    let mut file = fs::File::create(path).unwrap();
+    for name in names {
+        let payload = TfRecordReader::open(shared(name)?)
+            .unwrap()
+            .next()?
+            .unwrap();
+        let mut scenario = proto::Scenario::decode(payload.bytes.as_slice()).unwrap();
+        if scenario.map_features.is_empty() {
+            scenario.map_features.push(MapFeature {
+                id: Some(1),
+                feature_data: Some(FeatureData::RoadEdge(proto::RoadEdge {
+                    r#type: Some(1),
+                    polyline: [0.0, 1.0]
+                        .map(|x| proto::MapPoint {
+                            x: Some(x),
+                            y: Some(0.0),
+                            z: Some(0.0),
+                        })
+                        .into(),
+                })),
+            });
+        }
+        if let Some(ids) = jointly_predicted(submission, scenario.scenario_id()) {
+            let index = |id| scenario.tracks.iter().position(|t| t.id() == id).unwrap();
+            let target = |&id: &i32| RequiredPrediction {
+                track_index: Some(index(id) as i32),
+                difficulty: None,
+            };
+            scenario.tracks_to_predict = ids.iter().map(target).collect();
+        }
+        write_record(&mut file, &scenario.encode_to_vec()).unwrap();
+    }
+    Some(())
+}
+
+fn jointly_predicted(submission: &MotionChallengeSubmission, id: &str) -> Option<Vec<i32>> {
+    let mut messages = submission.scenario_predictions.iter();
+    let message = messages.find(|m| m.scenario_id() == id)?;
+    let Some(PredictionKind::JointPrediction(joint)) = &message.prediction_set else {
+        return None;
+    };
+    let trajectories = &joint.joint_trajectories[0].trajectories;
+    Some(trajectories.iter().map(|t| t.object_id()).collect())
+}
+
+/// The largest difference between our rows and the official ones.
+fn largest_difference(rows: &Value, official: &Value) -> f64 {
+    let mut largest = 0.0_f64;
+    let official = official["bundles"].as_array().unwrap();
+    for expected in official {
+        let class = ["vehicle", "pedestrian", "bicycle"]
+            [expected["object_type"].as_u64().unwrap() as usize - 1];
+        let seconds = (expected["measurement_step"].as_f64().unwrap() + 1.0) / 2.0;
+        let mut rows = rows.as_array().unwrap().iter();
+        let row = rows.find(|row| row["class"] == class && row["horizon_s"] == seconds);
+        let row = row.unwrap();
+        for (theirs, ours) in [
+            ("min_ade", "min_ade"),
+            ("min_fde", "min_fde"),
+            ("miss_rate", "miss_rate"),
+            ("overlap_rate", "overlap_rate"),
+            ("mAP", "map"),
+            ("soft_mAP", "soft_map"),
+        ] {
+            let (a, b) = (
+                expected[theirs].as_f64().unwrap(),
+                row[ours].as_f64().unwrap(),
+            );
+            largest = largest.max((a - b).abs());
+        }
+    }
+    assert!(official.len() >= 6);
+    largest
+}
+
+#[test]
+fn motion_numbers_are_the_official_ones() {
+    for set in ["gt", "cv", "noise8", "joint8"] {
+        let golden = format!("golden/wosac/motion/submission_{set}.binproto");
+        let Some(predictions) = shared(&golden) else {
+            return;
+        };
+        let official = shared(&format!("golden/wosac/motion/result_{set}.json")).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let submission = read_predictions(&predictions).unwrap();
+        let scenarios = folder.path().join("all.tfrecord");
+        if official_scenarios(&scenarios, &submission).is_none() {
+            return;
+        }
+        let words = format!(
+            "evaluate motion --scenarios all.tfrecord --rollouts {}",
+            predictions.display()
+        );
+        let found = results(&folder, &words, "out");
+        let official = serde_json::from_str(&fs::read_to_string(official).unwrap()).unwrap();
+        let difference = largest_difference(&found["rows"], &official);
+        println!("{set}: differs by at most {difference:e} from the official numbers");
+        assert!(difference < TOLERANCE, "{set}: {difference}");
+    }
+}
+
+#[test]
+fn the_log_is_a_perfect_forecaster() {
+    let folder = tempfile::tempdir().unwrap();
+    let words = format!(
+        "evaluate motion --scenarios {} --world log --futures 2",
+        mini()
+    );
+    let found = results(&folder, &words, "out");
+    assert_eq!(found["scenarios"], 24);
+    let rows = found["rows"].as_array().unwrap();
+    let last = rows.last().unwrap();
+    assert_eq!(
+        (&last["class"], &last["horizon_s"]),
+        (&"all".into(), &Value::Null)
+    );
+    assert_eq!(last["predictions"], found["predictions"]);
+    for row in rows {
+        // Made-up drivers never collide, and what happened is what was predicted.
+        for name in ["min_ade", "min_fde", "miss_rate"] {
+            assert_eq!(row[name], 0.0, "{name} of {row}");
+        }
+        assert_eq!((&row["map"], &row["soft_map"]), (&1.0.into(), &1.0.into()));
+    }
+    let interval = &found["intervals"][0]["min_ade"];
+    assert_eq!(interval, &serde_json::json!([0.0, 0.0]));
+}
+
+#[test]
+fn shards_add_up_and_an_interrupted_run_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let words = format!(
+        "evaluate motion --scenarios {} --world constant-velocity --futures 1 --seed 5",
+        mini()
+    );
+    let whole = results(&folder, &words, "whole");
+    for k in 1..=3 {
+        results(
+            &folder,
+            &format!("{words} --shard {k}/3"),
+            &format!("part{k}"),
+        );
+    }
+    let merged = results(&folder, "evaluate merge part3 part1 part2", "merged");
+    assert_eq!(merged, whole);
+    let again = results(&folder, &format!("{words} --threads 1"), "again");
+    assert_eq!(again, whole);
+    // A run that was stopped after some scenarios ends as if it had not been.
+    let ledger = fs::read_to_string(folder.path().join("whole/scenarios.toml")).unwrap();
+    let stopped = folder.path().join("stopped");
+    fs::create_dir(&stopped).unwrap();
+    fs::write(
+        stopped.join("scenarios.toml.partial"),
+        &ledger[..ledger.len() / 2],
+    )
+    .unwrap();
+    assert_eq!(results(&folder, &words, "stopped"), whole);
+}
+
+/// Two scenarios of one scene, in a file.
+fn two_scenarios(folder: &TempDir) -> Vec<Scenario> {
+    let scene = gump_scene::fixture::scenario(
+        "lane 1: -50,0 0,0 50,0 150,0 speed 15 width 3.5
+         ego vehicle 0: 0,0 velocity 8,0
+         agent vehicle 1: 20,0 velocity 6,0
+         agent pedestrian 2: 30,4
+         history 1 future 8 dt 0.1",
+    )
+    .unwrap();
+    let named = |id: &str| Scenario {
+        id: id.into(),
+        targets: vec![scene.ego],
+        ..scene.clone()
+    };
+    let scenarios = vec![named("a"), named("b")];
+    gump_data::womd::write_scenarios(&folder.path().join("two.tfrecord"), &scenarios).unwrap();
+    scenarios
+}
+
+/// Predictions of the log, `offset` metres beside it.
+fn predictions(scenario: &Scenario, offset: f64) -> Vec<Prediction> {
+    let of_agent = |&agent| {
+        let positions = (1..=16).map(|k| {
+            let frame = &scenario.log[scenario.now + 5 * k];
+            let mut position = frame.agent(agent).unwrap().state.pose.position;
+            position.y += offset;
+            position
+        });
+        Prediction {
+            agents: vec![agent],
+            modes: vec![PredictedMode {
+                confidence: 0.5,
+                paths: vec![positions.collect()],
+            }],
+        }
+    };
+    scenario.targets.iter().map(of_agent).collect()
+}
+
+fn write_motion(folder: &TempDir, name: &str, scenarios: &[&Scenario]) {
+    let message = |scenario: &&Scenario| {
+        predictions_to_proto(&scenario.id, &predictions(scenario, 0.25)).unwrap()
+    };
+    let submission = MotionChallengeSubmission {
+        scenario_predictions: scenarios.iter().map(message).collect(),
+        ..MotionChallengeSubmission::default()
+    };
+    write_predictions(&folder.path().join(name), &submission).unwrap();
+}
+
+#[test]
+fn predictions_come_from_files_of_either_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenarios = two_scenarios(&folder);
+    let evaluate = "evaluate motion --scenarios two.tfrecord --rollouts";
+    write_motion(&folder, "both.binproto", &[&scenarios[0], &scenarios[1]]);
+    let found = results(&folder, &format!("{evaluate} both.binproto"), "out");
+    let error = found["rows"][0]["min_ade"].as_f64().unwrap();
+    assert!((error - 0.25).abs() < 1e-5, "{error}");
+    // Futures of the sim agents challenge, one file per scenario.
+    fs::create_dir(folder.path().join("futures")).unwrap();
+    for scenario in &scenarios {
+        let path = folder
+            .path()
+            .join(format!("futures/{}.binproto", scenario.id));
+        write_rollouts(&path, &scenario.id, &[logged(scenario)]).unwrap();
+    }
+    let found = results(&folder, &format!("{evaluate} futures"), "out");
+    let error = found["rows"][0]["min_ade"].as_f64().unwrap();
+    assert!(error < 1e-5, "{error}");
+
+    write_motion(&folder, "one.binproto", &[&scenarios[0]]);
+    let words = |file: &str| format!("{evaluate} {file}");
+    let missing = "expected predictions of scenario b, found none";
+    fails(&folder, &words("one.binproto"), 1, missing);
+    write_motion(&folder, "twice.binproto", &[&scenarios[0], &scenarios[0]]);
+    let twice = "expected scenario a once, found it twice";
+    fails(&folder, &words("twice.binproto"), 1, twice);
+    let stranger = Scenario {
+        id: "x".into(),
+        ..scenarios[0].clone()
+    };
+    let three = [&scenarios[0], &scenarios[1], &stranger];
+    write_motion(&folder, "three.binproto", &three);
+    let unknown = "predictions of \"x\", which is not among the scenarios";
+    fails(&folder, &words("three.binproto"), 1, unknown);
+    fails(&folder, &words("two.tfrecord"), 1, "expected a");
+    fails(&folder, &words("nothing"), 1, "nothing");
+    let neither = "evaluate motion --scenarios two.tfrecord";
+    fails(&folder, neither, 2, "--world");
+    let wrong_shard = format!("{neither} --world idm --shard 3/2");
+    fails(&folder, &wrong_shard, 2, "K/N");
+}
+
+const MAKER: &str =
+    "--account me@example.org --method test --parameters 1K --complies-with-closed-loop";
+
+#[test]
+fn an_archive_is_packed_and_passes_its_own_check() {
+    let folder = tempfile::tempdir().unwrap();
+    two_scenarios(&folder);
+    let submit = "submit wosac --scenarios two.tfrecord";
+    let words = format!("{submit} --world constant-velocity {MAKER}");
+    let found = results(&folder, &words, "out");
+    assert_eq!(
+        (&found["scenarios"], &found["n_problems"]),
+        (&2.into(), &0.into())
+    );
+    assert_eq!(found["files"], serde_json::json!(["submission.tar.gz"]));
+    let words = format!("{submit} --archive out/submission.tar.gz");
+    assert_eq!(results(&folder, &words, "checked")["n_problems"], 0);
+    // The archive lacks the scenarios of another set.
+    let words = format!(
+        "submit wosac --scenarios {} --archive out/submission.tar.gz",
+        mini()
+    );
+    fails(
+        &folder,
+        &words,
+        1,
+        "breaks the challenge's rules in 26 ways",
+    );
+    let problems = report(&folder, "failed")["problems"].clone();
+    assert_eq!(problems[0], "scenario \"a\" is not one of those expected");
+}
+
+#[test]
+fn a_submission_that_breaks_the_rules_is_not_packed() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenarios = two_scenarios(&folder);
+    let submit = "submit wosac --scenarios two.tfrecord --rollouts futures.binproto";
+    let mut messages: Vec<_> = scenarios
+        .iter()
+        .map(|s| {
+            rollouts_to_proto(&s.id, &vec![logged(s); N_FUTURES])
+                .unwrap()
+                .0
+        })
+        .collect();
+    let mut write = |damage: &dyn Fn(&mut Vec<proto::ScenarioRollouts>)| {
+        let before = messages.clone();
+        damage(&mut messages);
+        let shard = SimAgentsChallengeSubmission {
+            scenario_rollouts: std::mem::replace(&mut messages, before),
+            ..SimAgentsChallengeSubmission::default()
+        };
+        fs::write(
+            folder.path().join("futures.binproto"),
+            shard.encode_to_vec(),
+        )
+        .unwrap();
+    };
+    let words = format!("{submit} {MAKER}");
+    write(&|_| {});
+    assert_eq!(results(&folder, &words, "good")["n_problems"], 0);
+    write(&|m| m[1].joint_scenes[3].simulated_trajectories[0].heading[2] = f32::NAN);
+    fails(
+        &folder,
+        &words,
+        1,
+        "scenario b: future 3: agent 0 has a state that is not a number",
+    );
+    assert!(!folder.path().join("failed/submission.tar.gz").exists());
+    write(&|m| m.truncate(1));
+    fails(&folder, &words, 1, "scenario b is missing");
+    write(&|m| m[0].joint_scenes.truncate(7));
+    fails(
+        &folder,
+        &words,
+        1,
+        "scenario a: expected 32 futures, found 7",
+    );
+    fails(&folder, submit, 2, "account_name");
+    fails(
+        &folder,
+        "submit wosac --scenarios two.tfrecord",
+        2,
+        "--rollouts",
+    );
+}
