@@ -54,9 +54,60 @@ pub enum DataError {
         path: PathBuf,
     },
     /// A directory holds no file of a known kind.
-    #[error("expected files named *.tfrecord*, found none in the directory {}", path.display())]
+    #[error(
+        "expected scenario files, found {others} files of other kinds in the directory {}",
+        path.display()
+    )]
     NoFiles {
+        /// How many files there are that hold no scenarios.
+        others: usize,
         /// The directory.
+        path: PathBuf,
+    },
+    /// A file is of a known kind that holds no scenarios.
+    #[error("expected scenarios, found {what}: {}", path.display())]
+    NotScenarios {
+        /// What it is.
+        what: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A document is longer than any that is read whole.
+    #[error("expected at most {limit} bytes of {what}, found more: {}", path.display())]
+    TooLarge {
+        /// What it holds.
+        what: &'static str,
+        /// The most that is accepted, bytes after unpacking.
+        limit: u64,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A document is not JSON, or not of the right shape.
+    #[error("expected {what}: {source}: {}", path.display())]
+    Json {
+        /// What it should be.
+        what: &'static str,
+        /// What the parser says, with line and column.
+        source: serde_json::Error,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A table is damaged or lacks a column.
+    #[error("expected {expected}, found {found}: {}", path.display())]
+    Table {
+        /// What should be there.
+        expected: String,
+        /// What is there.
+        found: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file needs another one beside it.
+    #[error("expected {expected} beside it, found none: {}", path.display())]
+    NoCompanion {
+        /// The missing file.
+        expected: String,
+        /// The file that needs it.
         path: PathBuf,
     },
     /// The content is of no known format.
@@ -254,6 +305,16 @@ pub enum Problem {
         found: f64,
         /// The later step.
         step: usize,
+    },
+    /// A value is not what the format promises.
+    #[error("expected {expected}, found {found} in {place}")]
+    Unexpected {
+        /// What should be there.
+        expected: &'static str,
+        /// What is there.
+        found: Box<str>,
+        /// Which part of the record.
+        place: Box<str>,
     },
     /// Imagined futures do not fit their scenario.
     #[error("{0}")]

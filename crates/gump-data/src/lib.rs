@@ -29,13 +29,23 @@
 //! * **stated** is what a format says, **inferred** what a reader adds, **dropped** what a reader
 //!   leaves out because [`Scenario`](gump_scene::Scenario) has no room for it or it is unusable.
 //!
-//! A new format is one file beside `womd` and one line in the table of `open`.
+//! A new format is one file beside `womd` and one line in the table of `files`.
 
+mod argoverse2;
+mod commonroad;
+mod document;
 mod error;
+mod features;
+mod files;
+mod gpudrive;
 mod infer;
 mod inspect;
+mod json;
+mod lanelet;
+mod motion;
 mod open;
 mod record;
+mod recording;
 mod stream;
 pub mod submission;
 pub mod sumo;
@@ -43,10 +53,12 @@ pub mod tfrecord;
 mod verify;
 pub mod womd;
 mod write_atomically;
+mod xml;
 
 pub use error::{DataError, Place, Problem};
+pub use files::list as list_files;
 pub use inspect::{Summary, inspect};
 pub use open::{Reader, find, open, open_with};
-pub use record::{ReadOptions, ReadReport, ScenarioRecord};
+pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
 pub use verify::{Finding, Severity, Verification, verify};
 pub use write_atomically::write_atomically;

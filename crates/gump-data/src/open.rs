@@ -1,24 +1,12 @@
 //! Opening a file or a directory by content, and finding one scenario by name.
 
-use std::collections::VecDeque;
-use std::fs;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 
 use gump_scene::Scenario;
 
-use crate::stream::{self, io_error};
-use crate::{DataError, ReadOptions, ScenarioRecord, sumo, womd};
-
-/// A format that content can be recognised as. A new format is one line in [`FORMATS`].
-pub(crate) struct Format {
-    /// Its name in reports and errors.
-    pub(crate) name: &'static str,
-    /// True if content that starts with these (up to [`HEAD_BYTES`], uncompressed) bytes is of
-    /// this format.
-    pub(crate) recognises: fn(&[u8]) -> bool,
-    /// Starts reading a file.
-    pub(crate) open: fn(&Path, ReadOptions) -> Result<BoxedSource, DataError>,
-}
+use crate::files::{self, Role};
+use crate::{DataError, ReadOptions, ScenarioRecord};
 
 /// How a format hands over its scenarios.
 pub(crate) type BoxedSource = Box<dyn Source>;
@@ -34,13 +22,8 @@ pub(crate) trait Source: Send {
     ) -> Option<Result<ScenarioRecord, DataError>>;
 }
 
-const FORMATS: [Format; 2] = [womd::FORMAT, sumo::FORMAT];
-
-/// How much of the content a recogniser sees.
-const HEAD_BYTES: u64 = 4096;
-
-/// Opens a file, or all `*.tfrecord*` files of a directory in order of their names, filling gaps
-/// with [`ReadOptions::ALL`].
+/// Opens a file, or every file of a directory that holds scenarios, in order of their paths and
+/// whatever their formats, filling gaps with [`ReadOptions::ALL`].
 ///
 /// # Errors
 /// As [`open_with`].
@@ -48,44 +31,58 @@ pub fn open(path: &Path) -> Result<Reader, DataError> {
     open_with(path, ReadOptions::ALL)
 }
 
-/// Opens a file, or all `*.tfrecord*` files of a directory in order of their names.
+/// Opens a file, or every file of a directory and its subdirectories that holds scenarios.
+///
+/// In a directory, files of other kinds are skipped and counted in [`Reader::skipped`]; files that
+/// should hold scenarios by their name or beginning but cannot be opened are errors of the reader,
+/// which goes on with the next.
 ///
 /// # Errors
 /// [`DataError::Missing`], [`DataError::NoFiles`], and for a single file [`DataError::Empty`],
-/// [`DataError::UnknownFormat`] and [`DataError::Io`]; of several files the reader tells them.
+/// [`DataError::UnknownFormat`], [`DataError::NotScenarios`] and [`DataError::Io`]; of several
+/// files the reader tells them.
 pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError> {
-    let mut files = if path.is_dir() {
-        files_in(path)?
+    let is_folder = path.is_dir();
+    let files = if is_folder {
+        files::list(path)?
     } else {
-        VecDeque::from([path.to_path_buf()])
-    };
-    let Some(first) = files.pop_front() else {
-        return Err(DataError::NoFiles { path: path.into() });
+        vec![path.to_path_buf()]
     };
     let mut reader = Reader {
-        source: Some(Box::new(NoRecords)),
+        source: Box::new(NoRecords),
         format: "unknown",
         unopened: None,
-        files,
+        files: files.into(),
+        is_folder,
+        skipped: BTreeMap::new(),
         options,
     };
-    match reader.start(&first) {
+    match reader.start_next() {
+        Some(Ok(())) => Ok(reader),
         // With more files to come, the first is one broken file among others.
-        Err(error) if !reader.files.is_empty() => reader.unopened = Some(error),
-        started => started?,
+        Some(Err(error)) if !reader.files.is_empty() => {
+            reader.unopened = Some(error);
+            Ok(reader)
+        }
+        Some(Err(error)) => Err(error),
+        None => Err(DataError::NoFiles {
+            others: reader.skipped.values().sum(),
+            path: path.into(),
+        }),
     }
-    Ok(reader)
 }
 
 /// An iterator over the scenarios of a file or directory; holds one record at a time.
 ///
 /// After an error it goes on with the next record, or the next file, where that is possible.
 pub struct Reader {
-    source: Option<BoxedSource>,
+    source: BoxedSource,
     format: &'static str,
     /// Why the first of several files could not be opened, until it is told.
     unopened: Option<DataError>,
     files: VecDeque<PathBuf>,
+    is_folder: bool,
+    skipped: BTreeMap<&'static str, usize>,
     options: ReadOptions,
 }
 
@@ -93,6 +90,11 @@ impl Reader {
     /// The format of the file being read.
     pub fn format(&self) -> &'static str {
         self.format
+    }
+
+    /// Files of a directory passed over so far, by what they are.
+    pub fn skipped(&self) -> &BTreeMap<&'static str, usize> {
+        &self.skipped
     }
 
     fn next_wanted(
@@ -103,26 +105,38 @@ impl Reader {
             return Some(Err(error));
         }
         loop {
-            let source = self.source.as_mut()?;
-            if let Some(record) = source.next_wanted(wanted) {
+            if let Some(record) = self.source.next_wanted(wanted) {
                 return Some(record);
             }
-            self.source = None;
-            let file = self.files.pop_front()?;
-            if let Err(error) = self.start(&file) {
-                // A source without records keeps the reader going with the files after it.
-                self.source = Some(Box::new(NoRecords));
+            // A source without records keeps the reader going with the files after a broken one.
+            self.source = Box::new(NoRecords);
+            if let Err(error) = self.start_next()? {
                 return Some(Err(error));
             }
         }
     }
 
-    /// Makes `file` the one being read.
-    fn start(&mut self, file: &Path) -> Result<(), DataError> {
-        let format = recognise(file)?;
-        self.source = Some((format.open)(file, self.options)?);
-        self.format = format.name;
-        Ok(())
+    /// Makes the next file that holds scenarios the one being read; `None` if there is none.
+    fn start_next(&mut self) -> Option<Result<(), DataError>> {
+        loop {
+            let file = self.files.pop_front()?;
+            let format = match files::role(&file) {
+                Ok(Role::Scenarios(format)) => format,
+                Ok(Role::Companion(what) | Role::Unknown(what, _)) if self.is_folder => {
+                    *self.skipped.entry(what).or_default() += 1;
+                    continue;
+                }
+                Ok(Role::Companion(what)) => {
+                    return Some(Err(DataError::NotScenarios { what, path: file }));
+                }
+                Ok(Role::Unknown(_, error)) => return Some(Err(error)),
+                Err(error) => return Some(Err(error)),
+            };
+            return Some((format.open)(&file, self.options).map(|source| {
+                self.source = source;
+                self.format = format.name;
+            }));
+        }
     }
 }
 
@@ -202,27 +216,4 @@ fn find_id(path: &Path, wanted: &str) -> Result<ScenarioRecord, DataError> {
         found,
         path: path.into(),
     }))
-}
-
-fn recognise(path: &Path) -> Result<Format, DataError> {
-    let head = stream::head(path, HEAD_BYTES)?;
-    let known = FORMATS.into_iter().find(|f| (f.recognises)(&head));
-    known.ok_or_else(|| DataError::UnknownFormat {
-        expected: FORMATS.map(|f| f.name).join(" or "),
-        found: head[..head.len().min(12)].escape_ascii().to_string(),
-        path: path.into(),
-    })
-}
-
-fn files_in(folder: &Path) -> Result<VecDeque<PathBuf>, DataError> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(folder).map_err(|e| io_error("list", e, folder))? {
-        let path = entry.map_err(|e| io_error("list", e, folder))?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        if name.contains(".tfrecord") && !name.ends_with(".partial") && path.is_file() {
-            files.push(path);
-        }
-    }
-    files.sort();
-    Ok(files.into())
 }

@@ -27,7 +27,22 @@ pub struct ReadReport {
     pub dropped: BTreeMap<&'static str, usize>,
     /// In the scenario but not stated by the format.
     pub inferred: BTreeMap<&'static str, usize>,
+    /// Single damaged things that were left out, each with its place; at most [`MAX_NOTES`].
+    #[serde(skip)]
+    pub notes: Vec<Note>,
 }
+
+/// One damaged thing that was left out.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Note {
+    /// The reason, a key of [`ReadReport::dropped`].
+    pub reason: &'static str,
+    /// Which one, and what is wrong with it.
+    pub detail: String,
+}
+
+/// So many damaged things are named one by one; all are counted. Damage may be everywhere.
+pub const MAX_NOTES: usize = 200;
 
 impl ReadReport {
     /// Counts `n` things left out; zero counts leave no entry.
@@ -35,12 +50,21 @@ impl ReadReport {
         add(&mut self.dropped, reason, n);
     }
 
+    /// Counts one damaged thing left out and says which.
+    pub fn drop_damaged(&mut self, reason: &'static str, detail: impl FnOnce() -> String) {
+        self.drop(reason, 1);
+        if self.notes.len() < MAX_NOTES {
+            let detail = detail();
+            self.notes.push(Note { reason, detail });
+        }
+    }
+
     /// Counts `n` things added; zero counts leave no entry.
     pub fn infer(&mut self, what: &'static str, n: usize) {
         add(&mut self.inferred, what, n);
     }
 
-    /// Adds the counts of another report.
+    /// Adds the counts of another report; its notes stay with their scenario.
     pub fn merge(&mut self, other: &Self) {
         for (reason, n) in &other.dropped {
             self.drop(reason, *n);
@@ -59,9 +83,15 @@ fn add(counts: &mut BTreeMap<&'static str, usize>, key: &'static str, n: usize) 
 
 /// Which gaps of a format a reader may fill by inference.
 ///
-/// The default fills all of them: planners need routes and drivable surfaces.
+/// The default fills all of them: planners need routes and drivable surfaces. Smoothing changes
+/// what a format states and is off unless asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
+    /// Which lane leads to which, which lie side by side, from the centre lines, where a format
+    /// states no links at all.
+    pub infer_lane_graph: bool,
+    /// Speed limits of lanes without one from the lanes before, after and beside.
+    pub infer_speed_limits: bool,
     /// Lane widths from the lines and lanes beside them; otherwise every lane has the default.
     pub infer_widths: bool,
     /// Which lanes lie inside an intersection, from the lanes they cross, fork from and join.
@@ -69,25 +99,60 @@ pub struct ReadOptions {
     /// Drivable surfaces from lanes and road edges; otherwise a map without stated surfaces has
     /// none, which means that nothing is off-road.
     pub infer_drivable: bool,
+    /// Road edges along the border of the drivable surface, where a format states none.
+    pub infer_edges: bool,
+    /// The lane of a light that states only where it is.
+    pub infer_light_lanes: bool,
     /// The ego's route from its logged path, **future included**: it tells where the ego went,
     /// as a navigation system would; it does not tell when or how.
     pub infer_route: bool,
+    /// Who the ego is, where a format does not say; otherwise such a record has no ego and is
+    /// refused.
+    pub infer_ego: bool,
+    /// Sizes of agents by their class; otherwise agents without a size are left out.
+    pub infer_sizes: bool,
+    /// Velocities from positions and headings from velocities; otherwise states without them are
+    /// left out.
+    pub infer_motion: bool,
+    /// Elevations of agents from the map; otherwise 0.
+    pub infer_elevation: bool,
+    /// Replaces tracks by a smoothed version, with velocities and headings that fit: for noisy
+    /// recordings such as NGSIM. Never on by default.
+    pub smooth: bool,
 }
 
 impl ReadOptions {
     /// Takes only what a format states.
     pub const STATED: Self = Self {
+        infer_lane_graph: false,
+        infer_speed_limits: false,
         infer_widths: false,
         infer_intersections: false,
         infer_drivable: false,
+        infer_edges: false,
+        infer_light_lanes: false,
         infer_route: false,
+        infer_ego: false,
+        infer_sizes: false,
+        infer_motion: false,
+        infer_elevation: false,
+        smooth: false,
     };
-    /// Fills every gap that can be filled.
+    /// Fills every gap that can be filled; smooths nothing.
     pub const ALL: Self = Self {
+        infer_lane_graph: true,
+        infer_speed_limits: true,
         infer_widths: true,
         infer_intersections: true,
         infer_drivable: true,
+        infer_edges: true,
+        infer_light_lanes: true,
         infer_route: true,
+        infer_ego: true,
+        infer_sizes: true,
+        infer_motion: true,
+        infer_elevation: true,
+        smooth: false,
     };
 }
 

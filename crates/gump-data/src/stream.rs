@@ -59,6 +59,25 @@ pub(crate) fn head(path: &Path, n: u64) -> Result<Vec<u8>, DataError> {
     Ok(bytes)
 }
 
+/// The whole content, for formats that are one document.
+///
+/// Error: those of [`open`], and [`DataError::TooLarge`] before more than `limit` bytes are held.
+pub(crate) fn content(path: &Path, what: &'static str, limit: u64) -> Result<Vec<u8>, DataError> {
+    let mut bytes = Vec::new();
+    open(path)?
+        .take(limit + 1)
+        .read_to_end(&mut bytes)
+        .map_err(|source| io_error("read", source, path))?;
+    if bytes.len() as u64 > limit {
+        return Err(DataError::TooLarge {
+            what,
+            limit,
+            path: path.into(),
+        });
+    }
+    Ok(bytes)
+}
+
 /// Names the file an operating-system error belongs to.
 pub(crate) fn io_error(doing: &'static str, source: io::Error, path: &Path) -> DataError {
     DataError::Io {

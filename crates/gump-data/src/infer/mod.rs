@@ -4,14 +4,17 @@
 //! read again is inferred the same. Start with [`map`] and [`route`].
 
 mod drivable;
+mod edges;
 mod intersections;
+mod lane_graph;
+mod light_lanes;
 mod route;
 mod widths;
 
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, distance_to_segment};
-use gump_scene::{LaneKind, MapParts, Scenario};
+use gump_scene::{LaneKind, Light, MapGraph, MapParts, Scenario};
 
 use crate::{ReadOptions, ReadReport};
 
@@ -37,6 +40,39 @@ pub(crate) fn map(parts: &mut MapParts, options: ReadOptions, report: &mut ReadR
     }
     if options.infer_drivable && parts.drivable.is_empty() {
         drivable::infer(parts, report);
+    }
+}
+
+/// Links lanes of a format that states no links; call it before [`map`], which looks at links.
+pub(crate) fn lane_graph(parts: &mut MapParts, options: ReadOptions, report: &mut ReadReport) {
+    if options.infer_lane_graph {
+        lane_graph::infer(parts, report);
+    }
+}
+
+/// Fills gaps that only some formats leave; call it after [`map`].
+pub(crate) fn limits_and_edges(
+    parts: &mut MapParts,
+    options: ReadOptions,
+    report: &mut ReadReport,
+) {
+    if options.infer_speed_limits {
+        lane_graph::speed_limits(parts, report);
+    }
+    if options.infer_edges {
+        edges::infer(parts, report);
+    }
+}
+
+/// Attaches lights of unknown lanes to lanes.
+pub(crate) fn light_lanes(
+    lights: &mut [(usize, Light)],
+    map: &MapGraph,
+    options: ReadOptions,
+    report: &mut ReadReport,
+) {
+    if options.infer_light_lanes {
+        light_lanes::infer(lights, map, report);
     }
 }
 

@@ -23,7 +23,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::open::{BoxedSource, Format};
+use crate::files::Format;
+use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
 use crate::{DataError, ReadOptions};
 use floating_cars::FloatingCars;
@@ -107,6 +108,27 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
 
 fn is_floating_cars(head: &[u8]) -> bool {
     root(head).is_some_and(|root| root == "fcd-export")
+}
+
+/// True for a network, which scenarios need beside them.
+pub(crate) fn is_network(head: &[u8]) -> bool {
+    root(head).is_some_and(|root| root == "net")
+}
+
+/// True for the other files of a SUMO simulation: demand, signals, detectors, configuration.
+pub(crate) fn is_other(head: &[u8]) -> bool {
+    const ROOTS: [&str; 9] = [
+        "additional",
+        "configuration",
+        "data",
+        "edgedata",
+        "meandata",
+        "routes",
+        "sumoConfiguration",
+        "tlsStates",
+        "turns",
+    ];
+    root(head).is_some_and(|root| ROOTS.contains(&root.as_str()))
 }
 
 /// The name of the first element, comments and declarations skipped.

@@ -11,7 +11,8 @@ use std::sync::Arc;
 
 use prost::Message;
 
-use crate::open::{BoxedSource, Format, Source};
+use crate::files::Format;
+use crate::open::{BoxedSource, Source};
 use crate::tfrecord::{self, TfRecordReader};
 use crate::{DataError, ReadOptions, ScenarioRecord};
 
