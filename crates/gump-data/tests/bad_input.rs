@@ -78,7 +78,7 @@ fn an_empty_directory() {
 
 #[test]
 fn not_a_tfrecord() {
-    let error = error_of(b"{\"objects\": []}");
+    let error = error_of(b"{\"agents\": []}");
     assert!(matches!(error, DataError::UnknownFormat { .. }));
     assert!(
         error

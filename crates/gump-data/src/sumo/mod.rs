@@ -117,7 +117,8 @@ pub(crate) fn is_network(head: &[u8]) -> bool {
 
 /// True for the other files of a SUMO simulation: demand, signals, detectors, configuration.
 pub(crate) fn is_other(head: &[u8]) -> bool {
-    const ROOTS: [&str; 9] = [
+    const ROOTS: [&str; 10] = [
+        "add",
         "additional",
         "configuration",
         "data",
