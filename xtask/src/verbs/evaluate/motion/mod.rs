@@ -99,9 +99,10 @@ impl Args {
         let mut ledger = Ledger::open(run.out(), &header)?;
         let mut ids = BTreeSet::new();
         let progress = run.progress("measuring", 0, "scenarios");
-        for (index, record) in self.open()?.enumerate() {
+        let mut records = self.open()?.enumerate();
+        while let Some((index, record)) = run.phase("read", |_| Ok(records.next()))? {
             run::stop_if_interrupted()?;
-            let mut scenario = run.phase("read", |_| Ok(record?.scenario))?;
+            let mut scenario = record?.scenario;
             ids.insert(scenario.id.clone());
             if !self.shard.holds(index) || ledger.has(index) {
                 continue;
