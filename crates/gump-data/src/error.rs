@@ -110,6 +110,16 @@ pub enum DataError {
         /// The file that needs it.
         path: PathBuf,
     },
+    /// A database cannot be read, or holds a value of another type.
+    #[error("could not {doing}: {source}: {}", path.display())]
+    Sqlite {
+        /// What was tried.
+        doing: &'static str,
+        /// What SQLite says.
+        source: rusqlite::Error,
+        /// The file.
+        path: PathBuf,
+    },
     /// The content is of no known format.
     #[error("expected {expected}, found a file that starts with {found}: {}", path.display())]
     UnknownFormat {

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
-use crate::{DataError, ReadOptions, argoverse2, commonroad, gpudrive, sumo, womd};
+use crate::{DataError, ReadOptions, argoverse2, commonroad, gpudrive, nuplan, sumo, womd};
 
 /// A format that content can be recognised as.
 pub(crate) struct Format {
@@ -24,13 +24,14 @@ pub(crate) struct Format {
 }
 
 /// The formats that hold scenarios; the first that recognises a file has it.
-static FORMATS: [Format; 6] = [
+static FORMATS: [Format; 7] = [
     womd::FORMAT,
     gpudrive::FORMAT,
     argoverse2::FORECASTING,
     argoverse2::SENSOR_LOG,
     commonroad::FORMAT,
     sumo::FORMAT,
+    nuplan::FORMAT,
 ];
 
 /// A kind of file without scenarios of its own.
@@ -42,7 +43,7 @@ pub(crate) struct Companion {
 }
 
 /// Files that belong to some format but hold no scenarios.
-static COMPANIONS: [Companion; 4] = [
+static COMPANIONS: [Companion; 5] = [
     Companion {
         what: "Argoverse 2 map",
         recognises: argoverse2::is_map,
@@ -59,6 +60,7 @@ static COMPANIONS: [Companion; 4] = [
         what: "other SUMO file",
         recognises: sumo::is_other,
     },
+    nuplan::MAP,
 ];
 
 /// How much of the content a recogniser sees.

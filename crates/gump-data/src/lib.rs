@@ -43,6 +43,7 @@ mod inspect;
 mod json;
 mod lanelet;
 mod motion;
+pub mod nuplan;
 mod open;
 mod record;
 mod recording;

@@ -237,7 +237,7 @@ impl MapGraph {
         areas
             .iter()
             .map(|&i| &self.parts.areas[i])
-            .filter(|area| area.kind == AreaKind::StopLine)
+            .filter(|area| matches!(area.kind, AreaKind::StopLine | AreaKind::TurnStop))
     }
 
     /// Stop signs.
