@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use gump_model::world::TransformerWorld;
-use gump_model::{CacheMode, Device, Mode, SamplingConfig, checkpoint};
+use gump_model::{CacheMode, Device, Mode, Precision, SamplingConfig, checkpoint};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
@@ -151,6 +151,9 @@ pub(crate) struct Draw {
     /// What is kept between the passes of a frame
     #[arg(long, value_enum, default_value_t = CacheName::Window)]
     cache: CacheName,
+    /// In which form the weights are multiplied
+    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
+    precision: PrecisionName,
     /// Divides the logits; above 1 is bolder [default: 1.1]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
@@ -172,8 +175,31 @@ enum ModeName {
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum CacheName {
+    /// Every pass reads the whole window
     None,
+    /// The window slides; within a frame nothing is read twice
     Window,
+    /// The window grows as far as it fits; between frames nothing is read twice either
+    Growing,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum PrecisionName {
+    F32,
+    Bf16,
+    Int8,
+}
+
+impl PrecisionName {
+    /// The model's form of the name.
+    pub(crate) fn resolve(self) -> Precision {
+        match self {
+            Self::F32 => Precision::F32,
+            Self::Bf16 => Precision::Bf16,
+            Self::Int8 => Precision::Int8,
+        }
+    }
 }
 
 impl Sampling {
@@ -199,7 +225,9 @@ impl Draw {
             cache: match self.cache {
                 CacheName::None => CacheMode::None,
                 CacheName::Window => CacheMode::Window,
+                CacheName::Growing => CacheMode::Growing,
             },
+            precision: self.precision.resolve(),
             temperature: self.temperature.unwrap_or(default.temperature),
             top_k: self.top_k.unwrap_or(default.top_k),
             decay: self.decay.unwrap_or(default.decay),

@@ -7,11 +7,11 @@ use gump_geometry::DVec2;
 use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
 
 use crate::config::ModelConfig;
-use crate::embedding::{ROWS_PER_TOKEN, SineTables, Tables};
+use crate::embedding::{ROWS_PER_TOKEN, SineKey, SineTables, Tables};
 use crate::mct::{PLACES, TokenBatch};
 
 /// A slot and where it stands in the presented window.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct PlacedSlot {
     pub(crate) slot: Slot,
     /// Index of the token, from 0 at the start of the window.
@@ -102,16 +102,15 @@ impl Packer {
         for (row, sequence) in sequences.iter().enumerate() {
             for (column, placed) in sequence.iter().enumerate() {
                 let flat = (row * t + column) as u32;
-                rows.extend(self.tables.rows(placed));
-                if self.sines.append(placed, &mut features) {
+                rows.extend(self.rows(placed));
+                if self.sine(placed, &mut features) {
                     sine_positions.push(flat);
                 }
-                if let (true, Slot::Key(_), Some(last)) = (self.local_map, placed.slot, placed.last)
-                {
+                if let Some(seen) = self.cells(placed) {
                     lookers.push(flat);
                     looker_rows.push(row as u32);
-                    for (cells, seconds) in places.iter_mut().zip(PLACES) {
-                        cells.push(self.cell(last.pose().position + last.velocity() * seconds));
+                    for (cells, cell) in places.iter_mut().zip(seen) {
+                        cells.push(cell);
                     }
                 }
             }
@@ -129,6 +128,28 @@ impl Packer {
             looker_rows,
             shape: (b, t),
         })
+    }
+
+    /// The table rows that a token sums, `u32::MAX` where there is none.
+    pub(crate) fn rows(&self, placed: &PlacedSlot) -> [u32; ROWS_PER_TOKEN] {
+        self.tables.rows(placed)
+    }
+
+    /// Which sine features a token has.
+    pub(crate) fn sine_key(&self, placed: &PlacedSlot) -> Option<SineKey> {
+        self.sines.key(placed)
+    }
+
+    /// Appends the sine features of a token to `out` if it has any.
+    pub(crate) fn sine(&self, placed: &PlacedSlot, out: &mut Vec<f32>) -> bool {
+        self.sines.append(placed, out)
+    }
+
+    /// The visual tokens at the places that a token's object looks at, if it looks.
+    pub(crate) fn cells(&self, placed: &PlacedSlot) -> Option<[u32; PLACES.len()]> {
+        let last = placed.last.filter(|_| self.local_map)?;
+        let at = |seconds| self.cell(last.pose().position + last.velocity() * seconds);
+        matches!(placed.slot, Slot::Key(_)).then(|| PLACES.map(at))
     }
 
     /// The visual token that covers a point of the scene frame, or the nearest one.

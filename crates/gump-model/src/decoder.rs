@@ -249,15 +249,19 @@ impl StateDecoder {
     /// Logits over the bins of one field: only its rows of the shared output matrix are multiplied,
     /// which is exact because nothing outside the field may be sampled.
     pub(crate) fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
+        ops::linear(output, &self.output_rows(field)?, None)
+    }
+
+    /// Rows of the output matrix for the bins of a field, [bins, C].
+    pub(crate) fn output_rows(&self, field: Field) -> Result<Tensor> {
         let rows = self
             .head
             .weight()
             .narrow(0, field.first_token() as usize, field.n_bins())?;
-        let rows = match &self.smooth {
-            Some(smooth) => smooth.output(&rows, field)?,
-            None => rows,
-        };
-        ops::linear(output, &rows, None)
+        match &self.smooth {
+            Some(smooth) => smooth.output(&rows, field),
+            None => Ok(rows),
+        }
     }
 
     /// Logits over what may follow a control or value token: the 321 keys, then BEGIN, NEWBORN and

@@ -89,6 +89,10 @@ impl Tables {
     }
 }
 
+/// What distinguishes the sine features of one token from another's: the bins, and whether only the
+/// first three count, as for a light.
+pub(crate) type SineKey = (QuantizedState, bool);
+
 /// Sine features of every bin of every field, computed once.
 ///
 /// A token's features are seven blocks of `2k` entries, k = ⌊width / 14⌋, in the order of
@@ -113,28 +117,30 @@ impl SineTables {
         }
     }
 
+    /// Which features a token has, if it has coordinates.
+    pub(crate) fn key(&self, placed: &PlacedSlot) -> Option<SineKey> {
+        match &placed.slot {
+            Slot::Value(state) => Some((*state, false)),
+            Slot::Light(light) => {
+                let place = QuantizedState {
+                    x: light.x,
+                    y: light.y,
+                    heading: light.heading,
+                    ..QuantizedState::default()
+                };
+                Some((place, true))
+            }
+            Slot::Key(_) if self.pairs_share => placed.last.map(|last| (last, false)),
+            _ => None,
+        }
+    }
+
     /// Appends the features of a token to `out` if it has coordinates.
     pub(crate) fn append(&self, placed: &PlacedSlot, out: &mut Vec<f32>) -> bool {
-        let (state, n_fields) = match &placed.slot {
-            Slot::Value(state) => (*state, Field::ALL.len()),
-            Slot::Light(light) => {
-                let (x, y, heading) = (light.x, light.y, light.heading);
-                (
-                    QuantizedState {
-                        x,
-                        y,
-                        heading,
-                        ..QuantizedState::default()
-                    },
-                    3,
-                )
-            }
-            Slot::Key(_) if self.pairs_share => match placed.last {
-                Some(last) => (last, Field::ALL.len()),
-                None => return false,
-            },
-            _ => return false,
+        let Some((state, is_light)) = self.key(placed) else {
+            return false;
         };
+        let n_fields = if is_light { 3 } else { Field::ALL.len() };
         let end = out.len() + self.width;
         let block = 2 * (self.width / (2 * Field::ALL.len()));
         for (field, table) in Field::ALL.into_iter().zip(&self.fields).take(n_fields) {

@@ -3,7 +3,7 @@
 //! The network reads a scene as tokens and a raster, and says what comes next. Read
 //! [`config::ModelConfig`] for its shape, `mct.rs` for the network in one sitting, `decoder.rs` for
 //! how a hidden vector becomes a state, [`train::Trainer`] for learning and
-//! [`world::TransformerWorld`] for imagining.
+//! [`world::TransformerWorld`] for imagining, whose arithmetic on a CPU is `engine`.
 //!
 //! # Terms
 //! * **key, value**: the two tokens of an object; the hidden vector at the key says the state.
@@ -20,16 +20,22 @@ mod closed_loop;
 pub mod config;
 mod decode;
 mod decoder;
+mod draw;
 mod embedding;
+mod engine;
 mod error;
+mod future;
 mod loss;
 mod mct;
 mod network;
 pub mod ops;
 mod optimizer;
 mod parameters;
+mod plain;
 mod sample;
 mod sampling;
+mod scene;
+mod session;
 #[cfg(test)]
 mod tests;
 pub mod train;
@@ -46,6 +52,7 @@ pub use config::ModelConfig;
 pub use error::ModelError;
 pub use loss::{LossConfig, LossParts};
 pub use network::Network;
+pub use ops::panels::Precision;
 pub use optimizer::OptimizerConfig;
 pub use parameters::Parameters;
 pub use sample::SampleConfig;

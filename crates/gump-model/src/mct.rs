@@ -20,7 +20,7 @@ use crate::parameters::{Init, Scope};
 
 /// Every table starts from this deviation, as GPT-2's do.
 pub(crate) const TABLE_DEVIATION: f64 = 0.02;
-const NORM_EPS: f64 = 1e-5;
+pub(crate) const NORM_EPS: f64 = 1e-5;
 
 /// Layer normalisation with scale and shift.
 #[derive(Debug)]
@@ -287,8 +287,8 @@ impl CrossBlock {
 #[derive(Clone, Debug)]
 pub(crate) struct VisualMemory {
     /// The visual tokens themselves, for looking up what lies under an object.
-    visual: Tensor,
-    key_values: Vec<(Tensor, Tensor)>,
+    pub(crate) visual: Tensor,
+    pub(crate) key_values: Vec<(Tensor, Tensor)>,
 }
 
 impl VisualMemory {

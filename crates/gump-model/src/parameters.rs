@@ -74,6 +74,11 @@ impl Parameters {
             .map(|(name, var)| (name.as_str(), var))
     }
 
+    /// The parameter called `name`, if there is one.
+    pub(crate) fn find(&self, name: &str) -> Option<&Var> {
+        self.variables.get(name)
+    }
+
     /// Number of trainable numbers.
     pub fn count(&self) -> usize {
         self.trainable().map(|(_, var)| var.elem_count()).sum()

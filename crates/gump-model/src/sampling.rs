@@ -1,17 +1,16 @@
-//! Drawing states from the decoder: temperature, top-k, forced fields, and streams that never
-//! depend on the batch.
+//! How futures are decoded, what is asked of the decoder for one object, and what it says.
+//!
+//! What lives here: the configuration and the words that both ways of computing share. What does
+//! not: drawing a bin, which is `draw`'s business.
 
-use candle_core::Tensor;
 use gump_geometry::{DVec2, Pose};
 use gump_scene::Seed;
 use gump_tokenizer::{Field, QuantizedState};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::ModelError;
 use crate::aggregation::Ring;
 use crate::decoder::{CHUNK, STEPS};
-use crate::network::Network;
+use crate::ops::panels::Precision;
 
 /// How futures are decoded.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -19,7 +18,7 @@ use crate::network::Network;
 pub struct SamplingConfig {
     /// One object after another, or all objects of a frame at once.
     pub mode: Mode,
-    /// What is kept between the passes of a frame.
+    /// What is kept between passes.
     pub cache: CacheMode,
     /// Divides the logits (paper, simulation: 1.1); above 1 is bolder.
     pub temperature: f64,
@@ -32,6 +31,8 @@ pub struct SamplingConfig {
     pub history: usize,
     /// Where provisional states come from in partial-AR decoding.
     pub surrogate: Surrogate,
+    /// In which form the weights are multiplied (on a CPU; other devices compute as trained).
+    pub precision: Precision,
 }
 
 impl Default for SamplingConfig {
@@ -44,6 +45,7 @@ impl Default for SamplingConfig {
             decay: 1.2,
             history: 3,
             surrogate: Surrogate::Chunk,
+            precision: Precision::F32,
         }
     }
 }
@@ -58,15 +60,22 @@ pub enum Mode {
     FullAr,
 }
 
-/// What is kept between the passes of a frame.
+/// What is kept between passes, and how far back the window reaches.
+///
+/// Keys and values are kept token by token as long as the token and all before it stand where they
+/// stood, so every cache is exact: the result is that of reading the same window afresh.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CacheMode {
     /// Nothing: every pass sees the whole window.
     None,
-    /// Keys and values of the window; it is read afresh for every frame, so the result is that of
-    /// no cache.
+    /// Keys and values of the window, which slides by one frame per frame; what slides changes its
+    /// place, so this saves passes over the window within a frame, not between frames.
     Window,
+    /// The window grows from frame to frame until it would be longer than a block, then falls back
+    /// to its `history`; only what is new or changed is read. Sees more of the past than
+    /// [`CacheMode::Window`], so its futures are others.
+    Growing,
 }
 
 /// Where provisional states come from.
@@ -135,189 +144,4 @@ pub(crate) fn poses(bins: &Bins) -> [Pose; CHUNK] {
             Field::Heading.dequantize(bins[at + 2]),
         )
     })
-}
-
-/// Decodes one state per request; `hidden` [K, C] are the hidden vectors at the keys.
-pub(crate) fn sample_states(
-    network: &Network,
-    hidden: &Tensor,
-    requests: &[Request],
-    config: &SamplingConfig,
-) -> Result<Vec<Bins>, ModelError> {
-    let table = network.decoder.input_table(&network.mct.token_table()?)?;
-    let mut states = network.decoder.begin(hidden);
-    let mut bins = vec![[0; STEPS.len()]; requests.len()];
-    let mut previous: Option<Tensor> = None;
-    for (step, field) in STEPS.into_iter().enumerate() {
-        let forced = requests
-            .iter()
-            .all(|request| request.forced[step].is_some());
-        let output = network
-            .decoder
-            .step(&table, &mut states, step, previous.as_ref())?;
-        if forced {
-            bins.iter_mut()
-                .zip(requests)
-                .for_each(|(b, r)| b[step] = r.forced[step].unwrap_or_default());
-        } else {
-            let n = field.n_bins();
-            let logits = network
-                .decoder
-                .logits(&output, field)?
-                .flatten_all()?
-                .to_vec1::<f32>()?;
-            bins.par_iter_mut()
-                .zip(requests)
-                .zip(logits.par_chunks(n))
-                .for_each(|((bins, request), logits)| {
-                    bins[step] = request.forced[step].unwrap_or_else(|| {
-                        draw(
-                            logits,
-                            field,
-                            allowed(request, step, field),
-                            step,
-                            request,
-                            config,
-                        )
-                    });
-                });
-        }
-        let tokens: Vec<u32> = bins.iter().map(|bins| field.token(bins[step])).collect();
-        previous = Some(Tensor::from_vec(tokens, requests.len(), network.device())?);
-    }
-    Ok(bins)
-}
-
-/// The bins of pose 0 near enough to where the object can be.
-///
-/// The released code throws away a sample more than 5 m off; restricting the draw instead is the
-/// same distribution given that it is near, and never fails.
-fn allowed(request: &Request, step: usize, field: Field) -> std::ops::Range<usize> {
-    let all = 0..field.n_bins();
-    let Some((centre, reach)) = request.near else {
-        return all;
-    };
-    let centre = match step {
-        4 => centre.x,
-        5 => centre.y,
-        _ => return all,
-    };
-    let (low, high) = (
-        field.quantize(centre - reach).bin,
-        field.quantize(centre + reach).bin,
-    );
-    usize::from(low)..usize::from(high) + 1
-}
-
-/// Draws a bin from tempered, truncated logits.
-fn draw(
-    logits: &[f32],
-    field: Field,
-    allowed: std::ops::Range<usize>,
-    step: usize,
-    request: &Request,
-    config: &SamplingConfig,
-) -> u16 {
-    debug_assert_eq!(logits.len(), field.n_bins());
-    let mut candidates: Vec<(f32, u16)> = allowed
-        .clone()
-        .map(|bin| (logits[bin], bin as u16))
-        .collect();
-    let k = config.top_k.clamp(1, candidates.len());
-    // Ties are broken by the bin, so the choice never depends on the sort.
-    let order = |a: &(f32, u16), b: &(f32, u16)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-    if k < candidates.len() {
-        candidates.select_nth_unstable_by(k - 1, order);
-        candidates.truncate(k);
-    }
-    candidates.sort_unstable_by(order);
-    let best = candidates[0];
-    if config.temperature <= 0.0 {
-        return best.1;
-    }
-    let weight = |logit: f32| (f64::from(logit - best.0) / config.temperature).exp();
-    let total: f64 = candidates.iter().map(|c| weight(c.0)).sum();
-    let mut left = uniform(request.stream.fork(step as u64)) * total;
-    for candidate in &candidates {
-        left -= weight(candidate.0);
-        if left < 0.0 {
-            return candidate.1;
-        }
-    }
-    best.1
-}
-
-/// A number in [0, 1) that is a function of the seed alone: no generator, no state.
-fn uniform(seed: Seed) -> f64 {
-    (seed.fork(0).0 >> 11) as f64 / (1u64 << 53) as f64
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn request() -> Request {
-        Request {
-            forced: [None; STEPS.len()],
-            stream: Seed(3),
-            near: None,
-            ring: Ring::default(),
-            frame: 0,
-        }
-    }
-
-    fn check(logits: &[f32], config: &SamplingConfig, seed: u64) -> u16 {
-        let request = Request {
-            stream: Seed(seed),
-            ..request()
-        };
-        draw(logits, Field::Width, 0..logits.len(), 0, &request, config)
-    }
-
-    #[test]
-    fn top_1_and_temperature_0_take_the_best() {
-        let mut logits = [0.0; 14];
-        logits[5] = 1.0;
-        let one = SamplingConfig {
-            top_k: 1,
-            ..SamplingConfig::default()
-        };
-        let cold = SamplingConfig {
-            temperature: 0.0,
-            ..SamplingConfig::default()
-        };
-        for seed in 0..50 {
-            assert_eq!(
-                (check(&logits, &one, seed), check(&logits, &cold, seed)),
-                (5, 5)
-            );
-        }
-    }
-
-    #[test]
-    fn draws_follow_the_tempered_distribution() {
-        let mut logits = [f32::NEG_INFINITY; 14];
-        (logits[2], logits[9]) = (0.0, (3.0f32).ln());
-        let config = SamplingConfig {
-            temperature: 1.0,
-            ..SamplingConfig::default()
-        };
-        let n = 4000;
-        let nines = (0..n)
-            .filter(|&seed| check(&logits, &config, seed) == 9)
-            .count();
-        // Standard deviation of the count is 27.
-        assert!((nines as i64 - 3000).abs() < 120, "{nines}");
-    }
-
-    #[test]
-    fn pose_0_stays_near_the_surrogate() {
-        let request = Request {
-            near: Some((DVec2::new(0.0, 50.0), 5.0)),
-            ..request()
-        };
-        assert_eq!(allowed(&request, 4, Field::X), 475..526);
-        assert_eq!(allowed(&request, 5, Field::Y), 725..776);
-        assert_eq!(allowed(&request, 7, Field::X), 0..1000);
-    }
 }

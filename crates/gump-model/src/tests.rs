@@ -8,15 +8,16 @@ use gump_tokenizer::{Identities, Slot, Tokenizer, TokenizerConfig};
 use crate::aggregation::Ring;
 use crate::batch::{PlacedSlot, place};
 use crate::config::{Gate, ModelConfig, VisualConfig};
-use crate::decode::{Passes, Window, decode};
+use crate::decode::{Window, present_all};
 use crate::decoder::STEPS;
 use crate::mct::{Cache, VisualMemory};
+use crate::plain::{Passes, decode};
 use crate::sampling::{CacheMode, Mode, Request, SamplingConfig, poses, settled_state};
 use crate::world::TransformerWorld;
 use crate::{ModelError, Network};
 
 /// A network small enough for tests, with gates open so that the map matters.
-fn network() -> Network {
+pub(crate) fn network() -> Network {
     let config = ModelConfig {
         width: 32,
         layers: 4,
@@ -33,7 +34,7 @@ fn network() -> Network {
     Network::random(config, Seed(1), &Device::Cpu).unwrap()
 }
 
-fn scenario() -> Scenario {
+pub(crate) fn scenario() -> Scenario {
     fixture::scenario(
         "lane 1: -100,0 100,0 speed 15
          edge: -100,-2 100,-2
@@ -48,7 +49,7 @@ fn scenario() -> Scenario {
 }
 
 /// Three frames of the scenario as slots.
-fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
+pub(crate) fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
     let scene = scenario.present();
     let frames = scene.strided_history(5, 3);
     let pose = scene.ego_now().state.pose;
@@ -63,14 +64,14 @@ fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
     place(&encoded.sequence)
 }
 
-fn memory(network: &Network, scenario: &Scenario) -> VisualMemory {
+pub(crate) fn memory(network: &Network, scenario: &Scenario) -> VisualMemory {
     let scene = scenario.present();
     let raster = gump_raster::rasterize(network.raster_spec(), &scene, scene.ego_now().state.pose);
     network.look(&[raster]).unwrap()
 }
 
 /// Hidden vectors, one row per token.
-fn hidden(
+pub(crate) fn hidden(
     network: &Network,
     sequences: &[&[PlacedSlot]],
     memory: &VisualMemory,
@@ -502,7 +503,6 @@ fn window(scenario: &Scenario) -> Window {
 fn surrogates_that_are_right_give_full_autoregression() {
     let (network, scenario) = (network(), scenario());
     let memory = memory(&network, &scenario);
-    let count = std::sync::atomic::AtomicU64::new(0);
     let run = |mode, window: &Window| {
         let sampling = SamplingConfig {
             mode,
@@ -510,12 +510,11 @@ fn surrogates_that_are_right_give_full_autoregression() {
             decay: 0.0,
             ..SamplingConfig::default()
         };
-        decode(
-            &Passes::new(&network, &sampling, &[&memory], &count),
-            std::slice::from_ref(window),
-        )
-        .unwrap()
-        .remove(0)
+        let windows = std::slice::from_ref(window);
+        let placed = present_all(windows, network.config().block_size).unwrap();
+        let memories = [&memory];
+        let passes = Passes::new(&network, &sampling, &memories);
+        decode(&passes, windows, &placed).unwrap().remove(0)
     };
     let mut window = window(&scenario);
     let full = run(Mode::FullAr, &window);

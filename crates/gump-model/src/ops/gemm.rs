@@ -169,17 +169,17 @@ pub(super) fn gemm(
 /// Runs `f` compiled for the widest vectors of this processor.
 ///
 /// Mark the closure and every helper it calls `#[inline(always)]`: only inlined code is compiled
-/// wide. The instructions change, the arithmetic does not (no multiply-add is contracted and sums
-/// keep their written order), so the bits are those of the plain build.
+/// wide. The instructions change, the arithmetic does not (a multiply-add is fused only where it is
+/// written so, and sums keep their written order), so the bits are those of the plain build.
 #[inline(always)]
-pub(super) fn wide<R>(f: impl FnOnce() -> R) -> R {
+pub(crate) fn wide<R>(f: impl FnOnce() -> R) -> R {
     #[cfg(target_arch = "x86_64")]
     {
         #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
         fn v4<R>(f: impl FnOnce() -> R) -> R {
             f()
         }
-        #[target_feature(enable = "avx2")]
+        #[target_feature(enable = "avx2,fma")]
         fn v3<R>(f: impl FnOnce() -> R) -> R {
             f()
         }
@@ -191,17 +191,118 @@ pub(super) fn wide<R>(f: impl FnOnce() -> R) -> R {
             // SAFETY: the four features were just detected.
             return unsafe { v4(f) };
         }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: the feature was just detected.
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            // SAFETY: the two features were just detected.
             return unsafe { v3(f) };
         }
     }
     f()
 }
 
+/// Whether the processor holds 32 registers of 512 bits.
+pub(super) fn has_many_registers() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    {
+        is_x86_feature_detected!("avx512f")
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        false
+    }
+}
+
+/// Columns of a panel, as in `panels`.
+const PANEL: usize = super::panels::PANEL;
+
+/// Products of `N` rows of unsigned bytes with a panel of signed ones, summed exactly.
+///
+/// `panel` is `[k / 4, PANEL, 4]`: four consecutive inner indices of a column lie side by side.
+///
+/// Panics when a row is not as long as the panel is deep.
+pub(super) fn byte_tile<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PANEL]; N] {
+    let depth = panel.len() / PANEL;
+    assert!(depth.is_multiple_of(4), "a panel of bytes has depth 4 i");
+    assert!(rows.iter().all(|row| row.len() == depth), "rows of {depth}");
+    #[cfg(target_arch = "x86_64")]
+    {
+        if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni") {
+            // SAFETY: the two features were just detected, the lengths just checked.
+            return unsafe { byte_tile_vnni(rows, panel) };
+        }
+    }
+    byte_tile_plain(rows, panel)
+}
+
+fn byte_tile_plain<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PANEL]; N] {
+    let mut sums = [[0i32; PANEL]; N];
+    wide(
+        #[inline(always)]
+        || {
+            for (i, group) in panel.as_chunks::<{ 4 * PANEL }>().0.iter().enumerate() {
+                for (sums, row) in sums.iter_mut().zip(rows) {
+                    let x = [0, 1, 2, 3].map(|t| i32::from(row[4 * i + t]));
+                    for (sum, w) in sums.iter_mut().zip(group.as_chunks::<4>().0) {
+                        let w = w.map(i32::from);
+                        *sum += x[0] * w[0] + x[1] * w[1] + x[2] * w[2] + x[3] * w[3];
+                    }
+                }
+            }
+        },
+    );
+    sums
+}
+
+/// SAFETY: rows are as long as the panel is deep, and that is a multiple of 4.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vnni")]
+unsafe fn byte_tile_vnni<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PANEL]; N] {
+    use std::arch::x86_64::{
+        _mm512_dpbusd_epi32, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_si512,
+        _mm512_storeu_si512,
+    };
+    let mut sums = [[_mm512_setzero_si512(); 2]; N];
+    for i in 0..panel.len() / (4 * PANEL) {
+        // SAFETY: group i of the panel is 128 bytes, group i of each row 4, and both exist.
+        unsafe {
+            let group = panel.as_ptr().add(4 * PANEL * i);
+            let low = _mm512_loadu_si512(group.cast());
+            let high = _mm512_loadu_si512(group.add(64).cast());
+            for (sums, row) in sums.iter_mut().zip(rows) {
+                let x = row.as_ptr().add(4 * i).cast::<i32>().read_unaligned();
+                let x = _mm512_set1_epi32(x);
+                sums[0] = _mm512_dpbusd_epi32(sums[0], x, low);
+                sums[1] = _mm512_dpbusd_epi32(sums[1], x, high);
+            }
+        }
+    }
+    let mut out = [[0i32; PANEL]; N];
+    for (out, sums) in out.iter_mut().zip(sums) {
+        let (low, high) = out.split_at_mut(PANEL / 2);
+        // SAFETY: each half is 16 numbers of 32 bits.
+        unsafe {
+            _mm512_storeu_si512(low.as_mut_ptr().cast(), sums[0]);
+            _mm512_storeu_si512(high.as_mut_ptr().cast(), sums[1]);
+        }
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn bytes_are_summed_exactly() {
+        let depth = 44;
+        let panel: Vec<i8> = (0..depth * PANEL).map(|i| (i * 37 % 255) as i8).collect();
+        let rows: Vec<u8> = (0..4 * depth).map(|i| (i * 91 % 256) as u8).collect();
+        let rows: [&[u8]; 4] = std::array::from_fn(|r| &rows[r * depth..][..depth]);
+        let sums = byte_tile(rows, &panel);
+        assert_eq!(sums, byte_tile_plain(rows, &panel));
+        let at = |k: usize, j: usize| i32::from(panel[(k / 4 * PANEL + j) * 4 + k % 4]);
+        let slow = (0..depth).map(|k| i32::from(rows[3][k]) * at(k, 7));
+        assert_eq!(sums[3][7], slow.sum::<i32>());
+    }
 
     #[test]
     fn products_of_strided_and_transposed_views() {

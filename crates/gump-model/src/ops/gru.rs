@@ -146,6 +146,17 @@ impl CustomOp3 for GruCell {
     }
 }
 
+/// One step of one row in place: `h` becomes the next state; gates `[3C]` as in [`gru_cell`].
+#[inline(always)]
+pub(crate) fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
+    let c = h.len();
+    let (x, g) = (gates(x_gates, 0, c), gates(h_gates, 0, c));
+    for (j, h) in h.iter_mut().enumerate() {
+        let [_, z, n] = cell(x, g, j);
+        *h = (1.0 - z) * n + z * *h;
+    }
+}
+
 /// The three gate rows of row `row`.
 #[inline(always)]
 fn gates(all: &[f32], row: usize, c: usize) -> [&[f32]; 3] {

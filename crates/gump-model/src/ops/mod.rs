@@ -19,6 +19,7 @@ mod gru;
 mod linear;
 mod loss;
 mod norm;
+pub(crate) mod panels;
 mod rows;
 
 pub use attention::{causal_attention, cross_attention, cross_attention_padded};
@@ -28,6 +29,12 @@ pub use gru::gru_cell;
 pub use linear::linear;
 pub use loss::{OrdinalSmoothing, masked_cross_entropy};
 pub use norm::layer_norm;
+
+pub(crate) use gelu::gelu_row;
+pub(crate) use gemm::wide;
+pub(crate) use gru::gru_row;
+pub(crate) use norm::normalize_row;
+pub(crate) use rows::{count_from, exp_shifted_sum, max};
 
 use candle_core::{
     CpuStorage, DType, Layout, Result, Shape, Storage, StorageRef, Tensor, WithDType, bail,

@@ -163,14 +163,26 @@ fn forward_rows(
         .zip(y.chunks_exact_mut(c))
         .zip(moments.chunks_exact_mut(2))
     {
-        let mean = sum(x) / c as f32;
-        let reciprocal = 1.0 / (sum_squares_from(x, mean) / c as f32 + eps).sqrt();
-        for (((y, x), w), b) in y.iter_mut().zip(x).zip(weight).zip(bias) {
-            *y = (x - mean) * reciprocal * w + b;
-        }
-        m[0] = mean;
-        m[1] = reciprocal;
+        m.copy_from_slice(&normalize_row(x, weight, bias, eps, y));
     }
+}
+
+/// Normalises one row; returns its mean and reciprocal deviation.
+#[inline(always)]
+pub(crate) fn normalize_row(
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    eps: f32,
+    y: &mut [f32],
+) -> [f32; 2] {
+    let c = weight.len() as f32;
+    let mean = sum(x) / c;
+    let reciprocal = 1.0 / (sum_squares_from(x, mean) / c + eps).sqrt();
+    for (((y, x), w), b) in y.iter_mut().zip(x).zip(weight).zip(bias) {
+        *y = (x - mean) * reciprocal * w + b;
+    }
+    [mean, reciprocal]
 }
 
 #[inline(always)]

@@ -200,7 +200,7 @@ pub(super) fn dot(x: &[f32], y: &[f32]) -> f32 {
 
 /// Largest element of a row; minus infinity for an empty one.
 #[inline(always)]
-pub(super) fn max(x: &[f32]) -> f32 {
+pub(crate) fn max(x: &[f32]) -> f32 {
     let mut lanes = [f32::NEG_INFINITY; LANES];
     let chunks = x.chunks_exact(LANES);
     let tail = chunks.remainder();
@@ -219,6 +219,17 @@ pub(super) fn max(x: &[f32]) -> f32 {
     lanes
         .iter()
         .fold(f32::NEG_INFINITY, |a, &b| if b > a { b } else { a })
+}
+
+/// How many elements of a row are at least `low`.
+pub(crate) fn count_from(x: &[f32], low: f32) -> usize {
+    wide(
+        #[inline(always)]
+        || {
+            let n: u32 = x.iter().map(|&x| u32::from(x >= low)).sum();
+            n as usize
+        },
+    )
 }
 
 /// `e^x` to about two units in the last place, in operations a compiler can vectorise.
@@ -249,7 +260,7 @@ pub(super) fn exp(x: f32) -> f32 {
 
 /// `x[i] = e^(x[i] - shift)`; returns the sum.
 #[inline(always)]
-pub(super) fn exp_shifted_sum(x: &mut [f32], shift: f32) -> f32 {
+pub(crate) fn exp_shifted_sum(x: &mut [f32], shift: f32) -> f32 {
     let mut lanes = [0.0; LANES];
     let mut chunks = x.chunks_exact_mut(LANES);
     for chunk in &mut chunks {

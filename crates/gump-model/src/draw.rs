@@ -1,0 +1,258 @@
+//! Drawing a bin from logits: temperature, top-k, a leash, and streams that never depend on the
+//! batch.
+//!
+//! A draw is the inverse of the distribution function over the bins in their order, at a number
+//! that is a function of the object's stream alone. Neighbouring bins are neighbouring values, so
+//! two futures whose logits differ a little draw values that differ a little: candidates of a
+//! planner that share their seed share their noise.
+
+use std::ops::Range;
+
+use gump_scene::Seed;
+use gump_tokenizer::Field;
+
+use crate::decoder::STEPS;
+use crate::sampling::{Request, SamplingConfig};
+
+/// Draws the bin of a step; `logits` are those of its field's bins, `room` is memory to work in.
+pub(crate) fn draw_field(
+    logits: &[f32],
+    step: usize,
+    request: &Request,
+    config: &SamplingConfig,
+    room: &mut Vec<f32>,
+) -> u16 {
+    let field = STEPS[step];
+    debug_assert_eq!(logits.len(), field.n_bins());
+    let allowed = allowed(request, step, field);
+    let uniform = uniform(request.stream.fork(step as u64));
+    let found = draw(&logits[allowed.clone()], uniform, config, room);
+    (allowed.start + found) as u16
+}
+
+/// The bins of pose 0 near enough to where the object can be.
+///
+/// The released code throws away a sample more than 5 m off; restricting the draw instead is the
+/// same distribution given that it is near, and never fails.
+fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
+    let all = 0..field.n_bins();
+    let Some((centre, reach)) = request.near else {
+        return all;
+    };
+    let centre = match step {
+        4 => centre.x,
+        5 => centre.y,
+        _ => return all,
+    };
+    let (low, high) = (
+        field.quantize(centre - reach).bin,
+        field.quantize(centre + reach).bin,
+    );
+    usize::from(low)..usize::from(high) + 1
+}
+
+/// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
+fn draw(logits: &[f32], uniform: f64, config: &SamplingConfig, room: &mut Vec<f32>) -> usize {
+    let best = (0..logits.len()).fold(0, |best, i| if logits[i] > logits[best] { i } else { best });
+    if config.temperature <= 0.0 || config.top_k <= 1 {
+        return best;
+    }
+    let (threshold, mut spare) = threshold(logits, config.top_k);
+    // Of equal logits at the threshold the first few are in.
+    let mut chosen = |logit: f32| {
+        if logit == threshold {
+            spare = spare.saturating_sub(1);
+            return spare > 0;
+        }
+        logit > threshold
+    };
+    let peak = logits[best];
+    let inverse = 1.0 / config.temperature;
+    room.clear();
+    room.extend(logits.iter().map(|&logit| {
+        if chosen(logit) {
+            (f64::from(logit - peak) * inverse).exp() as f32
+        } else {
+            0.0
+        }
+    }));
+    let total: f64 = room.iter().copied().map(f64::from).sum();
+    let mut left = uniform * total;
+    for (i, weight) in room.iter().enumerate() {
+        left -= f64::from(*weight);
+        if left < 0.0 {
+            return i;
+        }
+    }
+    best
+}
+
+/// The `k`-th largest logit, and one more than how many logits equal to it belong to the `k`
+/// largest; minus infinity where there are no more than `k`.
+fn threshold(logits: &[f32], k: usize) -> (f32, usize) {
+    if k >= logits.len() {
+        return (f32::NEG_INFINITY, usize::MAX);
+    }
+    // Bisection over floats in their order as integers: counting is one fast sweep.
+    let reaches = |key: i32| crate::ops::count_from(logits, float_of(key)) >= k;
+    let (mut low, mut high) = (key_of(f32::NEG_INFINITY), key_of(f32::INFINITY));
+    // A few steps over the range that logits really have spare most of those over all floats.
+    let peak = crate::ops::wide(
+        #[inline(always)]
+        || crate::ops::max(logits),
+    );
+    for reach in [1.0f32, 4.0, 16.0, 64.0] {
+        if reaches(key_of(peak - reach)) {
+            low = key_of(peak - reach);
+            break;
+        }
+        high = key_of(peak - reach);
+    }
+    while i64::from(high) - i64::from(low) > 1 {
+        let middle = ((i64::from(low) + i64::from(high)) / 2) as i32;
+        if reaches(middle) {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    let threshold = float_of(low);
+    let above = logits.iter().filter(|logit| **logit > threshold).count();
+    (threshold, k - above + 1)
+}
+
+/// An integer ordered as the float is.
+fn key_of(x: f32) -> i32 {
+    let bits = x.to_bits() as i32;
+    bits ^ (((bits >> 31) as u32) >> 1) as i32
+}
+
+fn float_of(key: i32) -> f32 {
+    f32::from_bits((key ^ (((key >> 31) as u32) >> 1) as i32) as u32)
+}
+
+/// A number in [0, 1) that is a function of the seed alone: no generator, no state.
+fn uniform(seed: Seed) -> f64 {
+    (seed.fork(0).0 >> 11) as f64 / (1u64 << 53) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::aggregation::Ring;
+    use gump_geometry::DVec2;
+
+    fn request() -> Request {
+        Request {
+            forced: [None; STEPS.len()],
+            stream: Seed(3),
+            near: None,
+            ring: Ring::default(),
+            frame: 0,
+        }
+    }
+
+    fn check(logits: &[f32], config: &SamplingConfig, seed: u64) -> u16 {
+        let request = Request {
+            stream: Seed(seed),
+            ..request()
+        };
+        draw_field(logits, 0, &request, config, &mut Vec::new())
+    }
+
+    #[test]
+    fn top_1_and_temperature_0_take_the_best() {
+        let mut logits = [0.0; 14];
+        logits[5] = 1.0;
+        let one = SamplingConfig {
+            top_k: 1,
+            ..SamplingConfig::default()
+        };
+        let cold = SamplingConfig {
+            temperature: 0.0,
+            ..SamplingConfig::default()
+        };
+        for seed in 0..50 {
+            assert_eq!(
+                (check(&logits, &one, seed), check(&logits, &cold, seed)),
+                (5, 5)
+            );
+        }
+    }
+
+    #[test]
+    fn draws_follow_the_tempered_distribution() {
+        let mut logits = [f32::NEG_INFINITY; 14];
+        (logits[2], logits[9]) = (0.0, (3.0f32).ln());
+        let config = SamplingConfig {
+            temperature: 1.0,
+            ..SamplingConfig::default()
+        };
+        let n = 4000;
+        let nines = (0..n)
+            .filter(|&seed| check(&logits, &config, seed) == 9)
+            .count();
+        // Standard deviation of the count is 27.
+        assert!((nines as i64 - 3000).abs() < 120, "{nines}");
+    }
+
+    #[test]
+    fn pose_0_stays_near_the_surrogate() {
+        let request = Request {
+            near: Some((DVec2::new(0.0, 50.0), 5.0)),
+            ..request()
+        };
+        assert_eq!(allowed(&request, 4, Field::X), 475..526);
+        assert_eq!(allowed(&request, 5, Field::Y), 725..776);
+        assert_eq!(allowed(&request, 7, Field::X), 0..1000);
+    }
+
+    /// The `k` largest, the first of equal ones, by sorting.
+    fn largest(logits: &[f32], k: usize) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..logits.len()).collect();
+        order.sort_by(|a, b| logits[*b].total_cmp(&logits[*a]).then(a.cmp(b)));
+        order.truncate(k);
+        order.sort_unstable();
+        order
+    }
+
+    #[test]
+    fn top_k_draws_from_the_k_largest() {
+        let spread: Vec<f32> = (0..1000).map(|i| (i as f32 * 0.7).sin() * 9.0).collect();
+        let ties: Vec<f32> = (0..1000).map(|i| (i % 7) as f32 - 3.0).collect();
+        let flat = vec![-2.5; 1000];
+        for logits in [spread, ties, flat] {
+            for k in [2, 40, 999, 1000] {
+                let config = SamplingConfig {
+                    top_k: k,
+                    temperature: 1e6,
+                    ..SamplingConfig::default()
+                };
+                let mut room = Vec::new();
+                let n = 4 * k;
+                let mut drawn: Vec<usize> = (0..n)
+                    .map(|i| draw(&logits, (i as f64 + 0.5) / n as f64, &config, &mut room))
+                    .collect();
+                drawn.dedup();
+                assert_eq!(drawn, largest(&logits, k));
+            }
+        }
+    }
+
+    #[test]
+    fn floats_keep_their_order_as_integers() {
+        let floats = [
+            f32::NEG_INFINITY,
+            -2.0,
+            -1e-30,
+            0.0,
+            1e-30,
+            2.0,
+            f32::INFINITY,
+        ];
+        assert!(floats.map(key_of).is_sorted());
+        for x in floats {
+            assert_eq!(float_of(key_of(x)).to_bits(), x.to_bits());
+        }
+    }
+}

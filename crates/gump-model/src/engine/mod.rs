@@ -1,0 +1,401 @@
+//! The engine: the network's forward pass and decoder without gradients, for a CPU.
+//!
+//! What lives here: everything between slots and sampled bins, over weights that are packed once.
+//! Sequences of any lengths go through together, row by row, with nothing padded; the map's keys
+//! and values stand once per scene; each sequence may keep a [`Context`], whose tokens are then
+//! not computed again. What does not: the network in one sitting, which is `mct`; it is also the
+//! oracle in the tests and what other devices run. Start with [`Engine::run`].
+//!
+//! A row's arithmetic does not depend on the rows around it, so what a future becomes depends
+//! neither on its neighbours, nor on the number of threads, nor on what a context held.
+//!
+//! Shapes: `R` new tokens of all sequences one after another, `C` width.
+
+mod cache;
+mod decoder;
+mod embed;
+#[cfg(test)]
+mod tests;
+mod weights;
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+pub(crate) use self::cache::Context;
+use self::cache::{Heads, Pages, attend};
+use self::decoder::Decoder;
+use self::embed::{Embedder, Ground};
+use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
+use crate::ModelError;
+use crate::batch::PlacedSlot;
+use crate::mct::VisualMemory;
+use crate::network::Network;
+use crate::ops::panels::{Panels, Precision, Room};
+use crate::ops::{gelu_row, wide};
+use crate::sampling::{Bins, Request, SamplingConfig};
+
+/// New tokens that go through the layers together; bounds the memory of a pass.
+const WAVE: usize = 8 * 1024;
+
+/// A network ready to imagine on a CPU.
+#[derive(Debug)]
+pub(crate) struct Engine {
+    width: usize,
+    heads: Heads,
+    embedder: Embedder,
+    layers: Vec<Layer>,
+    norm: Norm,
+    decoder: Decoder,
+    rooms: Pool,
+    products: AtomicU64,
+}
+
+/// What all futures of a scene share: the map's keys and values, and what lies under objects.
+#[derive(Debug, Default)]
+pub(crate) struct SceneMemory {
+    /// Visual tokens.
+    n: usize,
+    cross: Vec<Pages>,
+    ground: Ground,
+}
+
+/// One sequence in a pass.
+#[derive(Debug)]
+pub(crate) struct Job<'a> {
+    /// The whole sequence, what the context holds included.
+    pub(crate) slots: &'a [PlacedSlot],
+    /// Where hidden vectors are asked for, ascending and not empty; everything after the last is
+    /// ignored.
+    pub(crate) wanted: Vec<usize>,
+    pub(crate) memory: &'a SceneMemory,
+    /// Tokens of the sequence that it holds are not computed again; the new ones are added if
+    /// `keep` says so, else it is left empty.
+    pub(crate) context: &'a mut Context,
+    pub(crate) keep: bool,
+}
+
+/// Where a row stands: its job within the wave, its place in the job's sequence.
+type Row = (usize, usize);
+
+impl Engine {
+    /// Packs the numbers of a network.
+    ///
+    /// # Errors
+    /// What the tensor library reports.
+    pub(crate) fn new(network: &Network, precision: Precision) -> Result<Self, ModelError> {
+        let config = network.config();
+        let c = config.width;
+        let source = Source { network, precision };
+        Ok(Self {
+            width: c,
+            heads: Heads {
+                n: config.heads,
+                d: c / config.heads,
+            },
+            embedder: Embedder::new(&source)?,
+            layers: (0..config.layers)
+                .map(|i| Layer::new(&source, i, c))
+                .collect::<Result<_, _>>()?,
+            norm: source.norm("mct.norm")?,
+            decoder: Decoder::new(&source)?,
+            rooms: Pool::default(),
+            products: AtomicU64::new(0),
+        })
+    }
+
+    /// Multiplications made so far.
+    pub(crate) fn products(&self) -> u64 {
+        self.products.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the packed matrices of transformer and decoder.
+    pub(crate) fn weight_bytes(&self) -> usize {
+        let matrices = self.layers.iter().flat_map(Layer::matrices);
+        let matrices = matrices.chain(self.decoder.matrices());
+        matrices.map(Panels::bytes).sum()
+    }
+
+    /// Puts the memory of one scene into the engine's form.
+    ///
+    /// # Errors
+    /// What the tensor library reports.
+    pub(crate) fn remember(&self, memory: &VisualMemory) -> Result<SceneMemory, ModelError> {
+        let c = self.width;
+        let pages = |(k, v): &(candle_core::Tensor, candle_core::Tensor)| {
+            let (k, v) = (numbers(k)?, numbers(v)?);
+            let mut pages = Pages::default();
+            for (i, (k, v)) in k.chunks_exact(c).zip(v.chunks_exact(c)).enumerate() {
+                pages.write(self.heads, i, &[k, v].concat());
+            }
+            Ok::<_, ModelError>(pages)
+        };
+        Ok(SceneMemory {
+            n: memory.visual.dim(1)?,
+            cross: memory
+                .key_values
+                .iter()
+                .map(pages)
+                .collect::<Result<_, _>>()?,
+            ground: self.embedder.ground(&memory.visual)?,
+        })
+    }
+
+    /// The hidden vectors that all jobs ask for, one after another, `[wanted, C]`.
+    pub(crate) fn run(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
+        let mut hidden = Vec::new();
+        let mut rest = jobs;
+        while !rest.is_empty() {
+            let mut rows = 0;
+            let n = rest.iter().take_while(|job| {
+                let first = rows == 0;
+                rows += job.slots.len();
+                first || rows <= WAVE
+            });
+            let (wave, after) = rest.split_at_mut(n.count());
+            hidden.extend(self.run_wave(wave));
+            rest = after;
+        }
+        hidden
+    }
+
+    /// One state per request; `hidden` `[K, C]` are the hidden vectors at the keys.
+    pub(crate) fn sample(
+        &self,
+        hidden: &[f32],
+        requests: &[&Request],
+        config: &SamplingConfig,
+    ) -> Vec<Bins> {
+        // Widths and lengths are always given.
+        self.count(self.decoder.products(requests.len(), 2));
+        self.decoder.sample(hidden, requests, config, &self.rooms)
+    }
+
+    fn count(&self, products: u64) {
+        self.products.fetch_add(products, Ordering::Relaxed);
+    }
+
+    fn run_wave(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
+        let c = self.width;
+        let mut rows: Vec<Row> = Vec::new();
+        let mut starts = Vec::with_capacity(jobs.len());
+        for (i, job) in jobs.iter_mut().enumerate() {
+            let end = job.wanted.last().map_or(0, |last| last + 1);
+            job.slots = &job.slots[..end];
+            let first = job.wanted.first().copied().unwrap_or(0);
+            let start = job.context.reuse(job.slots, first);
+            let n_layers = if job.keep || start > 0 {
+                self.layers.len()
+            } else {
+                1
+            };
+            // What is not kept needs room for one layer at a time.
+            job.context.layers.resize(n_layers, Pages::default());
+            rows.extend((start..end).map(|place| (i, place)));
+            starts.push(start);
+        }
+        let slots: Vec<&PlacedSlot> = rows.iter().map(|&(i, at)| &jobs[i].slots[at]).collect();
+        let ground = |row: usize| &jobs[rows[row].0].memory.ground;
+        let (mut x, products) = self.embedder.embed(&slots, ground, &self.rooms); // [R, C]
+        self.count(products);
+        let mut kv = vec![0.0; 2 * x.len()]; // [R, 2C]
+        for (l, layer) in self.layers.iter().enumerate() {
+            self.keys_and_values(layer, &x, &mut kv);
+            write_pages(self.heads, l, jobs, &starts, &kv);
+            if l + 1 == self.layers.len() {
+                // Nothing after this reads but what is asked for.
+                (x, rows) = self.wanted(jobs, &starts, &x);
+            }
+            self.layer(l, layer, jobs, &rows, &mut x);
+        }
+        for (job, start) in jobs.iter_mut().zip(starts) {
+            if job.keep {
+                job.context.slots.extend_from_slice(&job.slots[start..]);
+            } else {
+                job.context.clear();
+            }
+        }
+        let mut hidden = vec![0.0; rows.len() * c];
+        self.norm.apply(&x, &mut hidden);
+        hidden
+    }
+
+    /// The rows of `x` that are asked for.
+    fn wanted(&self, jobs: &[Job<'_>], starts: &[usize], x: &[f32]) -> (Vec<f32>, Vec<Row>) {
+        let (mut wanted, mut rows, mut first) = (Vec::new(), Vec::new(), 0);
+        for (i, (job, start)) in jobs.iter().zip(starts).enumerate() {
+            for &place in &job.wanted {
+                let row = first + place - start;
+                wanted.extend_from_slice(&x[row * self.width..][..self.width]);
+                rows.push((i, place));
+            }
+            first += job.slots.len() - start;
+        }
+        (wanted, rows)
+    }
+
+    fn keys_and_values(&self, layer: &Layer, x: &[f32], kv: &mut [f32]) {
+        let c = self.width;
+        let rows = x.len() / c;
+        self.count(layer.key_value.products(rows));
+        let step = chunk_rows(rows);
+        x.par_chunks(step * c)
+            .zip(kv.par_chunks_mut(2 * step * c))
+            .for_each(|(x, kv)| {
+                self.rooms.with(|room| {
+                    let [normal, ..] = &mut room.buffers;
+                    normal.resize(x.len(), 0.0);
+                    layer.attention.norm.apply(x, normal);
+                    layer.key_value.apply_to_few(normal, kv, &mut room.products);
+                });
+            });
+    }
+
+    /// Everything of a layer but its keys and values, in place; `x` holds `rows`.
+    fn layer(&self, l: usize, layer: &Layer, jobs: &[Job<'_>], rows: &[Row], x: &mut [f32]) {
+        let c = self.width;
+        self.count_layer(layer, jobs, rows);
+        let own = |row: &Row| {
+            let context = &*jobs[row.0].context;
+            let l = if context.layers.len() == 1 { 0 } else { l };
+            (&context.layers[l], row.1 + 1)
+        };
+        let map = |row: &Row| {
+            let memory = jobs[row.0].memory;
+            (&memory.cross[l / 3], memory.n)
+        };
+        let step = chunk_rows(rows.len());
+        x.par_chunks_mut(step * c)
+            .zip(rows.par_chunks(step))
+            .for_each(|(x, rows)| {
+                self.rooms.with(|room| {
+                    self.attend(&layer.attention, rows, own, x, room);
+                    mlp(&layer.mlp, c, x, room);
+                    if let Some((attention, feed_forward)) = &layer.cross {
+                        self.attend(attention, rows, map, x, room);
+                        mlp(feed_forward, c, x, room);
+                    }
+                });
+            });
+    }
+
+    fn count_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[Row]) {
+        let dense = layer.matrices().map(|panels| panels.products(rows.len()));
+        let dense = dense.sum::<u64>() - layer.key_value.products(rows.len());
+        let seen = |row: &Row| {
+            let map = layer.cross.as_ref().map_or(0, |_| jobs[row.0].memory.n);
+            (row.1 + 1 + map) as u64
+        };
+        let attended = rows.iter().map(seen).sum::<u64>() * 2 * self.width as u64;
+        self.count(dense + attended);
+    }
+
+    /// `x += gate * out(attention(query(norm(x))))`, where `keys` says what a row sees and how much.
+    fn attend<'a>(
+        &self,
+        attention: &Attention,
+        rows: &[Row],
+        keys: impl Fn(&Row) -> (&'a Pages, usize),
+        x: &mut [f32],
+        room: &mut Workroom,
+    ) {
+        let c = self.width;
+        let [normal, q, attended, scores] = &mut room.buffers;
+        normal.resize(x.len(), 0.0);
+        q.resize(x.len(), 0.0);
+        attended.resize(x.len(), 0.0);
+        attention.norm.apply(x, normal);
+        attention.query.apply_to_few(normal, q, &mut room.products);
+        let scale = 1.0 / (self.heads.d as f32).sqrt();
+        q.iter_mut().for_each(|q| *q *= scale);
+        let mut first = 0;
+        for group in rows.chunk_by(|a, b| a.0 == b.0) {
+            let (pages, _) = keys(&group[0]);
+            let at = first * c..(first + group.len()) * c;
+            let (q, out) = (&q[at.clone()], &mut attended[at]);
+            let visible = |i: usize| keys(&group[i]).1;
+            wide(
+                #[inline(always)]
+                || {
+                    if group.len() == 1 {
+                        attend::<1>(self.heads, pages, q, visible, out, scores);
+                    } else {
+                        attend::<4>(self.heads, pages, q, visible, out, scores);
+                    }
+                },
+            );
+            first += group.len();
+        }
+        attention
+            .out
+            .apply_to_few(attended, normal, &mut room.products);
+        add_scaled(x, normal, attention.gate);
+    }
+}
+
+/// `x += gate * contract(gelu(expand(norm(x))))`
+fn mlp(mlp: &Mlp, c: usize, x: &mut [f32], room: &mut Workroom) {
+    let [normal, hidden, ..] = &mut room.buffers;
+    normal.resize(x.len(), 0.0);
+    mlp.norm.apply(x, normal);
+    hidden.resize(x.len() / c * mlp.expand.n_out(), 0.0);
+    mlp.expand.apply_to_few(normal, hidden, &mut room.products);
+    gelu_row(hidden);
+    mlp.contract
+        .apply_to_few(hidden, normal, &mut room.products);
+    add_scaled(x, normal, mlp.gate);
+}
+
+fn add_scaled(x: &mut [f32], y: &[f32], scale: f32) {
+    wide(
+        #[inline(always)]
+        || x.iter_mut().zip(y).for_each(|(x, y)| *x += scale * y),
+    );
+}
+
+/// Hands every job its new keys and values in layer `l`.
+fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], kv: &[f32]) {
+    let c = heads.n * heads.d;
+    let mut rest = kv;
+    let mut parts = Vec::with_capacity(jobs.len());
+    for (job, start) in jobs.iter_mut().zip(starts) {
+        let (own, after) = rest.split_at((job.slots.len() - start) * 2 * c);
+        rest = after;
+        parts.push((&mut *job.context, *start, own));
+    }
+    parts.into_par_iter().for_each(|(context, start, kv)| {
+        let l = if context.layers.len() == 1 { 0 } else { l };
+        context.layers[l].write(heads, start, kv);
+    });
+}
+
+/// Rows that one task takes through a layer: few enough for every thread to have some and for
+/// what lies between two products to stay in the second-level cache.
+fn chunk_rows(rows: usize) -> usize {
+    let each = rows.div_ceil(2 * rayon::current_num_threads());
+    each.next_multiple_of(4).clamp(4, 64)
+}
+
+/// Memory that one task works in.
+#[derive(Debug, Default)]
+pub(crate) struct Workroom {
+    buffers: [Vec<f32>; 4],
+    products: Room,
+    /// Candidates of a draw.
+    draws: Vec<f32>,
+}
+
+/// Work rooms that are free; tasks return them, so that none is built twice.
+#[derive(Debug, Default)]
+struct Pool(Mutex<Vec<Workroom>>);
+
+impl Pool {
+    fn with<T>(&self, work: impl FnOnce(&mut Workroom) -> T) -> T {
+        let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut room = free().pop().unwrap_or_default();
+        let done = work(&mut room);
+        free().push(room);
+        done
+    }
+}

@@ -1,0 +1,219 @@
+//! One future in progress: its window, what its agents foresaw, and how decoded states become its
+//! present.
+
+use std::collections::BTreeMap;
+
+use gump_geometry::Pose;
+use gump_scene::{Agent, AgentState, Frame, Seed};
+use gump_tokenizer::{QuantizedState, TokenAgent, TokenFrame};
+
+use crate::aggregation::Ring;
+use crate::decode::Window;
+use crate::decoder::STEPS;
+use crate::engine::Context;
+use crate::sample::TOKEN_DT;
+use crate::sampling::{
+    Bins, CacheMode, Request, SamplingConfig, Surrogate, poses, set_pose, settled_state,
+};
+use crate::scene::Scene;
+use crate::world::{KEEP_RANGE_M, TransformerWorld};
+
+/// How far a sampled position may lie from its surrogate (released code), metres.
+const GUARD_M: f64 = 5.0;
+
+/// One future in progress.
+#[derive(Debug)]
+pub(crate) struct Future {
+    pub(crate) scene: usize,
+    pub(crate) seed: Seed,
+    /// The last token frames: at most `history` of them, or as many as a growing window holds.
+    pub(crate) frames: Vec<TokenFrame>,
+    /// Number of the last frame.
+    pub(crate) index: usize,
+    pub(crate) rings: BTreeMap<u16, Ring>,
+    /// The last `history` frames in world coordinates; the last is the present.
+    pub(crate) recent: Vec<Frame>,
+    /// What the engine keeps of its window.
+    pub(crate) context: Context,
+}
+
+impl Future {
+    /// The window of one future: its history and the next frame with provisional states.
+    pub(crate) fn window(
+        &self,
+        scene: &Scene,
+        sampling: &SamplingConfig,
+        ego: Option<AgentState>,
+    ) -> Window {
+        let index = self.index + 1;
+        let last = self.frames.last().expect("a future has history");
+        let mut next = TokenFrame {
+            lights: last.lights.clone(),
+            tracked: Vec::new(),
+            newborn: Vec::new(),
+        };
+        let mut requests = Vec::new();
+        // Who was newborn is tracked now, and takes its place in the canonical order.
+        let mut agents: Vec<&TokenAgent> = last.agents().collect();
+        agents.sort_by_key(|agent| agent.key.order());
+        for agent in agents {
+            let id = agent.key.id;
+            let surrogate = match (id, ego) {
+                (0, Some(state)) => scene.quantize(state, agent.state),
+                _ => self.surrogate(agent, index, sampling),
+            };
+            let position = surrogate.pose().position;
+            if id != 0 && position.abs().max_element() >= KEEP_RANGE_M {
+                continue;
+            }
+            let driven = id == 0 && ego.is_some();
+            next.tracked.push(TokenAgent {
+                key: agent.key,
+                state: surrogate,
+            });
+            requests.push(Request {
+                forced: forced_fields(&surrogate, driven),
+                stream: stream(self.seed, index, id),
+                near: Some((position, GUARD_M)),
+                // A driven object was put where it is; what it once foresaw does not count.
+                ring: if driven {
+                    Ring::default()
+                } else {
+                    self.rings.get(&id).cloned().unwrap_or_default()
+                },
+                frame: index,
+            });
+        }
+        Window {
+            scene: self.scene,
+            history: self.frames.clone(),
+            next,
+            requests,
+        }
+    }
+
+    /// A provisional state of `agent` for frame `index`.
+    fn surrogate(
+        &self,
+        agent: &TokenAgent,
+        index: usize,
+        sampling: &SamplingConfig,
+    ) -> QuantizedState {
+        let (pose, velocity) = (agent.state.pose(), agent.state.velocity());
+        let moved = Pose {
+            position: pose.position + velocity * TOKEN_DT,
+            ..pose
+        };
+        let said = match sampling.surrogate {
+            Surrogate::Chunk => self
+                .rings
+                .get(&agent.key.id)
+                .and_then(|ring| ring.surrogate(index, sampling.decay)),
+            Surrogate::Copy => Some(pose),
+            Surrogate::ConstantVelocity => None,
+        };
+        // Half a second moves nobody farther from a straight line: such a word is noise.
+        let said = said.filter(|said| said.position.distance(moved.position) <= GUARD_M);
+        set_pose(agent.state, said.unwrap_or(moved))
+    }
+
+    /// Makes the decoded states the present and returns it in world coordinates.
+    pub(crate) fn commit(
+        &mut self,
+        window: Window,
+        decoded: &[Bins],
+        scene: &Scene,
+        world: &TransformerWorld,
+        ego: Option<AgentState>,
+    ) -> Frame {
+        let sampling = world.sampling();
+        self.index += 1;
+        let mut next = window.next;
+        let mut moved = BTreeMap::new();
+        for ((agent, request), bins) in next.tracked.iter_mut().zip(&window.requests).zip(decoded) {
+            let id = agent.key.id;
+            let driven = id == 0 && ego.is_some();
+            let ring = self.rings.entry(id).or_default();
+            if driven {
+                ring.clear();
+            }
+            ring.push(self.index, poses(bins));
+            let pose = request.settle(bins, sampling);
+            agent.state = settled_state(bins, pose);
+            let state = AgentState {
+                pose: scene.world_from_scene * pose,
+                velocity: scene.world_from_scene.rotate(agent.state.velocity()),
+            };
+            moved.insert(id, if driven { ego.unwrap_or(state) } else { state });
+        }
+        let now = self.recent.last().expect("a future has a present");
+        let agents = now.agents().iter().map(|agent| {
+            let token = scene.identities.key(agent.id).and_then(|id| moved.get(&id));
+            let driven = ego.filter(|_| agent.id == scene.ego);
+            agent.with_state(driven.or(token.copied()).unwrap_or_else(|| drift(agent)))
+        });
+        // Lights keep the colour they were seen in.
+        let frame = Frame::new(agents.collect(), now.lights().to_vec());
+        next.newborn = scene.arrivals(&frame, &next, self.frames.last(), world.longest_frame());
+        self.recent.push(frame.clone());
+        self.frames.push(next);
+        let history = sampling.history.max(1);
+        self.recent
+            .drain(..self.recent.len().saturating_sub(history));
+        if sampling.cache != CacheMode::Growing || self.overflows(world) {
+            self.frames
+                .drain(..self.frames.len().saturating_sub(history));
+        }
+        self.rings.retain(|id, _| moved.contains_key(id));
+        // In the first frame of a window nobody is newborn: who was, counts as tracked.
+        let first = std::mem::take(&mut self.frames[0]);
+        self.frames[0] = first.into_first();
+        frame
+    }
+
+    /// Whether the window with a next frame like the last would be longer than a block.
+    fn overflows(&self, world: &TransformerWorld) -> bool {
+        let last = self.frames.last().map_or(0, TokenFrame::len_slots);
+        let all: usize = self.frames.iter().map(TokenFrame::len_slots).sum();
+        all + last > world.network().config().block_size
+    }
+
+    /// How far the ego is from the origin of its scene frame along either axis, metres.
+    pub(crate) fn ego_reach(&self) -> f64 {
+        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        ego.map_or(0.0, |ego| ego.state.pose().position.abs().max_element())
+    }
+
+    /// Moves into another scene of the same traffic: tokens and chunks are expressed in its frame.
+    pub(crate) fn enter(&mut self, index: usize, from: &Scene, to: &Scene) {
+        let to_from_from = to.world_from_scene.inverse() * from.world_from_scene;
+        self.scene = index;
+        self.frames = to.history.clone();
+        self.context.clear();
+        self.rings
+            .values_mut()
+            .for_each(|ring| ring.transform(to_from_from));
+    }
+}
+
+/// The randomness of one object in one frame of one future, whatever the batch.
+pub(crate) fn stream(seed: Seed, frame: usize, id: u16) -> Seed {
+    seed.fork(frame as u64).fork(u64::from(id))
+}
+
+/// Sizes never drift; a driven object's state is given entirely.
+fn forced_fields(state: &QuantizedState, driven: bool) -> [Option<u16>; STEPS.len()] {
+    let mut forced = [None; STEPS.len()];
+    let given = if driven { 7 } else { 2 };
+    for (step, field) in STEPS.iter().enumerate().take(given) {
+        forced[step] = Some(state.get(*field));
+    }
+    forced
+}
+
+/// Half a second of constant velocity.
+fn drift(agent: &Agent) -> AgentState {
+    let mut state = agent.state;
+    state.pose.position += state.velocity * TOKEN_DT;
+    state
+}

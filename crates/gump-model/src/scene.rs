@@ -1,0 +1,175 @@
+//! What all futures of a start share: the frame of reference, the identities, the map and what the
+//! network remembers of it.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use gump_geometry::Pose;
+use gump_raster::rasterize;
+use gump_scene::{AgentId, AgentState, Frame, MapGraph, Route, SceneState};
+use gump_tokenizer::{Identities, Key, QuantizedState, TokenAgent, TokenFrame};
+
+use crate::ModelError;
+use crate::engine::{Context, SceneMemory};
+use crate::mct::VisualMemory;
+use crate::sample::TOKEN_DT;
+use crate::world::{KEEP_RANGE_M, TransformerWorld};
+
+/// What the network remembers of a map, in the form of whoever computes.
+#[derive(Debug)]
+pub(crate) enum Memory {
+    /// For the engine.
+    Packed(SceneMemory),
+    /// For the tensor library.
+    Plain(VisualMemory),
+}
+
+impl Memory {
+    /// The engine's form, if it is that.
+    pub(crate) fn packed(&self) -> Option<&SceneMemory> {
+        match self {
+            Self::Packed(memory) => Some(memory),
+            Self::Plain(_) => None,
+        }
+    }
+
+    /// The tensor library's form, if it is that.
+    pub(crate) fn plain(&self) -> Option<&VisualMemory> {
+        match self {
+            Self::Plain(memory) => Some(memory),
+            Self::Packed(_) => None,
+        }
+    }
+}
+
+/// What all futures of a start share.
+#[derive(Debug)]
+pub(crate) struct Scene {
+    pub(crate) world_from_scene: Pose,
+    pub(crate) ego: AgentId,
+    pub(crate) identities: Identities,
+    pub(crate) memory: Memory,
+    /// The history as read by the engine, which futures go on from.
+    pub(crate) prefix: Context,
+    pub(crate) history: Vec<TokenFrame>,
+    /// The same frames in world coordinates; the last is the present.
+    pub(crate) recent: Vec<Frame>,
+    pub(crate) map: Arc<MapGraph>,
+    pub(crate) route: Option<Arc<Route>>,
+}
+
+impl Scene {
+    /// What the present of a scene shows.
+    pub(crate) fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, ModelError> {
+        let world_from_scene = scene.ego_now().state.pose;
+        let stride = (TOKEN_DT / scene.dt).round().max(1.0) as usize;
+        if (stride as f64 * scene.dt - TOKEN_DT).abs() > 1e-3 {
+            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", scene.dt);
+            return Err(ModelError::Scene(what));
+        }
+        let frames = scene.strided_history(stride, world.sampling().history.max(1));
+        // The ego must be in every frame of the window: start after the last one it is missing in.
+        let first = frames
+            .iter()
+            .rposition(|frame| frame.agent(scene.ego).is_none())
+            .map_or(0, |i| i + 1);
+        let frames = &frames[first..];
+        let identities = Identities::ranked(frames, scene.ego, world_from_scene);
+        let recent = frames.iter().copied().cloned().collect();
+        let map = Arc::clone(scene.map);
+        let route = scene.route.map(Arc::clone);
+        Self::of_window(world, map, route, recent, scene.ego, identities)
+    }
+
+    /// What a window of frames half a second apart shows, in the frame of the ego in its last.
+    pub(crate) fn of_window(
+        world: &TransformerWorld,
+        map: Arc<MapGraph>,
+        route: Option<Arc<Route>>,
+        recent: Vec<Frame>,
+        ego: AgentId,
+        identities: Identities,
+    ) -> Result<Self, ModelError> {
+        let view = SceneState {
+            map: &map,
+            route: route.as_ref(),
+            history: &recent,
+            ego,
+            dt: TOKEN_DT,
+        };
+        let world_from_scene = view.ego_now().state.pose;
+        let frames: Vec<&Frame> = recent.iter().collect();
+        let encoded = world
+            .tokenizer()
+            .encode(&map, &frames, ego, world_from_scene, &identities);
+        let (sequence, _) = encoded.sequence.fit(world.longest_frame());
+        let raster = rasterize(world.network().raster_spec(), &view, world_from_scene);
+        let memory = world.network().look(std::slice::from_ref(&raster))?;
+        Ok(Self {
+            world_from_scene,
+            ego,
+            identities,
+            memory: match world.engine() {
+                Some(engine) => Memory::Packed(engine.remember(&memory)?),
+                None => Memory::Plain(memory),
+            },
+            prefix: Context::default(),
+            history: sequence.frames().to_vec(),
+            recent,
+            map,
+            route,
+        })
+    }
+
+    /// A world state in tokens, with the size of `like`.
+    pub(crate) fn quantize(&self, state: AgentState, like: QuantizedState) -> QuantizedState {
+        like.with_motion(&self.local(state))
+    }
+
+    /// A world state in the scene frame.
+    fn local(&self, state: AgentState) -> AgentState {
+        let scene_from_world = self.world_from_scene.inverse();
+        AgentState {
+            pose: scene_from_world * state.pose,
+            velocity: scene_from_world.rotate(state.velocity),
+        }
+    }
+
+    /// Agents of `frame` inside the window that neither `tokens` nor the frame before knows, because
+    /// they drifted in; as many as fit a frame of `longest` slots. One that has just left waits a
+    /// frame before it can be newborn.
+    pub(crate) fn arrivals(
+        &self,
+        frame: &Frame,
+        tokens: &TokenFrame,
+        before: Option<&TokenFrame>,
+        longest: usize,
+    ) -> Vec<TokenAgent> {
+        let present = tokens
+            .agents()
+            .chain(before.into_iter().flat_map(TokenFrame::agents));
+        let known: BTreeSet<u16> = present.map(|agent| agent.key.id).collect();
+        let mut arrivals: Vec<TokenAgent> = frame
+            .agents()
+            .iter()
+            .filter(|agent| agent.kind.is_moving())
+            .filter_map(|agent| {
+                let id = self
+                    .identities
+                    .key(agent.id)
+                    .filter(|id| !known.contains(id))?;
+                let local = self.local(agent.state);
+                let inside = local.pose.position.abs().max_element() < KEEP_RANGE_M;
+                let (state, _) = QuantizedState::new(&local, agent.length, agent.width);
+                let kind = agent.kind;
+                inside.then_some(TokenAgent {
+                    key: Key { id, kind },
+                    state,
+                })
+            })
+            .collect();
+        arrivals.sort_by_key(|agent| agent.key.order());
+        arrivals.truncate(longest.saturating_sub(tokens.len_slots()) / 2);
+        arrivals
+    }
+}

@@ -1,0 +1,160 @@
+//! Futures of several starts in progress, step by step.
+
+use std::sync::Arc;
+
+use gump_rollout::{BoxError, Session, Start};
+use gump_scene::{AgentState, Frame};
+use rayon::prelude::*;
+
+use crate::ModelError;
+use crate::decode::{Step, Window, present_all};
+use crate::engine::SceneMemory;
+use crate::future::Future;
+use crate::mct::VisualMemory;
+use crate::plain::{Passes, decode};
+use crate::sample::TOKEN_DT;
+use crate::sampling::Bins;
+use crate::scene::Scene;
+use crate::world::TransformerWorld;
+
+/// An ego farther than this from the origin of its scene gets a new scene around it, metres. Training
+/// shows windows up to 85 m away.
+const RECENTRE_M: f64 = 60.0;
+
+pub(crate) struct TransformerSession<'a> {
+    pub(crate) world: &'a TransformerWorld,
+    pub(crate) scenes: Vec<Scene>,
+    pub(crate) futures: Vec<Future>,
+}
+
+impl Session for TransformerSession<'_> {
+    fn dt(&self) -> f64 {
+        TOKEN_DT
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        if let Some(states) = ego
+            && states.len() != self.futures.len()
+        {
+            let what = format!(
+                "{} ego states for {} futures",
+                states.len(),
+                self.futures.len()
+            );
+            return Err(ModelError::Scene(what).into());
+        }
+        self.recentre()?;
+        let sampling = self.world.sampling();
+        let windows: Vec<Window> = self
+            .futures
+            .iter()
+            .enumerate()
+            .map(|(i, future)| {
+                let scene = &self.scenes[future.scene];
+                future.window(scene, sampling, ego.map(|states| states[i]))
+            })
+            .collect();
+        let decoded = self.decode(&windows)?;
+        let mut frames = Vec::with_capacity(self.futures.len());
+        for (i, (window, bins)) in windows.into_iter().zip(decoded).enumerate() {
+            let scene = &self.scenes[self.futures[i].scene];
+            let ego = ego.map(|states| states[i]);
+            frames.push(self.futures[i].commit(window, &bins, scene, self.world, ego));
+        }
+        Ok(frames)
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        let index = self.scenes.len();
+        let mut scene = Scene::new(self.world, start.scene)?;
+        let mut fresh = self.world.futures(index, &mut scene, 1, start.seed)?;
+        self.scenes.push(scene);
+        self.futures[future] = fresh.pop().expect("one future was asked for");
+        self.forget_unused_scenes();
+        Ok(())
+    }
+}
+
+impl TransformerSession<'_> {
+    /// Drops what the engine keeps, so that the next step reads everything afresh.
+    #[cfg(test)]
+    pub(crate) fn forget(&mut self) {
+        for future in &mut self.futures {
+            future.context = crate::engine::Context::default();
+        }
+    }
+
+    /// Gives every future whose ego nears the edge of its window a scene around the ego's present,
+    /// map and tokens alike; such a future shares its visual memory with no other any more.
+    fn recentre(&mut self) -> Result<(), ModelError> {
+        let far: Vec<usize> = (0..self.futures.len())
+            .filter(|i| self.futures[*i].ego_reach() >= RECENTRE_M)
+            .collect();
+        let around = |i: &usize| {
+            let future = &self.futures[*i];
+            let from = &self.scenes[future.scene];
+            Scene::of_window(
+                self.world,
+                Arc::clone(&from.map),
+                from.route.clone(),
+                future.recent.clone(),
+                from.ego,
+                from.identities.clone(),
+            )
+        };
+        let scenes: Vec<Scene> = far.par_iter().map(around).collect::<Result<_, _>>()?;
+        for (i, to) in far.into_iter().zip(scenes) {
+            let index = self.scenes.len();
+            let future = &mut self.futures[i];
+            future.enter(index, &self.scenes[future.scene], &to);
+            self.scenes.push(to);
+        }
+        self.forget_unused_scenes();
+        Ok(())
+    }
+
+    /// One chunk of bins per tracked agent of every window.
+    fn decode(&mut self, windows: &[Window]) -> Result<Vec<Vec<Bins>>, ModelError> {
+        let (network, sampling) = (self.world.network(), self.world.sampling());
+        let placed = present_all(windows, network.config().block_size)?;
+        let Some(engine) = self.world.engine() else {
+            let memories = self.scenes.iter().filter_map(|scene| scene.memory.plain());
+            let memories: Vec<&VisualMemory> = memories.collect();
+            let passes = Passes::new(network, sampling, &memories);
+            let decoded = decode(&passes, windows, &placed);
+            self.world.count_passes(passes.count());
+            return decoded;
+        };
+        let memories = self.scenes.iter().filter_map(|scene| scene.memory.packed());
+        let memories: Vec<&SceneMemory> = memories.collect();
+        let mut contexts: Vec<_> = self.futures.iter_mut().map(|f| &mut f.context).collect();
+        let step = Step {
+            engine,
+            sampling,
+            memories: &memories,
+            windows,
+            placed,
+        };
+        let (decoded, passes) = step.decode(&mut contexts);
+        self.world.count_passes(passes);
+        let kept = contexts.iter().map(|context| context.bytes()).sum();
+        self.world.note_context_bytes(kept);
+        Ok(decoded)
+    }
+
+    /// Drops scenes that no future is in.
+    fn forget_unused_scenes(&mut self) {
+        let used = |scene: usize| self.futures.iter().any(|future| future.scene == scene);
+        let mut places = Vec::with_capacity(self.scenes.len());
+        let mut n = 0;
+        for scene in 0..self.scenes.len() {
+            places.push(used(scene).then_some(n));
+            n += usize::from(used(scene));
+        }
+        let mut kept = places.iter().map(Option::is_some);
+        self.scenes.retain(|_| kept.next().unwrap_or(false));
+        for future in &mut self.futures {
+            future.scene = places[future.scene].expect("the scene of a future is in use");
+        }
+    }
+}
