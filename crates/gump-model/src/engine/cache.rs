@@ -9,8 +9,8 @@
 use std::sync::Arc;
 
 use crate::batch::PlacedSlot;
-use crate::ops::panels::{PANEL, tile};
-use crate::ops::{exp_shifted_sum, max};
+use crate::ops::panels::PANEL;
+use crate::ops::{exp_shifted_sum, max, tile, wide};
 
 /// Tokens of a page.
 const PAGE: usize = PANEL;
@@ -112,7 +112,6 @@ impl Context {
 
 /// Attention of `q` `[rows, C]`, scaled already, over the first `visible[row]` tokens of `pages`;
 /// `out` is shaped like `q`.
-#[inline(always)]
 pub(super) fn attend<const N: usize>(
     heads: Heads,
     pages: &Pages,
@@ -143,8 +142,7 @@ pub(super) fn attend<const N: usize>(
             for (r, scores) in scores.chunks_exact_mut(n).enumerate() {
                 let (seen, hidden) = scores.split_at_mut(visible(row(r)));
                 hidden.fill(0.0);
-                let peak = max(seen);
-                reciprocals[r] = 1.0 / exp_shifted_sum(seen, peak);
+                reciprocals[r] = 1.0 / softmax(seen);
             }
             let weights: [&[f32]; N] = std::array::from_fn(|r| &scores[r * n..][..n]);
             for panel in 0..heads.value_panels() {
@@ -160,4 +158,15 @@ pub(super) fn attend<const N: usize>(
             }
         }
     }
+}
+
+/// `x[i] = e^(x[i] - max)`; returns the sum.
+fn softmax(x: &mut [f32]) -> f32 {
+    wide(
+        #[inline(always)]
+        || {
+            let peak = max(x);
+            exp_shifted_sum(x, peak)
+        },
+    )
 }

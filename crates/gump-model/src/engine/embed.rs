@@ -66,13 +66,15 @@ impl Embedder {
         Ok(Ground(self.local.iter().map(see).collect()))
     }
 
-    /// The vectors of tokens, `[rows, C]`; `ground(row)` is the scene that a token's object is in.
+    /// The vectors of tokens into `x`, `[rows, C]`; `ground(row)` is the scene that a token's object
+    /// is in. Returns how many multiplications it took.
     pub(super) fn embed<'a>(
         &self,
         slots: &[&PlacedSlot],
         ground: impl Fn(usize) -> &'a Ground + Sync,
         rooms: &Pool,
-    ) -> (Vec<f32>, u64) {
+        x: &mut Vec<f32>,
+    ) -> u64 {
         let c = self.width;
         let (sine_of, features) = self.distinct_sines(slots);
         let n_sines = features.len() / c;
@@ -82,7 +84,8 @@ impl Embedder {
             .par_chunks(step)
             .zip(sines.par_chunks_mut(step))
             .for_each(|(features, sines)| self.embed_sines(features, sines, rooms));
-        let mut x = vec![0.0; slots.len() * c];
+        x.clear();
+        x.resize(slots.len() * c, 0.0);
         let step = chunk_rows(slots.len());
         x.par_chunks_mut(step * c)
             .enumerate()
@@ -100,8 +103,7 @@ impl Embedder {
                     }
                 }
             });
-        let products = self.sine_in.products(n_sines) + self.sine_out.products(n_sines);
-        (x, products)
+        self.sine_in.products(n_sines) + self.sine_out.products(n_sines)
     }
 
     /// Per token the number of its sine, and the features of each.

@@ -49,6 +49,7 @@ pub(crate) struct Engine {
     norm: Norm,
     decoder: Decoder,
     rooms: Pool,
+    waves: Pool<Wave>,
     products: AtomicU64,
 }
 
@@ -101,6 +102,7 @@ impl Engine {
             norm: source.norm("mct.norm")?,
             decoder: Decoder::new(&source)?,
             rooms: Pool::default(),
+            waves: Pool::default(),
             products: AtomicU64::new(0),
         })
     }
@@ -154,7 +156,7 @@ impl Engine {
                 first || rows <= WAVE
             });
             let (wave, after) = rest.split_at_mut(n.count());
-            hidden.extend(self.run_wave(wave));
+            hidden.extend(self.waves.with(|room| self.run_wave(wave, room)));
             rest = after;
         }
         hidden
@@ -176,7 +178,7 @@ impl Engine {
         self.products.fetch_add(products, Ordering::Relaxed);
     }
 
-    fn run_wave(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
+    fn run_wave(&self, jobs: &mut [Job<'_>], Wave { x, kv }: &mut Wave) -> Vec<f32> {
         let c = self.width;
         let mut rows: Vec<Row> = Vec::new();
         let mut starts = Vec::with_capacity(jobs.len());
@@ -197,17 +199,16 @@ impl Engine {
         }
         let slots: Vec<&PlacedSlot> = rows.iter().map(|&(i, at)| &jobs[i].slots[at]).collect();
         let ground = |row: usize| &jobs[rows[row].0].memory.ground;
-        let (mut x, products) = self.embedder.embed(&slots, ground, &self.rooms); // [R, C]
-        self.count(products);
-        let mut kv = vec![0.0; 2 * x.len()]; // [R, 2C]
+        self.count(self.embedder.embed(&slots, ground, &self.rooms, x)); // [R, C]
+        kv.resize(2 * x.len(), 0.0); // [R, 2C]
         for (l, layer) in self.layers.iter().enumerate() {
-            self.keys_and_values(layer, &x, &mut kv);
-            write_pages(self.heads, l, jobs, &starts, &kv);
+            self.keys_and_values(layer, x, kv);
+            write_pages(self.heads, l, jobs, &starts, kv);
             if l + 1 == self.layers.len() {
                 // Nothing after this reads but what is asked for.
-                (x, rows) = self.wanted(jobs, &starts, &x);
+                rows = self.keep_wanted(jobs, &starts, x);
             }
-            self.layer(l, layer, jobs, &rows, &mut x);
+            self.layer(l, layer, jobs, &rows, x);
         }
         for (job, start) in jobs.iter_mut().zip(starts) {
             if job.keep {
@@ -217,22 +218,24 @@ impl Engine {
             }
         }
         let mut hidden = vec![0.0; rows.len() * c];
-        self.norm.apply(&x, &mut hidden);
+        self.norm.apply(x, &mut hidden);
         hidden
     }
 
-    /// The rows of `x` that are asked for.
-    fn wanted(&self, jobs: &[Job<'_>], starts: &[usize], x: &[f32]) -> (Vec<f32>, Vec<Row>) {
-        let (mut wanted, mut rows, mut first) = (Vec::new(), Vec::new(), 0);
+    /// Leaves of `x` only the rows that are asked for.
+    fn keep_wanted(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut Vec<f32>) -> Vec<Row> {
+        let (mut rows, mut first) = (Vec::new(), 0);
         for (i, (job, start)) in jobs.iter().zip(starts).enumerate() {
             for &place in &job.wanted {
-                let row = first + place - start;
-                wanted.extend_from_slice(&x[row * self.width..][..self.width]);
+                let row = (first + place - start) * self.width;
+                // Rows only move to the front, so none is overwritten before it has moved.
+                x.copy_within(row..row + self.width, rows.len() * self.width);
                 rows.push((i, place));
             }
             first += job.slots.len() - start;
         }
-        (wanted, rows)
+        x.truncate(rows.len() * self.width);
+        rows
     }
 
     fn keys_and_values(&self, layer: &Layer, x: &[f32], kv: &mut [f32]) {
@@ -315,16 +318,11 @@ impl Engine {
             let at = first * c..(first + group.len()) * c;
             let (q, out) = (&q[at.clone()], &mut attended[at]);
             let visible = |i: usize| keys(&group[i]).1;
-            wide(
-                #[inline(always)]
-                || {
-                    if group.len() == 1 {
-                        attend::<1>(self.heads, pages, q, visible, out, scores);
-                    } else {
-                        attend::<4>(self.heads, pages, q, visible, out, scores);
-                    }
-                },
-            );
+            if group.len() == 1 {
+                attend::<1>(self.heads, pages, q, visible, out, scores);
+            } else {
+                attend::<4>(self.heads, pages, q, visible, out, scores);
+            }
             first += group.len();
         }
         attention
@@ -386,12 +384,19 @@ pub(crate) struct Workroom {
     draws: Vec<f32>,
 }
 
-/// Work rooms that are free; tasks return them, so that none is built twice.
+/// What a wave works in: its vectors, `[R, C]`, and their keys and values, `[R, 2C]`.
 #[derive(Debug, Default)]
-struct Pool(Mutex<Vec<Workroom>>);
+struct Wave {
+    x: Vec<f32>,
+    kv: Vec<f32>,
+}
 
-impl Pool {
-    fn with<T>(&self, work: impl FnOnce(&mut Workroom) -> T) -> T {
+/// Rooms that are free; tasks return them, so that none is built twice.
+#[derive(Debug, Default)]
+struct Pool<R = Workroom>(Mutex<Vec<R>>);
+
+impl<R: Default> Pool<R> {
+    fn with<T>(&self, work: impl FnOnce(&mut R) -> T) -> T {
         let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut room = free().pop().unwrap_or_default();
         let done = work(&mut room);

@@ -199,20 +199,93 @@ pub(crate) fn wide<R>(f: impl FnOnce() -> R) -> R {
     f()
 }
 
-/// Whether the processor holds 32 registers of 512 bits.
-pub(super) fn has_many_registers() -> bool {
-    #[cfg(target_arch = "x86_64")]
-    {
-        is_x86_feature_detected!("avx512f")
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    {
-        false
-    }
-}
-
 /// Columns of a panel, as in `panels`.
 const PANEL: usize = super::panels::PANEL;
+
+/// `sums[r][j] = Σ rows[r][i] * b[i][j]`, where `b` is the blocks, each `[.., PANEL]`, one below
+/// another; every sum is one chain of fused multiply-adds, on every processor.
+///
+/// Panics when a row is shorter than the blocks are deep together.
+pub(crate) fn tile<'a, const N: usize>(
+    rows: [&[f32]; N],
+    blocks: impl Iterator<Item = &'a [f32]>,
+) -> [[f32; PANEL]; N] {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if is_x86_feature_detected!("avx512f") {
+            // SAFETY: the feature was just detected.
+            return unsafe { tile_v4(rows, blocks) };
+        }
+    }
+    tile_plain(rows, blocks)
+}
+
+fn tile_plain<'a, const N: usize>(
+    rows: [&[f32]; N],
+    blocks: impl Iterator<Item = &'a [f32]>,
+) -> [[f32; PANEL]; N] {
+    let mut sums = [[0f32; PANEL]; N];
+    let mut at = 0;
+    for block in blocks {
+        let block = block.as_chunks::<PANEL>().0;
+        // Row by row: sums of one row fit the registers of any processor.
+        for (sums, row) in sums.iter_mut().zip(rows) {
+            let row = &row[at..at + block.len()];
+            wide(
+                #[inline(always)]
+                || {
+                    for (a, b) in row.iter().zip(block) {
+                        for (sum, b) in sums.iter_mut().zip(b) {
+                            *sum = a.mul_add(*b, *sum);
+                        }
+                    }
+                },
+            );
+        }
+        at += block.len();
+    }
+    sums
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+fn tile_v4<'a, const N: usize>(
+    rows: [&[f32]; N],
+    blocks: impl Iterator<Item = &'a [f32]>,
+) -> [[f32; PANEL]; N] {
+    use std::arch::x86_64::{
+        _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_storeu_ps,
+    };
+    let mut sums = [[_mm512_setzero_ps(); 2]; N];
+    let mut at = 0;
+    for block in blocks {
+        let depth = block.len() / PANEL;
+        let rows = rows.map(|row| row[at..at + depth].as_ptr());
+        for i in 0..depth {
+            // SAFETY: row i of the block is 32 numbers, and every row was cut to `depth`.
+            unsafe {
+                let b = block.as_ptr().add(i * PANEL);
+                let (low, high) = (_mm512_loadu_ps(b), _mm512_loadu_ps(b.add(PANEL / 2)));
+                for (sums, row) in sums.iter_mut().zip(rows) {
+                    let a = _mm512_set1_ps(*row.add(i));
+                    sums[0] = _mm512_fmadd_ps(a, low, sums[0]);
+                    sums[1] = _mm512_fmadd_ps(a, high, sums[1]);
+                }
+            }
+        }
+        at += depth;
+    }
+    let mut out = [[0f32; PANEL]; N];
+    for (out, sums) in out.iter_mut().zip(sums) {
+        let (low, high) = out.split_at_mut(PANEL / 2);
+        // SAFETY: each half is 16 numbers of 32 bits.
+        unsafe {
+            _mm512_storeu_ps(low.as_mut_ptr(), sums[0]);
+            _mm512_storeu_ps(high.as_mut_ptr(), sums[1]);
+        }
+    }
+    out
+}
 
 /// Products of `N` rows of unsigned bytes with a panel of signed ones, summed exactly.
 ///
@@ -302,6 +375,19 @@ mod tests {
         let at = |k: usize, j: usize| i32::from(panel[(k / 4 * PANEL + j) * 4 + k % 4]);
         let slow = (0..depth).map(|k| i32::from(rows[3][k]) * at(k, 7));
         assert_eq!(sums[3][7], slow.sum::<i32>());
+    }
+
+    #[test]
+    fn tiles_have_the_same_bits_on_every_processor() {
+        let number = |i: usize| (i * 7919 % 1013) as f32 / 500.0 - 1.0;
+        let rows: Vec<f32> = (0..4 * 50).map(number).collect();
+        let rows: [&[f32]; 4] = std::array::from_fn(|r| &rows[r * 50..][..50]);
+        let b: Vec<f32> = (0..50 * PANEL).map(number).collect();
+        let blocks = || [&b[..20 * PANEL], &b[20 * PANEL..]].into_iter();
+        let sums = tile(rows, blocks());
+        assert_eq!(sums, tile_plain(rows, blocks()));
+        let slow = (0..50).fold(0f32, |sum, i| rows[2][i].mul_add(b[i * PANEL + 9], sum));
+        assert_eq!(sums[2][9], slow);
     }
 
     #[test]

@@ -31,7 +31,7 @@ pub use loss::{OrdinalSmoothing, masked_cross_entropy};
 pub use norm::layer_norm;
 
 pub(crate) use gelu::gelu_row;
-pub(crate) use gemm::wide;
+pub(crate) use gemm::{tile, wide};
 pub(crate) use gru::gru_row;
 pub(crate) use norm::normalize_row;
 pub(crate) use rows::{count_from, exp_shifted_sum, max};

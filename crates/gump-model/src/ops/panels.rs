@@ -1,8 +1,8 @@
 //! Matrices packed once for the many products of inference.
 //!
 //! What lives here: [`Panels`], a weight matrix cut into panels of [`PANEL`] columns that a product
-//! reads from front to back, in one of three precisions, and the kernel [`tile`] that attention
-//! shares. What does not: products with a gradient, which are `linear`'s.
+//! reads from front to back, in one of three precisions, under the
+//! kernels of `gemm`. What does not: products with a gradient, which are `linear`'s.
 //!
 //! Every element of a product is one chain of fused multiply-adds in the order of the inner index,
 //! whatever rows stand around it: a row's bits depend neither on the batch nor on the threads.
@@ -10,12 +10,12 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::gemm::{byte_tile, has_many_registers, wide};
+use super::gemm::{byte_tile, tile, wide};
 
 /// Columns of a panel: two vectors of 512 bits.
 pub(crate) const PANEL: usize = 32;
 
-/// Rows multiplied together where there are registers enough for them.
+/// Rows multiplied together.
 const ROWS: usize = 4;
 
 /// In which form the weights of linear layers are kept and multiplied.
@@ -174,13 +174,8 @@ impl Panels {
             .par_chunks_exact(depth)
             .with_min_len(FEW_WEIGHTS / (4 * depth))
             .map(|panel| {
-                wide(
-                    #[inline(always)]
-                    || {
-                        let row = |r: usize| &x[r.min(rows - 1) * self.n_in..][..self.n_in];
-                        tile::<ROWS>(std::array::from_fn(row), std::iter::once(panel))
-                    },
-                )
+                let row = |r: usize| &x[r.min(rows - 1) * self.n_in..][..self.n_in];
+                tile::<ROWS>(std::array::from_fn(row), std::iter::once(panel))
             })
             .collect();
         for (p, sums) in sums.iter().enumerate() {
@@ -201,26 +196,12 @@ impl Panels {
 
     /// The columns of one panel.
     fn panel_product(&self, x: &[f32], p: usize, panel: &[f32], y: &mut [f32]) {
-        wide(
-            #[inline(always)]
-            || {
-                if has_many_registers() {
-                    self.panel_rows::<ROWS>(x, p, panel, y);
-                } else {
-                    self.panel_rows::<2>(x, p, panel, y);
-                }
-            },
-        );
-    }
-
-    #[inline(always)]
-    fn panel_rows<const N: usize>(&self, x: &[f32], p: usize, panel: &[f32], y: &mut [f32]) {
         let (k, n) = (self.n_in, self.n_out);
         let rows = x.len() / k;
-        let whole = rows / N * N;
-        for first in (0..whole).step_by(N) {
+        let whole = rows / ROWS * ROWS;
+        for first in (0..whole).step_by(ROWS) {
             let group = std::array::from_fn(|r| &x[(first + r) * k..][..k]);
-            let sums = tile::<N>(group, std::iter::once(panel));
+            let sums = tile::<ROWS>(group, std::iter::once(panel));
             for (r, sums) in sums.iter().enumerate() {
                 self.store(sums, p, &mut y[(first + r) * n..][..n]);
             }
@@ -258,10 +239,15 @@ impl Panels {
             let mut store = |r: usize, sums: &[i32; PANEL]| {
                 let input = room.scales[r];
                 let y = &mut y[r * n + p * PANEL..(r + 1) * n];
-                let columns = sums.iter().zip(offsets).zip(scales).zip(bias);
-                for (y, (((sum, offset), scale), bias)) in y.iter_mut().zip(columns) {
-                    *y = (sum - offset) as f32 * (input * scale) + bias;
-                }
+                wide(
+                    #[inline(always)]
+                    || {
+                        let columns = sums.iter().zip(offsets).zip(scales).zip(bias);
+                        for (y, (((sum, offset), scale), bias)) in y.iter_mut().zip(columns) {
+                            *y = sum.wrapping_sub(*offset) as f32 * (input * scale) + bias;
+                        }
+                    },
+                );
             };
             let whole = rows / ROWS * ROWS;
             for first in (0..whole).step_by(ROWS) {
@@ -277,34 +263,6 @@ impl Panels {
 
 /// Weights below which sharing out the columns of a product with few rows costs more than it saves.
 const FEW_WEIGHTS: usize = 64 * 1024;
-
-/// `sums[r][j] = Σ rows[r][i] * b[i][j]`, where `b` is the blocks, each `[.., PANEL]`, one below
-/// another.
-///
-/// Rows must be at least as long as the blocks are deep together.
-#[inline(always)]
-pub(crate) fn tile<'a, const N: usize>(
-    rows: [&[f32]; N],
-    blocks: impl Iterator<Item = &'a [f32]>,
-) -> [[f32; PANEL]; N] {
-    let mut sums = [[0f32; PANEL]; N];
-    let mut at = 0;
-    for block in blocks {
-        let block = block.as_chunks::<PANEL>().0;
-        let n = block.len();
-        let rows: [&[f32]; N] = std::array::from_fn(|r| &rows[r][at..at + n]);
-        for (i, b) in block.iter().enumerate() {
-            for r in 0..N {
-                let a = rows[r][i];
-                for j in 0..PANEL {
-                    sums[r][j] = a.mul_add(b[j], sums[r][j]);
-                }
-            }
-        }
-        at += n;
-    }
-    sums
-}
 
 /// `[out, in]` as panels of `[in, PANEL]`, padded with zeros.
 fn interleave<T: Copy + Default>(weight: &[f32], n_in: usize, cast: impl Fn(f32) -> T) -> Vec<T> {
@@ -364,8 +322,10 @@ fn quantize_row(x: &[f32], bytes: &mut [u8]) -> f32 {
                 .chain(tail)
                 .fold(0f32, |m, x| if x.abs() > m { x.abs() } else { m });
             let reciprocal = if largest > 0.0 { 127.0 / largest } else { 0.0 };
+            // Adding 1.5 * 2^23 rounds to an integer, which then sits in the low bits.
+            const ROUND: f32 = 12_582_912.0 + ZERO_POINT as f32;
             for (byte, x) in bytes.iter_mut().zip(x) {
-                *byte = ((x * reciprocal).round_ties_even() as i32 + ZERO_POINT) as u8;
+                *byte = (x * reciprocal + ROUND).to_bits() as u8;
             }
             largest / 127.0
         },

@@ -226,8 +226,8 @@ pub(crate) fn count_from(x: &[f32], low: f32) -> usize {
     wide(
         #[inline(always)]
         || {
-            let n: u32 = x.iter().map(|&x| u32::from(x >= low)).sum();
-            n as usize
+            let count = |n: u32, x: &f32| n.wrapping_add(u32::from(*x >= low));
+            x.iter().fold(0, count) as usize
         },
     )
 }
