@@ -9,7 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ablate, ci, data, demo, evaluate, simulate, submit, tidy, train};
+use crate::verbs::{ablate, bench, ci, data, demo, evaluate, simulate, submit, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -43,6 +43,9 @@ enum Verb {
     /// Leave a part out or swap it, and measure what it did.
     #[command(subcommand)]
     Ablate(ablate::Verb),
+    /// Measure speed, side by side.
+    #[command(subcommand)]
+    Bench(bench::Verb),
     /// Everything CI runs: format, lints, tests, docs, layers, house rules.
     Ci(ci::Args),
     /// Check the house rules of the repository.
@@ -95,6 +98,16 @@ impl Cli {
             }
             Verb::Ablate(ablate::Verb::Nar(args)) => {
                 Run::of("ablate nar", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Ablate(ablate::Verb::Quantization(args)) => {
+                Run::of("ablate quantization", &args.common, &args)?
+                    .execute(|run| args.execute(run))
+            }
+            Verb::Bench(bench::Verb::Engine(args)) => {
+                Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Bench(bench::Verb::Device(args)) => {
+                Run::of("bench device", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {

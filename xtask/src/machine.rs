@@ -45,6 +45,18 @@ pub(crate) fn peak_rss_mb() -> Option<f64> {
     Some((kib * 1024.0 / 1e5).round() / 10.0)
 }
 
+/// Seconds of processor time this process has used, over all threads, to a hundredth; `None` where
+/// the system does not tell.
+pub(crate) fn cpu_seconds() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The second field is a name in parentheses, which may hold spaces; user and system time are
+    // the 14th and 15th, in hundredths of a second on every Linux.
+    let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
+    let user: f64 = fields.next()?.parse().ok()?;
+    let system: f64 = fields.next()?.parse().ok()?;
+    Some((user + system) / 100.0)
+}
+
 /// The commit the checkout is at, with `-modified` if files differ from it; "unknown" without git.
 pub(crate) fn commit() -> String {
     let git = |arguments: &[&str]| {
@@ -94,6 +106,7 @@ mod tests {
     #[cfg(target_os = "linux")]
     fn linux_tells_memory() {
         assert!(peak_rss_mb().unwrap() > 0.5);
+        assert!((0.0..1e6).contains(&cpu_seconds().unwrap()));
         assert!(Machine::here("cpu").memory_gb.unwrap() > 0.1);
     }
 

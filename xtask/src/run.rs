@@ -49,6 +49,23 @@ pub(crate) enum Device {
 }
 
 impl Device {
+    /// Opens the device.
+    ///
+    /// Error: [`WrongArguments`] in a build without CUDA, or what the driver reports.
+    fn open(self) -> anyhow::Result<gump_model::Device> {
+        match self {
+            Self::Cpu => Ok(gump_model::Device::Cpu),
+            Self::Cuda if cfg!(feature = "cuda") => {
+                gump_model::Device::new_cuda(0).context("cannot open the first NVIDIA GPU")
+            }
+            Self::Cuda => {
+                let why = "--device cuda needs a build with CUDA, this one has none: \
+                           build with `--features cuda`";
+                Err(WrongArguments(why.into()).into())
+            }
+        }
+    }
+
     fn name(self) -> &'static str {
         match self {
             Self::Cpu => "cpu",
@@ -63,6 +80,7 @@ pub(crate) struct Run {
     seed: Seed,
     quiet: bool,
     threads: usize,
+    device: gump_model::Device,
     report: Report,
     began: Instant,
 }
@@ -76,10 +94,7 @@ impl Run {
         common: &Common,
         settings: &impl Serialize,
     ) -> anyhow::Result<Self> {
-        if common.device == Device::Cuda {
-            let why = "--device cuda needs a build with CUDA, this one has none";
-            return Err(WrongArguments(why.into()).into());
-        }
+        let device = common.device.open()?;
         let out = match &common.out {
             Some(out) => out.clone(),
             None => Path::new("out").join(verb.replace(' ', "-")),
@@ -94,6 +109,7 @@ impl Run {
             threads: common
                 .threads
                 .map_or_else(machine::cores, NonZeroUsize::get),
+            device,
             report: Report::begin(verb, seed, config, common.device.name()),
             began: Instant::now(),
             out,
@@ -180,6 +196,11 @@ impl Run {
     /// The output folder.
     pub(crate) fn out(&self) -> &Path {
         &self.out
+    }
+
+    /// Where tensors live.
+    pub(crate) fn device(&self) -> &gump_model::Device {
+        &self.device
     }
 
     /// Where all randomness comes from.

@@ -68,10 +68,22 @@ pub(crate) enum World {
 }
 
 impl World {
-    /// Builds the world; only `log` looks at more than the present of the scenario.
+    /// Builds the world on the CPU; only `log` looks at more than the present of the scenario.
     ///
     /// Error: weights that cannot be read or do not fit.
     pub(crate) fn build(
+        name: &WorldName,
+        scenario: &Scenario,
+        sampling: &SamplingConfig,
+    ) -> anyhow::Result<Self> {
+        Self::build_on(&Device::Cpu, name, scenario, sampling)
+    }
+
+    /// As [`World::build`], with a network on `device`.
+    ///
+    /// Error: weights that cannot be read or do not fit.
+    pub(crate) fn build_on(
+        device: &Device,
         name: &WorldName,
         scenario: &Scenario,
         sampling: &SamplingConfig,
@@ -81,7 +93,7 @@ impl World {
             WorldName::Idm => Self::Rule(Box::new(Idm::default())),
             WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
             WorldName::Model(path) => {
-                let network = checkpoint::load(path, &Device::Cpu)?;
+                let network = checkpoint::load(path, device)?;
                 Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))
             }
         })

@@ -14,13 +14,13 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use candle_core::Tensor;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
-use gump_scene::Seed;
+use gump_scene::{SceneState, Seed};
 use gump_tokenizer::{QuantizedState, Slot, TokenSequence, Tokenizer, TokenizerConfig};
 use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::aggregation::Ring;
-use crate::batch::place;
+use crate::batch::{PlacedSlot, place};
 use crate::decoder::STEPS;
 use crate::engine::{Engine, Job};
 use crate::future::{Future, stream};
@@ -214,32 +214,18 @@ impl TransformerWorld {
                 }
             })
             .collect();
-        self.count_passes(1);
         let places: Vec<usize> = keys.iter().map(|(i, ..)| *i).collect();
-        let bins = match (&self.engine, &scene.memory) {
-            (Some(engine), Memory::Packed(memory)) => {
-                let mut job = [Job {
-                    slots: &slots,
-                    wanted: places,
-                    memory,
-                    context: &mut scene.prefix,
-                    keep: true,
-                }];
-                let hidden = engine.run(&mut job).repeat(n);
+        let hidden = self.read_history(scene, &slots, places)?.repeat(n);
+        let bins = match &self.engine {
+            Some(engine) => {
                 let requests: Vec<&Request> = requests.iter().collect();
                 engine.sample(&hidden, &requests, &self.sampling)
             }
-            (_, Memory::Plain(memory)) => {
-                let batch = network.pack(&[&slots])?;
-                let features = network.mct.forward(&batch, memory, None, None)?;
-                let rows: Vec<u32> = (0..n)
-                    .flat_map(|_| places.iter().map(|i| *i as u32))
-                    .collect();
-                let rows = Tensor::new(rows, network.device())?;
-                let hidden = features.hidden.squeeze(0)?.index_select(&rows, 0)?;
+            None => {
+                let shape = (requests.len(), network.config().width);
+                let hidden = Tensor::from_vec(hidden, shape, network.device())?;
                 sample_states(network, &hidden, &requests, &self.sampling)?
             }
-            (None, Memory::Packed(_)) => unreachable!("the engine packed the memory"),
         };
         let per_future = |bins: &[Bins]| {
             keys.iter()
@@ -248,6 +234,57 @@ impl TransformerWorld {
                 .collect()
         };
         Ok(bins.chunks(keys.len().max(1)).map(per_future).collect())
+    }
+
+    /// Hidden vectors `[places, C]` of the history of a scene, in one pass; the engine keeps what
+    /// futures go on from.
+    fn read_history(
+        &self,
+        scene: &mut Scene,
+        slots: &[PlacedSlot],
+        places: Vec<usize>,
+    ) -> Result<Vec<f32>, ModelError> {
+        self.count_passes(1);
+        if let (Some(engine), Memory::Packed(memory)) = (&self.engine, &scene.memory) {
+            return Ok(engine.run(&mut [Job {
+                slots,
+                wanted: places,
+                memory,
+                context: &mut scene.prefix,
+                keep: true,
+            }]));
+        }
+        let memory = scene.memory.plain();
+        let memory = memory.expect("without an engine the memory is the tensor library's");
+        let batch = self.network.pack(&[slots])?;
+        let features = self.network.mct.forward(&batch, memory, None, None)?;
+        let places: Vec<u32> = places.into_iter().map(|i| i as u32).collect();
+        let places = Tensor::new(places, self.network.device())?;
+        let hidden = features.hidden.squeeze(0)?.index_select(&places, 0)?;
+        Ok(hidden.flatten_all()?.to_vec1::<f32>()?)
+    }
+
+    /// What the network makes of the last agent of a scene's present: its hidden vector, then the
+    /// logits of the first field. For comparing devices and ways of computing.
+    ///
+    /// # Errors
+    /// A scene that cannot be tokenised, or what the tensor library reports.
+    pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, ModelError> {
+        let mut scene = Scene::new(self, scene)?;
+        let sequence = TokenSequence::new(Vec::new(), scene.history.clone())
+            .map_err(|error| ModelError::Scene(error.to_string()))?;
+        let slots = place(&sequence);
+        let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
+        let key = key.expect("the ego is in every frame of the window");
+        let mut said = self.read_history(&mut scene, &slots, vec![key])?;
+        let network = &self.network;
+        let hidden = Tensor::from_slice(&said, (1, said.len()), network.device())?;
+        let decoder = &network.decoder;
+        let table = decoder.input_table(&network.mct.token_table()?)?;
+        let output = decoder.step(&table, &mut decoder.begin(&hidden), 0, None)?;
+        let logits = decoder.logits(&output, STEPS[0])?;
+        said.extend(logits.flatten_all()?.to_vec1::<f32>()?);
+        Ok(said)
     }
 }
 

@@ -1,5 +1,7 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
+mod quantization;
+
 use std::num::NonZeroUsize;
 
 use gump_data::find;
@@ -21,6 +23,8 @@ use crate::worlds::{Draw, World, WorldName};
 pub(crate) enum Verb {
     /// Decoding one agent after another (full-AR) against all at once (partial-AR)
     Nar(Args),
+    /// Weights in 32, 16 and 8 bits
+    Quantization(quantization::Args),
 }
 
 /// Arguments of `ablate nar`.

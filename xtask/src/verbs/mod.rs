@@ -1,6 +1,7 @@
 //! One file per verb: arguments, then what the verb does, by calling crates.
 
 pub(crate) mod ablate;
+pub(crate) mod bench;
 pub(crate) mod ci;
 pub(crate) mod data;
 pub(crate) mod demo;

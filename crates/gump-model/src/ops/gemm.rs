@@ -166,6 +166,18 @@ pub(super) fn gemm(
     }
 }
 
+/// The product of two `[n, n]` matrices by the matrix library on all threads: what the speed of
+/// everything else is held against.
+///
+/// Panics when a slice is shorter than `n * n`.
+pub fn square_product(a: &[f32], b: &[f32], n: usize) -> Vec<f32> {
+    let mut product = vec![0.0; n * n];
+    let dst = MatMut::new(&mut product, n, n);
+    let (a, b) = (Mat::new(a, n, n), Mat::new(b, n, n));
+    gemm(dst, Store::Replace, 1.0, a, b, Threads::Pool);
+    product
+}
+
 /// Runs `f` compiled for the widest vectors of this processor.
 ///
 /// Mark the closure and every helper it calls `#[inline(always)]`: only inlined code is compiled

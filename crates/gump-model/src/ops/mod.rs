@@ -25,6 +25,7 @@ mod rows;
 pub use attention::{causal_attention, cross_attention, cross_attention_padded};
 pub use conv::conv2d;
 pub use gelu::gelu;
+pub use gemm::square_product;
 pub use gru::gru_cell;
 pub use linear::linear;
 pub use loss::{OrdinalSmoothing, masked_cross_entropy};

@@ -1,0 +1,48 @@
+//! `bench`: speed, side by side in one run; ratios first.
+
+pub(crate) mod device;
+pub(crate) mod engine;
+
+use gump_scene::{Scenario, fixture};
+
+/// What is measured.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Verb {
+    /// Imagining: orders of decoding, caches, batches and sizes, against the machine's own rate
+    Engine(engine::Args),
+    /// The chosen device against the CPU: do they say the same, and how fast
+    Device(device::Args),
+}
+
+/// A made-up crossing of that many agents, all within the window of the tokens, with a second of
+/// history.
+fn crowd(n_agents: usize) -> anyhow::Result<Scenario> {
+    let mut text = String::from(
+        "lane 1: -100,0 100,0 speed 15\nlane 2: 0,-100 0,100 speed 15\n\
+         ego vehicle 0: 0,0 velocity 6,0\n",
+    );
+    for i in 1..n_agents {
+        let (column, row) = (i % 12, i / 12);
+        let (x, y) = (10 * column as i64 - 55, 10 * row as i64 - 50);
+        let kind = ["vehicle", "vehicle", "pedestrian", "bicycle"][i % 4];
+        let velocity = [4.0, 0.0, 1.0, 3.0][i % 4];
+        text += &format!("agent {kind} {i}: {x},{y} velocity {velocity},0\n");
+    }
+    fixture::scenario(&text).map_err(|error| anyhow::anyhow!(error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_crowd_has_as_many_agents_as_asked_for() {
+        for n in [1, 32, 128] {
+            let scenario = crowd(n).unwrap();
+            assert_eq!(scenario.present().now().agents().len(), n);
+            let inside =
+                |agent: &gump_scene::Agent| agent.state.pose.position.abs().max_element() < 80.0;
+            assert!(scenario.present().now().agents().iter().all(inside));
+        }
+    }
+}
