@@ -135,7 +135,7 @@ fn sequences_do_not_know_their_neighbours_or_the_threads() {
 #[test]
 fn a_probe_is_the_same_by_engine_and_by_tensors() {
     let scenario = scenario();
-    let sampling = crate::sampling::SamplingConfig::default();
+    let sampling = SamplingConfig::default();
     let fused = TransformerWorld::new(network(), sampling.clone());
     let plain = TransformerWorld::plain(network(), sampling);
     let said = [fused, plain].map(|world| world.probe(scenario.present()).unwrap());
