@@ -158,7 +158,7 @@ fn draw_lines(pen: &mut Pen<'_>, map: &MapGraph, colours: &Colours) {
 }
 
 /// Whether a marking is yellow, and whether it is broken. A double line is drawn as one.
-fn style(kind: RoadLineKind) -> (bool, bool) {
+pub(crate) fn style(kind: RoadLineKind) -> (bool, bool) {
     match kind {
         RoadLineKind::BrokenSingleWhite | RoadLineKind::Unknown => (false, true),
         RoadLineKind::SolidSingleWhite | RoadLineKind::SolidDoubleWhite => (false, false),
@@ -199,7 +199,7 @@ fn draw_stop_signs(pen: &mut Pen<'_>, map: &MapGraph, colours: &Colours) {
     }
 }
 
-fn is_for_cars(lane: &Lane) -> bool {
+pub(crate) fn is_for_cars(lane: &Lane) -> bool {
     lane.kind != LaneKind::BikeLane
 }
 

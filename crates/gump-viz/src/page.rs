@@ -67,7 +67,7 @@ impl Page {
              <title>{title}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<header>\n\
              <h1>{title}</h1>\n",
             title = escape(&self.title),
-            css = include_str!("page.css"),
+            css = concat!(include_str!("palette.css"), include_str!("page.css")),
         );
         if !self.lede.is_empty() {
             push(
@@ -119,6 +119,12 @@ impl Section {
     /// A paragraph.
     pub fn prose(&mut self, text: &str) -> &mut Self {
         self.add(format_args!("<p>{}</p>\n", escape(text)))
+    }
+
+    /// A paragraph that is a link to a file beside the page, such as `viewer.html`.
+    pub fn link(&mut self, file: &str, text: &str) -> &mut Self {
+        let (file, text) = (escape(file), escape(text));
+        self.add(format_args!("<p><a href=\"{file}\">{text}</a></p>\n"))
     }
 
     /// A command or other text in which spaces matter.
@@ -285,7 +291,7 @@ fn looks_numeric(cell: &str) -> bool {
 }
 
 /// Replaces what has a meaning in HTML text and attributes.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {
         match character {

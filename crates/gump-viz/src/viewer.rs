@@ -1,0 +1,394 @@
+//! The viewer: one HTML file in which to play a scene, its log and any number of futures.
+//!
+//! [`Viewer`] gathers what is to be seen; `viewer/pack.rs` makes it small; the page itself is
+//! `viewer/*.js`, plain script without libraries, put together here. How a page looks is in
+//! `theme.rs` and `palette.css`, which it shares with pictures and pages.
+
+mod pack;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::path::Path;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use flate2::Compression;
+use flate2::write::DeflateEncoder;
+use gump_geometry::DVec2;
+use gump_scene::{Agent, AgentId, AreaKind, Frame, Light, MapGraph, Rollout, Scenario};
+use serde_json::{Value, json};
+
+use crate::draw_map::{is_for_cars, style};
+use crate::files::write_whole;
+use crate::page::escape;
+use crate::theme::{Colours, Rgb};
+use crate::{Theme, VizError};
+use pack::{CENTI, Class, HEADINGS, Packer, units};
+
+/// How far from any agent the map is kept, metres.
+const MARGIN: f64 = 120.0;
+
+/// A scene under preparation for the browser.
+///
+/// The page shows positions to 1 cm, speeds to 1 cm/s, headings to 1/8192 of a turn. An agent
+/// keeps the extent it has in the present, or where it is first seen.
+#[derive(Clone, Debug)]
+pub struct Viewer<'a> {
+    scenario: &'a Scenario,
+    futures: Vec<(String, &'a Rollout)>,
+    metrics: Vec<MetricTrack>,
+    candidates: Vec<CandidatePath>,
+    note: String,
+}
+
+/// A metric of one agent over time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MetricTrack {
+    /// What it is, with its unit: "time to collision, s".
+    pub name: String,
+    /// Whose it is.
+    pub agent: AgentId,
+    /// The future it is of, in the order added; `None` for the log.
+    pub future: Option<usize>,
+    /// One value per frame of the log, or per imagined frame of the future; `None` where undefined.
+    pub values: Vec<Option<f64>>,
+}
+
+/// What a planner considered.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CandidatePath {
+    /// What it is, in words.
+    pub name: String,
+    /// How it was judged, higher is better; `None` if it was not.
+    pub score: Option<f64>,
+    /// Whether it was the choice.
+    pub is_chosen: bool,
+    /// Box centres of the ego, world frame, metres.
+    pub path: Vec<DVec2>,
+}
+
+/// The log or a future, as the page knows it.
+struct Take<'a> {
+    name: &'a str,
+    /// Seconds from the present to the first frame.
+    first: f64,
+    dt: f64,
+    frames: Vec<&'a Frame>,
+}
+
+impl<'a> Viewer<'a> {
+    /// A viewer of the log alone.
+    pub fn new(scenario: &'a Scenario) -> Self {
+        Self {
+            scenario,
+            futures: Vec::new(),
+            metrics: Vec::new(),
+            candidates: Vec::new(),
+            note: String::new(),
+        }
+    }
+
+    /// Sets the line under the title.
+    pub fn note(&mut self, text: impl Into<String>) -> &mut Self {
+        self.note = text.into();
+        self
+    }
+
+    /// Adds a future, which begins in the present of the scenario.
+    pub fn future(&mut self, name: impl Into<String>, rollout: &'a Rollout) -> &mut Self {
+        self.futures.push((name.into(), rollout));
+        self
+    }
+
+    /// Adds futures under the numbers 1, 2, ...
+    pub fn futures(&mut self, rollouts: &'a [Rollout]) -> &mut Self {
+        for rollout in rollouts {
+            let number = self.futures.len() + 1;
+            self.future(number.to_string(), rollout);
+        }
+        self
+    }
+
+    /// Adds a metric, shown when its agent is chosen.
+    pub fn metric(&mut self, track: MetricTrack) -> &mut Self {
+        self.metrics.push(track);
+        self
+    }
+
+    /// Adds what a planner considered.
+    pub fn candidate(&mut self, candidate: CandidatePath) -> &mut Self {
+        self.candidates.push(candidate);
+        self
+    }
+
+    /// The whole page; it refers to nothing outside itself.
+    pub fn to_html(&self) -> String {
+        let (facts, bytes) = self.pack();
+        // Inside a script nothing but "<" could end it; JSON may write it as an escape anywhere.
+        let facts = facts.to_string().replace('<', "\\u003c");
+        let parts = [
+            ("title", escape(&self.scenario.id)),
+            ("palette", include_str!("palette.css").to_owned()),
+            ("style", include_str!("viewer/viewer.css").to_owned()),
+            ("facts", facts),
+            ("data", BASE64.encode(deflate(&bytes))),
+            ("unpack", include_str!("viewer/unpack.js").to_owned()),
+            ("draw", include_str!("viewer/draw.js").to_owned()),
+            ("chart", include_str!("viewer/chart.js").to_owned()),
+            ("app", include_str!("viewer/app.js").to_owned()),
+            ("check", include_str!("viewer/check.js").to_owned()),
+        ];
+        fill(include_str!("viewer/viewer.html"), &parts)
+    }
+
+    /// Writes the page; a reader finds the old file or the new one, never half of one.
+    ///
+    /// # Errors
+    /// [`VizError::Write`] with the path.
+    pub fn save(&self, path: &Path) -> Result<(), VizError> {
+        write_whole(path, self.to_html().as_bytes())
+    }
+
+    /// What the page reads as JSON, and the bytes of road and traffic.
+    fn pack(&self) -> (Value, Vec<u8>) {
+        let scenario = self.scenario;
+        let takes = self.takes();
+        let agents = agents(scenario, &takes);
+        let lights = lights(&scenario.map, &takes);
+        let origin = scenario.present().ego_now().state.pose.position.round();
+        let mut packer = Packer::new(origin);
+        let n_features = self.pack_map(&mut packer, window(&takes));
+        for take in &takes {
+            for agent in &agents {
+                packer.track(agent.id, &take.frames);
+            }
+            for (light, _) in &lights {
+                packer.light(light.lane, &take.frames);
+            }
+        }
+        let local = |p: DVec2| {
+            let p = p - origin;
+            [units(p.x, CENTI), units(p.y, CENTI)]
+        };
+        let ego = agents.iter().position(|agent| agent.id == scenario.ego);
+        let facts = json!({
+            "id": scenario.id,
+            "note": self.note,
+            "origin": [origin.x, origin.y],
+            "ego": ego,
+            "centi": CENTI,
+            "headings": HEADINGS,
+            "features": n_features,
+            "themes": {
+                "light": theme(Theme::Light.colours()),
+                "dark": theme(Theme::Dark.colours()),
+            },
+            "agents": agents.iter().map(|a| json!({
+                "id": a.id.to_string(),
+                "kind": a.kind.name(),
+                "length": rounded(a.length),
+                "width": rounded(a.width),
+            })).collect::<Vec<_>>(),
+            "lights": lights.iter().map(|&(_, at)| local(at)).collect::<Vec<_>>(),
+            "takes": takes.iter().map(|take| json!({
+                "name": take.name,
+                "first": take.first,
+                "dt": take.dt,
+                "frames": take.frames.len(),
+            })).collect::<Vec<_>>(),
+            "metrics": self.metrics.iter().map(|track| json!({
+                "name": track.name,
+                "agent": agents.iter().position(|a| a.id == track.agent),
+                "take": track.future.map_or(0, |future| future + 1),
+                "values": track.values.iter().map(|v| v.map(rounded)).collect::<Vec<_>>(),
+            })).collect::<Vec<_>>(),
+            "candidates": self.candidates.iter().map(|c| json!({
+                "name": c.name,
+                "score": c.score,
+                "chosen": c.is_chosen,
+                "path": c.path.iter().map(|&p| local(p)).collect::<Vec<_>>(),
+            })).collect::<Vec<_>>(),
+        });
+        (facts, packer.into_bytes())
+    }
+
+    /// The log, then the futures with the present as their first frame.
+    fn takes(&self) -> Vec<Take<'_>> {
+        let scenario = self.scenario;
+        let log = Take {
+            name: "log",
+            first: -(scenario.now as f64) * scenario.dt,
+            dt: scenario.dt,
+            frames: scenario.log.iter().collect(),
+        };
+        let futures = self.futures.iter().map(|(name, rollout)| Take {
+            name,
+            first: 0.0,
+            dt: rollout.dt(),
+            frames: std::iter::once(rollout.start())
+                .chain(rollout.imagined())
+                .collect(),
+        });
+        std::iter::once(log).chain(futures).collect()
+    }
+
+    /// Packs the road near the agents in the order in which it is drawn; returns how many features.
+    fn pack_map(&self, packer: &mut Packer, window: (DVec2, DVec2)) -> usize {
+        let map = &self.scenario.map;
+        let mut n = 0;
+        let mut add = |class, width, points: &[DVec2]| {
+            if meets(points, window) {
+                packer.feature(class, width, points);
+                n += 1;
+            }
+        };
+        for polygon in map.drivable() {
+            add(Class::Surface, 0.0, polygon.ring());
+        }
+        for lane in map.lanes().iter().filter(|lane| is_for_cars(lane)) {
+            let class = if lane.in_intersection {
+                Class::Turn
+            } else {
+                Class::Lane
+            };
+            add(class, lane.width, lane.centerline.points());
+        }
+        if let Some(route) = &self.scenario.route {
+            let lanes: Vec<_> = route.lanes.iter().filter_map(|&id| map.lane(id)).collect();
+            for lane in &lanes {
+                add(Class::Route, lane.width, lane.centerline.points());
+            }
+            if lanes.is_empty() {
+                add(Class::Route, 3.0, route.path.points());
+            }
+        }
+        for area in map.areas() {
+            if let Some(class) = class_of(area.kind) {
+                add(class, 0.0, area.polygon.ring());
+            }
+        }
+        for line in map.road_lines() {
+            let class = match style(line.kind) {
+                (false, true) => Class::BrokenWhite,
+                (false, false) => Class::SolidWhite,
+                (true, true) => Class::BrokenYellow,
+                (true, false) => Class::SolidYellow,
+            };
+            add(class, 0.0, line.line.points());
+        }
+        for edge in map.road_edges() {
+            add(Class::Edge, 0.0, edge.line.points());
+        }
+        for sign in map.stop_signs() {
+            add(Class::StopSign, 0.0, &[sign.position.truncate()]);
+        }
+        n
+    }
+}
+
+fn class_of(kind: AreaKind) -> Option<Class> {
+    match kind {
+        AreaKind::Intersection | AreaKind::Driveway | AreaKind::Carpark => Some(Class::Surface),
+        AreaKind::Crosswalk => Some(Class::Crosswalk),
+        AreaKind::SpeedBump => Some(Class::SpeedBump),
+        AreaKind::StopLine | AreaKind::TurnStop => Some(Class::StopLine),
+        AreaKind::Walkway => None,
+    }
+}
+
+/// Every agent of any take by id, as it is in the present or else first seen.
+fn agents(scenario: &Scenario, takes: &[Take<'_>]) -> Vec<Agent> {
+    let present = scenario.log[scenario.now].agents();
+    let later = takes.iter().flat_map(|take| &take.frames);
+    let mut agents = BTreeMap::<AgentId, Agent>::new();
+    for agent in present.iter().chain(later.flat_map(|f| f.agents())) {
+        agents.entry(agent.id).or_insert(*agent);
+    }
+    agents.into_values().collect()
+}
+
+/// Every light of any take, by lane, and where to draw it.
+fn lights(map: &MapGraph, takes: &[Take<'_>]) -> Vec<(Light, DVec2)> {
+    let mut lights = BTreeMap::new();
+    for light in takes
+        .iter()
+        .flat_map(|take| &take.frames)
+        .flat_map(|frame| frame.lights())
+    {
+        let start = || map.lane(light.lane).map(|lane| lane.centerline.points()[0]);
+        if let Some(at) = light.stop_point.or_else(start) {
+            lights.entry(light.lane).or_insert((*light, at));
+        }
+    }
+    lights.into_values().collect()
+}
+
+/// The corners of the world that is worth keeping.
+fn window(takes: &[Take<'_>]) -> (DVec2, DVec2) {
+    let frames = takes.iter().flat_map(|take| &take.frames);
+    let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for agent in frames.flat_map(|frame| frame.agents()) {
+        let at = agent.state.pose.position;
+        (low, high) = (low.min(at), high.max(at));
+    }
+    (low - MARGIN, high + MARGIN)
+}
+
+/// Whether the bounds of the points and the window have a point in common.
+fn meets(points: &[DVec2], (low, high): (DVec2, DVec2)) -> bool {
+    let least = points.iter().copied().fold(DVec2::INFINITY, DVec2::min);
+    let most = points.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
+    least.cmple(high).all() && most.cmpge(low).all()
+}
+
+fn theme(colours: &Colours) -> Value {
+    let hex = |[r, g, b]: Rgb| format!("#{r:02x}{g:02x}{b:02x}");
+    json!({
+        "ground": hex(colours.ground),
+        "road": hex(colours.road),
+        "route": hex(colours.route),
+        "crosswalk": hex(colours.crosswalk),
+        "direction": hex(colours.direction),
+        "whiteLine": hex(colours.white_line),
+        "yellowLine": hex(colours.yellow_line),
+        "edge": hex(colours.edge),
+        "text": hex(colours.text),
+        "ego": hex(colours.ego),
+        "vehicle": hex(colours.vehicle),
+        "pedestrian": hex(colours.pedestrian),
+        "bicycle": hex(colours.bicycle),
+        "other": hex(colours.other),
+        "outline": hex(colours.outline),
+        "wedge": hex(colours.wedge),
+        "red": hex(colours.red),
+        "yellow": hex(colours.yellow),
+        "green": hex(colours.green),
+    })
+}
+
+/// To three decimals, which is what a chart can show.
+fn rounded(x: f64) -> f64 {
+    (x * 1000.0).round() / 1000.0
+}
+
+fn deflate(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = DeflateEncoder::new(Vec::new(), Compression::best());
+    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
+    written.expect("writing to memory cannot fail")
+}
+
+/// Puts the parts where the template names them, as `@@name@@`; what the parts say is not read.
+fn fill(template: &str, parts: &[(&str, String)]) -> String {
+    let pieces = template.split("@@").enumerate().map(|(i, piece)| {
+        if i % 2 == 0 {
+            return piece;
+        }
+        let part = parts.iter().find(|(name, _)| *name == piece);
+        part.expect("the template names only parts there are")
+            .1
+            .as_str()
+    });
+    pieces.collect()
+}

@@ -1,0 +1,69 @@
+// Small charts of one agent over time.
+
+// Curves: [{points: [[t, y]...], colour, width, alpha, dash}]. Times and values share one scale.
+function drawChart(canvas, curves, [from, to], now, colours, digits) {
+  const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext('2d');
+  Object.assign(canvas, { width: Math.round(w * ratio), height: Math.round(h * ratio) });
+  c.setTransform(ratio, 0, 0, ratio, 0, 0);
+  let low = Infinity, high = -Infinity;
+  for (const { points } of curves) for (const [, y] of points) if (Number.isFinite(y)) { low = Math.min(low, y); high = Math.max(high, y); }
+  if (!(low <= high)) [low, high] = [0, 1];
+  const least = 2 / 10 ** digits;
+  if (high - low < least) { const middle = (low + high) / 2; [low, high] = [middle - least / 2, middle + least / 2]; }
+  const left = 38, right = 4, top = 6, bottom = 16;
+  const px = t => left + (t - from) / Math.max(to - from, 1e-9) * (w - left - right);
+  const py = y => top + (high - y) / (high - low) * (h - top - bottom);
+  c.font = '11px system-ui, sans-serif';
+  c.fillStyle = c.strokeStyle = colours.text;
+  c.globalAlpha = 0.75; c.textAlign = 'right'; c.textBaseline = 'middle';
+  c.fillText(high.toFixed(digits), left - 5, top + 3);
+  c.fillText(low.toFixed(digits), left - 5, h - bottom - 2);
+  c.textBaseline = 'alphabetic'; c.textAlign = 'left'; c.fillText(`${from.toFixed(0)} s`, left, h - 3);
+  c.textAlign = 'right'; c.fillText(`${to.toFixed(0)} s`, w - right, h - 3);
+  c.globalAlpha = 0.2; c.lineWidth = 1;
+  for (const y of [top, h - bottom]) { c.beginPath(); c.moveTo(left, y + 0.5); c.lineTo(w - right, y + 0.5); c.stroke(); }
+  for (const { points, colour, width, alpha, dash } of curves) {
+    Object.assign(c, { strokeStyle: colour, lineWidth: width, globalAlpha: alpha, lineJoin: 'round' });
+    c.setLineDash(dash || []);
+    c.beginPath();
+    let pen = false;
+    for (const [t, y] of points) {
+      if (!Number.isFinite(y)) { pen = false; continue; }
+      if (pen) c.lineTo(px(t), py(y)); else c.moveTo(px(t), py(y));
+      pen = true;
+    }
+    c.stroke();
+  }
+  c.setLineDash([]);
+  c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1;
+  c.beginPath(); c.moveTo(px(now), top); c.lineTo(px(now), h - bottom); c.stroke();
+}
+
+// What can be charted of an agent: a name, decimals, and for a take the points.
+function quantities(world, agent) {
+  const points = (take, value) => Array.from({ length: take.frames }, (_, i) => [take.first + i * take.dt, value(take, agent * take.frames + i, take.first + i * take.dt)]);
+  // Unwound from the start of the log on, so that one turn does not tear the curve.
+  const list = [
+    { name: 'speed, m/s', digits: 1, of: take => points(world.takes[take], (k, i) => k.speed[i]) },
+    { name: 'heading, degrees', digits: 0, of: take => points(world.takes[take], (k, i) => k.heading[i] * 180 / Math.PI) },
+  ];
+  if (world.takes.length > 1) list.push({
+    name: 'distance from the log, m', digits: 1, of: take => {
+      if (take === 0) return [];
+      const { first, dt, frames } = world.takes[0];
+      return points(world.takes[take], (k, i, t) => {
+        if (t > first + (frames - 1) * dt + 1e-6) return NaN;
+        const logged = stateAt(world, 0, agent, t);
+        return logged ? Math.hypot(k.x[i] - logged.x, k.y[i] - logged.y) : NaN;
+      });
+    },
+  });
+  for (const name of new Set(facts.metrics.filter(m => m.agent === agent).map(m => m.name))) list.push({
+    name, digits: 2, of: take => {
+      const track = facts.metrics.find(m => m.name === name && m.agent === agent && m.take === take), { first, dt } = world.takes[take];
+      // A future's first frame is the present, its first value that of the frame after.
+      return track ? track.values.map((v, i) => [first + (i + (take > 0 ? 1 : 0)) * dt, v === null ? NaN : v]) : [];
+    },
+  });
+  return list;
+}

@@ -1,0 +1,40 @@
+// What the browser test runs: opened as viewer.html#check, the page tries itself and reports into
+// an element #report. Nothing of it runs otherwise.
+
+if (location.hash === '#check') {
+  const wait = milliseconds => new Promise(done => setTimeout(done, milliseconds));
+  const ready = async () => { while (!scene && !errors.length) await wait(10); };
+  const differs = (a, b) => a.length !== b.length || a.some((byte, i) => byte !== b[i]);
+  const picture = () => { paint(); return scene.canvas.toDataURL(); };
+  const state = (take, agent, t) => { const s = stateAt(world, take, agent, t); return s && [s.x + facts.origin[0], s.y + facts.origin[1], s.heading, s.speed]; };
+  const press = key => document.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));
+
+  const check = async () => {
+    await ready();
+    const packed = fromBase64($('data').textContent), report = {};
+    report.inflates_alike = !differs(await inflate(packed), inflateHere(packed));
+    report.takes = world.takes.length;
+    report.agents = facts.agents.length;
+    seek(span[0]); play(true);
+    // The time of a browser without a window leaps from timer to timer: many small waits.
+    for (let i = 0; i < 900 && ui.t - span[0] < 0.05; i++) await wait(16);
+    report.played_s = ui.t - span[0];
+    play(false); seek(span[1]);
+    const pictures = new Set();
+    for (let k = 0; k < world.takes.length; k++) { show(k); pictures.add(picture()); }
+    report.different_takes = pictures.size;
+    report.ends = world.takes.map((take, k) => state(k, facts.ego, take.first + (take.frames - 1) * take.dt));
+    const changes = keys => { const before = picture(); keys.forEach(press); return picture() !== before; };
+    report.changes = { all: changes(['a']), colour: changes(['c']), ego: changes(['e']), follow: changes(['f', 'Home']), heading: changes(['h']), trails: changes(['l', 't']), zoom: changes(['+']), fit: changes(['0']) };
+    report.charts = $('agent').querySelectorAll('canvas').length;
+    report.candidates = $('candidates').querySelectorAll('li').length;
+    report.wide = document.documentElement.scrollWidth > window.innerWidth;
+    return report;
+  };
+  check().catch(error => ({ error: String(error.stack || error) })).then(report => {
+    const out = document.createElement('pre');
+    out.id = 'report';
+    out.textContent = JSON.stringify({ ...report, errors });
+    document.body.append(out);
+  });
+}

@@ -1,0 +1,352 @@
+// Drawing: the camera, the road, the traffic of one take or of all.
+
+const KIND = { surface: 0, lane: 1, route: 2, crosswalk: 3, bump: 4, stopLine: 5, brokenWhite: 6, solidWhite: 7, brokenYellow: 8, solidYellow: 9, edge: 10, stopSign: 11, turn: 12 };
+const LIGHTS = [null, 'green', 'yellow', 'red', 'other'];
+const FAST = 20; // m/s, the end of the scale of speeds
+
+// Slow to fast; luminance rises, so that it reads without colour too.
+const RAMP = {
+  light: ['#440154', '#3b528b', '#21918c', '#5ec962', '#f0d51c'],
+  dark: ['#6a5acd', '#4a7fd0', '#2bb0a6', '#7ad151', '#fde725'],
+};
+
+function speedColour(speed, dark) {
+  const stops = RAMP[dark ? 'dark' : 'light'], x = Math.min(Math.max(speed / FAST, 0), 1) * (stops.length - 1);
+  const i = Math.min(Math.floor(x), stops.length - 2), parse = hex => [1, 3, 5].map(k => parseInt(hex.slice(k, k + 2), 16));
+  const [a, b] = [parse(stops[i]), parse(stops[i + 1])];
+  return `rgb(${a.map((c, k) => Math.round(c + (b[k] - c) * (x - i))).join(',')})`;
+}
+
+function kindColour(agent, colours) {
+  if (agent === facts.ego) return colours.ego;
+  return colours[facts.agents[agent].kind] || colours.other;
+}
+
+// Where an agent is at time t, between frames too; null if it is absent. Before the present a
+// future is what was recorded.
+function stateAt(world, takeIndex, agent, t) {
+  const take = world.takes[t < 0 ? 0 : takeIndex];
+  const x = Math.min(Math.max((t - take.first) / take.dt, 0), take.frames - 1);
+  const i = Math.floor(x + 1e-6), row = agent * take.frames, a = row + i;
+  if (Number.isNaN(take.x[a])) return null;
+  const b = i + 1 < take.frames && !Number.isNaN(take.x[a + 1]) ? a + 1 : a, s = Math.max(x - i, 0);
+  const mix = channel => channel[a] + (channel[b] - channel[a]) * s;
+  return { x: mix(take.x), y: mix(take.y), heading: mix(take.heading), speed: mix(take.speed) };
+}
+
+function lightAt(world, takeIndex, light, t) {
+  const take = world.takes[t < 0 ? 0 : takeIndex];
+  const i = Math.min(Math.max(Math.floor((t - take.first) / take.dt + 1e-6), 0), take.frames - 1);
+  return LIGHTS[take.lights[light * take.frames + i]];
+}
+
+// One path per way of drawing, in metres.
+function roadPaths(features) {
+  const road = { surface: new Path2D(), lanes: new Map(), routes: new Map(), zebras: [], bumps: new Path2D(), stops: new Path2D(), lines: [6, 7, 8, 9, 10].map(() => new Path2D()), signs: [], chevrons: [] };
+  const trace = (path, { xs, ys }, close) => {
+    // All rings run one way, or overlapping ones would cut holes into each other.
+    const order = close && ringArea(xs, ys) < 0 ? [...xs.keys()].reverse() : xs.keys();
+    let first = true;
+    for (const i of order) { if (first) path.moveTo(xs[i], ys[i]); else path.lineTo(xs[i], ys[i]); first = false; }
+    if (close) path.closePath();
+    return path;
+  };
+  const byWidth = (map, feature) => {
+    if (!map.has(feature.width)) map.set(feature.width, new Path2D());
+    trace(map.get(feature.width), feature, false);
+  };
+  for (const feature of features) {
+    const { kind, xs, ys } = feature;
+    if (kind === KIND.surface) trace(road.surface, feature, true);
+    else if (kind === KIND.lane || kind === KIND.turn) {
+      byWidth(road.lanes, feature);
+      if (kind === KIND.lane) road.chevrons.push(...along(xs, ys, 18));
+    } else if (kind === KIND.route) byWidth(road.routes, feature);
+    else if (kind === KIND.crosswalk) road.zebras.push({ outline: trace(new Path2D(), feature, true), bars: zebraBars(xs, ys) });
+    else if (kind === KIND.bump) trace(road.bumps, feature, true);
+    else if (kind === KIND.stopLine) trace(road.stops, feature, true);
+    else if (kind === KIND.stopSign) road.signs.push([xs[0], ys[0]]);
+    else trace(road.lines[kind - KIND.brokenWhite], feature, false);
+  }
+  return road;
+}
+
+function ringArea(xs, ys) {
+  let area = 0;
+  for (let i = 0, j = xs.length - 1; i < xs.length; j = i++) area += xs[j] * ys[i] - xs[i] * ys[j];
+  return area;
+}
+
+// Bars across the way people walk, which is the longest side.
+function zebraBars(xs, ys) {
+  let longest = [1, 0], best = 0;
+  for (let i = 0, j = xs.length - 1; i < xs.length; j = i++) {
+    const d = [xs[i] - xs[j], ys[i] - ys[j]], n = Math.hypot(...d);
+    if (n > best) { best = n; longest = [d[0] / n, d[1] / n]; }
+  }
+  const [ux, uy] = longest, s = xs.map((x, i) => x * ux + ys[i] * uy), w = xs.map((x, i) => ys[i] * ux - x * uy);
+  const low = Math.min(...w), high = Math.max(...w), bars = new Path2D(), point = (a, b) => [a * ux - b * uy, a * uy + b * ux];
+  for (let a = Math.min(...s); a < Math.max(...s); a += 1.2) {
+    bars.moveTo(...point(a, low)); bars.lineTo(...point(a, high)); bars.lineTo(...point(a + 0.6, high)); bars.lineTo(...point(a + 0.6, low));
+    bars.closePath();
+  }
+  return bars;
+}
+
+// Points with directions, evenly along a line.
+function along(xs, ys, spacing) {
+  const length = xs.slice(1).reduce((sum, x, i) => sum + Math.hypot(x - xs[i], ys[i + 1] - ys[i]), 0);
+  const n = Math.floor(length / spacing), found = [];
+  for (let i = 1, done = 0; i < xs.length; i++) {
+    const dx = xs[i] - xs[i - 1], dy = ys[i] - ys[i - 1], step = Math.hypot(dx, dy);
+    while (found.length < n && (found.length + 0.5) * length / n <= done + step && step > 0) {
+      const s = ((found.length + 0.5) * length / n - done) / step;
+      found.push([xs[i - 1] + dx * s, ys[i - 1] + dy * s, dx / step, dy / step]);
+    }
+    done += step;
+  }
+  return found;
+}
+
+class Scene {
+  constructor(canvas, world) {
+    Object.assign(this, { canvas, world, road: roadPaths(world.features), camera: { x: 0, y: 0, scale: 5, angle: 0 } });
+    this.context = canvas.getContext('2d', { alpha: false });
+    this.candidates = facts.candidates.map(({ path }) => path.map(p => p.map(c => c * facts.centi)));
+    this.overlay = { key: '', canvas: document.createElement('canvas') };
+  }
+
+  resize() {
+    const ratio = window.devicePixelRatio || 1, { clientWidth: w, clientHeight: h } = this.canvas;
+    Object.assign(this, { ratio, width: w, height: h });
+    const [pw, ph] = [Math.round(w * ratio), Math.round(h * ratio)];
+    if (this.canvas.width !== pw || this.canvas.height !== ph) Object.assign(this.canvas, { width: pw, height: ph });
+  }
+
+  // World metres, y up, to device pixels; angle is the heading that points up, less a quarter turn.
+  aim(context) {
+    const { x, y, scale, angle } = this.camera, k = scale * this.ratio, c = Math.cos(angle) * k, s = Math.sin(angle) * k;
+    context.setTransform(c, s, s, -c, this.width * this.ratio / 2 - c * x - s * y, this.height * this.ratio / 2 - s * x + c * y);
+  }
+
+  worldAt(px, py) {
+    const { x, y, scale, angle } = this.camera, dx = (px - this.width / 2) / scale, dy = (py - this.height / 2) / scale;
+    const c = Math.cos(angle), s = Math.sin(angle);
+    return [x + c * dx + s * dy, y + s * dx - c * dy];
+  }
+
+  px(metres, least) { return Math.max(metres, least / this.camera.scale); }
+
+  sees(x, y) { return Math.hypot(x - this.camera.x, y - this.camera.y) < Math.hypot(this.width, this.height) / 2 / this.camera.scale + 12; }
+
+  draw(ui, colours) {
+    const c = this.context;
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    c.fillStyle = colours.ground;
+    c.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    this.aim(c);
+    c.lineJoin = c.lineCap = 'round';
+    this.drawRoad(c, colours);
+    const shown = this.shown(ui);
+    if (ui.trails) {
+      if (ui.shown === 'all') this.drawOverlay(ui, colours);
+      else this.drawTrails(c, ui, shown[0], colours);
+    }
+    this.drawCandidates(c, ui, colours);
+    this.drawLights(c, ui, shown[0], colours);
+    if (shown.length > 1 && ui.t >= 0) this.drawGhosts(c, ui, shown, colours);
+    else this.drawAgents(c, ui, shown[0], colours);
+  }
+
+  shown(ui) { return ui.shown === 'all' ? this.world.takes.map((_, i) => i).slice(1) : [ui.shown]; }
+
+  drawRoad(c, colours) {
+    const { road } = this, widths = (map, colour) => {
+      c.strokeStyle = colour;
+      for (const [width, path] of map) { c.lineWidth = this.px(width, 1); c.stroke(path); }
+    };
+    c.fillStyle = colours.road;
+    c.fill(road.surface);
+    c.lineCap = 'butt';
+    widths(road.lanes, colours.road);
+    widths(road.routes, colours.route);
+    c.fillStyle = colours.crosswalk;
+    for (const { outline, bars } of road.zebras) { c.save(); c.clip(outline); c.fill(bars); c.restore(); }
+    c.globalAlpha = 0.5; c.fillStyle = colours.yellowLine; c.fill(road.bumps);
+    c.globalAlpha = 0.7; c.fillStyle = colours.whiteLine; c.fill(road.stops);
+    c.globalAlpha = 1;
+    if (this.camera.scale > 2.5) this.drawChevrons(c, colours);
+    [[0, colours.whiteLine, [2, 3]], [1, colours.whiteLine, []], [2, colours.yellowLine, [2, 3]], [3, colours.yellowLine, []]].forEach(([i, colour, dash]) => {
+      c.strokeStyle = colour; c.lineWidth = this.px(0.16, 0.9); c.setLineDash(dash); c.stroke(road.lines[i]);
+    });
+    c.setLineDash([]);
+    c.strokeStyle = colours.edge; c.lineWidth = this.px(0.22, 1.1); c.stroke(road.lines[4]);
+    c.lineCap = 'round';
+    for (const [x, y] of road.signs) for (const [r, colour] of [[1.35, colours.wedge], [1, colours.red]]) {
+      c.fillStyle = colour; c.beginPath();
+      for (let i = 0; i < 8; i++) { const a = (i + 0.5) * Math.PI / 4, m = this.px(0.8, 3) * r; c.lineTo(x + m * Math.cos(a), y + m * Math.sin(a)); }
+      c.fill();
+    }
+  }
+
+  drawChevrons(c, colours) {
+    c.strokeStyle = colours.direction; c.lineWidth = this.px(0.18, 1); c.beginPath();
+    for (const [x, y, dx, dy] of this.road.chevrons) {
+      if (!this.sees(x, y)) continue;
+      c.moveTo(x - 0.7 * dx - 0.7 * dy, y - 0.7 * dy + 0.7 * dx); c.lineTo(x, y); c.lineTo(x - 0.7 * dx + 0.7 * dy, y - 0.7 * dy - 0.7 * dx);
+    }
+    c.stroke();
+  }
+
+  // The last two seconds fade, what comes is a thin line.
+  drawTrails(c, ui, takeIndex, colours) {
+    const { takes } = this.world, end = takes[takeIndex].first + (takes[takeIndex].frames - 1) * takes[takeIndex].dt;
+    facts.agents.forEach((_, a) => {
+      const now = stateAt(this.world, takeIndex, a, ui.t);
+      if (!now) return;
+      const colour = ui.colour === 'speed' ? speedColour(now.speed, ui.dark) : kindColour(a, colours);
+      c.strokeStyle = colour;
+      c.lineWidth = this.px(0.35, a === ui.selected ? 2 : 1.2);
+      const line = (from, to, alpha) => {
+        c.globalAlpha = alpha; c.beginPath();
+        let pen = false;
+        for (let t = from; t < to + 0.099; t += 0.1) {
+          const s = stateAt(this.world, takeIndex, a, Math.min(t, to));
+          if (!s) { if (pen) break; continue; }
+          if (pen) c.lineTo(s.x, s.y); else c.moveTo(s.x, s.y);
+          pen = true;
+        }
+        c.stroke();
+      };
+      if (now.speed > 0.2 || a === ui.selected) for (let k = 0; k < 4; k++) line(Math.max(ui.t - 2 + k * 0.5, takes[0].first), ui.t - 1.5 + k * 0.5, 0.12 + 0.12 * k);
+      if (ui.t < end) line(ui.t, end, 0.45);
+    });
+    c.globalAlpha = 1;
+  }
+
+  // All futures over one another, kept until camera or theme change.
+  drawOverlay(ui, colours) {
+    const { overlay, canvas } = this, { x, y, scale, angle } = this.camera;
+    const key = [x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected].join();
+    if (overlay.key !== key) {
+      overlay.key = key;
+      Object.assign(overlay.canvas, { width: canvas.width, height: canvas.height });
+      const c = overlay.canvas.getContext('2d');
+      this.aim(c);
+      c.lineJoin = c.lineCap = 'round';
+      this.overlayPaths = this.overlayPaths || this.world.takes.slice(1).map(take => facts.agents.map((_, a) => futurePath(take, a)));
+      const fade = Math.max(0.06, 0.6 / Math.sqrt(this.overlayPaths.length));
+      for (const paths of this.overlayPaths) paths.forEach((entry, a) => {
+        if (!entry) return;
+        c.strokeStyle = kindColour(a, colours);
+        c.globalAlpha = ui.selected < 0 || a === ui.selected ? fade * (a === ui.selected ? 2 : 1) : fade * 0.35;
+        c.lineWidth = this.px(0.3, a === facts.ego || a === ui.selected ? 1.6 : 1.1);
+        c.stroke(entry);
+      });
+    }
+    this.context.setTransform(1, 0, 0, 1, 0, 0);
+    this.context.drawImage(overlay.canvas, 0, 0);
+    this.aim(this.context);
+  }
+
+  drawCandidates(c, ui, colours) {
+    const line = (path, colour, width, alpha) => {
+      c.strokeStyle = colour; c.lineWidth = this.px(width / 8, width); c.globalAlpha = alpha;
+      c.beginPath();
+      path.forEach(p => c.lineTo(...p));
+      c.stroke();
+    };
+    this.candidates.forEach((path, i) => {
+      const strong = i === ui.candidate || (ui.candidate < 0 && facts.candidates[i].chosen);
+      line(path, colours.text, strong ? 3 : 1.2, strong ? 0.95 : 0.35);
+    });
+    c.globalAlpha = 1;
+  }
+
+  drawLights(c, ui, takeIndex, colours) {
+    const r = Math.min(this.px(0.55, 2), 9 / this.camera.scale);
+    facts.lights.forEach((at, l) => {
+      const colour = lightAt(this.world, takeIndex, l, ui.t);
+      if (!colour) return;
+      for (const [k, fill] of [[1.4, colours.outline], [1, colours[colour]]]) {
+        c.fillStyle = fill; c.beginPath(); c.arc(at[0] * facts.centi, at[1] * facts.centi, r * k, 0, 2 * Math.PI); c.fill();
+      }
+    });
+  }
+
+  drawAgents(c, ui, takeIndex, colours) {
+    facts.agents.forEach((agent, a) => {
+      const s = stateAt(this.world, takeIndex, a, ui.t);
+      if (!s || !this.sees(s.x, s.y)) return;
+      this.box(c, agent, s, 0);
+      const moves = ui.colour === 'speed' && ['vehicle', 'pedestrian', 'bicycle'].includes(agent.kind);
+      c.fillStyle = moves ? speedColour(s.speed, ui.dark) : kindColour(a, colours);
+      c.fill();
+      c.strokeStyle = colours.outline; c.lineWidth = this.px(0.08, 0.8); c.stroke();
+      this.wedge(c, agent, s, colours);
+      if (a === ui.selected) { this.box(c, agent, s, 5 / this.camera.scale); c.strokeStyle = colours.text; c.lineWidth = 2 / this.camera.scale; c.stroke(); }
+    });
+  }
+
+  // The same instant in every future: what they agree on is solid.
+  drawGhosts(c, ui, shown, colours) {
+    const fade = Math.max(0.08, 0.9 / Math.sqrt(shown.length));
+    facts.agents.forEach((agent, a) => {
+      for (const take of shown) {
+        const s = stateAt(this.world, take, a, ui.t);
+        if (!s || !this.sees(s.x, s.y)) continue;
+        this.box(c, agent, s, 0);
+        c.globalAlpha = fade;
+        c.fillStyle = ui.colour === 'speed' ? speedColour(s.speed, ui.dark) : kindColour(a, colours);
+        c.fill();
+        if (a === ui.selected) { c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
+      }
+    });
+    c.globalAlpha = 1;
+  }
+
+  box(c, { length, width }, { x, y, heading }, margin) {
+    const l = this.px(length, 3) / 2 + margin, w = this.px(width, 3) / 2 + margin, ux = Math.cos(heading), uy = Math.sin(heading);
+    c.beginPath();
+    for (const [a, b] of [[l, w], [-l, w], [-l, -w], [l, -w]]) c.lineTo(x + a * ux - b * uy, y + a * uy + b * ux);
+    c.closePath();
+  }
+
+  wedge(c, { length, width }, { x, y, heading }, colours) {
+    if (length * this.camera.scale < 8) return;
+    const ux = Math.cos(heading), uy = Math.sin(heading), p = (a, b) => [x + a * ux - b * uy, y + a * uy + b * ux];
+    c.fillStyle = colours.wedge; c.globalAlpha = 0.75; c.beginPath();
+    c.moveTo(...p(length * 0.42, 0)); c.lineTo(...p(length * 0.12, width * 0.3)); c.lineTo(...p(length * 0.12, -width * 0.3)); c.fill();
+    c.globalAlpha = 1;
+  }
+
+  // The agent at a point of the canvas, or the nearest within reach of a finger; -1 if none.
+  pick(ui, px, py) {
+    const [x, y] = this.worldAt(px, py), reach = 14 / this.camera.scale;
+    let found = -1, best = reach;
+    for (const take of ui.t < 0 ? [0] : this.shown(ui)) facts.agents.forEach(({ length, width }, a) => {
+      const s = stateAt(this.world, take, a, ui.t);
+      if (!s) return;
+      const dx = x - s.x, dy = y - s.y, c = Math.cos(s.heading), k = Math.sin(s.heading);
+      const d = Math.hypot(Math.max(Math.abs(c * dx + k * dy) - length / 2, 0), Math.max(Math.abs(c * dy - k * dx) - width / 2, 0));
+      if (d < best) { best = d; found = a; }
+    });
+    return found;
+  }
+}
+
+// Where an agent goes in a future; nothing if it stays.
+function futurePath(take, agent) {
+  const path = new Path2D(), row = agent * take.frames;
+  let far = 0, first = -1, last = -1;
+  for (let i = 0; i < take.frames; i++) {
+    const x = take.x[row + i], y = take.y[row + i];
+    if (Number.isNaN(x)) { last = -1; continue; }
+    if (first < 0) first = i;
+    far = Math.max(far, Math.hypot(x - take.x[row + first], y - take.y[row + first]));
+    if (last < 0) path.moveTo(x, y);
+    else if (i % 2 === 0 || i === take.frames - 1) path.lineTo(x, y);
+    last = i;
+  }
+  return far > 0.5 ? path : null;
+}

@@ -1,0 +1,170 @@
+//! The viewer in a real browser without a window, if there is one on the path.
+//!
+//! Opened with `#check` the page tries itself (`viewer/check.js`) and reports into the document,
+//! which the browser prints.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gump_geometry::{dvec2, wrap_angle};
+use gump_scene::{AgentState, Frame, Rollout, Scenario, fixture};
+use gump_viz::{CandidatePath, MetricTrack, Viewer};
+use serde_json::Value;
+
+const BROWSERS: [&str; 5] = [
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+];
+
+fn browser() -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    let folders: Vec<_> = std::env::split_paths(&path).collect();
+    BROWSERS
+        .iter()
+        .flat_map(|name| folders.iter().map(move |folder| folder.join(name)))
+        .find(|file| file.is_file())
+}
+
+fn scenario() -> Scenario {
+    fixture::scenario(
+        "lane 1: -80,0 80,0 next 2
+         lane 2: 80,0 160,0
+         edge: -80,-2 160,-2
+         line: -80,2 160,2
+         drivable: -80,-2 160,-2 160,6 -80,6
+         crosswalk: 34,-2 38,-2 38,6 34,6
+         light 1 red: 30,0
+         route 1,2
+         ego vehicle 0: 10,0 velocity 8,0
+         agent pedestrian 7: 40,3 velocity 0,-1
+         agent bicycle 8: 5,-1 velocity 3,0
+         agent vehicle 9: 60,3.5 velocity -9,0
+         history 1 future 4 dt 0.1",
+    )
+    .expect("a scene in the language of the fixture")
+}
+
+/// Futures in which everybody turns, each in another way.
+fn futures(scenario: &Scenario, n: usize) -> Vec<Rollout> {
+    let turned = |k: usize| {
+        let mut rollout = Rollout::begin(scenario.present());
+        for step in 1..=40 {
+            let agents = rollout.start().agents().iter().map(|agent| {
+                let turn = 0.01 * (k as f64 - 1.5) * f64::from(step);
+                let mut state: AgentState = agent.state;
+                let along = state.velocity * 0.1 * f64::from(step);
+                state.pose.position += dvec2(turn.cos(), turn.sin()).rotate(along);
+                state.pose.heading = wrap_angle(state.pose.heading + 2.0 * turn);
+                agent.with_state(state)
+            });
+            let frame = Frame::new(agents.collect(), rollout.start().lights().to_vec());
+            rollout.push(frame);
+        }
+        rollout
+    };
+    (0..n).map(turned).collect()
+}
+
+/// What the page at `path` says of itself.
+fn report(browser: &Path, path: &Path, profile: &Path, size: &str) -> Value {
+    let output = Command::new(browser)
+        .args(["--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"])
+        .args(["--enable-logging=stderr", "--virtual-time-budget=20000"])
+        .arg(format!("--user-data-dir={}", profile.display()))
+        .arg(format!("--window-size={size}"))
+        .arg(format!("file://{}#check", path.display()))
+        .output()
+        .expect("the browser was found on the path");
+    let (dom, log) = (
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr),
+    );
+    let said: Vec<_> = log
+        .lines()
+        .filter(|line| line.contains("CONSOLE"))
+        .collect();
+    assert!(said.is_empty(), "{said:#?}");
+    let text = dom
+        .split_once("<pre id=\"report\">")
+        .and_then(|(_, rest)| rest.split_once("</pre>"))
+        .map_or_else(
+            || panic!("the page did not report: {log}"),
+            |(text, _)| text,
+        );
+    let text = text
+        .replace("&gt;", ">")
+        .replace("&lt;", "<")
+        .replace("&amp;", "&");
+    serde_json::from_str(&text).expect("the page reports JSON")
+}
+
+#[test]
+fn the_viewer_plays_and_switches_in_a_browser() {
+    let Some(browser) = browser() else {
+        eprintln!("skipped: no browser on the path, looked for {BROWSERS:?}");
+        return;
+    };
+    let scenario = scenario();
+    let futures = futures(&scenario, 4);
+    let mut viewer = Viewer::new(&scenario);
+    viewer.futures(&futures);
+    viewer.metric(MetricTrack {
+        name: "time to collision, s".into(),
+        agent: scenario.ego,
+        future: Some(0),
+        values: (0..40).map(|i| (i > 9).then_some(f64::from(i))).collect(),
+    });
+    for (name, score) in [("slow", Some(0.25)), ("fast", None)] {
+        viewer.candidate(CandidatePath {
+            name: name.into(),
+            score,
+            is_chosen: score.is_some(),
+            path: vec![dvec2(10.0, 0.0), dvec2(30.0, 1.0)],
+        });
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("viewer.html");
+    viewer.save(&path).expect("a file can be written there");
+    for size in ["1280,800", "390,844"] {
+        let report = report(&browser, &path, &folder.path().join(size), size);
+        eprintln!("{size}: {report}");
+        assert_eq!(report["errors"], serde_json::json!([]), "{report}");
+        assert!(report.get("error").is_none(), "{report}");
+        assert_eq!(report["inflates_alike"], true);
+        assert_eq!(
+            (&report["takes"], &report["agents"]),
+            (&5.into(), &4.into())
+        );
+        assert_eq!(report["different_takes"], 5);
+        let played = report["played_s"].as_f64().unwrap_or_default();
+        assert!(0.0 < played && played < 1.0, "{played}");
+        let changes = report["changes"].as_object().expect("a table of keys");
+        assert!(
+            changes.len() == 8 && changes.values().all(|changed| *changed == true),
+            "{report}"
+        );
+        // Speed, heading, distance from the log and the metric given.
+        assert_eq!(
+            (&report["charts"], &report["candidates"]),
+            (&4.into(), &2.into())
+        );
+        assert_eq!(report["wide"], false, "the page is wider than its window");
+        let ends = report["ends"].as_array().expect("one state per take");
+        let last = std::iter::once(&scenario.log[scenario.log.len() - 1])
+            .chain(futures.iter().map(|future| &future.imagined()[39]));
+        for (end, frame) in ends.iter().zip(last) {
+            let ego = frame.agent(scenario.ego).expect("the ego stays").state;
+            let number = |i: usize| end[i].as_f64().expect("a number");
+            assert!((number(0) - ego.pose.position.x).abs() < 0.006, "{end}");
+            assert!((number(1) - ego.pose.position.y).abs() < 0.006, "{end}");
+            assert!(
+                wrap_angle(number(2) - ego.pose.heading).abs() < 0.0005,
+                "{end}"
+            );
+            assert!((number(3) - ego.speed()).abs() < 0.006, "{end}");
+        }
+    }
+}
