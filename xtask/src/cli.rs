@@ -90,6 +90,9 @@ impl Cli {
             Verb::Evaluate(evaluate::Verb::Motion(args)) => {
                 Run::of("evaluate motion", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Evaluate(evaluate::Verb::Wosac(args)) => {
+                Run::of("evaluate wosac", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Evaluate(evaluate::Verb::Merge(args)) => {
                 Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))
             }
@@ -108,6 +111,9 @@ impl Cli {
             }
             Verb::Bench(bench::Verb::Device(args)) => {
                 Run::of("bench device", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Bench(bench::Verb::Wosac(args)) => {
+                Run::of("bench wosac", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {

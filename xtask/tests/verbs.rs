@@ -493,3 +493,142 @@ fn tidy_finds_nothing() {
     let results = &place.report("tidy")["results"];
     assert_eq!(results["problems"], 0);
 }
+
+/// Two made-up scenes of 9.1 s with a road.
+fn two_scenes(place: &Workplace) -> &'static str {
+    let scenes = [8.0, 5.0].map(|speed| {
+        let text = format!(
+            "lane 1: -50,0 0,0 150,0 speed 15 width 3.5
+             edge: -50,-4 150,-4
+             edge: 150,4 -50,4
+             ego vehicle 0: 0,0 velocity {speed},0
+             agent vehicle 1: 20,0 velocity 6,0
+             agent pedestrian 2: 30,6
+             history 1.0 future 8.0 dt 0.1"
+        );
+        let mut scene = gump_scene::fixture::scenario(&text).unwrap();
+        scene.id = format!("scene {speed}");
+        scene
+    });
+    gump_data::womd::write_scenarios(&place.path("two.tfrecord"), scenes).unwrap();
+    "two.tfrecord"
+}
+
+#[test]
+fn evaluate_wosac_scores_beside_oracle_and_baseline() {
+    let place = Workplace::new();
+    let scenes = two_scenes(&place);
+    for year in ["2023-v0", "2023", "2024", "2025", "2025-generation"] {
+        let words = format!("evaluate wosac --scenarios {scenes} --world idm --year {year}");
+        let words = format!("{words} --rollouts-per-scenario 2 --explain");
+        let results = &place.report(&words)["results"];
+        let rows = results["rows"].as_array().unwrap();
+        let worlds: Vec<_> = rows
+            .iter()
+            .map(|row| row["world"].as_str().unwrap())
+            .collect();
+        assert_eq!(
+            worlds,
+            ["idm", "logged-oracle", "constant-velocity"],
+            "{year}"
+        );
+        for row in rows {
+            assert_eq!((&row["year"], &row["scenarios"]), (&year.into(), &2.into()));
+            for key in [
+                "metametric",
+                "kinematic",
+                "interactive",
+                "map_based",
+                "min_ade",
+                "ade",
+            ] {
+                assert!(row[key].is_number(), "{key}");
+            }
+            let components = row["components"].as_object().unwrap();
+            let expected = if year.starts_with("2025") { 10 } else { 9 };
+            assert_eq!(components.len(), expected, "{year}");
+        }
+        let metametric = &results["intervals"][0];
+        let of = |key: &str| metametric[key].as_f64().unwrap();
+        assert!(of("idm low") <= of("idm") && of("idm") <= of("idm high"));
+        assert!(results["seconds_per_scenario"].as_f64().unwrap() > 0.0);
+        assert!(results["explain"][0]["cost"].as_f64().unwrap() > 0.0);
+        assert!(place.files().contains(&"explain.jsonl".to_owned()));
+    }
+}
+
+#[test]
+fn shards_of_an_evaluation_are_the_whole_to_the_bit() {
+    let place = Workplace::new();
+    let words = format!(
+        "evaluate wosac --scenarios {} --world idm",
+        two_scenes(&place)
+    );
+    let words = format!("{words} --rollouts-per-scenario 2 --threads");
+    let whole = place.report(&format!("{words} 2"))["results"].clone();
+    for shard in ["1", "2"] {
+        let output = place.run(&format!("{words} 1 --shard {shard}/2 --out {shard}"));
+        assert!(output.status.success(), "{}", stderr(&output));
+    }
+    let merged = place.report("evaluate merge 2 1")["results"].clone();
+    for key in ["scenarios", "rows", "intervals"] {
+        assert_eq!(whole[key], merged[key], "{key}");
+    }
+    place.fails("evaluate merge 1 --out m", 1, &["missing are [2]"]);
+}
+
+#[test]
+fn evaluate_wosac_takes_rollouts_from_files() {
+    let place = Workplace::new();
+    let scenes = two_scenes(&place);
+    let words = format!("simulate --scenario {scenes}#0 --world idm --futures 2 --format waymo");
+    place.report(&words);
+    let rollouts = place.path("rollouts.binproto");
+    fs::copy(place.path("out/rollouts.binproto"), &rollouts).unwrap();
+    let words = format!("evaluate wosac --scenarios {scenes} --rollouts rollouts.binproto");
+    place.fails(&words, 1, &["scene 5", "expected rollouts of it"]);
+    let words = format!("{words} --shard 1/2");
+    let row = place.report(&words)["results"]["rows"][0].clone();
+    assert_eq!(row["world"], "rollouts");
+    assert!(row["metametric"].as_f64().unwrap() > 0.3);
+    place.fails("evaluate wosac --scenarios two.tfrecord", 2, &["--world"]);
+    let both = "evaluate wosac --scenarios two.tfrecord --world idm --shard 3/2";
+    place.fails(both, 2, &["K/N"]);
+}
+
+#[test]
+fn official_rollouts_of_a_recorded_scenario_get_the_official_score() {
+    let place = Workplace::new();
+    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
+    let scenario = shared.join("data/waymo/scenario_a.tfrecord");
+    let rollouts = shared.join("golden/wosac/inputs_real/test_submission.binproto.gz");
+    if !(scenario.is_file() && rollouts.is_file()) {
+        eprintln!("skipped: no {}", scenario.display());
+        return;
+    }
+    // Wheels 1.6.0, 1.6.1, 1.6.4 and 1.6.7 of the official evaluator.
+    for (year, expected) in [
+        ("2023-v0", 0.231_545),
+        ("2023", 0.228_538),
+        ("2024", 0.231_282),
+        ("2025", 0.258_240),
+    ] {
+        let (scenario, rollouts) = (scenario.display(), rollouts.display());
+        let words = format!("evaluate wosac --scenarios {scenario} --rollouts {rollouts}");
+        let results = &place.report(&format!("{words} --year {year}"))["results"];
+        let found = results["rows"][0]["metametric"].as_f64().unwrap();
+        assert!((found - expected).abs() < 1e-6, "{year}: {found}");
+    }
+}
+
+#[test]
+fn bench_wosac_times_every_year() {
+    let place = Workplace::new();
+    let words = format!(
+        "bench wosac --repeat 1 --rollouts 2 --scenarios {}",
+        two_scenes(&place)
+    );
+    let rows = place.report(&words)["results"]["rows"].clone();
+    assert_eq!(rows.as_array().unwrap().len(), 5);
+    assert!(rows[3]["seconds_per_scenario"].as_f64().unwrap() > 0.0);
+}

@@ -11,23 +11,7 @@
 //! scenarios, [`crate::interval`] says how sure an average is. A year is a [`Config`], which is a TOML file.
 //! Reading Waymo's messages is the business of `gump-data`, checking a submission too.
 //!
-//! ```
-//! use gump_metrics::wosac::{Config, Log, Rollouts, State, Track, Trajectory, Year, score};
-//! use gump_scene::{AgentId, AgentKind};
-//!
-//! // One car of 4.8 x 2 m drives along x at 10 m/s: 91 steps of 0.1 s, the present is step 10.
-//! let at = |step| State::new([step as f32, 0.0, 0.0], 0.0, [4.8, 2.0, 1.5]);
-//! let car = Track::new(AgentId(7), AgentKind::Vehicle, (0..91).map(at).collect());
-//! let edge = vec![[-50.0, -4.0, 0.0], [150.0, -4.0, 0.0]];
-//! let log = Log::new("my scene", vec![car]).ego(AgentId(7))?.road_edges(vec![edge]);
-//! // A world that drives 5 % too fast, 32 times alike: x, y, z and heading of 80 steps.
-//! let x = (1..=80).map(|step| 10.0 + 1.05 * step as f32).collect();
-//! let drive = Trajectory::new(AgentId(7), x, vec![0.0; 80], vec![0.0; 80], vec![0.0; 80]);
-//! let rollouts = Rollouts::new("my scene", vec![vec![drive]]).repeated(32);
-//! let scores = score(&log, &rollouts, &Config::of(Year::Y2025))?;
-//! assert!(0.8 < scores.metametric && scores.metametric < 1.0);
-//! # Ok::<(), gump_metrics::wosac::WosacError>(())
-//! ```
+//! The front page of the crate scores a scene of one's own in a dozen lines.
 //!
 //! # Numbers
 //! The reference computes in f32 at world coordinates of thousands of metres; its rounding is part

@@ -2,6 +2,7 @@
 
 pub(crate) mod device;
 pub(crate) mod engine;
+pub(crate) mod wosac;
 
 use gump_scene::{Scenario, fixture};
 
@@ -12,6 +13,8 @@ pub(crate) enum Verb {
     Engine(engine::Args),
     /// The chosen device against the CPU: do they say the same, and how fast
     Device(device::Args),
+    /// Scoring the realism of 32 rollouts, against the official evaluator
+    Wosac(wosac::Args),
 }
 
 /// A made-up crossing of that many agents, all within the window of the tokens, with a second of

@@ -4,7 +4,7 @@
 //! written by this run, by the run it resumes or by shards on other machines: equal entries give
 //! equal totals, to the bit. TOML, because its numbers come back exactly as they were, NaN too.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -88,6 +88,11 @@ impl<T: Serialize + DeserializeOwned + Clone> Ledger<T> {
     /// True if the scenario at `index` needs no more work.
     pub(crate) fn has(&self, index: usize) -> bool {
         self.entries.contains_key(&index)
+    }
+
+    /// Scenarios that need no more work.
+    pub(crate) fn indices(&self) -> BTreeSet<usize> {
+        self.entries.keys().copied().collect()
     }
 
     /// Adds a scenario.
@@ -303,7 +308,7 @@ mod tests {
         ledger.file.write_all(cut).unwrap();
         drop(ledger);
         let mut ledger = Ledger::open(folder.path(), &header(1, 1)).unwrap();
-        assert!(ledger.has(0) && ledger.has(1) && !ledger.has(2));
+        assert_eq!(ledger.indices(), BTreeSet::from([0, 1]));
         ledger.enter(entry(2, 2.5)).unwrap();
         assert_eq!(ledger.close().unwrap().len(), 3);
         let (_, entries) = unite::<f64>(&[folder.path().to_owned()]).unwrap();
@@ -320,6 +325,11 @@ mod tests {
             settings: toml::Table::new(),
             ..header(1, 1)
         };
-        assert!(!Ledger::<f64>::open(folder.path(), &other).unwrap().has(0));
+        assert!(
+            Ledger::<f64>::open(folder.path(), &other)
+                .unwrap()
+                .indices()
+                .is_empty()
+        );
     }
 }

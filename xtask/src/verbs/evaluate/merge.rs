@@ -4,14 +4,17 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{ledger, motion};
+use super::{ledger, motion, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
 type Tell = fn(&mut Run, &[PathBuf]) -> anyhow::Result<()>;
 
 /// Benchmarks that can be sharded, by the name in their ledgers.
-const BENCHMARKS: &[(&str, Tell)] = &[(motion::NAME, motion::tell_merged)];
+const BENCHMARKS: &[(&str, Tell)] = &[
+    (motion::NAME, motion::tell_merged),
+    (wosac::BENCHMARK, wosac::tell_merged),
+];
 
 /// Arguments of `evaluate merge`.
 #[derive(Debug, Serialize, clap::Args)]

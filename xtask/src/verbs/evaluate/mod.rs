@@ -8,12 +8,15 @@ mod ledger;
 mod merge;
 pub(crate) mod motion;
 mod shard;
+pub(crate) mod wosac;
 
 /// Which benchmark.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Motion prediction: distances, misses, overlaps and mAP at 3, 5 and 8 s
     Motion(motion::Args),
+    /// Realism: the Waymo Sim Agents Challenge
+    Wosac(wosac::Args),
     /// Put the shards of one evaluation together
     Merge(merge::Args),
 }

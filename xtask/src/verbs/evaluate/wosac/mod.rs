@@ -1,0 +1,325 @@
+//! `evaluate wosac`: realism as the Waymo Sim Agents Challenge measures it.
+//!
+//! Scenarios stream through one at a time; each gets three scores (what is evaluated, the log
+//! itself as an oracle, constant velocity), which the ledger keeps. `recording` reads scenarios,
+//! `rollouts` finds a scenario's rollouts or imagines them, `tell` makes the report.
+
+mod recording;
+mod rollouts;
+mod tell;
+
+use std::io::Write as _;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use gump_data::ReadOptions;
+use gump_metrics::wosac::{Blame, Config, Mode, Reference, Scores, Year};
+use gump_rollout::worlds::ConstantVelocity;
+use gump_rollout::{SimulateConfig, Start, simulate};
+use serde::{Deserialize, Serialize};
+
+use super::ledger::{Entry, Header, Ledger};
+use super::shard::Shard;
+use crate::cli::WrongArguments;
+use crate::run::{Common, Run, interrupted};
+use crate::worlds::{Sampling, WorldName};
+pub(crate) use recording::{Recorded, recordings};
+use rollouts::Source;
+pub(crate) use tell::tell_merged;
+
+/// Name of the benchmark in ledgers.
+pub(crate) const BENCHMARK: &str = "wosac";
+
+/// Arguments of `evaluate wosac`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// File or directory of recorded scenarios
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// log, idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W", required_unless_present = "rollouts")]
+    world: Option<WorldName>,
+    /// File or directory of ScenarioRollouts messages or of a submission's shards
+    #[arg(long, value_name = "PATH", conflicts_with = "world")]
+    rollouts: Option<PathBuf>,
+    /// Which year's challenge
+    #[arg(long, value_enum, default_value_t = YearName::Y2025)]
+    year: YearName,
+    /// Rollouts that a world imagines of each scenario
+    #[arg(long, value_name = "N", default_value = "32")]
+    rollouts_per_scenario: NonZeroUsize,
+    /// Evaluate part K of N; put the parts together with `evaluate merge`
+    #[arg(long, value_name = "K/N")]
+    shard: Option<Shard>,
+    /// Also say what lowered the scores and when, in explain.jsonl and the dearest in the report
+    #[arg(long)]
+    explain: bool,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// [`Year`] as an argument.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, clap::ValueEnum)]
+pub(crate) enum YearName {
+    /// As first published: leaderboard V0
+    #[serde(rename = "2023-v0")]
+    #[value(name = "2023-v0")]
+    Y2023V0,
+    /// Leaderboard V1
+    #[serde(rename = "2023")]
+    #[value(name = "2023")]
+    Y2023,
+    #[serde(rename = "2024")]
+    #[value(name = "2024")]
+    Y2024,
+    /// Simulated agents
+    #[serde(rename = "2025")]
+    #[value(name = "2025")]
+    Y2025,
+    /// Scenario generation
+    #[serde(rename = "2025-generation")]
+    #[value(name = "2025-generation")]
+    Y2025Generation,
+}
+
+impl YearName {
+    fn year(self) -> Year {
+        match self {
+            Self::Y2023V0 => Year::Y2023V0,
+            Self::Y2023 => Year::Y2023,
+            Self::Y2024 => Year::Y2024,
+            Self::Y2025 => Year::Y2025,
+            Self::Y2025Generation => Year::Y2025Generation,
+        }
+    }
+}
+
+/// What the scores of a scenario depend on, beside the scenario.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Settings {
+    /// What is evaluated: a world or "rollouts".
+    pub(crate) world: String,
+    pub(crate) year: String,
+    /// How many rollouts a world imagines.
+    pub(crate) rollouts_per_scenario: usize,
+    /// File names, without the folders that differ between machines.
+    scenarios: String,
+    rollouts: String,
+    /// How a learned world decodes, as JSON.
+    sampling: String,
+    seed: String,
+}
+
+/// What one scenario got.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Scored {
+    /// Wall seconds that scoring took, without imagining.
+    pub(crate) seconds: f64,
+    pub(crate) evaluated: Scores,
+    pub(crate) oracle: Scores,
+    pub(crate) constant_velocity: Scores,
+}
+
+/// What one agent cost in one scenario, as it is written.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct Explained {
+    scenario: String,
+    component: &'static str,
+    agent: i64,
+    class: &'static str,
+    cost: f64,
+    likelihood: f64,
+    /// Seconds from the present.
+    seconds: Option<f64>,
+    logged: f64,
+    imagined: f64,
+}
+
+/// Explanations shown in the report.
+const N_EXPLAINED: usize = 20;
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let sampling = self.sampling.resolve()?;
+        let shard = self.shard.unwrap_or(Shard::WHOLE);
+        let settings = self.settings(run)?;
+        let header = Header {
+            benchmark: BENCHMARK.into(),
+            shard,
+            settings: toml::Table::try_from(&settings)?,
+        };
+        let config = Config::of(self.year.year());
+        let mut source = match (&self.world, &self.rollouts) {
+            (_, Some(path)) => run.phase("index rollouts", |_| Source::files(path))?,
+            (Some(world), None) => {
+                let n = self.rollouts_per_scenario.get();
+                Source::world(world.clone(), sampling, n, run.seed())
+            }
+            (None, None) => {
+                let wrong = "expected --world or --rollouts, found neither";
+                return Err(WrongArguments(wrong.into()).into());
+            }
+        };
+        let mut ledger = Ledger::open(run.out(), &header)?;
+        let mut explained = Vec::new();
+        run.phase("evaluate", |run| {
+            let mut log = match self.explain {
+                true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
+                false => None,
+            };
+            let progress = run.progress("evaluating", 0, "scenarios");
+            let kept = ledger.indices();
+            let wanted = move |index| shard.holds(index) && !kept.contains(&index);
+            for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
+                let recorded = recorded?;
+                let (entry, blames) = self.evaluate(run, &config, &recorded, &mut source)?;
+                ledger.enter(entry)?;
+                if let Some(log) = &mut log {
+                    note(
+                        log,
+                        &recorded.log.scenario,
+                        &config,
+                        &blames,
+                        &mut explained,
+                    )?;
+                }
+                progress.advance(1);
+                anyhow::ensure!(
+                    !interrupted(),
+                    "stopped by Ctrl-C; the same command goes on after scenario {}",
+                    recorded.index
+                );
+            }
+            Ok(())
+        })?;
+        let entries = ledger.close()?;
+        anyhow::ensure!(
+            !entries.is_empty(),
+            "expected scenarios in shard {shard}, found none: {}",
+            self.scenarios.display()
+        );
+        tell::tell(run, &settings, &entries)?;
+        if self.explain {
+            run.result("explain", &explained)?;
+        }
+        Ok(())
+    }
+
+    fn settings(&self, run: &Run) -> anyhow::Result<Settings> {
+        let name = |path: &PathBuf| {
+            let name = path.file_name().unwrap_or_default();
+            name.to_string_lossy().into_owned()
+        };
+        let world = self.world.as_ref().map(ToString::to_string);
+        Ok(Settings {
+            world: world.unwrap_or_else(|| "rollouts".into()),
+            year: self.year.year().name().into(),
+            rollouts_per_scenario: self.rollouts_per_scenario.get(),
+            scenarios: name(&self.scenarios),
+            rollouts: self.rollouts.as_ref().map(name).unwrap_or_default(),
+            sampling: serde_json::to_string(&self.sampling)?,
+            seed: run.seed().0.to_string(),
+        })
+    }
+
+    fn evaluate(
+        &self,
+        run: &Run,
+        config: &Config,
+        recorded: &Recorded,
+        source: &mut Source,
+    ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
+        let n = self.rollouts_per_scenario.get();
+        let id = &recorded.log.scenario;
+        let rollouts = source
+            .rollouts(run, recorded, config.mode)
+            .with_context(|| format!("cannot evaluate scenario {id}"))?;
+        let baseline = constant_velocity(recorded, config.mode)
+            .with_context(|| format!("cannot evaluate scenario {id}"))?;
+        let oracle = recorded.log.oracle(n, config.mode == Mode::Generation);
+        let began = Instant::now();
+        let reference = Reference::new(&recorded.log, config)?;
+        let evaluation = reference.evaluate(&rollouts)?;
+        let seconds = began.elapsed().as_secs_f64();
+        let scores = Scored {
+            seconds,
+            oracle: reference.evaluate(&oracle)?.scores,
+            constant_velocity: reference.evaluate(&baseline.repeated(n))?.scores,
+            evaluated: evaluation.scores.clone(),
+        };
+        let entry = Entry {
+            index: recorded.index,
+            id: id.clone(),
+            scores,
+        };
+        Ok((entry, evaluation.explain()))
+    }
+}
+
+/// Everyone goes straight on: one rollout, since all would be equal.
+fn constant_velocity(
+    recorded: &Recorded,
+    mode: Mode,
+) -> anyhow::Result<gump_metrics::wosac::Rollouts> {
+    let start = Start {
+        scene: recorded.scenario.present(),
+        n_futures: 1,
+        seed: gump_scene::Seed(0),
+    };
+    let rollouts = simulate(
+        &ConstantVelocity,
+        &[start],
+        None,
+        &SimulateConfig::default(),
+    )
+    .map_err(|error| anyhow::anyhow!(error))?;
+    let id = &recorded.log.scenario;
+    Ok(gump_metrics::wosac::Rollouts::of(id, &rollouts, mode)?)
+}
+
+/// Writes what a scenario's score lacks, and keeps the dearest of all scenarios.
+fn note(
+    log: &mut std::fs::File,
+    scenario: &str,
+    config: &Config,
+    blames: &[Blame],
+    dearest: &mut Vec<Explained>,
+) -> anyhow::Result<()> {
+    // Steps count from the first scored one: that after the present, or that 1 s before it.
+    let first = match config.mode {
+        Mode::SimAgents => 1.0,
+        Mode::Generation => -10.0,
+    };
+    for blame in blames {
+        let explained = Explained {
+            scenario: scenario.into(),
+            component: blame.component.name(),
+            agent: blame.agent.0,
+            class: blame.kind.name(),
+            cost: blame.cost,
+            likelihood: blame.likelihood,
+            seconds: blame.step.map(|step| (first + step as f64) / 10.0),
+            logged: blame.logged,
+            imagined: blame.imagined,
+        };
+        writeln!(log, "{}", serde_json::to_string(&explained)?)?;
+        dearest.push(explained);
+    }
+    dearest.sort_by(|a, b| b.cost.total_cmp(&a.cost));
+    dearest.truncate(N_EXPLAINED);
+    Ok(())
+}
+
+/// Which gaps of a format matter to a world.
+fn read_options(world: &WorldName) -> ReadOptions {
+    match world {
+        WorldName::Log | WorldName::ConstantVelocity => ReadOptions::STATED,
+        WorldName::Idm | WorldName::Model(_) => ReadOptions::ALL,
+    }
+}

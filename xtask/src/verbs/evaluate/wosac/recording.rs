@@ -1,0 +1,173 @@
+//! Recorded scenarios one at a time, as worlds see them and as the metric does.
+//!
+//! Of Waymo's messages the metric reads more than a scenario keeps: what invalid states hold,
+//! which signals flash, the order of the map. Other formats are scored as scenarios.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use gump_data::ReadOptions;
+use gump_data::tfrecord::TfRecordReader;
+use gump_data::womd::proto::{self, FeatureData, LaneType, ObjectType, SignalState};
+use gump_data::womd::scenario_from_proto;
+use gump_metrics::wosac::{Log, Signal, SignalLane, State, Track};
+use gump_scene::{AgentId, AgentKind, Scenario};
+use prost::Message as _;
+
+/// A recorded scenario.
+pub(crate) struct Recorded {
+    /// Position among all scenarios of the path.
+    pub(crate) index: usize,
+    /// As worlds see it.
+    pub(crate) scenario: Scenario,
+    /// As the metric does.
+    pub(crate) log: Log,
+}
+
+/// The `wanted` scenarios of a file or directory in order; holds one at a time.
+///
+/// Error: a path without scenarios; of single scenarios the iterator tells.
+pub(crate) fn recordings<'a>(
+    path: &Path,
+    options: ReadOptions,
+    wanted: impl Fn(usize) -> bool + 'a,
+) -> anyhow::Result<Box<dyn Iterator<Item = anyhow::Result<Recorded>> + 'a>> {
+    let files = waymo_files(path)?;
+    if files.is_empty() {
+        let records = gump_data::open_with(path, options)?.enumerate();
+        let records = records.filter(move |(index, _)| wanted(*index));
+        return Ok(Box::new(records.map(|(index, record)| {
+            let scenario = record?.scenario;
+            let log = Log::of(&scenario)?;
+            Ok(Recorded {
+                index,
+                scenario,
+                log,
+            })
+        })));
+    }
+    // Opened one after the other, as they are reached.
+    let payloads = files.into_iter().flat_map(|file| {
+        let (reader, error) = match TfRecordReader::open(file) {
+            Ok(reader) => (Some(reader), None),
+            Err(error) => (None, Some(Err(error))),
+        };
+        error.into_iter().chain(reader.into_iter().flatten())
+    });
+    let payloads = payloads.enumerate().filter(move |(index, payload)| {
+        // What is broken is always told.
+        wanted(*index) || payload.is_err()
+    });
+    Ok(Box::new(payloads.map(move |(index, payload)| {
+        let payload = payload?;
+        recorded(index, &payload.bytes, options).with_context(|| format!("{}", payload.place))
+    })))
+}
+
+/// The TFRecord files at a path in order of their names; none if it holds another format.
+fn waymo_files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    if !path.is_dir() {
+        let first = TfRecordReader::open(path.to_owned())?.next();
+        let is_waymo = matches!(first, Some(Ok(_)));
+        return Ok(is_waymo.then(|| path.to_owned()).into_iter().collect());
+    }
+    let mut files = Vec::new();
+    for entry in
+        std::fs::read_dir(path).with_context(|| format!("cannot list {}", path.display()))?
+    {
+        let file = entry?.path();
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        if name.contains(".tfrecord") && !name.ends_with(".partial") && file.is_file() {
+            files.push(file);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> anyhow::Result<Recorded> {
+    let message = proto::Scenario::decode(bytes).context("expected a Scenario message")?;
+    let id = message.scenario_id();
+    let (scenario, _) =
+        scenario_from_proto(&message, options).with_context(|| format!("scenario {id}"))?;
+    // Roles have been checked with the scenario; the metric's clock is its own.
+    anyhow::ensure!(
+        scenario.now == 10,
+        "scenario {id}: expected the present at step 10, found it at {}",
+        scenario.now
+    );
+    let log = log(&message, &scenario);
+    Ok(Recorded {
+        index,
+        scenario,
+        log,
+    })
+}
+
+/// What the metric reads of a message that is a scenario.
+fn log(message: &proto::Scenario, scenario: &Scenario) -> Log {
+    let tracks = message.tracks.iter().map(|track| {
+        let id = AgentId(track.id().into());
+        Track::new(
+            id,
+            kind(track.object_type()),
+            track.states.iter().map(state).collect(),
+        )
+    });
+    let mut log = Log::new(message.scenario_id(), tracks.collect());
+    log.ego = Some(scenario.ego);
+    log.targets.clone_from(&scenario.targets);
+    for feature in &message.map_features {
+        match &feature.feature_data {
+            Some(FeatureData::RoadEdge(edge)) => {
+                log.road_edges
+                    .push(edge.polyline.iter().map(point).collect());
+            }
+            Some(FeatureData::Lane(lane)) if lane.r#type() == LaneType::SurfaceStreet => {
+                let points = lane.polyline.iter().map(point);
+                log.lanes.push(SignalLane {
+                    id: feature.id(),
+                    points: points.map(|[x, y, _]| [x, y]).collect(),
+                });
+            }
+            _ => {}
+        }
+    }
+    let steps = message.dynamic_map_states.iter();
+    log.signals = steps
+        .map(|step| step.lane_states.iter().map(signal).collect())
+        .collect();
+    log
+}
+
+/// What an object is.
+pub(super) fn kind(object_type: ObjectType) -> AgentKind {
+    match object_type {
+        ObjectType::Vehicle => AgentKind::Vehicle,
+        ObjectType::Pedestrian => AgentKind::Pedestrian,
+        ObjectType::Cyclist => AgentKind::Bicycle,
+        ObjectType::Other | ObjectType::Unset => AgentKind::Other,
+    }
+}
+
+fn state(state: &proto::ObjectState) -> State {
+    State {
+        position: [state.center_x(), state.center_y(), state.center_z()].map(|v| v as f32),
+        heading: state.heading(),
+        size: [state.length(), state.width(), state.height()],
+        valid: state.valid(),
+    }
+}
+
+fn point(point: &proto::MapPoint) -> [f32; 3] {
+    [point.x(), point.y(), point.z()].map(|v| v as f32)
+}
+
+fn signal(signal: &proto::TrafficSignalLaneState) -> Signal {
+    let [x, y, _] = signal.stop_point.as_ref().map_or([0.0; 3], point);
+    Signal {
+        lane: signal.lane(),
+        stop: matches!(signal.state(), SignalState::Stop | SignalState::ArrowStop),
+        stop_point: [x, y],
+    }
+}

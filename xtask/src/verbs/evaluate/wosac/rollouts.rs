@@ -1,0 +1,190 @@
+//! Where rollouts of a scenario come from: a world that imagines them, or files.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use gump_data::ReadOptions;
+use gump_data::submission::read_rollouts;
+use gump_data::womd::proto::{ScenarioRollouts, SimulatedTrajectory};
+use gump_metrics::wosac::{Mode, Rollouts, Trajectory};
+use gump_model::SamplingConfig;
+use gump_scene::{AgentId, Seed};
+
+use super::Recorded;
+use super::recording::kind;
+use crate::imagine::imagine;
+use crate::run::Run;
+use crate::worlds::{World, WorldName};
+
+/// Seconds that the challenge asks for.
+const HORIZON_S: f64 = 8.0;
+
+/// Where rollouts come from.
+pub(crate) enum Source {
+    World {
+        name: WorldName,
+        sampling: SamplingConfig,
+        n_rollouts: usize,
+        seed: Seed,
+        /// The world, once it is built, unless it knows the log.
+        built: Option<World>,
+    },
+    Files {
+        folder: PathBuf,
+        by_scenario: BTreeMap<String, PathBuf>,
+        /// The file read last: scenarios of a shard follow each other.
+        open: Option<(PathBuf, Vec<ScenarioRollouts>)>,
+    },
+}
+
+impl Source {
+    /// Imagines rollouts.
+    pub(crate) fn world(
+        name: WorldName,
+        sampling: SamplingConfig,
+        n_rollouts: usize,
+        seed: Seed,
+    ) -> Self {
+        Self::World {
+            name,
+            sampling,
+            n_rollouts,
+            seed,
+            built: None,
+        }
+    }
+
+    /// Reads rollouts from a file or a directory, one file in memory at a time.
+    ///
+    /// Error: a file that cannot be read, or two of one scenario.
+    pub(crate) fn files(path: &Path) -> anyhow::Result<Self> {
+        let mut files = Vec::new();
+        if path.is_dir() {
+            let entries = std::fs::read_dir(path)
+                .with_context(|| format!("cannot list {}", path.display()))?;
+            for entry in entries {
+                let file = entry?.path();
+                let name = file.file_name().unwrap_or_default().to_string_lossy();
+                if file.is_file() && name.contains(".binproto") {
+                    files.push(file);
+                }
+            }
+            files.sort();
+        } else {
+            files.push(path.to_owned());
+        }
+        let mut by_scenario: BTreeMap<String, PathBuf> = BTreeMap::new();
+        for file in files {
+            for message in read_rollouts(&file)? {
+                let id = message.scenario_id().to_owned();
+                if let Some(other) = by_scenario.insert(id, file.clone()) {
+                    anyhow::bail!(
+                        "expected rollouts of scenario {} once, found them in {} and {}",
+                        message.scenario_id(),
+                        other.display(),
+                        file.display()
+                    );
+                }
+            }
+        }
+        anyhow::ensure!(
+            !by_scenario.is_empty(),
+            "expected rollouts in files named *.binproto*, found none: {}",
+            path.display()
+        );
+        Ok(Self::Files {
+            folder: path.to_owned(),
+            by_scenario,
+            open: None,
+        })
+    }
+
+    /// Which gaps of a format matter.
+    pub(crate) fn read_options(&self) -> ReadOptions {
+        match self {
+            Self::World { name, .. } => super::read_options(name),
+            Self::Files { .. } => ReadOptions::STATED,
+        }
+    }
+
+    /// Rollouts of one scenario.
+    ///
+    /// Error: what the world reports, or a scenario without rollouts.
+    pub(crate) fn rollouts(
+        &mut self,
+        run: &Run,
+        recorded: &Recorded,
+        mode: Mode,
+    ) -> anyhow::Result<Rollouts> {
+        let scenario = &recorded.scenario;
+        match self {
+            Self::World {
+                name,
+                sampling,
+                n_rollouts,
+                seed,
+                built,
+            } => {
+                if built.is_none() || *name == WorldName::Log {
+                    *built = Some(World::build(name, scenario, sampling)?);
+                }
+                let world = built.as_ref().context("the world has just been built")?;
+                // Worlds without chance imagine one future; it stands for all.
+                let (n, copies) = match name {
+                    WorldName::Log | WorldName::ConstantVelocity => (1, *n_rollouts),
+                    WorldName::Idm | WorldName::Model(_) => (*n_rollouts, 1),
+                };
+                let seed = seed.fork(recorded.index as u64);
+                let imagined = imagine(run, world, scenario.present(), n, HORIZON_S, seed)?;
+                let rollouts = Rollouts::of(&scenario.id, &imagined.rollouts, mode)?;
+                Ok(rollouts.repeated(copies))
+            }
+            Self::Files {
+                folder,
+                by_scenario,
+                open,
+            } => {
+                let file = by_scenario.get(&scenario.id).with_context(|| {
+                    format!("expected rollouts of it, found none: {}", folder.display())
+                })?;
+                if open.as_ref().is_none_or(|(path, _)| path != file) {
+                    *open = Some((file.clone(), read_rollouts(file)?));
+                }
+                let messages = open.iter().flat_map(|(_, messages)| messages);
+                let message = messages
+                    .into_iter()
+                    .find(|message| message.scenario_id() == scenario.id)
+                    .with_context(|| format!("the file has changed: {}", file.display()))?;
+                Ok(rollouts(message, mode))
+            }
+        }
+    }
+}
+
+/// A message as what is scored.
+fn rollouts(message: &ScenarioRollouts, mode: Mode) -> Rollouts {
+    let trajectory = |t: &SimulatedTrajectory| {
+        let drive = Trajectory::new(
+            AgentId(t.object_id().into()),
+            t.center_x.clone(),
+            t.center_y.clone(),
+            t.center_z.clone(),
+            t.heading.clone(),
+        );
+        if mode == Mode::SimAgents {
+            return drive;
+        }
+        let sizes = t.length.iter().zip(&t.width).zip(&t.height);
+        drive.with_box(
+            kind(t.object_type()),
+            sizes.map(|((&l, &w), &h)| [l, w, h]).collect(),
+        )
+    };
+    let scenes = message.joint_scenes.iter();
+    let futures = scenes.map(|scene| {
+        let trajectories = scene.simulated_trajectories.iter();
+        trajectories.map(trajectory).collect()
+    });
+    Rollouts::new(message.scenario_id(), futures.collect())
+}

@@ -1,0 +1,118 @@
+//! The report of an evaluation, from the entries of its ledger alone.
+
+use std::path::PathBuf;
+
+use gump_metrics::interval;
+use gump_metrics::wosac::{Component, Scores};
+use gump_scene::Seed;
+use serde_json::{Map, Value, json};
+
+use super::{Scored, Settings};
+use crate::run::Run;
+use crate::verbs::evaluate::ledger::{self, Entry};
+
+/// The name of the log as a world.
+const ORACLE: &str = "logged-oracle";
+/// The name of the baseline.
+const CONSTANT_VELOCITY: &str = "constant-velocity";
+
+/// Puts shards together and tells the whole.
+pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
+    let (header, entries) = ledger::unite::<Scored>(folders)?;
+    let settings: Settings = header.settings.try_into()?;
+    tell(run, &settings, &entries)
+}
+
+/// Totals, intervals and the time it took.
+pub(crate) fn tell(
+    run: &mut Run,
+    settings: &Settings,
+    entries: &[Entry<Scored>],
+) -> anyhow::Result<()> {
+    let of = |pick: fn(&Scored) -> &Scores| -> Vec<Scores> {
+        entries.iter().map(|e| pick(&e.scores).clone()).collect()
+    };
+    let mut worlds = vec![
+        (settings.world.as_str(), of(|scored| &scored.evaluated)),
+        (ORACLE, of(|scored| &scored.oracle)),
+    ];
+    if settings.world != CONSTANT_VELOCITY {
+        worlds.push((CONSTANT_VELOCITY, of(|scored| &scored.constant_velocity)));
+    }
+    run.result("scenarios", entries.len())?;
+    let rows = worlds.iter().filter_map(|(world, scores)| {
+        let mean = Scores::mean(scores)?;
+        Some(row(world, &settings.year, scores.len(), &mean))
+    });
+    run.result("rows", rows.collect::<Vec<_>>())?;
+    run.result("intervals", intervals(&worlds))?;
+    let undefined = entries
+        .iter()
+        .filter(|e| e.scores.evaluated.metametric.is_nan());
+    let undefined: Vec<&str> = undefined.map(|entry| entry.id.as_str()).collect();
+    if let Some(first) = undefined.first() {
+        run.say(&format!(
+            "warning: {} scenarios have a component without any valid step, {first} for one; \
+             as in the reference their scores and the means are no numbers",
+            undefined.len()
+        ));
+    }
+    let seconds: f64 = entries.iter().map(|entry| entry.scores.seconds).sum();
+    run.result("seconds_per_scenario", seconds / entries.len() as f64)
+}
+
+fn row(world: &str, year: &str, scenarios: usize, scores: &Scores) -> Value {
+    let components = scores.components.iter();
+    let components: Map<String, Value> = components
+        .map(|(component, score)| (component.name().into(), json!(score)))
+        .collect();
+    json!({
+        "world": world,
+        "year": year,
+        "scenarios": scenarios,
+        "metametric": scores.metametric,
+        "kinematic": scores.kinematic,
+        "interactive": scores.interactive,
+        "map_based": scores.map_based,
+        "min_ade": scores.min_ade,
+        "ade": scores.ade,
+        "collision_rate": scores.collision_rate,
+        "offroad_rate": scores.offroad_rate,
+        "traffic_light_violation_rate": scores.traffic_light_violation_rate,
+        "components": components,
+    })
+}
+
+/// One line per number: mean and 95 % interval over scenarios for every world.
+fn intervals(worlds: &[(&str, Vec<Scores>)]) -> Vec<Value> {
+    type Number = Box<dyn Fn(&Scores) -> Option<f64>>;
+    let mut numbers: Vec<(&str, Number)> = vec![
+        ("metametric", Box::new(|s| Some(s.metametric))),
+        ("kinematic", Box::new(|s| Some(s.kinematic))),
+        ("interactive", Box::new(|s| Some(s.interactive))),
+        ("map_based", Box::new(|s| Some(s.map_based))),
+        ("min_ade", Box::new(|s| Some(s.min_ade))),
+        ("ade", Box::new(|s| Some(s.ade))),
+    ];
+    for component in Component::ALL {
+        let of = move |scores: &Scores| scores.components.get(&component).copied();
+        numbers.push((component.name(), Box::new(of)));
+    }
+    let line = |(name, number): &(&str, Number)| {
+        let mut line = Map::from_iter([("score".into(), json!(name))]);
+        for (world, scores) in worlds {
+            let values: Vec<f64> = scores.iter().filter_map(number).collect();
+            if values.is_empty() {
+                return None;
+            }
+            let mean = values.iter().sum::<f64>() / values.len() as f64;
+            // Not the run's seed: an interval says nothing about the worlds' chance.
+            let interval = interval(&values, Seed(0));
+            line.insert((*world).into(), json!(mean));
+            line.insert(format!("{world} low"), json!(interval.map(|i| i.low)));
+            line.insert(format!("{world} high"), json!(interval.map(|i| i.high)));
+        }
+        Some(Value::Object(line))
+    };
+    numbers.iter().filter_map(line).collect()
+}
