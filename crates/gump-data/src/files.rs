@@ -10,7 +10,9 @@ use std::path::{Path, PathBuf};
 
 use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
-use crate::{DataError, ReadOptions, argoverse2, commonroad, gpudrive, nuplan, sumo, womd};
+use crate::{
+    DataError, ReadOptions, argoverse2, commonroad, gpudrive, nuplan, scenario_json, sumo, womd,
+};
 
 /// A format that content can be recognised as.
 pub(crate) struct Format {
@@ -24,12 +26,13 @@ pub(crate) struct Format {
 }
 
 /// The formats that hold scenarios; the first that recognises a file has it.
-static FORMATS: [Format; 7] = [
+static FORMATS: [Format; 8] = [
     womd::FORMAT,
     gpudrive::FORMAT,
     argoverse2::FORECASTING,
     argoverse2::SENSOR_LOG,
     commonroad::FORMAT,
+    scenario_json::FORMAT,
     sumo::FORMAT,
     nuplan::FORMAT,
 ];

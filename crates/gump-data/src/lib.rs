@@ -47,6 +47,7 @@ pub mod nuplan;
 mod open;
 mod record;
 mod recording;
+pub mod scenario_json;
 mod stream;
 pub mod submission;
 pub mod sumo;
@@ -61,5 +62,7 @@ pub use files::list as list_files;
 pub use inspect::{Summary, inspect};
 pub use open::{Reader, find, open, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
-pub use verify::{Finding, Severity, Verification, verify};
+pub use verify::{
+    Finding, FormatCounts, MAX_FINDINGS, Severity, Verification, verify, verify_one_of_many,
+};
 pub use write_atomically::write_atomically;

@@ -10,7 +10,8 @@ use gump_geometry::DVec2;
 use gump_scene::{Agent, AgentKind, Frame, Scenario};
 use serde::Serialize;
 
-use crate::{DataError, ReadOptions, ScenarioRecord, open_with};
+use crate::files::{self, Role};
+use crate::{DataError, ReadOptions, ReadReport, ScenarioRecord, open_with};
 
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -35,67 +36,216 @@ pub struct Finding {
     pub detail: String,
 }
 
-/// What a check of a file or directory found.
+/// What a check of files found.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Verification {
     /// Scenarios that could be read.
     pub scenarios: usize,
     /// Findings by kind of problem.
     pub counts: BTreeMap<&'static str, usize>,
-    /// The findings, in file order.
+    /// The findings, in file order; at most [`MAX_FINDINGS`].
     pub findings: Vec<Finding>,
+    /// What each format holds, by its name.
+    pub formats: BTreeMap<&'static str, FormatCounts>,
+    /// Files that hold no scenarios, by what they are.
+    pub skipped: BTreeMap<&'static str, usize>,
+    /// What was left out and what was added, over all scenarios.
+    #[serde(flatten)]
+    pub report: ReadReport,
 }
+
+/// What the files of one format hold.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct FormatCounts {
+    /// Files.
+    pub files: usize,
+    /// Their bytes as stored.
+    pub bytes: u64,
+    /// Scenarios that could be read.
+    pub scenarios: usize,
+    /// Agents over time.
+    pub tracks: usize,
+    /// Frames.
+    pub frames: usize,
+    /// Lanes.
+    pub lanes: usize,
+    /// Scenarios with a traffic light in any frame.
+    pub with_lights: usize,
+    /// Scenarios with a route, stated or inferred.
+    pub with_route: usize,
+    /// Things left out.
+    pub dropped: usize,
+    /// Things added.
+    pub inferred: usize,
+    /// Findings that make something unusable.
+    pub broken: usize,
+    /// Findings that are odd.
+    pub suspicious: usize,
+}
+
+/// So many findings are kept one by one; all are counted.
+pub const MAX_FINDINGS: usize = 20_000;
 
 impl Verification {
     /// True if anything is broken.
     pub fn is_broken(&self) -> bool {
-        let broken = |finding: &Finding| finding.severity == Severity::Broken;
-        self.findings.iter().any(broken)
+        self.formats.values().any(|counts| counts.broken > 0)
     }
 
-    fn add(&mut self, finding: Finding) {
+    /// Adds what another check found.
+    pub fn merge(&mut self, other: Self) {
+        self.scenarios += other.scenarios;
+        for (problem, n) in other.counts {
+            *self.counts.entry(problem).or_default() += n;
+        }
+        let room = MAX_FINDINGS.saturating_sub(self.findings.len());
+        self.findings.extend(other.findings.into_iter().take(room));
+        for (name, counts) in other.formats {
+            self.formats.entry(name).or_default().merge(counts);
+        }
+        for (what, n) in other.skipped {
+            *self.skipped.entry(what).or_default() += n;
+        }
+        self.report.merge(&other.report);
+    }
+
+    fn add(&mut self, format: &'static str, finding: Finding) {
+        let counts = self.formats.entry(format).or_default();
+        match finding.severity {
+            Severity::Broken => counts.broken += 1,
+            Severity::Suspicious => counts.suspicious += 1,
+        }
         *self.counts.entry(finding.problem).or_default() += 1;
-        self.findings.push(finding);
+        if self.findings.len() < MAX_FINDINGS {
+            self.findings.push(finding);
+        }
     }
 }
 
-/// Reads every record, checksums included, and checks each scenario.
+impl FormatCounts {
+    fn merge(&mut self, other: Self) {
+        self.files += other.files;
+        self.bytes += other.bytes;
+        self.scenarios += other.scenarios;
+        self.tracks += other.tracks;
+        self.frames += other.frames;
+        self.lanes += other.lanes;
+        self.with_lights += other.with_lights;
+        self.with_route += other.with_route;
+        self.dropped += other.dropped;
+        self.inferred += other.inferred;
+        self.broken += other.broken;
+        self.suspicious += other.suspicious;
+    }
+
+    fn add(&mut self, record: &ScenarioRecord) {
+        let scenario = &record.scenario;
+        let agents = scenario.log.iter().flat_map(Frame::agents);
+        self.scenarios += 1;
+        self.tracks += agents.map(|agent| agent.id).collect::<BTreeSet<_>>().len();
+        self.frames += scenario.log.len();
+        self.lanes += scenario.map.lanes().len();
+        let lit = scenario.log.iter().any(|frame| !frame.lights().is_empty());
+        self.with_lights += usize::from(lit);
+        self.with_route += usize::from(scenario.route.is_some());
+        self.dropped += record.report.dropped.values().sum::<usize>();
+        self.inferred += record.report.inferred.values().sum::<usize>();
+    }
+}
+
+/// Reads every record of a file, or of every file of a directory and its subdirectories, checksums
+/// included, and checks each scenario.
 ///
 /// # Errors
-/// Those of [`crate::open`]; broken records are findings.
+/// Those of [`crate::open`] for a file; in a directory files that cannot be opened are findings.
 pub fn verify(path: &Path) -> Result<Verification, DataError> {
+    if !path.is_dir() {
+        return verify_file(path);
+    }
+    let mut result = Verification::default();
+    for file in files::list(path)? {
+        result.merge(verify_one_of_many(&file));
+    }
+    if result.formats.is_empty() {
+        return Err(DataError::NoFiles {
+            others: result.skipped.values().sum(),
+            path: path.into(),
+        });
+    }
+    Ok(result)
+}
+
+/// Checks one file among others: what cannot be opened is a finding, what holds no scenarios is
+/// counted.
+pub fn verify_one_of_many(file: &Path) -> Verification {
+    let mut result = Verification::default();
+    match files::role(file) {
+        Ok(Role::Companion(what) | Role::Unknown(what, _)) => {
+            result.skipped.insert(what, 1);
+            return result;
+        }
+        Ok(Role::Scenarios(format)) => match verify_file(file) {
+            Ok(verification) => return verification,
+            Err(error) => result.add(format.name, unreadable("unreadable file", &error)),
+        },
+        Err(error) => result.add(UNKNOWN, unreadable("unreadable file", &error)),
+    }
+    for counts in result.formats.values_mut() {
+        counts.files = 1;
+    }
+    result
+}
+
+/// The format of files that cannot be told.
+const UNKNOWN: &str = "unknown";
+
+fn verify_file(path: &Path) -> Result<Verification, DataError> {
     let mut result = Verification::default();
     let mut ids = BTreeSet::new();
-    for record in open_with(path, ReadOptions::ALL)? {
+    let mut reader = open_with(path, ReadOptions::ALL)?;
+    let format = reader.format();
+    let bytes = std::fs::metadata(path).map_or(0, |metadata| metadata.len());
+    let counts = result.formats.entry(format).or_default();
+    (counts.files, counts.bytes) = (1, bytes);
+    for record in &mut reader {
         match record {
-            Ok(record) => {
-                result.scenarios += 1;
-                let id = record.scenario.id.clone();
-                if !ids.insert(id.clone()) {
-                    let detail = format!("expected unique scenario ids, found {id} twice");
-                    let doubled = found(Severity::Broken, "scenario id occurs twice", detail);
-                    result.add(Finding {
-                        scenario: id.clone(),
-                        ..doubled
-                    });
-                }
-                for finding in scenario_findings(&record) {
-                    result.add(Finding {
-                        scenario: id.clone(),
-                        ..finding
-                    });
-                }
-            }
-            Err(error) => {
-                result.add(found(
-                    Severity::Broken,
-                    "unreadable record",
-                    error.to_string(),
-                ));
-            }
+            Ok(record) => add_record(&mut result, format, &record, &mut ids),
+            Err(error) => result.add(format, unreadable("unreadable record", &error)),
         }
     }
     Ok(result)
+}
+
+fn unreadable(problem: &'static str, error: &DataError) -> Finding {
+    found(Severity::Broken, problem, error.to_string())
+}
+
+fn add_record(
+    result: &mut Verification,
+    format: &'static str,
+    record: &ScenarioRecord,
+    ids: &mut BTreeSet<String>,
+) {
+    let id = &record.scenario.id;
+    result.scenarios += 1;
+    result.formats.entry(format).or_default().add(record);
+    result.report.merge(&record.report);
+    let named = |finding| Finding {
+        scenario: id.clone(),
+        ..finding
+    };
+    if !ids.insert(id.clone()) {
+        let detail = format!("expected unique scenario ids, found {id} twice");
+        let doubled = found(Severity::Broken, "scenario id occurs twice", detail);
+        result.add(format, named(doubled));
+    }
+    for note in &record.report.notes {
+        let damage = found(Severity::Suspicious, note.reason, note.detail.clone());
+        result.add(format, named(damage));
+    }
+    for finding in scenario_findings(record) {
+        result.add(format, named(finding));
+    }
 }
 
 fn found(severity: Severity, problem: &'static str, detail: String) -> Finding {

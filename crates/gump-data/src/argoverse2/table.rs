@@ -27,6 +27,21 @@ pub(super) struct Table {
 
 /// Reads a Parquet file.
 pub(super) fn parquet(path: &Path) -> Result<Table, DataError> {
+    guarded(path, read_parquet)
+}
+
+/// Reads a Feather file (version 2, which is Arrow IPC).
+pub(super) fn feather(path: &Path) -> Result<Table, DataError> {
+    guarded(path, read_feather)
+}
+
+/// The table crates panic on some damaged files; here that is an error like any other.
+fn guarded(path: &Path, read: fn(&Path) -> Result<Table, DataError>) -> Result<Table, DataError> {
+    std::panic::catch_unwind(|| read(path))
+        .unwrap_or_else(|_| Err(damaged(&"damage that its reader cannot cope with", path)))
+}
+
+fn read_parquet(path: &Path) -> Result<Table, DataError> {
     let file = open(path)?;
     let builder = ParquetRecordBatchReaderBuilder::try_new(file).map_err(|e| damaged(&e, path))?;
     let stated = builder.metadata().file_metadata().num_rows();
@@ -37,8 +52,7 @@ pub(super) fn parquet(path: &Path) -> Result<Table, DataError> {
     collect(reader, path)
 }
 
-/// Reads a Feather file (version 2, which is Arrow IPC).
-pub(super) fn feather(path: &Path) -> Result<Table, DataError> {
+fn read_feather(path: &Path) -> Result<Table, DataError> {
     let file = BufReader::new(open(path)?);
     let reader = FileReader::try_new(file, None).map_err(|e| damaged(&e, path))?;
     collect(reader, path)

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use gump_data::{Severity, verify};
+use gump_data::{FormatCounts, Severity, Verification, list_files, verify, verify_one_of_many};
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::run::{self, Common, Run};
 
@@ -15,6 +15,9 @@ pub(crate) struct Args {
     /// Files or directories
     #[arg(value_name = "PATH", required = true)]
     paths: Vec<PathBuf>,
+    /// Tell what is odd one by one, not only in counts
+    #[arg(long)]
+    list: bool,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -22,41 +25,87 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
-        let (mut scenarios, mut broken, mut findings) = (0, 0, Vec::new());
-        run.phase("verify", |run| {
-            let progress = run.progress("verifying", self.paths.len() as u64, "files");
+        let mut findings = Vec::new();
+        let all = run.phase("verify", |run| {
+            let mut files = Vec::new();
             for path in &self.paths {
+                let of_path = list_files(path)?;
+                files.extend(of_path.into_iter().map(|file| (file, path.is_dir())));
+            }
+            let progress = run.progress("verifying", files.len() as u64, "files");
+            let mut all = Verification::default();
+            for (file, one_of_many) in &files {
                 run::stop_if_interrupted()?;
-                let verification = verify(path)?;
-                scenarios += verification.scenarios;
-                for (problem, n) in verification.counts {
-                    *counts.entry(problem).or_default() += n;
-                }
-                for finding in verification.findings {
-                    broken += usize::from(finding.severity == Severity::Broken);
-                    findings.push(json!({
+                let mut found = if *one_of_many {
+                    verify_one_of_many(file)
+                } else {
+                    verify(file)?
+                };
+                let told = found
+                    .findings
+                    .drain(..)
+                    .filter(|finding| self.list || finding.severity == Severity::Broken);
+                findings.extend(told.map(|finding| {
+                    json!({
                         "severity": finding.severity,
                         "problem": finding.problem,
                         "detail": finding.detail,
                         "scenario": finding.scenario,
-                        "path": path,
-                    }));
-                }
+                        "path": file,
+                    })
+                }));
+                all.merge(found);
                 progress.advance(1);
             }
-            Ok(())
+            Ok(all)
         })?;
+        let sum = |of: fn(&FormatCounts) -> usize| all.formats.values().map(of).sum::<usize>();
+        let broken = sum(|counts| counts.broken);
         run.result("paths", self.paths.len())?;
-        run.result("scenarios", scenarios)?;
+        run.result("files", sum(|counts| counts.files))?;
+        run.result("scenarios", all.scenarios)?;
         run.result("broken", broken)?;
-        run.result("suspicious", findings.len() - broken)?;
-        run.result("counts", counts)?;
+        run.result("suspicious", sum(|counts| counts.suspicious))?;
+        run.result("counts", &all.counts)?;
+        run.result("skipped", &all.skipped)?;
+        run.result("dropped", &all.report.dropped)?;
+        run.result("inferred", &all.report.inferred)?;
+        run.result("formats", rows(&all.formats)?)?;
+        if self.list {
+            for finding in &findings {
+                let text = |key: &str| finding[key].as_str().unwrap_or_default();
+                let (severity, problem) = (text("severity"), text("problem"));
+                let (scenario, detail) = (text("scenario"), text("detail"));
+                run.say(&format!(
+                    "{severity}: {problem}: {scenario}: {detail}: {}",
+                    text("path")
+                ));
+            }
+        }
         run.result("findings", findings)?;
         anyhow::ensure!(
             broken == 0,
             "found broken data, expected none: {broken} findings"
         );
+        anyhow::ensure!(
+            all.scenarios > 0,
+            "expected scenarios, found none in {} files of other kinds",
+            all.skipped.values().sum::<usize>()
+        );
         Ok(())
     }
+}
+
+/// One row per format.
+fn rows(formats: &BTreeMap<&'static str, FormatCounts>) -> anyhow::Result<Vec<Value>> {
+    let mut rows = Vec::new();
+    for (name, counts) in formats {
+        let mut row = serde_json::Map::new();
+        row.insert("format".into(), json!(name));
+        if let Value::Object(fields) = serde_json::to_value(counts)? {
+            row.extend(fields);
+        }
+        rows.push(Value::Object(row));
+    }
+    Ok(rows)
 }

@@ -1,0 +1,347 @@
+//! Each format on a small file made by hand, damaged files, and directories of all of them.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use gump_data::{
+    DataError, ReadOptions, ScenarioRecord, list_files, open, open_with, scenario_json, verify,
+};
+use gump_geometry::dvec2;
+use gump_scene::{AgentId, LaneId, LightState};
+use tempfile::TempDir;
+
+fn data(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/data")
+        .join(name)
+}
+
+fn only(path: &Path) -> ScenarioRecord {
+    let mut reader = open(path).expect("the file opens");
+    let record = reader
+        .next()
+        .expect("there is a record")
+        .expect("it can be read");
+    assert!(reader.next().is_none());
+    record
+}
+
+#[test]
+fn gpudrive_states_what_it_states_and_the_rest_is_inferred() {
+    let record = only(&data("gpudrive.json"));
+    let (scenario, report) = (&record.scenario, &record.report);
+    assert_eq!((scenario.id.as_str(), scenario.log.len()), ("abc", 3));
+    // Headings are in degrees: 359 faces along the motion, and 1 does too.
+    let ego = scenario.log[0].agent(scenario.ego).unwrap();
+    assert_eq!(
+        scenario.ego,
+        AgentId(6),
+        "the last vehicle that is always there"
+    );
+    assert!((ego.state.pose.heading + 1.0_f64.to_radians()).abs() < 1e-9);
+    // A valid state may lie beyond -10000; an invalid one is absent whatever it holds.
+    assert_eq!(ego.state.pose.position, dvec2(-10500.0, 4.0));
+    assert!(scenario.log[2].agent(AgentId(5)).is_none());
+    assert_eq!(
+        scenario.map.lane(LaneId(1)).unwrap().successors,
+        [LaneId(2)]
+    );
+    assert_eq!(
+        scenario.log[0].light(LaneId(2)).unwrap().state,
+        LightState::Red
+    );
+    assert!(scenario.log[1].lights().is_empty());
+    assert_eq!(
+        scenario.log[2].light(LaneId(2)).unwrap().state,
+        LightState::Green
+    );
+    assert_eq!(
+        report.dropped["simple shape of an outline that crosses itself"],
+        1
+    );
+    assert!(matches!(
+        open_with(&data("gpudrive.json"), ReadOptions::STATED)
+            .unwrap()
+            .next(),
+        Some(Err(DataError::Scenario { .. }))
+    ));
+}
+
+#[test]
+fn commonroad_lanelets_are_lanes() {
+    let record = only(&data("commonroad.xml"));
+    let (scenario, report) = (&record.scenario, &record.report);
+    let lane = scenario.map.lane(LaneId(1)).unwrap();
+    assert_eq!((lane.width, lane.speed_limit), (4.0, Some(11.176)));
+    assert_eq!(lane.successors, [LaneId(2)]);
+    assert!(lane.left_neighbors.is_empty(), "it leads the other way");
+    assert_eq!(
+        scenario.map.lane(LaneId(2)).unwrap().speed_limit,
+        Some(11.176)
+    );
+    assert_eq!(scenario.ego, AgentId(100));
+    assert_eq!(
+        report.inferred["ego: the obstacle at the planning problem's start"],
+        1
+    );
+    // The light rules the lane behind its stop line.
+    let states: Vec<_> = scenario
+        .log
+        .iter()
+        .map(|f| f.light(LaneId(2)).unwrap().state)
+        .collect();
+    assert_eq!(
+        states,
+        [LightState::Red, LightState::Red, LightState::Green]
+    );
+    let far = |x, y| {
+        scenario
+            .map
+            .road_edges()
+            .iter()
+            .map(|e| e.line.project(dvec2(x, y)).distance)
+            .fold(f64::MAX, f64::min)
+    };
+    assert!(far(25.0, -2.0) < 0.01 && far(25.0, 6.0) < 0.01 && far(25.0, 2.0) > 1.0);
+    assert!(
+        scenario.map.is_drivable(dvec2(25.0, 1.9)) && !scenario.map.is_drivable(dvec2(25.0, -2.1))
+    );
+}
+
+#[test]
+fn own_data_needs_little() {
+    let record = only(&data("own.json"));
+    let (scenario, report) = (&record.scenario, &record.report);
+    assert_eq!((scenario.dt, scenario.now, scenario.log.len()), (0.5, 1, 4));
+    let ego = scenario.log[1].agent(scenario.ego).unwrap();
+    assert_eq!(
+        (ego.state.velocity, ego.state.pose.heading),
+        (dvec2(10.0, 0.0), 0.0)
+    );
+    assert_eq!(ego.elevation, 2.0 + ego.height / 2.0);
+    let walker = scenario.log[0].agent(AgentId(7)).unwrap();
+    assert_eq!(walker.state.velocity, dvec2(0.0, -1.0));
+    assert_eq!(report.notes.len(), 1, "{:?}", report.notes);
+    assert!(report.notes[0].detail.starts_with("track 7 at step 3"));
+    assert!(scenario.log[3].agent(AgentId(7)).is_none());
+    let lanes = scenario.map.lanes();
+    assert_eq!(lanes[0].successors, [lanes[1].id]);
+    assert_eq!(scenario.log[0].lights()[0].lane, lanes[1].id);
+    assert!(scenario.route.is_some());
+}
+
+#[test]
+fn what_is_written_as_json_is_read_again() {
+    let folder = TempDir::new().unwrap();
+    let written = common::crossing();
+    for name in ["a.json", "a.json.gz"] {
+        let path = folder.path().join(name);
+        scenario_json::write_scenario(&path, &written).unwrap();
+        let read = only(&path).scenario;
+        assert_eq!(read.id, written.id);
+        assert_eq!(
+            (read.dt, read.now, read.ego),
+            (written.dt, written.now, written.ego)
+        );
+        assert_eq!(read.log, written.log);
+        assert_eq!(read.targets, written.targets);
+        for lane in written.map.lanes() {
+            let again = read.map.lane(lane.id).unwrap();
+            assert_eq!(again.centerline, lane.centerline);
+            assert_eq!(again.successors, lane.successors);
+            assert_eq!(again.left_neighbors, lane.left_neighbors);
+        }
+        assert_eq!(read.map.areas().len(), written.map.areas().len());
+    }
+}
+
+#[test]
+fn a_wrong_version_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let check = |from: &str, old: &str, new: &str, expected: &str| {
+        let text = fs::read_to_string(data(from)).unwrap().replace(old, new);
+        let path = folder.path().join(from);
+        fs::write(&path, text).unwrap();
+        let error = open(&path)
+            .unwrap()
+            .next()
+            .unwrap()
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains(expected) && error.ends_with(from), "{error}");
+    };
+    check(
+        "own.json",
+        "\"version\": 1",
+        "\"version\": 2",
+        "expected version 1, found 2",
+    );
+    check("commonroad.xml", "2020a", "2031x", "found 2031x");
+    check(
+        "commonroad.xml",
+        "timeStepSize=\"0.5\"",
+        "timeStepSize=\"-1\"",
+        "time step",
+    );
+}
+
+#[test]
+fn a_directory_of_all_formats_with_damage_and_strangers() {
+    let folder = TempDir::new().unwrap();
+    let inner = folder.path().join("deep/er");
+    fs::create_dir_all(&inner).unwrap();
+    for name in ["gpudrive.json", "commonroad.xml", "own.json"] {
+        fs::copy(data(name), inner.join(name)).unwrap();
+    }
+    let whole = fs::read(data("gpudrive.json")).unwrap();
+    fs::write(folder.path().join("cut.json"), &whole[..whole.len() / 2]).unwrap();
+    fs::write(folder.path().join("empty.json"), "").unwrap();
+    fs::write(folder.path().join("noise.tfrecord"), [7; 100]).unwrap();
+    fs::write(folder.path().join("README.md"), "nothing to see").unwrap();
+    fs::write(folder.path().join("index.json"), "[{\"file\": 1}]").unwrap();
+    assert_eq!(list_files(folder.path()).unwrap().len(), 8);
+    let mut reader = open(folder.path()).unwrap();
+    let (good, bad): (Vec<_>, Vec<_>) = reader.by_ref().partition(Result::is_ok);
+    assert_eq!((good.len(), bad.len()), (3, 3));
+    assert_eq!(reader.skipped()["other text"], 2);
+    for error in bad.into_iter().filter_map(Result::err) {
+        let text = error.to_string();
+        assert!(
+            ["cut.json", "empty.json", "noise.tfrecord"]
+                .iter()
+                .any(|n| text.ends_with(n)),
+            "{text}"
+        );
+    }
+    let verification = verify(folder.path()).unwrap();
+    assert_eq!(
+        (verification.scenarios, verification.is_broken()),
+        (3, true)
+    );
+    let files: usize = verification
+        .formats
+        .values()
+        .map(|counts| counts.files)
+        .sum();
+    let broken: usize = verification
+        .formats
+        .values()
+        .map(|counts| counts.broken)
+        .sum();
+    assert_eq!(
+        (files, broken, verification.skipped["other text"]),
+        (6, 3, 2)
+    );
+}
+
+/// Reads a damaged copy; only panics and endless growth are wrong.
+fn read_damaged(path: &Path, bytes: &[u8]) -> usize {
+    fs::write(path, bytes).expect("the temporary folder is writable");
+    open(path).map_or(0, |reader| reader.filter(Result::is_ok).count())
+}
+
+/// Deterministic damage: cuts, flipped bits, other digits, repeated and removed stretches.
+fn replay(name: &str, original: &[u8], path: &Path, rounds: usize) {
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+    let mut random = |n: usize| {
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1);
+        (state >> 33) as usize % n.max(1)
+    };
+    let mut read = 0;
+    for round in 0..rounds {
+        let mut bytes = original.to_vec();
+        for _ in 0..=random(3) {
+            let at = random(bytes.len());
+            match round % 6 {
+                0 => bytes.truncate(at),
+                1 => bytes
+                    .iter_mut()
+                    .skip(at)
+                    .take(1)
+                    .for_each(|b| *b ^= 1 << (round % 8)),
+                2 => bytes
+                    .iter_mut()
+                    .skip(at)
+                    .find(|b| b.is_ascii_digit())
+                    .into_iter()
+                    .for_each(|b| *b = b'9'),
+                3 => drop(
+                    bytes
+                        .drain(at..(at + random(40)).min(original.len()).max(at))
+                        .collect::<Vec<_>>(),
+                ),
+                4 => {
+                    let stretch = bytes[at..(at + 60).min(bytes.len())].to_vec();
+                    bytes.splice(at..at, stretch);
+                }
+                _ => drop(bytes.splice(at..at, *b"e99").collect::<Vec<_>>()),
+            }
+            if bytes.is_empty() {
+                break;
+            }
+        }
+        read += read_damaged(path, &bytes);
+    }
+    assert!(
+        read > 0 && read < rounds,
+        "{name}: {read} of {rounds} damaged files were read"
+    );
+}
+
+#[test]
+fn damaged_documents_never_panic() {
+    let folder = TempDir::new().unwrap();
+    for name in ["gpudrive.json", "commonroad.xml", "own.json"] {
+        let original = fs::read(data(name)).unwrap();
+        replay(name, &original, &folder.path().join(name), 600);
+    }
+}
+
+#[test]
+fn damaged_argoverse_tables_never_panic() {
+    let Some(samples) = common::shared("data/argoverse2") else {
+        return;
+    };
+    let folder = TempDir::new().unwrap();
+    for file in list_files(&samples).unwrap() {
+        let name = file.file_name().unwrap().to_str().unwrap();
+        let table = name.ends_with(".parquet") || name.starts_with("annotations");
+        if !table {
+            continue;
+        }
+        let inner = folder
+            .path()
+            .join(file.parent().unwrap().file_name().unwrap());
+        fs::create_dir_all(&inner).unwrap();
+        for sibling in list_files(file.parent().unwrap()).unwrap() {
+            fs::copy(&sibling, inner.join(sibling.file_name().unwrap())).unwrap();
+        }
+        let original = fs::read(&file).unwrap();
+        let copy = inner.join(name);
+        fs::remove_file(&copy).unwrap();
+        replay(name, &original, &copy, 24);
+    }
+}
+
+#[test]
+fn absurd_documents_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("deep.json");
+    fs::write(&path, format!("{{\"objects\": {}", "[".repeat(100_000))).unwrap();
+    let error = open(&path).unwrap().next().unwrap().unwrap_err();
+    assert!(matches!(error, DataError::Json { .. }), "{error}");
+    // A megabyte of gzip that unpacks to 200 MB.
+    let mut packer = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut packer, b"{\"objects\": [").unwrap();
+    for _ in 0..200 {
+        std::io::Write::write_all(&mut packer, &vec![b' '; 1 << 20]).unwrap();
+    }
+    let path = folder.path().join("bomb.json.gz");
+    fs::write(&path, packer.finish().unwrap()).unwrap();
+    let error = open(&path).unwrap().next().unwrap().unwrap_err();
+    assert!(matches!(error, DataError::TooLarge { .. }), "{error}");
+}
