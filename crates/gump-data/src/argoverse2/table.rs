@@ -1,7 +1,7 @@
 //! Columns of a Parquet or Feather table, by name, as plain vectors.
 
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{Cursor, Read};
 use std::path::Path;
 
 use arrow_array::cast::AsArray;
@@ -53,9 +53,63 @@ fn read_parquet(path: &Path) -> Result<Table, DataError> {
 }
 
 fn read_feather(path: &Path) -> Result<Table, DataError> {
-    let file = BufReader::new(open(path)?);
-    let reader = FileReader::try_new(file, None).map_err(|e| damaged(&e, path))?;
+    let mut bytes = Vec::new();
+    let read = open(path)?.take(MAX_BYTES).read_to_end(&mut bytes);
+    read.map_err(|e| io_error("read", e, path))?;
+    let unpacked = unpacked_bytes(&bytes).ok_or_else(|| damaged(&"no sound footer", path))?;
+    if unpacked > MAX_BYTES {
+        let found = format!("columns of {unpacked} bytes, more than {MAX_BYTES}");
+        return Err(damaged(&found, path));
+    }
+    let reader = FileReader::try_new(Cursor::new(bytes), None).map_err(|e| damaged(&e, path))?;
     collect(reader, path)
+}
+
+/// What the columns of a Feather file claim to unpack to, bytes; `None` if it has no sound footer.
+///
+/// The crate that unpacks them allocates what a column claims before it looks at the column.
+///
+/// Source: "Arrow columnar format", IPC file format and body compression: the footer lists blocks
+/// of a message and a body; a packed buffer of the body begins with its length, -1 if it is not.
+fn unpacked_bytes(bytes: &[u8]) -> Option<u64> {
+    const TAIL: usize = 10;
+    let tail = bytes.len().checked_sub(TAIL)?;
+    let length = i32::from_le_bytes(*bytes.get(tail..)?.first_chunk()?);
+    let footer = bytes.get(tail.checked_sub(usize::try_from(length).ok()?)?..tail)?;
+    let footer = arrow_ipc::root_as_footer(footer).ok()?;
+    let batches = footer.recordBatches().into_iter().flatten();
+    let blocks = batches.chain(footer.dictionaries().into_iter().flatten());
+    let mut total = 0_u64;
+    for block in blocks {
+        let start = usize::try_from(block.offset()).ok()?;
+        let body = start.checked_add(usize::try_from(block.metaDataLength()).ok()?)?;
+        let message = bytes.get(start..body)?;
+        // Since version 0.15 a marker of four bytes stands before the length.
+        let prefix = if message.starts_with(&[0xff; 4]) {
+            8
+        } else {
+            4
+        };
+        let message = arrow_ipc::root_as_message(message.get(prefix..)?).ok()?;
+        let dictionary = message.header_as_dictionary_batch().and_then(|d| d.data());
+        let Some(batch) = message.header_as_record_batch().or(dictionary) else {
+            continue;
+        };
+        if batch.compression().is_none() {
+            continue;
+        }
+        for buffer in batch
+            .buffers()
+            .into_iter()
+            .flatten()
+            .filter(|b| b.length() > 0)
+        {
+            let at = body.checked_add(usize::try_from(buffer.offset()).ok()?)?;
+            let claimed = i64::from_le_bytes(*bytes.get(at..)?.first_chunk()?);
+            total = total.saturating_add(u64::try_from(claimed).unwrap_or(0));
+        }
+    }
+    Some(total)
 }
 
 fn open(path: &Path) -> Result<File, DataError> {

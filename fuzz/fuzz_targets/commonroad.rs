@@ -1,0 +1,10 @@
+//! Any bytes in a file named `some.xml`: reading them may fail, never panic.
+
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+#[path = "read.rs"]
+mod read;
+
+fuzz_target!(|bytes: &[u8]| read::read("some.xml", bytes));
