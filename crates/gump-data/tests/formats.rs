@@ -345,3 +345,29 @@ fn absurd_documents_are_refused() {
     let error = open(&path).unwrap().next().unwrap().unwrap_err();
     assert!(matches!(error, DataError::TooLarge { .. }), "{error}");
 }
+
+#[test]
+fn real_files_hold_what_an_independent_count_finds() {
+    // Scenarios, tracks, frames and lanes, counted by a script of a few lines in Python.
+    let check = |name: &str, expected: [usize; 4]| {
+        let Some(path) = common::shared(name) else {
+            return;
+        };
+        let found = verify(&path).unwrap();
+        let sum = |of: fn(&gump_data::FormatCounts) -> usize| {
+            found.formats.values().map(of).sum::<usize>()
+        };
+        let counts = [
+            found.scenarios,
+            sum(|c| c.tracks),
+            sum(|c| c.frames),
+            sum(|c| c.lanes),
+        ];
+        assert_eq!(counts, expected, "{name}");
+        assert!(!found.is_broken(), "{name}: {:?}", found.counts);
+    };
+    check("data/gpudrive/lights", [11, 622, 1001, 1273]);
+    check("data/gpudrive/validation", [23, 867, 2093, 2269]);
+    check("data/argoverse2", [4, 441, 579, 631]);
+    check("data/commonroad_ngsim", [77, 2454, 5189, 3210]);
+}

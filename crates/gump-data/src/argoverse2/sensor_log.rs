@@ -35,12 +35,14 @@ fn recognises(head: &[u8]) -> bool {
 
 /// The ego's category where annotations include it.
 const EGO: &str = "EGO_VEHICLE";
-/// The ego's length, width and height, metres, and how far its box centre lies ahead of its
-/// origin, the middle of its rear axle.
+/// The ego's length, width and height, metres.
 ///
-/// Source: the ego's box in the annotated logs of the Argoverse 2 scenario-mining sample.
+/// Source: the ego's box in the annotated logs of the scenario-mining sample.
 const EGO_SIZE: [f64; 3] = [4.877, 2.0, 1.473];
-const EGO_AHEAD: f64 = 1.422;
+/// How far the ego's box centre lies ahead of its origin, the middle of its rear axle, metres: half
+/// the wheelbase of the Ford Fusion (2.85 m), taking its overhangs for equal. The sample's own box
+/// for the ego is centred on the origin, which contradicts where the format puts that.
+const EGO_AHEAD: f64 = 1.425;
 
 /// Boxes by time, ego poses by time, the map.
 pub(crate) struct File {
