@@ -22,6 +22,7 @@ mod report;
 mod rollout_files;
 mod run;
 mod shipped;
+mod sumo;
 mod table;
 mod verbs;
 mod worlds;

@@ -41,6 +41,8 @@ pub struct Summary {
     pub lights_now: BTreeMap<&'static str, usize>,
     /// Scenarios with a route of the ego, stated or inferred.
     pub with_route: usize,
+    /// Scenarios by tag.
+    pub tags: BTreeMap<&'static str, usize>,
     /// What was left out and what was added, over all scenarios.
     #[serde(flatten)]
     pub report: ReadReport,
@@ -51,6 +53,18 @@ pub struct Summary {
 /// # Errors
 /// Those of [`crate::open`].
 pub fn inspect(path: &Path, options: ReadOptions) -> Result<Summary, DataError> {
+    inspect_with(path, options, |_| {})
+}
+
+/// As [`inspect`], with something added to every scenario before it is counted, for instance tags.
+///
+/// # Errors
+/// Those of [`crate::open`].
+pub fn inspect_with(
+    path: &Path,
+    options: ReadOptions,
+    complete: impl Fn(&mut Scenario),
+) -> Result<Summary, DataError> {
     let mut reader = open_with(path, options)?;
     let mut summary = Summary {
         format: reader.format().into(),
@@ -58,7 +72,10 @@ pub fn inspect(path: &Path, options: ReadOptions) -> Result<Summary, DataError> 
     };
     for record in &mut reader {
         match record {
-            Ok(record) => summary.add(&record.scenario, &record.report),
+            Ok(mut record) => {
+                complete(&mut record.scenario);
+                summary.add(&record.scenario, &record.report);
+            }
             Err(error) => summary.unreadable.push(error.to_string()),
         }
     }
@@ -73,6 +90,9 @@ impl Summary {
         self.targets += scenario.targets.len();
         self.with_route += usize::from(scenario.route.is_some());
         self.report.merge(report);
+        for tag in &scenario.tags {
+            *self.tags.entry(tag.name()).or_default() += 1;
+        }
         self.add_agents(scenario);
         self.add_map(scenario);
         self.add_lights(scenario);

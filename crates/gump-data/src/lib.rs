@@ -59,7 +59,7 @@ mod xml;
 
 pub use error::{DataError, Place, Problem};
 pub use files::list as list_files;
-pub use inspect::{Summary, inspect};
+pub use inspect::{Summary, inspect, inspect_with};
 pub use open::{Reader, find, open, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
 pub use verify::{

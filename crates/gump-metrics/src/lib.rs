@@ -57,6 +57,7 @@ mod red_light;
 mod reward;
 mod road_edge;
 mod summary;
+pub mod tags;
 pub mod wosac;
 
 pub use bootstrap::{Interval, interval, intervals};

@@ -1,7 +1,8 @@
 //! Scenarios made up from nothing: procedural roads and rule-driven traffic.
 //!
 //! Free of any recording and of its licence, endless, and the same for the same seed. Start with
-//! [`synthesize`].
+//! [`synthesize`]. Scenes that SUMO simulates begin with [`draw_sumo_demand`]; running SUMO is the
+//! driver's affair, reading what it puts out that of `gump_data::sumo`.
 //!
 //! ```
 //! use gump_scene::Seed;
@@ -21,8 +22,12 @@ mod network;
 mod plan;
 mod record;
 mod scenario;
+mod smooth;
+mod sumo_demand;
 mod traffic;
 
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;
 pub use scenario::{synthesize, synthesize_many};
+pub use smooth::smooth_motion;
+pub use sumo_demand::{SumoDemand, draw_sumo_demand};

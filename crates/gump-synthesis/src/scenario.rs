@@ -72,7 +72,7 @@ fn draw_scenario(
     let map = build_map(&network, &placement).expect("networks have finite coordinates");
     let route = route(&network, ego, &traffic, &placement);
     let log = frames(&recording, &placement, config.dt);
-    Some(Scenario {
+    let mut scenario = Scenario {
         id: format!("{family}-{:016x}", seed.0),
         map: Arc::new(map),
         route: Some(Arc::new(route)),
@@ -83,7 +83,9 @@ fn draw_scenario(
         now: config.now(),
         objects_of_interest: Vec::new(),
         tags: Vec::new(),
-    })
+    };
+    scenario.tags = gump_metrics::tags::mine(&scenario);
+    Some(scenario)
 }
 
 fn draw_demand(config: &SynthesisConfig, network: &Network, rng: &mut gump_scene::Rng) -> Demand {

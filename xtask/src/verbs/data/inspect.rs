@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_data::{ReadOptions, ReadReport, Summary, find, inspect};
+use gump_data::{ReadOptions, ReadReport, Summary, find, inspect_with};
 use gump_scene::Scenario;
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde::Serialize;
@@ -32,7 +32,7 @@ impl Args {
             if one {
                 summary_of_one(&self.scenario)
             } else {
-                Ok(inspect(whole, ReadOptions::ALL)?)
+                Ok(inspect_with(whole, ReadOptions::ALL, add_tags)?)
             }
         })?;
         let n_unreadable = summary.unreadable.len();
@@ -75,8 +75,16 @@ pub(crate) fn picture(scenario: &Scenario) -> Picture {
     draw_futures(&scene, &[scenario.future()], &spec)
 }
 
+/// Mines the tags of a scenario whose format states none.
+fn add_tags(scenario: &mut Scenario) {
+    if scenario.tags.is_empty() {
+        scenario.tags = gump_metrics::tags::mine(scenario);
+    }
+}
+
 fn summary_of_one(name: &str) -> anyhow::Result<Summary> {
-    let wanted = find(name)?;
+    let mut wanted = find(name)?;
+    add_tags(&mut wanted);
     let path = name.rsplit_once('#').map_or(name, |(path, _)| path);
     let mut reader = gump_data::open(Path::new(path))?;
     let mut summary = Summary {

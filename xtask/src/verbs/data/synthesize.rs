@@ -2,16 +2,27 @@
 
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
+use std::path::PathBuf;
 
+use anyhow::Context as _;
 use gump_scene::Scenario;
-use gump_synthesis::{RoadFamily, SynthesisConfig, synthesize};
+use gump_synthesis::{RoadFamily, SumoDemand, SynthesisConfig, synthesize};
 use rayon::prelude::*;
 use serde::Serialize;
 
+use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
+use crate::sumo::{self, Sumo};
 
 /// Files to spread scenes over; fewer if there are fewer scenes.
 const SHARDS: usize = 8;
+/// Scenes of SUMO per file at most, where the number of files is not given: they are held in
+/// memory until their file is written.
+const SHARD_SCENES: usize = 200;
+/// Scenes that a run of SUMO gives at least, as a rule.
+const RUN_SCENES: u64 = 12;
+/// So many runs without a scene mean that there will be none.
+const BARREN_RUNS: u64 = 8;
 
 /// Arguments of `data synthesize`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -32,6 +43,9 @@ pub(crate) struct Args {
     /// Files to spread the scenes over [default: 8, or one per scene if those are fewer]
     #[arg(long, value_name = "N")]
     shards: Option<NonZeroUsize>,
+    /// For --kind sumo: a network, or a folder of networks to take in turn [default: made anew]
+    #[arg(long, value_name = "FILE_OR_DIR")]
+    network: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -43,17 +57,54 @@ pub(crate) struct Args {
 enum Kind {
     /// Drawn roads, rule-driven traffic.
     Procedural,
+    /// Roads and traffic of SUMO, which must be installed.
+    Sumo,
 }
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let Kind::Procedural = self.kind;
+        self.check()?;
+        let mut made = Made::default();
+        match self.kind {
+            Kind::Procedural => {
+                let scenes = self.procedural(run)?;
+                made.add(&scenes);
+                let names = shard_names(self.n_shards(SHARDS));
+                run.phase("write", |run| write(run, &names, &scenes))?;
+                made.files = names;
+            }
+            Kind::Sumo => self.sumo(run, &mut made)?,
+        }
+        run.result("scenes", made.scenes)?;
+        run.result("agents", made.by_class.values().sum::<usize>())?;
+        run.result("by_class", made.by_class)?;
+        run.result("by_road", made.by_road)?;
+        run.result("by_tag", made.by_tag)?;
+        run.result("files", made.files)?;
+        Ok(())
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        let why = match self.kind {
+            Kind::Procedural if self.network.is_some() => "--network is for --kind sumo",
+            Kind::Sumo if self.family.is_some() => "--family is for --kind procedural",
+            _ => return Ok(()),
+        };
+        Err(WrongArguments(why.into()).into())
+    }
+
+    fn n_shards(&self, default: usize) -> usize {
+        let asked = self.shards.map_or(default, NonZeroUsize::get);
+        asked.min(self.scenes.get())
+    }
+
+    fn procedural(&self, run: &mut Run) -> anyhow::Result<Vec<Scenario>> {
         let config = SynthesisConfig {
             density: self.density,
             family: self.family,
             ..SynthesisConfig::standard()
         };
-        let scenes = run.phase("synthesize", |run| {
+        run.phase("synthesize", |run| {
             let n = self.scenes.get() as u64;
             let progress = run.progress("synthesizing", n, "scenes");
             let seed = run.seed();
@@ -67,57 +118,148 @@ impl Args {
                 .into_par_iter()
                 .map(scene)
                 .collect::<anyhow::Result<Vec<_>>>()
-        })?;
-        let files = run.phase("write", |run| self.write(run, &scenes))?;
-        run.result("scenes", scenes.len())?;
-        run.result(
-            "agents",
-            count(&scenes, |scene| scene.present().now().agents().len()),
-        )?;
-        run.result("by_class", by_class(&scenes))?;
-        run.result("by_road", by_road(&scenes))?;
-        run.result("files", files)?;
+        })
+    }
+
+    /// Simulates and writes shard by shard, so that thousands of scenes need little memory.
+    ///
+    /// Run `r` comes from `seed.fork(r)` and scenes are taken in the order of their runs, so the
+    /// number of threads changes nothing.
+    fn sumo(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
+        let sumo = Sumo::find()?;
+        run.setting("sumo", sumo.version()?)?;
+        let work = run.path("work");
+        std::fs::create_dir_all(&work)
+            .with_context(|| format!("cannot create the folder {}", work.display()))?;
+        let files = match &self.network {
+            Some(path) => sumo::networks(path)?,
+            None => Vec::new(),
+        };
+        let places = files.iter().map(|file| sumo.prepare(file, &work));
+        let places = places.collect::<anyhow::Result<Vec<_>>>()?;
+        let demand = SumoDemand {
+            density: self.density,
+            ..SumoDemand::standard()
+        };
+        let seed = run.seed();
+        let one = |r: u64| -> anyhow::Result<Vec<Scenario>> {
+            run::stop_if_interrupted()?;
+            let folder = work.join(format!("run-{r:05}"));
+            std::fs::create_dir_all(&folder)
+                .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+            let seed = seed.fork(r);
+            let fresh;
+            let place = match places.get(r as usize % places.len().max(1)) {
+                Some(place) => place,
+                None => {
+                    fresh = sumo.generate(seed, &folder)?;
+                    &fresh
+                }
+            };
+            let id = format!("{}-{r:05}", place.name);
+            sumo.scenes(place, &demand, seed.fork(2), &id, &folder)
+        };
+        let n = self.scenes.get();
+        let names = shard_names(self.n_shards(SHARDS.max(n.div_ceil(SHARD_SCENES))));
+        let progress = run.progress("simulating", n as u64, "scenes");
+        let (mut left, mut next, mut barren) = (Vec::new(), 0_u64, 0);
+        for (shard, name) in names.iter().enumerate() {
+            let wanted = n * (shard + 1) / names.len() - n * shard / names.len();
+            while left.len() < wanted {
+                let runs = ((wanted - left.len()) as u64).div_ceil(RUN_SCENES).max(places.len() as u64);
+                let found = run.phase("simulate", |_| {
+                    let found = (next..next + runs).into_par_iter().map(|r| {
+                        let scenes = one(r)?;
+                        progress.advance(scenes.len() as u64);
+                        Ok(scenes)
+                    });
+                    found.collect::<anyhow::Result<Vec<_>>>()
+                })?;
+                next += runs;
+                let before = left.len();
+                // Taken in turn, so that every network has its share however few are wanted.
+                interleave(found, &mut left);
+                barren = if left.len() > before { 0 } else { barren + runs };
+                anyhow::ensure!(
+                    barren < BARREN_RUNS,
+                    "{barren} runs of SUMO in a row gave no scene: is there room to drive?"
+                );
+            }
+            let rest = left.split_off(wanted);
+            run.phase("write", |run| write(run, std::slice::from_ref(name), &left))?;
+            made.add(&left);
+            made.files.push(name.clone());
+            left = rest;
+        }
+        drop(progress);
+        std::fs::remove_dir_all(&work)
+            .with_context(|| format!("cannot remove {}", work.display()))?;
+        run.result("runs", next)?;
         Ok(())
     }
+}
 
-    /// Writes the shards; scene `k` goes to shard `k` modulo their number.
-    fn write(&self, run: &Run, scenes: &[Scenario]) -> anyhow::Result<Vec<String>> {
-        let n_shards = self
-            .shards
-            .map_or(SHARDS, NonZeroUsize::get)
-            .min(scenes.len());
-        let names: Vec<String> = (0..n_shards)
-            .map(|shard| format!("scenes-{shard:05}-of-{n_shards:05}.tfrecord.gz"))
-            .collect();
-        names.par_iter().enumerate().try_for_each(|(shard, name)| {
-            let of_shard = scenes.iter().skip(shard).step_by(n_shards);
-            gump_data::womd::write_scenarios(&run.path(name), of_shard).map(drop)
-        })?;
-        Ok(names)
+/// What a run made, counted.
+#[derive(Default)]
+struct Made {
+    scenes: usize,
+    by_class: BTreeMap<&'static str, usize>,
+    by_road: BTreeMap<String, usize>,
+    by_tag: BTreeMap<&'static str, usize>,
+    files: Vec<String>,
+}
+
+impl Made {
+    fn add(&mut self, scenes: &[Scenario]) {
+        self.scenes += scenes.len();
+        for scene in scenes {
+            for agent in scene.present().now().agents() {
+                *self.by_class.entry(agent.kind.name()).or_default() += 1;
+            }
+            for tag in &scene.tags {
+                *self.by_tag.entry(tag.name()).or_default() += 1;
+            }
+            *self.by_road.entry(road(&scene.id)).or_default() += 1;
+        }
     }
 }
 
-fn count(scenes: &[Scenario], of: impl Fn(&Scenario) -> usize) -> usize {
-    scenes.iter().map(of).sum()
-}
-
-fn by_class(scenes: &[Scenario]) -> BTreeMap<&'static str, usize> {
-    let mut counts = BTreeMap::new();
-    for agent in scenes
-        .iter()
-        .flat_map(|scene| scene.present().now().agents())
-    {
-        *counts.entry(agent.kind.name()).or_default() += 1;
-    }
-    counts
-}
-
-/// Scenes per road family, told from the front of their ids.
-fn by_road(scenes: &[Scenario]) -> BTreeMap<&'static str, usize> {
+/// The kind of road or the network, told from the front of a scene's id: what comes before the
+/// first part that begins with a digit or is a seed.
+fn road(id: &str) -> String {
     let families = RoadFamily::ALL.iter().map(|family| family.name());
-    let counts =
-        families.map(|name| (name, count(scenes, |s| usize::from(s.id.starts_with(name)))));
-    counts.filter(|&(_, n)| n > 0).collect()
+    if let Some(family) = families.into_iter().find(|name| id.starts_with(name)) {
+        return family.to_owned();
+    }
+    // NETWORK-RUN-WINDOW-EGO
+    id.rsplitn(4, '-').nth(3).unwrap_or(id).to_owned()
+}
+
+/// Adds the first of every list, then the second, and so on.
+fn interleave(lists: Vec<Vec<Scenario>>, all: &mut Vec<Scenario>) {
+    let mut lists: Vec<_> = lists.into_iter().map(Vec::into_iter).collect();
+    loop {
+        let before = all.len();
+        all.extend(lists.iter_mut().filter_map(Iterator::next));
+        if all.len() == before {
+            return;
+        }
+    }
+}
+
+fn shard_names(n_shards: usize) -> Vec<String> {
+    (0..n_shards)
+        .map(|shard| format!("scenes-{shard:05}-of-{n_shards:05}.tfrecord.gz"))
+        .collect()
+}
+
+/// Writes shards; scene `k` goes to shard `k` modulo their number.
+fn write(run: &Run, names: &[String], scenes: &[Scenario]) -> anyhow::Result<()> {
+    names.par_iter().enumerate().try_for_each(|(shard, name)| {
+        let of_shard = scenes.iter().skip(shard).step_by(names.len());
+        gump_data::womd::write_scenarios(&run.path(name), of_shard).map(drop)
+    })?;
+    Ok(())
 }
 
 fn road_family(name: &str) -> Result<RoadFamily, String> {

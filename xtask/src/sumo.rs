@@ -1,0 +1,300 @@
+//! The real SUMO: found, asked for if it is missing, and run.
+//!
+//! What a run is told comes from `gump_synthesis`, what it puts out is read by `gump_data::sumo`;
+//! here are the programs, the folders, and one run from a seed to scenes.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+
+use anyhow::Context as _;
+use gump_data::ReadOptions;
+use gump_data::sumo::{CutOptions, Demand, Network, Roads, open_on};
+use gump_scene::{Scenario, Seed};
+use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion};
+use rand::Rng as _;
+
+/// Simulated seconds before the first window, so that queues have formed.
+const WARMUP_S: f64 = 60.0;
+/// Windows of nine seconds per run.
+const WINDOWS: usize = 6;
+/// Seconds between two windows: scenes of one run shall differ.
+const PAUSE_S: f64 = 5.0;
+/// Seconds between frames.
+const STEP_S: f64 = 0.1;
+
+/// Lateral acceleration at which curves of junctions are driven, metres per second squared.
+/// SUMO's default of 5.5 makes the yaw rates of a race; see docs/results/0006-factory.md.
+const TURN_ACCELERATION: f64 = 2.2;
+/// Points of a curve through a junction; SUMO's default of 5 leaves corners.
+const CURVE_POINTS: u32 = 12;
+
+/// The programs of a SUMO installation.
+#[derive(Clone, Debug)]
+pub(crate) struct Sumo {
+    programs: PathBuf,
+    home: Option<PathBuf>,
+}
+
+/// A network to simulate on, and its name in scene ids.
+pub(crate) struct Place {
+    pub(crate) name: String,
+    file: PathBuf,
+    network: Network,
+    roads: Arc<Roads>,
+}
+
+impl Sumo {
+    /// Looks for SUMO in `SUMO_HOME`, on the path, and among the packages of Python.
+    ///
+    /// Error: a sentence that tells how to install it.
+    pub(crate) fn find() -> anyhow::Result<Self> {
+        let has = |folder: &Path| folder.join("sumo").is_file();
+        if let Some(home) = std::env::var_os("SUMO_HOME").map(PathBuf::from) {
+            let programs = home.join("bin");
+            if has(&programs) {
+                let home = Some(home);
+                return Ok(Self { programs, home });
+            }
+        }
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        if let Some(programs) = std::env::split_paths(&path).find(|folder| has(folder)) {
+            let home = None;
+            return Ok(Self { programs, home });
+        }
+        if let Some(home) = home_of_python_package() {
+            let programs = home.join("bin");
+            if has(&programs) {
+                let home = Some(home);
+                return Ok(Self { programs, home });
+            }
+        }
+        anyhow::bail!(
+            "--kind sumo needs SUMO and found none in SUMO_HOME, on the PATH or in Python: \
+             install it with `pip install eclipse-sumo` or `apt-get install sumo`; \
+             --kind procedural needs nothing"
+        )
+    }
+
+    /// What `sumo --version` says first.
+    pub(crate) fn version(&self) -> anyhow::Result<String> {
+        let output = self.command("sumo").arg("--version").output();
+        let output = output.context("cannot start sumo")?;
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        Ok(text.lines().next().unwrap_or_default().trim().to_owned())
+    }
+
+    /// Makes a network from a seed: a grid, a spider's web, or something irregular.
+    pub(crate) fn generate(&self, seed: Seed, folder: &Path) -> anyhow::Result<Place> {
+        let mut rng = seed.rng();
+        let shape = ["grid", "spider", "random"][rng.random_range(0..3)];
+        let length = rng.random_range(90..190).to_string();
+        let arms = rng.random_range(4..7).to_string();
+        let mut arguments: Vec<&str> = match shape {
+            "grid" => vec!["--grid", "--grid.number", "4", "--grid.length", &length],
+            "spider" => vec![
+                "--spider", "--spider.arm-number", &arms, "--spider.circle-number", "3",
+                "--spider.space-radius", &length,
+            ],
+            _ => vec![
+                "--rand", "--rand.iterations", "60", "--rand.min-distance", "80",
+                "--rand.max-distance", &length,
+            ],
+        };
+        let lanes = rng.random_range(1..4).to_string();
+        let speed = ["11.11", "13.89", "16.67"][rng.random_range(0..3)];
+        let control = ["traffic_light", "traffic_light", "priority", "allway_stop"];
+        let control = control[rng.random_range(0..control.len())];
+        arguments.extend(["--default.lanenumber", &lanes, "--default.speed", speed]);
+        arguments.extend(["--default.junctions.type", control]);
+        arguments.extend(["--default.junctions.radius", "7"]);
+        arguments.extend(["--sidewalks.guess", "--crossings.guess"]);
+        arguments.extend(["--perturb-x", "5", "--perturb-y", "5"]);
+        if rng.random_bool(0.4) {
+            arguments.push("--bikelanes.guess");
+        }
+        if lanes != "1" && control == "traffic_light" && rng.random_bool(0.5) {
+            arguments.extend(["--turn-lanes", "1", "--turn-lanes.length", "40"]);
+        }
+        let file = folder.join("made.net.xml");
+        let seed = (seed.0 % (1 << 31)).to_string();
+        let mut command = self.command("netgenerate");
+        command.args(arguments).args(["--seed", &seed]);
+        run(curves(&mut command).arg("-o").arg(&file))?;
+        Place::read(format!("made-{shape}"), file)
+    }
+
+    /// Prepares a network for simulation: finer and slower curves through junctions.
+    pub(crate) fn prepare(&self, network: &Path, folder: &Path) -> anyhow::Result<Place> {
+        let name = name_of(network);
+        let file = folder.join(format!("{name}.net.xml"));
+        let mut command = self.command("netconvert");
+        command.arg("-s").arg(network);
+        run(curves(&mut command).arg("-o").arg(&file))?;
+        Place::read(name, file)
+    }
+
+    /// Simulates once on a network and cuts scenes out; the same for the same seed.
+    pub(crate) fn scenes(
+        &self,
+        place: &Place,
+        demand: &SumoDemand,
+        seed: Seed,
+        id: &str,
+        folder: &Path,
+    ) -> anyhow::Result<Vec<Scenario>> {
+        std::fs::create_dir_all(folder)
+            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        let cut = CutOptions {
+            pause_s: PAUSE_S,
+            without_overlaps: true,
+            seed: seed.fork(1),
+            ..CutOptions::standard()
+        };
+        let window_s = cut.history_s + cut.future_s + PAUSE_S;
+        let until_s = WARMUP_S + WINDOWS as f64 * window_s;
+        let demand = SumoDemand { until_s, ..demand.clone() };
+        let routes = folder.join("demand.rou.xml");
+        draw_sumo_demand(&place.network, &demand, seed).write(&routes)?;
+        let orders = folder.join("signals.add.xml");
+        let systems = place.network.signal_systems();
+        // SUMO takes the path from the folder of the orders.
+        Demand::write_signal_log(&systems, "states.xml", &orders)?;
+        let cars = folder.join(format!("{id}.fcd.xml"));
+        let mut command = self.command("sumo");
+        command.arg("-n").arg(&place.file).arg("-r").arg(&routes).arg("-a").arg(&orders);
+        command.arg("--fcd-output").arg(&cars);
+        command.args(["--fcd-output.attributes", "x,y,angle,type", "--precision", "3"]);
+        command.args(["--step-length", &STEP_S.to_string()]);
+        command.args(["--device.fcd.begin", &WARMUP_S.to_string()]);
+        command.args(["--end", &until_s.to_string()]);
+        command.args(["--seed", &(seed.0 % (1 << 31)).to_string()]);
+        // Half lanes side by side: smooth lane changes, cars pass bicycles within a lane.
+        command.args(["--lateral-resolution", "0.8", "--ignore-route-errors"]);
+        command.args(["--time-to-teleport", "-1", "--collision.action", "none"]);
+        command.args(["--no-step-log", "--no-warnings", "--xml-validation", "never"]);
+        run(&mut command)?;
+        let mut scenes = Vec::new();
+        for record in open_on(&cars, Arc::clone(&place.roads), cut, ReadOptions::ALL)? {
+            let mut scene = record?.scenario;
+            smooth_motion(&mut scene);
+            scene.tags = gump_metrics::tags::mine(&scene);
+            scenes.push(scene);
+        }
+        std::fs::remove_dir_all(folder)
+            .with_context(|| format!("cannot remove {}", folder.display()))?;
+        Ok(scenes)
+    }
+
+    fn command(&self, program: &str) -> Command {
+        let mut command = Command::new(self.programs.join(program));
+        if let Some(home) = &self.home {
+            command.env("SUMO_HOME", home);
+        }
+        command.stdin(Stdio::null());
+        command
+    }
+}
+
+impl Place {
+    fn read(name: String, file: PathBuf) -> anyhow::Result<Self> {
+        let network = Network::read(&file)?;
+        let roads = Arc::new(Roads::new(&network));
+        Ok(Self { name, file, network, roads })
+    }
+}
+
+/// The networks of a file or folder, in the order of their paths.
+///
+/// Error: a folder that cannot be listed or holds no network.
+pub(crate) fn networks(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    if path.is_dir() {
+        list(path, &mut found)?;
+        found.sort();
+    } else {
+        anyhow::ensure!(path.is_file(), "expected a network, found none: {}", path.display());
+        found.push(path.to_owned());
+    }
+    let folder = path.display();
+    anyhow::ensure!(!found.is_empty(), "expected *.net.xml or *.net.xml.gz, found none: {folder}");
+    Ok(found)
+}
+
+fn list(folder: &Path, found: &mut Vec<PathBuf>) -> anyhow::Result<()> {
+    let cannot = || format!("cannot list {}", folder.display());
+    for entry in std::fs::read_dir(folder).with_context(cannot)? {
+        let path = entry.with_context(cannot)?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if path.is_dir() {
+            list(&path, found)?;
+        } else if name.ends_with(".net.xml") || name.ends_with(".net.xml.gz") {
+            found.push(path);
+        }
+    }
+    Ok(())
+}
+
+/// A network's name: its file's, or its folder's where the file is named after nothing.
+fn name_of(network: &Path) -> String {
+    let stem = |path: &Path| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        name.split('.').next().unwrap_or_default().replace('_', "-")
+    };
+    let name = stem(network);
+    match network.parent() {
+        Some(folder) if ["net", "network", "osm", "map"].contains(&name.as_str()) => stem(folder),
+        _ => name,
+    }
+}
+
+fn curves(command: &mut Command) -> &mut Command {
+    command.args(["--junctions.limit-turn-speed", &TURN_ACCELERATION.to_string()]);
+    command.args(["--junctions.internal-link-detail", &CURVE_POINTS.to_string()]);
+    command.args(["--no-turnarounds.except-deadend", "--no-warnings"]);
+    command.args(["--xml-validation", "never"])
+}
+
+/// Runs a program to its end.
+///
+/// Error: it cannot be started, or fails; then with the last line it wrote.
+fn run(command: &mut Command) -> anyhow::Result<()> {
+    let program = command.get_program().to_string_lossy().into_owned();
+    let output = command.output().with_context(|| format!("cannot start {program}"))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let lines: Vec<_> = said.lines().filter(|line| line.contains("rror")).collect();
+    anyhow::bail!("{program} failed ({}): {}", output.status, lines.join(" "))
+}
+
+fn home_of_python_package() -> Option<PathBuf> {
+    let asked = Command::new("python3")
+        .args(["-c", "import sumo; print(sumo.SUMO_HOME)"])
+        .stdin(Stdio::null())
+        .output()
+        .ok()?;
+    let home = String::from_utf8_lossy(&asked.stdout).trim().to_owned();
+    (asked.status.success() && !home.is_empty()).then(|| PathBuf::from(home))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn networks_are_named_after_what_tells_them_apart() {
+        let check = |path: &str, expected| assert_eq!(name_of(Path::new(path)), expected);
+        check("a/acosta_buslanes.net.xml.gz", "acosta-buslanes");
+        check("a/berlin_doerpfeldstr/net.net.xml.gz", "berlin-doerpfeldstr");
+        check("i80.net.xml", "i80");
+    }
+
+    #[test]
+    fn a_folder_without_networks_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = networks(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("found none"), "{error}");
+    }
+}
