@@ -46,6 +46,12 @@ pub(crate) struct ManifestFile {
     pub(crate) scenes: usize,
     /// Lower-case hexadecimal.
     pub(crate) sha256: String,
+    /// An SPDX expression, where it is not that of the set.
+    pub(crate) licence: Option<String>,
+    /// How it came about, where that is not how the set did.
+    pub(crate) provenance: Option<String>,
+    /// What must be passed on with it.
+    pub(crate) notice: Option<String>,
     /// Which of its scenes are for what.
     pub(crate) split: Splits,
 }
@@ -146,6 +152,8 @@ pub(crate) fn read(parts: &[Part], progress: &Progress) -> anyhow::Result<Vec<Sc
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeSet;
+
     use crate::machine::repository;
     use sha2::{Digest, Sha256};
 
@@ -158,6 +166,10 @@ mod tests {
         assert_eq!(manifest.licence, "Apache-2.0");
         let silent = Progress::begin(true, "", 0, "");
         for file in &manifest.files {
+            let is_ours = file.licence.is_none() || file.licence.as_deref() == Some("Apache-2.0");
+            assert!(is_ours || file.notice.is_some(), "{}", file.path.display());
+            let made = file.provenance.as_ref();
+            assert!(made.is_none_or(|how| how.starts_with("cargo xtask data synthesize")));
             let path = folder.join(&file.path);
             let digest = Sha256::digest(std::fs::read(&path).unwrap());
             let digest: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -170,12 +182,22 @@ mod tests {
             scenes.into_iter().map(|scene| scene.id).collect::<Vec<_>>()
         };
         let [train, validation, test] = [Split::Train, Split::Validation, Split::Test].map(of);
-        assert_eq!((train.len(), validation.len(), test.len()), (16, 4, 4));
-        assert!(
-            train
-                .iter()
-                .all(|id| !validation.contains(id) && !test.contains(id))
-        );
+        assert_eq!((train.len(), validation.len(), test.len()), (66, 12, 24));
+        // The ids of SUMO's scenes are NETWORK-RUN-WINDOW-EGO.
+        let network = |id: &String| {
+            let mut parts = id.rsplitn(4, '-');
+            let is_numbered = parts.by_ref().take(3).all(|p| p.parse::<u32>().is_ok());
+            let name = parts.next().filter(|_| is_numbered);
+            name.map(str::to_owned)
+        };
+        let networks = |ids: &[String]| ids.iter().filter_map(network).collect::<BTreeSet<_>>();
+        let [a, b, c] = [&train, &validation, &test].map(|ids| networks(ids));
+        assert!(a.contains("berlin-doerpfeldstr") && c.contains("tavf-hamburg"));
+        for (one, other) in [(&a, &b), (&a, &c), (&b, &c)] {
+            assert!(one.is_disjoint(other), "{one:?} and {other:?}");
+        }
+        let all: BTreeSet<_> = train.iter().chain(&validation).chain(&test).collect();
+        assert_eq!(all.len(), 102, "every scene has an id of its own");
     }
 
     #[test]

@@ -10,7 +10,8 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::sumo::{CutOptions, Demand, Network, Roads, open_on};
-use gump_scene::{Scenario, Seed};
+use gump_metrics::overlapping;
+use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion};
 use rand::Rng as _;
 
@@ -26,6 +27,8 @@ const STEP_S: f64 = 0.1;
 /// Lateral acceleration at which curves of junctions are driven, metres per second squared.
 /// SUMO's default of 5.5 makes the yaw rates of a race; see docs/results/0006-factory.md.
 const TURN_ACCELERATION: f64 = 2.2;
+/// Nobody of SUMO's people runs: more is a jump, metres per second.
+const FASTEST_WALK: f64 = 4.0;
 /// Points of a curve through a junction; SUMO's default of 5 leaves corners.
 const CURVE_POINTS: u32 = 12;
 
@@ -93,12 +96,22 @@ impl Sumo {
         let mut arguments: Vec<&str> = match shape {
             "grid" => vec!["--grid", "--grid.number", "4", "--grid.length", &length],
             "spider" => vec![
-                "--spider", "--spider.arm-number", &arms, "--spider.circle-number", "3",
-                "--spider.space-radius", &length,
+                "--spider",
+                "--spider.arm-number",
+                &arms,
+                "--spider.circle-number",
+                "3",
+                "--spider.space-radius",
+                &length,
             ],
             _ => vec![
-                "--rand", "--rand.iterations", "60", "--rand.min-distance", "80",
-                "--rand.max-distance", &length,
+                "--rand",
+                "--rand.iterations",
+                "60",
+                "--rand.min-distance",
+                "80",
+                "--rand.max-distance",
+                &length,
             ],
         };
         let lanes = rng.random_range(1..4).to_string();
@@ -153,7 +166,10 @@ impl Sumo {
         };
         let window_s = cut.history_s + cut.future_s + PAUSE_S;
         let until_s = WARMUP_S + WINDOWS as f64 * window_s;
-        let demand = SumoDemand { until_s, ..demand.clone() };
+        let demand = SumoDemand {
+            until_s,
+            ..demand.clone()
+        };
         let routes = folder.join("demand.rou.xml");
         draw_sumo_demand(&place.network, &demand, seed).write(&routes)?;
         let orders = folder.join("signals.add.xml");
@@ -162,9 +178,20 @@ impl Sumo {
         Demand::write_signal_log(&systems, "states.xml", &orders)?;
         let cars = folder.join(format!("{id}.fcd.xml"));
         let mut command = self.command("sumo");
-        command.arg("-n").arg(&place.file).arg("-r").arg(&routes).arg("-a").arg(&orders);
+        command
+            .arg("-n")
+            .arg(&place.file)
+            .arg("-r")
+            .arg(&routes)
+            .arg("-a")
+            .arg(&orders);
         command.arg("--fcd-output").arg(&cars);
-        command.args(["--fcd-output.attributes", "x,y,angle,type", "--precision", "3"]);
+        command.args([
+            "--fcd-output.attributes",
+            "x,y,angle,type",
+            "--precision",
+            "3",
+        ]);
         command.args(["--step-length", &STEP_S.to_string()]);
         command.args(["--device.fcd.begin", &WARMUP_S.to_string()]);
         command.args(["--end", &until_s.to_string()]);
@@ -172,12 +199,20 @@ impl Sumo {
         // Half lanes side by side: smooth lane changes, cars pass bicycles within a lane.
         command.args(["--lateral-resolution", "0.8", "--ignore-route-errors"]);
         command.args(["--time-to-teleport", "-1", "--collision.action", "none"]);
-        command.args(["--no-step-log", "--no-warnings", "--xml-validation", "never"]);
+        command.args([
+            "--no-step-log",
+            "--no-warnings",
+            "--xml-validation",
+            "never",
+        ]);
         run(&mut command)?;
         let mut scenes = Vec::new();
         for record in open_on(&cars, Arc::clone(&place.roads), cut, ReadOptions::ALL)? {
             let mut scene = record?.scenario;
             smooth_motion(&mut scene);
+            if is_odd(&scene) {
+                continue;
+            }
             scene.tags = gump_metrics::tags::mine(&scene);
             scenes.push(scene);
         }
@@ -200,8 +235,25 @@ impl Place {
     fn read(name: String, file: PathBuf) -> anyhow::Result<Self> {
         let network = Network::read(&file)?;
         let roads = Arc::new(Roads::new(&network));
-        Ok(Self { name, file, network, roads })
+        Ok(Self {
+            name,
+            file,
+            network,
+            roads,
+        })
     }
+}
+
+/// Boxes overlap at the present, or somebody on foot jumps, as SUMO's people do now and then where
+/// sidewalks end.
+fn is_odd(scene: &Scenario) -> bool {
+    let present = scene.present().now();
+    let mut agents = present.agents().iter();
+    let overlaps = agents.any(|agent| overlapping(present, agent).next().is_some());
+    let jumps =
+        |agent: &Agent| agent.kind == AgentKind::Pedestrian && agent.state.speed() > FASTEST_WALK;
+    let mut log = scene.log.iter().flat_map(|frame| frame.agents());
+    overlaps || log.any(jumps)
 }
 
 /// The networks of a file or folder, in the order of their paths.
@@ -213,11 +265,18 @@ pub(crate) fn networks(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
         list(path, &mut found)?;
         found.sort();
     } else {
-        anyhow::ensure!(path.is_file(), "expected a network, found none: {}", path.display());
+        anyhow::ensure!(
+            path.is_file(),
+            "expected a network, found none: {}",
+            path.display()
+        );
         found.push(path.to_owned());
     }
     let folder = path.display();
-    anyhow::ensure!(!found.is_empty(), "expected *.net.xml or *.net.xml.gz, found none: {folder}");
+    anyhow::ensure!(
+        !found.is_empty(),
+        "expected *.net.xml or *.net.xml.gz, found none: {folder}"
+    );
     Ok(found)
 }
 
@@ -225,7 +284,11 @@ fn list(folder: &Path, found: &mut Vec<PathBuf>) -> anyhow::Result<()> {
     let cannot = || format!("cannot list {}", folder.display());
     for entry in std::fs::read_dir(folder).with_context(cannot)? {
         let path = entry.with_context(cannot)?.path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
         if path.is_dir() {
             list(&path, found)?;
         } else if name.ends_with(".net.xml") || name.ends_with(".net.xml.gz") {
@@ -249,8 +312,14 @@ fn name_of(network: &Path) -> String {
 }
 
 fn curves(command: &mut Command) -> &mut Command {
-    command.args(["--junctions.limit-turn-speed", &TURN_ACCELERATION.to_string()]);
-    command.args(["--junctions.internal-link-detail", &CURVE_POINTS.to_string()]);
+    command.args([
+        "--junctions.limit-turn-speed",
+        &TURN_ACCELERATION.to_string(),
+    ]);
+    command.args([
+        "--junctions.internal-link-detail",
+        &CURVE_POINTS.to_string(),
+    ]);
     command.args(["--no-turnarounds.except-deadend", "--no-warnings"]);
     command.args(["--xml-validation", "never"])
 }
@@ -260,7 +329,9 @@ fn curves(command: &mut Command) -> &mut Command {
 /// Error: it cannot be started, or fails; then with the last line it wrote.
 fn run(command: &mut Command) -> anyhow::Result<()> {
     let program = command.get_program().to_string_lossy().into_owned();
-    let output = command.output().with_context(|| format!("cannot start {program}"))?;
+    let output = command
+        .output()
+        .with_context(|| format!("cannot start {program}"))?;
     if output.status.success() {
         return Ok(());
     }
@@ -287,7 +358,10 @@ mod tests {
     fn networks_are_named_after_what_tells_them_apart() {
         let check = |path: &str, expected| assert_eq!(name_of(Path::new(path)), expected);
         check("a/acosta_buslanes.net.xml.gz", "acosta-buslanes");
-        check("a/berlin_doerpfeldstr/net.net.xml.gz", "berlin-doerpfeldstr");
+        check(
+            "a/berlin_doerpfeldstr/net.net.xml.gz",
+            "berlin-doerpfeldstr",
+        );
         check("i80.net.xml", "i80");
     }
 

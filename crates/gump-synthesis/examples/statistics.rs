@@ -1,5 +1,6 @@
 //! Prints what procedural scenes are like: sizes, speeds, turns, accelerations, and how fast they
-//! are made. `cargo run -p gump-synthesis --example statistics -- [SCENES] [SEED]`
+//! are made. `cargo run -p gump-synthesis --example statistics -- [SCENES] [SEED]`, or the same of
+//! the scenes in a file: `... -- FILE`
 
 use std::collections::BTreeMap;
 
@@ -8,13 +9,25 @@ use gump_scene::{AgentKind, Scenario, Seed};
 use gump_synthesis::{SynthesisConfig, synthesize_many};
 
 fn main() {
+    let file = std::env::args().nth(1).map(std::path::PathBuf::from);
+    if let Some(file) = file.filter(|file| file.exists()) {
+        let records = gump_data::open(&file).expect("the file holds scenarios");
+        let scenes: Vec<_> = records.flatten().map(|record| record.scenario).collect();
+        print(&scenes);
+        return;
+    }
     let mut args = std::env::args()
         .skip(1)
         .filter_map(|arg| arg.parse::<u64>().ok());
     let (n, seed) = (args.next().unwrap_or(100), args.next().unwrap_or(0));
     let scenes = synthesize_many(&SynthesisConfig::standard(), Seed(seed), n as usize);
+    print(&scenes);
+}
+
+fn print(scenes: &[Scenario]) {
+    let n = scenes.len();
     let mut families: BTreeMap<&str, usize> = BTreeMap::new();
-    for scene in &scenes {
+    for scene in scenes {
         let family = scene.id.rsplit_once('-').map_or("", |(family, _)| family);
         *families.entry(family).or_default() += 1;
     }
@@ -23,11 +36,11 @@ fn main() {
         println!(
             "{} per scene: {}",
             kind.name(),
-            quantiles(count(&scenes, kind))
+            quantiles(count(scenes, kind))
         );
     }
     let mut steps = Steps::default();
-    for scene in &scenes {
+    for scene in scenes {
         steps.add(scene);
     }
     println!(

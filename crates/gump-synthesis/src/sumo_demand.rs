@@ -222,7 +222,13 @@ impl<'a> Part<'a> {
         let mut roads: Vec<Road<'_>> = normal()
             .filter_map(|edge| Road::of(edge, |lane| lane.access.cars))
             .collect();
+        // Without walking areas people jump from one end of a junction to the other.
+        let can_walk = network
+            .edges
+            .iter()
+            .any(|e| e.function == EdgeFunction::WalkingArea);
         let mut walks: Vec<Road<'_>> = normal()
+            .filter(|_| can_walk)
             .filter_map(|edge| Road::of(edge, |lane| lane.access.pedestrians))
             .collect();
         if !roads.is_empty() {

@@ -24,8 +24,8 @@ const INTEREST_RANGE: f64 = 50.0;
 const MANY_NEIGHBORS: f64 = 12.0;
 /// An ego drives at least this far in a window, metres.
 const MIN_DRIVEN: f64 = 5.0;
-/// An ego is a car or a van: at most this long, metres.
-const MAX_EGO_LENGTH: f64 = 7.0;
+/// An ego is a car or a van: so long, metres.
+const EGO_LENGTH: [f64; 2] = [3.0, 7.0];
 /// Time stamps may stray from the step by this, seconds: they are written with two digits.
 const TIME_TOLERANCE: f64 = 0.011;
 
@@ -196,7 +196,9 @@ impl Scenes {
         for (&id, placed) in now {
             let draw: f64 = rng.random_range(0.0..1.0);
             let stands: f64 = rng.random_range(0.0..1.0);
-            if placed.body.kind != AgentKind::Vehicle || placed.body.size[0] > MAX_EGO_LENGTH {
+            if placed.body.kind != AgentKind::Vehicle
+                || !(EGO_LENGTH[0]..EGO_LENGTH[1]).contains(&placed.body.size[0])
+            {
                 continue;
             }
             let there: Option<Vec<DVec2>> = self

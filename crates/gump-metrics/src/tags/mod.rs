@@ -521,10 +521,7 @@ fn is_on_crosswalk(s: &Situation<'_>, other: &Other<'_>) -> bool {
 fn shares_crosswalk(s: &Situation<'_>, other: &Other<'_>) -> bool {
     let place = other.agent.state.pose.position;
     let own = footprint(s.ego);
-    let mut crosswalks = s
-        .scenario
-        .map
-        .areas_containing(place, AreaKind::Crosswalk);
+    let mut crosswalks = s.scenario.map.areas_containing(place, AreaKind::Crosswalk);
     crosswalks.any(|area| area.polygon.intersects(&own))
 }
 

@@ -166,7 +166,9 @@ impl Args {
         for (shard, name) in names.iter().enumerate() {
             let wanted = n * (shard + 1) / names.len() - n * shard / names.len();
             while left.len() < wanted {
-                let runs = ((wanted - left.len()) as u64).div_ceil(RUN_SCENES).max(places.len() as u64);
+                let runs = ((wanted - left.len()) as u64)
+                    .div_ceil(RUN_SCENES)
+                    .max(places.len() as u64);
                 let found = run.phase("simulate", |_| {
                     let found = (next..next + runs).into_par_iter().map(|r| {
                         let scenes = one(r)?;
@@ -179,7 +181,11 @@ impl Args {
                 let before = left.len();
                 // Taken in turn, so that every network has its share however few are wanted.
                 interleave(found, &mut left);
-                barren = if left.len() > before { 0 } else { barren + runs };
+                barren = if left.len() > before {
+                    0
+                } else {
+                    barren + runs
+                };
                 anyhow::ensure!(
                     barren < BARREN_RUNS,
                     "{barren} runs of SUMO in a row gave no scene: is there room to drive?"
