@@ -2,7 +2,7 @@
 
 use gump_geometry::DVec2;
 use gump_rollout::BoxError;
-use gump_scene::AgentId;
+use gump_scene::{AgentId, RoadblockId};
 
 /// Why there is no plan.
 #[derive(Debug, thiserror::Error)]
@@ -16,6 +16,18 @@ pub enum PlanError {
     NoLaneAhead {
         /// Where the ego is, world frame, metres.
         position: DVec2,
+    },
+    /// A planner of the closed loop was asked before it was told where to go.
+    #[error("the planner was asked to drive before it was given a mission")]
+    NoMission,
+    /// There is nowhere to go.
+    #[error("the mission has no route, expected the roadblocks to drive through")]
+    NoRoute,
+    /// The route belongs to another map.
+    #[error("no roadblock of the route is in the map, the first is {first}")]
+    ForeignRoute {
+        /// The first roadblock of the route.
+        first: RoadblockId,
     },
     /// A state in the present frame is NaN or infinite.
     #[error("agent {agent} has a state that is not a finite number")]

@@ -27,19 +27,24 @@
 //! assert!(plan.candidates.iter().all(|c| c.score.as_ref().unwrap().mean <= score.mean + 1e-6));
 //! ```
 
+mod considered;
 mod driver;
 mod error;
 mod idm;
 mod interactive;
 mod obstacle;
 mod path_ahead;
+mod pdm;
 mod planner;
 mod proposal;
 mod propose;
+pub mod route_search;
 
+pub use considered::{Considered, Explain};
 pub use error::PlanError;
 pub use idm::IdmPlanner;
 pub use interactive::{Interactive, InteractiveConfig, planning_reward};
+pub use pdm::{PdmClosed, PdmConfig, PdmScore};
 pub use planner::{Candidate, CandidateScore, Plan, Planner, PlannerPolicy};
 pub use proposal::{Proposal, ProposalKind};
 pub use propose::{ProposalConfig, Proposals, emergency_brake, propose};

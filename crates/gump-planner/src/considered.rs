@@ -1,0 +1,38 @@
+//! What a driver considered before it decided.
+
+use gump_geometry::Pose;
+use gump_rollout::closed_loop::Driver;
+
+/// A driver that can say what it weighed in its last step.
+pub trait Explain: Driver {
+    /// Everything it considered, one of it chosen; empty before the first step.
+    fn considered(&self) -> Vec<Considered>;
+}
+
+/// One thing a driver might have done.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Considered {
+    /// What it is, in a few words.
+    pub name: String,
+    /// Whether it was done.
+    pub chosen: bool,
+    /// How good it was found; `None` where nothing is compared.
+    pub score: Option<f64>,
+    /// What the score is made of, by name.
+    pub parts: Vec<(&'static str, f64)>,
+    /// Where it leads: rear axle, world frame; may be empty.
+    pub poses: Vec<Pose>,
+}
+
+impl Considered {
+    /// What was done without an alternative.
+    pub fn alone(name: &str, poses: Vec<Pose>) -> Self {
+        Self {
+            name: name.to_owned(),
+            chosen: true,
+            score: None,
+            parts: Vec::new(),
+            poses,
+        }
+    }
+}

@@ -1,0 +1,267 @@
+//! How good the tracked proposals are.
+//!
+//! Definitions shared with nuPlan's metrics (whose fault a collision is, what is ahead, comfort)
+//! come from `gump_metrics::nuplan`; what is PDM's own is here.
+
+use std::collections::BTreeSet;
+
+use gump_geometry::{DVec2, OrientedBox, Quad};
+use gump_metrics::nuplan::{classify, is_ahead, is_behind};
+use gump_scene::{EgoState, VehicleParameters};
+
+use super::comfort::ComfortFilters;
+use super::forecast::{Forecast, MOMENTS, Object, Token};
+use super::ground::{Footing, Ground};
+use super::propose::Line;
+
+/// Metres against the traffic that halve the score, and that spoil it.
+const WRONG_WAY: [f64; 2] = [2.0, 6.0];
+/// If no proposal comes farther than this, metres, none is blamed for it.
+const NO_PROGRESS: f64 = 0.1;
+/// Steps ahead at which a collision at constant speed is looked for.
+const TTC_STEPS: [usize; 4] = [0, 3, 6, 9];
+/// Below this speed, metres per second, nobody runs into anything.
+const TTC_STANDING: f64 = 0.005;
+/// Weights of progress, time to collision and comfort.
+const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
+
+/// The score of a proposal with its parts.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PdmScore {
+    /// What counts: the product of the first three parts times the weighted mean of the others.
+    pub total: f64,
+    /// 1, 0.5 if a static thing is hit, 0 if anyone else is, by the ego's fault.
+    pub no_at_fault_collision: f64,
+    /// 1 if the ego stays on the road, else 0.
+    pub drivable_area: f64,
+    /// 1, 0.5 or 0 by how far the ego drives against the traffic.
+    pub driving_direction: f64,
+    /// Share of the way of the proposal that comes farthest.
+    pub progress: f64,
+    /// 1 if nothing is run into within a second at constant speed, else 0.
+    pub time_to_collision: f64,
+    /// 1 if it is comfortable, else 0.
+    pub comfort: f64,
+    /// Metres along the centre line.
+    pub progress_m: f64,
+    /// Step of the first collision by the ego's fault.
+    pub collision_step: Option<usize>,
+    /// First step from which something is run into.
+    pub ttc_step: Option<usize>,
+}
+
+impl PdmScore {
+    fn gates(&self) -> f64 {
+        self.no_at_fault_collision * self.drivable_area * self.driving_direction
+    }
+}
+
+/// What proposals are judged against.
+pub(crate) struct Judge<'a> {
+    pub(crate) vehicle: &'a VehicleParameters,
+    pub(crate) forecast: &'a Forecast,
+    pub(crate) ground: &'a Ground,
+    pub(crate) centerline: &'a Line,
+}
+
+/// One proposal as the vehicle would drive it.
+struct Tracked<'a> {
+    states: &'a [EgoState],
+    boxes: Vec<OrientedBox>,
+    quads: Vec<Quad>,
+    footings: Vec<Footing>,
+}
+
+impl Tracked<'_> {
+    fn off_lane(&self, step: usize) -> bool {
+        self.footings[step].multiple_lanes || self.footings[step].off_road
+    }
+}
+
+impl Judge<'_> {
+    /// One score per proposal.
+    pub(crate) fn judge(
+        &self,
+        drives: &[Vec<EgoState>],
+        comfort: &mut ComfortFilters,
+    ) -> Vec<PdmScore> {
+        let mut scores: Vec<PdmScore> = drives
+            .iter()
+            .map(|states| {
+                let tracked = self.track(states);
+                let (no_at_fault_collision, collision_step) = self.collision(&tracked);
+                let ttc_step = self.time_to_collision(&tracked);
+                let off_road = tracked.footings.iter().any(|footing| footing.off_road);
+                PdmScore {
+                    no_at_fault_collision,
+                    collision_step,
+                    ttc_step,
+                    time_to_collision: f64::from(u8::from(ttc_step.is_none())),
+                    drivable_area: f64::from(u8::from(!off_road)),
+                    driving_direction: driving_direction(&tracked),
+                    comfort: f64::from(u8::from(comfort.are_comfortable(states))),
+                    progress_m: self.progress(&tracked),
+                    ..PdmScore::default()
+                }
+            })
+            .collect();
+        normalize(&mut scores);
+        scores
+    }
+
+    fn track<'s>(&self, states: &'s [EgoState]) -> Tracked<'s> {
+        let boxes: Vec<OrientedBox> = states
+            .iter()
+            .map(|state| self.vehicle.footprint(state.rear_axle))
+            .collect();
+        let quads: Vec<Quad> = boxes.iter().map(Quad::from).collect();
+        let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        let (min, max) = quads.iter().map(Quad::bounds).fold(none, |all, (min, max)| {
+            (all.0.min(min), all.1.max(max))
+        });
+        let mut surfaces = Vec::new();
+        self.ground.within(min, max, &mut surfaces);
+        let footings = quads
+            .iter()
+            .zip(&boxes)
+            .map(|(quad, shape)| self.ground.footing(quad.corners(), shape.pose.position, &surfaces))
+            .collect();
+        Tracked {
+            states,
+            boxes,
+            quads,
+            footings,
+        }
+    }
+
+    fn progress(&self, tracked: &Tracked<'_>) -> f64 {
+        let at = |shape: &OrientedBox| self.centerline.project(shape.pose.position);
+        let (first, last) = (&tracked.boxes[0], &tracked.boxes[tracked.boxes.len() - 1]);
+        (at(last) - at(first)).max(0.0)
+    }
+
+    /// The factor for collisions, and when the first is the ego's fault.
+    fn collision(&self, tracked: &Tracked<'_>) -> (f64, Option<usize>) {
+        let mut ignored = self.forecast.collided.clone();
+        let (mut score, mut first) = (1.0, None);
+        let nearby = self.nearby(tracked.quads.iter());
+        for (step, quad) in tracked.quads.iter().enumerate() {
+            for object in &nearby {
+                if !touches(quad, object, step / 2) || ignored.contains(&object.token()) {
+                    continue;
+                }
+                let state = &tracked.states[step];
+                let met = object.agent(step / 2);
+                let kind = classify(&tracked.boxes[step], state.rear_axle, state.speed(), &met);
+                if kind.is_at_fault(!tracked.off_lane(step)) {
+                    let factor = if object.agent.kind.is_moving() { 0.0 } else { 0.5 };
+                    score = f64::min(score, factor);
+                    first = first.or(Some(step));
+                } else {
+                    ignored.insert(object.token());
+                }
+            }
+        }
+        (score, first)
+    }
+
+    /// The first step at which going straight on would run into something within a second.
+    fn time_to_collision(&self, tracked: &Tracked<'_>) -> Option<usize> {
+        let mut ignored: BTreeSet<Token> = self.forecast.collided.clone();
+        let ahead = |step: usize, ahead: usize| {
+            let state = &tracked.states[step];
+            let way = state.rear_axle.direction() * (state.speed() * 0.1 * ahead as f64);
+            Quad::new(tracked.quads[step].corners().map(|corner| corner + way))
+        };
+        let last = TTC_STEPS[TTC_STEPS.len() - 1];
+        let far: Vec<Quad> = (0..tracked.quads.len()).map(|step| ahead(step, last)).collect();
+        let nearby = self.nearby(tracked.quads.iter().chain(&far));
+        if nearby.is_empty() {
+            return None;
+        }
+        for (step, state) in tracked.states.iter().enumerate() {
+            if state.speed() < TTC_STANDING {
+                continue;
+            }
+            let mut careful: Option<bool> = None;
+            for later in TTC_STEPS {
+                let quad = ahead(step, later);
+                let moment = (step + later) / 2;
+                for object in &nearby {
+                    if !touches(&quad, object, moment) || ignored.contains(&object.token()) {
+                        continue;
+                    }
+                    let place = object.center(moment);
+                    let rear_axle = state.rear_axle;
+                    let careful = *careful.get_or_insert_with(|| {
+                        tracked.off_lane(step) || self.ground.is_in_intersection(rear_axle.position)
+                    });
+                    if is_ahead(rear_axle, place) || (careful && !is_behind(rear_axle, place)) {
+                        return Some(step);
+                    }
+                    ignored.insert(object.token());
+                }
+            }
+        }
+        None
+    }
+
+    /// Objects that some of these boxes might ever meet.
+    fn nearby<'q>(&self, quads: impl Iterator<Item = &'q Quad>) -> Vec<&Object> {
+        let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        let (low, high) = quads.map(Quad::bounds).fold(none, |all, (min, max)| {
+            (all.0.min(min), all.1.max(max))
+        });
+        let objects = self.forecast.objects.iter();
+        objects
+            .filter(|object| {
+                let (min, max) = object.swept();
+                min.cmple(high).all() && low.cmple(max).all()
+            })
+            .collect()
+    }
+}
+
+fn touches(quad: &Quad, object: &Object, moment: usize) -> bool {
+    let (low, high) = object.bounds(moment.min(MOMENTS - 1));
+    let (min, max) = quad.bounds();
+    min.cmple(high).all() && low.cmple(max).all() && quad.intersects(&object.quad(moment))
+}
+
+/// The factor for the longest stretch driven against the traffic.
+fn driving_direction(tracked: &Tracked<'_>) -> f64 {
+    let (mut longest, mut stretch) = (0.0f64, 0.0);
+    for (step, footing) in tracked.footings.iter().enumerate() {
+        if !footing.oncoming {
+            stretch = 0.0;
+        } else if step > 0 {
+            let place = |i: usize| tracked.boxes[i].pose.position;
+            stretch += place(step).distance(place(step - 1));
+        }
+        longest = longest.max(stretch);
+    }
+    match longest {
+        l if l < WRONG_WAY[0] => 1.0,
+        l if l < WRONG_WAY[1] => 0.5,
+        _ => 0.0,
+    }
+}
+
+/// Relates progress to the farthest proposal and adds everything up.
+fn normalize(scores: &mut [PdmScore]) {
+    let farthest = scores
+        .iter()
+        .map(|score| score.progress_m * score.gates())
+        .fold(0.0, f64::max);
+    for score in scores {
+        let gates = score.gates();
+        score.progress = if farthest > NO_PROGRESS {
+            score.progress_m * gates / farthest
+        } else {
+            f64::from(u8::from(gates != 0.0))
+        };
+        let parts = [score.progress, score.time_to_collision, score.comfort];
+        let sum: f64 = parts.iter().zip(WEIGHTS).map(|(part, weight)| part * weight).sum();
+        score.total = gates * sum / WEIGHTS.iter().sum::<f64>();
+    }
+}
