@@ -1,7 +1,8 @@
 //! What can keep a planner from planning.
 
 use gump_geometry::DVec2;
-use gump_rollout::BoxError;
+use gump_metrics::nuplan::NuPlanError;
+use gump_rollout::{BoxError, RolloutError};
 use gump_scene::{AgentId, RoadblockId};
 
 /// Why there is no plan.
@@ -23,6 +24,12 @@ pub enum PlanError {
     /// There is nowhere to go.
     #[error("the mission has no route, expected the roadblocks to drive through")]
     NoRoute,
+    /// A closed loop stopped.
+    #[error(transparent)]
+    Drive(#[from] RolloutError),
+    /// A drive that cannot be scored.
+    #[error(transparent)]
+    Score(#[from] NuPlanError),
     /// The route belongs to another map.
     #[error("no roadblock of the route is in the map, the first is {first}")]
     ForeignRoute {

@@ -27,8 +27,10 @@
 //! assert!(plan.candidates.iter().all(|c| c.score.as_ref().unwrap().mean <= score.mean + 1e-6));
 //! ```
 
+pub mod closed_loop;
 mod considered;
 mod driver;
+mod drivers;
 mod error;
 mod idm;
 mod interactive;
@@ -41,6 +43,7 @@ mod propose;
 pub mod route_search;
 
 pub use considered::{Considered, Explain};
+pub use drivers::{LogDriver, NuplanIdmDriver, Planned, SimpleDriver};
 pub use error::PlanError;
 pub use idm::IdmPlanner;
 pub use interactive::{Interactive, InteractiveConfig, planning_reward};

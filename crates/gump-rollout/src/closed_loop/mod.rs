@@ -9,11 +9,13 @@
 mod controller;
 mod driver;
 mod recording;
+mod roadblocks;
 mod traffic;
 
 pub use controller::{Controller, Tracking};
 pub use driver::{Driver, Mission, Moment};
 pub use recording::Recording;
+pub use roadblocks::derive_roadblocks;
 pub use traffic::{Imagined, Others, Replayed, Step, Traffic};
 
 use gump_scene::{EgoState, Frame, Rollout, SceneState};

@@ -1,0 +1,122 @@
+//! Closed-loop evaluation: drive, score, over and over.
+//!
+//! [`drive_and_score`] does one recording, [`evaluate`] many at once. What fails is an error of its
+//! recording; nothing here averages.
+
+use gump_metrics::nuplan::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
+use gump_metrics::nuplan::{open_loop, score};
+use gump_rollout::closed_loop::{DriveConfig, Driven, Driver, Recording, Tracking, Traffic, drive};
+use gump_scene::{EgoState, MapGraph};
+use rayon::prelude::*;
+
+use crate::PlanError;
+
+/// A finished drive with what it is worth.
+#[derive(Clone, Debug)]
+pub struct Scored {
+    /// What happened.
+    pub driven: Driven,
+    /// Every metric.
+    pub metrics: ClosedLoop,
+    /// nuPlan's score, 0 to 1.
+    pub score: f64,
+}
+
+/// Lets a driver drive a recording among some traffic and scores it as nuPlan's closed-loop
+/// challenges do.
+///
+/// `map` is what the drive is judged on; usually that of the recording, but one without the
+/// roadblocks that were derived for driving judges by what was really stated.
+///
+/// # Errors
+/// [`PlanError::Drive`] with the iteration if the loop cannot go on, [`PlanError::Score`] if what
+/// was driven cannot be scored.
+pub fn drive_and_score(
+    recording: &Recording,
+    map: &MapGraph,
+    traffic: &mut dyn Traffic,
+    driver: &mut dyn Driver,
+    config: &DriveConfig,
+) -> Result<Scored, PlanError> {
+    let driven = drive(recording, traffic, driver, config)?;
+    let samples = samples(&driven);
+    let metrics = score(&judged(recording, map, &samples, &driven))?;
+    Ok(Scored {
+        score: metrics.score(&Scoring::closed_loop()),
+        metrics,
+        driven,
+    })
+}
+
+/// Lets a driver plan along the log without being followed, and compares its plans with what was
+/// driven; `after` is what was driven after the recording's end, if that is known.
+///
+/// # Errors
+/// As [`drive_and_score`].
+pub fn plan_and_compare(
+    recording: &Recording,
+    after: &[EgoState],
+    traffic: &mut dyn Traffic,
+    driver: &mut dyn Driver,
+    seconds: f64,
+) -> Result<OpenLoop, PlanError> {
+    let config = DriveConfig {
+        tracking: Tracking::Log,
+        seconds,
+        keep_plans: true,
+    };
+    let driven = drive(recording, traffic, driver, &config)?;
+    let samples = samples(&driven);
+    let judged = judged(recording, &recording.scenario().map, &samples, &driven);
+    let config = OpenLoopConfig::default();
+    let per_second = (1.0 / recording.scenario().dt).round() as usize;
+    let last = (samples.len() - 1) / per_second * per_second;
+    let all = recording.expert().iter().chain(after).skip(last);
+    let longest = config.horizons[config.horizons.len() - 1].0;
+    let future: Vec<EgoState> =
+        all.step_by(per_second).skip(1).take(longest).copied().collect();
+    Ok(open_loop(&judged, &future, &config)?)
+}
+
+/// What was driven in the form that metrics read.
+pub fn samples(driven: &Driven) -> Vec<Sample> {
+    let states = driven.ego.iter().enumerate();
+    states
+        .map(|(i, ego)| Sample {
+            ego: *ego,
+            frame: driven.rollout.at(i).now().clone(),
+            plan: driven.plans.get(i).map_or(Vec::new(), |plan| plan.states().to_vec()),
+        })
+        .collect()
+}
+
+fn judged<'a>(
+    recording: &'a Recording,
+    map: &'a MapGraph,
+    samples: &'a [Sample],
+    driven: &Driven,
+) -> Drive<'a> {
+    let n = (driven.ego.len() + 1).min(recording.expert().len());
+    Drive {
+        samples,
+        expert: &recording.expert()[..n],
+        map,
+        ego: Some(recording.scenario().ego),
+        vehicle: *recording.vehicle(),
+    }
+}
+
+/// Works on recordings side by side, in memory only as many as there are threads; results come in
+/// the order of the recordings, whatever finishes first.
+pub fn evaluate<T: Send, R: Send>(
+    recordings: impl Iterator<Item = T> + Send,
+    work: impl Fn(usize, T) -> R + Sync,
+) -> Vec<R> {
+    let mut done: Vec<(usize, R)> = recordings
+        .enumerate()
+        .par_bridge()
+        .map(|(i, recording)| (i, work(i, recording)))
+        .collect();
+    done.sort_by_key(|(i, _)| *i);
+    done.into_iter().map(|(_, result)| result).collect()
+}

@@ -1,0 +1,65 @@
+//! The recorded driver, an oracle.
+
+use gump_rollout::closed_loop::{Driver, Mission, Moment, Recording};
+use gump_rollout::dynamics::Trajectory;
+use gump_rollout::{BoxError, RolloutError};
+use gump_scene::EgoState;
+
+use crate::considered::{Considered, Explain};
+
+/// Iterations between the states of a plan: half a second.
+const STRIDE: usize = 5;
+/// States of a plan besides the present: 8 s.
+const STATES: usize = 16;
+
+/// Plans what was driven: the present and the next 8 s of the log, as far as it goes.
+///
+/// It has seen the future; its score is that of the recorded driver, or of the controller that
+/// follows it. Source: nuPlan's log-future planner.
+#[derive(Clone, Debug)]
+pub struct LogDriver {
+    states: Vec<EgoState>,
+}
+
+impl LogDriver {
+    /// Takes what was driven from the present on, and what was driven after the recording's end if
+    /// that is known.
+    pub fn new(recording: &Recording, after: &[EgoState]) -> Self {
+        let mut states = recording.expert().to_vec();
+        states.extend_from_slice(after);
+        Self { states }
+    }
+}
+
+impl Driver for LogDriver {
+    fn name(&self) -> &str {
+        "log"
+    }
+
+    fn start(&mut self, _: &Mission<'_>) -> Result<(), BoxError> {
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let rest = self.states.get(moment.iteration..).unwrap_or_default();
+        let mut plan: Vec<EgoState> =
+            rest.iter().step_by(STRIDE).take(STATES + 1).copied().collect();
+        // Near the end of the log a last, shorter step reaches it.
+        match (plan.last(), rest.last()) {
+            (Some(planned), Some(last)) if plan.len() <= STATES && planned != last => {
+                plan.push(*last);
+            }
+            _ => {}
+        }
+        if plan.len() < 2 {
+            return Err(RolloutError::TooFewStates(plan.len()).into());
+        }
+        Ok(Trajectory::new(plan)?)
+    }
+}
+
+impl Explain for LogDriver {
+    fn considered(&self) -> Vec<Considered> {
+        vec![Considered::alone("what was driven", Vec::new())]
+    }
+}

@@ -1,0 +1,75 @@
+//! A car that rolls on straight.
+
+use gump_geometry::DVec2;
+use gump_rollout::BoxError;
+use gump_rollout::closed_loop::{Driver, Mission, Moment};
+use gump_rollout::dynamics::{Controls, Trajectory, propagate_by};
+use gump_scene::{EgoState, VehicleParameters};
+
+use crate::PlanError;
+use crate::considered::{Considered, Explain};
+
+/// Seconds between the states of a plan.
+const DT: f64 = 0.25;
+/// States of a plan besides the present: 10 s.
+const STATES: usize = 40;
+
+/// Goes straight on at its speed, slowing down to 5 m/s; the floor that others must beat.
+///
+/// Source: nuPlan's simple planner with its default parameters.
+#[derive(Clone, Debug)]
+pub struct SimpleDriver {
+    max_speed: f64,
+    vehicle: Option<VehicleParameters>,
+}
+
+impl Default for SimpleDriver {
+    fn default() -> Self {
+        Self {
+            max_speed: 5.0,
+            vehicle: None,
+        }
+    }
+}
+
+impl Driver for SimpleDriver {
+    fn name(&self) -> &str {
+        "simple"
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.vehicle = Some(mission.vehicle);
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
+        let mut state = EgoState {
+            time_us: moment.ego.time_us,
+            rear_axle: moment.ego.rear_axle,
+            velocity: moment.ego.velocity,
+            ..EgoState::default()
+        };
+        let mut plan = vec![state];
+        for _ in 0..STATES {
+            if state.speed() > self.max_speed {
+                state.acceleration = DVec2::new(self.max_speed - state.speed(), 0.0);
+            }
+            // Asking for what already is keeps the lags of the vehicle out of the plan.
+            let controls = Controls {
+                acceleration: state.acceleration.x,
+                steering_rate: 0.0,
+            };
+            let time_us = state.time_us + (DT * 1e6) as i64;
+            state = propagate_by(&state, &controls, vehicle.wheel_base, DT, time_us);
+            plan.push(state);
+        }
+        Ok(Trajectory::new(plan)?)
+    }
+}
+
+impl Explain for SimpleDriver {
+    fn considered(&self) -> Vec<Considered> {
+        vec![Considered::alone("straight on", Vec::new())]
+    }
+}

@@ -1,0 +1,197 @@
+//! Roadblocks for maps that have none: what lets datasets of lanes alone run in the closed loop.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_geometry::{DVec2, Polygon};
+use gump_scene::{
+    Area, AreaKind, Lane, LaneId, MapGraph, MapParts, Roadblock, RoadblockId, Route, Scenario,
+};
+
+use crate::path::curvature_at_start;
+
+/// How far a route is led on past its end, metres: no planner looks farther ahead.
+const BEYOND: f64 = 200.0;
+/// Ids of derived areas start here, clear of those of a format.
+const FIRST_AREA: i64 = 1 << 40;
+
+/// Completes a scenario whose map has lanes but no roadblocks; one that has them is left alone.
+///
+/// Lanes that are neighbours of one another share a roadblock, named after its lowest lane.
+/// Outlines are the lanes' surfaces. Lanes through intersections become the area of the
+/// intersection. The route names the roadblocks of its lanes and goes on straight for 200 m.
+pub fn derive_roadblocks(scenario: &mut Scenario) {
+    if !scenario.map.roadblocks().is_empty() {
+        return;
+    }
+    let old = Arc::clone(&scenario.map);
+    let block_of = group(&old);
+    let mut parts = MapParts {
+        lanes: old.lanes().to_vec(),
+        roadblocks: roadblocks(&old, &block_of),
+        road_lines: old.road_lines().to_vec(),
+        road_edges: old.road_edges().to_vec(),
+        areas: old.areas().to_vec(),
+        stop_signs: old.stop_signs().to_vec(),
+        drivable: old.drivable().to_vec(),
+    };
+    for lane in &mut parts.lanes {
+        lane.outline = lane.surface().map(|polygon| polygon.into_owned());
+        lane.roadblock = block_of.get(&lane.id).copied();
+    }
+    let inside = parts.lanes.iter().filter(|lane| lane.in_intersection);
+    let outlines = inside.filter_map(|lane| lane.outline.clone());
+    let intersections: Vec<Area> = outlines
+        .enumerate()
+        .map(|(i, outline)| Area::new(FIRST_AREA + i as i64, AreaKind::Intersection, outline))
+        .collect();
+    parts.areas.extend(intersections);
+    // A map that was valid stays valid: nothing was renamed and every number comes from it.
+    let map = Arc::new(MapGraph::new(parts).expect("parts of a valid map"));
+    if let Some(route) = &scenario.route {
+        scenario.route = Some(Arc::new(with_roadblocks(&map, route)));
+    }
+    scenario.map = map;
+}
+
+/// The roadblock of every lane that has a surface.
+fn group(map: &MapGraph) -> BTreeMap<LaneId, RoadblockId> {
+    let mut block_of = BTreeMap::new();
+    let usable = |lane: &&Lane| lane.surface().is_some();
+    let mut ids: Vec<LaneId> = map.lanes().iter().filter(usable).map(|lane| lane.id).collect();
+    ids.sort_unstable();
+    for &first in &ids {
+        let mut open = vec![first];
+        while let Some(id) = open.pop() {
+            let Some(lane) = map.lane(id).filter(|lane| ids.binary_search(&lane.id).is_ok()) else {
+                continue;
+            };
+            if block_of.contains_key(&id) {
+                continue;
+            }
+            block_of.insert(id, RoadblockId(first.0));
+            let beside = lane.left_neighbors.iter().chain(&lane.right_neighbors);
+            open.extend(beside.filter(|&&other| {
+                map.lane(other).is_some_and(|other| other.in_intersection == lane.in_intersection)
+            }));
+        }
+    }
+    block_of
+}
+
+fn roadblocks(map: &MapGraph, block_of: &BTreeMap<LaneId, RoadblockId>) -> Vec<Roadblock> {
+    let mut lanes: BTreeMap<RoadblockId, Vec<&Lane>> = BTreeMap::new();
+    for lane in map.lanes() {
+        if let Some(&block) = block_of.get(&lane.id) {
+            lanes.entry(block).or_default().push(lane);
+        }
+    }
+    let linked = |block: RoadblockId, lanes: &[LaneId]| -> Vec<RoadblockId> {
+        let blocks = lanes.iter().filter_map(|id| block_of.get(id).copied());
+        blocks.filter(|&other| other != block).collect()
+    };
+    let blocks = lanes.into_iter().filter_map(|(id, lanes)| {
+        let surfaces = lanes.iter().filter_map(|lane| lane.surface());
+        let corners = surfaces.flat_map(|surface| surface.ring().to_vec()).collect();
+        let all = |links: fn(&Lane) -> &Vec<LaneId>| {
+            let mut blocks: Vec<RoadblockId> = Vec::new();
+            for block in lanes.iter().flat_map(|lane| linked(id, links(lane))) {
+                if !blocks.contains(&block) {
+                    blocks.push(block);
+                }
+            }
+            blocks
+        };
+        Some(Roadblock {
+            id,
+            outline: Polygon::new(convex_hull(corners))?,
+            // Formats without roadblocks cut ways through intersections into lanes that overlap;
+            // called connectors, they would look like a route that comes back to a place.
+            in_intersection: false,
+            predecessors: all(|lane| &lane.predecessors),
+            successors: all(|lane| &lane.successors),
+        })
+    });
+    blocks.collect()
+}
+
+/// The route with the roadblocks of its lanes, led on along the straightest lanes.
+fn with_roadblocks(map: &MapGraph, route: &Route) -> Route {
+    let mut lanes = route.lanes.clone();
+    let mut beyond = 0.0;
+    while let Some(&last) = lanes.last().filter(|_| beyond < BEYOND) {
+        let next = map
+            .successors(last)
+            .filter(|lane| !lanes.contains(&lane.id))
+            .min_by(|a, b| {
+                let turn = |lane: &Lane| curvature_at_start(lane).abs();
+                turn(a).total_cmp(&turn(b))
+            });
+        let Some(next) = next else { break };
+        beyond += next.centerline.length();
+        lanes.push(next.id);
+    }
+    let blocks = lanes.iter().filter_map(|&id| map.lane(id)?.roadblock);
+    let mut roadblocks: Vec<RoadblockId> = blocks.collect();
+    roadblocks.dedup();
+    Route {
+        roadblocks,
+        ..route.clone()
+    }
+}
+
+/// The corners of the smallest convex shape around some points, counter-clockwise.
+fn convex_hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
+    points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+    points.dedup();
+    let chain = |points: &mut dyn Iterator<Item = DVec2>| {
+        let mut chain: Vec<DVec2> = Vec::new();
+        for point in points {
+            while let [.., a, b] = chain[..] {
+                if (b - a).perp_dot(point - b) > 0.0 {
+                    break;
+                }
+                chain.pop();
+            }
+            chain.push(point);
+        }
+        chain.pop();
+        chain
+    };
+    let mut hull = chain(&mut points.iter().copied());
+    hull.extend(chain(&mut points.iter().rev().copied()));
+    hull
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_geometry::dvec2;
+    use gump_scene::fixture;
+
+    #[test]
+    fn neighbours_share_a_roadblock_and_the_route_goes_on() {
+        let mut scenario = fixture::scenario(
+            "lane 1: 0,0 50,0 next 3 left 2
+             lane 2: 0,3.5 50,3.5 right 1
+             lane 3: 50,0 90,0 next 4,5
+             lane 4: 90,0 130,40
+             lane 5: 90,0 150,0
+             route 1
+             ego vehicle 0: 10,0 velocity 5,0",
+        )
+        .unwrap();
+        derive_roadblocks(&mut scenario);
+        let map = &scenario.map;
+        let block = |id: i64| map.lane(LaneId(id)).unwrap().roadblock.unwrap().0;
+        assert_eq!([1, 2, 3, 4, 5].map(block), [1, 1, 3, 4, 5]);
+        let first = map.roadblock(RoadblockId(1)).unwrap();
+        assert_eq!(first.successors, [RoadblockId(3)]);
+        assert!(first.outline.contains(dvec2(25.0, 4.0)));
+        let route = scenario.route.as_ref().unwrap();
+        assert_eq!(route.roadblocks, [1, 3, 5].map(RoadblockId));
+        let before = Arc::clone(map);
+        derive_roadblocks(&mut scenario);
+        assert!(Arc::ptr_eq(&before, &scenario.map));
+    }
+}
