@@ -9,7 +9,9 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{ablate, bench, ci, data, demo, evaluate, simulate, submit, tidy, train};
+use crate::verbs::{
+    ablate, bench, ci, data, demo, evaluate, plan, simulate, submit, tidy, train,
+};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -34,6 +36,8 @@ enum Verb {
     Train(train::Args),
     /// Imagine how a recorded scene goes on, many times over.
     Simulate(simulate::Args),
+    /// Let a planner drive through a scene and see everything it considered.
+    Plan(plan::Args),
     /// Measure on the benchmarks of the field.
     #[command(subcommand)]
     Evaluate(evaluate::Verb),
@@ -92,6 +96,16 @@ impl Cli {
             }
             Verb::Evaluate(evaluate::Verb::Wosac(args)) => {
                 Run::of("evaluate wosac", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Plan(args) => {
+                Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Evaluate(evaluate::Verb::ClosedLoop(args)) => {
+                Run::of("evaluate closed-loop", &args.common, &args)?
+                    .execute(|run| args.execute(run))
+            }
+            Verb::Evaluate(evaluate::Verb::OpenLoop(args)) => {
+                Run::of("evaluate open-loop", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Evaluate(evaluate::Verb::Merge(args)) => {
                 Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))

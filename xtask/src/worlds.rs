@@ -88,8 +88,22 @@ impl World {
         scenario: &Scenario,
         sampling: &SamplingConfig,
     ) -> anyhow::Result<Self> {
+        match name {
+            WorldName::Log => Ok(Self::Rule(Box::new(LogReplay::new(scenario)))),
+            _ => Self::without_log(device, name, sampling),
+        }
+    }
+
+    /// Builds a world that looks at no log.
+    ///
+    /// Error: the world `log`, and as [`World::build`].
+    pub(crate) fn without_log(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+    ) -> anyhow::Result<Self> {
         Ok(match name {
-            WorldName::Log => Self::Rule(Box::new(LogReplay::new(scenario))),
+            WorldName::Log => anyhow::bail!("the world log needs a scenario to replay"),
             WorldName::Idm => Self::Rule(Box::new(Idm::default())),
             WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
             WorldName::Model(path) => {

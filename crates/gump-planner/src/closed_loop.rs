@@ -73,8 +73,12 @@ pub fn plan_and_compare(
     let last = (samples.len() - 1) / per_second * per_second;
     let all = recording.expert().iter().chain(after).skip(last);
     let longest = config.horizons[config.horizons.len() - 1].0;
-    let future: Vec<EgoState> =
-        all.step_by(per_second).skip(1).take(longest).copied().collect();
+    let future: Vec<EgoState> = all
+        .step_by(per_second)
+        .skip(1)
+        .take(longest)
+        .copied()
+        .collect();
     Ok(open_loop(&judged, &future, &config)?)
 }
 
@@ -85,7 +89,10 @@ pub fn samples(driven: &Driven) -> Vec<Sample> {
         .map(|(i, ego)| Sample {
             ego: *ego,
             frame: driven.rollout.at(i).now().clone(),
-            plan: driven.plans.get(i).map_or(Vec::new(), |plan| plan.states().to_vec()),
+            plan: driven
+                .plans
+                .get(i)
+                .map_or(Vec::new(), |plan| plan.states().to_vec()),
         })
         .collect()
 }

@@ -51,7 +51,9 @@ fn join(
     first: RoadblockId,
     candidates: &[RoadblockId],
 ) {
-    let back = search(map, first, DEPTH_BACK, Direction::Back, |id| candidates.contains(&id));
+    let back = search(map, first, DEPTH_BACK, Direction::Back, |id| {
+        candidates.contains(&id)
+    });
     if let Some(mut chain) = back {
         chain.reverse();
         chain.pop();
@@ -59,7 +61,9 @@ fn join(
         return;
     }
     let targets = &route[..route.len().min(3)];
-    let ahead = search(map, here, DEPTH_AHEAD, Direction::Ahead, |id| targets.contains(&id));
+    let ahead = search(map, here, DEPTH_AHEAD, Direction::Ahead, |id| {
+        targets.contains(&id)
+    });
     if let Some(chain) = ahead {
         let met = chain.last().copied();
         let skip = route.iter().position(|&id| Some(id) == met).unwrap_or(0);
@@ -76,7 +80,10 @@ fn roadblock_of_ego(
     let mut near: Vec<&Roadblock> = map.roadblocks_in_square(rear_axle.position, HERE).collect();
     if near.is_empty() {
         for in_intersection in [false, true] {
-            let layer = map.roadblocks().iter().filter(|b| b.in_intersection == in_intersection);
+            let layer = map
+                .roadblocks()
+                .iter()
+                .filter(|b| b.in_intersection == in_intersection);
             let distance = |b: &Roadblock| b.outline.signed_distance(rear_axle.position);
             near.extend(layer.min_by(|a, b| distance(a).total_cmp(&distance(b))));
         }
@@ -92,7 +99,9 @@ fn roadblock_of_ego(
             .min_by(|a, b| a.1.total_cmp(&b.1))
             .map(|&(id, _)| id)
     };
-    let here = best(true).or_else(|| best(false)).or(near.first().map(|block| block.id));
+    let here = best(true)
+        .or_else(|| best(false))
+        .or(near.first().map(|block| block.id));
     let mut candidates: Vec<_> = rated.into_iter().map(|(id, _)| id).collect();
     candidates.extend(here.filter(|id| !candidates.contains(id)));
     (here, candidates)
@@ -157,7 +166,9 @@ fn fill_gaps(map: &MapGraph, route: &[RoadblockId]) -> Vec<RoadblockId> {
     for pair in route.windows(2) {
         let is_next = |block: &Roadblock| block.successors.contains(&pair[1]);
         if !map.roadblock(pair[0]).is_some_and(is_next) {
-            let chain = search(map, pair[0], DEPTH_AHEAD, Direction::Ahead, |id| id == pair[1]);
+            let chain = search(map, pair[0], DEPTH_AHEAD, Direction::Ahead, |id| {
+                id == pair[1]
+            });
             if let Some(chain) = chain.filter(|chain| chain.len() >= 3) {
                 filled.extend(&chain[1..chain.len() - 1]);
             }
@@ -174,7 +185,10 @@ fn without_loop(map: &MapGraph, route: &[RoadblockId]) -> Vec<RoadblockId> {
         let Some(block) = map.roadblock(id).filter(|block| block.in_intersection) else {
             continue;
         };
-        if passed.iter().any(|other| shared_area(other, &block.outline) > SHARED_AREA) {
+        if passed
+            .iter()
+            .any(|other| shared_area(other, &block.outline) > SHARED_AREA)
+        {
             return route[..i].to_vec();
         }
         passed.push(&block.outline);
@@ -184,7 +198,10 @@ fn without_loop(map: &MapGraph, route: &[RoadblockId]) -> Vec<RoadblockId> {
 
 /// Area that two polygons share, square metres, counted in small squares.
 fn shared_area(a: &Polygon, b: &Polygon) -> f64 {
-    let (low, high) = (a.bounds().0.max(b.bounds().0), a.bounds().1.min(b.bounds().1));
+    let (low, high) = (
+        a.bounds().0.max(b.bounds().0),
+        a.bounds().1.min(b.bounds().1),
+    );
     if low.cmpge(high).any() {
         return 0.0;
     }
@@ -194,7 +211,9 @@ fn shared_area(a: &Polygon, b: &Polygon) -> f64 {
         let point = low + dvec2(column as f64 + 0.5, row as f64 + 0.5) * AREA_CELL;
         a.contains(point) && b.contains(point)
     };
-    let count = (0..n.x as usize * n.y as usize).filter(|&i| inside(i)).count();
+    let count = (0..n.x as usize * n.y as usize)
+        .filter(|&i| inside(i))
+        .count();
     count as f64 * AREA_CELL * AREA_CELL
 }
 
@@ -222,7 +241,10 @@ pub fn shortest_lanes(map: &MapGraph, start: LaneId, route: &[RoadblockId]) -> V
     met.insert(start, (1.0, 1, None));
     let mut end = start;
     loop {
-        let nearest = open.iter().min_by(|a, b| met[a].0.total_cmp(&met[b].0)).copied();
+        let nearest = open
+            .iter()
+            .min_by(|a, b| met[a].0.total_cmp(&met[b].0))
+            .copied();
         let Some(id) = nearest else {
             // The deepest lane reached, of several the nearest.
             let rank = |id: &&LaneId| {

@@ -42,8 +42,12 @@ impl Driver for LogDriver {
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let rest = self.states.get(moment.iteration..).unwrap_or_default();
-        let mut plan: Vec<EgoState> =
-            rest.iter().step_by(STRIDE).take(STATES + 1).copied().collect();
+        let mut plan: Vec<EgoState> = rest
+            .iter()
+            .step_by(STRIDE)
+            .take(STATES + 1)
+            .copied()
+            .collect();
         // Near the end of the log a last, shorter step reaches it.
         match (plan.last(), rest.last()) {
             (Some(planned), Some(last)) if plan.len() <= STATES && planned != last => {

@@ -152,7 +152,8 @@ impl Known {
             .flat_map(|(i, &id)| self.map.roadblock_lanes(id).map(move |lane| (lane, n - i)))
             .collect();
         let holds = |(lane, _): &&(&Lane, usize)| {
-            lane.surface().is_some_and(|polygon| polygon.contains(center))
+            lane.surface()
+                .is_some_and(|polygon| polygon.contains(center))
         };
         if let Some(&found) = lanes.iter().find(holds) {
             return Ok(found);
@@ -162,7 +163,9 @@ impl Known {
             let surface = lane.surface();
             surface.map_or(f64::INFINITY, |polygon| own.distance_to_polygon(&polygon))
         };
-        let nearest = lanes.iter().min_by(|a, b| distance(a.0).total_cmp(&distance(b.0)));
+        let nearest = lanes
+            .iter()
+            .min_by(|a, b| distance(a.0).total_cmp(&distance(b.0)));
         nearest.copied().ok_or(PlanError::NoRoute)
     }
 
@@ -215,7 +218,10 @@ impl Known {
             .min_by(|a, b| a.0.total_cmp(&b.0));
         match nearest {
             Some((gap, obstacle)) => (gap, obstacle.speed_along(footprint.pose.heading)),
-            None => (way.path.length() - progress - self.vehicle.length() / 2.0, 0.0),
+            None => (
+                way.path.length() - progress - self.vehicle.length() / 2.0,
+                0.0,
+            ),
         }
     }
 
@@ -226,11 +232,15 @@ impl Known {
             agent.id != scene.ego && away < RADIUS
         });
         let objects = near.map(|agent| Obstacle::Object(Quad::from(&agent.oriented_box()), agent));
-        let red = scene.now().lights().iter().filter(|light| {
-            light.state == LightState::Red && self.lanes.contains(&light.lane)
-        });
+        let red = scene
+            .now()
+            .lights()
+            .iter()
+            .filter(|light| light.state == LightState::Red && self.lanes.contains(&light.lane));
         let lanes = red.filter_map(|light| self.map.lane(light.lane));
-        let surfaces = lanes.filter(|lane| lane.in_intersection).filter_map(Lane::surface);
+        let surfaces = lanes
+            .filter(|lane| lane.in_intersection)
+            .filter_map(Lane::surface);
         let lights = surfaces.map(|polygon| Obstacle::RedLight(polygon.into_owned()));
         objects.chain(lights).collect()
     }

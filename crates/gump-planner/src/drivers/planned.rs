@@ -88,15 +88,25 @@ impl<P: Planner> Explain for Planned<P> {
             return Vec::new();
         };
         let all = plan.candidates.iter().enumerate().map(|(i, candidate)| {
-            let futures = candidate.score.iter().flat_map(|score| score.futures.first());
-            let gates = futures.clone().flat_map(|f| f.gates.iter().map(|g| (g.name, g.factor)));
+            let futures = candidate
+                .score
+                .iter()
+                .flat_map(|score| score.futures.first());
+            let gates = futures
+                .clone()
+                .flat_map(|f| f.gates.iter().map(|g| (g.name, g.factor)));
             let terms = futures.flat_map(|f| f.terms.iter().map(|t| (t.name, t.contribution())));
             Considered {
                 name: name(&candidate.proposal.kind),
                 chosen: i == plan.chosen,
                 score: candidate.score.as_ref().map(|score| score.mean),
                 parts: gates.clone().chain(terms).collect(),
-                poses: candidate.proposal.states.iter().map(|state| state.pose).collect(),
+                poses: candidate
+                    .proposal
+                    .states
+                    .iter()
+                    .map(|state| state.pose)
+                    .collect(),
             }
         });
         all.collect()

@@ -40,7 +40,11 @@ impl Filter {
         for i in 0..n {
             let mut impulse = vec![0.0; n];
             impulse[i] = 1.0;
-            columns.push(filter.filter(&impulse).expect("a window longer than its polynomial"));
+            columns.push(
+                filter
+                    .filter(&impulse)
+                    .expect("a window longer than its polynomial"),
+            );
         }
         let row = |i: usize| {
             let weights: Vec<f64> = columns.iter().map(|column| column[i]).collect();

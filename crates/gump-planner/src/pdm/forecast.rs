@@ -49,7 +49,11 @@ impl Object {
         let velocity = agent.state.velocity;
         let ahead = agent.state.pose.direction();
         let speed = if moving { velocity.length() } else { 0.0 };
-        let drift = if velocity.dot(ahead) < 0.0 { -ahead } else { ahead } * speed;
+        let drift = if velocity.dot(ahead) < 0.0 {
+            -ahead
+        } else {
+            ahead
+        } * speed;
         let quad = Quad::from(&agent.oriented_box());
         let (min, max) = quad.bounds();
         let moved = drift * (MOMENT_DT * (MOMENTS - 1) as f64);
@@ -155,7 +159,9 @@ impl Forecast {
 
     /// Objects that were not touched.
     pub(crate) fn relevant(&self) -> impl Iterator<Item = &Object> {
-        self.objects.iter().filter(|object| !self.collided.contains(&object.token()))
+        self.objects
+            .iter()
+            .filter(|object| !self.collided.contains(&object.token()))
     }
 
     /// Red lights the ego is not inside of.

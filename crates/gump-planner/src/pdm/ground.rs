@@ -67,7 +67,9 @@ impl Ground {
             });
         }
         let intersections = map.areas_in_square(center, RADIUS, AreaKind::Intersection);
-        self.intersections = intersections.map(|a| PolygonIndex::new(&a.polygon)).collect();
+        self.intersections = intersections
+            .map(|a| PolygonIndex::new(&a.polygon))
+            .collect();
     }
 
     /// The lanes near the ego.
@@ -86,7 +88,9 @@ impl Ground {
 
     /// True if a point is in an intersection.
     pub(crate) fn is_in_intersection(&self, point: DVec2) -> bool {
-        self.intersections.iter().any(|polygon| polygon.contains(point))
+        self.intersections
+            .iter()
+            .any(|polygon| polygon.contains(point))
     }
 
     /// The surfaces that share a point with a box, as indices for [`Ground::footing`].
@@ -99,7 +103,12 @@ impl Ground {
     }
 
     /// Where a vehicle with these corners stands; only `surfaces` are looked at.
-    pub(crate) fn footing(&self, corners: &[DVec2; 4], center: DVec2, surfaces: &[usize]) -> Footing {
+    pub(crate) fn footing(
+        &self,
+        corners: &[DVec2; 4],
+        center: DVec2,
+        surfaces: &[usize],
+    ) -> Footing {
         let min = corners.iter().fold(center, |min, &c| min.min(c));
         let max = corners.iter().fold(center, |max, &c| max.max(c));
         let (mut n_touched, mut held, mut on_route) = (0, false, false);

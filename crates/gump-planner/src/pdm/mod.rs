@@ -14,9 +14,9 @@ mod forecast;
 mod ground;
 mod propose;
 mod score;
-mod track;
 #[cfg(test)]
 mod tests;
+mod track;
 
 pub use score::PdmScore;
 
@@ -176,7 +176,10 @@ fn check(config: &PdmConfig) -> Result<(), PlanError> {
         ("max_deceleration", law.max_deceleration),
         ("exponent", law.exponent),
     ];
-    let fractions = config.speed_fractions.iter().map(|&f| ("speed_fraction", f));
+    let fractions = config
+        .speed_fractions
+        .iter()
+        .map(|&f| ("speed_fraction", f));
     for (name, value) in numbers.into_iter().chain(fractions) {
         if !(value > 0.0 && value.is_finite()) {
             let expected = "a positive number";
@@ -188,7 +191,12 @@ fn check(config: &PdmConfig) -> Result<(), PlanError> {
         }
     }
     let n = config.speed_fractions.len() * config.lateral_offsets.len();
-    if n == 0 || config.lateral_offsets.iter().any(|offset| !offset.is_finite()) {
+    if n == 0
+        || config
+            .lateral_offsets
+            .iter()
+            .any(|offset| !offset.is_finite())
+    {
         return Err(PlanError::Parameter {
             name: "number of proposals",
             value: n as f64,
@@ -224,7 +232,12 @@ impl Driver for PdmClosed {
         state.lay_lines(lane, &self.config)?;
         let limit = state.map.lane(lane).and_then(|lane| lane.speed_limit);
         let limit = limit.unwrap_or(self.config.fallback_speed);
-        let speeds: Vec<f64> = self.config.speed_fractions.iter().map(|f| f * limit).collect();
+        let speeds: Vec<f64> = self
+            .config
+            .speed_fractions
+            .iter()
+            .map(|f| f * limit)
+            .collect();
         let way = state.way.as_ref().expect("the lines were just laid");
         let proposer = Proposer {
             law: &self.config.law,
@@ -270,7 +283,10 @@ impl Driver for PdmClosed {
 /// [`PlanError::NoRoute`] if the mission states none, [`PlanError::ForeignRoute`] if none of them
 /// is in the map.
 pub(crate) fn stated_route(mission: &Mission<'_>) -> Result<Vec<RoadblockId>, PlanError> {
-    let stated = mission.route.map(|route| &route.roadblocks[..]).unwrap_or_default();
+    let stated = mission
+        .route
+        .map(|route| &route.roadblocks[..])
+        .unwrap_or_default();
     if stated.is_empty() {
         return Err(PlanError::NoRoute);
     }
@@ -335,8 +351,10 @@ impl State {
         let ego = moment.ego;
         if self.way.is_none() {
             let route = correct_route(&self.map, &self.stated, ego.rear_axle);
-            let in_order: Vec<LaneId> =
-                lanes_of_route(&self.map, &route).iter().map(|lane| lane.id).collect();
+            let in_order: Vec<LaneId> = lanes_of_route(&self.map, &route)
+                .iter()
+                .map(|lane| lane.id)
+                .collect();
             if in_order.is_empty() {
                 return Err(PlanError::NoRoute);
             }
@@ -351,9 +369,14 @@ impl State {
         }
         let way = self.way.as_ref().expect("the way was just found");
         let footprint = self.vehicle.footprint(ego.rear_axle);
-        self.ground.look(&self.map, &way.lanes, footprint.pose.position);
+        self.ground
+            .look(&self.map, &way.lanes, footprint.pose.position);
         let scene = moment.scene;
-        let others = scene.now().agents().iter().filter(|agent| agent.id != scene.ego);
+        let others = scene
+            .now()
+            .agents()
+            .iter()
+            .filter(|agent| agent.id != scene.ego);
         let red = red_lights(&self.map, &scene, &way.lanes);
         self.forecast.look(&footprint, others, red);
         Ok(())
@@ -362,7 +385,11 @@ impl State {
     /// The lane of the route that the ego is on, or the one to go to.
     fn starting_lane(&self, ego: &EgoState) -> Result<LaneId, PlanError> {
         let way = self.way.as_ref().ok_or(PlanError::NoRoute)?;
-        let at = |id: &LaneId| self.map.lane(*id).expect("lanes of the route are in the map");
+        let at = |id: &LaneId| {
+            self.map
+                .lane(*id)
+                .expect("lanes of the route are in the map")
+        };
         let turned = |id: &LaneId| {
             let vertex = nearest_vertex(at(id), ego.rear_axle.position);
             angle_difference(vertex.heading, ego.rear_axle.heading).abs()
@@ -382,7 +409,10 @@ impl State {
         let distance = |id: &LaneId| {
             surface(id).map_or(f64::INFINITY, |polygon| own.distance_to_polygon(&polygon))
         };
-        let nearest = way.in_order.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        let nearest = way
+            .in_order
+            .iter()
+            .min_by(|a, b| distance(a).total_cmp(&distance(b)));
         nearest.copied().ok_or(PlanError::NoRoute)
     }
 
@@ -393,7 +423,11 @@ impl State {
             return Ok(());
         }
         let block = self.map.lane(start).and_then(|lane| lane.roadblock);
-        let here = way.route.iter().position(|&id| Some(id) == block).unwrap_or(0);
+        let here = way
+            .route
+            .iter()
+            .position(|&id| Some(id) == block)
+            .unwrap_or(0);
         let window = &way.route[here..way.route.len().min(here + WINDOW)];
         let lanes = shortest_lanes(&self.map, start, window);
         let poses: Vec<Pose> = lanes

@@ -136,11 +136,7 @@ impl Proposer<'_> {
     }
 
     /// Drives proposals of one line on over further steps.
-    pub(crate) fn drive(
-        &self,
-        batch: &mut [Proposal],
-        steps: std::ops::RangeInclusive<usize>,
-    ) {
+    pub(crate) fn drive(&self, batch: &mut [Proposal], steps: std::ops::RangeInclusive<usize>) {
         let Some(first) = batch.first() else { return };
         let line = &self.lines[first.line];
         let surroundings = Surroundings::new(self, line, first.drives[0].progress, steps.clone());
@@ -316,7 +312,10 @@ impl Corridor {
 
     fn intersects_polygon(&self, polygon: &Polygon) -> bool {
         self.may_reach(polygon.bounds())
-            && self.pieces.iter().any(|piece| piece.intersects_polygon(polygon))
+            && self
+                .pieces
+                .iter()
+                .any(|piece| piece.intersects_polygon(polygon))
     }
 }
 
@@ -336,4 +335,3 @@ fn centroid(polygon: &Polygon) -> DVec2 {
     }
     origin + sum / (3.0 * doubled)
 }
-

@@ -116,15 +116,19 @@ impl Judge<'_> {
             .collect();
         let quads: Vec<Quad> = boxes.iter().map(Quad::from).collect();
         let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        let (min, max) = quads.iter().map(Quad::bounds).fold(none, |all, (min, max)| {
-            (all.0.min(min), all.1.max(max))
-        });
+        let (min, max) = quads
+            .iter()
+            .map(Quad::bounds)
+            .fold(none, |all, (min, max)| (all.0.min(min), all.1.max(max)));
         let mut surfaces = Vec::new();
         self.ground.within(min, max, &mut surfaces);
         let footings = quads
             .iter()
             .zip(&boxes)
-            .map(|(quad, shape)| self.ground.footing(quad.corners(), shape.pose.position, &surfaces))
+            .map(|(quad, shape)| {
+                self.ground
+                    .footing(quad.corners(), shape.pose.position, &surfaces)
+            })
             .collect();
         Tracked {
             states,
@@ -154,7 +158,11 @@ impl Judge<'_> {
                 let met = object.agent(step / 2);
                 let kind = classify(&tracked.boxes[step], state.rear_axle, state.speed(), &met);
                 if kind.is_at_fault(!tracked.off_lane(step)) {
-                    let factor = if object.agent.kind.is_moving() { 0.0 } else { 0.5 };
+                    let factor = if object.agent.kind.is_moving() {
+                        0.0
+                    } else {
+                        0.5
+                    };
                     score = f64::min(score, factor);
                     first = first.or(Some(step));
                 } else {
@@ -174,7 +182,9 @@ impl Judge<'_> {
             Quad::new(tracked.quads[step].corners().map(|corner| corner + way))
         };
         let last = TTC_STEPS[TTC_STEPS.len() - 1];
-        let far: Vec<Quad> = (0..tracked.quads.len()).map(|step| ahead(step, last)).collect();
+        let far: Vec<Quad> = (0..tracked.quads.len())
+            .map(|step| ahead(step, last))
+            .collect();
         let nearby = self.nearby(tracked.quads.iter().chain(&far));
         if nearby.is_empty() {
             return None;
@@ -209,9 +219,9 @@ impl Judge<'_> {
     /// Objects that some of these boxes might ever meet.
     fn nearby<'q>(&self, quads: impl Iterator<Item = &'q Quad>) -> Vec<&Object> {
         let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        let (low, high) = quads.map(Quad::bounds).fold(none, |all, (min, max)| {
-            (all.0.min(min), all.1.max(max))
-        });
+        let (low, high) = quads
+            .map(Quad::bounds)
+            .fold(none, |all, (min, max)| (all.0.min(min), all.1.max(max)));
         let objects = self.forecast.objects.iter();
         objects
             .filter(|object| {
@@ -261,7 +271,11 @@ fn normalize(scores: &mut [PdmScore]) {
             f64::from(u8::from(gates != 0.0))
         };
         let parts = [score.progress, score.time_to_collision, score.comfort];
-        let sum: f64 = parts.iter().zip(WEIGHTS).map(|(part, weight)| part * weight).sum();
+        let sum: f64 = parts
+            .iter()
+            .zip(WEIGHTS)
+            .map(|(part, weight)| part * weight)
+            .sum();
         score.total = gates * sum / WEIGHTS.iter().sum::<f64>();
     }
 }

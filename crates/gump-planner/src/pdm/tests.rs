@@ -26,20 +26,33 @@ fn numbers(value: &Value) -> Vec<f64> {
 }
 
 fn read(name: &str) -> Value {
-    let path = format!("{}/tests/data/nuplan/{name}.json", env!("CARGO_MANIFEST_DIR"));
+    let path = format!(
+        "{}/tests/data/nuplan/{name}.json",
+        env!("CARGO_MANIFEST_DIR")
+    );
     serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
 }
 
 fn id(value: &Value) -> i64 {
-    value.as_i64().unwrap_or_else(|| value.as_str().unwrap().parse().unwrap())
+    value
+        .as_i64()
+        .unwrap_or_else(|| value.as_str().unwrap().parse().unwrap())
 }
 
 fn ids<T>(value: &Value, wrap: fn(i64) -> T) -> Vec<T> {
-    value.as_array().unwrap().iter().map(|v| wrap(id(v))).collect()
+    value
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|v| wrap(id(v)))
+        .collect()
 }
 
 fn points(value: &Value) -> Vec<gump_geometry::DVec2> {
-    rows(value).iter().map(|row| dvec2(row[0], row[1])).collect()
+    rows(value)
+        .iter()
+        .map(|row| dvec2(row[0], row[1]))
+        .collect()
 }
 
 /// The synthetic intersection that the goldens were made on.
@@ -135,16 +148,20 @@ fn frame(input: &Value, ego_state: &EgoState) -> Frame {
             },
         });
     }
-    let lights = input["traffic_lights"].as_array().unwrap().iter().map(|light| Light {
-        lane: LaneId(id(&light[0])),
-        state: match light[1].as_str().unwrap() {
-            "RED" => LightState::Red,
-            "GREEN" => LightState::Green,
-            "YELLOW" => LightState::Yellow,
-            _ => LightState::Unknown,
-        },
-        stop_point: None,
-    });
+    let lights = input["traffic_lights"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|light| Light {
+            lane: LaneId(id(&light[0])),
+            state: match light[1].as_str().unwrap() {
+                "RED" => LightState::Red,
+                "GREEN" => LightState::Green,
+                "YELLOW" => LightState::Yellow,
+                _ => LightState::Unknown,
+            },
+            stop_point: None,
+        });
     Frame::new(agents, lights.collect())
 }
 
@@ -181,9 +198,21 @@ fn check(map: &Arc<MapGraph>, name: &str, golden: &Value) {
     check_ground(name, &planner, golden);
     check_proposals(name, planner.thought(), golden);
     check_scores(name, planner.thought(), golden);
-    assert_eq!(planner.best() as i64, golden["best"].as_i64().unwrap(), "{name}");
-    assert_eq!(plan.states().len() as i64, golden["trajectory_n"].as_i64().unwrap());
-    for (found, row) in plan.states().iter().step_by(5).zip(rows(&golden["trajectory"])) {
+    assert_eq!(
+        planner.best() as i64,
+        golden["best"].as_i64().unwrap(),
+        "{name}"
+    );
+    assert_eq!(
+        plan.states().len() as i64,
+        golden["trajectory_n"].as_i64().unwrap()
+    );
+    for (found, row) in plan
+        .states()
+        .iter()
+        .step_by(5)
+        .zip(rows(&golden["trajectory"]))
+    {
         assert_eq!(found.time_us, row[0] as i64, "{name}");
         check_pose(name, found.rear_axle, &row[1..]);
     }
@@ -193,29 +222,51 @@ fn check_pose(name: &str, found: Pose, row: &[f64]) {
     let off = found.position.distance(dvec2(row[0], row[1]));
     assert!(off < TOLERANCE, "{name}: {found:?} is {off} m off {row:?}");
     let turned = angle_difference(found.heading, row[2]);
-    assert!(turned.abs() < TOLERANCE, "{name}: {found:?} is turned off {row:?}");
+    assert!(
+        turned.abs() < TOLERANCE,
+        "{name}: {found:?} is turned off {row:?}"
+    );
 }
 
 fn check_ground(name: &str, planner: &PdmClosed, golden: &Value) {
     let state = planner.mission.as_ref().unwrap();
     let way = state.way.as_ref().unwrap();
     let path = &way.centerline.path;
-    assert_abs_diff_eq!(path.length(), golden["centerline_len"].as_f64().unwrap(), epsilon = 1e-5);
-    assert_eq!(path.poses().count() as i64, golden["centerline_n"].as_i64().unwrap(), "{name}");
+    assert_abs_diff_eq!(
+        path.length(),
+        golden["centerline_len"].as_f64().unwrap(),
+        epsilon = 1e-5
+    );
+    assert_eq!(
+        path.poses().count() as i64,
+        golden["centerline_n"].as_i64().unwrap(),
+        "{name}"
+    );
     for (pose, row) in path.poses().zip(rows(&golden["centerline_xyh_head"])) {
         check_pose(name, pose, &row);
     }
     let mut lanes: Vec<i64> = state.ground.lanes().map(|lane| lane.0).collect();
     lanes.sort_unstable();
-    let drivable: BTreeSet<i64> = ids(&golden["drivable_tokens"], |id| id).into_iter().collect();
+    let drivable: BTreeSet<i64> = ids(&golden["drivable_tokens"], |id| id)
+        .into_iter()
+        .collect();
     let known: BTreeSet<i64> = lanes.iter().copied().collect();
-    assert!(known.is_subset(&drivable), "{name}: {known:?} and {drivable:?}");
+    assert!(
+        known.is_subset(&drivable),
+        "{name}: {known:?} and {drivable:?}"
+    );
     let n_seen = golden["observation_tokens_t0"].as_array().unwrap().len();
     let found = state.forecast.objects.len() + state.forecast.red_lights.len();
     assert_eq!(found, n_seen, "{name}");
     let n_collided = golden["collided_track_ids"].as_array().unwrap().len();
     assert_eq!(state.forecast.collided.len(), n_collided, "{name}");
-    assert!(state.forecast.collided.iter().all(|t| matches!(t, Token::Agent(_) | Token::RedLight(_))));
+    assert!(
+        state
+            .forecast
+            .collided
+            .iter()
+            .all(|t| matches!(t, Token::Agent(_) | Token::RedLight(_)))
+    );
 }
 
 fn check_proposals(name: &str, thought: &Thought, golden: &Value) {
@@ -227,15 +278,27 @@ fn check_proposals(name: &str, thought: &Thought, golden: &Value) {
             let lead = proposal.leads[k];
             for (found, expected) in [lead.progress, lead.speed, lead.rear].iter().zip(&leads[k]) {
                 let off = (found - expected).abs();
-                assert!(off < TOLERANCE, "{name} {i} {k}: lead {lead:?}, not {:?}", leads[k]);
+                assert!(
+                    off < TOLERANCE,
+                    "{name} {i} {k}: lead {lead:?}, not {:?}",
+                    leads[k]
+                );
             }
-            let off = (drive.progress - row[0]).abs().max((drive.speed - row[1]).abs());
+            let off = (drive.progress - row[0])
+                .abs()
+                .max((drive.speed - row[1]).abs());
             assert!(off < TOLERANCE, "{name} {i} {k}: {drive:?}, not {row:?}");
         }
-        for (k, row) in [10, 20, 30, 40].iter().zip(rows(&golden["proposals_t10_20_30_40"][i])) {
+        for (k, row) in [10, 20, 30, 40]
+            .iter()
+            .zip(rows(&golden["proposals_t10_20_30_40"][i]))
+        {
             check_pose(name, proposal.poses[*k], &row);
         }
-        for (k, row) in [0, 1, 10, 20, 40].iter().zip(rows(&golden["simulated_t0_1_10_20_40"][i])) {
+        for (k, row) in [0, 1, 10, 20, 40]
+            .iter()
+            .zip(rows(&golden["simulated_t0_1_10_20_40"][i]))
+        {
             let state = thought.drives[i][*k];
             check_pose(name, state.rear_axle, &row);
             let found = [
@@ -250,7 +313,10 @@ fn check_proposals(name: &str, thought: &Thought, golden: &Value) {
             ];
             for (field, (found, expected)) in found.iter().zip(&row[3..]).enumerate() {
                 let off = (found - expected).abs();
-                assert!(off < TOLERANCE, "{name} {i} {k} field {field}: {found}, not {expected}");
+                assert!(
+                    off < TOLERANCE,
+                    "{name} {i} {k} field {field}: {found}, not {expected}"
+                );
             }
         }
     }
@@ -263,7 +329,9 @@ fn check_scores(name: &str, thought: &Thought, golden: &Value) {
     let totals = numbers(&golden["scores"]);
     let steps = |key: &str| -> Vec<Option<usize>> {
         let steps = numbers(&golden[key]).into_iter();
-        steps.map(|step| step.is_finite().then_some(step as usize)).collect()
+        steps
+            .map(|step| step.is_finite().then_some(step as usize))
+            .collect()
     };
     let (collisions, ttc) = (steps("collision_time_idx"), steps("ttc_time_idx"));
     for (i, score) in thought.scores.iter().enumerate() {
@@ -284,7 +352,10 @@ fn check_scores(name: &str, thought: &Thought, golden: &Value) {
             (score.progress, terms[0][i]),
             (score.total, totals[i]),
         ] {
-            assert!((found - expected).abs() < TOLERANCE, "{name} {i}: {score:?}, not {expected}");
+            assert!(
+                (found - expected).abs() < TOLERANCE,
+                "{name} {i}: {score:?}, not {expected}"
+            );
         }
     }
 }

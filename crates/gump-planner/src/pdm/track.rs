@@ -48,7 +48,13 @@ impl Tracker {
             let state = states[k];
             let controls = track_target(&state, &target, wheel_base);
             let time_us = ego.time_us + (k as i64 + 1) * 100_000;
-            states.push(propagate_by(&state, &controls, wheel_base, TRACKING_DT, time_us));
+            states.push(propagate_by(
+                &state,
+                &controls,
+                wheel_base,
+                TRACKING_DT,
+                time_us,
+            ));
         }
     }
 }

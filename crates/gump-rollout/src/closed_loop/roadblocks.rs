@@ -58,12 +58,20 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
 fn group(map: &MapGraph) -> BTreeMap<LaneId, RoadblockId> {
     let mut block_of = BTreeMap::new();
     let usable = |lane: &&Lane| lane.surface().is_some();
-    let mut ids: Vec<LaneId> = map.lanes().iter().filter(usable).map(|lane| lane.id).collect();
+    let mut ids: Vec<LaneId> = map
+        .lanes()
+        .iter()
+        .filter(usable)
+        .map(|lane| lane.id)
+        .collect();
     ids.sort_unstable();
     for &first in &ids {
         let mut open = vec![first];
         while let Some(id) = open.pop() {
-            let Some(lane) = map.lane(id).filter(|lane| ids.binary_search(&lane.id).is_ok()) else {
+            let Some(lane) = map
+                .lane(id)
+                .filter(|lane| ids.binary_search(&lane.id).is_ok())
+            else {
                 continue;
             };
             if block_of.contains_key(&id) {
@@ -72,7 +80,8 @@ fn group(map: &MapGraph) -> BTreeMap<LaneId, RoadblockId> {
             block_of.insert(id, RoadblockId(first.0));
             let beside = lane.left_neighbors.iter().chain(&lane.right_neighbors);
             open.extend(beside.filter(|&&other| {
-                map.lane(other).is_some_and(|other| other.in_intersection == lane.in_intersection)
+                map.lane(other)
+                    .is_some_and(|other| other.in_intersection == lane.in_intersection)
             }));
         }
     }
@@ -92,7 +101,9 @@ fn roadblocks(map: &MapGraph, block_of: &BTreeMap<LaneId, RoadblockId>) -> Vec<R
     };
     let blocks = lanes.into_iter().filter_map(|(id, lanes)| {
         let surfaces = lanes.iter().filter_map(|lane| lane.surface());
-        let corners = surfaces.flat_map(|surface| surface.ring().to_vec()).collect();
+        let corners = surfaces
+            .flat_map(|surface| surface.ring().to_vec())
+            .collect();
         let all = |links: fn(&Lane) -> &Vec<LaneId>| {
             let mut blocks: Vec<RoadblockId> = Vec::new();
             for block in lanes.iter().flat_map(|lane| linked(id, links(lane))) {

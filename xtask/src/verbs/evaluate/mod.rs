@@ -4,11 +4,15 @@
 //! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of [`merge::BENCHMARKS`].
 
+mod closed_loop;
 mod ledger;
 mod merge;
 pub(crate) mod motion;
+mod open_loop;
 mod shard;
 pub(crate) mod wosac;
+
+pub(crate) use closed_loop::Driving;
 
 /// Which benchmark.
 #[derive(Debug, clap::Subcommand)]
@@ -17,6 +21,10 @@ pub(crate) enum Verb {
     Motion(motion::Args),
     /// Realism: the Waymo Sim Agents Challenge
     Wosac(wosac::Args),
+    /// How well a planner drives, as nuPlan scores it
+    ClosedLoop(closed_loop::Args),
+    /// How near a planner's plans are to what was driven
+    OpenLoop(open_loop::Args),
     /// Put the shards of one evaluation together
     Merge(merge::Args),
 }

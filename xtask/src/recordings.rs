@@ -1,0 +1,61 @@
+//! Recordings to drive through, from any readable file.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use gump_rollout::closed_loop::{Recording, derive_roadblocks};
+use gump_scene::{EgoState, MapGraph, Scenario};
+
+/// A recording with what judging it takes besides.
+pub(crate) struct Case {
+    /// What is driven through.
+    pub(crate) recording: Recording,
+    /// What drives are judged on: the map as it was stated.
+    pub(crate) map: Arc<MapGraph>,
+    /// What was driven after the recording's end, if that is known.
+    pub(crate) after: Vec<EgoState>,
+}
+
+/// A case or why there is none, by the name of its scenario.
+pub(crate) struct Named {
+    /// The scenario's id; where it cannot be read, where it was.
+    pub(crate) id: String,
+    /// The case.
+    pub(crate) case: anyhow::Result<Case>,
+}
+
+/// Every scenario of a file or folder, read one by one.
+///
+/// Error: nothing there to read.
+pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named> + Send>> {
+    let place: PathBuf = path.into();
+    let records = gump_data::open(path)?.enumerate();
+    Ok(Box::new(records.map(move |(i, record)| match record {
+        Ok(record) => Named {
+            id: record.scenario.id.clone(),
+            case: of_boxes(record.scenario),
+        },
+        Err(error) => Named {
+            id: format!("{}#{i}", place.display()),
+            case: Err(error.into()),
+        },
+    })))
+}
+
+/// One scenario: `PATH`, `PATH#INDEX` or `PATH#ID`.
+///
+/// Error: no such scenario, or one that cannot be driven through.
+pub(crate) fn find(source: &str) -> anyhow::Result<Case> {
+    of_boxes(gump_data::find(source)?)
+}
+
+/// A case of a scenario that knows boxes alone.
+fn of_boxes(mut scenario: Scenario) -> anyhow::Result<Case> {
+    let map = Arc::clone(&scenario.map);
+    derive_roadblocks(&mut scenario);
+    Ok(Case {
+        recording: Recording::of_boxes(scenario)?,
+        map,
+        after: Vec::new(),
+    })
+}

@@ -1,0 +1,151 @@
+//! `evaluate open-loop`: how near a planner's plans are to what was driven, as nuPlan scores it.
+
+use std::path::PathBuf;
+
+use gump_metrics::nuplan::{OpenLoop, Scoring};
+use gump_planner::closed_loop::{evaluate, plan_and_compare};
+use gump_rollout::closed_loop::Replayed;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::intervals::{interval, mean};
+use crate::planners::{PlannerName, Surroundings};
+use crate::recordings::{self, Case, Named};
+use crate::run::{Common, Run};
+use crate::worlds::{Sampling, WorldName};
+
+/// Seconds that plans are compared over.
+const HORIZON: f64 = 8.0;
+
+/// Arguments of `evaluate open-loop`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// A file or folder of scenarios
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// Who plans; several for several rows
+    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1..)]
+    planner: Vec<PlannerName>,
+    /// What the interactive planner imagines in: idm or model:WEIGHTS
+    #[arg(long, value_name = "W", default_value = "idm")]
+    world: WorldName,
+    /// At most so many scenarios [default: all]
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+type Outcome = (String, anyhow::Result<OpenLoop>);
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let sampling = self.sampling.resolve()?;
+        let surroundings = run.phase("load", |_| Surroundings::load(&self.world, &sampling))?;
+        let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
+        for &planner in &self.planner {
+            let outcomes = run.phase("plan", |run| self.plan(run, planner, &surroundings))?;
+            rows.push(row(planner.name(), &outcomes, run));
+            scenarios.extend(outcomes.iter().map(|outcome| tell(planner.name(), outcome)));
+        }
+        run.result("rows", rows)?;
+        run.result("scenarios", &scenarios)?;
+        let all_failed = scenarios.iter().all(|entry| entry["error"].is_string());
+        anyhow::ensure!(
+            !all_failed,
+            "every scenario failed, see the errors in the report"
+        );
+        Ok(())
+    }
+
+    fn plan(
+        &self,
+        run: &Run,
+        planner: PlannerName,
+        surroundings: &Surroundings,
+    ) -> anyhow::Result<Vec<Outcome>> {
+        let cases = recordings::open(&self.scenarios)?.take(self.limit.unwrap_or(usize::MAX));
+        let progress = run.progress(planner.name(), self.limit.unwrap_or(0) as u64, "scenarios");
+        let outcomes = evaluate(cases, |i, named: Named| {
+            let outcome = named.case.and_then(|case| {
+                let seed = run.seed().fork(i as u64);
+                let mut driver = planner.build(&case, surroundings.imagination(), seed, 10)?;
+                let seconds = comparable_seconds(&case);
+                let (recording, after) = (&case.recording, &case.after);
+                let mut traffic = Replayed;
+                Ok(plan_and_compare(
+                    recording,
+                    after,
+                    &mut traffic,
+                    &mut *driver,
+                    seconds,
+                )?)
+            });
+            progress.advance(1);
+            (named.id, outcome)
+        });
+        crate::run::stop_if_interrupted()?;
+        Ok(outcomes)
+    }
+}
+
+/// How long plans can be made so that each still has what was driven to be compared with.
+fn comparable_seconds(case: &Case) -> f64 {
+    let scenario = case.recording.scenario();
+    let known = (scenario.future().len() + case.after.len()) as f64 * scenario.dt;
+    // One more second than plans start in, because they start at every whole one.
+    (known - HORIZON + 1.0).clamp(2.0 * scenario.dt, 15.0)
+}
+
+fn numbers(open: &OpenLoop) -> [(&'static str, f64); 6] {
+    let [three, five, eight] = &open.horizons;
+    [
+        ("score", Scoring::open_loop().score(&open.scores)),
+        ("ade_8s", eight.ade),
+        ("fde_3s", three.fde),
+        ("fde_5s", five.fde),
+        ("fde_8s", eight.fde),
+        ("miss_rate", eight.miss_rate),
+    ]
+}
+
+fn tell(planner: &str, (id, outcome): &Outcome) -> Value {
+    let mut told = json!({ "id": id, "planner": planner });
+    match outcome {
+        Ok(open) => {
+            for (name, value) in numbers(open) {
+                told[name] = json!(value);
+            }
+        }
+        Err(error) => told["error"] = json!(format!("{error:#}")),
+    }
+    told
+}
+
+fn row(planner: &str, outcomes: &[Outcome], run: &Run) -> Value {
+    let done: Vec<_> = outcomes
+        .iter()
+        .filter_map(|(_, outcome)| outcome.as_ref().ok())
+        .map(numbers)
+        .collect();
+    let mut row = json!({
+        "planner": planner,
+        "scenarios": outcomes.len(),
+        "failed": outcomes.len() - done.len(),
+    });
+    for column in 0..6 {
+        let values: Vec<f64> = done.iter().map(|numbers| numbers[column].1).collect();
+        let name = done.first().map_or("score", |numbers| numbers[column].0);
+        row[name] = json!(mean(&values));
+        if column == 0 {
+            let (low, high) = interval(&values, run.seed()).unzip();
+            row["low"] = json!(low);
+            row["high"] = json!(high);
+        }
+    }
+    row
+}

@@ -1,0 +1,159 @@
+//! `plan`: one planner through one scenario, with everything it considered.
+
+use gump_planner::closed_loop::{Scored, drive_and_score};
+use gump_planner::{Considered, Explain};
+use gump_rollout::BoxError;
+use gump_rollout::closed_loop::{Driver, Mission, Moment};
+use gump_rollout::dynamics::Trajectory;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::evaluate::Driving;
+use crate::futures;
+use crate::planners::{PlannerName, Surroundings, Timed};
+use crate::recordings;
+use crate::run::{Common, Run};
+use crate::worlds::{Sampling, WorldName};
+
+/// Arguments of `plan`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID
+    #[arg(long, value_name = "S")]
+    scenario: String,
+    /// Who plans
+    #[arg(long, value_enum, value_name = "P", default_value_t = PlannerName::Interactive)]
+    planner: PlannerName,
+    /// Whom it meets, and what it imagines in: log, idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W", default_value = "idm")]
+    world: WorldName,
+    #[command(flatten)]
+    #[serde(flatten)]
+    driving: Driving,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// A driver that notes what it considered.
+struct Noted<'a> {
+    inner: Box<dyn Explain + 'a>,
+    steps: Vec<Vec<Considered>>,
+}
+
+impl Driver for Noted<'_> {
+    fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.inner.start(mission)
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let plan = self.inner.drive(moment)?;
+        self.steps.push(self.inner.considered());
+        Ok(plan)
+    }
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        self.driving.check()?;
+        let sampling = self.sampling.resolve()?;
+        let case = run.phase("read", |_| recordings::find(&self.scenario))?;
+        let surroundings = run.phase("load", |_| Surroundings::load(&self.world, &sampling))?;
+        let seed = run.seed();
+        let imagination = surroundings.imagination();
+        let inner = self
+            .planner
+            .build(&case, imagination, seed, self.driving.replan_every())?;
+        let steps = Vec::new();
+        let mut noted = Noted { inner, steps };
+        let mut timed = Timed::new(&mut noted, self.driving.budget());
+        let mut traffic = surroundings.traffic(seed);
+        let config = self.driving.config();
+        let scored = run.phase("drive", |_| {
+            let (recording, map) = (&case.recording, &case.map);
+            Ok(drive_and_score(
+                recording,
+                map,
+                &mut *traffic,
+                &mut timed,
+                &config,
+            )?)
+        })?;
+        let milliseconds = timed.milliseconds_per_step();
+        let scenario = case.recording.scenario();
+        run.phase("write", |run| {
+            let label = format!("{} among {}", self.planner.name(), self.world);
+            let film = futures::film(scenario, &[(&label, &scored.driven.rollout)])?;
+            film.save(&run.path("film.gif"))?;
+            write_candidates(run, &noted.steps)
+        })?;
+        run.result("scenario", &scenario.id)?;
+        run.result("planner", self.planner.name())?;
+        run.result("world", self.world.to_string())?;
+        run.result("steps", scored.driven.ego.len())?;
+        run.result("milliseconds_per_step", milliseconds)?;
+        tell(run, &scored)?;
+        let first = noted.steps.first().map_or(&[][..], |step| step);
+        run.result(
+            "candidates",
+            first.iter().map(candidate).collect::<Vec<_>>(),
+        )
+    }
+}
+
+fn tell(run: &mut Run, scored: &Scored) -> anyhow::Result<()> {
+    run.result("score", scored.score)?;
+    for (name, score) in scored.metrics.scores() {
+        run.result(&name, score)?;
+    }
+    Ok(())
+}
+
+/// A candidate as a row of the table: the first step's are shown, the file has all.
+fn candidate(considered: &Considered) -> Value {
+    let mut row = json!({
+        "candidate": considered.name,
+        "chosen": if considered.chosen { "yes" } else { "" },
+        "score": considered.score,
+    });
+    for &(name, value) in &considered.parts {
+        row[name] = json!(value);
+    }
+    row
+}
+
+/// `candidates.json`: per step every candidate, with its poses to the centimetre.
+fn write_candidates(run: &Run, steps: &[Vec<Considered>]) -> anyhow::Result<()> {
+    let rounded = |x: f64, unit: f64| (x / unit).round() * unit;
+    let all: Vec<Vec<Value>> = steps
+        .iter()
+        .map(|step| {
+            let full = step.iter().map(|considered| {
+                let mut told = candidate(considered);
+                let poses = considered.poses.iter().map(|pose| {
+                    let p = pose.position;
+                    [
+                        rounded(p.x, 0.01),
+                        rounded(p.y, 0.01),
+                        rounded(pose.heading, 1e-4),
+                    ]
+                });
+                told["poses"] = json!(poses.collect::<Vec<_>>());
+                told
+            });
+            full.collect()
+        })
+        .collect();
+    let path = run.path("candidates.json");
+    gump_data::write_atomically(&path, |file| {
+        serde_json::to_writer(file, &all)
+            .map_err(|error| anyhow::anyhow!("cannot write {}: {error}", path.display()))
+    })
+}
