@@ -1,58 +1,71 @@
-//! A planner that imagines, what it weighs, and how it drives.
+//! A planner of one's own, driven through recorded scenes among reactive traffic and scored as
+//! nuPlan scores.
 //!
-//! `cargo run -p examples --example score_a_planner [FILE#INDEX]`. A planner of your own takes the
-//! place of `Interactive` by implementing `gump_planner::Planner`.
+//! `cargo run -p examples --example score_a_planner [FILE]`. The planner is the first twenty lines;
+//! `main` works for any: exchange `Cruise` for `gump_planner::PdmClosed::default()`, or for
+//! `Planned::new(Interactive::new(...)?, 5)` to let one imagine before it drives.
 
-use gump_planner::{Interactive, InteractiveConfig, Planner, PlannerPolicy, planning_reward};
-use gump_rollout::{SimulateConfig, Start, simulate, worlds::Idm};
-use gump_scene::Seed;
+use gump_geometry::dvec2;
+use gump_planner::closed_loop::drive_and_score;
+use gump_rollout::BoxError;
+use gump_rollout::closed_loop::{
+    DriveConfig, Driver, Mission, Moment, Recording, derive_roadblocks,
+};
+use gump_rollout::dynamics::Trajectory;
+use gump_rollout::worlds::NuplanIdm;
+use gump_scene::EgoState;
+
+/// Goes on straight at the speed it has.
+struct Cruise;
+
+impl Driver for Cruise {
+    fn name(&self) -> &str {
+        "cruise"
+    }
+
+    fn start(&mut self, _: &Mission<'_>) -> Result<(), BoxError> {
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let after = |i: i64| {
+            let mut state = EgoState {
+                time_us: moment.ego.time_us + i * 100_000,
+                ..*moment.ego
+            };
+            state.rear_axle.position = state.rear_axle * dvec2(state.speed() * 0.1 * i as f64, 0.0);
+            state
+        };
+        Ok(Trajectory::new((0..=40).map(after).collect())?)
+    }
+}
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
-    "/../datasets/mini/procedural.tfrecord.gz#22"
+    "/../datasets/mini/procedural.tfrecord.gz"
 );
 
 fn main() -> anyhow::Result<()> {
-    let name = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
-    let scenario = gump_data::find(&name)?;
-    let scene = scenario.present();
-
-    // The planner makes proposals, drives each through the world, where others answer it, and
-    // takes the best over four futures. It keeps all of them, so that a choice can be explained.
-    let world = Idm::default();
-    let mut planner = Interactive::new(&world, InteractiveConfig::default())?;
-    let plan = planner.plan(&scene)?;
-    for (i, candidate) in plan.candidates.iter().enumerate() {
-        let mark = if i == plan.chosen { '>' } else { ' ' };
-        // The emergency brake, the last resort, is not imagined and has no score.
-        let score = candidate.score.as_ref().map_or(f64::NAN, |s| s.mean);
-        println!("{mark} {score:.3}  {:?}", candidate.proposal.kind);
-    }
-
-    // In closed loop it plans afresh at every step. Here the traffic it meets is the traffic it
-    // imagines; another world in this place is the harder test.
-    let mut policy = PlannerPolicy::new(planner);
-    let start = Start {
-        scene,
-        n_futures: 1,
-        seed: Seed(0),
-    };
-    let config = SimulateConfig {
-        seconds: 4.0,
-        ..SimulateConfig::default()
-    };
-    let driven = simulate(&world, &[start], Some(&mut policy), &config)
-        .map_err(anyhow::Error::from_boxed)?;
-
-    // The reward it planned with, now over what it did, with its parts.
-    for rollout in &driven {
-        let score = planning_reward().over_rollout(rollout, scenario.ego);
-        println!("4 s of driving score {:.3}", score.total);
-        for gate in &score.gates {
-            println!("  times {} for {}", gate.factor, gate.name);
-        }
-        for term in &score.terms {
-            println!("  plus {:.3} from {}", term.contribution(), term.name);
+    let path = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
+    for record in gump_data::open(path.as_ref())?.take(5) {
+        let mut scenario = record?.scenario;
+        // Drives are judged on the map as it is; driving needs roadblocks, which not all have.
+        let map = scenario.map.clone();
+        derive_roadblocks(&mut scenario);
+        let recording = Recording::of_boxes(scenario)?;
+        let mut traffic = NuplanIdm::default();
+        let config = DriveConfig::default();
+        match drive_and_score(&recording, &map, &mut traffic, &mut Cruise, &config) {
+            Ok(scored) => {
+                println!("{}: {:.3}", recording.scenario().id, scored.score);
+                for (metric, score) in scored.metrics.scores() {
+                    println!(
+                        "    {metric} {}",
+                        score.map_or("-".into(), |s| format!("{s:.3}"))
+                    );
+                }
+            }
+            Err(error) => println!("{}: {error}", recording.scenario().id),
         }
     }
     Ok(())

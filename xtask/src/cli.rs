@@ -129,6 +129,9 @@ impl Cli {
             Verb::Bench(bench::Verb::Wosac(args)) => {
                 Run::of("bench wosac", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Bench(bench::Verb::Planning(args)) => {
+                Run::of("bench planning", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {
                 Run::of("tidy", &args.common, &args)?.execute(|run| args.execute(run))

@@ -15,7 +15,6 @@ mod config;
 mod dataset;
 mod futures;
 mod imagine;
-mod intervals;
 mod losses;
 mod machine;
 mod planners;

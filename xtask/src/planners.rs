@@ -87,7 +87,7 @@ impl Surroundings {
         sampling: &gump_model::SamplingConfig,
     ) -> anyhow::Result<Self> {
         let learned = match name {
-            WorldName::Model(_) => Some(World::without_log(name, sampling)?),
+            WorldName::Model(_) => Some(World::without_log(&Device::Cpu, name, sampling)?),
             _ => None,
         };
         Ok(Self {

@@ -1,9 +1,13 @@
 //! Proposals, imagining them in any world, choosing one.
 //!
 //! Start with [`Interactive`]: it proposes what the ego might do, imagines how others answer and
-//! keeps every candidate with its score. [`Planner`] is what all planners are; [`PlannerPolicy`]
-//! lets one drive in a simulation. How traffic moves is a world's business, what is good a
-//! reward's; nothing here reads a file or steps a world by itself.
+//! keeps every candidate with its score. [`Planner`] is what plans from a scene alone;
+//! [`PlannerPolicy`] lets one drive in a simulation. How traffic moves is a world's business, what
+//! is good a reward's; nothing here reads a file or steps a world by itself.
+//!
+//! nuPlan's closed loop is driven by a [`gump_rollout::closed_loop::Driver`]: [`PdmClosed`],
+//! [`NuplanIdmDriver`], [`SimpleDriver`], the oracle [`LogDriver`], or any [`Planner`] as
+//! [`Planned`]. [`closed_loop`] lets one drive and scores it.
 //!
 //! # Terms
 //! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with what became of it.
@@ -25,6 +29,31 @@
 //! assert_eq!(plan.candidates.len(), 15);
 //! let score = plan.choice().score.as_ref().unwrap();
 //! assert!(plan.candidates.iter().all(|c| c.score.as_ref().unwrap().mean <= score.mean + 1e-6));
+//! ```
+//!
+//! # Scoring a planner
+//! A planner of one's own takes the place of `PdmClosed` by implementing `Driver`: a name, a start,
+//! and a trajectory per step; `examples/score_a_planner.rs` has one.
+//! ```
+//! use gump_planner::{PdmClosed, closed_loop::drive_and_score};
+//! use gump_rollout::closed_loop::{DriveConfig, Recording, derive_roadblocks};
+//! use gump_rollout::worlds::NuplanIdm;
+//!
+//! let mut scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 300,0 speed 12
+//!      drivable: -10,-2 300,-2 300,2 -10,2
+//!      route 1
+//!      ego vehicle 0: 10,0 velocity 8,0 size 5.176,2.297
+//!      agent vehicle 1: 60,0 velocity 8,0",
+//! ).unwrap();
+//! let map = scenario.map.clone();
+//! derive_roadblocks(&mut scenario);
+//! let recording = Recording::of_boxes(scenario).unwrap();
+//! let (mut traffic, mut driver) = (NuplanIdm::default(), PdmClosed::default());
+//! let config = DriveConfig::default();
+//! let scored = drive_and_score(&recording, &map, &mut traffic, &mut driver, &config).unwrap();
+//! assert_eq!(scored.metrics.collisions.score, 1.0);
+//! assert!(scored.score > 0.5);
 //! ```
 
 pub mod closed_loop;

@@ -13,9 +13,9 @@ pub(crate) const RADIUS: f64 = 50.0;
 #[derive(Debug, Default)]
 pub(crate) struct Ground {
     lanes: BTreeMap<LaneId, Arc<PolygonIndex>>,
-    carparks: BTreeMap<i64, Arc<PolygonIndex>>,
+    areas: BTreeMap<(i64, bool), Arc<PolygonIndex>>,
     near: Vec<Surface>,
-    intersections: Vec<PolygonIndex>,
+    intersections: Vec<Arc<PolygonIndex>>,
 }
 
 #[derive(Debug)]
@@ -55,21 +55,31 @@ impl Ground {
                 }));
             }
         }
-        for area in map.areas_in_square(center, RADIUS, AreaKind::Carpark) {
-            let polygon = self
-                .carparks
-                .entry(area.id)
-                .or_insert_with(|| Arc::new(PolygonIndex::new(&area.polygon)));
-            self.near.push(Surface {
+        let carparks: Vec<_> = self.areas_near(map, center, AreaKind::Carpark);
+        self.near
+            .extend(carparks.into_iter().map(|polygon| Surface {
                 lane: None,
-                polygon: Arc::clone(polygon),
+                polygon,
                 on_route: false,
-            });
-        }
-        let intersections = map.areas_in_square(center, RADIUS, AreaKind::Intersection);
-        self.intersections = intersections
-            .map(|a| PolygonIndex::new(&a.polygon))
-            .collect();
+            }));
+        self.intersections = self.areas_near(map, center, AreaKind::Intersection);
+    }
+
+    fn areas_near(
+        &mut self,
+        map: &MapGraph,
+        center: DVec2,
+        kind: AreaKind,
+    ) -> Vec<Arc<PolygonIndex>> {
+        let known = &mut self.areas;
+        let areas = map.areas_in_square(center, RADIUS, kind);
+        areas
+            .map(|area| {
+                // Ids are unique within a layer of a map at least.
+                let prepared = known.entry((area.id, kind == AreaKind::Carpark));
+                Arc::clone(prepared.or_insert_with(|| Arc::new(PolygonIndex::new(&area.polygon))))
+            })
+            .collect()
     }
 
     /// The lanes near the ego.

@@ -285,29 +285,42 @@ impl<'a> Surroundings<'a> {
     }
 }
 
-/// Convex pieces of road with common bounds.
+/// Pieces of a corridor that share bounds.
+const CHUNK: usize = 8;
+
+/// Convex pieces of road, with the bounds of all and of every few.
 struct Corridor {
     pieces: Vec<Quad>,
-    min: DVec2,
-    max: DVec2,
+    chunks: Vec<(DVec2, DVec2)>,
+    whole: (DVec2, DVec2),
 }
 
 impl Corridor {
     fn new(pieces: Vec<Quad>) -> Self {
-        let (mut min, mut max) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        for piece in &pieces {
-            let (low, high) = piece.bounds();
-            (min, max) = (min.min(low), max.max(high));
+        let around = |pieces: &[Quad]| {
+            let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+            pieces
+                .iter()
+                .map(Quad::bounds)
+                .fold(none, |all, (min, max)| (all.0.min(min), all.1.max(max)))
+        };
+        Self {
+            chunks: pieces.chunks(CHUNK).map(around).collect(),
+            whole: around(&pieces),
+            pieces,
         }
-        Self { pieces, min, max }
     }
 
-    fn may_reach(&self, (min, max): (DVec2, DVec2)) -> bool {
-        min.cmple(self.max).all() && self.min.cmple(max).all()
+    fn may_reach(&self, bounds: (DVec2, DVec2)) -> bool {
+        overlap(self.whole, bounds)
     }
 
     fn intersects(&self, quad: &Quad) -> bool {
-        self.pieces.iter().any(|piece| piece.intersects(quad))
+        let bounds = quad.bounds();
+        let chunks = self.pieces.chunks(CHUNK).zip(&self.chunks);
+        chunks
+            .filter(|(_, around)| overlap(**around, bounds))
+            .any(|(pieces, _)| pieces.iter().any(|piece| piece.intersects(quad)))
     }
 
     fn intersects_polygon(&self, polygon: &Polygon) -> bool {
@@ -317,6 +330,10 @@ impl Corridor {
                 .iter()
                 .any(|piece| piece.intersects_polygon(polygon))
     }
+}
+
+fn overlap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> bool {
+    a.0.cmple(b.1).all() && b.0.cmple(a.1).all()
 }
 
 /// Centre of the area of a polygon's outer ring.

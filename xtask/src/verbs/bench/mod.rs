@@ -1,7 +1,10 @@
-//! `bench`: speed, side by side in one run; ratios first.
+//! `bench`: speed, side by side in one run; ratios first, then times.
+//!
+//! A new bench is a file here and a variant of [`Verb`]; Criterion benches live in the crates.
 
 pub(crate) mod device;
 pub(crate) mod engine;
+mod planning;
 pub(crate) mod wosac;
 
 use gump_scene::{Scenario, fixture};
@@ -15,6 +18,8 @@ pub(crate) enum Verb {
     Device(device::Args),
     /// Scoring the realism of 32 rollouts, against the official evaluator
     Wosac(wosac::Args),
+    /// PDM-Closed, reactive traffic and a whole scored drive, against nuPlan's own times
+    Planning(planning::Args),
 }
 
 /// A made-up crossing of that many agents, all within the window of the tokens, with a second of

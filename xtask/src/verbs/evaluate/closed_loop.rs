@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
 
+use gump_metrics::interval;
 use gump_metrics::nuplan::MetricScores;
 use gump_planner::closed_loop::{Scored, drive_and_score, evaluate};
 use gump_rollout::closed_loop::{DriveConfig, Tracking};
@@ -13,7 +14,6 @@ use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
 use crate::futures;
-use crate::intervals::{interval, mean};
 use crate::planners::{PlannerName, Surroundings, Timed};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run, interrupted};
@@ -286,15 +286,15 @@ fn row(planner: &str, world: &str, entries: &[Entry], seed: Seed) -> Value {
         .filter_map(|e| e.outcome.as_ref().ok())
         .collect();
     let scores: Vec<f64> = done.iter().map(|(score, ..)| *score).collect();
-    let (low, high) = interval(&scores, seed).unzip();
+    let span = interval(&scores, seed);
     let mut row = json!({
         "planner": planner,
         "world": world,
         "scenarios": entries.len(),
         "failed": entries.len() - done.len(),
         "score": mean(&scores),
-        "low": low,
-        "high": high,
+        "low": span.map(|span| span.low),
+        "high": span.map(|span| span.high),
     });
     for (column, metric) in COLUMNS {
         let of_metric = done
@@ -305,4 +305,9 @@ fn row(planner: &str, world: &str, entries: &[Entry], seed: Seed) -> Value {
     let times: Vec<f64> = done.iter().map(|(.., ms)| *ms).collect();
     row["milliseconds_per_step"] = json!(mean(&times));
     row
+}
+
+/// Mean; `None` of nothing.
+pub(super) fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }

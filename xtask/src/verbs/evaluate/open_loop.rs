@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 
+use gump_metrics::interval;
 use gump_metrics::nuplan::{OpenLoop, Scoring};
 use gump_planner::closed_loop::{evaluate, plan_and_compare};
 use gump_rollout::closed_loop::Replayed;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::intervals::{interval, mean};
+use super::closed_loop::mean;
 use crate::planners::{PlannerName, Surroundings};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run};
@@ -142,9 +143,9 @@ fn row(planner: &str, outcomes: &[Outcome], run: &Run) -> Value {
         let name = done.first().map_or("score", |numbers| numbers[column].0);
         row[name] = json!(mean(&values));
         if column == 0 {
-            let (low, high) = interval(&values, run.seed()).unzip();
-            row["low"] = json!(low);
-            row["high"] = json!(high);
+            let span = interval(&values, run.seed());
+            row["low"] = json!(span.map(|span| span.low));
+            row["high"] = json!(span.map(|span| span.high));
         }
     }
     row
