@@ -1,0 +1,189 @@
+//! The closed loop from the outside: drivers that behave, and all the ways in which one may not.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::sync::Arc;
+
+use gump_geometry::Pose;
+use gump_planner::closed_loop::{drive_and_score, evaluate};
+use gump_planner::{
+    Explain, Interactive, InteractiveConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned,
+    SimpleDriver,
+};
+use gump_rollout::BoxError;
+use gump_rollout::closed_loop::{
+    DriveConfig, Driver, Mission, Moment, Recording, Replayed, derive_roadblocks,
+};
+use gump_rollout::dynamics::Trajectory;
+use gump_rollout::worlds::{Idm, NuplanIdm};
+use gump_scene::{EgoState, MapGraph, fixture};
+
+const STREET: &str = "
+    lane 1: 0,0 400,0 speed 12 left 2
+    lane 2: 0,3.5 400,3.5 speed 12 right 1
+    drivable: -20,-2 400,-2 400,6 -20,6
+    agent vehicle 1: 70,0 velocity 6,0
+    agent vehicle 2: 30,3.5 velocity 9,0
+    agent pedestrian 3: 90,5.5 velocity 0.5,0
+";
+
+fn recording(text: &str) -> (Recording, Arc<MapGraph>) {
+    let mut scenario = fixture::scenario(text).unwrap();
+    let map = Arc::clone(&scenario.map);
+    derive_roadblocks(&mut scenario);
+    (Recording::of_boxes(scenario).unwrap(), map)
+}
+
+fn street() -> (Recording, Arc<MapGraph>) {
+    recording(&format!(
+        "{STREET} route 1\n ego vehicle 0: 20,0 velocity 8,0 size 5,2"
+    ))
+}
+
+fn drive_with(case: &(Recording, Arc<MapGraph>), driver: &mut dyn Driver) -> Result<f64, String> {
+    let mut traffic = NuplanIdm::default();
+    let config = DriveConfig::default();
+    drive_and_score(&case.0, &case.1, &mut traffic, driver, &config)
+        .map(|scored| scored.score)
+        .map_err(|error| error.to_string())
+}
+
+#[test]
+fn every_driver_comes_home_on_a_map_without_roadblocks() {
+    let case = street();
+    let world = Idm::default();
+    let imagining = Interactive::new(&world, InteractiveConfig::default()).unwrap();
+    let drivers: [Box<dyn Explain>; 5] = [
+        Box::new(LogDriver::new(&case.0, &[])),
+        Box::new(NuplanIdmDriver::default()),
+        Box::new(SimpleDriver::default()),
+        Box::new(PdmClosed::default()),
+        Box::new(Planned::new(imagining, 10)),
+    ];
+    for mut driver in drivers {
+        let score = drive_with(&case, &mut *driver).unwrap();
+        assert!((0.0..=1.0).contains(&score), "{}: {score}", driver.name());
+        let chosen = driver.considered().iter().filter(|c| c.chosen).count();
+        assert_eq!(chosen, 1, "{}", driver.name());
+        // Once more gives the same: nothing is left over from the first drive.
+        assert_eq!(
+            drive_with(&case, &mut *driver).unwrap(),
+            score,
+            "{}",
+            driver.name()
+        );
+    }
+}
+
+#[test]
+fn the_log_replayed_is_the_log() {
+    let (recording, map) = street();
+    let mut log = LogDriver::new(&recording, &[]);
+    let config = DriveConfig::default();
+    let scored = drive_and_score(&recording, &map, &mut Replayed, &mut log, &config).unwrap();
+    for (step, state) in scored.driven.ego.iter().enumerate() {
+        let logged = recording.ego_at(step).rear_axle.position;
+        assert!(
+            state.rear_axle.position.distance(logged) < 0.05,
+            "step {step}"
+        );
+    }
+    let other = scored.driven.rollout.last();
+    let logged = &recording.scenario().log[recording.scenario().now + scored.driven.ego.len() - 1];
+    assert_eq!(other.now().agents().len(), logged.agents().len());
+}
+
+/// Answers with whatever it was made of, from the iteration given on.
+struct Odd {
+    from: usize,
+    answer: fn(&EgoState) -> Result<Vec<EgoState>, BoxError>,
+}
+
+impl Driver for Odd {
+    fn name(&self) -> &str {
+        "odd"
+    }
+
+    fn start(&mut self, _: &Mission<'_>) -> Result<(), BoxError> {
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let stay = |i: i64| EgoState {
+            time_us: moment.ego.time_us + i * 500_000,
+            ..*moment.ego
+        };
+        if moment.iteration < self.from {
+            return Ok(Trajectory::new((0..9).map(stay).collect())?);
+        }
+        Ok(Trajectory::new((self.answer)(moment.ego)?)?)
+    }
+}
+
+#[test]
+fn drivers_that_fail_are_named_with_the_iteration() {
+    let case = street();
+    let check = |answer: fn(&EgoState) -> Result<Vec<EgoState>, BoxError>, expected: &str| {
+        let error = drive_with(&case, &mut Odd { from: 3, answer }).unwrap_err();
+        assert!(error.starts_with("iteration 3: odd: "), "{error}");
+        assert!(error.contains(expected), "{error}");
+    };
+    check(|ego| Ok(vec![*ego]), "at least two states, got 1");
+    check(
+        |ego| {
+            let rear_axle = Pose::new(f64::NAN, 0.0, 0.0);
+            let next = EgoState {
+                time_us: ego.time_us + 100_000,
+                rear_axle,
+                ..*ego
+            };
+            Ok(vec![*ego, next])
+        },
+        "not a finite number",
+    );
+    check(|ego| Ok(vec![*ego, *ego]), "not later than the one before");
+    check(
+        |ego| {
+            let soon = EgoState {
+                time_us: ego.time_us + 50_000,
+                ..*ego
+            };
+            Ok(vec![*ego, soon])
+        },
+        "says nothing of",
+    );
+    check(|_| Err("lost its way".into()), "lost its way");
+}
+
+#[test]
+fn missing_routes_are_named_and_an_ego_off_the_road_still_drives() {
+    let astray = recording(&format!("{STREET} ego vehicle 0: 20,0 velocity 8,0"));
+    for mut driver in [
+        Box::new(PdmClosed::default()) as Box<dyn Driver>,
+        Box::new(NuplanIdmDriver::default()),
+    ] {
+        let error = drive_with(&astray, &mut *driver).unwrap_err();
+        assert!(error.contains("has no route"), "{error}");
+    }
+    let text = format!("{STREET} route 1\n ego vehicle 0: 20,-9 velocity 8,0");
+    let score = drive_with(&recording(&text), &mut PdmClosed::default()).unwrap();
+    assert_eq!(score, 0.0, "driving beside the road is worth nothing");
+}
+
+#[test]
+fn failures_keep_their_place_among_results() {
+    let texts: Vec<String> = (0..6)
+        .map(|i| {
+            let route = if i % 3 == 1 { "" } else { "route 1\n" };
+            format!("{STREET} {route} ego vehicle 0: {},0 velocity 8,0", 20 + i)
+        })
+        .collect();
+    let results = evaluate(texts.iter(), |i, text| {
+        (
+            i,
+            drive_with(&recording(text), &mut PdmClosed::default()).is_ok(),
+        )
+    });
+    let expected: Vec<(usize, bool)> = (0..6).map(|i| (i, i % 3 != 1)).collect();
+    assert_eq!(results, expected);
+}
