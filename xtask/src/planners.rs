@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use gump_model::Device;
 use gump_planner::{
     Explain, Interactive, InteractiveConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned,
     SimpleDriver,

@@ -32,10 +32,10 @@ const AREA_CELL: f64 = 0.2;
 pub fn correct_route(map: &MapGraph, route: &[RoadblockId], rear_axle: Pose) -> Vec<RoadblockId> {
     let (here, candidates) = roadblock_of_ego(map, route, rear_axle);
     let mut route = route.to_vec();
-    if let (Some(here), Some(&first)) = (here, route.first()) {
-        if !route.contains(&here) {
-            join(map, &mut route, here, first, &candidates);
-        }
+    if let (Some(here), Some(&first)) = (here, route.first())
+        && !route.contains(&here)
+    {
+        join(map, &mut route, here, first, &candidates);
     }
     let route = without_loop(map, &fill_gaps(map, &route));
     let mut seen = BTreeSet::new();

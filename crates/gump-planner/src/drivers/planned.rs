@@ -51,10 +51,10 @@ impl<P: Planner> Driver for Planned<P> {
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
-        if let Some(known) = &self.following {
-            if !moment.iteration.is_multiple_of(self.every) {
-                return Ok(known.clone());
-            }
+        if let Some(known) = &self.following
+            && !moment.iteration.is_multiple_of(self.every)
+        {
+            return Ok(known.clone());
         }
         let plan = self.planner.plan(&moment.scene)?;
         let following = follow(&plan.choice().proposal, moment, &vehicle)?;
