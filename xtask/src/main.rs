@@ -17,6 +17,7 @@ mod futures;
 mod imagine;
 mod losses;
 mod machine;
+mod nuplan_recordings;
 mod planners;
 mod progress;
 mod recordings;

@@ -3,8 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use gump_rollout::closed_loop::{Recording, derive_roadblocks};
 use gump_scene::{EgoState, MapGraph, Scenario};
+
+use crate::nuplan_recordings;
 
 /// A recording with what judging it takes besides.
 pub(crate) struct Case {
@@ -28,6 +31,10 @@ pub(crate) struct Named {
 ///
 /// Error: nothing there to read.
 pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named> + Send>> {
+    let logs = nuplan_recordings::logs_of(path);
+    if !logs.is_empty() {
+        return nuplan_recordings::open(&logs);
+    }
     let place: PathBuf = path.into();
     let records = gump_data::open(path)?.enumerate();
     Ok(Box::new(records.map(move |(i, record)| match record {
@@ -46,6 +53,14 @@ pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named>
 ///
 /// Error: no such scenario, or one that cannot be driven through.
 pub(crate) fn find(source: &str) -> anyhow::Result<Case> {
+    let (path, wanted) = source.split_once('#').unwrap_or((source, "0"));
+    let logs = nuplan_recordings::logs_of(Path::new(path));
+    if !logs.is_empty() {
+        let mut all = nuplan_recordings::open(&logs)?.enumerate();
+        let found = all.find(|(i, named)| named.id == wanted || i.to_string() == wanted);
+        let (_, named) = found.with_context(|| format!("no scenario {wanted} in {path}"))?;
+        return named.case;
+    }
     of_boxes(gump_data::find(source)?)
 }
 
