@@ -9,9 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
-use crate::verbs::{
-    ablate, bench, ci, data, demo, evaluate, plan, simulate, submit, tidy, train,
-};
+use crate::verbs::{ablate, bench, ci, data, demo, evaluate, plan, simulate, submit, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
