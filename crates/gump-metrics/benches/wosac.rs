@@ -22,14 +22,14 @@ fn city() -> Log {
         )
     };
     let edge = |k: usize| {
-        let side = if k % 2 == 0 { -5.0 } else { 5.0 };
+        let side = if k.is_multiple_of(2) { -5.0 } else { 5.0 };
         let point = |j: usize| {
             let x = j as f32 * 1.5 - 50.0;
             [x, street(k / 2) + side + (x * 0.02 + k as f32).sin(), 0.0]
         };
         let points = (0..400).map(point);
         // The road lies on the left of its edges.
-        if k % 2 == 0 {
+        if k.is_multiple_of(2) {
             points.collect()
         } else {
             points.rev().collect()
