@@ -314,6 +314,7 @@ fn simulate_writes_futures_in_every_world() {
             "picture.png",
             "report.json",
             "rollouts.binproto",
+            "viewer.html",
         ];
         assert_eq!(place.files(), files, "{world}");
         let path = place.path("out/rollouts.binproto");
@@ -485,6 +486,8 @@ fn demo_tells_its_stages_or_what_is_missing() {
     }
     let page = fs::read_to_string(place.path("out/index.html")).unwrap();
     assert!(page.contains("data:image/gif;base64,") && !page.contains("src=\"http"));
+    let viewer = fs::read_to_string(place.path("out/viewer.html")).unwrap();
+    assert!(page.contains("href=\"viewer.html\"") && viewer.contains("\"chosen\":true"));
 }
 
 #[test]

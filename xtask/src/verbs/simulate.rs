@@ -6,6 +6,7 @@ use anyhow::Context as _;
 use gump_data::{find, submission};
 use gump_metrics::{Part, Summary, summarize};
 use gump_scene::{Rollout, Scenario};
+use gump_viz::Viewer;
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -83,6 +84,15 @@ impl Args {
         let label = format!("{} in the world {}", scenario.id, self.world);
         futures::picture(scenario, rollouts, &label).save_png(&run.path("picture.png"))?;
         futures::film(scenario, &futures::first_few(rollouts))?.save(&run.path("film.gif"))?;
+        let mut viewer = Viewer::new(scenario);
+        viewer
+            .note(format!(
+                "{} futures in the world {}",
+                rollouts.len(),
+                self.world
+            ))
+            .futures(rollouts);
+        viewer.save(&run.path("viewer.html"))?;
         Ok(())
     }
 

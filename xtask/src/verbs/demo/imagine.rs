@@ -4,8 +4,8 @@ use gump_metrics::summarize;
 use gump_model::checkpoint;
 use gump_model::{Device, world::TransformerWorld};
 use gump_planner::{Interactive, InteractiveConfig, Plan, Planner as _, ProposalKind};
-use gump_scene::Rollout;
-use gump_viz::{Camera, FilmSpec, overlay_film};
+use gump_scene::{Rollout, SceneState};
+use gump_viz::{Camera, CandidatePath, FilmSpec, overlay_film};
 use serde_json::{Value, json};
 
 use super::Demo;
@@ -70,6 +70,7 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         }
     }
     show(demo, run, &learned)?;
+    demo.futures = learned;
     demo.page
         .section("How good they are")
         .prose(
@@ -106,6 +107,7 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
     demo.page
         .section("Futures")
         .prose("From the present on, the shipped network drives everyone, the ego too.")
+        .link("viewer.html", "Play them all in the viewer")
         .film(&film, "What really happened, and three of the futures.")
         .film(
             &overlay,
@@ -124,6 +126,7 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         ..InteractiveConfig::default()
     };
     let plan = Interactive::new(&world, config)?.plan(&demo.scenario.present())?;
+    demo.candidates = candidates(&plan, &demo.scenario.present());
     let table: Vec<_> = ranked(&plan)
         .into_iter()
         .map(|(i, mean)| {
@@ -154,6 +157,25 @@ fn ranked(plan: &Plan) -> Vec<(usize, Option<f64>)> {
     let key = |score: Option<f64>| score.unwrap_or(f64::NEG_INFINITY);
     order.sort_by(|a, b| key(b.1).total_cmp(&key(a.1)));
     order
+}
+
+/// The candidates as lines from where the ego is.
+fn candidates(plan: &Plan, scene: &SceneState<'_>) -> Vec<CandidatePath> {
+    let start = scene.ego_now().state.pose.position;
+    let candidates = plan.candidates.iter().enumerate();
+    candidates
+        .map(|(i, candidate)| {
+            let states = &candidate.proposal.states;
+            CandidatePath {
+                name: proposal(candidate.proposal.kind),
+                score: candidate.score.as_ref().map(|score| score.mean),
+                is_chosen: i == plan.chosen,
+                path: std::iter::once(start)
+                    .chain(states.iter().map(|state| state.pose.position))
+                    .collect(),
+            }
+        })
+        .collect()
 }
 
 fn proposal(kind: ProposalKind) -> String {

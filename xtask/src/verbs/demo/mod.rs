@@ -9,8 +9,8 @@ mod look;
 
 use gump_data::find;
 use gump_model::SamplingConfig;
-use gump_scene::Scenario;
-use gump_viz::Page;
+use gump_scene::{Rollout, Scenario};
+use gump_viz::{CandidatePath, Page, Viewer};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -38,6 +38,10 @@ struct Demo {
     scenario: Scenario,
     sampling: SamplingConfig,
     page: Page,
+    /// Of the learned world.
+    futures: Vec<Rollout>,
+    /// What the planner considered in it.
+    candidates: Vec<CandidatePath>,
 }
 
 /// A stage: its name in the report, what it is doing, and the doing.
@@ -78,6 +82,8 @@ impl Args {
                 ..SamplingConfig::default()
             },
             page: Page::new("gump: one scene, many futures"),
+            futures: Vec::new(),
+            candidates: Vec::new(),
         };
         demo.page.lede(format!(
             "Everything below was made from the scenario {} in {name} by one command, offline.",
@@ -94,6 +100,7 @@ impl Args {
 
 fn page(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let path = run.path("index.html");
+    view(demo, run)?;
     demo.page.footer(format!(
         "cargo xtask demo, seed {}, commit {}, on {}.",
         run.seed().0,
@@ -103,4 +110,19 @@ fn page(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     demo.page.save(&path)?;
     run.say(&format!("open {}", path.display()));
     Ok(serde_json::json!({ "file": path }))
+}
+
+/// Writes the viewer of the futures and the plan beside the page.
+fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
+    let mut viewer = Viewer::new(&demo.scenario);
+    viewer
+        .note(format!(
+            "{} futures in the learned world",
+            demo.futures.len()
+        ))
+        .futures(&demo.futures);
+    for candidate in &demo.candidates {
+        viewer.candidate(candidate.clone());
+    }
+    Ok(viewer.save(&run.path("viewer.html"))?)
 }
