@@ -42,10 +42,14 @@ function drawChart(canvas, curves, [from, to], now, colours, digits) {
 // What can be charted of an agent: a name, decimals, and for a take the points.
 function quantities(world, agent) {
   const points = (take, value) => Array.from({ length: take.frames }, (_, i) => [take.first + i * take.dt, value(take, agent * take.frames + i, take.first + i * take.dt)]);
-  // Unwound from the start of the log on, so that one turn does not tear the curve.
+  // Headings go on past half a turn; a future may have begun a whole turn away from the log.
+  const turns = take => {
+    const { first, frames, heading } = world.takes[take], logged = stateAt(world, 0, agent, first), start = heading[agent * frames];
+    return take > 0 && logged && !Number.isNaN(start) ? 360 * Math.round((logged.heading - start) / (2 * Math.PI)) : 0;
+  };
   const list = [
     { name: 'speed, m/s', digits: 1, of: take => points(world.takes[take], (k, i) => k.speed[i]) },
-    { name: 'heading, degrees', digits: 0, of: take => points(world.takes[take], (k, i) => k.heading[i] * 180 / Math.PI) },
+    { name: 'heading, degrees', digits: 0, of: take => { const more = turns(take); return points(world.takes[take], (k, i) => k.heading[i] * 180 / Math.PI + more); } },
   ];
   if (world.takes.length > 1) list.push({
     name: 'distance from the log, m', digits: 1, of: take => {
