@@ -140,7 +140,8 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         );
         assert_eq!(report["different_takes"], 5);
         let played = report["played_s"].as_f64().unwrap_or_default();
-        assert!(0.0 < played && played < 1.0, "{played}");
+        // Thirty sixtieths of a second, and what the browser drew of its own accord in between.
+        assert!((0.499..0.9).contains(&played), "{played}");
         let changes = report["changes"].as_object().expect("a table of keys");
         assert!(
             changes.len() == 8 && changes.values().all(|changed| *changed == true),

@@ -294,15 +294,18 @@ function listenToPointers(canvas) {
 
 let last = 0;
 function tick(time) {
-  const elapsed = Math.min((time - last) / 1000, 0.1);
+  advance(Math.min((time - last) / 1000, 0.1));
   last = time;
+  requestAnimationFrame(tick);
+}
+
+function advance(elapsed) {
   if (ui.playing) {
     ui.t += elapsed * ui.speed;
     if (ui.t >= span[1]) { ui.t = span[1]; play(false); }
     stale = true;
   }
   if (stale) paint();
-  requestAnimationFrame(tick);
 }
 
 function paint() {

@@ -16,8 +16,8 @@ if (location.hash === '#check') {
     report.takes = world.takes.length;
     report.agents = facts.agents.length;
     seek(span[0]); play(true);
-    // The time of a browser without a window leaps from timer to timer: many small waits.
-    for (let i = 0; i < 900 && ui.t - span[0] < 0.05; i++) await wait(16);
+    // A browser without a window draws when it likes: here the clock is ours.
+    for (let i = 0; i < 30; i++) advance(1 / 60);
     report.played_s = ui.t - span[0];
     play(false); seek(span[1]);
     const pictures = new Set();
