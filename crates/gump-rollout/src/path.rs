@@ -36,15 +36,18 @@ impl Path {
     /// A path through the poses that are followed by another one elsewhere; `None` if there are
     /// fewer than two.
     ///
-    /// The last pose is dropped even where it is not repeated. Source: nuPlan's path of a vehicle;
-    /// routes are short by one point for it, which the goldens see.
+    /// The last pose is dropped even where it is not repeated, unless too few would be left. Source:
+    /// nuPlan's path of a vehicle; routes are short by one point for it, which the goldens see.
     pub fn without_last(poses: &[Pose]) -> Option<Self> {
-        let kept: Vec<Pose> = poses
+        let mut kept: Vec<Pose> = poses
             .windows(2)
             .filter(|pair| pair[0].position.distance(pair[1].position) > SAME)
             .map(|pair| pair[0])
             .collect();
-        if kept.len() < 2 {
+        if kept.len() == 1 {
+            kept.extend(poses.last());
+        }
+        if kept.is_empty() {
             return None;
         }
         Self::through(&kept)
