@@ -3,15 +3,15 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use gump_geometry::{DVec2, Polygon};
+use gump_geometry::{DVec2, Polygon, angle_difference};
 use gump_scene::{
     Area, AreaKind, Lane, LaneId, MapGraph, MapParts, Roadblock, RoadblockId, Route, Scenario,
 };
 
-use crate::path::curvature_at_start;
-
 /// How far a route is led on past its end, metres: no planner looks farther ahead.
 const BEYOND: f64 = 200.0;
+/// How far into a lane its turn is looked for, metres.
+const TURN_SEEN: f64 = 10.0;
 /// Ids of derived areas start here, clear of those of a format.
 const FIRST_AREA: i64 = 1 << 40;
 
@@ -131,11 +131,15 @@ fn with_roadblocks(map: &MapGraph, route: &Route) -> Route {
     let mut lanes = route.lanes.clone();
     let mut beyond = 0.0;
     while let Some(&last) = lanes.last().filter(|_| beyond < BEYOND) {
+        let ahead = map.lane(last).map(|lane| {
+            let line = &lane.centerline;
+            line.pose_at(line.length()).heading
+        });
         let next = map
             .successors(last)
             .filter(|lane| !lanes.contains(&lane.id))
             .min_by(|a, b| {
-                let turn = |lane: &Lane| curvature_at_start(lane).abs();
+                let turn = |lane: &Lane| turn_into(lane, ahead.unwrap_or_default());
                 turn(a).total_cmp(&turn(b))
             });
         let Some(next) = next else { break };
@@ -149,6 +153,13 @@ fn with_roadblocks(map: &MapGraph, route: &Route) -> Route {
         roadblocks,
         ..route.clone()
     }
+}
+
+/// How far a lane turns away from `heading` in its first metres, radians.
+fn turn_into(lane: &Lane, heading: f64) -> f64 {
+    let line = &lane.centerline;
+    let begun = line.pose_at(TURN_SEEN.min(line.length())).heading;
+    angle_difference(begun, heading).abs()
 }
 
 /// The corners of the smallest convex shape around some points, counter-clockwise.
