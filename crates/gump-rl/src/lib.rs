@@ -33,9 +33,11 @@ mod env;
 mod error;
 mod observation;
 mod replay_buffer;
+mod vector_env;
 
 pub use action::{Action, ActionLimits};
 pub use env::{End, Env, EnvConfig, Failure, Step};
 pub use error::RlError;
 pub use observation::{Observation, ObservationSpec, observe};
 pub use replay_buffer::{ReplayBuffer, Transition};
+pub use vector_env::VectorEnv;
