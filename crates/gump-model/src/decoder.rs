@@ -272,7 +272,21 @@ impl StateDecoder {
         let specials = weight.narrow(0, gump_tokenizer::BEGIN as usize, 3)?;
         ops::linear(hidden, &Tensor::cat(&[&keys, &specials], 0)?, None)
     }
+
+    /// Logits over the state of the light that follows a BEGIN or a light, in the order of their
+    /// tokens; [N, 4].
+    pub(crate) fn light_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+        let first = gump_tokenizer::FIRST_LIGHT as usize;
+        ops::linear(
+            hidden,
+            &self.head.weight().narrow(0, first, N_LIGHT_STATES)?,
+            None,
+        )
+    }
 }
+
+/// States of a light: green, yellow, red, unknown.
+pub(crate) const N_LIGHT_STATES: usize = 4;
 
 /// Keys in the control alphabet: the ego's and 320 agents'.
 pub(crate) const CONTROL_KEYS: usize = 321;

@@ -12,7 +12,7 @@ use crate::decoder::STEPS;
 use crate::mct::Dropout;
 use crate::network::Network;
 use crate::ops::{self, OrdinalSmoothing};
-use crate::sample::{Sample, TrajectoryTarget};
+use crate::sample::{ControlTarget, Sample, TrajectoryTarget};
 use crate::trajectory::{FUTURE, MODES, PAST, POSE, Trajectories};
 
 /// Weights of the parts.
@@ -21,6 +21,10 @@ use crate::trajectory::{FUTURE, MODES, PAST, POSE, Trajectories};
 pub struct LossConfig {
     /// Weight of the successor of control and value tokens (released code v1.1: 0.1).
     pub control: f64,
+    /// Weight of the states of traffic lights.
+    pub lights: f64,
+    /// Weight of the classes of agents not seen before.
+    pub classes: f64,
     /// Weights of the trajectory heads, shallow to deep (paper: 0.25, 0.25, 0.5, 0.5); a network
     /// with fewer heads uses the last ones.
     pub trajectory: [f64; 4],
@@ -39,6 +43,8 @@ impl Default for LossConfig {
     fn default() -> Self {
         Self {
             control: 0.1,
+            lights: 0.1,
+            classes: 0.1,
             trajectory: [0.25, 0.25, 0.5, 0.5],
             past: 0.25,
             reconstruction: 1.0,
@@ -59,6 +65,12 @@ pub struct LossParts {
     pub fields: Vec<f64>,
     /// Cross-entropy of successors, nats.
     pub control: f64,
+    /// Cross-entropy of the states of lights, nats; 0 where there are none.
+    #[serde(default)]
+    pub lights: f64,
+    /// Cross-entropy of the classes of agents not seen before, nats.
+    #[serde(default)]
+    pub classes: f64,
     /// Trajectory heads, weighted.
     pub trajectory: f64,
     /// Mean absolute error of the reconstructed raster.
@@ -70,6 +82,8 @@ impl LossParts {
     pub fn first_not_finite(&self) -> Option<String> {
         let named = [
             ("control", self.control),
+            ("lights", self.lights),
+            ("classes", self.classes),
             ("trajectory", self.trajectory),
             ("reconstruction", self.reconstruction),
             ("total", self.total),
@@ -116,9 +130,37 @@ pub(crate) fn loss(
     if let Some(state) = state_loss(network, samples, t, &flat, config, &mut parts)? {
         total = (total + state)?;
     }
-    if let Some(control) = control_loss(network, samples, t, &flat)? {
-        parts.control = scalar(&control)?;
-        total = (total + (control * config.control)?)?;
+    let decoder = &network.decoder;
+    let spoken = [
+        successor_loss(
+            samples,
+            |s| &s.control,
+            t,
+            &flat,
+            |hidden| decoder.control_logits(hidden),
+        )?,
+        successor_loss(
+            samples,
+            |s| &s.lights,
+            t,
+            &flat,
+            |hidden| decoder.light_logits(hidden),
+        )?,
+        successor_loss(
+            samples,
+            |s| &s.classes,
+            t,
+            &flat,
+            |hidden| network.mct.class_logits(hidden),
+        )?,
+    ];
+    let weights = [config.control, config.lights, config.classes];
+    let said = [&mut parts.control, &mut parts.lights, &mut parts.classes];
+    for ((loss, weight), said) in spoken.into_iter().zip(weights).zip(said) {
+        if let Some(loss) = loss {
+            *said = scalar(&loss)?;
+            total = (total + (loss * weight)?)?;
+        }
     }
     let targets = trajectory_targets(samples, t, config.max_trajectories);
     if !targets.is_empty() {
@@ -223,22 +265,21 @@ fn state_loss(
     Ok(total)
 }
 
-/// Mean cross-entropy of what follows control and value tokens.
-fn control_loss(
-    network: &Network,
+/// Mean cross-entropy of what is said of the successors of some slots.
+fn successor_loss(
     samples: &[Sample],
+    targets: impl Fn(&Sample) -> &Vec<ControlTarget>,
     t: usize,
     flat: &Tensor,
+    logits: impl Fn(&Tensor) -> candle_core::Result<Tensor>,
 ) -> Result<Option<Tensor>, ModelError> {
-    let device = network.device();
+    let device = flat.device();
     let (rows, successors): (Vec<u32>, Vec<u32>) = samples
         .iter()
         .enumerate()
         .flat_map(|(row, sample)| {
-            sample
-                .control
-                .iter()
-                .map(move |target| ((row * t + target.slot) as u32, target.successor))
+            let of_sample = targets(sample).iter();
+            of_sample.map(move |target| ((row * t + target.slot) as u32, target.successor))
         })
         .unzip();
     let n = rows.len();
@@ -246,11 +287,13 @@ fn control_loss(
         return Ok(None);
     }
     let hidden = flat.index_select(&Tensor::from_vec(rows, n, device)?, 0)?;
-    let logits = network.decoder.control_logits(&hidden)?;
     let weights = Tensor::ones(n, candle_core::DType::F32, device)?;
     let targets = Tensor::from_vec(successors, n, device)?;
     Ok(Some(ops::masked_cross_entropy(
-        &logits, &targets, &weights, None,
+        &logits(&hidden)?,
+        &targets,
+        &weights,
+        None,
     )?))
 }
 

@@ -11,6 +11,7 @@
 
 use candle_core::{Result, Tensor};
 use gump_scene::Seed;
+use gump_tokenizer::N_CLASSES;
 
 use crate::ModelError;
 use crate::config::{Gate, ModelConfig};
@@ -424,6 +425,13 @@ impl Mct {
     /// The rows of the token table, [TABLE_ROWS, C], which the decoder reads too.
     pub(crate) fn token_table(&self) -> Result<Tensor> {
         self.table.narrow(0, 0, Tables::CLASS)
+    }
+
+    /// Logits over the class of an agent not seen before, from the slot before its key; the rows by
+    /// which classes enter are also those by which they are told; [N, 3].
+    pub(crate) fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+        let rows = self.table.narrow(0, Tables::CLASS, N_CLASSES)?;
+        ops::linear(hidden, &rows, None)
     }
 
     /// The MLP over sine features, [N, C] to [N, C].

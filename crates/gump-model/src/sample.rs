@@ -7,9 +7,12 @@ use std::collections::BTreeMap;
 
 use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_raster::{Raster, RasterSpec, rasterize};
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario, SceneState, Seed};
+use gump_scene::{
+    Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario, ScenarioTag, SceneState, Seed,
+};
 use gump_tokenizer::{
-    Field, Identities, Key, PAD, QuantizedState, Slot, TokenFrame, TokenSequence, Tokenizer,
+    FIRST_LIGHT, Field, Identities, Key, MAX_PROMPTS, PAD, QuantizedState, Slot, TokenFrame,
+    TokenSequence, Tokenizer, class_index, light_token,
 };
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
@@ -58,6 +61,8 @@ pub struct SampleConfig {
     pub shuffle_ids: bool,
     /// Probability of leaving out the prompts.
     pub prompt_dropout: f64,
+    /// Probability that the window begins with the frame of reference, as a scene to generate does.
+    pub from_reference: f64,
 }
 
 impl Default for SampleConfig {
@@ -75,6 +80,7 @@ impl Default for SampleConfig {
             surrogate_noise: 0.5,
             shuffle_ids: true,
             prompt_dropout: 0.5,
+            from_reference: 0.25,
         }
     }
 }
@@ -93,6 +99,7 @@ impl SampleConfig {
             surrogate_noise: 0.0,
             shuffle_ids: false,
             prompt_dropout: 1.0,
+            from_reference: 0.0,
             ..Self::default()
         }
     }
@@ -105,6 +112,8 @@ pub(crate) struct Sample {
     pub(crate) raster: Raster,
     pub(crate) states: Vec<StateTarget>,
     pub(crate) control: Vec<ControlTarget>,
+    pub(crate) lights: Vec<ControlTarget>,
+    pub(crate) classes: Vec<ControlTarget>,
     pub(crate) trajectories: Vec<TrajectoryTarget>,
 }
 
@@ -124,7 +133,8 @@ impl StateTarget {
     }
 }
 
-/// What the control head should say at a slot: an index into the control alphabet.
+/// What should be said of the successor at a slot: an index into the control alphabet, a light's
+/// state or a class.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ControlTarget {
     pub(crate) slot: usize,
@@ -261,16 +271,17 @@ pub(crate) fn draw(
         window.world_from_scene,
         &identities,
     );
-    let prompts = prompts(scenario, config, &mut rng);
+    let prompts = prompts(&window, config, &mut rng);
     let sequence = TokenSequence::new(prompts, encoded.sequence.frames().to_vec()).ok()?;
     let mut slots = place(&sequence);
     let (states, trajectories) = targets(&slots, &window, &identities);
-    let control = control_targets(&slots);
     let mut sample = Sample {
         raster: draw_raster(&window, spec),
         slots: Vec::new(),
         states,
-        control,
+        control: control_targets(&slots),
+        lights: light_targets(&slots),
+        classes: class_targets(&slots),
         trajectories,
     };
     if rng.random_bool(config.surrogate_noise) {
@@ -307,7 +318,15 @@ fn choose_window<'a>(
     };
     let first_start = reference.checked_sub(lead)?;
     let latest = last_start.checked_sub(first_start)? / stride;
-    let start = first_start + stride * rng.random_range(0..=latest.min(LONGEST_ROLLOUT));
+    let drawn = rng.random_range(0..=latest.min(LONGEST_ROLLOUT));
+    let lead_frames = lead / stride;
+    // Scene generation begins with the very frame that the raster shows.
+    let frames_on = if lead_frames <= latest && rng.random_bool(config.from_reference) {
+        lead_frames
+    } else {
+        drawn
+    };
+    let start = first_start + stride * frames_on;
     let seen = |index: usize| {
         let drive = driven.and_then(|driven| driven.drive.frame(index));
         drive.unwrap_or(&scenario.log[index])
@@ -411,19 +430,29 @@ fn drop_agents(frames: &[Frame], centre: AgentId, probability: f64, rng: &mut Rn
     kept.collect()
 }
 
-fn prompts(
-    scenario: &Scenario,
-    config: &SampleConfig,
-    rng: &mut Rng,
-) -> Vec<Option<gump_scene::ScenarioTag>> {
-    if scenario.tags.is_empty() || rng.random_bool(config.prompt_dropout) {
+/// Some of the tags that hold for the centre in the first presented frame, which is what prompts of
+/// a scene to generate are about.
+fn prompts(window: &Window<'_>, config: &SampleConfig, rng: &mut Rng) -> Vec<Option<ScenarioTag>> {
+    if rng.random_bool(config.prompt_dropout) {
         return Vec::new();
     }
-    let mut tags = scenario.tags.clone();
+    let scenario = window.scenario;
+    let is_own = window.centre == scenario.ego && window.start == scenario.now;
+    let mut tags = if is_own && !scenario.tags.is_empty() {
+        scenario.tags.clone()
+    } else {
+        let seen = Scenario {
+            now: window.start,
+            ego: window.centre,
+            route: None,
+            ..scenario.clone()
+        };
+        gump_metrics::tags::mine(&seen)
+    };
     for i in (1..tags.len()).rev() {
         tags.swap(i, rng.random_range(0..=i));
     }
-    tags.into_iter().take(4).map(Some).collect()
+    tags.into_iter().take(MAX_PROMPTS).map(Some).collect()
 }
 
 fn draw_raster(window: &Window<'_>, spec: &RasterSpec) -> Raster {
@@ -531,6 +560,40 @@ fn control_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     targets
 }
 
+/// Before every light, the state it will have: of those of the same frame, the ones before it are
+/// seen.
+fn light_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
+    let successor = |next: &PlacedSlot| match next.slot {
+        Slot::Light(light) => Some(light_token(light.state) - FIRST_LIGHT),
+        _ => None,
+    };
+    successors(slots, successor)
+}
+
+/// Before every agent that the window has not had yet, its class; the ego's is known.
+fn class_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
+    let successor = |next: &PlacedSlot| match next.slot {
+        Slot::Key(key) if !key.is_ego() && next.last.is_none() => {
+            Some(class_index(key.kind) as u32)
+        }
+        _ => None,
+    };
+    successors(slots, successor)
+}
+
+/// A target at every slot for whose successor `say` has a word.
+fn successors(
+    slots: &[PlacedSlot],
+    say: impl Fn(&PlacedSlot) -> Option<u32>,
+) -> Vec<ControlTarget> {
+    let pairs = slots.windows(2).enumerate();
+    let target = |(slot, pair): (usize, &[PlacedSlot])| {
+        let successor = say(&pair[1])?;
+        Some(ControlTarget { slot, successor })
+    };
+    pairs.filter_map(target).collect()
+}
+
 /// Replaces the last frame's values by what a surrogate might have said: off by a few bins.
 fn perturb_last_frame(slots: &mut [PlacedSlot], frames: &[TokenFrame], rng: &mut Rng) {
     let last = frames.len() - 1;
@@ -565,7 +628,9 @@ fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
     let is_blank = |slot: usize| blanked[sample.slots[slot].frame.min(blanked.len() - 1)];
     sample.states.retain(|target| !is_blank(target.key));
     sample.trajectories.retain(|target| !is_blank(target.key));
-    sample.control.retain(|target| !is_blank(target.slot));
+    for targets in [&mut sample.control, &mut sample.lights, &mut sample.classes] {
+        targets.retain(|target| !is_blank(target.slot));
+    }
     for placed in &mut sample.slots {
         if blanked[placed.frame.min(blanked.len() - 1)] && !matches!(placed.slot, Slot::Prompt(_)) {
             placed.slot = Slot::Pad;
@@ -582,7 +647,8 @@ mod tests {
     fn scenario() -> Scenario {
         fixture::scenario(
             "lane 1: -100,0 100,0
-             light 1 red: 60,0
+             lane 2: 30,0 100,0
+             light 2 red: 60,0
              ego vehicle 0: 0,0 velocity 8,0
              agent vehicle 1: 20,0 velocity 5,0
              agent pedestrian 7: 30,3 velocity 0,-1",
@@ -630,6 +696,40 @@ mod tests {
             .filter(|p| matches!(p.slot, Slot::Value(_)))
             .count();
         assert_eq!(sample.control.len(), values + 4 * 3 - 1);
+    }
+
+    #[test]
+    fn lights_and_classes_are_told_before_they_come() {
+        let sample = sample(&SampleConfig::plain(4), 1);
+        let successor = |target: &ControlTarget| sample.slots[target.slot + 1].slot;
+        // One light per frame, seen from its BEGIN.
+        assert_eq!(sample.lights.len(), 4);
+        for target in &sample.lights {
+            assert!(matches!(sample.slots[target.slot].slot, Slot::Begin));
+            assert!(matches!(successor(target), Slot::Light(_)));
+            assert_eq!(target.successor, 2, "the light is red");
+        }
+        let classes: Vec<u32> = sample.classes.iter().map(|t| t.successor).collect();
+        // The vehicle and the pedestrian of the first frame; nobody is new after it.
+        assert_eq!(classes, [0, 1]);
+    }
+
+    #[test]
+    fn a_window_may_begin_with_its_reference() {
+        let config = SampleConfig {
+            from_reference: 1.0,
+            prompt_dropout: 0.0,
+            ..SampleConfig::plain(4)
+        };
+        let sample = sample(&config, 1);
+        let value = sample.slots.iter().find_map(|placed| match placed.slot {
+            Slot::Value(state) => Some(state.pose()),
+            _ => None,
+        });
+        let ego = value.expect("the ego has a value");
+        assert!(ego.position.length() < 0.2 && ego.heading.abs() < 0.02);
+        // 8 m/s behind a vehicle: what the tags say of it is the prompt.
+        assert!(matches!(sample.slots[0].slot, Slot::Prompt(Some(_))));
     }
 
     #[test]

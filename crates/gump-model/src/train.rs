@@ -383,6 +383,8 @@ impl Trainer {
             sum.total += share * parts.total;
             sum.state += share * parts.state;
             sum.control += share * parts.control;
+            sum.lights += share * parts.lights;
+            sum.classes += share * parts.classes;
             sum.trajectory += share * parts.trajectory;
             sum.reconstruction += share * parts.reconstruction;
             sum.fields

@@ -248,6 +248,8 @@ fn per_field(report: &StepReport) -> Value {
         state,
         fields,
         control,
+        lights,
+        classes,
         trajectory,
         reconstruction,
         ..
@@ -261,6 +263,8 @@ fn per_field(report: &StepReport) -> Value {
     }
     parts.insert("state".into(), json!(state));
     parts.insert("control".into(), json!(control));
+    parts.insert("lights".into(), json!(lights));
+    parts.insert("classes".into(), json!(classes));
     parts.insert("trajectory".into(), json!(trajectory));
     parts.insert("reconstruction".into(), json!(reconstruction));
     Value::Object(parts)
