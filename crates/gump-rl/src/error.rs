@@ -68,4 +68,26 @@ pub enum RlError {
         /// How many were asked for.
         asked: usize,
     },
+    /// An environment of another shape than a policy.
+    #[error("the environment has {found} numbers in its {what}, the policy expects {expected}")]
+    Shape {
+        /// Observations or actions.
+        what: &'static str,
+        /// The policy's.
+        expected: usize,
+        /// The environment's.
+        found: usize,
+    },
+    /// Learning left the realm of numbers.
+    #[error("learning diverged at gradient step {step}: a loss is not a finite number")]
+    Diverged {
+        /// Which gradient step.
+        step: usize,
+    },
+    /// Bytes that are no stored policy or run.
+    #[error("no policy or run of reinforcement learning: {what}")]
+    Archive {
+        /// What is wrong with them.
+        what: String,
+    },
 }

@@ -1,9 +1,9 @@
-//! A vectorised environment over any world, and a replay buffer.
+//! A vectorised environment over any world, and policies that learn to drive in it.
 //!
 //! Start with [`Env`]: many episodes side by side, one batched call of the world per step. What an
-//! agent sees is [`Observation`], what it does [`Action`]; [`ReplayBuffer`] keeps what happened.
-//! Everyone but the ego is the world's business, what is good a reward's. No learning algorithm
-//! lives here yet, and so no tensor either.
+//! agent sees is [`Observation`], what it does [`Action`].
+//! Everyone but the ego is the world's business, what is good a reward's. Learners know a
+//! [`VectorEnv`] alone: [`sac`] learns from rewards and from experts, and gives an [`Actor`].
 //!
 //! # Terms
 //! * **slot**: a place in the batch. **Episode**: what happens in a slot from a start to an end.
@@ -29,15 +29,17 @@
 //! ```
 
 mod action;
+mod actor;
 mod env;
 mod error;
+pub mod networks;
 mod observation;
-mod replay_buffer;
+pub mod sac;
 mod vector_env;
 
 pub use action::{Action, ActionLimits};
+pub use actor::Actor;
 pub use env::{End, Env, EnvConfig, Failure, Step};
 pub use error::RlError;
 pub use observation::{Observation, ObservationSpec, observe};
-pub use replay_buffer::{ReplayBuffer, Transition};
 pub use vector_env::VectorEnv;

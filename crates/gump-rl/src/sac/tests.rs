@@ -1,0 +1,339 @@
+//! Gradient steps against hand-computed numbers and finite differences; runs that are resumed.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+
+use gump_scene::Seed;
+
+use super::replay_buffer::{ReplayBuffer, Transition};
+use super::toys::{Reach, Toy};
+use super::{Algorithm, Batch, Learner, SacConfig, StepReport, Training};
+use crate::networks::Normalizer;
+use crate::{Actor, RlError, VectorEnv as _};
+
+fn config() -> SacConfig {
+    SacConfig {
+        steps: 60,
+        segment: 20,
+        batch: 10,
+        hidden: vec![16, 16],
+        initial_steps: 30,
+        ..SacConfig::default()
+    }
+}
+
+/// Three transitions of a learner, an end, a time-out and an ordinary one, and an expert's.
+fn batch(n_imitated: usize) -> Batch {
+    let n = 3 + n_imitated;
+    Batch {
+        observations: vec![0.4, -0.2, 0.1, 0.9, -0.7, 0.3, 0.2, 0.2][..2 * n].to_vec(),
+        actions: vec![0.5, -0.6, 0.1, 0.3][..n].to_vec(),
+        rewards: vec![-5.0, 1.0, 0.5, 0.7][..n].to_vec(),
+        nexts: vec![0.3, 0.1, -0.4, 0.5, 0.8, -0.1, 0.0, 0.6][..2 * n].to_vec(),
+        terminated: vec![true, false, false, false][..n].to_vec(),
+        n_imitated,
+    }
+}
+
+/// A learner whose networks give constants: actor (0, 0), critics 0, targets `values`.
+fn constant(config: SacConfig, values: [f32; 2]) -> Learner {
+    let mut learner = Learner::new(config, 2, 1, Seed(0));
+    learner.actor.network.parameters_mut().fill(0.0);
+    for (critic, value) in learner.critics.iter_mut().zip(values) {
+        critic.online.parameters_mut().fill(0.0);
+        critic.target.parameters_mut().fill(0.0);
+        *critic.target.parameters_mut().last_mut().unwrap() = value;
+    }
+    learner
+}
+
+#[test]
+fn a_critic_loss_by_hand() {
+    let check = |values: [f32; 2], entropy_in_target: bool, expected: f64| {
+        let config = SacConfig {
+            discount: 0.9,
+            entropy_in_target,
+            initial_log_alpha: 0.5f64.ln(),
+            ..config()
+        };
+        let report = constant(config, values).update(&batch(0), Seed(1));
+        let error = (report.critic_loss - expected).abs();
+        assert!(error < 1e-4, "{}, {expected}", report.critic_loss);
+    };
+    // Targets -5, 1 + 0.9 * 2 and 0.5 + 0.9 * 2, for two critics that say 0.
+    let by_hand = 2.0 * (25.0 + 2.8 * 2.8 + 2.3 * 2.3) / 3.0;
+    check([3.0, 2.0], false, by_hand);
+    check([2.0, 3.0], false, by_hand);
+    // The entropy of the drawn actions is worth half its nats.
+    let noise = |row: usize| {
+        let mut rng = Seed(1).fork(1).rng();
+        let drawn: Vec<f64> = (0..3)
+            .map(|_| crate::networks::standard_normal(&mut rng))
+            .collect();
+        drawn[row]
+    };
+    let log_density = |row: usize| {
+        let u = noise(row);
+        let normal = -0.5 * u * u - 0.5 * std::f64::consts::TAU.ln();
+        normal - (1.0 - u.tanh().powi(2)).ln()
+    };
+    let target = |row: usize, reward: f64| reward + 0.9 * (2.0 - 0.5 * log_density(row));
+    let by_hand = 2.0 * (25.0 + target(1, 1.0).powi(2) + target(2, 0.5).powi(2)) / 3.0;
+    check([2.0, 3.0], true, by_hand);
+}
+
+#[test]
+fn the_actor_trusts_the_lower_critic() {
+    let mut learner = constant(
+        SacConfig {
+            actor_on_next: false,
+            ..config()
+        },
+        [0.0, 0.0],
+    );
+    *learner.critics[0]
+        .online
+        .parameters_mut()
+        .last_mut()
+        .unwrap() = 4.0;
+    *learner.critics[1]
+        .online
+        .parameters_mut()
+        .last_mut()
+        .unwrap() = -1.5;
+    let report = learner.update(&batch(0), Seed(1));
+    // alpha is 1: the loss is minus entropy minus value.
+    assert!((report.actor_loss - (-report.entropy + 1.5)).abs() < 1e-6);
+    assert_eq!(report.value, 4.0);
+}
+
+#[test]
+fn entropy_above_its_target_lowers_the_temperature() {
+    let check = |target_entropy: f64, falls: bool| {
+        let config = SacConfig {
+            target_entropy,
+            ..config()
+        };
+        let mut learner = Learner::new(config, 2, 1, Seed(0));
+        let before = learner.alpha();
+        learner.update(&batch(0), Seed(1));
+        assert_eq!(learner.alpha() < before, falls);
+    };
+    check(-1.6, true);
+    check(2.0, false);
+}
+
+/// Finite differences of a loss by every fifth parameter. ReLU has kinks, on which the two sides
+/// disagree: those are few and left out.
+fn check_gradient(found: &[f32], loss: impl Fn(usize, f32) -> f64) {
+    let h = 2e-3f32;
+    let middle = loss(0, 0.0);
+    let (mut checked, mut kinks) = (0, 0);
+    for (i, &found) in found.iter().enumerate().step_by(5) {
+        let (up, down) = (loss(i, h), loss(i, -h));
+        let [right, left] = [up - middle, middle - down].map(|d| d / f64::from(h));
+        if (right - left).abs() > 0.02 * (1.0 + right.abs()) {
+            kinks += 1;
+            continue;
+        }
+        let expected = (right + left) / 2.0;
+        let error = (f64::from(found) - expected).abs();
+        assert!(
+            error < 5e-3 * (1.0 + expected.abs()),
+            "{i}: {found}, {expected}"
+        );
+        checked += 1;
+    }
+    assert!(kinks * 10 < checked, "{kinks} kinks, {checked} checked");
+}
+
+#[test]
+fn gradients_of_all_losses_are_finite_differences() {
+    for actor_on_next in [false, true] {
+        let config = SacConfig {
+            actor_on_next,
+            imitation_weight: 0.7,
+            initial_log_alpha: -1.0,
+            head_gain: 1.0,
+            ..config()
+        };
+        let learner = Learner::new(config, 2, 1, Seed(3));
+        let after = |mut learner: Learner| {
+            let report = learner.update(&batch(1), Seed(4));
+            (learner, report)
+        };
+        let actor_loss = |i: usize, h: f32| {
+            let mut moved = learner.clone();
+            moved.actor.network.parameters_mut()[i] += h;
+            let report = after(moved).1;
+            report.actor_loss + 0.7 * report.imitation_loss
+        };
+        check_gradient(after(learner.clone()).0.actor_gradient_taken(), actor_loss);
+        for k in 0..2 {
+            let critic_loss = |i: usize, h: f32| {
+                let mut moved = learner.clone();
+                moved.critics[k].online.parameters_mut()[i] += h;
+                after(moved).1.critic_loss
+            };
+            let taken = after(learner.clone()).0.critics[k]
+                .gradient_taken()
+                .to_vec();
+            check_gradient(&taken, critic_loss);
+        }
+    }
+}
+
+#[test]
+fn a_batch_holds_its_share_of_experts() {
+    let filled = |reward: f32| {
+        let mut buffer = ReplayBuffer::new(4, 2, 1).unwrap();
+        buffer.push(Transition {
+            observation: &[1.0, 2.0],
+            action: &[0.1],
+            reward,
+            next: &[3.0, 4.0],
+            terminated: false,
+        });
+        buffer
+    };
+    let (own, expert) = (filled(0.0), filled(1.0));
+    let mut batch = Batch::default();
+    let (normalizer, mut rng) = (Normalizer::identity(2), Seed(0).rng());
+    let n = SacConfig::default();
+    let (n_own, n_imitated) = (n.batch - n.n_imitated(), n.n_imitated());
+    batch
+        .draw((&own, n_own), (&expert, n_imitated), &normalizer, &mut rng)
+        .unwrap();
+    assert_eq!((batch.len(), batch.n_own()), (2048, 1638));
+    assert_eq!(batch.rewards.iter().sum::<f32>(), 410.0);
+    assert!(batch.rewards[n_own..].iter().all(|&r| r == 1.0));
+}
+
+fn experts() -> ReplayBuffer {
+    let mut expert = ReplayBuffer::new(8, 2, 2).unwrap();
+    for i in 0..8usize {
+        let x = i as f32 / 8.0;
+        expert.push(Transition {
+            observation: &[x, -x],
+            action: &[-x, x],
+            reward: x,
+            next: &[0.5 * x, -0.5 * x],
+            terminated: i.is_multiple_of(2),
+        });
+    }
+    expert
+}
+
+fn go_on(training: &mut Training, segments: usize) -> Vec<StepReport> {
+    let mut env = Toy::new(Reach, 4);
+    let mut reports = Vec::new();
+    for _ in 0..segments {
+        let keep = |report| {
+            reports.push(report);
+            ControlFlow::Continue(())
+        };
+        match training.algorithm() {
+            Algorithm::Sac => training.segment(&mut env, keep).unwrap(),
+            Algorithm::Imitation => training.imitation_segment(keep).unwrap(),
+        }
+    }
+    reports
+}
+
+#[test]
+fn a_resumed_run_is_the_run() {
+    let notes = BTreeMap::from([("world".to_owned(), "toy".to_owned())]);
+    for algorithm in [Algorithm::Sac, Algorithm::Imitation] {
+        // The buffer is written over: 30 random steps and four per gradient step.
+        let config = SacConfig {
+            replay_capacity: 100,
+            ..config()
+        };
+        let mut whole = Training::new(algorithm, config, experts(), Seed(11)).unwrap();
+        let mut first = whole.clone();
+        let all = go_on(&mut whole, 3);
+        assert!(whole.is_done());
+        go_on(&mut first, 1);
+        let bytes = first.to_bytes(&notes).unwrap();
+        let (mut resumed, found) = Training::from_bytes(&bytes).unwrap();
+        assert_eq!((found, resumed.steps()), (notes.clone(), 20));
+        let rest = go_on(&mut resumed, 2);
+        assert_eq!(rest, all[20..]);
+        let [a, b] = [&whole, &resumed].map(|run| run.to_bytes(&notes).unwrap());
+        assert!(a == b, "{algorithm:?}");
+    }
+}
+
+#[test]
+fn the_number_of_threads_changes_nothing() {
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        pool.install(|| {
+            let mut run = Training::new(Algorithm::Sac, config(), experts(), Seed(1)).unwrap();
+            go_on(&mut run, 1);
+            run.to_bytes(&BTreeMap::new()).unwrap()
+        })
+    };
+    assert_eq!(run(1), run(2));
+}
+
+#[test]
+fn a_policy_is_found_in_its_own_file_and_in_its_run() {
+    let mut run = Training::new(Algorithm::Sac, config(), experts(), Seed(1)).unwrap();
+    go_on(&mut run, 1);
+    let notes = BTreeMap::from([("a".to_owned(), "b".to_owned())]);
+    let alone = run.actor().to_bytes(&notes).unwrap();
+    let whole = run.to_bytes(&notes).unwrap();
+    for bytes in [&alone, &whole] {
+        let (actor, found) = Actor::from_bytes(bytes).unwrap();
+        assert_eq!((&actor, &found), (run.actor(), &notes));
+    }
+    assert!(
+        Training::from_bytes(&alone)
+            .unwrap_err()
+            .to_string()
+            .contains("no run")
+    );
+}
+
+#[test]
+fn damaged_files_are_refused() {
+    let run = Training::new(Algorithm::Sac, config(), experts(), Seed(1)).unwrap();
+    let bytes = run.to_bytes(&BTreeMap::new()).unwrap();
+    for length in [0, 7, 100, bytes.len() - 1] {
+        assert!(Training::from_bytes(&bytes[..length]).is_err());
+    }
+    let find = |text: &str| bytes.windows(text.len()).position(|w| w == text.as_bytes());
+    let with = |old: &str, new: &str| {
+        let mut bytes = bytes.clone();
+        let at = find(old).unwrap();
+        bytes[at..at + new.len()].copy_from_slice(new.as_bytes());
+        Training::from_bytes(&bytes).unwrap_err().to_string()
+    };
+    assert!(with("gump-rl-1", "gump-rl-9").contains("expected gump-rl-1"));
+    assert!(with("hidden = [16", "hidden = [99").contains("configuration"));
+    assert!(with(r#"capacity\":8"#, r#"capacity\":3"#).contains("expert"));
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let nothing = || ReplayBuffer::new(1, 2, 2).unwrap();
+    let empty = Training::new(Algorithm::Imitation, config(), nothing(), Seed(0));
+    assert!(matches!(empty, Err(RlError::EmptyBuffer { .. })));
+    let narrow = ReplayBuffer::new(1, 3, 2).unwrap();
+    let mut training = Training::new(Algorithm::Sac, config(), narrow, Seed(0)).unwrap();
+    let mut env = Toy::new(Reach, 2);
+    assert_eq!(env.observation_len(), 2);
+    let error = training
+        .segment(&mut env, |_| ControlFlow::Continue(()))
+        .unwrap_err();
+    assert!(
+        error.to_string().contains("2 numbers in its observations"),
+        "{error}"
+    );
+}

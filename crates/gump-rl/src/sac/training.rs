@@ -1,0 +1,333 @@
+//! Collecting and learning in turns, in segments that a run can be resumed between.
+
+use std::ops::ControlFlow;
+
+use gump_scene::Seed;
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+use super::replay_buffer::{ReplayBuffer, Transition};
+use super::{Batch, Learner, SacConfig, UpdateReport};
+use crate::networks::Normalizer;
+use crate::{Actor, RlError, VectorEnv};
+
+/// What is learned from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Algorithm {
+    /// Rewards, with a share of expert transitions.
+    Sac,
+    /// Expert transitions alone; no environment is needed.
+    Imitation,
+}
+
+/// A run: the learner, what it remembers, and how far it is.
+///
+/// Nothing random is kept between gradient steps, everything is drawn from forks of one seed; and
+/// all episodes start afresh at the beginning of a segment. So the state between two segments is
+/// complete, and [`Training::to_bytes`] holds all of it.
+#[derive(Clone, Debug)]
+pub struct Training {
+    pub(super) algorithm: Algorithm,
+    pub(super) seed: Seed,
+    pub(super) learner: Learner,
+    pub(super) replay: ReplayBuffer,
+    pub(super) expert: ReplayBuffer,
+    pub(super) env_steps: u64,
+    batch: Batch,
+    /// Reward and steps so far of the episode in progress in every environment.
+    running: Vec<Episode>,
+    finished: Vec<Episode>,
+}
+
+/// An episode that ended while learning.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Episode {
+    /// Sum of its rewards, not discounted.
+    pub total: f64,
+    /// Its steps.
+    pub steps: usize,
+    /// Whether it ended for good, not by being cut off.
+    pub terminated: bool,
+}
+
+/// What one gradient step came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StepReport {
+    /// Gradient steps done, this one included.
+    pub step: usize,
+    /// Steps of environments done.
+    pub env_steps: u64,
+    /// The gradient step.
+    pub update: UpdateReport,
+    /// Episodes that ended since the last gradient step.
+    pub episodes: Vec<Episode>,
+}
+
+/// What a seed is forked for.
+#[derive(Clone, Copy)]
+enum Purpose {
+    Networks,
+    Episodes,
+    Actions,
+    Batch,
+    Noise,
+}
+
+impl Training {
+    /// A run that is to begin; `expert` holds what experts did, perhaps nothing.
+    ///
+    /// # Errors
+    /// [`RlError::Parameter`] for a configuration out of range; [`RlError::EmptyBuffer`] for
+    /// imitation without experts.
+    pub fn new(
+        algorithm: Algorithm,
+        config: SacConfig,
+        expert: ReplayBuffer,
+        seed: Seed,
+    ) -> Result<Self, RlError> {
+        config.check()?;
+        if algorithm == Algorithm::Imitation && expert.is_empty() {
+            return Err(RlError::EmptyBuffer {
+                asked: config.batch,
+            });
+        }
+        let [o, a] = [expert.observation_len, expert.action_len];
+        let networks = fork(seed, Purpose::Networks, 0);
+        let mut training = Self {
+            algorithm,
+            seed,
+            replay: ReplayBuffer::new(config.replay_capacity, o, a)?,
+            learner: Learner::new(config, o, a, networks),
+            expert,
+            env_steps: 0,
+            batch: Batch::default(),
+            running: Vec::new(),
+            finished: Vec::new(),
+        };
+        if algorithm == Algorithm::Imitation {
+            training.fit_normalizer();
+        }
+        Ok(training)
+    }
+
+    /// A run put together from its stored parts.
+    pub(super) fn restored(
+        (algorithm, seed): (Algorithm, Seed),
+        learner: Learner,
+        [replay, expert]: [ReplayBuffer; 2],
+        env_steps: u64,
+    ) -> Self {
+        Self {
+            algorithm,
+            seed,
+            learner,
+            replay,
+            expert,
+            env_steps,
+            batch: Batch::default(),
+            running: Vec::new(),
+            finished: Vec::new(),
+        }
+    }
+
+    /// The policy so far.
+    pub fn actor(&self) -> &Actor {
+        self.learner.actor()
+    }
+
+    /// What learns.
+    pub fn learner(&self) -> &Learner {
+        &self.learner
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &SacConfig {
+        &self.learner.config
+    }
+
+    /// What is learned from.
+    pub fn algorithm(&self) -> Algorithm {
+        self.algorithm
+    }
+
+    /// Where all randomness comes from.
+    pub fn seed(&self) -> Seed {
+        self.seed
+    }
+
+    /// Gradient steps done.
+    pub fn steps(&self) -> usize {
+        self.learner.steps()
+    }
+
+    /// Steps of environments done.
+    pub fn env_steps(&self) -> u64 {
+        self.env_steps
+    }
+
+    /// True once all gradient steps are done.
+    pub fn is_done(&self) -> bool {
+        self.steps() >= self.config().steps
+    }
+
+    /// Goes on to the end of the segment, or until `observe` breaks: that leaves a run which can
+    /// be gone on with, but not one which is as if it had never stopped.
+    ///
+    /// # Errors
+    /// What the environment reports; [`RlError::Shape`] for one of other observations or actions
+    /// than the run was begun with; [`RlError::Diverged`] once a number is not finite.
+    pub fn segment(
+        &mut self,
+        env: &mut dyn VectorEnv,
+        mut observe: impl FnMut(StepReport) -> ControlFlow<()>,
+    ) -> Result<(), RlError> {
+        check_shape(env, self.actor())?;
+        let end = self.end_of_segment();
+        env.reset(fork(self.seed, Purpose::Episodes, self.steps() as u64))?;
+        self.running = vec![Episode::default(); env.n_envs()];
+        self.finished.clear();
+        if self.steps() == 0 {
+            while self.env_steps < self.config().initial_steps as u64 {
+                self.collect(env)?;
+            }
+            self.fit_normalizer();
+        }
+        while self.steps() < end {
+            for _ in 0..self.config().unroll {
+                self.collect(env)?;
+            }
+            for _ in 0..self.config().updates {
+                let report = self.learn()?;
+                if observe(report).is_break() {
+                    return Ok(());
+                }
+                if self.steps() == end {
+                    break;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// As [`Training::segment`], from the experts alone.
+    ///
+    /// # Errors
+    /// [`RlError::Diverged`] once a number is not finite.
+    pub fn imitation_segment(
+        &mut self,
+        mut observe: impl FnMut(StepReport) -> ControlFlow<()>,
+    ) -> Result<(), RlError> {
+        let end = self.end_of_segment();
+        while self.steps() < end {
+            let report = self.learn()?;
+            if observe(report).is_break() {
+                return Ok(());
+            }
+        }
+        Ok(())
+    }
+
+    fn end_of_segment(&self) -> usize {
+        let SacConfig { steps, segment, .. } = self.config();
+        ((self.steps() / segment + 1) * segment).min(*steps)
+    }
+
+    /// One step of all environments; at random before learning.
+    fn collect(&mut self, env: &mut dyn VectorEnv) -> Result<(), RlError> {
+        let before = env.observations().to_vec();
+        let mut rng = fork(self.seed, Purpose::Actions, self.env_steps).rng();
+        let is_random = self.env_steps < self.config().initial_steps as u64;
+        let actions: Vec<f32> = if is_random {
+            let n = env.n_envs() * env.action_len();
+            (0..n).map(|_| rng.random_range(-1.0..=1.0)).collect()
+        } else {
+            self.actor().sample(&before, &mut rng)
+        };
+        env.step(&actions)?;
+        let (o, a) = (env.observation_len(), env.action_len());
+        for i in 0..env.n_envs() {
+            let (reward, terminated) = (env.rewards()[i], env.terminated()[i]);
+            self.replay.push(Transition {
+                observation: &before[i * o..][..o],
+                action: &actions[i * a..][..a],
+                reward,
+                next: &env.final_observations()[i * o..][..o],
+                terminated,
+            });
+            let episode = &mut self.running[i];
+            episode.total += f64::from(reward);
+            episode.steps += 1;
+            episode.terminated = terminated;
+            if terminated || env.truncated()[i] {
+                self.finished.push(std::mem::take(episode));
+            }
+        }
+        self.env_steps += env.n_envs() as u64;
+        Ok(())
+    }
+
+    /// One gradient step.
+    fn learn(&mut self) -> Result<StepReport, RlError> {
+        let step = self.steps() as u64;
+        let (batch, learner) = (&mut self.batch, &mut self.learner);
+        let n = learner.config.batch;
+        let n_imitated = match self.algorithm {
+            Algorithm::Imitation => n,
+            Algorithm::Sac if self.expert.is_empty() => 0,
+            Algorithm::Sac => learner.config.n_imitated(),
+        };
+        batch.draw(
+            (&self.replay, n - n_imitated),
+            (&self.expert, n_imitated),
+            &learner.actor.normalizer,
+            &mut fork(self.seed, Purpose::Batch, step).rng(),
+        )?;
+        let update = match self.algorithm {
+            Algorithm::Imitation => learner.imitate(batch),
+            Algorithm::Sac => learner.update(batch, fork(self.seed, Purpose::Noise, step)),
+        };
+        if !(update.critic_loss + update.actor_loss + update.imitation_loss).is_finite() {
+            return Err(RlError::Diverged { step: self.steps() });
+        }
+        Ok(StepReport {
+            step: self.steps(),
+            env_steps: self.env_steps,
+            update,
+            episodes: std::mem::take(&mut self.finished),
+        })
+    }
+
+    /// Fixes the scale of observations by all that is known.
+    fn fit_normalizer(&mut self) {
+        if self.config().normalize {
+            let pieces = [self.replay.observations(), self.expert.observations()];
+            let len = self.actor().observation_len();
+            self.learner.actor.normalizer = Normalizer::fitted(len, &pieces);
+        }
+    }
+}
+
+fn fork(seed: Seed, purpose: Purpose, k: u64) -> Seed {
+    seed.fork(purpose as u64).fork(k)
+}
+
+fn check_shape(env: &dyn VectorEnv, actor: &Actor) -> Result<(), RlError> {
+    for (what, expected, found) in [
+        (
+            "observations",
+            actor.observation_len(),
+            env.observation_len(),
+        ),
+        ("actions", actor.action_len(), env.action_len()),
+    ] {
+        if expected != found {
+            return Err(RlError::Shape {
+                what,
+                expected,
+                found,
+            });
+        }
+    }
+    Ok(())
+}
