@@ -43,6 +43,7 @@
 //! ```
 
 mod bootstrap;
+mod border;
 mod collision;
 mod comfort;
 mod displacement;
@@ -61,6 +62,7 @@ pub mod tags;
 pub mod wosac;
 
 pub use bootstrap::{Interval, interval, intervals};
+pub use border::Border;
 pub use collision::{Collision, overlapping};
 pub use comfort::{ComfortBounds, Discomfort, Felt};
 pub use displacement::{Displacement, average_displacement};

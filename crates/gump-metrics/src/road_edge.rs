@@ -56,29 +56,50 @@ pub fn signed_distance_to_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Opt
 /// open end of an edge, where the map knows nothing of a border. `None` on a map without road edges.
 pub(crate) fn metres_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
     let (distance, edge, segment) = nearest(map, point, z)?;
-    let spot = Spot::new(map, edge, segment, point);
-    let beyond = side(&spot) > 0.0 && !spot.is_past_open_end();
+    let beyond = is_beyond(map, edge, segment, point);
     Some(if beyond { distance } else { 0.0 })
 }
 
+/// True if `point`, nearest to this segment, is off the road.
+pub(crate) fn is_beyond(map: &MapGraph, edge: usize, segment: usize, point: DVec2) -> bool {
+    let spot = Spot::new(map, edge, segment, point);
+    side(&spot) > 0.0 && !spot.is_past_open_end()
+}
+
 /// The segment nearest in space as (distance in the plane, edge, segment).
-fn nearest(map: &MapGraph, point: DVec2, z: f64) -> Option<(f64, usize, usize)> {
+pub(crate) fn nearest(map: &MapGraph, point: DVec2, z: f64) -> Option<(f64, usize, usize)> {
     let mut best: Option<(f64, f64, usize, usize)> = None;
     for (edge, segment, distance) in map.nearest_road_edges(point) {
         // Segments come by distance in the plane, which the distance in space only exceeds.
         if best.is_some_and(|(least, ..)| distance > least) {
             break;
         }
-        let points = map.road_edges()[edge].line.points();
-        if points[segment] == points[segment + 1] {
+        let Some(in_space) = distance_in_space(map, edge, segment, point, z, distance) else {
             continue;
-        }
-        let in_space = distance.hypot(Z_STRETCH * rise(&map.road_edges()[edge], segment, point, z));
+        };
         if best.is_none_or(|(least, ..)| in_space < least) {
             best = Some((in_space, distance, edge, segment));
         }
     }
     best.map(|(_, distance, edge, segment)| (distance, edge, segment))
+}
+
+/// The distance by which the nearest segment is chosen, metres, of a segment that is `distance`
+/// away in the plane; `None` for repeated points, which have no sides.
+pub(crate) fn distance_in_space(
+    map: &MapGraph,
+    edge: usize,
+    segment: usize,
+    point: DVec2,
+    z: f64,
+    distance: f64,
+) -> Option<f64> {
+    let edge = &map.road_edges()[edge];
+    let points = edge.line.points();
+    if points[segment] == points[segment + 1] {
+        return None;
+    }
+    Some(distance.hypot(Z_STRETCH * rise(edge, segment, point, z)))
 }
 
 /// Height of `z` over the foot of `point` on a segment.

@@ -1,7 +1,7 @@
 //! What can go wrong between an environment and who uses it.
 
 use gump_rollout::BoxError;
-use gump_scene::AgentId;
+use gump_scene::{AgentId, ScenarioError};
 
 /// Why an environment or a buffer could not do what was asked.
 #[derive(Debug, thiserror::Error)]
@@ -22,37 +22,71 @@ pub enum RlError {
     /// Stepping before the first reset, or after a step that failed.
     #[error("the environment has no episodes in progress, reset it first")]
     NotReset,
-    /// More or fewer answers than slots.
-    #[error("{who} gave {found} answers for {expected} slots")]
+    /// A batch of another size than the environment's.
+    #[error("{who} gave {found} values, expected {expected}")]
     Count {
         /// Who answered.
         who: &'static str,
-        /// Slots in the environment.
+        /// What the environment needs.
         expected: usize,
-        /// Answers received.
+        /// What it got.
         found: usize,
     },
     /// An action that is NaN or infinite.
-    #[error("the action of slot {slot} is not a finite number")]
+    #[error("the action of row {row} is not a finite number")]
     NotFinite {
-        /// Which slot.
-        slot: usize,
+        /// Which row.
+        row: usize,
     },
-    /// The world's time step cannot be divided into steps of the scenario.
-    #[error("the world steps by {session} s, which is not a multiple of the scenario's {scene} s")]
+    /// An action outside its box.
+    #[error("number {dimension} of the action of row {row} is {value}, expected -1 to 1")]
+    OutOfRange {
+        /// Which row.
+        row: usize,
+        /// Which number of its action.
+        dimension: usize,
+        /// What was given.
+        value: f32,
+    },
+    /// Stepping an episode that has ended.
+    #[error("the episode of row {row} has ended, reset the row first")]
+    Finished {
+        /// Which row.
+        row: usize,
+    },
+    /// A scenario that does not exist.
+    #[error("row {row} asks for scenario {scenario}, but there are {n}")]
+    NoSuchScenario {
+        /// Which row.
+        row: usize,
+        /// What it asked for.
+        scenario: usize,
+        /// How many there are.
+        n: usize,
+    },
+    /// A scenario that nobody can drive through.
+    #[error("the scenario {id} cannot be driven: {source}")]
+    Scenario {
+        /// Its id.
+        id: String,
+        /// Why.
+        source: ScenarioError,
+    },
+    /// The step is not a whole number of frames.
+    #[error("a step takes {step} s, expected a multiple of the {frames} s between frames")]
     TimeStep {
-        /// Seconds between the frames of the world.
-        session: f64,
-        /// Seconds between the frames of the scenario.
-        scene: f64,
+        /// Seconds per step of the environment.
+        step: f64,
+        /// Seconds between the frames of the scenario or the world.
+        frames: f64,
     },
     /// The world lost the ego.
-    #[error("the world dropped the ego (agent {ego}) from slot {slot}")]
+    #[error("the world dropped the ego (agent {ego}) from row {row}")]
     EgoVanished {
         /// The ego.
         ego: AgentId,
-        /// Which slot.
-        slot: usize,
+        /// Which row.
+        row: usize,
     },
     /// The world failed.
     #[error("the world \"{world}\" failed: {source}")]

@@ -1,0 +1,100 @@
+//! What can be chosen about an environment.
+
+use std::fmt;
+
+use gump_rollout::WorldModel;
+
+use super::Sampling;
+use crate::{ObservationSpec, RlError, Rules};
+
+/// How many episodes, and what is seen and done in them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EnvConfig {
+    /// Episodes side by side, > 0.
+    pub n_envs: usize,
+    /// What is driven, for how long and for what.
+    pub rules: Rules,
+    /// What is seen.
+    pub observation: ObservationSpec,
+    /// When a row whose episode ended gets the next one.
+    pub autoreset: Autoreset,
+    /// How episodes choose their scenarios.
+    pub sampling: Sampling,
+}
+
+impl Default for EnvConfig {
+    /// 128 environments as in the paper.
+    fn default() -> Self {
+        Self {
+            n_envs: 128,
+            rules: Rules::default(),
+            observation: ObservationSpec::default(),
+            autoreset: Autoreset::default(),
+            sampling: Sampling::default(),
+        }
+    }
+}
+
+/// When a row whose episode ended gets the next one.
+///
+/// Source: the modes and names of Gymnasium 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Autoreset {
+    /// Within the step that ends it; what the step led to is in the final observations.
+    #[default]
+    SameStep,
+    /// In the step after, which ignores the row's action, earns nothing and ends nothing.
+    NextStep,
+    /// When asked; stepping a row that ended is an error.
+    Disabled,
+}
+
+/// Who moves everyone but the ego.
+#[derive(Clone, Copy)]
+pub enum Traffic<'w> {
+    /// The log: everyone does what was recorded, whatever the ego does. An episode is truncated
+    /// where the log ends.
+    Log,
+    /// A world, which may react to the ego.
+    World(&'w dyn WorldModel),
+}
+
+impl Traffic<'_> {
+    /// A short name for tables and reports.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Log => "log",
+            Self::World(world) => world.name(),
+        }
+    }
+}
+
+impl fmt::Debug for Traffic<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl EnvConfig {
+    /// Refuses parameters out of range.
+    pub(super) fn check(&self) -> Result<(), RlError> {
+        let refuse = |(name, value, expected)| {
+            Err(RlError::Parameter {
+                name,
+                value,
+                expected,
+            })
+        };
+        if self.n_envs == 0 {
+            return refuse(("n_envs", 0.0, "at least one episode"));
+        }
+        let horizon = self.rules.horizon;
+        if !(horizon > 0.0 && horizon.is_finite()) {
+            return refuse(("horizon", horizon, "a positive number"));
+        }
+        if let Some(wrong) = self.rules.dynamics.check().or(self.sampling.check()) {
+            return refuse(wrong);
+        }
+        self.observation.check()
+    }
+}

@@ -1,0 +1,156 @@
+//! Who moves the others: the log, which costs nothing, or a session of a world.
+
+use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_scene::{AgentState, Frame};
+
+use super::Traffic;
+use super::row::Row;
+use crate::{Course, RlError, Rules};
+
+/// The others of all rows.
+pub(super) struct Others<'w> {
+    world: Option<&'w dyn WorldModel>,
+    session: Option<Box<dyn Session + 'w>>,
+}
+
+impl<'w> Others<'w> {
+    pub(super) fn new(traffic: Traffic<'w>) -> Self {
+        Self {
+            world: match traffic {
+                Traffic::Log => None,
+                Traffic::World(world) => Some(world),
+            },
+            session: None,
+        }
+    }
+
+    /// Begins the episodes of all rows.
+    pub(super) fn open(&mut self, courses: &[Course], rows: &mut [Row]) -> Result<(), RlError> {
+        self.session = None;
+        for row in rows.iter_mut() {
+            row.imagined = [None, None];
+            row.in_log = self.world.is_none();
+        }
+        let Some(world) = self.world else {
+            return Ok(());
+        };
+        let starts: Vec<Start<'_>> = rows.iter().map(|row| start(courses, row)).collect();
+        let session = world.open(&starts).map_err(|e| failed(world, e))?;
+        frames_per_step(courses[rows[0].start.scenario].dt(), session.dt())?;
+        self.session = Some(session);
+        Ok(())
+    }
+
+    /// Begins new episodes in some rows.
+    pub(super) fn restart(
+        &mut self,
+        courses: &[Course],
+        rows: &mut [Row],
+        chosen: &[usize],
+    ) -> Result<(), RlError> {
+        if chosen.len() == rows.len() {
+            // All at once is cheaper, and nothing is lost.
+            return self.open(courses, rows);
+        }
+        for &i in chosen {
+            rows[i].imagined = [None, None];
+        }
+        if let (Some(world), Some(session)) = (self.world, &mut self.session) {
+            for &i in chosen {
+                let start = start(courses, &rows[i]);
+                session.replace(i, start).map_err(|e| failed(world, e))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Lets everyone but the egos move while these are driven by `actions`. Egos whose episode has
+    /// ended stay where they are.
+    ///
+    /// The session is put back only if all goes well: one that failed halfway is of no use.
+    pub(super) fn step(
+        &mut self,
+        courses: &[Course],
+        rules: &Rules,
+        rows: &mut [Row],
+        actions: &[f32],
+    ) -> Result<(), RlError> {
+        let Some(world) = self.world else {
+            return Ok(());
+        };
+        if rows.iter().all(|row| row.state.end.is_some()) {
+            return Ok(());
+        }
+        let mut session = self.session.take().ok_or(RlError::NotReset)?;
+        let dt = courses[rows[0].start.scenario].dt();
+        let n = frames_per_step(dt, session.dt())?;
+        let len = rules.dynamics.action_len();
+        let mut frames = Vec::new();
+        for k in 1..=n {
+            let elapsed = dt * k as f64 / n as f64;
+            let drive = |(row, action): (&Row, &[f32])| {
+                let now = row.state.ego.state;
+                match row.state.end {
+                    Some(_) => now,
+                    None => rules.dynamics.advance(&now, action, dt, elapsed),
+                }
+            };
+            let egos: Vec<AgentState> = rows
+                .iter()
+                .zip(actions.chunks_exact(len))
+                .map(drive)
+                .collect();
+            frames = session.step(Some(&egos)).map_err(|e| failed(world, e))?;
+        }
+        check(rows, &frames)?;
+        for (row, frame) in rows.iter_mut().zip(frames) {
+            let before = row.imagined[0].take();
+            row.imagined = [Some(frame), before];
+        }
+        self.session = Some(session);
+        Ok(())
+    }
+}
+
+fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
+    if frames.len() != rows.len() {
+        return Err(RlError::Count {
+            who: "the world",
+            expected: rows.len(),
+            found: frames.len(),
+        });
+    }
+    let lost = |(row, frame): (&Row, &Frame)| frame.agent(row.state.ego.id).is_none();
+    match rows.iter().zip(frames).position(lost) {
+        Some(row) => Err(RlError::EgoVanished {
+            ego: rows[row].state.ego.id,
+            row,
+        }),
+        None => Ok(()),
+    }
+}
+
+fn start<'a>(courses: &'a [Course], row: &Row) -> Start<'a> {
+    Start {
+        scene: courses[row.start.scenario].scenario().present(),
+        n_futures: 1,
+        seed: row.start.seed,
+    }
+}
+
+/// Frames of a world in a step.
+fn frames_per_step(step: f64, frames: f64) -> Result<usize, RlError> {
+    let n = (step / frames).round();
+    if n >= 1.0 && (step / frames - n).abs() < 1e-6 {
+        Ok(n as usize)
+    } else {
+        Err(RlError::TimeStep { step, frames })
+    }
+}
+
+fn failed(world: &dyn WorldModel, source: BoxError) -> RlError {
+    RlError::World {
+        world: world.name().to_owned(),
+        source,
+    }
+}

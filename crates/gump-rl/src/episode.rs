@@ -1,0 +1,332 @@
+//! The rules of one episode as functions of values: no randomness, no buffers, nothing hidden.
+//!
+//! A state is cheap to clone, so that one can look ahead from it; the same state and action give
+//! the same successor. Who moves the others is the caller's choice: [`Rules::step`] reads them from
+//! the log, [`Rules::advance`] takes what any world imagined.
+
+use gump_geometry::OrientedBox;
+use gump_metrics::{ComfortBounds, Felt};
+use gump_scene::{Agent, AgentKind, AgentState, Frame};
+
+use crate::{Course, Dynamics, RlError};
+
+/// What is driven, for how long and for what.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rules {
+    /// What an action does to the ego.
+    pub dynamics: Dynamics,
+    /// What a step earns.
+    pub reward: RewardWeights,
+    /// Seconds until an episode is truncated, > 0; rounded to whole steps.
+    pub horizon: f64,
+}
+
+impl Default for Rules {
+    /// 8 s, the future of a Waymo scenario: 16 steps of half a second, a frame of the world model.
+    fn default() -> Self {
+        Self {
+            dynamics: Dynamics::default(),
+            reward: RewardWeights::default(),
+            horizon: 8.0,
+        }
+    }
+}
+
+/// A step's reward is the sum of these weights times what happened in it.
+///
+/// What happened is measured as [`gump_metrics::Progress`], [`gump_metrics::Collision`],
+/// [`gump_metrics::OffRoad`] and [`gump_metrics::Discomfort`] do.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RewardWeights {
+    /// Per metre of progress along the route.
+    pub progress: f64,
+    /// For a collision.
+    pub collision: f64,
+    /// For leaving the road.
+    pub off_road: f64,
+    /// For a broken comfort bound.
+    pub discomfort: f64,
+}
+
+impl Default for RewardWeights {
+    /// The weights of [`gump_metrics::Reward::driving_step`].
+    fn default() -> Self {
+        Self {
+            progress: 0.1,
+            collision: -5.0,
+            off_road: -5.0,
+            discomfort: -0.05,
+        }
+    }
+}
+
+/// How an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum End {
+    /// By failure: nothing comes after.
+    Terminated(Failure),
+    /// Cut off at the horizon, at the end of the log that others replay or at the end of the
+    /// route: more would have come.
+    Truncated,
+}
+
+/// What went wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Failure {
+    /// The ego's box overlapped another.
+    Collision,
+    /// A corner of the ego's box left the road.
+    OffRoad,
+}
+
+/// An episode after some steps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EpisodeState {
+    /// Steps made.
+    pub steps: usize,
+    /// The ego now.
+    pub ego: Agent,
+    /// The ego one and two steps ago, as far as known; for comfort.
+    before: [Option<AgentState>; 2],
+    /// Metres along the route.
+    pub(crate) along: f64,
+    /// What the last step earned.
+    pub reward: f64,
+    /// What all steps brought.
+    pub totals: Totals,
+    /// How it ended, if it did.
+    pub end: Option<End>,
+}
+
+/// What an episode brought so far.
+#[derive(Clone, Copy, Debug, PartialEq, Default)]
+pub struct Totals {
+    /// Sum of the rewards.
+    pub reward: f64,
+    /// Metres along the route.
+    pub progress: f64,
+    /// True if the ego's box overlapped another.
+    pub collided: bool,
+    /// True if a corner of the ego's box left the road.
+    pub off_road: bool,
+    /// True if a comfort bound was broken.
+    pub uncomfortable: bool,
+}
+
+impl EpisodeState {
+    /// The ego's acceleration over the last step, metres per second squared along its heading, and
+    /// its yaw rate, radians per second; zeros where the log begins.
+    pub(crate) fn motion(&self, dt: f64) -> (f64, f64) {
+        self.before[0].map_or((0.0, 0.0), |before| {
+            let now = &self.ego.state;
+            let acceleration = (now.velocity - before.velocity) / dt;
+            (
+                acceleration.dot(now.pose.direction()),
+                turn_rate(&before, now, dt),
+            )
+        })
+    }
+}
+
+impl Rules {
+    /// The state in which every episode on a course begins: the present of its scenario.
+    pub fn reset(&self, course: &Course) -> EpisodeState {
+        let ego = *course.scenario().present().ego_now();
+        EpisodeState {
+            steps: 0,
+            ego,
+            before: [course.ego_before(1), course.ego_before(2)],
+            along: course.along_route(ego.state.pose.position),
+            reward: 0.0,
+            totals: Totals::default(),
+            end: None,
+        }
+    }
+
+    /// One step among others that replay the log.
+    ///
+    /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
+    ///
+    /// # Errors
+    /// [`RlError::Finished`] if the episode has ended; [`RlError::Count`], [`RlError::NotFinite`]
+    /// and [`RlError::OutOfRange`] for actions that are none.
+    pub fn step(
+        &self,
+        course: &Course,
+        state: &EpisodeState,
+        action: &[f32],
+    ) -> Result<EpisodeState, RlError> {
+        if state.end.is_some() {
+            return Err(RlError::Finished { row: 0 });
+        }
+        self.check_actions(action, 1)?;
+        Ok(self.step_in_log(course, state, action))
+    }
+
+    /// One step of `action_len` checked numbers among others that replay the log.
+    pub(crate) fn step_in_log(
+        &self,
+        course: &Course,
+        state: &EpisodeState,
+        action: &[f32],
+    ) -> EpisodeState {
+        let dt = course.dt();
+        let ego = self.dynamics.advance(&state.ego.state, action, dt, dt);
+        let mut next = self.advance(course, state, ego, course.logged(state.steps + 1));
+        if next.end.is_none() && next.steps >= course.logged_steps() {
+            next.end = Some(End::Truncated);
+        }
+        next
+    }
+
+    /// The state after one step that brought the ego to `ego` and everyone to `frame`.
+    ///
+    /// A collision or leaving the road terminates, in this order; an episode that starts in a
+    /// collision ends with its first step. The horizon and the end of the route truncate.
+    pub fn advance(
+        &self,
+        course: &Course,
+        state: &EpisodeState,
+        ego: AgentState,
+        frame: &Frame,
+    ) -> EpisodeState {
+        let seen = frame.agent(state.ego.id).unwrap_or(&state.ego);
+        let mut next = EpisodeState {
+            steps: state.steps + 1,
+            ego: seen.with_state(ego),
+            before: [Some(state.ego.state), state.before[0]],
+            along: course.along_route(ego.pose.position),
+            ..state.clone()
+        };
+        let moved = ego.pose.position.distance(state.ego.state.pose.position);
+        let progress = (next.along - state.along).clamp(-moved, moved);
+        let collided = collides(&next.ego, frame);
+        let off_road = is_off_road(course, &next.ego);
+        let uncomfortable = next.is_uncomfortable(course.dt());
+
+        let weights = &self.reward;
+        let happened = |weight: f64, it: bool| if it { weight } else { 0.0 };
+        next.reward = weights.progress * progress
+            + happened(weights.collision, collided)
+            + happened(weights.off_road, off_road)
+            + happened(weights.discomfort, uncomfortable);
+        next.totals.reward += next.reward;
+        next.totals.progress += progress;
+        next.totals.collided |= collided;
+        next.totals.off_road |= off_road;
+        next.totals.uncomfortable |= uncomfortable;
+        let horizon = (self.horizon / course.dt()).round().max(1.0) as usize;
+        let at_end_of_route = course.route().is_some_and(|r| next.along >= r.length());
+        next.end = if collided {
+            Some(End::Terminated(Failure::Collision))
+        } else if off_road {
+            Some(End::Terminated(Failure::OffRoad))
+        } else if next.steps >= horizon || at_end_of_route {
+            Some(End::Truncated)
+        } else {
+            None
+        };
+        next
+    }
+
+    /// The action that comes nearest to what the log does next; keeps the velocity where the log
+    /// says nothing.
+    ///
+    /// Shape: `action` is `[action_len]`.
+    pub fn expert_action(&self, course: &Course, state: &EpisodeState, action: &mut [f32]) {
+        let ahead = self.dynamics.action_len().div_ceil(3);
+        let logged = (1..=ahead).map_while(|k| course.logged_ego(state.steps + k));
+        let targets: Vec<AgentState> = logged.collect();
+        let now = &state.ego.state;
+        self.dynamics.towards(now, &targets, course.dt(), action);
+    }
+
+    /// Refuses what is no batch of `n` actions.
+    pub(crate) fn check_actions(&self, actions: &[f32], n: usize) -> Result<(), RlError> {
+        let len = self.dynamics.action_len();
+        if actions.len() != n * len {
+            return Err(RlError::Count {
+                who: "the policy",
+                expected: n * len,
+                found: actions.len(),
+            });
+        }
+        // Rounding may carry a number that was scaled into the box just beyond it.
+        let fits = |v: &f32| v.abs() <= 1.0 + 1e-5;
+        let Some(i) = actions.iter().position(|v| !fits(v)) else {
+            return Ok(());
+        };
+        let row = i / len;
+        Err(if actions[i].is_finite() {
+            RlError::OutOfRange {
+                row,
+                dimension: i % len,
+                value: actions[i],
+            }
+        } else {
+            RlError::NotFinite { row }
+        })
+    }
+}
+
+impl EpisodeState {
+    /// [`gump_metrics::Discomfort`] of the last step.
+    fn is_uncomfortable(&self, dt: f64) -> bool {
+        let [Some(before), earlier] = self.before else {
+            return false;
+        };
+        let now = &self.ego.state;
+        let forward = now.pose.direction();
+        let acceleration = (now.velocity - before.velocity) / dt;
+        let yaw_rate = turn_rate(&before, now, dt);
+        let jerk = earlier.map(|earlier| {
+            let acceleration_before = (before.velocity - earlier.velocity) / dt;
+            let jerk = (acceleration - acceleration_before) / dt;
+            let change = (acceleration.length() - acceleration_before.length()) / dt;
+            let yaw_acceleration = (yaw_rate - turn_rate(&earlier, &before, dt)) / dt;
+            (jerk.dot(forward), change, yaw_acceleration)
+        });
+        let felt = Felt {
+            longitudinal_acceleration: acceleration.dot(forward),
+            lateral_acceleration: acceleration.dot(forward.perp()),
+            yaw_rate: Some(yaw_rate),
+            yaw_acceleration: jerk.map(|(_, _, yaw)| yaw),
+            longitudinal_jerk: jerk.map(|(along, _, _)| along),
+            jerk: jerk.map(|(_, change, _)| change),
+        };
+        !ComfortBounds::NUPLAN.allow(&felt)
+    }
+}
+
+fn turn_rate(from: &AgentState, to: &AgentState, dt: f64) -> f64 {
+    gump_geometry::angle_difference(to.pose.heading, from.pose.heading) / dt
+}
+
+/// [`gump_metrics::Collision`] of the ego.
+fn collides(ego: &Agent, frame: &Frame) -> bool {
+    let own = ego.oriented_box();
+    frame.agents().iter().any(|other| {
+        // Half the sum of length and width is no less than half the diagonal.
+        let reach = (own.length + own.width + other.length + other.width) / 2.0;
+        let distance = own
+            .pose
+            .position
+            .distance_squared(other.state.pose.position);
+        distance < reach * reach && other.id != ego.id && own.overlaps(&other.oriented_box())
+    })
+}
+
+/// [`gump_metrics::OffRoad`] of the ego.
+fn is_off_road(course: &Course, ego: &Agent) -> bool {
+    if ego.kind != AgentKind::Vehicle {
+        return false;
+    }
+    let z = ego.elevation - ego.height / 2.0;
+    let is_off = |corner| {
+        let metres = course.border.metres_off_road(corner, z);
+        metres.is_some_and(|metres| metres > 0.0)
+    };
+    OrientedBox::corners(&ego.oriented_box())
+        .into_iter()
+        .any(is_off)
+}

@@ -1,0 +1,115 @@
+//! What a policy sees of an episode: numbers (`vector`) or a picture (`raster`).
+
+mod buffer;
+mod raster;
+mod vector;
+
+use gump_scene::Frame;
+
+use crate::{Course, EpisodeState, RlError};
+
+pub(crate) use buffer::{Observed, ObservedRow};
+pub(crate) use raster::Texture;
+pub use raster::{RASTER_LAYERS, RasterView, expand};
+pub use vector::VectorView;
+
+/// What is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ObservationSpec {
+    /// A short vector of numbers in the ego's frame.
+    Vector(VectorView),
+    /// A picture from above, centred on the ego, of layers that are 0 or 1.
+    Raster(RasterView),
+}
+
+impl Default for ObservationSpec {
+    fn default() -> Self {
+        Self::Vector(VectorView::default())
+    }
+}
+
+impl ObservationSpec {
+    /// The axes of an observation: `[numbers]` or `[layer, row, column]`.
+    pub fn shape(&self) -> Vec<usize> {
+        match self {
+            Self::Vector(view) => vec![view.len()],
+            Self::Raster(view) => vec![RASTER_LAYERS.len(), view.side_px, view.side_px],
+        }
+    }
+
+    /// Numbers in an observation.
+    #[allow(
+        clippy::len_without_is_empty,
+        reason = "an observation always holds the ego"
+    )]
+    pub fn len(&self) -> usize {
+        self.shape().iter().product()
+    }
+
+    /// Bytes of a packed observation; 0 for vectors, which are not packed.
+    pub fn packed_len(&self) -> usize {
+        match self {
+            Self::Vector(_) => 0,
+            Self::Raster(view) => view.packed_len(),
+        }
+    }
+
+    /// Refuses parameters out of range.
+    pub(crate) fn check(&self) -> Result<(), RlError> {
+        let parameters = match self {
+            Self::Vector(view) => [
+                ("route_spacing", view.route_spacing),
+                ("agent_range", view.agent_range),
+                ("ray_range", view.ray_range),
+            ],
+            Self::Raster(view) => {
+                let whole_bytes = view.side_px > 0 && view.side_px.is_multiple_of(8);
+                if !whole_bytes {
+                    return Err(RlError::Parameter {
+                        name: "side_px",
+                        value: view.side_px as f64,
+                        expected: "a positive multiple of 8",
+                    });
+                }
+                [("metres_per_px", view.metres_per_px); 3]
+            }
+        };
+        match parameters
+            .into_iter()
+            .find(|(_, v)| !(*v > 0.0 && v.is_finite()))
+        {
+            Some((name, value)) => Err(RlError::Parameter {
+                name,
+                value,
+                expected: "a positive number",
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// An episode at one instant, as an observer finds it.
+#[derive(Clone, Copy, Debug)]
+pub struct View<'a> {
+    /// Where it takes place.
+    pub course: &'a Course,
+    /// How far it has come.
+    pub state: &'a EpisodeState,
+    /// Everyone now. The ego in it is ignored.
+    pub now: &'a Frame,
+    /// Everyone one step ago, if known.
+    pub before: Option<&'a Frame>,
+}
+
+/// Describes an episode as `spec` says.
+///
+/// Shape: `numbers` is `[spec.len()]`, `packed` is `[spec.packed_len()]`; both are overwritten.
+pub fn observe(spec: &ObservationSpec, view: &View<'_>, numbers: &mut [f32], packed: &mut [u8]) {
+    match spec {
+        ObservationSpec::Vector(vector) => vector.observe(view, numbers),
+        ObservationSpec::Raster(raster) => {
+            raster.observe(view, packed);
+            expand(packed, numbers);
+        }
+    }
+}
