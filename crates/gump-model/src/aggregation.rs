@@ -14,15 +14,18 @@ const GATE_M: f64 = 5.0;
 /// Likewise for headings, radians.
 const GATE_RAD: f64 = std::f64::consts::FRAC_PI_2;
 
-/// The last chunks of one agent, scene frame.
+/// Where an agent says it will be, half a second apart, scene frame.
+pub(crate) type Chunk = [Pose; CHUNK];
+
+/// The last chunks of one agent.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Ring {
-    chunks: Vec<(usize, [Pose; CHUNK])>,
+    chunks: Vec<(usize, Chunk)>,
 }
 
 impl Ring {
     /// Remembers the raw chunk decoded for `frame`.
-    pub(crate) fn push(&mut self, frame: usize, chunk: [Pose; CHUNK]) {
+    pub(crate) fn push(&mut self, frame: usize, chunk: Chunk) {
         self.chunks.retain(|(tag, _)| tag + CHUNK > frame + 1);
         self.chunks.push((frame, chunk));
     }

@@ -1,14 +1,17 @@
 //! Token sequences as tensors: here padding is born, and nowhere else.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
 use gump_geometry::DVec2;
 use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
+use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::embedding::{ROWS_PER_TOKEN, SineKey, SineTables, Tables};
 use crate::mct::{PLACES, TokenBatch};
+use crate::surroundings::{N_NUMBERS, Surroundings, Survey, look_around};
 
 /// A slot and where it stands in the presented window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,6 +68,7 @@ pub(crate) struct Packer {
     sines: SineTables,
     width: usize,
     local_map: bool,
+    surroundings: bool,
     visual_side: usize,
     cell_m: f64,
 }
@@ -76,23 +80,39 @@ impl Packer {
             sines: SineTables::new(config),
             width: config.width,
             local_map: config.local_map,
+            surroundings: config.surroundings,
             visual_side: config.visual_side(),
             cell_m: config.visual.metres_per_px * config.visual.encoder.stride() as f64,
         }
     }
 
-    /// Packs sequences side by side; shorter ones are padded at the end, where causality hides it.
+    /// Packs sequences side by side, without their first `from` slots; shorter ones are padded at
+    /// the end, where causality hides it. As many sequences in a row share each of the `surveys`.
     pub(crate) fn pack(
         &self,
         sequences: &[&[PlacedSlot]],
+        from: usize,
+        surveys: &[Arc<Survey>],
         device: &Device,
     ) -> candle_core::Result<TokenBatch> {
-        let t = sequences
-            .iter()
-            .map(|sequence| sequence.len())
-            .max()
-            .unwrap_or(0);
+        let longest = sequences.iter().map(|sequence| sequence.len()).max();
+        let t = longest.unwrap_or(0).saturating_sub(from);
         let b = sequences.len();
+        let sharing = b / surveys.len().max(1);
+        let look = |(row, slots): (usize, &&[PlacedSlot])| {
+            if !self.surroundings {
+                return Vec::new();
+            }
+            let mut seen = look_around(&surveys[row / sharing], slots, from);
+            seen.iter_mut()
+                .for_each(|(at, _)| *at = *at + row * t - from);
+            seen
+        };
+        let seen: Vec<(usize, Surroundings)> = sequences
+            .par_iter()
+            .enumerate()
+            .flat_map_iter(look)
+            .collect();
         let mut rows: Vec<u32> = Vec::with_capacity(b * t * ROWS_PER_TOKEN);
         let mut sine_positions: Vec<u32> = Vec::new();
         let mut features: Vec<f32> = Vec::new();
@@ -100,6 +120,7 @@ impl Packer {
         let mut looker_rows: Vec<u32> = Vec::new();
         let mut places: [Vec<u32>; PLACES.len()] = Default::default();
         for (row, sequence) in sequences.iter().enumerate() {
+            let sequence = &sequence[from.min(sequence.len())..];
             for (column, placed) in sequence.iter().enumerate() {
                 let flat = (row * t + column) as u32;
                 rows.extend(self.rows(placed));
@@ -115,7 +136,7 @@ impl Packer {
                 }
             }
             for position in sequence.len()..t {
-                rows.extend(self.tables.rows(&padding(position)));
+                rows.extend(self.tables.rows(&padding(from + position)));
             }
         }
         let (n, k) = (sine_positions.len(), lookers.len());
@@ -126,6 +147,15 @@ impl Packer {
             lookers: Tensor::from_vec(lookers, k, device)?,
             places,
             looker_rows,
+            seers: Tensor::from_iter(seen.iter().map(|(at, _)| *at as u32), device)?,
+            surroundings: Tensor::from_vec(
+                seen.iter()
+                    .flat_map(|(_, numbers)| numbers)
+                    .copied()
+                    .collect(),
+                (seen.len(), N_NUMBERS),
+                device,
+            )?,
             shape: (b, t),
         })
     }

@@ -37,6 +37,14 @@ pub struct ModelConfig {
     /// True lets an object's key see the visual features under the object, and one and two seconds
     /// ahead of it, directly (the paper: through cross-attention alone); needs `pairs_share`.
     pub local_map: bool,
+    /// True says an object's chunk in the frame of its last state, in finer bins (the paper: in the
+    /// frame of the scene), so that a way of driving is learned once for all places and directions.
+    #[serde(default)]
+    pub anchored: bool,
+    /// True shows every object the paths ahead, road edges and neighbours in its own frame, as
+    /// numbers at its key (the paper: the raster and the tokens alone).
+    #[serde(default)]
+    pub surroundings: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
     /// True builds the decoder that reconstructs the raster from the visual features.
@@ -126,6 +134,8 @@ impl ModelConfig {
             pairs_share: true,
             smooth_bins: true,
             local_map: true,
+            anchored: true,
+            surroundings: true,
             dropout: 0.0,
             reconstruction: true,
             visual: VisualConfig {
@@ -156,6 +166,8 @@ impl ModelConfig {
             pairs_share: false,
             smooth_bins: false,
             local_map: false,
+            anchored: false,
+            surroundings: false,
             dropout: 0.1,
             reconstruction: true,
             visual: VisualConfig {

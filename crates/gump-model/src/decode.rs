@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::ModelError;
 use crate::batch::{PlacedSlot, place};
 use crate::engine::{Context, Engine, Job, SceneMemory};
-use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig, settled_state};
+use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
 
 /// What is known of one future's next frame.
 #[derive(Debug)]
@@ -141,7 +141,7 @@ impl Step<'_> {
                 let pose = request.settle(&bins, self.sampling);
                 let slots = &mut self.placed[w];
                 let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
-                slots[value].slot = Slot::Value(settled_state(&bins, pose));
+                slots[value].slot = Slot::Value(request.settled_state(&bins, pose));
                 decoded[w].push(bins);
             }
         }

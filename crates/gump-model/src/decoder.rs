@@ -44,6 +44,8 @@ pub(crate) struct StateDecoder {
     slots: Tensor,
     head: Linear,
     smooth: Option<SmoothBins>,
+    /// Rows of its own for the tokens it has said, where they do not mean what the transformer's do.
+    table: Option<Tensor>,
 }
 
 /// What is added to the rows of a field's bins, on the way in and on the way out: a learned map of
@@ -162,8 +164,14 @@ impl StateDecoder {
                 )?,
             })
         };
+        let rows = (gump_tokenizer::TABLE_ROWS as usize, c);
+        let table = config
+            .anchored
+            .then(|| scope.get("table", rows, Init::Normal(TABLE_DEVIATION)))
+            .transpose()?;
         Ok(Self {
             smooth,
+            table,
             layers: (0..config.gru_layers)
                 .map(|i| layer(i, &mut scope))
                 .collect::<std::result::Result<_, _>>()?,
@@ -179,8 +187,10 @@ impl StateDecoder {
         })
     }
 
-    /// The rows by which tokens enter the decoder, [TABLE_ROWS, C], from those of the transformer.
+    /// The rows by which tokens enter the decoder, [TABLE_ROWS, C], from those of the transformer
+    /// unless it has its own.
     pub(crate) fn input_table(&self, table: &Tensor) -> Result<Tensor> {
+        let table = self.table.as_ref().unwrap_or(table);
         match &self.smooth {
             Some(smooth) => smooth.raise(table),
             None => table.contiguous(),

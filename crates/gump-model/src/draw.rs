@@ -39,16 +39,13 @@ fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
     let Some((centre, reach)) = request.near else {
         return all;
     };
-    let centre = match step {
-        4 => centre.x,
-        5 => centre.y,
+    let [x, y] = request.anchor.near(centre, reach);
+    let bins = match step {
+        4 => x,
+        5 => y,
         _ => return all,
     };
-    let (low, high) = (
-        field.quantize(centre - reach).bin,
-        field.quantize(centre + reach).bin,
-    );
-    usize::from(low)..usize::from(high) + 1
+    usize::from(*bins.start())..usize::from(*bins.end()) + 1
 }
 
 /// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
@@ -140,10 +137,12 @@ fn uniform(seed: Seed) -> f64 {
 mod tests {
     use super::*;
     use crate::aggregation::Ring;
+    use crate::anchor::Anchor;
     use gump_geometry::DVec2;
 
     fn request() -> Request {
         Request {
+            anchor: Anchor::SCENE,
             forced: [None; STEPS.len()],
             stream: Seed(3),
             near: None,

@@ -8,13 +8,12 @@ use gump_scene::{Agent, AgentState, Frame, Seed};
 use gump_tokenizer::{QuantizedState, TokenAgent, TokenFrame};
 
 use crate::aggregation::Ring;
+use crate::anchor::Anchor;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::engine::Context;
 use crate::sample::TOKEN_DT;
-use crate::sampling::{
-    Bins, CacheMode, Request, SamplingConfig, Surrogate, poses, set_pose, settled_state,
-};
+use crate::sampling::{Bins, CacheMode, Request, SamplingConfig, Surrogate, set_pose};
 use crate::scene::Scene;
 use crate::world::{KEEP_RANGE_M, TransformerWorld};
 
@@ -42,9 +41,10 @@ impl Future {
     pub(crate) fn window(
         &self,
         scene: &Scene,
-        sampling: &SamplingConfig,
+        world: &TransformerWorld,
         ego: Option<AgentState>,
     ) -> Window {
+        let sampling = world.sampling();
         let index = self.index + 1;
         let last = self.frames.last().expect("a future has history");
         let mut next = TokenFrame {
@@ -71,8 +71,14 @@ impl Future {
                 key: agent.key,
                 state: surrogate,
             });
+            let anchor = self.anchor(agent, scene, world);
+            let is = match (id, ego) {
+                (0, Some(state)) => scene.local(state),
+                _ => surrogate.to_agent_state(),
+            };
             requests.push(Request {
-                forced: forced_fields(&surrogate, driven),
+                anchor,
+                forced: given(anchor, &surrogate, is, driven),
                 stream: stream(self.seed, index, id),
                 near: Some((position, GUARD_M)),
                 // A driven object was put where it is; what it once foresaw does not count.
@@ -90,6 +96,18 @@ impl Future {
             next,
             requests,
         }
+    }
+
+    /// In whose frame the next chunk of `agent`, a token of the last frame, is said: where it is,
+    /// not rounded.
+    fn anchor(&self, agent: &TokenAgent, scene: &Scene, world: &TransformerWorld) -> Anchor {
+        if !world.network().config().anchored {
+            return Anchor::SCENE;
+        }
+        let id = scene.identities.agent(agent.key.id);
+        let present = self.recent.last().expect("a future has a present");
+        let known = id.and_then(|id| present.agent(id));
+        Anchor::at(known.map_or(agent.state.pose(), |known| scene.local(known.state).pose))
     }
 
     /// A provisional state of `agent` for frame `index`.
@@ -137,12 +155,13 @@ impl Future {
             if driven {
                 ring.clear();
             }
-            ring.push(self.index, poses(bins));
+            ring.push(self.index, request.anchor.poses(bins));
             let pose = request.settle(bins, sampling);
-            agent.state = settled_state(bins, pose);
+            agent.state = request.settled_state(bins, pose);
+            let velocity = request.anchor.velocity(bins);
             let state = AgentState {
                 pose: scene.world_from_scene * pose,
-                velocity: scene.world_from_scene.rotate(agent.state.velocity()),
+                velocity: scene.world_from_scene.rotate(velocity),
             };
             moved.insert(id, if driven { ego.unwrap_or(state) } else { state });
         }
@@ -201,14 +220,15 @@ pub(crate) fn stream(seed: Seed, frame: usize, id: u16) -> Seed {
     seed.fork(frame as u64).fork(u64::from(id))
 }
 
-/// Sizes never drift; a driven object's state is given entirely.
-fn forced_fields(state: &QuantizedState, driven: bool) -> [Option<u16>; STEPS.len()] {
-    let mut forced = [None; STEPS.len()];
-    let given = if driven { 7 } else { 2 };
-    for (step, field) in STEPS.iter().enumerate().take(given) {
-        forced[step] = Some(state.get(*field));
-    }
-    forced
+/// Sizes never drift; the state `is` of a driven object is given entirely.
+fn given(
+    anchor: Anchor,
+    like: &QuantizedState,
+    is: AgentState,
+    driven: bool,
+) -> [Option<u16>; STEPS.len()] {
+    let state = driven.then_some(is);
+    anchor.bins(*like, [state, None, None, None])
 }
 
 /// Half a second of constant velocity.

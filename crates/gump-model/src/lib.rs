@@ -8,12 +8,15 @@
 //! # Terms
 //! * **key, value**: the two tokens of an object; the hidden vector at the key says the state.
 //! * **chunk**: the four poses decoded at a key, half a second apart; the first is the frame's own.
+//! * **anchor**: the pose in whose frame a chunk is said: the object's last one, or the scene's.
+//! * **surroundings**: what an object sees of map and traffic in its own frame.
 //! * **surrogate**: a provisional state, from earlier chunks, that lets all objects of a frame be
 //!   decoded in one pass (partial autoregression).
 //! * **aggregation**: averaging what several chunks say of the same instant.
 //! * **visual memory**: keys and values of the map, computed once per scene.
 
 mod aggregation;
+mod anchor;
 mod batch;
 pub mod checkpoint;
 mod closed_loop;
@@ -36,6 +39,7 @@ mod sample;
 mod sampling;
 mod scene;
 mod session;
+mod surroundings;
 #[cfg(test)]
 mod tests;
 pub mod train;

@@ -4,6 +4,8 @@
 //!
 //! Source: GUMP's loss with separate means for values and keys, winner-takes-all trajectories.
 
+use std::sync::Arc;
+
 use candle_core::{D, Device, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -12,7 +14,7 @@ use crate::decoder::STEPS;
 use crate::mct::Dropout;
 use crate::network::Network;
 use crate::ops::{self, OrdinalSmoothing};
-use crate::sample::{ControlTarget, Sample, TrajectoryTarget};
+use crate::sample::{ControlTarget, Sample, StateTarget, TrajectoryTarget};
 use crate::trajectory::{FUTURE, MODES, PAST, POSE, Trajectories};
 
 /// Weights of the parts.
@@ -32,6 +34,9 @@ pub struct LossConfig {
     pub past: f64,
     /// Weight of reconstructing the raster (paper: 1).
     pub reconstruction: f64,
+    /// Weight of objects that the window has not shown before, relative to the others (paper: 1);
+    /// where they are is nearly all chance.
+    pub unknown: f64,
     /// Width of the label smoothing over neighbouring bins, as a standard deviation in bins; 0 is
     /// none (paper).
     pub smoothing_bins: f64,
@@ -48,6 +53,7 @@ impl Default for LossConfig {
             trajectory: [0.25, 0.25, 0.5, 0.5],
             past: 0.25,
             reconstruction: 1.0,
+            unknown: 1.0,
             smoothing_bins: 0.0,
             max_trajectories: 512,
         }
@@ -115,12 +121,15 @@ pub(crate) fn loss(
     let rasters: Vec<_> = samples.iter().map(|sample| sample.raster.clone()).collect();
     let raster = network.raster_tensor(&rasters)?;
     let features = network.visual.features(&raster, training)?;
-    let memory = network.mct.remember(&network.place(&features)?)?;
+    let surveys = samples.iter().map(|sample| Arc::clone(&sample.survey));
+    let memory = network
+        .mct
+        .remember(&network.place(&features)?, surveys.collect())?;
     let sequences: Vec<_> = samples
         .iter()
         .map(|sample| sample.slots.as_slice())
         .collect();
-    let batch = network.pack(&sequences)?;
+    let batch = network.pack(&sequences, 0, &memory)?;
     let (b, t) = batch.shape;
     let passed = network.mct.forward(&batch, &memory, None, dropout)?;
     let flat = passed.hidden.reshape((b * t, width))?;
@@ -228,10 +237,15 @@ fn state_loss(
         &tokens,
     )?;
 
-    let counts: Vec<usize> = (0..STEPS.len())
-        .map(|step| targets.iter().filter(|t| t.bins[step].is_some()).count())
+    let weight = |target: &StateTarget, step: usize| match target.bins[step] {
+        None => 0.0,
+        Some(_) if target.is_known => 1.0,
+        Some(_) => config.unknown,
+    };
+    let weights: Vec<f64> = (0..STEPS.len())
+        .map(|step| targets.iter().map(|target| weight(target, step)).sum())
         .collect();
-    let n: usize = counts.iter().sum();
+    let n: f64 = weights.iter().sum::<f64>().max(f64::MIN_POSITIVE);
     let mut total = None;
     for (step, field) in STEPS.into_iter().enumerate() {
         let bins: Vec<u32> = targets
@@ -240,7 +254,7 @@ fn state_loss(
             .collect();
         let valid: Vec<f32> = targets
             .iter()
-            .map(|t| f32::from(u8::from(t.bins[step].is_some())))
+            .map(|target| weight(target, step) as f32)
             .collect();
         let logits = network.decoder.logits(&outputs.get(step)?, field)?; // [K, bins]
         let smoothing = (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
@@ -254,7 +268,7 @@ fn state_loss(
             smoothing,
         )?;
         parts.fields.push(scalar(&mean)?);
-        let share = counts[step] as f64 / n as f64;
+        let share = weights[step] / n;
         parts.state += share * parts.fields[step];
         let part = (mean * share)?;
         total = Some(match total {

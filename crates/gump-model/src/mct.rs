@@ -9,6 +9,8 @@
 //!
 //! Source: GUMP (ECCV 2024); GPT-2 blocks; gated cross-attention after Flamingo.
 
+use std::sync::Arc;
+
 use candle_core::{Result, Tensor};
 use gump_scene::Seed;
 use gump_tokenizer::N_CLASSES;
@@ -18,6 +20,7 @@ use crate::config::{Gate, ModelConfig};
 use crate::embedding::{Tables, embedding_sum};
 use crate::ops;
 use crate::parameters::{Init, Scope};
+use crate::surroundings::{N_NUMBERS, Survey};
 
 /// Every table starts from this deviation, as GPT-2's do.
 pub(crate) const TABLE_DEVIATION: f64 = 0.02;
@@ -287,6 +290,8 @@ impl CrossBlock {
 /// `[S, M, C]`; computed once and shared by all futures of the scene.
 #[derive(Clone, Debug)]
 pub(crate) struct VisualMemory {
+    /// Per scene, its map laid out for looking around.
+    pub(crate) surveys: Vec<Arc<Survey>>,
     /// The visual tokens themselves, for looking up what lies under an object.
     pub(crate) visual: Tensor,
     pub(crate) key_values: Vec<(Tensor, Tensor)>,
@@ -308,7 +313,9 @@ impl VisualMemory {
                 join(&|part| part.key_values[i].1.clone())?,
             ))
         });
+        let surveys = parts.iter().flat_map(|part| &part.surveys);
         Ok(Self {
+            surveys: surveys.cloned().collect(),
             visual: join(&|part| part.visual.clone())?,
             key_values: key_values.collect::<Result<_>>()?,
         })
@@ -356,6 +363,8 @@ pub(crate) struct Mct {
     levels: Vec<usize>,
     /// One map per place an object looks at, if it does.
     local: Vec<Linear>,
+    /// Two layers over what an object sees around itself, if it does.
+    surroundings: Option<(Linear, Linear)>,
 }
 
 /// Tokens ready to embed: `B` sequences of `T` tokens each.
@@ -373,6 +382,10 @@ pub(crate) struct TokenBatch {
     pub(crate) places: [Vec<u32>; PLACES.len()],
     /// Row of the batch each of them stands in, [K].
     pub(crate) looker_rows: Vec<u32>,
+    /// Flat indices of the keys that see their surroundings, [K'].
+    pub(crate) seers: Tensor,
+    /// What they see, [K', N_NUMBERS].
+    pub(crate) surroundings: Tensor,
     /// (B, T)
     pub(crate) shape: (usize, usize),
 }
@@ -400,7 +413,20 @@ impl Mct {
                 )
             })
             .collect::<std::result::Result<_, _>>()?;
+        let surroundings = config
+            .surroundings
+            .then(|| {
+                let mut scope = scope.part("surroundings");
+                let zero = Some(Init::Constant(0.0));
+                let small = Init::Normal(TABLE_DEVIATION);
+                Ok::<_, ModelError>((
+                    Linear::new(&mut scope, "in", N_NUMBERS, 2 * c)?,
+                    Linear::with(&mut scope, "out", 2 * c, c, small, zero)?,
+                ))
+            })
+            .transpose()?;
         Ok(Self {
+            surroundings,
             table: scope.get(
                 "tables",
                 (tables.n_rows(), c),
@@ -443,10 +469,15 @@ impl Mct {
         self.sine_out.forward(&hidden)
     }
 
-    /// Reads the visual tokens once, [S, M, C].
-    pub(crate) fn remember(&self, visual: &Tensor) -> Result<VisualMemory> {
+    /// Reads the visual tokens of scenes once, [S, M, C].
+    pub(crate) fn remember(
+        &self,
+        visual: &Tensor,
+        surveys: Vec<Arc<Survey>>,
+    ) -> Result<VisualMemory> {
         let key_values = self.cross.iter().map(|cross| cross.remember(visual));
         Ok(VisualMemory {
+            surveys,
             visual: visual.clone(),
             key_values: key_values.collect::<Result<_>>()?,
         })
@@ -488,6 +519,12 @@ impl Mct {
         }
         if !batch.looker_rows.is_empty() {
             x = x.index_add(&batch.lookers, &self.look_around(batch, visual)?, 0)?;
+        }
+        if let Some((first, second)) = &self.surroundings
+            && batch.surroundings.dim(0)? > 0
+        {
+            let seen = second.forward(&ops::gelu(&first.forward(&batch.surroundings)?)?)?;
+            x = x.index_add(&batch.seers, &seen, 0)?;
         }
         let mut x = drop_out(x.reshape((b, t, ()))?, dropout)?; // [B, T, C]
         let mut levels = Vec::with_capacity(self.levels.len());

@@ -1,5 +1,7 @@
 //! The whole network with its parameters: what a checkpoint holds and everything else calls.
 
+use std::sync::Arc;
+
 use candle_core::{Device, Tensor};
 use gump_raster::{Raster, RasterSpec};
 use gump_scene::Seed;
@@ -10,6 +12,7 @@ use crate::config::ModelConfig;
 use crate::decoder::StateDecoder;
 use crate::mct::{Mct, TokenBatch, VisualMemory};
 use crate::parameters::Parameters;
+use crate::surroundings::Survey;
 use crate::trajectory::TrajectoryHead;
 use crate::visual::Visual;
 
@@ -88,9 +91,15 @@ impl Network {
         self.parameters.device()
     }
 
-    /// Sequences of slots as a batch.
-    pub(crate) fn pack(&self, sequences: &[&[PlacedSlot]]) -> Result<TokenBatch, ModelError> {
-        Ok(self.packer.pack(sequences, self.device())?)
+    /// Sequences of slots as a batch, without their first `from`.
+    pub(crate) fn pack(
+        &self,
+        sequences: &[&[PlacedSlot]],
+        from: usize,
+        memory: &VisualMemory,
+    ) -> Result<TokenBatch, ModelError> {
+        let surveys = &memory.surveys;
+        Ok(self.packer.pack(sequences, from, surveys, self.device())?)
     }
 
     /// Rasters of several scenes as one tensor, [S, P, side, side].
@@ -111,8 +120,12 @@ impl Network {
     }
 
     /// Looks at the maps once, for any number of passes.
-    pub(crate) fn look(&self, rasters: &[Raster]) -> Result<VisualMemory, ModelError> {
+    pub(crate) fn look(
+        &self,
+        rasters: &[Raster],
+        surveys: Vec<Arc<Survey>>,
+    ) -> Result<VisualMemory, ModelError> {
         let features = self.visual.features(&self.raster_tensor(rasters)?, false)?;
-        Ok(self.mct.remember(&self.place(&features)?)?)
+        Ok(self.mct.remember(&self.place(&features)?, surveys)?)
     }
 }

@@ -18,7 +18,7 @@ use crate::decoder::STEPS;
 use crate::draw::draw_field;
 use crate::mct::{Cache, VisualMemory};
 use crate::network::Network;
-use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig, settled_state};
+use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
 
 /// Everything a transformer pass needs.
 pub(crate) struct Passes<'a> {
@@ -47,7 +47,7 @@ impl<'a> Passes<'a> {
         self.count.get()
     }
 
-    /// Hidden vectors [B, T, C] of new slots, after those in the cache if there is one.
+    /// Hidden vectors [B, T, C] of the slots that the cache, if there is one, does not hold.
     fn run(
         &self,
         slots: &[&[PlacedSlot]],
@@ -56,7 +56,8 @@ impl<'a> Passes<'a> {
     ) -> Result<Tensor, ModelError> {
         self.count.set(self.count.get() + 1);
         let network = self.network;
-        let batch = network.pack(slots)?;
+        let from = cache.as_ref().map_or(0, |cache| cache.len());
+        let batch = network.pack(slots, from, memory)?;
         Ok(network.mct.forward(&batch, memory, cache, None)?.hidden)
     }
 
@@ -166,16 +167,16 @@ impl Group<'_> {
         for i in 0..n {
             let key = first + 2 * i;
             let from = cache.as_ref().map_or(0, Cache::len);
-            let presented: Vec<&[PlacedSlot]> =
-                rows.iter().map(|slots| &slots[from..=key]).collect();
+            let presented: Vec<&[PlacedSlot]> = rows.iter().map(|slots| &slots[..=key]).collect();
             let hidden = passes.run(&presented, &self.memory, cache.as_mut())?;
             let at_key = hidden.narrow(1, key - from, 1)?.squeeze(1)?.contiguous()?; // [B, C]
             let requests: Vec<Request> =
                 self.windows.iter().map(|w| w.requests[i].clone()).collect();
             let bins = sample_states(passes.network, &at_key, &requests, passes.sampling)?;
             for (row, bins) in bins.into_iter().enumerate() {
-                let pose = requests[row].settle(&bins, passes.sampling);
-                rows[row][key + 1].slot = Slot::Value(settled_state(&bins, pose));
+                let request = &requests[row];
+                let pose = request.settle(&bins, passes.sampling);
+                rows[row][key + 1].slot = Slot::Value(request.settled_state(&bins, pose));
                 decoded[row].push(bins);
             }
         }

@@ -4,6 +4,7 @@
 //! tokenized, so that map and agents cannot fall out of register.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_raster::{Raster, RasterSpec, rasterize};
@@ -12,14 +13,17 @@ use gump_scene::{
 };
 use gump_tokenizer::{
     FIRST_LIGHT, Field, Identities, Key, MAX_PROMPTS, PAD, QuantizedState, Slot, TokenFrame,
-    TokenSequence, Tokenizer, class_index, light_token,
+    TokenSequence, Tokenizer, TokenizerConfig, class_index, light_token,
 };
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
+use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::closed_loop::Drive;
-use crate::decoder::{CHUNK, CONTROL_KEYS, STEPS};
+use crate::decoder::{CONTROL_KEYS, STEPS};
+use crate::network::Network;
+use crate::surroundings::Survey;
 use crate::trajectory::{FUTURE, PAST, POSE};
 
 /// Seconds between token frames.
@@ -110,6 +114,7 @@ impl SampleConfig {
 pub(crate) struct Sample {
     pub(crate) slots: Vec<PlacedSlot>,
     pub(crate) raster: Raster,
+    pub(crate) survey: Arc<Survey>,
     pub(crate) states: Vec<StateTarget>,
     pub(crate) control: Vec<ControlTarget>,
     pub(crate) lights: Vec<ControlTarget>,
@@ -122,8 +127,10 @@ pub(crate) struct Sample {
 pub(crate) struct StateTarget {
     /// Index of the key in the slots.
     pub(crate) key: usize,
-    /// Bin per step; `None` where the log has nothing.
+    /// Bin per step, in the object's anchor; `None` where the log has nothing.
     pub(crate) bins: [Option<u16>; STEPS.len()],
+    /// False if the window has not shown the object before, so that it could be anywhere.
+    pub(crate) is_known: bool,
 }
 
 impl StateTarget {
@@ -218,12 +225,13 @@ impl Window<'_> {
         Some(self.state(&agent))
     }
 
-    /// The value that should stand where `seen` stands: itself, unless the agent was driven.
-    fn truth(&self, seen: QuantizedState, frame: usize, id: AgentId) -> QuantizedState {
-        match self.driven.and(self.expected(frame, -1, 1, id)) {
-            Some(state) => seen.with_motion(&state),
-            None => seen,
-        }
+    /// In whose frame the chunk of an object is asked for that was last shown as `last`: where it
+    /// was a frame ago, to the millimetre, as a rollout knows it.
+    fn anchor(&self, last: Option<QuantizedState>, frame: usize, id: AgentId) -> Anchor {
+        last.map_or(Anchor::SCENE, |last| {
+            let before = self.seen(frame, -1).and_then(|frame| frame.agent(id));
+            Anchor::at(before.map_or(last.pose(), |agent| self.state(agent).pose))
+        })
     }
 
     /// An agent in scene coordinates.
@@ -241,13 +249,31 @@ pub(crate) fn stride_of(dt: f64) -> usize {
     (TOKEN_DT / dt).round().max(1.0) as usize
 }
 
+/// What samples are made for.
+pub(crate) struct Reader {
+    pub(crate) spec: RasterSpec,
+    pub(crate) tokenizer: Tokenizer,
+    /// True asks for chunks in the frames of their objects.
+    pub(crate) anchored: bool,
+}
+
+impl Reader {
+    /// Samples for this network.
+    pub(crate) fn of(network: &Network) -> Self {
+        Self {
+            spec: network.raster_spec().clone(),
+            tokenizer: Tokenizer::new(TokenizerConfig::default()),
+            anchored: network.config().anchored,
+        }
+    }
+}
+
 /// Draws a sample, from a drive of the scenario if there is one; `None` if the scenario is too
 /// short for one.
 pub(crate) fn draw(
     scenario: &Scenario,
     driven: Option<Driven<'_>>,
-    spec: &RasterSpec,
-    tokenizer: &Tokenizer,
+    reader: &Reader,
     config: &SampleConfig,
     seed: Seed,
 ) -> Option<Sample> {
@@ -264,7 +290,7 @@ pub(crate) fn draw(
     } else {
         Identities::ranked(&views, centre, pose)
     };
-    let encoded = tokenizer.encode(
+    let encoded = reader.tokenizer.encode(
         &scenario.map,
         &views,
         window.centre,
@@ -274,9 +300,10 @@ pub(crate) fn draw(
     let prompts = prompts(&window, config, &mut rng);
     let sequence = TokenSequence::new(prompts, encoded.sequence.frames().to_vec()).ok()?;
     let mut slots = place(&sequence);
-    let (states, trajectories) = targets(&slots, &window, &identities);
+    let (states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
     let mut sample = Sample {
-        raster: draw_raster(&window, spec),
+        raster: draw_raster(&window, &reader.spec),
+        survey: Arc::new(Survey::new(&scenario.map, window.world_from_scene)),
         slots: Vec::new(),
         states,
         control: control_targets(&slots),
@@ -476,6 +503,7 @@ fn targets(
     slots: &[PlacedSlot],
     window: &Window<'_>,
     identities: &Identities,
+    anchored: bool,
 ) -> (Vec<StateTarget>, Vec<TrajectoryTarget>) {
     let mut states = Vec::new();
     let mut trajectories = Vec::new();
@@ -490,11 +518,16 @@ fn targets(
             continue;
         };
         let frame = placed.frame;
+        let anchor = match anchored {
+            true => window.anchor(placed.last, frame, id),
+            false => Anchor::SCENE,
+        };
+        let mut chunk = std::array::from_fn(|pose| window.expected(frame, -1, pose + 1, id));
+        chunk[0] = chunk[0].or(Some(value.to_agent_state()));
         states.push(StateTarget {
             key: i,
-            bins: state_bins(window.truth(value, frame, id), |pose| {
-                window.expected(frame, -1, pose + 1, id)
-            }),
+            bins: anchor.bins(value, chunk),
+            is_known: placed.last.is_some(),
         });
         let seen = |offset: isize| {
             let agent = window.seen(frame, offset)?.agent(id)?;
@@ -514,31 +547,6 @@ fn targets(
         }
     }
     (states, trajectories)
-}
-
-/// The bins of a chunk: size, velocity and pose of the value itself, then three poses of the log.
-fn state_bins(
-    value: QuantizedState,
-    look: impl Fn(usize) -> Option<AgentState>,
-) -> [Option<u16>; STEPS.len()] {
-    let mut bins = [None; STEPS.len()];
-    for (step, field) in STEPS.iter().enumerate().take(7) {
-        bins[step] = Some(value.get(*field));
-    }
-    for pose in 1..CHUNK {
-        let Some(state) = look(pose) else {
-            continue;
-        };
-        let (x, y) = (state.pose.position.x, state.pose.position.y);
-        // A pose beyond the window has no bin; the clamped one would be a lie.
-        if x.abs() <= Field::X.high() && y.abs() <= Field::Y.high() {
-            let first = 4 + 3 * pose;
-            bins[first] = Some(Field::X.quantize(x).bin);
-            bins[first + 1] = Some(Field::Y.quantize(y).bin);
-            bins[first + 2] = Some(Field::Heading.quantize(state.pose.heading).bin);
-        }
-    }
-    bins
 }
 
 /// At every control or value slot, what follows it (model.md 10.1).
@@ -642,7 +650,14 @@ fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
 mod tests {
     use super::*;
     use gump_scene::fixture;
-    use gump_tokenizer::TokenizerConfig;
+
+    fn reader() -> Reader {
+        Reader {
+            spec: RasterSpec::full(16, 12.0),
+            tokenizer: Tokenizer::new(TokenizerConfig::default()),
+            anchored: false,
+        }
+    }
 
     fn scenario() -> Scenario {
         fixture::scenario(
@@ -657,19 +672,8 @@ mod tests {
     }
 
     fn sample(config: &SampleConfig, seed: u64) -> Sample {
-        let spec = RasterSpec::full(16, 12.0);
-        let tokenizer = Tokenizer::new(TokenizerConfig::default());
         (0..64)
-            .find_map(|i| {
-                draw(
-                    &scenario(),
-                    None,
-                    &spec,
-                    &tokenizer,
-                    config,
-                    Seed(seed).fork(i),
-                )
-            })
+            .find_map(|i| draw(&scenario(), None, &reader(), config, Seed(seed).fork(i)))
             .expect("a sample can be drawn")
     }
 
@@ -801,8 +805,6 @@ mod tests {
             stride,
             frames: (1..=4).map(|i| driven(present + i * stride)).collect(),
         };
-        let spec = RasterSpec::full(16, 12.0);
-        let tokenizer = Tokenizer::new(TokenizerConfig::default());
         let way = Driven {
             drive: &drive,
             slack: 0.5,
@@ -810,7 +812,7 @@ mod tests {
         let config = SampleConfig::plain(4);
         let sample = (0..64).find_map(|i| {
             let seed = Seed(i);
-            draw(&scenario, Some(way), &spec, &tokenizer, &config, seed)
+            draw(&scenario, Some(way), &reader(), &config, seed)
                 // The last two of four frames are driven ones.
                 .filter(|sample| sample.states.len() == 12)
         });

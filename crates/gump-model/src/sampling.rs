@@ -4,12 +4,13 @@
 //! not: drawing a bin, which is `draw`'s business.
 
 use gump_geometry::{DVec2, Pose};
-use gump_scene::Seed;
+use gump_scene::{AgentState, Seed};
 use gump_tokenizer::{Field, QuantizedState};
 use serde::{Deserialize, Serialize};
 
 use crate::aggregation::Ring;
-use crate::decoder::{CHUNK, STEPS};
+use crate::anchor::Anchor;
+use crate::decoder::STEPS;
 use crate::ops::panels::Precision;
 
 /// How futures are decoded.
@@ -93,6 +94,8 @@ pub enum Surrogate {
 /// What is asked of the decoder for one object.
 #[derive(Clone, Debug)]
 pub(crate) struct Request {
+    /// In whose frame the bins are said.
+    pub(crate) anchor: Anchor,
     /// Bins that are given, per step.
     pub(crate) forced: [Option<u16>; STEPS.len()],
     /// The object's own stream of randomness in this frame.
@@ -108,19 +111,20 @@ pub(crate) struct Request {
 impl Request {
     /// The final pose of a decoded object: its sample, aggregated; scene frame, not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> Pose {
-        self.ring
-            .aggregate(self.frame, poses(bins)[0], config.decay)
+        let said = self.anchor.poses(bins)[0];
+        self.ring.aggregate(self.frame, said, config.decay)
     }
-}
 
-/// The token state of a decoded object whose final pose is `pose`: the one value that embedding,
-/// sine, geometry and the next surrogate all derive from.
-pub(crate) fn settled_state(bins: &Bins, pose: Pose) -> QuantizedState {
-    let mut state = QuantizedState::default();
-    for (field, &bin) in STEPS.iter().zip(bins).take(4) {
-        state.set(*field, bin);
+    /// The token state of a decoded object whose final pose is `pose`: the one value that embedding,
+    /// sine, geometry and the next surrogate all derive from.
+    pub(crate) fn settled_state(&self, bins: &Bins, pose: Pose) -> QuantizedState {
+        let mut state = QuantizedState::default();
+        for (field, &bin) in STEPS.iter().zip(bins).take(2) {
+            state.set(*field, bin);
+        }
+        let velocity = self.anchor.velocity(bins);
+        state.with_motion(&AgentState { pose, velocity })
     }
-    set_pose(state, pose)
 }
 
 /// The same state at another pose.
@@ -131,17 +135,5 @@ pub(crate) fn set_pose(mut state: QuantizedState, pose: Pose) -> QuantizedState 
     state
 }
 
-/// What the decoder says of one object: a bin per step.
+/// What the decoder says of one object: a bin per step, to be read through the object's anchor.
 pub(crate) type Bins = [u16; STEPS.len()];
-
-/// The poses of a chunk, scene frame.
-pub(crate) fn poses(bins: &Bins) -> [Pose; CHUNK] {
-    std::array::from_fn(|i| {
-        let at = 4 + 3 * i;
-        Pose::new(
-            Field::X.dequantize(bins[at]),
-            Field::Y.dequantize(bins[at + 1]),
-            Field::Heading.dequantize(bins[at + 2]),
-        )
-    })
-}

@@ -9,11 +9,14 @@ use gump_raster::rasterize;
 use gump_scene::{AgentId, AgentState, Frame, MapGraph, Route, SceneState};
 use gump_tokenizer::{Identities, Key, QuantizedState, TokenAgent, TokenFrame};
 
-use crate::ModelError;
+use crate::anchor::Anchor;
+use crate::batch::PlacedSlot;
 use crate::engine::{Context, SceneMemory};
 use crate::mct::VisualMemory;
 use crate::sample::TOKEN_DT;
+use crate::surroundings::Survey;
 use crate::world::{KEEP_RANGE_M, TransformerWorld};
+use crate::{ModelConfig, ModelError};
 
 /// What the network remembers of a map, in the form of whoever computes.
 #[derive(Debug)]
@@ -104,7 +107,10 @@ impl Scene {
             .encode(&map, &frames, ego, world_from_scene, &identities);
         let (sequence, _) = encoded.sequence.fit(world.longest_frame());
         let raster = rasterize(world.network().raster_spec(), &view, world_from_scene);
-        let memory = world.network().look(std::slice::from_ref(&raster))?;
+        let survey = Arc::new(Survey::new(&map, world_from_scene));
+        let memory = world
+            .network()
+            .look(std::slice::from_ref(&raster), vec![survey])?;
         Ok(Self {
             world_from_scene,
             ego,
@@ -121,13 +127,32 @@ impl Scene {
         })
     }
 
+    /// The state of an object in the present, scene frame, not rounded.
+    pub(crate) fn present(&self, id: u16) -> Option<AgentState> {
+        self.was(id, 0)
+    }
+
+    /// In whose frame the chunk at a key of the present is said.
+    pub(crate) fn anchor(&self, key: &PlacedSlot, id: u16, config: &ModelConfig) -> Anchor {
+        let last = key.last.filter(|_| config.anchored);
+        last.map_or(Anchor::SCENE, |last| {
+            Anchor::at(self.was(id, 1).map_or(last.pose(), |state| state.pose))
+        })
+    }
+
+    /// The state of an object some frames ago.
+    fn was(&self, id: u16, ago: usize) -> Option<AgentState> {
+        let frame = self.recent.iter().rev().nth(ago)?;
+        Some(self.local(frame.agent(self.identities.agent(id)?)?.state))
+    }
+
     /// A world state in tokens, with the size of `like`.
     pub(crate) fn quantize(&self, state: AgentState, like: QuantizedState) -> QuantizedState {
         like.with_motion(&self.local(state))
     }
 
     /// A world state in the scene frame.
-    fn local(&self, state: AgentState) -> AgentState {
+    pub(crate) fn local(&self, state: AgentState) -> AgentState {
         let scene_from_world = self.world_from_scene.inverse();
         AgentState {
             pose: scene_from_world * state.pose,

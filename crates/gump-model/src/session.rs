@@ -44,14 +44,13 @@ impl Session for TransformerSession<'_> {
             return Err(ModelError::Scene(what).into());
         }
         self.recentre()?;
-        let sampling = self.world.sampling();
         let windows: Vec<Window> = self
             .futures
             .iter()
             .enumerate()
             .map(|(i, future)| {
                 let scene = &self.scenes[future.scene];
-                future.window(scene, sampling, ego.map(|states| states[i]))
+                future.window(scene, self.world, ego.map(|states| states[i]))
             })
             .collect();
         let decoded = self.decode(&windows)?;

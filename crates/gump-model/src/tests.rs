@@ -1,18 +1,22 @@
 //! Invariants of the network as a whole (model.md, section 13).
 
+use std::sync::Arc;
+
 use candle_core::{Device, Tensor};
 use gump_rollout::{Start, WorldModel};
 use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
 use gump_tokenizer::{Identities, Slot, Tokenizer, TokenizerConfig};
 
 use crate::aggregation::Ring;
+use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::config::{Gate, ModelConfig, VisualConfig};
 use crate::decode::{Window, present_all};
 use crate::decoder::STEPS;
 use crate::mct::{Cache, VisualMemory};
 use crate::plain::{Passes, decode};
-use crate::sampling::{CacheMode, Mode, Request, SamplingConfig, poses, settled_state};
+use crate::sampling::{CacheMode, Mode, Request, SamplingConfig};
+use crate::surroundings::Survey;
 use crate::world::TransformerWorld;
 use crate::{ModelError, Network};
 
@@ -67,7 +71,8 @@ pub(crate) fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
 pub(crate) fn memory(network: &Network, scenario: &Scenario) -> VisualMemory {
     let scene = scenario.present();
     let raster = gump_raster::rasterize(network.raster_spec(), &scene, scene.ego_now().state.pose);
-    network.look(&[raster]).unwrap()
+    let survey = Survey::new(scene.map, scene.ego_now().state.pose);
+    network.look(&[raster], vec![Arc::new(survey)]).unwrap()
 }
 
 /// Hidden vectors, one row per token.
@@ -76,7 +81,7 @@ pub(crate) fn hidden(
     sequences: &[&[PlacedSlot]],
     memory: &VisualMemory,
 ) -> Vec<Vec<Vec<f32>>> {
-    let batch = network.pack(sequences).unwrap();
+    let batch = network.pack(sequences, 0, memory).unwrap();
     network
         .mct
         .forward(&batch, memory, None, None)
@@ -164,8 +169,10 @@ fn the_cache_is_exact() {
     let whole = &hidden(&network, &[&slots], &memory)[0];
     let mut cache = Cache::new(network.config().layers);
     let mut pieces = Vec::new();
-    for piece in [&slots[..11], &slots[11..12], &slots[12..]] {
-        let batch = network.pack(&[piece]).unwrap();
+    for end in [11, 12, slots.len()] {
+        let batch = network
+            .pack(&[&slots[..end]], cache.len(), &memory)
+            .unwrap();
         let rows = network
             .mct
             .forward(&batch, &memory, Some(&mut cache), None)
@@ -484,6 +491,7 @@ fn window(scenario: &Scenario) -> Window {
     };
     let next = history[history.len() - 1].clone();
     let request = |(i, _)| Request {
+        anchor: Anchor::SCENE,
         forced: [None; STEPS.len()],
         stream: Seed(i as u64),
         near: None,
@@ -520,8 +528,9 @@ fn surrogates_that_are_right_give_full_autoregression() {
     let full = run(Mode::FullAr, &window);
     let guessed = run(Mode::PartialAr, &window);
     assert_eq!(full[0], guessed[0], "the first object sees no surrogate");
-    for (agent, bins) in window.next.tracked.iter_mut().zip(&full) {
-        agent.state = settled_state(bins, poses(bins)[0]);
+    let agents = window.next.tracked.iter_mut().zip(&window.requests);
+    for ((agent, request), bins) in agents.zip(&full) {
+        agent.state = request.settled_state(bins, request.anchor.poses(bins)[0]);
     }
     assert_eq!(run(Mode::PartialAr, &window), full);
 }

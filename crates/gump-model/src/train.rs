@@ -9,9 +9,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 
 use candle_core::{Device, Tensor};
-use gump_raster::RasterSpec;
 use gump_scene::{Scenario, Seed};
-use gump_tokenizer::{Tokenizer, TokenizerConfig};
 use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -25,7 +23,7 @@ use crate::mct::Dropout;
 use crate::network::Network;
 use crate::optimizer::{AdamW, OptimizerConfig};
 use crate::parameters::Parameters;
-use crate::sample::{Driven, Sample, SampleConfig, draw};
+use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
 
 /// How to train.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -142,8 +140,7 @@ struct Source {
     /// Scenes as the network drove them.
     drives: Vec<Drive>,
     closed_loop: ClosedLoopConfig,
-    spec: RasterSpec,
-    tokenizer: Tokenizer,
+    reader: Reader,
     config: SampleConfig,
     batch: usize,
     seed: Seed,
@@ -170,8 +167,7 @@ impl Source {
                     draw(
                         &self.scenarios[scenario],
                         driven,
-                        &self.spec,
-                        &self.tokenizer,
+                        &self.reader,
                         &self.config,
                         seed.fork(1),
                     )
@@ -273,8 +269,7 @@ impl Trainer {
             drives,
             closed_loop: config.closed_loop.clone().unwrap_or_default(),
             scenarios,
-            spec: network.raster_spec().clone(),
-            tokenizer: Tokenizer::new(TokenizerConfig::default()),
+            reader: Reader::of(&network),
             config: config.sample.clone(),
             batch: config.batch,
             seed: Seed(config.seed).fork(1),
@@ -357,8 +352,7 @@ impl Trainer {
                 draw(
                     scenario,
                     None,
-                    &source.spec,
-                    &source.tokenizer,
+                    &source.reader,
                     &config,
                     Seed(0).fork(i as u64),
                 )

@@ -19,14 +19,15 @@ use gump_tokenizer::{QuantizedState, Slot, TokenSequence, Tokenizer, TokenizerCo
 use rayon::prelude::*;
 
 use crate::ModelError;
-use crate::aggregation::Ring;
+use crate::aggregation::{Chunk, Ring};
+use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::decoder::STEPS;
 use crate::engine::{Engine, Job};
 use crate::future::{Future, stream};
 use crate::network::Network;
 use crate::plain::sample_states;
-use crate::sampling::{Bins, Request, SamplingConfig, poses};
+use crate::sampling::{Bins, Request, SamplingConfig};
 use crate::scene::{Memory, Scene};
 use crate::session::TransformerSession;
 
@@ -157,7 +158,7 @@ impl TransformerWorld {
             .history
             .last()
             .map_or(0, |_| shared.history.len() - 1);
-        let future = |(k, rings): (usize, Vec<(u16, Bins)>)| {
+        let future = |(k, rings): (usize, Vec<(u16, Chunk)>)| {
             let mut future = Future {
                 scene,
                 seed: seed.fork(k as u64),
@@ -167,8 +168,8 @@ impl TransformerWorld {
                 recent: shared.recent.clone(),
                 context: shared.prefix.clone(),
             };
-            for (id, bins) in rings {
-                future.rings.entry(id).or_default().push(last, poses(&bins));
+            for (id, chunk) in rings {
+                future.rings.entry(id).or_default().push(last, chunk);
             }
             future
         };
@@ -182,31 +183,32 @@ impl TransformerWorld {
         scene: &mut Scene,
         n: usize,
         seed: Seed,
-    ) -> Result<Vec<Vec<(u16, Bins)>>, ModelError> {
+    ) -> Result<Vec<Vec<(u16, Chunk)>>, ModelError> {
         let network = &self.network;
         let sequence = TokenSequence::new(Vec::new(), scene.history.clone())
             .map_err(|error| ModelError::Scene(error.to_string()))?;
         let slots = place(&sequence);
         let last = scene.history.len() - 1;
-        let keys: Vec<(usize, u16, QuantizedState)> = slots
+        let keys: Vec<(usize, u16, QuantizedState, Anchor)> = slots
             .windows(2)
             .enumerate()
             .filter_map(|(i, pair)| match (pair[0].slot, pair[1].slot) {
-                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => {
-                    Some((i, key.id, state))
-                }
+                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => Some((
+                    i,
+                    key.id,
+                    state,
+                    scene.anchor(&pair[0], key.id, network.config()),
+                )),
                 _ => None,
             })
             .collect();
         let requests: Vec<Request> = (0..n)
             .flat_map(|k| keys.iter().map(move |key| (k, key)))
-            .map(|(k, (_, id, state))| {
-                let mut forced = [None; STEPS.len()];
-                for (step, field) in STEPS.iter().enumerate().take(7) {
-                    forced[step] = Some(state.get(*field));
-                }
+            .map(|(k, (_, id, state, anchor))| {
+                let is = scene.present(*id).unwrap_or(state.to_agent_state());
                 Request {
-                    forced,
+                    anchor: *anchor,
+                    forced: anchor.bins(*state, [Some(is), None, None, None]),
                     stream: stream(seed.fork(k as u64), last, *id),
                     near: None,
                     ring: Ring::default(),
@@ -230,7 +232,7 @@ impl TransformerWorld {
         let per_future = |bins: &[Bins]| {
             keys.iter()
                 .zip(bins)
-                .map(|((_, id, _), b)| (*id, *b))
+                .map(|((_, id, _, anchor), b)| (*id, anchor.poses(b)))
                 .collect()
         };
         Ok(bins.chunks(keys.len().max(1)).map(per_future).collect())
@@ -256,7 +258,7 @@ impl TransformerWorld {
         }
         let memory = scene.memory.plain();
         let memory = memory.expect("without an engine the memory is the tensor library's");
-        let batch = self.network.pack(&[slots])?;
+        let batch = self.network.pack(&[slots], 0, memory)?;
         let features = self.network.mct.forward(&batch, memory, None, None)?;
         let places: Vec<u32> = places.into_iter().map(|i| i as u32).collect();
         let places = Tensor::new(places, self.network.device())?;

@@ -13,7 +13,8 @@ use crate::batch::{Packer, PlacedSlot};
 use crate::embedding::SineKey;
 use crate::mct::PLACES;
 use crate::ops::panels::{Panels, Room};
-use crate::ops::wide;
+use crate::ops::{gelu_row, wide};
+use crate::surroundings::{N_NUMBERS, Surroundings, Survey, look_around};
 
 use super::weights::{Norm, Source, numbers};
 use super::{Pool, chunk_rows};
@@ -29,6 +30,8 @@ pub(super) struct Embedder {
     sine_out: Panels,
     /// One map per place an object looks at, if it does.
     local: Vec<Panels>,
+    /// Two layers over what an object sees around itself, if it does.
+    surroundings: Option<[Panels; 2]>,
 }
 
 /// What an object sees of a scene at each place it looks at, `[M, C]` per place.
@@ -50,6 +53,13 @@ impl Embedder {
             local: (0..n_places)
                 .map(|i| source.linear(&format!("mct.local.{i}"), c))
                 .collect::<Result<_, _>>()?,
+            surroundings: match config.surroundings {
+                true => Some([
+                    source.linear("mct.surroundings.in", N_NUMBERS)?,
+                    source.linear("mct.surroundings.out", 2 * c)?,
+                ]),
+                false => None,
+            },
         })
     }
 
@@ -104,6 +114,51 @@ impl Embedder {
                 }
             });
         self.sine_in.products(n_sines) + self.sine_out.products(n_sines)
+    }
+
+    /// What the objects at the keys from slot `from` on see, if this network's do.
+    pub(super) fn surroundings(
+        &self,
+        survey: &Survey,
+        slots: &[PlacedSlot],
+        from: usize,
+    ) -> Vec<(usize, Surroundings)> {
+        match self.surroundings {
+            Some(_) => look_around(survey, slots, from),
+            None => Vec::new(),
+        }
+    }
+
+    /// Adds to rows of `x` what their objects see. Returns how many multiplications it took.
+    pub(super) fn add_surroundings(
+        &self,
+        seen: &[(usize, Surroundings)],
+        rooms: &Pool,
+        x: &mut [f32],
+    ) -> u64 {
+        let Some([first, second]) = &self.surroundings else {
+            return 0;
+        };
+        let c = self.width;
+        let step = chunk_rows(seen.len());
+        let mut vectors = vec![0.0; seen.len() * c];
+        let pairs = seen.par_chunks(step).zip(vectors.par_chunks_mut(step * c));
+        pairs.for_each(|(seen, vectors)| {
+            rooms.with(|room| {
+                let [numbers, hidden, ..] = &mut room.buffers;
+                numbers.clear();
+                seen.iter()
+                    .for_each(|(_, seen)| numbers.extend_from_slice(seen));
+                hidden.resize(2 * c * seen.len(), 0.0);
+                first.apply(numbers, hidden, &mut room.products);
+                gelu_row(hidden);
+                second.apply(hidden, vectors, &mut room.products);
+            });
+        });
+        for ((row, _), vector) in seen.iter().zip(vectors.chunks_exact(c)) {
+            add(&mut x[row * c..][..c], vector);
+        }
+        first.products(seen.len()) + second.products(seen.len())
     }
 
     /// Per token the number of its sine, and the features of each.

@@ -19,7 +19,7 @@ mod tests;
 mod weights;
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
@@ -35,6 +35,7 @@ use crate::network::Network;
 use crate::ops::panels::{Panels, Precision, Room};
 use crate::ops::{gelu_row, wide};
 use crate::sampling::{Bins, Request, SamplingConfig};
+use crate::surroundings::{Surroundings, Survey};
 
 /// New tokens that go through the layers together; bounds the memory of a pass.
 const WAVE: usize = 8 * 1024;
@@ -60,6 +61,7 @@ pub(crate) struct SceneMemory {
     n: usize,
     cross: Vec<Pages>,
     ground: Ground,
+    survey: Arc<Survey>,
 }
 
 /// One sequence in a pass.
@@ -141,6 +143,7 @@ impl Engine {
                 .map(pages)
                 .collect::<Result<_, _>>()?,
             ground: self.embedder.ground(&memory.visual)?,
+            survey: memory.surveys.first().cloned().unwrap_or_default(),
         })
     }
 
@@ -200,6 +203,7 @@ impl Engine {
         let slots: Vec<&PlacedSlot> = rows.iter().map(|&(i, at)| &jobs[i].slots[at]).collect();
         let ground = |row: usize| &jobs[rows[row].0].memory.ground;
         self.count(self.embedder.embed(&slots, ground, &self.rooms, x)); // [R, C]
+        self.count(self.look_around(jobs, &starts, x));
         kv.resize(2 * x.len(), 0.0); // [R, 2C]
         for (l, layer) in self.layers.iter().enumerate() {
             self.keys_and_values(layer, x, kv);
@@ -220,6 +224,30 @@ impl Engine {
         let mut hidden = vec![0.0; rows.len() * c];
         self.norm.apply(x, &mut hidden);
         hidden
+    }
+
+    /// Adds to the rows of keys what their objects see. Returns how many multiplications it took.
+    fn look_around(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut [f32]) -> u64 {
+        let news = jobs
+            .iter()
+            .zip(starts)
+            .map(|(job, start)| job.slots.len() - start);
+        let firsts = news.scan(0, |next, n| Some(std::mem::replace(next, *next + n)));
+        let firsts: Vec<usize> = firsts.collect();
+        let seen = jobs
+            .par_iter()
+            .zip(starts)
+            .zip(firsts)
+            .map(|((job, &start), first)| {
+                let rows = |(place, numbers)| (first + place - start, numbers);
+                let seen = self
+                    .embedder
+                    .surroundings(&job.memory.survey, job.slots, start);
+                seen.into_iter().map(rows).collect::<Vec<_>>()
+            });
+        let seen: Vec<Vec<(usize, Surroundings)>> = seen.collect();
+        self.embedder
+            .add_surroundings(&seen.concat(), &self.rooms, x)
     }
 
     /// Leaves of `x` only the rows that are asked for.
