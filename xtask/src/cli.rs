@@ -27,7 +27,7 @@ pub(crate) struct Cli {
 enum Verb {
     /// Start here: one scene through everything, offline, and a page to look at.
     Demo(demo::Args),
-    /// Look into scenario files, check them, make new ones.
+    /// Look into scenario files, check them, convert them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
     /// Train a world model.
@@ -79,6 +79,9 @@ impl Cli {
             }
             Verb::Data(data::Verb::Verify(args)) => {
                 Run::of("data verify", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Data(data::Verb::Convert(args)) => {
+                Run::of("data convert", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Data(data::Verb::Synthesize(args)) => {
                 Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))

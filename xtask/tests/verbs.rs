@@ -254,6 +254,64 @@ fn verify_tells_sound_from_broken() {
 }
 
 #[test]
+fn convert_makes_a_cache_that_goes_on_where_it_stopped() {
+    let place = Workplace::new();
+    let scene = fs::read(place.path(place.scene())).unwrap();
+    fs::create_dir(place.path("in")).unwrap();
+    for name in ["a", "b", "c"] {
+        fs::write(place.path(&format!("in/{name}.tfrecord")), &scene).unwrap();
+    }
+    fs::write(place.path("in/broken.tfrecord"), &scene[..99]).unwrap();
+    let results = |words: &str| place.report(words)["results"].clone();
+    let all = "data convert --from in --to cache";
+    let first = results(all);
+    assert_eq!(
+        (&first["scenarios"], &first["resumed"]),
+        (&3.into(), &0.into())
+    );
+    let problem = first["problems"][0].as_str().unwrap();
+    assert!(problem.contains("in/broken.tfrecord"), "{problem}");
+    // What a run that was stopped lacks is made, the rest is kept.
+    let lost = fs::read(place.path("cache/scenes-00000.cache")).unwrap();
+    fs::remove_file(place.path("cache/scenes-00000.cache")).unwrap();
+    let again = results(&format!("{all} --threads 1"));
+    assert_eq!(again["resumed"], first["files"]);
+    for key in ["scenarios", "bytes", "files", "problems", "inferred"] {
+        assert_eq!(again[key], first[key], "{key}");
+    }
+    assert_eq!(
+        fs::read(place.path("cache/scenes-00000.cache")).unwrap(),
+        lost
+    );
+    let seen = results("data inspect cache");
+    assert_eq!(
+        (&seen["format"], &seen["scenarios"]),
+        (&"gump cache".into(), &3.into())
+    );
+    place.fails(&format!("{all} --strict"), 1, &["1 were refused"]);
+    place.fails(
+        "data convert --from in --to in/cache",
+        2,
+        &["lies in --from"],
+    );
+    place.fails(
+        "data convert --from in --to cache --format waymo",
+        2,
+        &["another format"],
+    );
+    place.fails(
+        "data convert --from cache --to in",
+        2,
+        &["4 files of something else"],
+    );
+    place.fails(
+        "data convert --from in/broken.tfrecord --to x",
+        1,
+        &["none could be"],
+    );
+}
+
+#[test]
 fn synthesized_scenes_are_sound_and_depend_on_the_seed_alone() {
     let place = Workplace::new();
     let bytes = |words: &str| {

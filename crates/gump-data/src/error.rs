@@ -164,6 +164,18 @@ pub enum DataError {
         /// Where.
         place: Place,
     },
+    /// A file of the cache is damaged, cut off or of another version.
+    #[error("expected {expected}, found {found}: at byte {offset} of {}", path.display())]
+    Cache {
+        /// What should be there.
+        expected: String,
+        /// What is there.
+        found: String,
+        /// Where, bytes from the start of the file.
+        offset: u64,
+        /// The file.
+        path: PathBuf,
+    },
     /// An XML file is not well formed, or does not say what it should.
     #[error("{problem}: at byte {offset} of {}", path.display())]
     Xml {

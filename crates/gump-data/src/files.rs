@@ -11,7 +11,8 @@ use std::path::{Path, PathBuf};
 use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
 use crate::{
-    DataError, ReadOptions, argoverse2, commonroad, gpudrive, nuplan, scenario_json, sumo, womd,
+    DataError, ReadOptions, argoverse2, cache, commonroad, gpudrive, nuplan, scenario_json, sumo,
+    womd,
 };
 
 /// A format that content can be recognised as.
@@ -26,7 +27,8 @@ pub(crate) struct Format {
 }
 
 /// The formats that hold scenarios; the first that recognises a file has it.
-static FORMATS: [Format; 8] = [
+static FORMATS: [Format; 9] = [
+    cache::FORMAT,
     womd::FORMAT,
     gpudrive::FORMAT,
     argoverse2::FORECASTING,

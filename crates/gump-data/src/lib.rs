@@ -32,7 +32,9 @@
 //! A new format is one file beside `womd` and one line in the table of `files`.
 
 mod argoverse2;
+pub mod cache;
 mod commonroad;
+mod convert;
 mod document;
 mod error;
 mod features;
@@ -52,16 +54,19 @@ mod stream;
 pub mod submission;
 pub mod sumo;
 pub mod tfrecord;
+mod tracks;
 mod verify;
 pub mod womd;
 mod write_atomically;
 mod xml;
 
+pub use convert::{Converted, OutputFormat, convert, groups};
 pub use error::{DataError, Place, Problem};
 pub use files::list as list_files;
 pub use inspect::{Summary, inspect, inspect_with};
-pub use open::{Reader, find, open, open_with};
+pub use open::{Reader, find, open, open_files, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
+pub use tracks::write_tracks;
 pub use verify::{
     Finding, FormatCounts, MAX_FINDINGS, Severity, Verification, verify, verify_one_of_many,
 };

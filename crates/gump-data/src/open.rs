@@ -49,13 +49,8 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
         vec![path.to_path_buf()]
     };
     let mut reader = Reader {
-        source: Box::new(NoRecords),
-        format: "unknown",
-        unopened: None,
-        files: files.into(),
         is_folder,
-        skipped: BTreeMap::new(),
-        options,
+        ..open_files(files, options)
     };
     match reader.start_next() {
         Some(Ok(())) => Ok(reader),
@@ -69,6 +64,20 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
             others: reader.skipped.values().sum(),
             path: path.into(),
         }),
+    }
+}
+
+/// Reads files one after another like those of a directory: what holds no scenarios is skipped and
+/// counted, what cannot be opened is an error of the reader.
+pub fn open_files(files: Vec<PathBuf>, options: ReadOptions) -> Reader {
+    Reader {
+        source: Box::new(NoRecords),
+        format: "unknown",
+        unopened: None,
+        files: files.into(),
+        is_folder: true,
+        skipped: BTreeMap::new(),
+        options,
     }
 }
 

@@ -1,5 +1,6 @@
-//! `data`: look into scenario files, check them, make new ones.
+//! `data`: look into scenario files, check them, convert them, make new ones.
 
+mod convert;
 mod inspect;
 mod synthesize;
 mod verify;
@@ -13,6 +14,8 @@ pub(crate) enum Verb {
     Inspect(inspect::Args),
     /// Check every record; exit status 1 if anything is broken
     Verify(verify::Args),
+    /// Turn any readable format into the cache that training reads from, or into another format
+    Convert(convert::Args),
     /// Make up scenarios that are free of any recording's licence
     Synthesize(synthesize::Args),
 }

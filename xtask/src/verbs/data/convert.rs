@@ -1,0 +1,268 @@
+//! `data convert`: from any readable format to one that programs read fast, or that others read.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use gump_data::{Converted, OutputFormat, ReadOptions, convert, groups, list_files};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::cli::WrongArguments;
+use crate::run::{self, Common, Run};
+
+/// What a folder of converted scenes knows of its making.
+const LEDGER: &str = "conversion.json";
+
+/// Arguments of `data convert`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// A file or directory of any readable format
+    #[arg(long, value_name = "PATH")]
+    from: PathBuf,
+    /// Folder for the converted files; an interrupted conversion goes on there
+    #[arg(long, value_name = "DIR")]
+    to: PathBuf,
+    /// What to write
+    #[arg(long, value_enum, default_value_t = Format::Cache)]
+    format: Format,
+    /// Exit status 1 if anything could not be converted
+    #[arg(long)]
+    strict: bool,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What to write.
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Format {
+    /// The cache, which training reads from
+    Cache,
+    /// Waymo's scenarios as TFRecord
+    Waymo,
+    /// JSON, a file per scenario
+    ScenarioJson,
+    /// Tables of tracks
+    Parquet,
+}
+
+impl From<Format> for OutputFormat {
+    fn from(format: Format) -> Self {
+        match format {
+            Format::Cache => Self::Cache,
+            Format::Waymo => Self::Waymo,
+            Format::ScenarioJson => Self::ScenarioJson,
+            Format::Parquet => Self::Parquet,
+        }
+    }
+}
+
+/// What is in a folder of converted scenes; equal sources in an equal format are taken up again.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Ledger {
+    /// SHA-256 of the format and of every source's path and size.
+    source: String,
+    /// What became of each group of sources, by its number.
+    groups: BTreeMap<usize, Group>,
+}
+
+/// What became of some sources.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Group {
+    scenarios: usize,
+    bytes: u64,
+    /// Names of the files written.
+    files: Vec<String>,
+    /// Sentences about what could not be converted.
+    refused: Vec<String>,
+    skipped: BTreeMap<String, usize>,
+    dropped: BTreeMap<String, usize>,
+    inferred: BTreeMap<String, usize>,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let files = list_files(&self.from)?;
+        let groups = groups(&files);
+        let ledger = self.ledger(&files)?;
+        let resumed = ledger.groups.len();
+        let before: usize = ledger.groups.values().map(|group| group.scenarios).sum();
+        if resumed > 0 {
+            run.say(&format!("{resumed} of {} files are there", groups.len()));
+        }
+        let ledger = Mutex::new(ledger);
+        let began = Instant::now();
+        let converted = run.phase("convert", |run| {
+            let progress = run.progress("converting", 0, "scenes");
+            groups.par_iter().enumerate().try_for_each(|(i, range)| {
+                if lock(&ledger).groups.contains_key(&i) {
+                    return Ok(());
+                }
+                let stem = self.to.join(format!("scenes-{i:05}"));
+                let converted = convert(
+                    &files[range.clone()],
+                    ReadOptions::ALL,
+                    self.format.into(),
+                    &stem,
+                    |_| {
+                        progress.advance(1);
+                        run::stop_if_interrupted()
+                    },
+                )?;
+                let mut ledger = lock(&ledger);
+                ledger.groups.insert(i, Group::of(&converted));
+                self.save(&ledger)
+            })
+        });
+        let seconds = began.elapsed().as_secs_f64();
+        let ledger = ledger
+            .into_inner()
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        let all = Group::sum(ledger.groups.into_values());
+        let source_bytes = files.iter().filter_map(|file| file.metadata().ok());
+        run.result("scenarios", all.scenarios)?;
+        run.result("bytes", all.bytes)?;
+        run.result("source_bytes", source_bytes.map(|m| m.len()).sum::<u64>())?;
+        let fresh = (all.scenarios - before) as f64;
+        run.result("records_per_second", fresh / seconds)?;
+        run.result("files", all.files.len())?;
+        run.result("resumed", resumed)?;
+        run.result("refused", all.refused.len())?;
+        run.result("skipped", &all.skipped)?;
+        run.result("dropped", &all.dropped)?;
+        run.result("inferred", &all.inferred)?;
+        run.result("problems", &all.refused)?;
+        converted?;
+        for problem in all.refused.iter().take(TOLD) {
+            run.say(&format!("refused: {problem}"));
+        }
+        if all.scenarios == 0 {
+            // Whatever is wrong with the path as a whole says more than a count.
+            gump_data::open(&self.from).map(drop)?;
+            anyhow::bail!("expected scenarios, none could be converted");
+        }
+        anyhow::ensure!(
+            !self.strict || all.refused.is_empty(),
+            "expected every record to be converted, {} were refused",
+            all.refused.len()
+        );
+        Ok(())
+    }
+
+    /// The ledger of an earlier run of the same conversion, without what has disappeared since; an
+    /// empty one for a new folder.
+    ///
+    /// Error: [`WrongArguments`] for a folder that holds something else.
+    fn ledger(&self, files: &[PathBuf]) -> anyhow::Result<Ledger> {
+        std::fs::create_dir_all(&self.to)
+            .with_context(|| format!("cannot create the folder {}", self.to.display()))?;
+        let [from, to] = [&self.from, &self.to].map(std::fs::canonicalize);
+        let wrong = |why: String| anyhow::Error::from(WrongArguments(why));
+        if to?.starts_with(from?) {
+            return Err(wrong(format!(
+                "--to {} lies in --from: its files would be converted again",
+                self.to.display()
+            )));
+        }
+        let source = fingerprint(self.format, files)?;
+        let Ok(text) = std::fs::read_to_string(self.to.join(LEDGER)) else {
+            let others = list_files(&self.to)?.len();
+            if others > 0 {
+                return Err(wrong(format!(
+                    "--to {} holds {others} files of something else",
+                    self.to.display()
+                )));
+            }
+            let groups = BTreeMap::new();
+            return Ok(Ledger { source, groups });
+        };
+        let mut ledger: Ledger = serde_json::from_str(&text)
+            .with_context(|| format!("expected a ledger: {}", self.to.join(LEDGER).display()))?;
+        if ledger.source != source {
+            return Err(wrong(format!(
+                "--to {} holds the conversion of other files or to another format",
+                self.to.display()
+            )));
+        }
+        let is_there = |name: &String| self.to.join(name).is_file();
+        ledger
+            .groups
+            .retain(|_, group| group.files.iter().all(is_there));
+        Ok(ledger)
+    }
+
+    fn save(&self, ledger: &Ledger) -> anyhow::Result<()> {
+        let path = self.to.join(LEDGER);
+        gump_data::write_atomically(&path, |file| {
+            serde_json::to_writer_pretty(file, ledger)
+                .with_context(|| format!("cannot write {}", path.display()))
+        })
+    }
+}
+
+/// Refused records told on the terminal; the report has all.
+const TOLD: usize = 10;
+
+fn lock(ledger: &Mutex<Ledger>) -> std::sync::MutexGuard<'_, Ledger> {
+    ledger
+        .lock()
+        .unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+/// What a conversion depends on.
+fn fingerprint(format: Format, files: &[PathBuf]) -> anyhow::Result<String> {
+    let mut hash = Sha256::new();
+    hash.update(serde_json::to_string(&format)?);
+    for file in files {
+        let size = |path: &Path| path.metadata().map(|metadata| metadata.len());
+        let bytes = size(file).with_context(|| format!("cannot read {}", file.display()))?;
+        hash.update(format!("{}\0{bytes}\0", file.display()));
+    }
+    let digest = hash.finalize();
+    Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+impl Group {
+    fn of(converted: &Converted) -> Self {
+        let named = |counts: &BTreeMap<&'static str, usize>| {
+            let pairs = counts.iter();
+            pairs.map(|(&name, &n)| (name.to_owned(), n)).collect()
+        };
+        let names = converted.files.iter().filter_map(|file| file.file_name());
+        Self {
+            scenarios: converted.scenarios,
+            bytes: converted.bytes,
+            files: names
+                .map(|name| name.to_string_lossy().into_owned())
+                .collect(),
+            refused: converted.refused.iter().map(ToString::to_string).collect(),
+            skipped: named(&converted.skipped),
+            dropped: named(&converted.report.dropped),
+            inferred: named(&converted.report.inferred),
+        }
+    }
+
+    fn sum(groups: impl Iterator<Item = Self>) -> Self {
+        groups.fold(Self::default(), |mut sum, group| {
+            sum.scenarios += group.scenarios;
+            sum.bytes += group.bytes;
+            sum.files.extend(group.files);
+            sum.refused.extend(group.refused);
+            for (to, from) in [
+                (&mut sum.skipped, group.skipped),
+                (&mut sum.dropped, group.dropped),
+                (&mut sum.inferred, group.inferred),
+            ] {
+                for (name, n) in from {
+                    *to.entry(name).or_default() += n;
+                }
+            }
+            sum
+        })
+    }
+}
