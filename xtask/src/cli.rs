@@ -27,7 +27,7 @@ pub(crate) struct Cli {
 enum Verb {
     /// Start here: one scene through everything, offline, and a page to look at.
     Demo(demo::Args),
-    /// Look into scenario files, check them, convert them, make new ones.
+    /// Look into scenario files, check and convert them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
     /// Train a world model.

@@ -97,13 +97,11 @@ pub fn convert<E: From<DataError>>(
         each,
     };
     match format {
-        OutputFormat::Cache => conversion.into_file(&with_ending(stem, ".cache"), new_shard)?,
-        OutputFormat::Waymo => {
-            conversion.into_file(&with_ending(stem, ".tfrecord"), new_messages)?
-        }
-        OutputFormat::Parquet => conversion.into_file(&with_ending(stem, ".parquet"), new_table)?,
-        OutputFormat::ScenarioJson => conversion.into_documents(stem)?,
-    }
+        OutputFormat::Cache => conversion.write_file(&with_ending(stem, ".cache"), new_shard),
+        OutputFormat::Waymo => conversion.write_file(&with_ending(stem, ".tfrecord"), new_messages),
+        OutputFormat::Parquet => conversion.write_file(&with_ending(stem, ".parquet"), new_table),
+        OutputFormat::ScenarioJson => conversion.write_documents(stem),
+    }?;
     let mut result = conversion.result;
     result.skipped = conversion.reader.skipped().clone();
     for file in &result.files {
@@ -226,7 +224,7 @@ impl<F> Conversion<F> {
         }
     }
 
-    fn into_file<E: From<DataError>>(
+    fn write_file<E: From<DataError>>(
         &mut self,
         path: &Path,
         begin: for<'f> fn(&'f mut BufWriter<File>, &'f Path) -> Begun<'f>,
@@ -255,7 +253,7 @@ impl<F> Conversion<F> {
         Ok(())
     }
 
-    fn into_documents<E: From<DataError>>(&mut self, stem: &Path) -> Result<(), E>
+    fn write_documents<E: From<DataError>>(&mut self, stem: &Path) -> Result<(), E>
     where
         F: FnMut(&Scenario) -> Result<(), E>,
     {

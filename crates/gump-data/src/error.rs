@@ -110,6 +110,16 @@ pub enum DataError {
         /// The file that needs it.
         path: PathBuf,
     },
+    /// A sound file holds nothing that a scenario can be taken from.
+    #[error("expected {expected}, found {found}: {}", path.display())]
+    NoScenarios {
+        /// What a scenario is taken from.
+        expected: &'static str,
+        /// What is there.
+        found: String,
+        /// The file.
+        path: PathBuf,
+    },
     /// A database cannot be read, or holds a value of another type.
     #[error("could not {doing}: {source}: {}", path.display())]
     Sqlite {

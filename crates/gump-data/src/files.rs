@@ -48,7 +48,7 @@ pub(crate) struct Companion {
 }
 
 /// Files that belong to some format but hold no scenarios.
-static COMPANIONS: [Companion; 5] = [
+static COMPANIONS: [Companion; 6] = [
     Companion {
         what: "Argoverse 2 map",
         recognises: argoverse2::is_map,
@@ -66,6 +66,7 @@ static COMPANIONS: [Companion; 5] = [
         recognises: sumo::is_other,
     },
     nuplan::MAP,
+    nuplan::OTHER,
 ];
 
 /// How much of the content a recogniser sees.

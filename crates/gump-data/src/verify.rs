@@ -186,6 +186,11 @@ pub fn verify_one_of_many(file: &Path) -> Verification {
         }
         Ok(Role::Scenarios(format)) => match verify_file(file) {
             Ok(verification) => return verification,
+            // Nothing is wrong with such a file, but whoever put it there expects something of it.
+            Err(error @ DataError::NoScenarios { .. }) => {
+                let (odd, detail) = (Severity::Suspicious, error.to_string());
+                result.add(format.name, found(odd, "file without scenarios", detail));
+            }
             Err(error) => result.add(format.name, unreadable("unreadable file", &error)),
         },
         Err(error) => result.add(UNKNOWN, unreadable("unreadable file", &error)),

@@ -1,5 +1,7 @@
 //! The cache gives back what went in, to the bit, and says what is wrong with a damaged file.
 
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 mod common;
 
 use std::fs;

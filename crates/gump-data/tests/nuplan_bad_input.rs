@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use gump_data::ReadOptions;
 use gump_data::nuplan::read_map;
+use gump_data::{ReadOptions, verify};
 use gump_scene::LaneId;
 
 #[path = "common/nuplan.rs"]
@@ -130,6 +130,29 @@ fn a_log_without_tags_or_the_merged_lidar_says_what_it_has() {
     );
     fs::write(folder.log(), unpacked("minimal.db")).unwrap();
     fails(&folder, &["a tagged row", "0 rows in 10 scenes"]);
+}
+
+#[test]
+fn a_log_without_scenarios_and_a_database_of_another_kind_are_not_broken() {
+    let folder = Folder::new();
+    fs::write(folder.log(), unpacked("minimal.db")).unwrap();
+    fs::remove_file(folder.map()).unwrap();
+    let other = folder.0.path().join("tracks.shf");
+    Folder::execute(&other, "CREATE TABLE Trajectory (vehicle, time, x, y)");
+    let found = verify(folder.0.path()).unwrap();
+    assert!(!found.is_broken(), "{:?}", found.findings);
+    assert_eq!(found.counts["file without scenarios"], 1);
+    assert!(found.findings[0].detail.contains("a tagged row"));
+    assert_eq!(found.skipped["other SQLite database"], 1);
+    let error = gump_data::open(&other).err().unwrap().to_string();
+    assert!(error.contains("found other SQLite database"), "{error}");
+    // A log that is no longer sound is, and so is one whose map is missing.
+    Folder::execute(&folder.log(), "DROP TABLE scenario_tag");
+    assert!(verify(folder.0.path()).unwrap().is_broken());
+    fs::write(folder.log(), unpacked("log.db")).unwrap();
+    let found = verify(folder.0.path()).unwrap();
+    assert!(found.is_broken());
+    assert!(found.findings[0].detail.contains("NUPLAN_MAPS_ROOT"));
 }
 
 #[test]

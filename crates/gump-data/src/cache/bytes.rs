@@ -3,6 +3,8 @@
 //! What they mean is the affair of `log` and `map`. A [`Decoder`] trusts nothing: it asks for no
 //! memory that the bytes at hand do not account for.
 
+use std::fmt::Display;
+
 use gump_geometry::{DVec2, Polygon, Polyline};
 
 /// Why bytes are not what an [`Encoder`] wrote.
@@ -149,7 +151,7 @@ impl<'a> Decoder<'a> {
     }
 
     /// Says that something else was expected at the place just read.
-    pub(super) fn damage(&self, expected: impl Into<String>, found: impl ToString) -> Damage {
+    pub(super) fn damage(&self, expected: impl Into<String>, found: &dyn Display) -> Damage {
         Damage {
             expected: expected.into(),
             found: found.to_string(),
@@ -161,14 +163,14 @@ impl<'a> Decoder<'a> {
     pub(super) fn end(&self) -> Decoded<()> {
         match self.bytes.len() - self.at {
             0 => Ok(()),
-            rest => Err(self.damage("the end", format!("{rest} more bytes"))),
+            rest => Err(self.damage("the end", &format!("{rest} more bytes"))),
         }
     }
 
     pub(super) fn take(&mut self, n: usize) -> Decoded<&'a [u8]> {
         let rest = &self.bytes[self.at..];
         let Some(taken) = rest.get(..n) else {
-            return Err(self.damage(format!("{n} more bytes"), rest.len()));
+            return Err(self.damage(format!("{n} more bytes"), &rest.len()));
         };
         self.at += n;
         Ok(taken)
@@ -188,7 +190,7 @@ impl<'a> Decoder<'a> {
         match self.byte()? {
             0 => Ok(false),
             1 => Ok(true),
-            other => Err(self.damage("0 or 1", other)),
+            other => Err(self.damage("0 or 1", &other)),
         }
     }
 
@@ -202,10 +204,10 @@ impl<'a> Decoder<'a> {
             }
             value |= bits << shift;
             if byte < 0x80 {
-                return usize::try_from(value).map_err(|_| self.damage("a count", value));
+                return usize::try_from(value).map_err(|_| self.damage("a count", &value));
             }
         }
-        Err(self.damage("a count", "one beyond 64 bits"))
+        Err(self.damage("a count", &"one beyond 64 bits"))
     }
 
     /// A number of things that take at least `bytes` each, no more than there can be.
@@ -213,7 +215,7 @@ impl<'a> Decoder<'a> {
         let n = self.count()?;
         let most = (self.bytes.len() - self.at) / bytes;
         if n > most {
-            return Err(self.damage(format!("a count of at most {most}"), n));
+            return Err(self.damage(format!("a count of at most {most}"), &n));
         }
         Ok(n)
     }
@@ -241,7 +243,7 @@ impl<'a> Decoder<'a> {
     pub(super) fn text(&mut self) -> Decoded<&'a str> {
         let n = self.count()?;
         let bytes = self.take(n)?;
-        std::str::from_utf8(bytes).map_err(|_| self.damage("text in UTF-8", "other bytes"))
+        std::str::from_utf8(bytes).map_err(|_| self.damage("text in UTF-8", &"other bytes"))
     }
 
     pub(super) fn option<T>(
@@ -254,7 +256,7 @@ impl<'a> Decoder<'a> {
     pub(super) fn variant<T: Copy>(&mut self, all: &[T]) -> Decoded<T> {
         let place = self.byte()?;
         let found = all.get(usize::from(place)).copied();
-        found.ok_or_else(|| self.damage(format!("a number below {}", all.len()), place))
+        found.ok_or_else(|| self.damage(format!("a number below {}", all.len()), &place))
     }
 
     /// A list of things that take at least `bytes` each.
@@ -286,7 +288,7 @@ impl<'a> Decoder<'a> {
             SINGLE => self.values(n, |bytes| f64::from(f32::from_le_bytes(bytes))),
             DECIMALS => self.values(n, |bytes| f64::from(i32::from_le_bytes(bytes)) / DECIMAL),
             DOUBLE => self.values(n, f64::from_le_bytes),
-            other => Err(self.damage("a kind of column", other)),
+            other => Err(self.damage("a kind of column", &other)),
         }
     }
 
@@ -304,14 +306,14 @@ impl<'a> Decoder<'a> {
 
     pub(super) fn polyline(&mut self) -> Decoded<Polyline> {
         let line = Polyline::new(self.points()?);
-        line.ok_or_else(|| self.damage("a line of points", "none"))
+        line.ok_or_else(|| self.damage("a line of points", &"none"))
     }
 
     pub(super) fn polygon(&mut self) -> Decoded<Polygon> {
         let ring = self.ring()?;
         let holes = self.list(1, Self::ring)?;
         let polygon = Polygon::with_holes(ring, holes);
-        polygon.ok_or_else(|| self.damage("a polygon", "fewer than three corners"))
+        polygon.ok_or_else(|| self.damage("a polygon", &"fewer than three corners"))
     }
 
     /// A ring with its first corner repeated at the end, where a polygon drops it: a ring whose

@@ -86,7 +86,7 @@ pub(super) fn decode(bytes: &[u8]) -> Decoded<Scenario> {
     let route = from.option(read_route)?.map(Arc::new);
     let steps = from.count()?;
     if steps > MAX_STEPS {
-        return Err(from.damage(format!("at most {MAX_STEPS} frames"), steps));
+        return Err(from.damage(format!("at most {MAX_STEPS} frames"), &steps));
     }
     let agents = read_tracks(from, steps)?;
     let lights = read_lights(from, steps)?;
@@ -95,7 +95,7 @@ pub(super) fn decode(bytes: &[u8]) -> Decoded<Scenario> {
     let log = log.collect();
     let parts = map::read(from)?;
     from.end()?;
-    let map = MapGraph::new(parts).map_err(|error| from.damage("a sound map", error))?;
+    let map = MapGraph::new(parts).map_err(|error| from.damage("a sound map", &error))?;
     Ok(Scenario {
         id,
         map: Arc::new(map),
@@ -113,7 +113,7 @@ pub(super) fn decode(bytes: &[u8]) -> Decoded<Scenario> {
 fn read_tag(from: &mut Decoder<'_>) -> Decoded<ScenarioTag> {
     let name = from.text()?;
     name.parse()
-        .map_err(|_| from.damage("a scenario tag", format!("\"{name}\"")))
+        .map_err(|_| from.damage("a scenario tag", &format!("\"{name}\"")))
 }
 
 fn write_route(to: &mut Encoder, route: &Route) {
@@ -190,7 +190,9 @@ fn read_tracks(from: &mut Decoder<'_>, steps: usize) -> Decoded<Vec<Vec<Agent>>>
 }
 
 fn write_lights(to: &mut Encoder, log: &[Frame]) {
-    let mut signals: BTreeMap<(LaneId, Option<[u64; 2]>), Vec<(usize, &Light)>> = BTreeMap::new();
+    /// A light by its lane and, to the bit, its stop point: the same one from frame to frame.
+    type Signal = (LaneId, Option<[u64; 2]>);
+    let mut signals: BTreeMap<Signal, Vec<(usize, &Light)>> = BTreeMap::new();
     for (step, frame) in log.iter().enumerate() {
         for light in frame.lights() {
             let place = light.stop_point.map(|p| p.to_array().map(f64::to_bits));
@@ -222,7 +224,7 @@ fn read_lights(from: &mut Decoder<'_>, steps: usize) -> Decoded<Vec<Vec<Light>>>
         let runs = read_steps(from, steps)?;
         total += runs.iter().map(|run| run.len()).sum::<usize>();
         if total > MAX_LIGHTS {
-            return Err(from.damage(format!("at most {MAX_LIGHTS} lights"), "more"));
+            return Err(from.damage(format!("at most {MAX_LIGHTS} lights"), &"more"));
         }
         for step in runs.into_iter().flatten() {
             frames[step].push(Light {
@@ -259,7 +261,7 @@ fn read_steps(from: &mut Decoder<'_>, steps: usize) -> Decoded<Vec<std::ops::Ran
         let start = before.saturating_add(from.count()?);
         let end = start.saturating_add(from.count()?);
         if end > steps {
-            return Err(from.damage(format!("steps up to {steps}"), end));
+            return Err(from.damage(format!("steps up to {steps}"), &end));
         }
         before = end;
         Ok(start..end)

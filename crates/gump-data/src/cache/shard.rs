@@ -242,13 +242,13 @@ fn read_index(bytes: &[u8], end: u64) -> Decoded<Vec<Entry>> {
         };
         offset = offset.saturating_add(length as u64);
         if offset > end {
-            return Err(from.damage(format!("records up to byte {end}"), offset));
+            return Err(from.damage(format!("records up to byte {end}"), &offset));
         }
         Ok(entry)
     })?;
     from.end()?;
     if offset != end {
-        return Err(from.damage(format!("records up to byte {end}"), offset));
+        return Err(from.damage(format!("records up to byte {end}"), &offset));
     }
     Ok(records)
 }

@@ -58,8 +58,14 @@ pub use utm::Utm;
 
 pub(crate) const FORMAT: Format = Format {
     name: "nuPlan log (SQLite)",
-    recognises: |head| head.starts_with(database::MAGIC) && !is_geopackage(head),
+    recognises: |head| head.starts_with(database::MAGIC) && !is_geopackage(head) && !is_other(head),
     open,
+};
+
+/// Databases of other programs.
+pub(crate) const OTHER: Companion = Companion {
+    what: "other SQLite database",
+    recognises: |head| head.starts_with(database::MAGIC) && !is_geopackage(head) && is_other(head),
 };
 
 /// Maps, which are read along with the logs of their location.
@@ -77,13 +83,26 @@ fn is_geopackage(head: &[u8]) -> bool {
         || head.windows(TABLE.len()).any(|window| window == TABLE)
 }
 
+/// True for a schema without any of a log's tables. A log that lacks one of them is still a log,
+/// and so is a file whose schema cannot be seen: reading it tells what is wrong.
+fn is_other(head: &[u8]) -> bool {
+    let has = |name: &str| {
+        head.windows(name.len())
+            .any(|window| window.eq_ignore_ascii_case(name.as_bytes()))
+    };
+    has("CREATE TABLE")
+        && !["lidar_pc", "ego_pose", "scenario_tag"]
+            .into_iter()
+            .any(has)
+}
+
 fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
     let log = Log::open(path)?;
     let filter = ScenarioFilter::default();
     let events = log.events(filter.untagged)?;
     if events.is_empty() {
-        return Err(DataError::Table {
-            expected: "a tagged row that a scenario can be taken from".into(),
+        return Err(DataError::NoScenarios {
+            expected: "a tagged row that a scenario can be taken from",
             found: filter.explain(&log.census()?),
             path: path.into(),
         });

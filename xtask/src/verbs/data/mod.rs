@@ -1,4 +1,4 @@
-//! `data`: look into scenario files, check them, convert them, make new ones.
+//! `data`: look into scenario files, check and convert them, make new ones.
 
 mod convert;
 mod inspect;
