@@ -159,9 +159,7 @@ impl Args {
     ///
     /// Error: [`WrongArguments`] for a folder that holds something else.
     fn ledger(&self, files: &[PathBuf]) -> anyhow::Result<Ledger> {
-        std::fs::create_dir_all(&self.to)
-            .with_context(|| format!("cannot create the folder {}", self.to.display()))?;
-        let [from, to] = [&self.from, &self.to].map(std::fs::canonicalize);
+        let [from, to] = [&self.from, &self.to].map(std::path::absolute);
         let wrong = |why: String| anyhow::Error::from(WrongArguments(why));
         if to?.starts_with(from?) {
             return Err(wrong(format!(
@@ -169,6 +167,8 @@ impl Args {
                 self.to.display()
             )));
         }
+        std::fs::create_dir_all(&self.to)
+            .with_context(|| format!("cannot create the folder {}", self.to.display()))?;
         let source = fingerprint(self.format, files)?;
         let Ok(text) = std::fs::read_to_string(self.to.join(LEDGER)) else {
             let others = list_files(&self.to)?.len();
