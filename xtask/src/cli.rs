@@ -27,7 +27,7 @@ pub(crate) struct Cli {
 enum Verb {
     /// Start here: one scene through everything, offline, and a page to look at.
     Demo(demo::Args),
-    /// Look into scenario files, check and convert them, make new ones.
+    /// Look into scenario files, check, count and convert them, make new ones.
     #[command(subcommand)]
     Data(data::Verb),
     /// Train a world model.
@@ -79,6 +79,9 @@ impl Cli {
             }
             Verb::Data(data::Verb::Verify(args)) => {
                 Run::of("data verify", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Data(data::Verb::Stats(args)) => {
+                Run::of("data stats", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Data(data::Verb::Convert(args)) => {
                 Run::of("data convert", &args.common, &args)?.execute(|run| args.execute(run))

@@ -1,9 +1,12 @@
 //! Data sets with splits: a folder with a `manifest.toml`, or any path for a set without.
 
+use std::borrow::Cow;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
+use gump_data::cache::Cache;
+use gump_model::{ModelError, Scenes};
 use gump_scene::Scenario;
 use serde::Deserialize;
 
@@ -136,17 +139,86 @@ pub(crate) fn parts(data: &Path, split: Split) -> anyhow::Result<Vec<Part>> {
 ///
 /// Error: the first record that cannot be read, or Ctrl-C.
 pub(crate) fn read(parts: &[Part], progress: &Progress) -> anyhow::Result<Vec<Scenario>> {
+    read_first(usize::MAX, parts, progress)
+}
+
+/// Reads the first `limit` scenarios of the parts.
+///
+/// Error: the first record that cannot be read, or Ctrl-C.
+pub(crate) fn read_first(
+    limit: usize,
+    parts: &[Part],
+    progress: &Progress,
+) -> anyhow::Result<Vec<Scenario>> {
     let mut scenarios = Vec::new();
     for part in parts {
         let records = gump_data::open(&part.path)?;
         let Range { start, end } = part.scenes;
         for record in records.take(end).skip(start) {
+            if scenarios.len() == limit {
+                return Ok(scenarios);
+            }
             stop_if_interrupted()?;
             scenarios.push(record?.scenario);
             progress.advance(1);
         }
     }
     Ok(scenarios)
+}
+
+/// Scenarios to train on: those in a cache stay there until they are asked for, others are held.
+pub(crate) struct Training {
+    /// Each with the number of the first scenario after it.
+    sources: Vec<(usize, Source)>,
+}
+
+enum Source {
+    Held(Vec<Scenario>),
+    Cached { cache: Cache, start: usize },
+}
+
+impl Training {
+    /// Opens the parts, and reads those that are no cache.
+    ///
+    /// Error: the first record that cannot be read, a damaged index of a cache, or Ctrl-C.
+    pub(crate) fn open(parts: &[Part], progress: &Progress) -> anyhow::Result<Self> {
+        let (mut sources, mut end) = (Vec::new(), 0);
+        for part in parts {
+            let source = if Cache::is_at(&part.path)? {
+                let cache = Cache::open(&part.path)?;
+                let Range { start, end: stop } = part.scenes;
+                end += stop.min(cache.len()).saturating_sub(start);
+                Source::Cached { cache, start }
+            } else {
+                let held = read(std::slice::from_ref(part), progress)?;
+                end += held.len();
+                Source::Held(held)
+            };
+            sources.push((end, source));
+        }
+        Ok(Self { sources })
+    }
+}
+
+impl Scenes for Training {
+    fn len(&self) -> usize {
+        self.sources.last().map_or(0, |(end, _)| *end)
+    }
+
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+        let missing = || ModelError::Scene(format!("there is no scenario {index}"));
+        let i = self.sources.partition_point(|(end, _)| *end <= index);
+        let begin = i.checked_sub(1).map_or(0, |before| self.sources[before].0);
+        match self.sources.get(i).map(|(_, source)| source) {
+            None => Err(missing()),
+            Some(Source::Held(held)) => Ok(Cow::Borrowed(&held[index - begin])),
+            Some(Source::Cached { cache, start }) => {
+                let found = cache.get(start + index - begin);
+                let found = found.map_err(|error| ModelError::Scene(error.to_string()))?;
+                found.map(Cow::Owned).ok_or_else(missing)
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -206,5 +278,33 @@ mod tests {
         let whole = Part::whole(folder.path());
         assert_eq!(parts(folder.path(), Split::Train).unwrap(), [whole]);
         assert!(parts(folder.path(), Split::Validation).unwrap().is_empty());
+    }
+
+    #[test]
+    fn scenes_of_a_cache_and_of_a_file_have_the_same_numbers() {
+        let folder = tempfile::tempdir().unwrap();
+        let named = |id: &usize| Scenario {
+            id: id.to_string(),
+            ..gump_scene::fixture::scenario("ego vehicle 0: 0,0 velocity 1,0").unwrap()
+        };
+        let ids: Vec<usize> = (0..7).collect();
+        let [file, shard] = ["file.tfrecord", "shard"].map(|name| folder.path().join(name));
+        gump_data::womd::write_scenarios(&file, ids.iter().map(named)).unwrap();
+        gump_data::cache::write_shard(&shard, ids.iter().map(named)).unwrap();
+        let part = |path: &Path, scenes| Part {
+            path: path.to_owned(),
+            scenes,
+        };
+        let silent = Progress::begin(true, "", 0, "");
+        let numbers = |parts: &[Part]| {
+            let scenes = Training::open(parts, &silent).unwrap();
+            let id = |i| scenes.get(i).unwrap().id.clone();
+            assert!(scenes.get(scenes.len()).is_err());
+            (0..scenes.len()).map(id).collect::<Vec<_>>().join("")
+        };
+        let parts = [part(&shard, 2..4), part(&file, 1..3), part(&shard, 5..99)];
+        assert_eq!(numbers(&parts), "231256");
+        assert_eq!(numbers(&[Part::whole(&shard)]), "0123456");
+        assert_eq!(numbers(&[Part::whole(&file)]), "0123456");
     }
 }

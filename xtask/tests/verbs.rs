@@ -254,6 +254,36 @@ fn verify_tells_sound_from_broken() {
 }
 
 #[test]
+fn stats_count_sources_classes_and_tags() {
+    let place = Workplace::new();
+    let scene = place.scene();
+    let results = place.report(&format!("data stats {scene} {scene}"))["results"].clone();
+    assert_eq!(
+        (&results["scenes"], &results["refused"]),
+        (&2.into(), &0.into())
+    );
+    let sources = results["sources"].as_array().unwrap();
+    assert_eq!((sources.len(), &sources[0]), (2, &sources[1]));
+    assert_eq!(sources[0]["vehicle"], 2);
+    assert_eq!(sources[0]["pedestrian"], 1);
+    assert_eq!(sources[0]["lane_km"], 0.2);
+    assert_eq!(results["duration_s"]["median"], 9.0);
+    let vehicles = &results["classes"][0];
+    assert_eq!(vehicles["class"], "vehicle");
+    assert_eq!(vehicles["standing"], 0.0);
+    assert_eq!(vehicles["speed_median"], 6.0);
+    assert_eq!(vehicles["speed_p99"], 8.0);
+    assert_eq!(results["classes"][1]["standing"], 1.0);
+    let tags = results["tags"].as_array().unwrap();
+    assert!(
+        tags.iter()
+            .any(|row| row["tag"] == "following_lane_with_lead"),
+        "{tags:?}"
+    );
+    place.fails("data stats nowhere", 1, &["nowhere"]);
+}
+
+#[test]
 fn convert_makes_a_cache_that_goes_on_where_it_stopped() {
     let place = Workplace::new();
     let scene = fs::read(place.path(place.scene())).unwrap();
@@ -489,6 +519,32 @@ fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
     assert_eq!(again, losses);
     let words = format!("train --data {scene} --out out --resume --steps 9");
     place.fails(&words, 2, &["--steps 9", "began with 6"]);
+}
+
+#[test]
+fn training_from_a_cache_is_training_from_its_source() {
+    let place = Workplace::new();
+    let scene = place.scene();
+    place.report(&format!(
+        "data convert --from {scene} --to cache --format cache"
+    ));
+    let mut model = very_small();
+    model.visual.side_px = 64;
+    model.visual.metres_per_px = 2.0;
+    let config = RunConfig {
+        model: ModelChoice::Config(Box::new(model)),
+        train: TrainConfig {
+            steps: 3,
+            batch: 2,
+            ..TrainConfig::default()
+        },
+    };
+    fs::write(place.path("run.toml"), toml::to_string(&config).unwrap()).unwrap();
+    let losses = |data: &str| {
+        place.report(&format!("train --data {data} --config run.toml"));
+        fs::read_to_string(place.path("out/losses.csv")).unwrap()
+    };
+    assert_eq!(losses(scene), losses("cache"));
 }
 
 #[test]

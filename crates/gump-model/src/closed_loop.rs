@@ -10,7 +10,7 @@
 
 use gump_geometry::angle_difference;
 use gump_rollout::{Start, WorldModel};
-use gump_scene::{Agent, Frame, Scenario, SceneState, Seed};
+use gump_scene::{Agent, Frame, SceneState, Seed};
 use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -19,6 +19,7 @@ use crate::ModelError;
 use crate::network::Network;
 use crate::sample::{HISTORY, LONGEST_ROLLOUT, stride_of};
 use crate::sampling::SamplingConfig;
+use crate::scenes::Scenes;
 use crate::world::TransformerWorld;
 
 /// Metres that a radian of heading error counts for, when candidates are compared.
@@ -84,7 +85,7 @@ impl Drive {
 /// Those of the world.
 pub(crate) fn drive(
     network: Network,
-    scenarios: &[Scenario],
+    scenarios: &dyn Scenes,
     config: &ClosedLoopConfig,
     seed: Seed,
 ) -> Result<Vec<Drive>, ModelError> {
@@ -112,12 +113,12 @@ pub(crate) fn drive(
 
 fn drive_one(
     world: &TransformerWorld,
-    scenarios: &[Scenario],
+    scenarios: &dyn Scenes,
     index: usize,
     candidates: usize,
     seed: Seed,
 ) -> Result<Option<Drive>, ModelError> {
-    let scenario = &scenarios[index];
+    let scenario = &*scenarios.get(index)?;
     let stride = stride_of(scenario.dt);
     let lead = (HISTORY - 1) * stride;
     let Some(last) = scenario.log.len().checked_sub(1 + HISTORY * stride) else {
@@ -193,7 +194,7 @@ fn nearest(draws: &[Frame], logged: &Frame) -> Frame {
 mod tests {
     use super::*;
     use candle_core::Device;
-    use gump_scene::fixture;
+    use gump_scene::{Scenario, fixture};
 
     use crate::ModelConfig;
 
@@ -231,7 +232,7 @@ mod tests {
 
     #[test]
     fn drives_repeat_and_more_candidates_stay_nearer_to_the_log() {
-        let scenarios = [scenario()];
+        let scenarios = vec![scenario()];
         let network = || Network::random(ModelConfig::tiny(), Seed(1), &Device::Cpu).unwrap();
         let drives = |candidates: usize| {
             let config = ClosedLoopConfig {

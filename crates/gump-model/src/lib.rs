@@ -38,6 +38,7 @@ mod plain;
 mod sample;
 mod sampling;
 mod scene;
+mod scenes;
 mod session;
 mod surroundings;
 #[cfg(test)]
@@ -61,4 +62,5 @@ pub use optimizer::OptimizerConfig;
 pub use parameters::Parameters;
 pub use sample::SampleConfig;
 pub use sampling::{CacheMode, Mode, SamplingConfig, Surrogate};
+pub use scenes::Scenes;
 pub use train::{RunConfig, TrainConfig, Trainer};

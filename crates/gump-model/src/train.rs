@@ -24,6 +24,7 @@ use crate::network::Network;
 use crate::optimizer::{AdamW, OptimizerConfig};
 use crate::parameters::Parameters;
 use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
+use crate::scenes::Scenes;
 
 /// How to train.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -131,12 +132,12 @@ pub struct Trainer {
     drivers: BTreeMap<String, Tensor>,
     source: Arc<Source>,
     /// Samples of the next step, being drawn while the present one is computed.
-    next: Receiver<Vec<Sample>>,
+    next: Receiver<Result<Vec<Sample>, ModelError>>,
 }
 
 /// Where samples come from; shared with the threads that draw them.
 struct Source {
-    scenarios: Vec<Scenario>,
+    scenarios: Box<dyn Scenes>,
     /// Scenes as the network drove them.
     drives: Vec<Drive>,
     closed_loop: ClosedLoopConfig,
@@ -148,32 +149,39 @@ struct Source {
 
 impl Source {
     /// The samples of a step. A scenario too short for a sample is replaced by another draw.
-    fn samples(&self, step: usize) -> Vec<Sample> {
+    fn samples(&self, step: usize) -> Result<Vec<Sample>, ModelError> {
+        const ATTEMPTS: u64 = 64;
         let seed = self.seed.fork(step as u64);
-        (0..self.batch)
-            .filter_map(|i| {
-                let seed = seed.fork(i as u64);
-                (0..64).find_map(|attempt| {
-                    let seed = seed.fork(attempt);
-                    let pick = |n: usize| (seed.fork(0).0 % n as u64) as usize;
-                    let is_driven = !self.drives.is_empty()
-                        && seed.fork(2).rng().random_bool(self.closed_loop.share);
-                    let driven = is_driven.then(|| Driven {
-                        drive: &self.drives[pick(self.drives.len())],
-                        slack: self.closed_loop.slack,
-                    });
-                    let scenario =
-                        driven.map_or_else(|| pick(self.scenarios.len()), |d| d.drive.scenario);
-                    draw(
-                        &self.scenarios[scenario],
-                        driven,
-                        &self.reader,
-                        &self.config,
-                        seed.fork(1),
-                    )
-                })
-            })
-            .collect()
+        let mut samples = Vec::with_capacity(self.batch);
+        for i in 0..self.batch {
+            let seed = seed.fork(i as u64);
+            for attempt in 0..ATTEMPTS {
+                if let Some(sample) = self.sample(seed.fork(attempt))? {
+                    samples.push(sample);
+                    break;
+                }
+            }
+        }
+        Ok(samples)
+    }
+
+    /// One draw; `None` if the scenario drawn is too short.
+    fn sample(&self, seed: Seed) -> Result<Option<Sample>, ModelError> {
+        let pick = |n: usize| (seed.fork(0).0 % n as u64) as usize;
+        let is_driven =
+            !self.drives.is_empty() && seed.fork(2).rng().random_bool(self.closed_loop.share);
+        let driven = is_driven.then(|| Driven {
+            drive: &self.drives[pick(self.drives.len())],
+            slack: self.closed_loop.slack,
+        });
+        let scenario = driven.map_or_else(|| pick(self.scenarios.len()), |d| d.drive.scenario);
+        Ok(draw(
+            &*self.scenarios.get(scenario)?,
+            driven,
+            &self.reader,
+            &self.config,
+            seed.fork(1),
+        ))
     }
 }
 
@@ -185,7 +193,7 @@ impl Trainer {
     pub fn new(
         model: ModelConfig,
         config: TrainConfig,
-        scenarios: Vec<Scenario>,
+        scenarios: impl Scenes + 'static,
         device: &Device,
     ) -> Result<Self, ModelError> {
         let network = Network::random(model, Seed(config.seed).fork(0), device)?;
@@ -199,14 +207,14 @@ impl Trainer {
     pub fn continuing(
         network: Network,
         config: TrainConfig,
-        scenarios: Vec<Scenario>,
+        scenarios: impl Scenes + 'static,
     ) -> Result<Self, ModelError> {
         let optimizer = AdamW::new(network.parameters())?;
         let drivers = match config.closed_loop {
             Some(_) => copies(&network)?,
             None => BTreeMap::new(),
         };
-        Self::assemble(network, optimizer, config, 0, drivers, scenarios)
+        Self::assemble(network, optimizer, config, 0, drivers, Box::new(scenarios))
     }
 
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
@@ -215,7 +223,7 @@ impl Trainer {
     /// A file that is not a run's checkpoint, or no scenario to train on.
     pub fn resume(
         path: &Path,
-        scenarios: Vec<Scenario>,
+        scenarios: impl Scenes + 'static,
         device: &Device,
     ) -> Result<Self, ModelError> {
         let mut archive = checkpoint::read(path)?;
@@ -240,7 +248,14 @@ impl Trainer {
                 name: name.to_owned(),
             })
         })?;
-        Self::assemble(network, optimizer, config, step, drivers, scenarios)
+        Self::assemble(
+            network,
+            optimizer,
+            config,
+            step,
+            drivers,
+            Box::new(scenarios),
+        )
     }
 
     fn assemble(
@@ -249,7 +264,7 @@ impl Trainer {
         config: TrainConfig,
         step: usize,
         drivers: BTreeMap<String, Tensor>,
-        scenarios: Vec<Scenario>,
+        scenarios: Box<dyn Scenes>,
     ) -> Result<Self, ModelError> {
         if scenarios.is_empty() || config.batch == 0 {
             return Err(ModelError::NoData {
@@ -261,7 +276,7 @@ impl Trainer {
                 let weights = Parameters::loaded(drivers.clone(), network.device());
                 let driver = Network::build(network.config().clone(), weights)?;
                 let seed = Seed(config.seed).fork(3);
-                closed_loop::drive(driver, &scenarios, closed_loop, seed)?
+                closed_loop::drive(driver, scenarios.as_ref(), closed_loop, seed)?
             }
             None => Vec::new(),
         };
@@ -289,11 +304,12 @@ impl Trainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`ModelError::LossNotFinite`] before anything is changed, or a tensor error.
+    /// [`ModelError::LossNotFinite`] before anything is changed, [`ModelError::Scene`] for a scenario
+    /// that cannot be fetched, or a tensor error.
     pub fn step(&mut self) -> Result<StepReport, ModelError> {
         let samples = self.next.recv().map_err(|_| ModelError::NoData {
             frames: self.config.sample.frames,
-        })?;
+        })??;
         if samples.is_empty() {
             return Err(ModelError::NoData {
                 frames: self.config.sample.frames,
@@ -446,7 +462,7 @@ fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, ModelError> {
 /// Draws the samples of a step while the present one is computed.
 ///
 /// On a thread of its own: a job of the pool could wait for ever behind the step that waits for it.
-fn prefetch(source: &Arc<Source>, step: usize) -> Receiver<Vec<Sample>> {
+fn prefetch(source: &Arc<Source>, step: usize) -> Receiver<Result<Vec<Sample>, ModelError>> {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.

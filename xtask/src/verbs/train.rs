@@ -16,7 +16,7 @@ use toml::Table;
 
 use crate::cli::WrongArguments;
 use crate::config;
-use crate::dataset::{self, Part, Split};
+use crate::dataset::{self, Part, Split, Training};
 use crate::losses::Losses;
 use crate::run::{self, Common, Run};
 
@@ -32,7 +32,8 @@ const WINDOW: usize = 20;
 /// Arguments of `train`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// A folder with a manifest.toml, or any file or folder of scenarios
+    /// A folder with a manifest.toml, or any file or folder of scenarios; a cache is not held in
+    /// memory
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
     /// Scenarios to validate on [default: the manifest's]
@@ -163,14 +164,15 @@ impl Args {
         Ok(())
     }
 
-    fn read(&self, run: &Run) -> anyhow::Result<(Vec<Scenario>, Vec<Scenario>)> {
+    fn read(&self, run: &Run) -> anyhow::Result<(Training, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
-        let training = dataset::read(&dataset::parts(&self.data, Split::Train)?, &progress)?;
+        let training = Training::open(&dataset::parts(&self.data, Split::Train)?, &progress)?;
         let validation = match &self.validation {
             Some(path) => vec![Part::whole(path)],
             None => dataset::parts(&self.data, Split::Validation)?,
         };
-        Ok((training, dataset::read(&validation, &progress)?))
+        let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
+        Ok((training, validation))
     }
 }
 

@@ -1,7 +1,8 @@
-//! `data`: look into scenario files, check and convert them, make new ones.
+//! `data`: look into scenario files, check, count and convert them, make new ones.
 
 mod convert;
 mod inspect;
+mod stats;
 mod synthesize;
 mod verify;
 
@@ -14,6 +15,8 @@ pub(crate) enum Verb {
     Inspect(inspect::Args),
     /// Check every record; exit status 1 if anything is broken
     Verify(verify::Args),
+    /// What scenes consist of, as a table: agents, speeds, roads, lights, kinds of situation
+    Stats(stats::Args),
     /// Turn any readable format into the cache that training reads from, or into another format
     Convert(convert::Args),
     /// Make up scenarios that are free of any recording's licence

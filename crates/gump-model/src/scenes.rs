@@ -1,0 +1,36 @@
+//! Where training takes its scenarios from: memory, or files that are larger than memory.
+
+use std::borrow::Cow;
+
+use gump_scene::Scenario;
+
+use crate::ModelError;
+
+/// Scenarios by number, asked for from many threads at once.
+///
+/// What a number stands for must not change: samples are drawn by it, in a resumed run too.
+pub trait Scenes: Send + Sync {
+    /// How many there are.
+    fn len(&self) -> usize;
+
+    /// True if there are none.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Scenario `index`, which is below [`Scenes::len`].
+    ///
+    /// # Errors
+    /// [`ModelError::Scene`] for one that cannot be fetched.
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError>;
+}
+
+impl Scenes for Vec<Scenario> {
+    fn len(&self) -> usize {
+        Self::len(self)
+    }
+
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+        Ok(Cow::Borrowed(&self[index]))
+    }
+}
