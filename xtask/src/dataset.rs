@@ -285,7 +285,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let named = |id: &usize| Scenario {
             id: id.to_string(),
-            ..gump_scene::fixture::scenario("ego vehicle 0: 0,0 velocity 1,0").unwrap()
+            ..gump_scene::fixture::scenario("lane 1: 0,0 99,0\nego vehicle 0: 0,0").unwrap()
         };
         let ids: Vec<usize> = (0..7).collect();
         let [file, shard] = ["file.tfrecord", "shard"].map(|name| folder.path().join(name));
