@@ -14,10 +14,12 @@ use gump_tokenizer::Field;
 use crate::decoder::STEPS;
 use crate::sampling::{Request, SamplingConfig};
 
-/// Draws the bin of a step; `logits` are those of its field's bins, `room` is memory to work in.
+/// Draws the bin of a step; `logits` are those of its field's bins, `drawn` the bins of the steps
+/// before, `room` is memory to work in.
 pub(crate) fn draw_field(
     logits: &[f32],
     step: usize,
+    drawn: &[u16],
     request: &Request,
     config: &SamplingConfig,
     room: &mut Vec<f32>,
@@ -26,6 +28,12 @@ pub(crate) fn draw_field(
     debug_assert_eq!(logits.len(), field.n_bins());
     let allowed = allowed(request, step, field);
     let uniform = uniform(request.stream.fork(step as u64));
+    let mask = request.restrict.as_ref();
+    if let Some(mask) = mask.and_then(|mask| mask.allowed(step, &drawn[..step]))
+        && mask.contains(&true)
+    {
+        return draw_masked(logits, &mask, uniform, config, room) as u16;
+    }
     let found = draw(&logits[allowed.clone()], uniform, config, room);
     (allowed.start + found) as u16
 }
@@ -46,6 +54,19 @@ fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
         _ => return all,
     };
     usize::from(*bins.start())..usize::from(*bins.end()) + 1
+}
+
+/// As [`draw`], among the bins that `mask` has.
+fn draw_masked(
+    logits: &[f32],
+    mask: &[bool],
+    uniform: f64,
+    config: &SamplingConfig,
+    room: &mut Vec<f32>,
+) -> usize {
+    let places: Vec<usize> = (0..logits.len()).filter(|i| mask[*i]).collect();
+    let left: Vec<f32> = places.iter().map(|i| logits[*i]).collect();
+    places[draw(&left, uniform, config, room)]
 }
 
 /// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
@@ -129,7 +150,7 @@ fn float_of(key: i32) -> f32 {
 }
 
 /// A number in [0, 1) that is a function of the seed alone: no generator, no state.
-fn uniform(seed: Seed) -> f64 {
+pub(crate) fn uniform(seed: Seed) -> f64 {
     (seed.fork(0).0 >> 11) as f64 / (1u64 << 53) as f64
 }
 
@@ -148,6 +169,7 @@ mod tests {
             near: None,
             ring: Ring::default(),
             frame: 0,
+            restrict: None,
         }
     }
 
@@ -156,7 +178,7 @@ mod tests {
             stream: Seed(seed),
             ..request()
         };
-        draw_field(logits, 0, &request, config, &mut Vec::new())
+        draw_field(logits, 0, &[], &request, config, &mut Vec::new())
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use gump_geometry::Pose;
 use gump_scene::{Agent, AgentState, Frame, Seed};
-use gump_tokenizer::{QuantizedState, TokenAgent, TokenFrame};
+use gump_tokenizer::{Identities, QuantizedState, TokenAgent, TokenFrame};
 
 use crate::aggregation::Ring;
 use crate::anchor::Anchor;
@@ -32,6 +32,8 @@ pub(crate) struct Future {
     pub(crate) rings: BTreeMap<u16, Ring>,
     /// The last `history` frames in world coordinates; the last is the present.
     pub(crate) recent: Vec<Frame>,
+    /// Who has which key; of those who came in this future, too.
+    pub(crate) identities: Identities,
     /// What the engine keeps of its window.
     pub(crate) context: Context,
 }
@@ -88,6 +90,7 @@ impl Future {
                     self.rings.get(&id).cloned().unwrap_or_default()
                 },
                 frame: index,
+                restrict: None,
             });
         }
         Window {
@@ -104,7 +107,7 @@ impl Future {
         if !world.network().config().anchored {
             return Anchor::SCENE;
         }
-        let id = scene.identities.agent(agent.key.id);
+        let id = self.identities.agent(agent.key.id);
         let present = self.recent.last().expect("a future has a present");
         let known = id.and_then(|id| present.agent(id));
         Anchor::at(known.map_or(agent.state.pose(), |known| scene.local(known.state).pose))
@@ -167,13 +170,14 @@ impl Future {
         }
         let now = self.recent.last().expect("a future has a present");
         let agents = now.agents().iter().map(|agent| {
-            let token = scene.identities.key(agent.id).and_then(|id| moved.get(&id));
+            let token = self.identities.key(agent.id).and_then(|id| moved.get(&id));
             let driven = ego.filter(|_| agent.id == scene.ego);
             agent.with_state(driven.or(token.copied()).unwrap_or_else(|| drift(agent)))
         });
         // Lights keep the colour they were seen in.
         let frame = Frame::new(agents.collect(), now.lights().to_vec());
-        next.newborn = scene.arrivals(&frame, &next, self.frames.last(), world.longest_frame());
+        let (before, longest) = (self.frames.last(), world.longest_frame());
+        next.newborn = scene.arrivals(&frame, &next, before, longest, &self.identities);
         self.recent.push(frame.clone());
         self.frames.push(next);
         let history = sampling.history.max(1);

@@ -28,6 +28,8 @@ mod embedding;
 mod engine;
 mod error;
 mod future;
+pub mod generation;
+mod life;
 mod loss;
 mod mct;
 mod network;

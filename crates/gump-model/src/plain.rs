@@ -217,8 +217,9 @@ pub(crate) fn sample_states(
                 .zip(requests)
                 .zip(logits.par_chunks(n))
                 .for_each_init(Vec::new, |room, ((bins, request), logits)| {
-                    bins[step] = request.forced[step]
-                        .unwrap_or_else(|| draw_field(logits, step, request, config, room));
+                    bins[step] = request.forced[step].unwrap_or_else(|| {
+                        draw_field(logits, step, &bins[..], request, config, room)
+                    });
                 });
         }
         let tokens: Vec<u32> = bins.iter().map(|bins| field.token(bins[step])).collect();

@@ -3,6 +3,9 @@
 //! What lives here: the configuration and the words that both ways of computing share. What does
 //! not: drawing a bin, which is `draw`'s business.
 
+use std::fmt;
+use std::sync::Arc;
+
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentState, Seed};
 use gump_tokenizer::{Field, QuantizedState};
@@ -32,6 +35,9 @@ pub struct SamplingConfig {
     pub history: usize,
     /// Where provisional states come from in partial-AR decoding.
     pub surrogate: Surrogate,
+    /// Whether agents come and leave and lights change as the network says (on a CPU); else those
+    /// who are there stay, and lights keep the colour they were seen in.
+    pub life: bool,
     /// In which form the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
@@ -46,6 +52,7 @@ impl Default for SamplingConfig {
             decay: 1.2,
             history: 3,
             surrogate: Surrogate::Chunk,
+            life: false,
             precision: Precision::F32,
         }
     }
@@ -106,6 +113,15 @@ pub(crate) struct Request {
     pub(crate) ring: Ring,
     /// Number of the frame being decoded.
     pub(crate) frame: usize,
+    /// Which bins may be drawn, beyond that.
+    pub(crate) restrict: Option<Arc<dyn Restrict>>,
+}
+
+/// A mask that knows what was drawn before.
+pub(crate) trait Restrict: fmt::Debug + Send + Sync {
+    /// Which bins of `step` may be drawn after the steps in `drawn`; `None` leaves all. Where none
+    /// may, the draw is free, and whoever asked will find out.
+    fn allowed(&self, step: usize, drawn: &[u16]) -> Option<Vec<bool>>;
 }
 
 impl Request {

@@ -2,16 +2,19 @@
 //! network remembers of it.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use gump_geometry::Pose;
 use gump_raster::rasterize;
-use gump_scene::{AgentId, AgentState, Frame, MapGraph, Route, SceneState};
-use gump_tokenizer::{Identities, Key, QuantizedState, TokenAgent, TokenFrame};
+use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, MapGraph, Route, SceneState};
+use gump_tokenizer::{
+    Identities, Key, N_CLASSES, QuantizedState, TokenAgent, TokenFrame, class_index,
+};
 
 use crate::anchor::Anchor;
 use crate::batch::PlacedSlot;
 use crate::engine::{Context, SceneMemory};
+use crate::generation::ground::Ground;
 use crate::mct::VisualMemory;
 use crate::sample::TOKEN_DT;
 use crate::surroundings::Survey;
@@ -55,10 +58,14 @@ pub(crate) struct Scene {
     /// The history as read by the engine, which futures go on from.
     pub(crate) prefix: Context,
     pub(crate) history: Vec<TokenFrame>,
+    /// The lane that each light token controls, light 1 first.
+    pub(crate) lights: Vec<LaneId>,
     /// The same frames in world coordinates; the last is the present.
     pub(crate) recent: Vec<Frame>,
     pub(crate) map: Arc<MapGraph>,
     pub(crate) route: Option<Arc<Route>>,
+    /// Where new agents may come, by class; made when first asked for.
+    grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
 }
 
 impl Scene {
@@ -121,9 +128,11 @@ impl Scene {
             },
             prefix: Context::default(),
             history: sequence.frames().to_vec(),
+            lights: encoded.lights,
             recent,
             map,
             route,
+            grounds: Default::default(),
         })
     }
 
@@ -151,6 +160,13 @@ impl Scene {
         like.with_motion(&self.local(state))
     }
 
+    /// Where agents of a class may come.
+    pub(crate) fn ground(&self, kind: AgentKind) -> Arc<Ground> {
+        let ground = &self.grounds[class_index(kind)];
+        let make = || Arc::new(Ground::of_class(&self.map, self.world_from_scene, kind));
+        Arc::clone(ground.get_or_init(make))
+    }
+
     /// A world state in the scene frame.
     pub(crate) fn local(&self, state: AgentState) -> AgentState {
         let scene_from_world = self.world_from_scene.inverse();
@@ -169,6 +185,7 @@ impl Scene {
         tokens: &TokenFrame,
         before: Option<&TokenFrame>,
         longest: usize,
+        identities: &Identities,
     ) -> Vec<TokenAgent> {
         let present = tokens
             .agents()
@@ -179,10 +196,7 @@ impl Scene {
             .iter()
             .filter(|agent| agent.kind.is_moving())
             .filter_map(|agent| {
-                let id = self
-                    .identities
-                    .key(agent.id)
-                    .filter(|id| !known.contains(id))?;
+                let id = identities.key(agent.id).filter(|id| !known.contains(id))?;
                 let local = self.local(agent.state);
                 let inside = local.pose.position.abs().max_element() < KEEP_RANGE_M;
                 let (state, _) = QuantizedState::new(&local, agent.length, agent.width);

@@ -44,7 +44,8 @@ impl Session for TransformerSession<'_> {
             return Err(ModelError::Scene(what).into());
         }
         self.recentre()?;
-        let windows: Vec<Window> = self
+        let sampling = self.world.sampling();
+        let mut windows: Vec<Window> = self
             .futures
             .iter()
             .enumerate()
@@ -53,12 +54,18 @@ impl Session for TransformerSession<'_> {
                 future.window(scene, self.world, ego.map(|states| states[i]))
             })
             .collect();
+        if sampling.life {
+            self.before_decoding(&mut windows)?;
+        }
         let decoded = self.decode(&windows)?;
         let mut frames = Vec::with_capacity(self.futures.len());
         for (i, (window, bins)) in windows.into_iter().zip(decoded).enumerate() {
             let scene = &self.scenes[self.futures[i].scene];
             let ego = ego.map(|states| states[i]);
             frames.push(self.futures[i].commit(window, &bins, scene, self.world, ego));
+        }
+        if sampling.life {
+            self.after_decoding(&mut frames)?;
         }
         Ok(frames)
     }
@@ -98,7 +105,7 @@ impl TransformerSession<'_> {
                 from.route.clone(),
                 future.recent.clone(),
                 from.ego,
-                from.identities.clone(),
+                future.identities.clone(),
             )
         };
         let scenes: Vec<Scene> = far.par_iter().map(around).collect::<Result<_, _>>()?;

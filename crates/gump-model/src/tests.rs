@@ -497,6 +497,7 @@ fn window(scenario: &Scenario) -> Window {
         near: None,
         ring: Ring::default(),
         frame: 3,
+        restrict: None,
     };
     let requests = next.tracked.iter().enumerate().map(request).collect();
     Window {

@@ -166,6 +166,7 @@ impl TransformerWorld {
                 index: last,
                 rings: BTreeMap::new(),
                 recent: shared.recent.clone(),
+                identities: shared.identities.clone(),
                 context: shared.prefix.clone(),
             };
             for (id, chunk) in rings {
@@ -213,6 +214,7 @@ impl TransformerWorld {
                     near: None,
                     ring: Ring::default(),
                     frame: last,
+                    restrict: None,
                 }
             })
             .collect();

@@ -161,7 +161,7 @@ impl Decoder {
                     Some(bin) => bin,
                     None => {
                         let logits = all_logits.clone().nth(i).expect("a row per request");
-                        draw_field(logits, step, request, config, draws)
+                        draw_field(logits, step, &bins[..], request, config, draws)
                     }
                 };
             }

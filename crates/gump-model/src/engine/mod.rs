@@ -14,6 +14,7 @@
 mod cache;
 mod decoder;
 mod embed;
+mod successor;
 #[cfg(test)]
 mod tests;
 mod weights;
@@ -27,6 +28,8 @@ pub(crate) use self::cache::Context;
 use self::cache::{Heads, Pages, attend};
 use self::decoder::Decoder;
 use self::embed::{Embedder, Ground};
+pub(crate) use self::successor::Successor;
+use self::successor::Successors;
 use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
 use crate::ModelError;
 use crate::batch::PlacedSlot;
@@ -49,6 +52,7 @@ pub(crate) struct Engine {
     layers: Vec<Layer>,
     norm: Norm,
     decoder: Decoder,
+    successors: Successors,
     rooms: Pool,
     waves: Pool<Wave>,
     products: AtomicU64,
@@ -103,6 +107,7 @@ impl Engine {
                 .collect::<Result<_, _>>()?,
             norm: source.norm("mct.norm")?,
             decoder: Decoder::new(&source)?,
+            successors: Successors::new(&source)?,
             rooms: Pool::default(),
             waves: Pool::default(),
             products: AtomicU64::new(0),
@@ -175,6 +180,16 @@ impl Engine {
         // Widths and lengths are always given.
         self.count(self.decoder.products(requests.len(), 2));
         self.decoder.sample(hidden, requests, config, &self.rooms)
+    }
+
+    /// What may follow the tokens whose hidden vectors `[N, C]` are given.
+    pub(crate) fn say(&self, hidden: &[f32]) -> Vec<Successor> {
+        let rows = hidden.len() / self.width;
+        self.count(self.successors.products(rows));
+        hidden
+            .chunks_exact(self.width)
+            .map(|hidden| self.successors.say(hidden))
+            .collect()
     }
 
     fn count(&self, products: u64) {

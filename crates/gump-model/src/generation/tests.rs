@@ -1,0 +1,154 @@
+//! Scenes of a network that has learned nothing keep their rules all the same.
+
+use super::constraint::{ObjectSpec, parse_constraints};
+use super::*;
+use crate::config::ModelConfig;
+use crate::network::Network;
+use crate::sampling::SamplingConfig;
+use gump_metrics::overlapping;
+use gump_scene::fixture;
+
+/// Two lanes each way with edges, a crosswalk, a light.
+const ROAD: &str = "lane 1: -100,-2 100,-2 width 3.6
+     lane 2: 100,2 -100,2 width 3.6
+     lane 3: -100,-6 100,-6 width 3.6
+     edge: -100,-8 100,-8
+     edge: 100,4 -100,4
+     drivable: -100,-8 100,-8 100,4 -100,4
+     crosswalk: 30,-8 34,-8 34,4 30,4
+     light 1 red: 28,-2
+     ego vehicle 0: 0,-2 velocity 8,0";
+
+fn world() -> TransformerWorld {
+    let mut config = ModelConfig::tiny();
+    config.visual.side_px = 104;
+    config.visual.metres_per_px = 2.0;
+    let device = candle_core::Device::Cpu;
+    let network = Network::random(config, Seed(5), &device).unwrap();
+    TransformerWorld::new(network, SamplingConfig::default())
+}
+
+fn request(objects: Vec<ObjectSpec>) -> GenerateRequest {
+    let scenario = fixture::scenario(ROAD).unwrap();
+    let now = scenario.present().now();
+    GenerateRequest {
+        map: Arc::clone(&scenario.map),
+        ego: EgoStart {
+            pose: scenario.present().ego_now().state.pose,
+            length: 4.8,
+            width: 2.0,
+            velocity: None,
+        },
+        lights: now.lights().to_vec(),
+        fixtures: Vec::new(),
+        prompts: Vec::new(),
+        counts: Some(Counts {
+            vehicles: 6,
+            pedestrians: 2,
+            bicycles: 2,
+        }),
+        objects,
+        config: GenerateConfig::default(),
+    }
+}
+
+fn make(request: &GenerateRequest, n: u64) -> Vec<GeneratedScene> {
+    let seeds: Vec<Seed> = (0..n).map(Seed).collect();
+    let scenes = world().generate(request, &seeds).unwrap();
+    scenes.into_iter().map(Result::unwrap).collect()
+}
+
+#[test]
+fn scenes_have_what_was_asked_for_and_nobody_overlaps() {
+    let request = request(Vec::new());
+    for scene in make(&request, 3) {
+        let agents = scene.frame.agents();
+        let n = |kind| agents.iter().filter(|agent| agent.kind == kind).count();
+        let counts = AgentKind::MOVING.map(n);
+        assert_eq!(counts, [7, 2, 2]);
+        for agent in agents {
+            assert_eq!(overlapping(&scene.frame, agent).count(), 0);
+            let on_road = agent.kind != AgentKind::Vehicle
+                || request.map.is_drivable(agent.state.pose.position);
+            assert!(on_road, "{agent:?}");
+        }
+        let scenario = scene.scenario("made".into(), &request.map, &[]);
+        scenario.validate().unwrap();
+        assert_eq!(scene.frame.lights().len(), 1);
+    }
+}
+
+#[test]
+fn a_scene_depends_on_its_seed_alone() {
+    let request = request(Vec::new());
+    let many = make(&request, 3);
+    let one = world().generate(&request, &[Seed(2)]).unwrap();
+    let one = one.into_iter().next().unwrap().unwrap();
+    assert_eq!(one.frame, many[2].frame);
+    assert_ne!(many[1].frame, many[2].frame);
+}
+
+#[test]
+fn wishes_are_met() {
+    let objects = parse_constraints(
+        "[[object]]\nid = \"ego\"\nspeed = [1, 2]\n\
+         [[object]]\nid = \"bike\"\nclass = \"bicycle\"\nahead_of = { object = \"ego\", metres = 6 }\n\
+         [[object]]\nid = \"truck\"\nlane = 2\nlength = 12\nspeed = 0\nx = [-40, 40]",
+    )
+    .unwrap();
+    for scene in make(&request(objects), 3) {
+        let agent = |name: &str| scene.frame.agent(scene.names[name]).unwrap();
+        let (ego, bike, truck) = (agent("ego"), agent("bike"), agent("truck"));
+        assert!((0.8..2.2).contains(&ego.state.speed()));
+        let gap = bike.state.pose.position.x
+            - ego.state.pose.position.x
+            - (bike.length + ego.length) / 2.0;
+        assert!((gap - 6.0).abs() < 0.5, "{gap}");
+        assert_eq!((truck.length, truck.state.speed()), (12.0, 0.0));
+        assert!((truck.state.pose.position.y - 2.0).abs() < 1.0);
+        assert!(truck.state.pose.heading.cos() < -0.9);
+    }
+}
+
+#[test]
+fn the_network_may_decide_how_many_there_are() {
+    let mut request = request(Vec::new());
+    request.counts = None;
+    request.config.max_agents = 12;
+    let scenes = make(&request, 4);
+    let counts: Vec<usize> = scenes.iter().map(|s| s.frame.agents().len()).collect();
+    // One that has learned nothing hardly ever stops.
+    assert!(counts.iter().all(|n| (1..=13).contains(n)), "{counts:?}");
+    for scene in &scenes {
+        assert_eq!(scene.frame.agents()[0].id, scene.ego);
+    }
+}
+
+#[test]
+fn what_cannot_be_met_is_said() {
+    let world = world();
+    let error = |request: &GenerateRequest| match world.generate(request, &[Seed(0)]) {
+        Err(error) => error.to_string(),
+        Ok(mut scenes) => scenes.remove(0).unwrap_err().to_string(),
+    };
+    let wish = |text: &str| request(parse_constraints(text).unwrap());
+    let found = error(&wish("[[object]]\nid = \"a\"\nlane = 9"));
+    assert!(found.contains("the map has no lane 9"), "{found}");
+    let found = error(&wish("[[object]]\nid = \"a\"\nlane = 2\ny = [-9, -5]"));
+    assert!(found.contains("no point of lane 2"), "{found}");
+    let field = "[[object]]\nid = \"a\"\nx = 5\ny = 40";
+    let found = error(&wish(field));
+    assert!(
+        found.contains("\"a\" found no place") && found.contains("on the road"),
+        "{found}"
+    );
+    let mut many = request(Vec::new());
+    many.counts = Some(Counts {
+        vehicles: 400,
+        ..Counts::default()
+    });
+    assert!(error(&many).contains("400 objects are more than the"));
+    let mut nowhere = request(Vec::new());
+    nowhere.map = fixture::scenario("ego vehicle 0: 0,0").unwrap().map;
+    assert!(error(&nowhere).contains("no drivable lane"));
+}
