@@ -97,10 +97,9 @@ impl Vehicle {
         scene: &Scene<'_>,
         others: impl Iterator<Item = &'a Self>,
         dt: f64,
-        scratch: &mut Vec<Quad>,
     ) {
         self.extend(scene);
-        let lead = self.lead(scene, others, scratch);
+        let lead = self.lead(scene, others);
         let last = self.lanes.back().and_then(|&id| scene.map.lane(id));
         if let Some(limit) = last.and_then(|lane| lane.speed_limit).filter(|&l| l > 0.0) {
             self.target_speed = limit;
@@ -162,49 +161,43 @@ impl Vehicle {
     }
 
     /// The nearest of all that reaches into the way ahead; its end, where nothing does.
-    fn lead<'a>(
-        &self,
-        scene: &Scene<'_>,
-        others: impl Iterator<Item = &'a Self>,
-        scratch: &mut Vec<Quad>,
-    ) -> Lead {
+    fn lead<'a>(&self, scene: &Scene<'_>, others: impl Iterator<Item = &'a Self>) -> Lead {
         let bounds = self.corridor.bounds_from(self.progress);
-        scratch.clear();
-        let mut nearest: Option<(f64, f64)> = None;
-        let mut consider = |distance: f64, speed: f64| {
-            if nearest.is_none_or(|(least, _)| distance < least) {
-                nearest = Some((distance, speed));
+        let fixed = scene.fixed.iter();
+        let fixed = fixed.map(|fixed| (&fixed.footprint, fixed.heading, fixed.speed));
+        let others = others.map(|other| (&other.footprint, other.pose().heading, other.speed));
+        let mut near: Vec<_> = fixed
+            .chain(others)
+            .filter(|(footprint, ..)| footprint.is_within(bounds))
+            .enumerate()
+            .map(|(i, other)| (self.footprint.gap_at_least(other.0), i, other))
+            .collect();
+        near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let mut nearest: Option<(f64, usize, f64)> = None;
+        for (gap, i, (footprint, heading, speed)) in near {
+            if nearest.is_some_and(|(least, ..)| gap > least) {
+                break;
             }
-        };
-        let mut is_ahead = |footprint: &Footprint| {
-            if !footprint.is_within(bounds) {
-                return false;
+            if !self.corridor.is_touched(self.progress, footprint) {
+                continue;
             }
-            if scratch.is_empty() {
-                self.corridor.pieces(self.progress, f64::INFINITY, scratch);
-            }
-            footprint.intersects(scratch)
-        };
-        let along = |heading: f64| (heading - self.pose().heading).cos();
-        for fixed in &scene.fixed {
-            if is_ahead(&fixed.footprint) {
-                let distance = self.footprint.distance(&fixed.footprint);
-                consider(distance, fixed.speed * along(fixed.heading));
-            }
-        }
-        for other in others {
-            if is_ahead(&other.footprint) {
-                let distance = self.footprint.distance(&other.footprint);
-                consider(distance, other.speed * along(other.pose().heading));
+            let distance = self.footprint.distance(footprint);
+            // Of several as near as each other the first counts.
+            if nearest.is_none_or(|(least, first, _)| (distance, i) < (least, first)) {
+                nearest = Some((distance, i, speed * (heading - self.pose().heading).cos()));
             }
         }
+        let mut nearest = nearest.map(|(distance, _, speed)| (distance, speed));
         for line in self
             .lanes
             .iter()
             .flat_map(|&lane| scene.red_stop_lines(lane))
         {
             if self.reaches(line, bounds) {
-                consider(self.footprint.distance_to_polygon(line), 0.0);
+                let distance = self.footprint.distance_to_polygon(line);
+                if nearest.is_none_or(|(least, _)| distance < least) {
+                    nearest = Some((distance, 0.0));
+                }
             }
         }
         match nearest {

@@ -4,6 +4,9 @@ use gump_geometry::{DVec2, Polygon, Quad, joint};
 
 use crate::Path;
 
+/// Segments that share bounds.
+const CHUNK: usize = 16;
+
 /// A path made as wide as a vehicle. Pieces are cut once per path, not once per step.
 #[derive(Clone, Debug)]
 pub(super) struct Corridor {
@@ -15,6 +18,8 @@ pub(super) struct Corridor {
     joints: Vec<Option<Quad>>,
     /// Bounds of all that follows the start of each segment.
     bounds: Vec<(DVec2, DVec2)>,
+    /// Bounds of every few segments with their joints.
+    chunks: Vec<(DVec2, DVec2)>,
 }
 
 impl Corridor {
@@ -43,7 +48,17 @@ impl Corridor {
             bounds.push(all);
         }
         bounds.reverse();
+        let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        let chunks = stretches.chunks(CHUNK).map(|chunk| {
+            let (low, high) = chunk
+                .iter()
+                .map(Quad::bounds)
+                .fold(none, |all, (min, max)| (all.0.min(min), all.1.max(max)));
+            (low - margin, high + margin)
+        });
+        let chunks = chunks.collect();
         Self {
+            chunks,
             path,
             half_width,
             stretches,
@@ -90,6 +105,38 @@ impl Corridor {
                 pieces.push(stretch(start, end, side));
             }
         }
+    }
+
+    /// True if a footprint reaches into the corridor anywhere from arc length `from` on.
+    pub(super) fn is_touched(&self, from: f64, footprint: &Footprint) -> bool {
+        let length = self.path.length();
+        let from = from.clamp(0.0, length);
+        if from >= length {
+            return false;
+        }
+        let first = self.segment(from);
+        let mut cut = Vec::new();
+        let end = self.path.line().arc_lengths()[first + 1];
+        self.pieces(from, end, &mut cut);
+        if footprint.intersects(&cut) {
+            return true;
+        }
+        let touches = |piece: &Quad| {
+            let (min, max) = piece.bounds();
+            footprint.is_within((min, max)) && footprint.pieces.iter().any(|p| p.intersects(piece))
+        };
+        for (chunk, bounds) in self.chunks.iter().enumerate().skip((first + 1) / CHUNK) {
+            if !footprint.is_within(*bounds) {
+                continue;
+            }
+            let segments = (chunk * CHUNK).max(first + 1)..self.stretches.len();
+            for i in segments.take_while(|i| *i < (chunk + 1) * CHUNK) {
+                if touches(&self.stretches[i]) || self.joints[i].as_ref().is_some_and(touches) {
+                    return true;
+                }
+            }
+        }
+        false
     }
 
     /// Index of the segment that holds arc length `s`.
@@ -142,10 +189,25 @@ impl Footprint {
         pieces.iter().any(touches)
     }
 
+    /// A lower bound of [`Footprint::distance`], metres: the gap between the bounding boxes.
+    pub(super) fn gap_at_least(&self, other: &Self) -> f64 {
+        let gap = (other.min - self.max).max(self.min - other.max);
+        gap.max(DVec2::ZERO).length()
+    }
+
     /// Metres between two footprints, 0 if they intersect.
     pub(super) fn distance(&self, other: &Self) -> f64 {
         let mut least = f64::INFINITY;
+        // Only pieces near the other's bounds can be the nearest.
+        let far = |own: &Quad, least: f64| {
+            let (min, max) = own.bounds();
+            let gap = (other.min - max).max(min - other.max);
+            gap.max(DVec2::ZERO).length() >= least
+        };
         for own in &self.pieces {
+            if far(own, least) {
+                continue;
+            }
             for piece in &other.pieces {
                 if own.gap_at_least(piece) < least {
                     least = least.min(own.distance(piece));
@@ -220,6 +282,28 @@ mod tests {
         check(10.0, 18.0, Some((10.0, 18.0)));
         check(-5.0, 99.0, Some((0.0, 30.0)));
         check(30.0, 35.0, None);
+    }
+
+    #[test]
+    fn what_touches_is_what_the_pieces_say() {
+        let corridor = bend();
+        let (mut touched, mut free) = (0, 0);
+        for i in 0..400 {
+            let (x, y) = (f64::from(i % 20) * 1.3 - 3.0, f64::from(i / 20) * 1.3 - 3.0);
+            let footprint = Footprint::new(widen(&[dvec2(x, y), dvec2(x + 2.0, y)], 0.5, 0.0));
+            for from in [-1.0, 0.0, 3.3, 17.0, 31.0, 99.0] {
+                let mut pieces = Vec::new();
+                corridor.pieces(from, f64::INFINITY, &mut pieces);
+                let slow = footprint.intersects(&pieces);
+                assert_eq!(
+                    corridor.is_touched(from, &footprint),
+                    slow,
+                    "{x} {y} {from}"
+                );
+                *if slow { &mut touched } else { &mut free } += 1;
+            }
+        }
+        assert!(touched > 100 && free > 100);
     }
 
     #[test]

@@ -154,12 +154,11 @@ impl Traffic for NuplanIdm {
             frame: logged,
             fixed: fixed_obstacles(&ego, step.ego.speed(), logged),
         };
-        let mut scratch = Vec::new();
         for i in 0..self.vehicles.len() {
             let (before, rest) = self.vehicles.split_at_mut(i);
             let (vehicle, after) = rest.split_first_mut().expect("vehicle i exists");
             let others = before.iter().chain(after.iter());
-            vehicle.step(&scene, others, step.dt(), &mut scratch);
+            vehicle.step(&scene, others, step.dt());
         }
         Ok(self.others(logged))
     }
