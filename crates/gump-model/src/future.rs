@@ -21,7 +21,7 @@ use crate::world::{KEEP_RANGE_M, TransformerWorld};
 const GUARD_M: f64 = 5.0;
 
 /// One future in progress.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Future {
     pub(crate) scene: usize,
     pub(crate) seed: Seed,

@@ -70,6 +70,14 @@ impl Session for TransformerSession<'_> {
         Ok(frames)
     }
 
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let mut index = 0..;
+        self.futures
+            .retain(|_| index.next().is_some_and(|i| futures.contains(&i)));
+        self.forget_unused_scenes();
+        true
+    }
+
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
         let index = self.scenes.len();
         let mut scene = Scene::new(self.world, start.scene)?;

@@ -289,6 +289,31 @@ fn futures_do_not_know_their_neighbours() {
 }
 
 #[test]
+fn starts_of_one_scene_share_what_they_look_at() {
+    let scenario = scenario();
+    let world = TransformerWorld::new(network(), SamplingConfig::default());
+    let start = |seed: u64| Start {
+        scene: scenario.present(),
+        n_futures: 2,
+        seed: Seed(seed),
+    };
+    let mut shared = world.open(&[start(5), start(5), start(6)]).unwrap();
+    // The history is read once for each seed, not for each start.
+    assert_eq!(world.passes(), 2);
+    let mut single = world.open(&[start(6)]).unwrap();
+    for _ in 0..3 {
+        let frames = shared.step(None).unwrap();
+        assert_eq!(frames[..2], frames[2..4]);
+        assert_ne!(frames[..2], frames[4..]);
+        assert_eq!(frames[4..], single.step(None).unwrap());
+    }
+    // Those that are kept go on as if nobody had left.
+    assert!(shared.keep(&[4]));
+    let alone = shared.step(None).unwrap();
+    assert_eq!(alone[..], single.step(None).unwrap()[..1]);
+}
+
+#[test]
 fn nothing_looks_at_the_logged_future() {
     let scenario = scenario();
     let mut blinded = scenario.clone();

@@ -10,6 +10,7 @@
 //! comes into the window is the network's from then on.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use candle_core::Tensor;
@@ -128,20 +129,40 @@ impl TransformerWorld {
     }
 
     /// A session over all futures of all starts.
+    ///
+    /// Starts that show one and the same scene share it: its map is looked at and its history read
+    /// once; those with one seed besides begin with equal futures.
     pub(crate) fn open_session(
         &self,
         starts: &[Start<'_>],
     ) -> Result<TransformerSession<'_>, ModelError> {
-        let scenes = starts.par_iter().map(|start| Scene::new(self, start.scene));
+        let mut distinct: Vec<SceneState<'_>> = Vec::new();
+        let mut scene_of = Vec::with_capacity(starts.len());
+        for start in starts {
+            let known = distinct.iter().position(|seen| is_same(seen, &start.scene));
+            scene_of.push(known.unwrap_or(distinct.len()));
+            if known.is_none() {
+                distinct.push(start.scene);
+            }
+        }
+        let scenes = distinct.par_iter().map(|scene| Scene::new(self, *scene));
         let mut scenes: Vec<Scene> = scenes.collect::<Result<_, _>>()?;
-        let mut futures = Vec::new();
-        for (i, (start, scene)) in starts.iter().zip(&mut scenes).enumerate() {
-            futures.extend(self.futures(i, scene, start.n_futures, start.seed)?);
+        let mut futures: Vec<Vec<Future>> = Vec::with_capacity(starts.len());
+        for (i, start) in starts.iter().enumerate() {
+            let (scene, n) = (scene_of[i], start.n_futures);
+            let like = |j: &usize| {
+                let other = &starts[*j];
+                scene_of[*j] == scene && other.seed == start.seed && other.n_futures == n
+            };
+            futures.push(match (0..i).find(like) {
+                Some(twin) => futures[twin].clone(),
+                None => self.futures(scene, &mut scenes[scene], n, start.seed)?,
+            });
         }
         Ok(TransformerSession {
             world: self,
             scenes,
-            futures,
+            futures: futures.into_iter().flatten().collect(),
         })
     }
 
@@ -290,6 +311,15 @@ impl TransformerWorld {
         said.extend(logits.flatten_all()?.to_vec1::<f32>()?);
         Ok(said)
     }
+}
+
+/// True if two views look at the same frames on the same road.
+fn is_same(a: &SceneState<'_>, b: &SceneState<'_>) -> bool {
+    let route = |scene: &SceneState<'_>| scene.route.map(Arc::as_ptr);
+    Arc::ptr_eq(a.map, b.map)
+        && std::ptr::eq(a.history, b.history)
+        && route(a) == route(b)
+        && (a.ego, a.dt) == (b.ego, b.dt)
 }
 
 impl WorldModel for TransformerWorld {

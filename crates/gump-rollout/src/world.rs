@@ -48,6 +48,15 @@ pub trait Session {
     /// Whatever keeps the implementation from imagining the frame.
     fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError>;
 
+    /// Goes on with these futures alone, given by ascending index; true if it does.
+    ///
+    /// What becomes of those kept does not change. A session that cannot let futures go says false
+    /// and keeps all; so does the default.
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let _ = futures;
+        false
+    }
+
     /// Reuses the slot of a finished future for a fresh start (of one future).
     ///
     /// # Errors

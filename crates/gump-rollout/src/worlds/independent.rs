@@ -67,6 +67,13 @@ impl<F: Future> Session for Independent<'_, F> {
         Ok(frames.collect())
     }
 
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let mut index = 0..;
+        self.futures
+            .retain(|_| index.next().is_some_and(|i| futures.contains(&i)));
+        true
+    }
+
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
         let n = self.futures.len();
         if future >= n {
