@@ -3,10 +3,17 @@
 use gump_geometry::Pose;
 use gump_rollout::closed_loop::Driver;
 
+use crate::Decision;
+
 /// A driver that can say what it weighed in its last step.
 pub trait Explain: Driver {
     /// Everything it considered, one of it chosen; empty before the first step.
     fn considered(&self) -> Vec<Considered>;
+
+    /// What the last step rests on, from those who imagine before they decide.
+    fn decision(&self) -> Option<&Decision> {
+        None
+    }
 }
 
 /// One thing a driver might have done.

@@ -257,7 +257,7 @@ mod tests {
                 speed_fraction,
                 lateral_offset,
             } => (speed_fraction, lateral_offset),
-            ProposalKind::EmergencyBrake => panic!("the emergency brake was chosen"),
+            other => panic!("{other} was chosen"),
         }
     }
 

@@ -5,14 +5,18 @@
 //! [`PlannerPolicy`] lets one drive in a simulation. How traffic moves is a world's business, what
 //! is good a reward's; nothing here reads a file or steps a world by itself.
 //!
-//! nuPlan's closed loop is driven by a [`gump_rollout::closed_loop::Driver`]: [`PdmClosed`],
-//! [`NuplanIdmDriver`], [`SimpleDriver`], the oracle [`LogDriver`], or any [`Planner`] as
-//! [`Planned`]. [`closed_loop`] lets one drive and scores it.
+//! nuPlan's closed loop is driven by a [`gump_rollout::closed_loop::Driver`]: [`PdmClosed`], the
+//! paper's [`InteractiveDriver`], which is PDM with imagination in place of a forecast,
+//! [`ImitationDriver`], [`NuplanIdmDriver`], [`SimpleDriver`], the oracle [`LogDriver`], or any
+//! [`Planner`] as [`Planned`]. [`closed_loop`] lets one drive and scores it; [`Comparison`] says who
+//! is better and how sure that is, [`value_policies`] does it for any policy in any world.
 //!
 //! # Terms
 //! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with what became of it.
 //! * **plan**: all candidates and which one was chosen.
 //! * **way**: the line a proposal follows, the route or the lanes ahead.
+//! * **prospect**: a policy with all that was imagined of it. **Decision**: all prospects and which
+//!   one drives on.
 //!
 //! ```
 //! use gump_planner::{Interactive, InteractiveConfig, Planner};
@@ -57,12 +61,14 @@
 //! ```
 
 pub mod closed_loop;
+mod compare;
 mod considered;
 mod driver;
 mod drivers;
 mod error;
 mod idm;
 mod interactive;
+mod interactive_driver;
 mod obstacle;
 mod path_ahead;
 mod pdm;
@@ -71,11 +77,15 @@ mod proposal;
 mod propose;
 pub mod route_search;
 
+pub use compare::{Comparison, PolicyValue, ValueConfig, value_policies};
 pub use considered::{Considered, Explain};
-pub use drivers::{LogDriver, NuplanIdmDriver, Planned, SimpleDriver};
+pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, Planned, SimpleDriver};
 pub use error::PlanError;
 pub use idm::IdmPlanner;
 pub use interactive::{Interactive, InteractiveConfig, planning_reward};
+pub use interactive_driver::{
+    Decision, InteractiveDriver, InteractiveDriverConfig, Phases, PlanBudget, Prospect, Worth,
+};
 pub use pdm::{PdmClosed, PdmConfig, PdmScore};
 pub use planner::{Candidate, CandidateScore, Plan, Planner, PlannerPolicy};
 pub use proposal::{Proposal, ProposalKind};

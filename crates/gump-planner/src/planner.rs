@@ -77,6 +77,22 @@ impl CandidateScore {
         })
     }
 
+    /// Means over the futures of every gate's factor and every term's value, by name.
+    pub fn parts(&self) -> Vec<(&'static str, f64)> {
+        let Some(first) = self.futures.first() else {
+            return Vec::new();
+        };
+        let n = self.futures.len() as f64;
+        let mean = |value: &dyn Fn(&Score) -> f64| self.futures.iter().map(value).sum::<f64>() / n;
+        let gates = (0..first.gates.len())
+            .map(|i| (first.gates[i].name, mean(&|score| score.gates[i].factor)));
+        let terms = (0..first.terms.len()).map(|i| {
+            let value = |score: &Score| score.terms[i].value.unwrap_or(0.0);
+            (first.terms[i].name, mean(&value))
+        });
+        gates.chain(terms).collect()
+    }
+
     /// True if some gate is closed in every future: there is nothing good about the candidate.
     pub fn is_hopeless(&self) -> bool {
         let closed = |score: &Score| score.gates.iter().any(|gate| gate.factor == 0.0);

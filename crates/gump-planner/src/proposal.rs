@@ -3,6 +3,8 @@
 //! Here is the trajectory and its interpolation; `propose` makes them, [`crate::Interactive`]
 //! judges them.
 
+use std::fmt;
+
 use gump_geometry::{Pose, interpolate_angle};
 use gump_scene::AgentState;
 
@@ -27,11 +29,49 @@ pub enum ProposalKind {
         /// Metres to the left of the centre line.
         lateral_offset: f64,
     },
+    /// What the imagined world has the ego do.
+    Imitation,
     /// Braking straight ahead as hard as allowed.
     EmergencyBrake,
 }
 
+impl fmt::Display for ProposalKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Idm {
+                speed_fraction,
+                lateral_offset,
+            } => {
+                let percent = speed_fraction * 100.0;
+                write!(f, "idm {percent:.0} % of the limit, {lateral_offset:+.1} m")
+            }
+            Self::Imitation => f.write_str("imitation"),
+            Self::EmergencyBrake => f.write_str("emergency brake"),
+        }
+    }
+}
+
 impl Proposal {
+    /// Through these box centres, `dt` seconds apart, of which the first is now; velocities are
+    /// taken over two steps, since imagined places come in quanta.
+    ///
+    /// # Panics
+    /// If there are fewer than two places.
+    pub fn through(kind: ProposalKind, places: &[Pose], dt: f64) -> Self {
+        let last = places.len() - 1;
+        let state = |i: usize| {
+            let (a, b) = (i - 1, (i + 1).min(last));
+            let moved = places[b].position - places[a].position;
+            AgentState {
+                pose: places[i],
+                velocity: moved / ((b - a) as f64 * dt),
+            }
+        };
+        let states: Vec<_> = (1..=last).map(state).collect();
+        assert!(!states.is_empty(), "a proposal leads somewhere");
+        Self { kind, dt, states }
+    }
+
     /// The state `elapsed` seconds after `now`, between states by a cubic that meets positions and
     /// velocities; past the last state at its velocity.
     pub fn state_at(&self, now: &AgentState, elapsed: f64) -> AgentState {

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use gump_geometry::Pose;
 use gump_planner::closed_loop::{drive_and_score, evaluate};
 use gump_planner::{
-    Explain, Interactive, InteractiveConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned,
-    SimpleDriver,
+    Explain, ImitationDriver, Interactive, InteractiveConfig, InteractiveDriver,
+    InteractiveDriverConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned, SimpleDriver,
 };
 use gump_rollout::BoxError;
 use gump_rollout::closed_loop::{
@@ -16,7 +16,7 @@ use gump_rollout::closed_loop::{
 };
 use gump_rollout::dynamics::Trajectory;
 use gump_rollout::worlds::{Idm, NuplanIdm};
-use gump_scene::{EgoState, MapGraph, fixture};
+use gump_scene::{EgoState, MapGraph, Seed, fixture};
 
 const STREET: &str = "
     lane 1: 0,0 400,0 speed 12 left 2
@@ -53,12 +53,19 @@ fn every_driver_comes_home_on_a_map_without_roadblocks() {
     let case = street();
     let world = Idm::default();
     let imagining = Interactive::new(&world, InteractiveConfig::default()).unwrap();
-    let drivers: [Box<dyn Explain>; 5] = [
+    let policies = InteractiveDriverConfig {
+        n_futures: 1,
+        replan_every: 10,
+        ..InteractiveDriverConfig::default()
+    };
+    let drivers: [Box<dyn Explain>; 7] = [
         Box::new(LogDriver::new(&case.0, &[])),
         Box::new(NuplanIdmDriver::default()),
         Box::new(SimpleDriver::default()),
         Box::new(PdmClosed::default()),
         Box::new(Planned::new(imagining, 10)),
+        Box::new(InteractiveDriver::new(&world, policies).unwrap()),
+        Box::new(ImitationDriver::new(&world, 1, 10, Seed(0)).unwrap()),
     ];
     for mut driver in drivers {
         let score = drive_with(&case, &mut *driver).unwrap();
@@ -158,9 +165,11 @@ fn drivers_that_fail_are_named_with_the_iteration() {
 #[test]
 fn missing_routes_are_named_and_an_ego_off_the_road_still_drives() {
     let astray = recording(&format!("{STREET} ego vehicle 0: 20,0 velocity 8,0"));
+    let (world, config) = (Idm::default(), InteractiveDriverConfig::default());
     for mut driver in [
         Box::new(PdmClosed::default()) as Box<dyn Driver>,
         Box::new(NuplanIdmDriver::default()),
+        Box::new(InteractiveDriver::new(&world, config).unwrap()),
     ] {
         let error = drive_with(&astray, &mut *driver).unwrap_err();
         assert!(error.contains("has no route"), "{error}");

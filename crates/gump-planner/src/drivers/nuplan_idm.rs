@@ -14,7 +14,7 @@ use gump_scene::{
 
 use crate::PlanError;
 use crate::considered::{Considered, Explain};
-use crate::pdm::stated_route;
+use crate::pdm::mission::stated_route;
 use crate::route_search::{first_lanes, lanes_of_route};
 
 /// States of a plan besides the present ...

@@ -7,7 +7,7 @@ use gump_rollout::dynamics::Trajectory;
 use gump_scene::{EgoState, VehicleParameters};
 
 use crate::considered::{Considered, Explain};
-use crate::{Plan, PlanError, Planner, Proposal, ProposalKind};
+use crate::{Plan, PlanError, Planner, Proposal};
 
 /// Seconds between the states that the vehicle is given.
 const DT: f64 = 0.1;
@@ -97,7 +97,7 @@ impl<P: Planner> Explain for Planned<P> {
                 .flat_map(|f| f.gates.iter().map(|g| (g.name, g.factor)));
             let terms = futures.flat_map(|f| f.terms.iter().map(|t| (t.name, t.contribution())));
             Considered {
-                name: name(&candidate.proposal.kind),
+                name: candidate.proposal.kind.to_string(),
                 chosen: i == plan.chosen,
                 score: candidate.score.as_ref().map(|score| score.mean),
                 parts: gates.clone().chain(terms).collect(),
@@ -110,18 +110,5 @@ impl<P: Planner> Explain for Planned<P> {
             }
         });
         all.collect()
-    }
-}
-
-fn name(kind: &ProposalKind) -> String {
-    match kind {
-        ProposalKind::Idm {
-            speed_fraction,
-            lateral_offset,
-        } => {
-            let percent = speed_fraction * 100.0;
-            format!("idm {percent:.0} % of the limit, {lateral_offset:+.1} m")
-        }
-        ProposalKind::EmergencyBrake => "emergency brake".to_owned(),
     }
 }

@@ -1,8 +1,8 @@
-//! Who is where over the next seconds, if everyone keeps its speed and direction.
+//! Who is where over the next seconds: as imagined, and else with constant speed and direction.
 
 use std::collections::BTreeSet;
 
-use gump_geometry::{DVec2, OrientedBox, Polygon, Quad};
+use gump_geometry::{DVec2, OrientedBox, Polygon, Pose, Quad};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, LaneId};
 
 /// Objects whose centre is farther from the ego's are not seen, metres.
@@ -21,17 +21,25 @@ pub(crate) enum Token {
     RedLight(LaneId),
 }
 
-/// One object over all moments.
+/// One object over all moments: where it is known to be, then straight on.
 #[derive(Clone, Debug)]
 pub(crate) struct Object {
     pub(crate) agent: Agent,
-    /// 0 for what does not move by itself.
-    pub(crate) speed: f64,
-    /// World frame, metres per second; along the heading, or against it if it rolls back.
+    /// From now on, one per moment; never empty.
+    known: Vec<Spot>,
+    /// How it goes on from the last of them: world frame, metres per second.
     drift: DVec2,
-    quad: Quad,
     /// Bounds over all moments.
     swept: (DVec2, DVec2),
+}
+
+/// Where an object is at a moment.
+#[derive(Clone, Copy, Debug)]
+struct Spot {
+    quad: Quad,
+    pose: Pose,
+    /// 0 for what does not move by itself.
+    speed: f64,
 }
 
 /// The forecast of one planning step.
@@ -44,6 +52,7 @@ pub(crate) struct Forecast {
 }
 
 impl Object {
+    /// An object that keeps its speed; it goes along its heading, or against it if it rolls back.
     fn new(agent: &Agent) -> Self {
         let moving = agent.kind.is_moving();
         let velocity = agent.state.velocity;
@@ -55,20 +64,40 @@ impl Object {
             ahead
         } * speed;
         let quad = Quad::from(&agent.oriented_box());
-        let (min, max) = quad.bounds();
-        let moved = drift * (MOMENT_DT * (MOMENTS - 1) as f64);
-        Self {
+        let mut object = Self {
             agent: *agent,
-            speed,
+            known: vec![Spot {
+                quad,
+                pose: agent.state.pose,
+                speed,
+            }],
             drift,
-            quad,
-            swept: (min.min(min + moved), max.max(max + moved)),
+            swept: quad.bounds(),
+        };
+        object.sweep();
+        object
+    }
+
+    /// Adds where it is imagined at the next moments, and how it goes on from there.
+    pub(crate) fn imagine(&mut self, poses: impl Iterator<Item = Pose>, drift: DVec2) {
+        for pose in poses {
+            let state = AgentState {
+                pose,
+                velocity: drift,
+            };
+            self.known.push(Spot {
+                quad: Quad::from(&self.agent.with_state(state).oriented_box()),
+                pose,
+                speed: drift.length(),
+            });
         }
+        self.drift = drift;
+        self.sweep();
     }
 
     /// True if its footprint never changes.
     pub(crate) fn is_still(&self) -> bool {
-        self.drift == DVec2::ZERO
+        self.known.len() == 1 && self.drift == DVec2::ZERO
     }
 
     /// Bounds of all its footprints.
@@ -78,37 +107,63 @@ impl Object {
 
     /// Its centre at a moment.
     pub(crate) fn center(&self, moment: usize) -> DVec2 {
-        self.agent.state.pose.position + self.offset(moment)
+        let (spot, offset) = self.at(moment);
+        spot.pose.position + offset
     }
 
     /// Its footprint at a moment.
     pub(crate) fn quad(&self, moment: usize) -> Quad {
-        let offset = self.offset(moment);
-        Quad::new(self.quad.corners().map(|corner| corner + offset))
+        let (spot, offset) = self.at(moment);
+        Quad::new(spot.quad.corners().map(|corner| corner + offset))
     }
 
     /// Bounds of its footprint at a moment.
     pub(crate) fn bounds(&self, moment: usize) -> (DVec2, DVec2) {
-        let (offset, (min, max)) = (self.offset(moment), self.quad.bounds());
+        let (spot, offset) = self.at(moment);
+        let (min, max) = spot.quad.bounds();
         (min + offset, max + offset)
+    }
+
+    /// Its speed at a moment along a heading, metres per second.
+    pub(crate) fn speed_along(&self, heading: f64, moment: usize) -> f64 {
+        let (spot, _) = self.at(moment);
+        let turned = spot.pose.heading - heading;
+        spot.speed * turned.cos()
     }
 
     /// The agent at a moment.
     pub(crate) fn agent(&self, moment: usize) -> Agent {
-        let mut pose = self.agent.state.pose;
-        pose.position += self.offset(moment);
-        self.agent.with_state(AgentState {
-            pose,
-            ..self.agent.state
-        })
+        let (spot, offset) = self.at(moment);
+        let mut pose = spot.pose;
+        pose.position += offset;
+        let velocity = if self.known.len() == 1 {
+            self.agent.state.velocity
+        } else {
+            self.drift
+        };
+        self.agent.with_state(AgentState { pose, velocity })
     }
 
     pub(crate) fn token(&self) -> Token {
         Token::Agent(self.agent.id)
     }
 
-    fn offset(&self, moment: usize) -> DVec2 {
-        self.drift * (MOMENT_DT * moment as f64)
+    /// The last place known by a moment, and how far it has gone on from there.
+    fn at(&self, moment: usize) -> (&Spot, DVec2) {
+        let last = moment.min(self.known.len() - 1);
+        let beyond = MOMENT_DT * (moment - last) as f64;
+        (&self.known[last], self.drift * beyond)
+    }
+
+    fn sweep(&mut self) {
+        let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        let join = |all: (DVec2, DVec2), spot: &Spot| {
+            let (min, max) = spot.quad.bounds();
+            (all.0.min(min), all.1.max(max))
+        };
+        let (low, high) = self.known.iter().fold(none, join);
+        let (min, max) = self.bounds(MOMENTS - 1);
+        self.swept = (low.min(min), high.max(max));
     }
 }
 
@@ -144,7 +199,7 @@ impl Forecast {
         }
         let own = Quad::from(ego);
         for object in &self.objects {
-            if object.quad.intersects(&own) {
+            if object.quad(0).intersects(&own) {
                 self.collided.insert(object.token());
             }
         }

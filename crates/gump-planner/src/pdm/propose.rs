@@ -103,6 +103,15 @@ pub(crate) struct Proposal {
     pub(crate) poses: Vec<Pose>,
 }
 
+impl Proposal {
+    /// Forgets all steps after the first `n`.
+    pub(crate) fn truncate(&mut self, n: usize) {
+        self.drives.truncate(n + 1);
+        self.leads.truncate(n + 1);
+        self.poses.truncate(n + 1);
+    }
+}
+
 /// What does not change from proposal to proposal.
 pub(crate) struct Proposer<'a> {
     pub(crate) law: &'a IdmConfig,
@@ -116,30 +125,56 @@ impl Proposer<'_> {
     /// Proposals of `n` steps, all speeds of a line after one another.
     pub(crate) fn propose(&self, rear_axle: Pose, speed: f64, n: usize) -> Vec<Proposal> {
         let mut all = Vec::with_capacity(self.lines.len() * self.desired_speeds.len());
-        for (line, way) in self.lines.iter().enumerate() {
-            let start = Drive {
-                progress: way.project(rear_axle.position),
-                speed,
-            };
-            let batch = self.desired_speeds.iter().map(|&desired_speed| Proposal {
-                line,
-                desired_speed,
-                drives: vec![start],
-                leads: vec![Lead::default()],
-                poses: vec![way.pose_at(start.progress)],
-            });
+        for line in 0..self.lines.len() {
             let from = all.len();
-            all.extend(batch);
+            let begun = self.begin(line, rear_axle, speed);
+            all.extend(self.desired_speeds.iter().map(|&desired_speed| Proposal {
+                desired_speed,
+                ..begun.clone()
+            }));
             self.drive(&mut all[from..], 1..=n);
         }
         all
     }
 
+    /// A proposal along a line that has not driven yet, for the first of the speeds.
+    pub(crate) fn begin(&self, line: usize, rear_axle: Pose, speed: f64) -> Proposal {
+        let way = &self.lines[line];
+        let progress = way.project(rear_axle.position);
+        Proposal {
+            line,
+            desired_speed: self.desired_speeds[0],
+            drives: vec![Drive { progress, speed }],
+            leads: vec![Lead::default()],
+            poses: vec![way.pose_at(progress)],
+        }
+    }
+
     /// Drives proposals of one line on over further steps.
     pub(crate) fn drive(&self, batch: &mut [Proposal], steps: std::ops::RangeInclusive<usize>) {
         let Some(first) = batch.first() else { return };
+        let corridor = self.corridor(first.line, first.drives[0].progress);
+        self.drive_within(&corridor, batch, steps);
+    }
+
+    /// What a vehicle might sweep from some progress along a line on.
+    pub(crate) fn corridor(&self, line: usize, progress: f64) -> Corridor {
+        let fastest = self.desired_speeds.iter().copied().fold(0.0, f64::max);
+        let end = progress + fastest * CORRIDOR_SECONDS;
+        let half_width = self.vehicle.width / 2.0;
+        Corridor::new(self.lines[line].corridor(progress, end, half_width))
+    }
+
+    /// [`Proposer::drive`] with the corridor at hand.
+    pub(crate) fn drive_within(
+        &self,
+        corridor: &Corridor,
+        batch: &mut [Proposal],
+        steps: std::ops::RangeInclusive<usize>,
+    ) {
+        let Some(first) = batch.first() else { return };
         let line = &self.lines[first.line];
-        let surroundings = Surroundings::new(self, line, first.drives[0].progress, steps.clone());
+        let surroundings = Surroundings::new(self, line, corridor, steps.clone());
         for k in steps {
             if k.is_multiple_of(2) {
                 self.look(line, &surroundings, batch, k);
@@ -180,8 +215,7 @@ impl Proposer<'_> {
                 Some((distance, obstacle)) => {
                     lead.progress = progress + distance;
                     if let Some(object) = obstacle {
-                        let turned = object.agent.state.pose.heading - pose.heading;
-                        lead.speed = object.speed * turned.cos();
+                        lead.speed = object.speed_along(pose.heading, k / 2);
                     }
                 }
                 None => {
@@ -212,13 +246,9 @@ impl<'a> Surroundings<'a> {
     fn new(
         proposer: &Proposer<'a>,
         line: &Line,
-        progress: f64,
+        corridor: &Corridor,
         steps: std::ops::RangeInclusive<usize>,
     ) -> Self {
-        let fastest = proposer.desired_speeds.iter().copied().fold(0.0, f64::max);
-        let end = progress + fastest * CORRIDOR_SECONDS;
-        let half_width = proposer.vehicle.width / 2.0;
-        let corridor = Corridor::new(line.corridor(progress, end, half_width));
         let (first, last) = (steps.start() / 2, steps.end() / 2);
         let mut moments: Vec<Vec<Obstacle<'_>>> = (first..=last).map(|_| Vec::new()).collect();
         for object in proposer.forecast.relevant() {
@@ -289,7 +319,8 @@ impl<'a> Surroundings<'a> {
 const CHUNK: usize = 8;
 
 /// Convex pieces of road, with the bounds of all and of every few.
-struct Corridor {
+#[derive(Debug)]
+pub(crate) struct Corridor {
     pieces: Vec<Quad>,
     chunks: Vec<(DVec2, DVec2)>,
     whole: (DVec2, DVec2),

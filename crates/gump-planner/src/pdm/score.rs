@@ -17,13 +17,13 @@ use super::propose::Line;
 /// Metres against the traffic that halve the score, and that spoil it.
 const WRONG_WAY: [f64; 2] = [2.0, 6.0];
 /// If no proposal comes farther than this, metres, none is blamed for it.
-const NO_PROGRESS: f64 = 0.1;
+pub(crate) const NO_PROGRESS: f64 = 0.1;
 /// Steps ahead at which a collision at constant speed is looked for.
 const TTC_STEPS: [usize; 4] = [0, 3, 6, 9];
 /// Below this speed, metres per second, nobody runs into anything.
 const TTC_STANDING: f64 = 0.005;
 /// Weights of progress, time to collision and comfort.
-const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
+pub(crate) const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
 
 /// The score of a proposal with its parts.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -46,17 +46,20 @@ pub struct PdmScore {
     pub progress_m: f64,
     /// Step of the first collision by the ego's fault.
     pub collision_step: Option<usize>,
+    /// First step off the road.
+    pub off_road_step: Option<usize>,
     /// First step from which something is run into.
     pub ttc_step: Option<usize>,
 }
 
 impl PdmScore {
-    fn gates(&self) -> f64 {
+    pub(crate) fn gates(&self) -> f64 {
         self.no_at_fault_collision * self.drivable_area * self.driving_direction
     }
 }
 
 /// What proposals are judged against.
+#[derive(Clone, Copy)]
 pub(crate) struct Judge<'a> {
     pub(crate) vehicle: &'a VehicleParameters,
     pub(crate) forecast: &'a Forecast,
@@ -85,28 +88,42 @@ impl Judge<'_> {
         drives: &[Vec<EgoState>],
         comfort: &mut ComfortFilters,
     ) -> Vec<PdmScore> {
-        let mut scores: Vec<PdmScore> = drives
-            .iter()
-            .map(|states| {
-                let tracked = self.track(states);
-                let (no_at_fault_collision, collision_step) = self.collision(&tracked);
-                let ttc_step = self.time_to_collision(&tracked);
-                let off_road = tracked.footings.iter().any(|footing| footing.off_road);
-                PdmScore {
-                    no_at_fault_collision,
-                    collision_step,
-                    ttc_step,
-                    time_to_collision: f64::from(u8::from(ttc_step.is_none())),
-                    drivable_area: f64::from(u8::from(!off_road)),
-                    driving_direction: driving_direction(&tracked),
-                    comfort: f64::from(u8::from(comfort.are_comfortable(states))),
-                    progress_m: self.progress(&tracked),
-                    ..PdmScore::default()
-                }
-            })
-            .collect();
+        let judged = drives.iter().map(|states| self.parts(states, comfort));
+        let mut scores: Vec<PdmScore> = judged.collect();
         normalize(&mut scores);
         scores
+    }
+
+    /// The parts of a score that take no other drive; [`normalize`] adds the rest.
+    pub(crate) fn parts(&self, states: &[EgoState], comfort: &mut ComfortFilters) -> PdmScore {
+        let tracked = self.track(states);
+        let (no_at_fault_collision, collision_step) = self.collision(&tracked);
+        let ttc_step = self.time_to_collision(&tracked);
+        let off_road_step = tracked.footings.iter().position(|footing| footing.off_road);
+        PdmScore {
+            no_at_fault_collision,
+            collision_step,
+            off_road_step,
+            ttc_step,
+            time_to_collision: f64::from(u8::from(ttc_step.is_none())),
+            drivable_area: f64::from(u8::from(off_road_step.is_none())),
+            driving_direction: driving_direction(&tracked),
+            comfort: f64::from(u8::from(comfort.are_comfortable(states))),
+            progress_m: self.progress(&tracked),
+            ..PdmScore::default()
+        }
+    }
+
+    /// How far along the way the vehicle's centre is, metres.
+    pub(crate) fn place(&self, state: &EgoState) -> f64 {
+        let center = self.vehicle.center_of(state.rear_axle);
+        self.centerline.project(center.position)
+    }
+
+    /// True if nothing that happens after these states can open the gates of the score again.
+    pub(crate) fn is_lost(&self, states: &[EgoState]) -> bool {
+        let tracked = self.track(states);
+        tracked.footings.iter().any(|footing| footing.off_road) || self.collision(&tracked).0 == 0.0
     }
 
     fn track<'s>(&self, states: &'s [EgoState]) -> Tracked<'s> {
@@ -258,7 +275,7 @@ fn driving_direction(tracked: &Tracked<'_>) -> f64 {
 }
 
 /// Relates progress to the farthest proposal and adds everything up.
-fn normalize(scores: &mut [PdmScore]) {
+pub(crate) fn normalize(scores: &mut [PdmScore]) {
     let farthest = scores
         .iter()
         .map(|score| score.progress_m * score.gates())

@@ -1,11 +1,13 @@
 //! Every intermediate result of the planner against its authors' code, on scenes made by hand.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use approx::assert_abs_diff_eq;
-use gump_geometry::{Polygon, Polyline, Pose, dvec2};
+use gump_geometry::{Polygon, Polyline, Pose, angle_difference, dvec2};
 use gump_scene::{
-    Agent, AgentId, AgentKind, AgentState, Area, AreaKind, Frame, Light, MapParts, Roadblock, Route,
+    Agent, AgentId, AgentKind, AgentState, Area, AreaKind, Frame, Lane, LaneId, Light, LightState,
+    MapGraph, MapParts, Roadblock, RoadblockId, Route, SceneState, VehicleParameters,
 };
 use serde_json::Value;
 
@@ -230,8 +232,7 @@ fn check_pose(name: &str, found: Pose, row: &[f64]) {
 
 fn check_ground(name: &str, planner: &PdmClosed, golden: &Value) {
     let state = planner.mission.as_ref().unwrap();
-    let way = state.way.as_ref().unwrap();
-    let path = &way.centerline.path;
+    let path = &state.centerline().path;
     assert_abs_diff_eq!(
         path.length(),
         golden["centerline_len"].as_f64().unwrap(),

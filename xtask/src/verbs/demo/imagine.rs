@@ -3,7 +3,7 @@
 use gump_metrics::summarize;
 use gump_model::checkpoint;
 use gump_model::{Device, world::TransformerWorld};
-use gump_planner::{Interactive, InteractiveConfig, Plan, Planner as _, ProposalKind};
+use gump_planner::{Interactive, InteractiveConfig, Plan, Planner as _};
 use gump_scene::{Rollout, SceneState};
 use gump_viz::{Camera, CandidatePath, FilmSpec, overlay_film};
 use serde_json::{Value, json};
@@ -131,7 +131,7 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         .into_iter()
         .map(|(i, mean)| {
             let chosen = if i == plan.chosen { "chosen" } else { "" };
-            let name = proposal(plan.candidates[i].proposal.kind);
+            let name = plan.candidates[i].proposal.kind.to_string();
             vec![name, mean.map_or("-".into(), decimal), chosen.to_owned()]
         })
         .collect();
@@ -145,7 +145,7 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let choice = plan.choice();
     Ok(json!({
         "candidates": plan.candidates.len(),
-        "chosen": proposal(choice.proposal.kind),
+        "chosen": choice.proposal.kind.to_string(),
         "score": choice.score.as_ref().map(|score| score.mean),
     }))
 }
@@ -167,7 +167,7 @@ fn candidates(plan: &Plan, scene: &SceneState<'_>) -> Vec<CandidatePath> {
         .map(|(i, candidate)| {
             let states = &candidate.proposal.states;
             CandidatePath {
-                name: proposal(candidate.proposal.kind),
+                name: candidate.proposal.kind.to_string(),
                 score: candidate.score.as_ref().map(|score| score.mean),
                 is_chosen: i == plan.chosen,
                 path: std::iter::once(start)
@@ -176,17 +176,4 @@ fn candidates(plan: &Plan, scene: &SceneState<'_>) -> Vec<CandidatePath> {
             }
         })
         .collect()
-}
-
-fn proposal(kind: ProposalKind) -> String {
-    match kind {
-        ProposalKind::Idm {
-            speed_fraction,
-            lateral_offset,
-        } => {
-            let percent = 100.0 * speed_fraction;
-            format!("{percent:.0} % of the limit, {lateral_offset:+.1} m from the centre line")
-        }
-        ProposalKind::EmergencyBrake => "emergency brake".into(),
-    }
 }

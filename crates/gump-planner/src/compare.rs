@@ -1,0 +1,283 @@
+//! Who is better, how sure that is, and how much more would have to be tried to be sure.
+//!
+//! [`value_policies`] lets policies drive through imagined futures; [`Comparison`] sets two lists of
+//! scores of the same scenes side by side, whoever made them.
+
+use gump_metrics::{Interval, Reward, interval};
+use gump_rollout::{BoxError, Policy, SimulateConfig, Start, WorldModel, simulate};
+use gump_scene::{SceneState, Seed};
+
+/// How policies are valued.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ValueConfig {
+    /// Futures of every scene, > 0.
+    pub n_futures: usize,
+    /// Where chance comes from; all policies meet the same.
+    pub seed: Seed,
+    /// How far and how finely.
+    pub simulate: SimulateConfig,
+}
+
+impl Default for ValueConfig {
+    /// Four futures of 4 s, as the paper's planner has them.
+    fn default() -> Self {
+        Self {
+            n_futures: 4,
+            seed: Seed(0),
+            simulate: SimulateConfig {
+                seconds: 4.0,
+                ..SimulateConfig::default()
+            },
+        }
+    }
+}
+
+/// What a policy is worth.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PolicyValue {
+    /// Its name.
+    pub name: String,
+    /// The reward of every future, `[scene][future]`; never empty.
+    pub scores: Vec<Vec<f64>>,
+    /// Mean over scenes and futures.
+    pub mean: f64,
+    /// 95 % interval of the mean over scenes; `None` for a single scene.
+    pub interval: Option<Interval>,
+}
+
+/// Lets every policy drive the ego through futures of every scene and values what happens; best
+/// first, the order given where they are equal.
+///
+/// Future *k* of a scene meets the same chance whoever drives.
+///
+/// # Errors
+/// What the world or a policy reports; a state that is not a number is one.
+pub fn value_policies(
+    world: &dyn WorldModel,
+    scenes: &[SceneState<'_>],
+    policies: &mut [&mut dyn Policy],
+    reward: &Reward,
+    config: &ValueConfig,
+) -> Result<Vec<PolicyValue>, BoxError> {
+    let n = config.n_futures;
+    let starts: Vec<Start<'_>> = scenes
+        .iter()
+        .enumerate()
+        .map(|(i, &scene)| Start {
+            scene,
+            n_futures: n,
+            seed: config.seed.fork(i as u64),
+        })
+        .collect();
+    let mut values = Vec::with_capacity(policies.len());
+    for policy in policies {
+        let rollouts = simulate(world, &starts, Some(&mut **policy), &config.simulate)?;
+        let scores: Vec<Vec<f64>> = rollouts
+            .chunks(n.max(1))
+            .zip(scenes)
+            .map(|(futures, scene)| {
+                let scores = reward.over_rollouts(futures, scene.ego);
+                scores.into_iter().map(|score| score.total).collect()
+            })
+            .collect();
+        let means: Vec<f64> = scores.iter().map(|futures| mean(futures)).collect();
+        values.push(PolicyValue {
+            name: policy.name().to_owned(),
+            mean: mean(&means),
+            interval: interval(&means, config.seed),
+            scores,
+        });
+    }
+    values.sort_by(|a, b| b.mean.total_cmp(&a.mean));
+    Ok(values)
+}
+
+/// The difference between two lists of scores of the same scenes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Comparison {
+    /// Mean of the first less that of the second.
+    pub difference: f64,
+    /// Its 95 % interval over scenes.
+    pub interval: Interval,
+    /// Variance of the difference between scenes, chance taken out.
+    pub between_scenes: f64,
+    /// Variance of the difference between futures of a scene.
+    pub within_scenes: f64,
+}
+
+/// Standard errors between a difference that is told from none and 0: 1.96 for an error of the first
+/// kind of 5 %, 0.84 for one of the second of 20 %.
+const TOLD: f64 = 1.96 + 0.84;
+
+impl Comparison {
+    /// Compares `[scene][future]` with the same scenes and futures of another; `None` for fewer than
+    /// two scenes, a scene without futures, or lists of different shapes.
+    pub fn new(a: &[Vec<f64>], b: &[Vec<f64>], seed: Seed) -> Option<Self> {
+        let shapes = |x: &[Vec<f64>]| x.iter().map(Vec::len).collect::<Vec<_>>();
+        if shapes(a) != shapes(b) || a.iter().any(Vec::is_empty) {
+            return None;
+        }
+        let pairs: Vec<Vec<f64>> = a
+            .iter()
+            .zip(b)
+            .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a - b).collect())
+            .collect();
+        let means: Vec<f64> = pairs.iter().map(|futures| mean(futures)).collect();
+        let interval = interval(&means, seed)?;
+        let within: Vec<f64> = pairs.iter().filter_map(|p| variance(p)).collect();
+        let within_scenes = if within.is_empty() {
+            0.0
+        } else {
+            mean(&within)
+        };
+        let futures = pairs.iter().map(Vec::len).sum::<usize>() as f64 / pairs.len() as f64;
+        // The means of scenes vary by chance as well, by less the more futures there are.
+        let all = variance(&means).unwrap_or(0.0);
+        Some(Self {
+            difference: mean(&means),
+            interval,
+            between_scenes: (all - within_scenes / futures).max(0.0),
+            within_scenes,
+        })
+    }
+
+    /// Compares one score per scene.
+    pub fn of_scenes(a: &[f64], b: &[f64], seed: Seed) -> Option<Self> {
+        let alone = |x: &[f64]| x.iter().map(|&score| vec![score]).collect::<Vec<_>>();
+        Self::new(&alone(a), &alone(b), seed)
+    }
+
+    /// True if the interval leaves 0 out.
+    pub fn is_sure(&self) -> bool {
+        self.interval.low > 0.0 || self.interval.high < 0.0
+    }
+
+    /// How many scenes with `n_futures` futures each would tell the two apart four times out of
+    /// five, if the difference is what it seems; `None` if there is none.
+    ///
+    /// Source: sample size of a paired comparison of means, two-sided at 5 %, power 80 %.
+    pub fn scenes_needed(&self, n_futures: usize) -> Option<usize> {
+        let variance = self.between_scenes + self.within_scenes / n_futures.max(1) as f64;
+        let needed = (TOLD / self.difference).powi(2) * variance;
+        needed.is_finite().then(|| (needed.ceil() as usize).max(2))
+    }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+fn variance(values: &[f64]) -> Option<f64> {
+    let middle = mean(values);
+    let squares: f64 = values.iter().map(|v| (v - middle).powi(2)).sum();
+    (values.len() > 1).then(|| squares / (values.len() - 1) as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{IdmPlanner, PlannerPolicy, ProposalConfig, planning_reward};
+    use approx::assert_abs_diff_eq;
+    use gump_rollout::Command;
+    use gump_rollout::worlds::ConstantVelocity;
+    use gump_scene::fixture;
+
+    /// Holds an acceleration whatever happens.
+    struct Holds(&'static str, f64);
+
+    impl Policy for Holds {
+        fn name(&self) -> &str {
+            self.0
+        }
+
+        fn act(&mut self, scenes: &[SceneState<'_>]) -> Result<Vec<Command>, BoxError> {
+            let command = Command::Drive {
+                acceleration: self.1,
+                curvature: 0.0,
+            };
+            Ok(vec![command; scenes.len()])
+        }
+    }
+
+    #[test]
+    fn policies_are_ranked_by_what_they_come_to() {
+        let street = |x: u32| {
+            let text = format!(
+                "lane 1: 0,0 400,0 speed 12\nroute 1\n ego vehicle 0: 10,0 velocity 10,0\n
+                 agent vehicle 1: {x},0 velocity 2,0"
+            );
+            fixture::scenario(&text).unwrap()
+        };
+        let scenarios = [street(40), street(45), street(300)];
+        let scenes: Vec<_> = scenarios.iter().map(|s| s.present()).collect();
+        let mut careful = PlannerPolicy::new(IdmPlanner::new(ProposalConfig::default()).unwrap());
+        let (mut blind, mut lazy) = (Holds("blind", 0.0), Holds("lazy", -4.0));
+        let mut policies: [&mut dyn Policy; 3] = [&mut blind, &mut lazy, &mut careful];
+        let (reward, config) = (planning_reward(), ValueConfig::default());
+        let ranked =
+            value_policies(&ConstantVelocity, &scenes, &mut policies, &reward, &config).unwrap();
+        let names: Vec<&str> = ranked.iter().map(|value| value.name.as_str()).collect();
+        assert_eq!(names, ["idm", "lazy", "blind"]);
+        // The blind one hits the car in two scenes of three.
+        let blind: Vec<bool> = ranked[2].scores.iter().map(|s| s[0] > 0.0).collect();
+        assert_eq!(blind, [false, false, true]);
+        let span = ranked[0].interval.unwrap();
+        assert!(span.low <= ranked[0].mean && ranked[0].mean <= span.high);
+        let mut broken: [&mut dyn Policy; 1] = [&mut Holds("broken", f64::NAN)];
+        let error = value_policies(&ConstantVelocity, &scenes, &mut broken, &reward, &config);
+        assert!(
+            error
+                .unwrap_err()
+                .to_string()
+                .contains("not a finite number")
+        );
+    }
+
+    #[test]
+    fn a_comparison_by_hand() {
+        let a = [vec![3.0, 5.0], vec![2.0, 2.0]];
+        let b = [vec![1.0, 1.0], vec![1.0, 3.0]];
+        // Differences 2, 4 and 1, -1: means 3 and 0, variances within 2 and 2.
+        let found = Comparison::new(&a, &b, Seed(0)).unwrap();
+        assert_eq!((found.difference, found.within_scenes), (1.5, 2.0));
+        // Variance of the means 4.5, of which 2 / 2 is chance.
+        assert_abs_diff_eq!(found.between_scenes, 3.5);
+        assert!(!found.is_sure());
+        // (2.8 / 1.5)^2 * (3.5 + 2 / 4) = 13.9.
+        assert_eq!(found.scenes_needed(4), Some(14));
+        assert!(found.scenes_needed(1) > found.scenes_needed(100));
+        let same = Comparison::of_scenes(&[1.0, 2.0], &[1.0, 2.0], Seed(0)).unwrap();
+        assert_eq!((same.difference, same.scenes_needed(4)), (0.0, None));
+        assert_eq!(Comparison::of_scenes(&[1.0], &[2.0], Seed(0)), None);
+        assert_eq!(Comparison::new(&a, &b[..1], Seed(0)), None);
+    }
+
+    #[test]
+    fn as_many_scenes_as_needed_tell_them_apart_four_times_in_five() {
+        // Differences of mean 0.3 and variance 1, as sums of twelve uniform numbers.
+        let draw = |seed: Seed| {
+            let uniform = |i: u64| (seed.fork(i).0 >> 11) as f64 / (1u64 << 53) as f64;
+            0.3 + (0..12).map(uniform).sum::<f64>() - 6.0
+        };
+        let sample =
+            |seed: Seed, n: u64| -> Vec<f64> { (0..n).map(|i| draw(seed.fork(i))).collect() };
+        let zeros = |n: u64| vec![0.0; n as usize];
+        let truth = Comparison {
+            difference: 0.3,
+            interval: Interval {
+                low: 0.0,
+                high: 0.0,
+            },
+            between_scenes: 1.0,
+            within_scenes: 0.0,
+        };
+        let n = truth.scenes_needed(1).unwrap() as u64;
+        assert_eq!(n, 88);
+        let told = (0..100).filter(|&k| {
+            let found = Comparison::of_scenes(&sample(Seed(k), n), &zeros(n), Seed(k));
+            found.unwrap().is_sure()
+        });
+        let told = told.count();
+        assert!((68..=92).contains(&told), "{told} of 100");
+    }
+}

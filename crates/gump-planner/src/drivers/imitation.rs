@@ -1,0 +1,135 @@
+//! The world's own ego as a driver.
+
+use gump_geometry::{DVec2, Pose, dvec2};
+use gump_rollout::closed_loop::{Driver, Mission, Moment};
+use gump_rollout::dynamics::Trajectory;
+use gump_rollout::{BoxError, RolloutError, Start, WorldModel};
+use gump_scene::{EgoState, Seed, VehicleParameters};
+
+use crate::considered::{Considered, Explain};
+use crate::{PlanError, Proposal, ProposalKind};
+
+/// Seconds of a plan: what nuPlan's open loop compares.
+const SECONDS: f64 = 8.0;
+/// Seconds between the states of a plan.
+const DT: f64 = 0.1;
+
+/// Plans the mean of what the world has the ego do in several futures.
+///
+/// The world sees the whole scene and drives everyone. Source: the open-loop use of the GUMP paper.
+pub struct ImitationDriver<'w> {
+    world: &'w dyn WorldModel,
+    n_futures: usize,
+    every: usize,
+    seed: Seed,
+    vehicle: Option<VehicleParameters>,
+    plan: Option<Trajectory>,
+}
+
+impl<'w> ImitationDriver<'w> {
+    /// A driver that imagines `n_futures` futures at every `every`-th iteration.
+    ///
+    /// # Errors
+    /// [`PlanError::Parameter`] if either is 0.
+    pub fn new(
+        world: &'w dyn WorldModel,
+        n_futures: usize,
+        every: usize,
+        seed: Seed,
+    ) -> Result<Self, PlanError> {
+        for (name, n) in [("n_futures", n_futures), ("every", every)] {
+            if n == 0 {
+                let expected = "at least 1";
+                return Err(PlanError::Parameter {
+                    name,
+                    value: 0.0,
+                    expected,
+                });
+            }
+        }
+        Ok(Self {
+            world,
+            n_futures,
+            every,
+            seed,
+            vehicle: None,
+            plan: None,
+        })
+    }
+
+    /// Where the ego is in the middle of all futures, now first; and the seconds in between.
+    fn imagine(&self, moment: &Moment<'_>) -> Result<(Vec<Pose>, f64), BoxError> {
+        let scene = moment.scene;
+        let mut session = self.world.open(&[Start {
+            scene,
+            n_futures: self.n_futures,
+            seed: self.seed.fork(moment.iteration as u64),
+        }])?;
+        let dt = session.dt();
+        let mut places = vec![scene.ego_now().state.pose];
+        for step in 0..(SECONDS / dt).ceil() as usize {
+            let (mut sum, mut ahead) = (DVec2::ZERO, DVec2::ZERO);
+            let frames = session.step(None)?;
+            for (future, frame) in frames.iter().enumerate() {
+                let ego = scene.ego;
+                let own =
+                    frame
+                        .agent(ego)
+                        .ok_or(RolloutError::EgoVanished { ego, future, step })?;
+                sum += own.state.pose.position;
+                ahead += own.state.pose.direction();
+            }
+            places.push(Pose {
+                position: sum / frames.len() as f64,
+                heading: ahead.to_angle(),
+            });
+        }
+        Ok((places, dt))
+    }
+}
+
+impl Driver for ImitationDriver<'_> {
+    fn name(&self) -> &str {
+        "imitation"
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.vehicle = Some(mission.vehicle);
+        self.plan = None;
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
+        if let Some(plan) = &self.plan
+            && !moment.iteration.is_multiple_of(self.every)
+        {
+            return Ok(plan.clone());
+        }
+        let (places, dt) = self.imagine(moment)?;
+        let proposal = Proposal::through(ProposalKind::Imitation, &places, dt);
+        let now = moment.scene.ego_now().state;
+        let mut states = vec![*moment.ego];
+        for (i, state) in proposal.resampled(&now, DT).iter().enumerate() {
+            states.push(EgoState {
+                time_us: moment.ego.time_us + (i as i64 + 1) * (DT * 1e6) as i64,
+                rear_axle: vehicle.rear_axle_of(state.pose),
+                velocity: dvec2(state.velocity.dot(state.pose.direction()), 0.0),
+                ..EgoState::default()
+            });
+        }
+        let plan = Trajectory::new(states)?;
+        self.plan = Some(plan.clone());
+        Ok(plan)
+    }
+}
+
+impl Explain for ImitationDriver<'_> {
+    fn considered(&self) -> Vec<Considered> {
+        let poses = |plan: &Trajectory| plan.states().iter().map(|s| s.rear_axle).collect();
+        self.plan
+            .iter()
+            .map(|plan| Considered::alone("the mean of what is imagined", poses(plan)))
+            .collect()
+    }
+}

@@ -1,0 +1,269 @@
+//! What is known since a mission began: the way, the road around the ego and everyone on it.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use gump_geometry::{Polygon, Pose, Quad, angle_difference};
+use gump_rollout::closed_loop::{Mission, Moment};
+use gump_rollout::dynamics::Trajectory;
+use gump_rollout::worlds::IdmConfig;
+use gump_rollout::{Path, RolloutError, baseline};
+use gump_scene::{
+    EgoState, Lane, LaneId, LightState, MapGraph, RoadblockId, SceneState, VehicleParameters,
+};
+
+use super::forecast::Forecast;
+use super::ground::Ground;
+use super::propose::{DT, Line, Proposer};
+use super::{PdmConfig, TRAJECTORY_STEPS};
+use crate::PlanError;
+use crate::route_search::{correct_route, lanes_of_route, nearest_vertex, shortest_lanes};
+
+/// Roadblocks of the route that the centre line is laid through.
+const WINDOW: usize = 30;
+
+/// What it knows since the mission began.
+#[derive(Debug)]
+pub(crate) struct State {
+    pub(crate) map: Arc<MapGraph>,
+    pub(crate) vehicle: VehicleParameters,
+    stated: Vec<RoadblockId>,
+    /// The way, once the ego has been seen.
+    way: Option<Way>,
+    pub(crate) ground: Ground,
+    pub(crate) forecast: Forecast,
+}
+
+#[derive(Debug)]
+struct Way {
+    lanes: BTreeSet<LaneId>,
+    in_order: Vec<LaneId>,
+    route: Vec<RoadblockId>,
+    /// One per lateral offset, the centre line among them where the offset is 0.
+    lines: Vec<Line>,
+    centerline: Line,
+}
+
+impl State {
+    /// Takes a mission; the way is found once the ego is seen.
+    ///
+    /// # Errors
+    /// As [`stated_route`].
+    pub(crate) fn new(mission: &Mission<'_>) -> Result<Self, PlanError> {
+        Ok(Self {
+            stated: stated_route(mission)?,
+            map: Arc::clone(mission.map),
+            vehicle: mission.vehicle,
+            way: None,
+            ground: Ground::default(),
+            forecast: Forecast::default(),
+        })
+    }
+
+    /// Sees the moment and lays the lines if that was not done; returns the desired speeds, metres
+    /// per second.
+    ///
+    /// # Errors
+    /// [`PlanError::NoRoute`] if there is no way from where the ego is.
+    pub(crate) fn prepare(
+        &mut self,
+        moment: &Moment<'_>,
+        config: &PdmConfig,
+    ) -> Result<Vec<f64>, PlanError> {
+        self.look(moment, config)?;
+        let lane = self.starting_lane(moment.ego)?;
+        self.lay_lines(lane, config)?;
+        let limit = self.map.lane(lane).and_then(|lane| lane.speed_limit);
+        let limit = limit.unwrap_or(config.fallback_speed);
+        Ok(config.speed_fractions.iter().map(|f| f * limit).collect())
+    }
+
+    /// What proposes in the prepared moment.
+    pub(crate) fn proposer<'a>(&'a self, law: &'a IdmConfig, speeds: &'a [f64]) -> Proposer<'a> {
+        Proposer {
+            law,
+            vehicle: &self.vehicle,
+            forecast: &self.forecast,
+            lines: &self.prepared().lines,
+            desired_speeds: speeds,
+        }
+    }
+
+    /// The middle of the way.
+    pub(crate) fn centerline(&self) -> &Line {
+        &self.prepared().centerline
+    }
+
+    fn prepared(&self) -> &Way {
+        self.way.as_ref().expect("the moment was prepared")
+    }
+
+    /// Takes in the road and everyone around.
+    fn look(&mut self, moment: &Moment<'_>, config: &PdmConfig) -> Result<(), PlanError> {
+        let ego = moment.ego;
+        if self.way.is_none() {
+            let route = correct_route(&self.map, &self.stated, ego.rear_axle);
+            let in_order: Vec<LaneId> = lanes_of_route(&self.map, &route)
+                .iter()
+                .map(|lane| lane.id)
+                .collect();
+            if in_order.is_empty() {
+                return Err(PlanError::NoRoute);
+            }
+            let nowhere = Path::through(&[ego.rear_axle]).expect("a path of one pose");
+            self.way = Some(Way {
+                lanes: in_order.iter().copied().collect(),
+                in_order,
+                route,
+                lines: Vec::with_capacity(config.lateral_offsets.len()),
+                centerline: Line::new(nowhere),
+            });
+        }
+        let way = self.way.as_ref().expect("the way was just found");
+        let footprint = self.vehicle.footprint(ego.rear_axle);
+        self.ground
+            .look(&self.map, &way.lanes, footprint.pose.position);
+        let scene = moment.scene;
+        let others = scene
+            .now()
+            .agents()
+            .iter()
+            .filter(|agent| agent.id != scene.ego);
+        let red = red_lights(&self.map, &scene, &way.lanes);
+        self.forecast.look(&footprint, others, red);
+        Ok(())
+    }
+
+    /// The lane of the route that the ego is on, or the one to go to.
+    fn starting_lane(&self, ego: &EgoState) -> Result<LaneId, PlanError> {
+        let way = self.way.as_ref().ok_or(PlanError::NoRoute)?;
+        let at = |id: &LaneId| {
+            self.map
+                .lane(*id)
+                .expect("lanes of the route are in the map")
+        };
+        let turned = |id: &LaneId| {
+            let vertex = nearest_vertex(at(id), ego.rear_axle.position);
+            angle_difference(vertex.heading, ego.rear_axle.heading).abs()
+        };
+        let own = self.ground.route_lanes_at(ego.rear_axle.position);
+        if let Some(lane) = own.min_by(|a, b| turned(a).total_cmp(&turned(b))) {
+            return Ok(lane);
+        }
+        let footprint = self.vehicle.footprint(ego.rear_axle);
+        let center = footprint.pose.position;
+        let surface = |id: &LaneId| at(id).surface();
+        let holds = |id: &&LaneId| surface(id).is_some_and(|polygon| polygon.contains(center));
+        if let Some(&lane) = way.in_order.iter().find(holds) {
+            return Ok(lane);
+        }
+        let own = Quad::from(&footprint);
+        let distance = |id: &LaneId| {
+            surface(id).map_or(f64::INFINITY, |polygon| own.distance_to_polygon(&polygon))
+        };
+        let nearest = way
+            .in_order
+            .iter()
+            .min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        nearest.copied().ok_or(PlanError::NoRoute)
+    }
+
+    /// Lays the lines through the route, once per mission.
+    fn lay_lines(&mut self, start: LaneId, config: &PdmConfig) -> Result<(), PlanError> {
+        let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
+        if !way.lines.is_empty() {
+            return Ok(());
+        }
+        let block = self.map.lane(start).and_then(|lane| lane.roadblock);
+        let here = way
+            .route
+            .iter()
+            .position(|&id| Some(id) == block)
+            .unwrap_or(0);
+        let window = &way.route[here..way.route.len().min(here + WINDOW)];
+        let lanes = shortest_lanes(&self.map, start, window);
+        let poses: Vec<Pose> = lanes
+            .iter()
+            .filter_map(|&id| self.map.lane(id))
+            .flat_map(baseline)
+            .collect();
+        let center = Path::through(&poses).ok_or(PlanError::NoRoute)?;
+        way.lines = config
+            .lateral_offsets
+            .iter()
+            .map(|&left| Line::new(center.shifted(left)))
+            .collect();
+        way.centerline = Line::new(center);
+        Ok(())
+    }
+}
+
+/// Surfaces of the route's lanes through intersections whose lights are red.
+fn red_lights(
+    map: &MapGraph,
+    scene: &SceneState<'_>,
+    route: &BTreeSet<LaneId>,
+) -> Vec<(LaneId, Polygon)> {
+    let lights = scene.now().lights().iter();
+    let red = lights.filter(|light| light.state == LightState::Red && route.contains(&light.lane));
+    let lanes = red.filter_map(|light| map.lane(light.lane));
+    lanes
+        .filter(|lane| lane.in_intersection)
+        .filter_map(|lane: &Lane| Some((lane.id, lane.surface()?.into_owned())))
+        .collect()
+}
+
+/// The roadblocks of a mission that are in the map.
+///
+/// # Errors
+/// [`PlanError::NoRoute`] if the mission states none, [`PlanError::ForeignRoute`] if none of them
+/// is in the map.
+pub(crate) fn stated_route(mission: &Mission<'_>) -> Result<Vec<RoadblockId>, PlanError> {
+    let stated = mission
+        .route
+        .map(|route| &route.roadblocks[..])
+        .unwrap_or_default();
+    if stated.is_empty() {
+        return Err(PlanError::NoRoute);
+    }
+    let known: Vec<_> = stated
+        .iter()
+        .copied()
+        .filter(|&id| mission.map.roadblock(id).is_some())
+        .collect();
+    if known.is_empty() {
+        return Err(PlanError::ForeignRoute { first: stated[0] });
+    }
+    Ok(known)
+}
+
+/// Poses of the rear axle a tenth of a second apart as something to follow.
+pub(crate) fn trajectory(start_us: i64, poses: &[Pose]) -> Result<Trajectory, RolloutError> {
+    let state = |(i, &rear_axle): (usize, &Pose)| EgoState {
+        time_us: start_us + i as i64 * 100_000,
+        rear_axle,
+        ..EgoState::default()
+    };
+    Trajectory::new(poses.iter().enumerate().map(state).collect())
+}
+
+/// A reference straight ahead at a constant speed that makes the tracker brake hard. That speed is
+/// mostly negative: the reference runs backwards, and is laid afresh at every step.
+pub(crate) fn brake(ego: &EgoState, vehicle: &VehicleParameters) -> Vec<Pose> {
+    let (low, high) = (-4.05, 2.4);
+    let speed = ego.velocity.x;
+    let swing = vehicle.rear_axle_to_center() * (ego.yaw_rate.powi(2) + ego.yaw_acceleration);
+    let acceleration = ego.acceleration.x + swing;
+    let reference = if speed > 0.2 {
+        1.1 * (speed + (-10.0 * speed).clamp(low, high))
+    } else {
+        (-4.0 * speed - acceleration).clamp(low, high)
+    };
+    let direction = ego.rear_axle.direction();
+    (0..=TRAJECTORY_STEPS)
+        .map(|i| Pose {
+            position: ego.rear_axle.position + direction * (reference * DT * i as f64),
+            ..ego.rear_axle
+        })
+        .collect()
+}
