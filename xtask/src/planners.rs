@@ -1,11 +1,12 @@
-//! Planners by name, with a clock: `log`, `idm`, `simple`, `pdm-closed` and `interactive`.
+//! Planners by name, with a clock: `log`, `idm`, `simple`, `pdm-closed`, `imitation` and
+//! `interactive`.
 
 use std::time::{Duration, Instant};
 
 use gump_model::Device;
 use gump_planner::{
-    Explain, Interactive, InteractiveConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned,
-    SimpleDriver,
+    Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
+    NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
 };
 use gump_rollout::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
 use gump_rollout::dynamics::Trajectory;
@@ -14,6 +15,7 @@ use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
 use serde::Serialize;
 
+use crate::cli::WrongArguments;
 use crate::recordings::Case;
 use crate::worlds::{World, WorldName};
 
@@ -29,8 +31,14 @@ pub(crate) enum PlannerName {
     Simple,
     /// PDM-Closed: 15 proposals against a constant-velocity forecast
     PdmClosed,
-    /// 15 proposals, each imagined in the world
+    /// What the imagined world has the ego do: the mean of several futures
+    #[value(alias = "model")]
+    Imitation,
+    /// 15 policies and imitation, each imagined among others who react
     Interactive,
+    /// PDM's 15 proposals, each alone to the end: two rows, the best of them and the best in each
+    /// scenario, an oracle
+    Proposals,
 }
 
 impl PlannerName {
@@ -41,34 +49,108 @@ impl PlannerName {
             Self::Idm => "idm",
             Self::Simple => "simple",
             Self::PdmClosed => "pdm-closed",
+            Self::Imitation => "imitation",
             Self::Interactive => "interactive",
+            Self::Proposals => "proposals",
         }
     }
 
-    /// The planner for one case; `imagination` is the world that the interactive one thinks in.
+    /// The planner for one case; `imagination` is the world that those think in who do.
+    ///
+    /// Error: `proposals`, who are many.
     pub(crate) fn build<'w>(
         self,
         case: &Case,
         imagination: &'w dyn WorldModel,
         seed: Seed,
-        replan_every: usize,
+        thinking: &Thinking,
     ) -> anyhow::Result<Box<dyn Explain + 'w>> {
         Ok(match self {
             Self::Log => Box::new(LogDriver::new(&case.recording, &case.after)),
             Self::Idm => Box::new(NuplanIdmDriver::default()),
             Self::Simple => Box::new(SimpleDriver::default()),
             Self::PdmClosed => Box::new(PdmClosed::default()),
-            Self::Interactive => {
-                let config = InteractiveConfig {
-                    seed,
-                    ..InteractiveConfig::default()
-                };
-                Box::new(Planned::new(
-                    Interactive::new(imagination, config)?,
-                    replan_every,
-                ))
+            Self::Imitation => Box::new(thinking.imitation(imagination, seed)?),
+            Self::Interactive => Box::new(thinking.interactive(imagination, seed)?),
+            Self::Proposals => {
+                let wrong = "proposals are fifteen planners, only evaluate closed-loop takes them";
+                return Err(WrongArguments(wrong.into()).into());
             }
         })
+    }
+}
+
+/// How planners that imagine do it.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Thinking {
+    /// Futures that imagining planners see
+    #[arg(long, value_name = "N", default_value_t = 4)]
+    futures: usize,
+    /// Agents that are imagined, those nearest to the ego
+    #[arg(long, value_name = "N", default_value_t = 12)]
+    nearest: usize,
+    /// Seconds that the interactive planner imagines
+    #[arg(long, value_name = "S", default_value_t = 4.0)]
+    horizon: f64,
+    /// The interactive planner stops imagining after so long [default: no limit]
+    #[arg(long, value_name = "MS")]
+    think_ms: Option<f64>,
+    /// Planners that imagine decide at every N-th step
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    replan_every: usize,
+    /// Discount per half second; without it a future is worth the score of the whole drive
+    #[arg(long, value_name = "X")]
+    discount: Option<f64>,
+}
+
+impl Thinking {
+    /// The interactive planner with a clock.
+    ///
+    /// Error: a number out of its range.
+    pub(crate) fn interactive<'w>(
+        &self,
+        world: &'w dyn WorldModel,
+        seed: Seed,
+    ) -> anyhow::Result<InteractiveDriver<'w>> {
+        let wall = match self.think_ms {
+            Some(ms) if !(ms > 0.0 && ms.is_finite()) => {
+                let wrong = format!("--think-ms: expected a number above 0, found {ms}");
+                return Err(WrongArguments(wrong).into());
+            }
+            ms => ms.map(|ms| Duration::from_secs_f64(ms * 1e-3)),
+        };
+        let config = InteractiveDriverConfig {
+            n_futures: self.futures,
+            seed,
+            replan_every: self.replan_every,
+            worth: self
+                .discount
+                .map_or(Worth::Rollout, |gamma| Worth::DiscountedStep { gamma }),
+            budget: PlanBudget {
+                nearest: self.nearest,
+                horizon: self.horizon,
+                wall,
+            },
+            ..InteractiveDriverConfig::default()
+        };
+        let began = Instant::now();
+        Ok(InteractiveDriver::new(world, config)?.with_clock(move || began.elapsed()))
+    }
+
+    /// The imitating planner.
+    ///
+    /// Error: a number out of its range.
+    fn imitation<'w>(
+        &self,
+        world: &'w dyn WorldModel,
+        seed: Seed,
+    ) -> anyhow::Result<ImitationDriver<'w>> {
+        Ok(ImitationDriver::new(
+            world,
+            self.futures,
+            self.replan_every,
+            seed,
+        )?)
     }
 }
 
@@ -98,7 +180,22 @@ impl Surroundings {
         })
     }
 
-    /// The world planners imagine in: the network where there is one, else reactive rules.
+    /// As [`Surroundings::load`], to imagine in: what planners look ahead fits a window that grows,
+    /// in which nothing is read twice.
+    ///
+    /// Error: weights that cannot be read.
+    pub(crate) fn load_imagination(
+        name: &WorldName,
+        sampling: &gump_model::SamplingConfig,
+    ) -> anyhow::Result<Self> {
+        let growing = gump_model::SamplingConfig {
+            cache: gump_model::CacheMode::Growing,
+            ..sampling.clone()
+        };
+        Self::load(name, &growing)
+    }
+
+    /// A world to imagine in: the network where there is one, else reactive rules.
     pub(crate) fn imagination(&self) -> &dyn WorldModel {
         match &self.learned {
             Some(world) => world.model(),

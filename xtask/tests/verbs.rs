@@ -608,6 +608,72 @@ fn tidy_finds_nothing() {
     assert_eq!(results["problems"], 0);
 }
 
+#[test]
+fn planners_are_judged_in_three_worlds_by_one_command() {
+    let place = Workplace::new();
+    let (scenes, weights) = (two_scenes(&place), place.weights());
+    let drive = "--seconds 1 --films 0 --futures 2";
+    let words = format!(
+        "evaluate closed-loop --scenarios {scenes} --world log,idm,model:{weights} \
+         --planner idm,pdm-closed,imitation,interactive,proposals {drive}"
+    );
+    let results = &place.report(&words)["results"];
+    assert_eq!(results["imagination"], format!("model:{weights}"));
+    let rows = results["rows"].as_array().unwrap();
+    // Proposals are two rows.
+    assert_eq!(rows.len(), 3 * 6);
+    for row in rows {
+        assert_eq!((&row["scenarios"], &row["failed"]), (&2.into(), &0.into()));
+        let of = |key: &str| row[key].as_f64().unwrap();
+        assert!(
+            of("low") <= of("score") && of("score") <= of("high"),
+            "{row}"
+        );
+    }
+    for world in rows.chunks(6) {
+        let score = |i: usize| world[i]["score"].as_f64().unwrap();
+        assert!(
+            score(5) >= score(4),
+            "the oracle is at least the best proposal"
+        );
+    }
+    let pairs = results["comparisons"].as_array().unwrap();
+    assert_eq!(pairs.len(), 3 * 15);
+    assert!(results["ranking_changes"].is_array());
+    place.fails(&format!("{words} --limit 0"), 2, &["--limit"]);
+    let words = format!("evaluate open-loop --scenarios {scenes} --planner model --world idm");
+    let row = &place.report(&words)["results"]["rows"][0];
+    assert_eq!(row["planner"], "imitation");
+    assert!(row["ade_8s"].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn a_decision_is_explained() {
+    let place = Workplace::new();
+    let (scenes, weights) = (two_scenes(&place), place.weights());
+    let plan = format!("plan --scenario {scenes} --world model:{weights} --seconds 1 --futures 2");
+    let results = &place.report(&format!("{plan} --explain 5"))["results"];
+    let decision = &results["decision"];
+    assert_eq!(
+        (&decision["candidates"], &decision["futures"]),
+        (&16.into(), &2.into())
+    );
+    assert!(decision["milliseconds"]["frames"].as_f64().unwrap() > 0.0);
+    let page = fs::read_to_string(place.path("out/explain.html")).unwrap();
+    assert_eq!(page.matches("data:image/gif;base64,").count(), 16);
+    for part in ["What the others did", "time_to_collision", "vehicle 1"] {
+        assert!(page.contains(part), "{part}");
+    }
+    let viewer = fs::read_to_string(place.path("out/viewer.html")).unwrap();
+    assert!(viewer.contains("\"chosen\":true"));
+    let blind = format!("{plan} --planner pdm-closed --explain 5");
+    place.fails(
+        &blind,
+        2,
+        &["--explain 5", "planner that imagines", "pdm-closed"],
+    );
+}
+
 /// Two made-up scenes of 9.1 s with a road.
 fn two_scenes(place: &Workplace) -> &'static str {
     let scenes = [8.0, 5.0].map(|speed| {

@@ -6,6 +6,7 @@ pub(crate) mod ci;
 pub(crate) mod data;
 pub(crate) mod demo;
 pub(crate) mod evaluate;
+mod explain;
 pub(crate) mod plan;
 pub(crate) mod simulate;
 pub(crate) mod submit;

@@ -1,17 +1,20 @@
 //! `plan`: one planner through one scenario, with everything it considered.
 
 use gump_planner::closed_loop::{Scored, drive_and_score};
-use gump_planner::{Considered, Explain};
+use gump_planner::{Considered, Decision, Explain};
 use gump_rollout::BoxError;
 use gump_rollout::closed_loop::{Driver, Mission, Moment};
 use gump_rollout::dynamics::Trajectory;
+use gump_scene::{Frame, Scenario};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::evaluate::Driving;
+use super::explain;
+use crate::cli::WrongArguments;
 use crate::futures;
-use crate::planners::{PlannerName, Surroundings, Timed};
-use crate::recordings;
+use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
+use crate::recordings::{self, Case};
 use crate::run::{Common, Run};
 use crate::worlds::{Sampling, WorldName};
 
@@ -27,9 +30,15 @@ pub(crate) struct Args {
     /// Whom it meets, and what it imagines in: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
+    /// Write a page on the decision of a step [default: the first]
+    #[arg(long, value_name = "STEP", num_args = 0..=1, default_missing_value = "0")]
+    explain: Option<usize>,
     #[command(flatten)]
     #[serde(flatten)]
     driving: Driving,
+    #[command(flatten)]
+    #[serde(flatten)]
+    thinking: Thinking,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -42,6 +51,9 @@ pub(crate) struct Args {
 struct Noted<'a> {
     inner: Box<dyn Explain + 'a>,
     steps: Vec<Vec<Considered>>,
+    /// The step to explain, and then its past with the decision.
+    explain: Option<usize>,
+    explained: Option<(Vec<Frame>, Decision)>,
 }
 
 impl Driver for Noted<'_> {
@@ -56,6 +68,11 @@ impl Driver for Noted<'_> {
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let plan = self.inner.drive(moment)?;
         self.steps.push(self.inner.considered());
+        if self.explain == Some(moment.iteration) {
+            let past = moment.scene.history.to_vec();
+            let decision = self.inner.decision().cloned();
+            self.explained = decision.map(|decision| (past, decision));
+        }
         Ok(plan)
     }
 }
@@ -67,12 +84,19 @@ impl Args {
         let case = run.phase("read", |_| recordings::find(&self.scenario))?;
         let surroundings = run.phase("load", |_| Surroundings::load(&self.world, &sampling))?;
         let seed = run.seed();
-        let imagination = surroundings.imagination();
+        let imagined = run.phase("load", |_| {
+            Surroundings::load_imagination(&self.world, &sampling)
+        })?;
+        let imagination = imagined.imagination();
         let inner = self
             .planner
-            .build(&case, imagination, seed, self.driving.replan_every())?;
-        let steps = Vec::new();
-        let mut noted = Noted { inner, steps };
+            .build(&case, imagination, seed, &self.thinking)?;
+        let mut noted = Noted {
+            inner,
+            steps: Vec::new(),
+            explain: self.explain,
+            explained: None,
+        };
         let mut timed = Timed::new(&mut noted, self.driving.budget());
         let mut traffic = surroundings.traffic(seed);
         let config = self.driving.config();
@@ -92,7 +116,8 @@ impl Args {
             let label = format!("{} among {}", self.planner.name(), self.world);
             let film = futures::film(scenario, &[(&label, &scored.driven.rollout)])?;
             film.save(&run.path("film.gif"))?;
-            write_candidates(run, &noted.steps)
+            write_candidates(run, &noted.steps)?;
+            self.explain(run, &case, &noted)
         })?;
         run.result("scenario", &scenario.id)?;
         run.result("planner", self.planner.name())?;
@@ -105,6 +130,33 @@ impl Args {
             "candidates",
             first.iter().map(candidate).collect::<Vec<_>>(),
         )
+    }
+}
+
+impl Args {
+    /// Writes the page of the decision that was asked for.
+    ///
+    /// Error: a planner that imagines nothing, a step that is no decision's.
+    fn explain(&self, run: &mut Run, case: &Case, noted: &Noted<'_>) -> anyhow::Result<()> {
+        let Some(step) = self.explain else {
+            return Ok(());
+        };
+        let Some((past, decision)) = &noted.explained else {
+            let wrong = format!(
+                "--explain {step}: expected a step of the drive and a planner that imagines, \
+                 found {} steps of {}",
+                noted.steps.len(),
+                self.planner.name()
+            );
+            return Err(WrongArguments(wrong).into());
+        };
+        let scenario = Scenario {
+            now: past.len() - 1,
+            log: past.clone(),
+            ..case.recording.scenario().clone()
+        };
+        explain::write(run, &scenario, case.recording.vehicle(), decision)?;
+        run.result("decision", explain::summary(decision))
     }
 }
 

@@ -1,5 +1,6 @@
 //! `evaluate closed-loop`: how well a planner drives, as nuPlan scores it.
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
@@ -7,20 +8,23 @@ use std::time::Duration;
 use gump_metrics::interval;
 use gump_metrics::nuplan::MetricScores;
 use gump_planner::closed_loop::{Scored, drive_and_score, evaluate};
+use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
+use gump_rollout::WorldModel;
 use gump_rollout::closed_loop::{DriveConfig, Tracking};
 use gump_scene::Seed;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::ranking;
 use crate::cli::WrongArguments;
 use crate::futures;
-use crate::planners::{PlannerName, Surroundings, Timed};
+use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run, interrupted};
 use crate::worlds::{Sampling, WorldName};
 
 /// Columns of the table, by nuPlan's names of the metrics.
-const COLUMNS: [(&str, &str); 8] = [
+pub(super) const COLUMNS: [(&str, &str); 8] = [
     ("no_at_fault_collisions", "no_ego_at_fault_collisions"),
     ("drivable_area", "drivable_area_compliance"),
     ("driving_direction", "driving_direction_compliance"),
@@ -37,18 +41,24 @@ pub(crate) struct Args {
     /// A file or folder of scenarios
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
-    /// Who plans; several for several rows
-    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1..)]
+    /// Who plans; several, apart by commas, for several rows
+    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
-    /// log, idm, constant-velocity or model:WEIGHTS; several for several rows
-    #[arg(long, value_name = "W", default_value = "idm", num_args = 1..)]
+    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, for several tables
+    #[arg(long, value_name = "W", default_value = "idm", num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
+    /// What planners imagine in [default: the learned world of --world, else idm]
+    #[arg(long, value_name = "W")]
+    imagination: Option<WorldName>,
     #[command(flatten)]
     #[serde(flatten)]
     driving: Driving,
+    #[command(flatten)]
+    #[serde(flatten)]
+    thinking: Thinking,
     /// At most so many scenarios [default: all]
     #[arg(long, value_name = "N")]
-    limit: Option<usize>,
+    limit: Option<NonZeroUsize>,
     /// Films of the first so many scenarios
     #[arg(long, value_name = "N", default_value_t = 2)]
     films: usize,
@@ -69,9 +79,6 @@ pub(crate) struct Driving {
     /// How the ego follows its plans
     #[arg(long, value_enum, default_value_t = TrackingName::TwoStage)]
     controller: TrackingName,
-    /// The interactive planner plans at every N-th step
-    #[arg(long, value_name = "N", default_value_t = 5)]
-    replan_every: usize,
     /// A planner that takes longer for a step has failed [default: no limit]
     #[arg(long, value_name = "MS")]
     budget_ms: Option<f64>,
@@ -120,11 +127,6 @@ impl Driving {
     pub(crate) fn budget(&self) -> Option<Duration> {
         self.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3))
     }
-
-    /// Steps between the plans of the interactive planner.
-    pub(crate) fn replan_every(&self) -> usize {
-        self.replan_every
-    }
 }
 
 /// One drive by one planner.
@@ -136,28 +138,69 @@ pub(crate) struct Finished {
 }
 
 /// What one scenario got.
-struct Entry {
+#[derive(Clone)]
+pub(super) struct Entry {
     id: String,
     outcome: Result<(f64, MetricScores, f64), String>,
+}
+
+/// A row of a world's table: one planner, every scenario.
+pub(super) struct Drives {
+    /// Who drove.
+    pub(super) planner: String,
+    entries: Vec<Entry>,
+}
+
+impl Drives {
+    /// The scores of the scenarios, in their order; `None` where one failed.
+    pub(super) fn scores(&self) -> impl Iterator<Item = Option<f64>> + '_ {
+        let score = |entry: &Entry| entry.outcome.as_ref().ok().map(|(score, ..)| *score);
+        self.entries.iter().map(score)
+    }
 }
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
         let sampling = self.sampling.resolve()?;
+        let learned = |world: &&WorldName| matches!(world, WorldName::Model(_));
+        let imagination = self
+            .imagination
+            .as_ref()
+            .or_else(|| self.world.iter().find(learned));
+        let imagination = imagination.unwrap_or(&WorldName::Idm);
+        let imagined = run.phase("load", |_| {
+            Surroundings::load_imagination(imagination, &sampling)
+        })?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
+        let mut worlds = Vec::new();
         for world in &self.world {
             let surroundings = run.phase("load", |_| Surroundings::load(world, &sampling))?;
+            let mut drives = Vec::new();
             for &planner in &self.planner {
-                let entries = run.phase("drive", |run| {
-                    self.drive(run, planner, &surroundings, world)
-                })?;
-                let row = row(planner.name(), &world.to_string(), &entries, run.seed());
-                rows.push(row);
-                scenarios.extend(entries.iter().map(|e| e.tell(planner.name(), world)));
+                let drive = Drive {
+                    args: self,
+                    world,
+                    surroundings: &surroundings,
+                    imagination: imagined.imagination(),
+                };
+                drives.extend(run.phase("drive", |run| drive.all(run, planner))?);
             }
+            let told = drives.iter().map(|drives| row(drives, world, run.seed()));
+            let told: Vec<Value> = told.collect();
+            if self.world.len() > 1 {
+                run.say(&ranking::table_of(world, &told));
+            }
+            rows.extend(told);
+            let entries = drives
+                .iter()
+                .flat_map(|d| d.entries.iter().map(|e| e.tell(&d.planner, world)));
+            scenarios.extend(entries);
+            worlds.push((world.to_string(), drives));
         }
+        run.result("imagination", imagination)?;
         run.result("rows", rows)?;
+        ranking::tell(run, &worlds)?;
         run.result("scenarios", &scenarios)?;
         let all_failed = scenarios.iter().all(|entry| entry["error"].is_string());
         anyhow::ensure!(
@@ -167,28 +210,81 @@ impl Args {
         Ok(())
     }
 
+    /// Scenarios to drive through.
+    fn limit(&self) -> usize {
+        self.limit.map_or(usize::MAX, NonZeroUsize::get)
+    }
+}
+
+/// What the drives of one row share.
+struct Drive<'a> {
+    args: &'a Args,
+    world: &'a WorldName,
+    surroundings: &'a Surroundings,
+    imagination: &'a dyn WorldModel,
+}
+
+impl Drive<'_> {
+    /// The rows of a planner; nearly all have one.
+    fn all(&self, run: &Run, planner: PlannerName) -> anyhow::Result<Vec<Drives>> {
+        if planner != PlannerName::Proposals {
+            let thinking = &self.args.thinking;
+            let entries = self.through(run, planner.name(), &|case, seed| {
+                planner.build(case, self.imagination, seed, thinking)
+            })?;
+            return Ok(vec![Drives {
+                planner: planner.name().into(),
+                entries,
+            }]);
+        }
+        let all = PdmConfig::default();
+        let mut alone = Vec::new();
+        for &lateral_offset in &all.lateral_offsets {
+            for &speed_fraction in &all.speed_fractions {
+                let kind = ProposalKind::Idm {
+                    speed_fraction,
+                    lateral_offset,
+                };
+                let name = kind.to_string();
+                let entries = self.through(run, &name, &|_, _| {
+                    let only = PdmConfig {
+                        speed_fractions: vec![speed_fraction],
+                        lateral_offsets: vec![lateral_offset],
+                        ..PdmConfig::default()
+                    };
+                    Ok(Box::new(PdmClosed::new(only)?))
+                })?;
+                alone.push(Drives {
+                    planner: name,
+                    entries,
+                });
+            }
+        }
+        Ok(best_and_oracle(alone))
+    }
+
     /// Drives every scenario; those that fail say why.
-    fn drive(
+    fn through<'d>(
         &self,
         run: &Run,
-        planner: PlannerName,
-        surroundings: &Surroundings,
-        world: &WorldName,
+        name: &str,
+        build: &(dyn Fn(&Case, Seed) -> anyhow::Result<Box<dyn Explain + 'd>> + Sync),
     ) -> anyhow::Result<Vec<Entry>> {
-        let cases = recordings::open(&self.scenarios)?;
-        let cases = cases
-            .take(self.limit.unwrap_or(usize::MAX))
-            .take_while(|_| !interrupted());
-        let label = format!("{} among {world}", planner.name());
-        let progress = run.progress(&label, self.limit.unwrap_or(0) as u64, "scenarios");
+        let args = self.args;
+        let cases = recordings::open(&args.scenarios)?;
+        let cases = cases.take(args.limit()).take_while(|_| !interrupted());
+        let label = format!("{name} among {}", self.world);
+        let total = args.limit.map_or(0, NonZeroUsize::get) as u64;
+        let progress = run.progress(&label, total, "scenarios");
         let film_error = Mutex::new(None);
         let entries = evaluate(cases, |i, named: Named| {
             let seed = run.seed().fork(i as u64);
             let finished = named.case.and_then(|case| {
-                let finished = drive_one(&case, planner, surroundings, &self.driving, seed)?;
-                if i < self.films {
-                    let name = format!("{i}-{}-{}.gif", planner.name(), short(world));
-                    if let Err(error) = film(run, &case, &finished.scored, &label, &name) {
+                let mut driver = build(&case, seed)?;
+                let finished = drive_one(&case, &mut *driver, self.surroundings, args, seed)?;
+                if i < args.films {
+                    let file = format!("{i}-{}-{}.gif", file_name(name), short(self.world));
+                    if let Err(error) = film(run, &case, &finished.scored, &label, &file) {
                         *film_error.lock().expect("nobody panics while holding it") = Some(error);
                     }
                 }
@@ -209,6 +305,42 @@ impl Args {
         crate::run::stop_if_interrupted()?;
         failed.map_or(Ok(entries), Err)
     }
+}
+
+/// Of proposals that were each driven to the end: the one that is best on average, and the best of
+/// every scenario, which no one who does not know the outcome can choose.
+fn best_and_oracle(mut alone: Vec<Drives>) -> Vec<Drives> {
+    let average = |drives: &Drives| mean(&drives.scores().flatten().collect::<Vec<_>>());
+    let value = |drives: &Drives| average(drives).unwrap_or(f64::NEG_INFINITY);
+    let best = (0..alone.len()).fold(0, |best, i| {
+        if value(&alone[i]) > value(&alone[best]) {
+            i
+        } else {
+            best
+        }
+    });
+    let n = alone[best].entries.len();
+    let oracle = (0..n).map(|scene| {
+        let entries = alone.iter().map(|drives| &drives.entries[scene]);
+        let mut finished: Vec<&Entry> = entries.collect();
+        let score = |entry: &Entry| entry.outcome.as_ref().map_or(-1.0, |(score, ..)| *score);
+        // The first of the best: the sort is stable.
+        finished.sort_by(|a, b| score(b).total_cmp(&score(a)));
+        finished[0].clone()
+    });
+    let oracle = Drives {
+        planner: "oracle of the proposals".into(),
+        entries: oracle.collect(),
+    };
+    let mut best = alone.swap_remove(best);
+    best.planner = format!("best proposal: {}", best.planner);
+    vec![best, oracle]
+}
+
+/// A name without what file systems dislike.
+fn file_name(name: &str) -> String {
+    let plain = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
+    name.chars().map(plain).collect()
 }
 
 /// A film of what was driven beside the log.
@@ -233,18 +365,16 @@ pub(crate) fn short(world: &WorldName) -> String {
 /// One planner through one case.
 ///
 /// Error: what the planner, the traffic or the recording fail at.
-pub(crate) fn drive_one(
+fn drive_one(
     case: &Case,
-    planner: PlannerName,
+    driver: &mut dyn Explain,
     surroundings: &Surroundings,
-    driving: &Driving,
+    args: &Args,
     seed: Seed,
 ) -> anyhow::Result<Finished> {
-    let imagination = surroundings.imagination();
-    let mut driver = planner.build(case, imagination, seed, driving.replan_every())?;
-    let mut timed = Timed::new(&mut *driver, driving.budget());
+    let mut timed = Timed::new(driver, args.driving.budget());
     let mut traffic = surroundings.traffic(seed);
-    let config = driving.config();
+    let config = args.driving.config();
     let scored = drive_and_score(
         &case.recording,
         &case.map,
@@ -280,7 +410,8 @@ impl Entry {
 }
 
 /// Means over the scenarios that were driven to the end; how many were not stands beside them.
-fn row(planner: &str, world: &str, entries: &[Entry], seed: Seed) -> Value {
+fn row(drives: &Drives, world: &WorldName, seed: Seed) -> Value {
+    let entries = &drives.entries;
     let done: Vec<_> = entries
         .iter()
         .filter_map(|e| e.outcome.as_ref().ok())
@@ -288,8 +419,8 @@ fn row(planner: &str, world: &str, entries: &[Entry], seed: Seed) -> Value {
     let scores: Vec<f64> = done.iter().map(|(score, ..)| *score).collect();
     let span = interval(&scores, seed);
     let mut row = json!({
-        "planner": planner,
-        "world": world,
+        "planner": drives.planner,
+        "world": world.to_string(),
         "scenarios": entries.len(),
         "failed": entries.len() - done.len(),
         "score": mean(&scores),

@@ -9,6 +9,7 @@ mod ledger;
 mod merge;
 pub(crate) mod motion;
 mod open_loop;
+mod ranking;
 mod shard;
 pub(crate) mod wosac;
 

@@ -1,5 +1,6 @@
 //! `evaluate open-loop`: how near a planner's plans are to what was driven, as nuPlan scores it.
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use gump_metrics::interval;
@@ -10,7 +11,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
-use crate::planners::{PlannerName, Surroundings};
+use crate::planners::{PlannerName, Surroundings, Thinking};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run};
 use crate::worlds::{Sampling, WorldName};
@@ -25,14 +26,17 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
     /// Who plans; several for several rows
-    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1..)]
+    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
-    /// What the interactive planner imagines in: idm or model:WEIGHTS
+    /// What planners imagine in: idm or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
     /// At most so many scenarios [default: all]
     #[arg(long, value_name = "N")]
-    limit: Option<usize>,
+    limit: Option<NonZeroUsize>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    thinking: Thinking,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -46,7 +50,9 @@ type Outcome = (String, anyhow::Result<OpenLoop>);
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let sampling = self.sampling.resolve()?;
-        let surroundings = run.phase("load", |_| Surroundings::load(&self.world, &sampling))?;
+        let surroundings = run.phase("load", |_| {
+            Surroundings::load_imagination(&self.world, &sampling)
+        })?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         for &planner in &self.planner {
             let outcomes = run.phase("plan", |run| self.plan(run, planner, &surroundings))?;
@@ -69,12 +75,15 @@ impl Args {
         planner: PlannerName,
         surroundings: &Surroundings,
     ) -> anyhow::Result<Vec<Outcome>> {
-        let cases = recordings::open(&self.scenarios)?.take(self.limit.unwrap_or(usize::MAX));
-        let progress = run.progress(planner.name(), self.limit.unwrap_or(0) as u64, "scenarios");
+        let cases = recordings::open(&self.scenarios)?;
+        let limit = self.limit.map(NonZeroUsize::get);
+        let cases = cases.take(limit.unwrap_or(usize::MAX));
+        let progress = run.progress(planner.name(), limit.unwrap_or(0) as u64, "scenarios");
         let outcomes = evaluate(cases, |i, named: Named| {
             let outcome = named.case.and_then(|case| {
                 let seed = run.seed().fork(i as u64);
-                let mut driver = planner.build(&case, surroundings.imagination(), seed, 10)?;
+                let imagination = surroundings.imagination();
+                let mut driver = planner.build(&case, imagination, seed, &self.thinking)?;
                 let seconds = comparable_seconds(&case);
                 let (recording, after) = (&case.recording, &case.after);
                 let mut traffic = Replayed;
