@@ -216,6 +216,9 @@ impl Args {
     }
 }
 
+/// Makes the driver of a case.
+type Build<'b, 'd> = &'b (dyn Fn(&Case, Seed) -> anyhow::Result<Box<dyn Explain + 'd>> + Sync);
+
 /// What the drives of one row share.
 struct Drive<'a> {
     args: &'a Args,
@@ -268,7 +271,7 @@ impl Drive<'_> {
         &self,
         run: &Run,
         name: &str,
-        build: &(dyn Fn(&Case, Seed) -> anyhow::Result<Box<dyn Explain + 'd>> + Sync),
+        build: Build<'_, 'd>,
     ) -> anyhow::Result<Vec<Entry>> {
         let args = self.args;
         let cases = recordings::open(&args.scenarios)?;
