@@ -24,6 +24,7 @@ pub mod config;
 mod decode;
 mod decoder;
 mod draw;
+mod drift;
 mod embedding;
 mod engine;
 mod error;

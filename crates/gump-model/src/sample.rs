@@ -22,6 +22,7 @@ use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::closed_loop::Drive;
 use crate::decoder::{CONTROL_KEYS, STEPS};
+use crate::drift;
 use crate::network::Network;
 use crate::surroundings::Survey;
 use crate::trajectory::{FUTURE, PAST, POSE};
@@ -57,6 +58,10 @@ pub struct SampleConfig {
     pub agent_dropout: f64,
     /// Probability of blanking a frame (paper: 0.1).
     pub frame_dropout: f64,
+    /// Probability that what drives is shown a little off its way, with the way back asked for.
+    pub sway: f64,
+    /// The farthest that it is pushed to a side at once, metres.
+    pub sway_m: f64,
     /// Probability that the last frame's values are seen perturbed, as partial-AR decoding sees
     /// surrogates; the targets stay true.
     pub surrogate_noise: f64,
@@ -81,6 +86,8 @@ impl Default for SampleConfig {
             translation_m: 5.0,
             agent_dropout: 0.1,
             frame_dropout: 0.1,
+            sway: 0.0,
+            sway_m: 0.8,
             surrogate_noise: 0.5,
             shuffle_ids: true,
             prompt_dropout: 0.5,
@@ -100,6 +107,7 @@ impl SampleConfig {
             augment: 0.0,
             agent_dropout: 0.0,
             frame_dropout: 0.0,
+            sway: 0.0,
             surrogate_noise: 0.0,
             shuffle_ids: false,
             prompt_dropout: 1.0,
@@ -278,7 +286,25 @@ pub(crate) fn draw(
     seed: Seed,
 ) -> Option<Sample> {
     let mut rng = seed.rng();
-    let window = choose_window(scenario, driven, config, &mut rng)?;
+    let mut window = choose_window(scenario, driven, config, &mut rng)?;
+    let swaying = if driven.is_none() && rng.random_bool(config.sway) {
+        let (start, stride) = (window.start, window.stride);
+        let drive = drift::sway(
+            scenario,
+            start,
+            stride,
+            config.frames,
+            config.sway_m,
+            &mut rng,
+        );
+        Some(drive)
+    } else {
+        None
+    };
+    if let Some(drive) = &swaying {
+        let slack = drift::SLACK;
+        window.driven = Some(Driven { drive, slack });
+    }
     let frames: Vec<Frame> = (0..config.frames)
         .filter_map(|i| Some(thin(window.seen(i, 0)?, &window, config)))
         .collect();
