@@ -9,6 +9,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::config;
 use crate::run::Run;
+use crate::verbs::ablate::Knob;
 use crate::verbs::{ablate, bench, ci, data, demo, evaluate, plan, simulate, submit, tidy, train};
 
 /// The generative world model for driving: every pipeline as a verb.
@@ -123,6 +124,22 @@ impl Cli {
             Verb::Ablate(ablate::Verb::Quantization(args)) => {
                 Run::of("ablate quantization", &args.common, &args)?
                     .execute(|run| args.execute(run))
+            }
+            Verb::Ablate(ablate::Verb::Temperature(args)) => {
+                Run::of("ablate temperature", &args.common, &args)?
+                    .execute(|run| args.execute(run, Knob::Temperature))
+            }
+            Verb::Ablate(ablate::Verb::Decay(args)) => {
+                Run::of("ablate decay", &args.common, &args)?
+                    .execute(|run| args.execute(run, Knob::Decay))
+            }
+            Verb::Ablate(ablate::Verb::History(args)) => {
+                Run::of("ablate history", &args.common, &args)?
+                    .execute(|run| args.execute(run, Knob::History))
+            }
+            Verb::Ablate(ablate::Verb::Chunking(args)) => {
+                Run::of("ablate chunking", &args.common, &args)?
+                    .execute(|run| args.execute(run, Knob::Chunking))
             }
             Verb::Bench(bench::Verb::Engine(args)) => {
                 Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))

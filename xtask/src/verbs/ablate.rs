@@ -1,5 +1,6 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
+mod decoding;
 mod quantization;
 
 use std::num::NonZeroUsize;
@@ -12,6 +13,7 @@ use gump_viz::Picture;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
+pub(crate) use self::decoding::Knob;
 use crate::futures;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
@@ -25,6 +27,14 @@ pub(crate) enum Verb {
     Nar(Args),
     /// Weights in 32, 16 and 8 bits
     Quantization(quantization::Args),
+    /// Realism over the temperature of the draws
+    Temperature(decoding::Args),
+    /// Realism over the weight of earlier predictions
+    Decay(decoding::Args),
+    /// Realism over the frames of history that are seen
+    History(decoding::Args),
+    /// One pose at a time against chunks of four, without and with averaging
+    Chunking(decoding::Args),
 }
 
 /// Arguments of `ablate nar`.

@@ -26,7 +26,7 @@ use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
 use crate::worlds::{Sampling, WorldName};
 pub(crate) use recording::{Recorded, recordings};
-use rollouts::Source;
+pub(crate) use rollouts::Source;
 pub(crate) use tell::tell_merged;
 
 /// Name of the benchmark in ledgers.

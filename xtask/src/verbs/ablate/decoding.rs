@@ -1,0 +1,198 @@
+//! `ablate temperature|decay|history|chunking`: how decoding changes realism.
+//!
+//! One knob at a time; scenes, seeds and weights stay. Realism is that of the Waymo Sim Agents
+//! Challenge, since displacements alone would reward timid futures.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use gump_metrics::interval;
+use gump_metrics::wosac::{Config, Reference, Scores, Year};
+use gump_model::{Mode, SamplingConfig, Surrogate};
+use gump_scene::Seed;
+use gump_viz::{Chart, Series};
+use serde::Serialize;
+use serde_json::json;
+
+use crate::cli::WrongArguments;
+use crate::run::{Common, Run, stop_if_interrupted};
+use crate::shipped;
+use crate::verbs::evaluate::wosac::{Source, recordings};
+use crate::worlds::{Draw, WorldName};
+
+/// Arguments of the ablations of decoding.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// File or folder of recorded scenarios [default: the shipped procedural ones]
+    #[arg(long, value_name = "PATH")]
+    scenarios: Option<PathBuf>,
+    /// model:WEIGHTS [default: the shipped weights]
+    #[arg(long, value_name = "W")]
+    world: Option<WorldName>,
+    /// Rollouts of each scenario
+    #[arg(long, value_name = "N", default_value = "8")]
+    rollouts_per_scenario: NonZeroUsize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    draw: Draw,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What is turned.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Knob {
+    Temperature,
+    Decay,
+    History,
+    Chunking,
+}
+
+/// One setting of a knob: what the table calls it, its place on the axis, how to decode.
+type Setting = (String, f64, SamplingConfig);
+
+impl Knob {
+    /// What the horizontal axis says.
+    fn label(self) -> &'static str {
+        match self {
+            Self::Temperature => "temperature",
+            Self::Decay => "decay (0: no averaging)",
+            Self::History => "frames of history, half a second apart",
+            Self::Chunking => "1: one pose, 2: surrogates from chunks, 3: chunks averaged",
+        }
+    }
+
+    fn settings(self, base: &SamplingConfig) -> Vec<Setting> {
+        let with = |value: f64, change: &dyn Fn(&mut SamplingConfig)| {
+            let mut config = base.clone();
+            change(&mut config);
+            (value.to_string(), value, config)
+        };
+        match self {
+            Self::Temperature => [0.3, 0.5, 0.7, 0.9, 1.1, 1.3]
+                .map(|t| with(t, &|config| config.temperature = t))
+                .into(),
+            Self::Decay => [0.0, 0.3, 0.6, 0.9, 1.2, 1.5]
+                .map(|decay| with(decay, &|config| config.decay = decay))
+                .into(),
+            Self::History => [1, 2, 3, 4]
+                .map(|frames| with(frames as f64, &|config| config.history = frames))
+                .into(),
+            Self::Chunking => {
+                let average = if base.decay > 0.0 { base.decay } else { 1.2 };
+                let ways = [
+                    ("one pose", Surrogate::ConstantVelocity, 0.0),
+                    ("surrogates from chunks", Surrogate::Chunk, 0.0),
+                    ("chunks averaged", Surrogate::Chunk, average),
+                ];
+                let setting = |(i, (name, surrogate, decay)): (usize, (&str, _, _))| {
+                    let config = SamplingConfig {
+                        surrogate,
+                        decay,
+                        ..base.clone()
+                    };
+                    (name.to_owned(), (i + 1) as f64, config)
+                };
+                ways.into_iter().enumerate().map(setting).collect()
+            }
+        }
+    }
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run, knob: Knob) -> anyhow::Result<()> {
+        let world = self.world.clone().unwrap_or_else(shipped::world);
+        if !matches!(world, WorldName::Model(_)) {
+            let wrong = format!("--world: expected model:WEIGHTS, found {world}");
+            return Err(WrongArguments(wrong).into());
+        }
+        let procedural = || shipped::data().join("procedural.tfrecord.gz");
+        let path = self.scenarios.clone().unwrap_or_else(procedural);
+        run.setting("scenarios", path.display().to_string())?;
+        let settings = knob.settings(&self.draw.resolve(Mode::PartialAr)?);
+        let mut rows = Vec::new();
+        let mut curve = Vec::new();
+        for (name, at, sampling) in settings {
+            let scores = run.phase(&name, |run| self.score(run, &path, &world, sampling))?;
+            let mean = Scores::mean(&scores)
+                .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
+            let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
+            let interval = interval(&metametrics, Seed(0));
+            curve.push((at, mean.metametric));
+            rows.push(json!({
+                "setting": name,
+                "metametric": mean.metametric,
+                "low": interval.map(|interval| interval.low),
+                "high": interval.map(|interval| interval.high),
+                "kinematic": mean.kinematic,
+                "interactive": mean.interactive,
+                "map_based": mean.map_based,
+                "min_ade": mean.min_ade,
+                "ade": mean.ade,
+                "collision_rate": mean.collision_rate,
+                "offroad_rate": mean.offroad_rate,
+            }));
+        }
+        run.result("rows", rows)?;
+        let chart = Chart {
+            x_label: knob.label().into(),
+            y_label: "realism meta-metric of 2025".into(),
+            markers: true,
+            series: vec![Series {
+                name: String::new(),
+                points: curve,
+            }],
+            ..Chart::default()
+        };
+        std::fs::write(run.path("realism.svg"), chart.to_svg()?)?;
+        Ok(())
+    }
+
+    fn score(
+        &self,
+        run: &Run,
+        path: &std::path::Path,
+        world: &WorldName,
+        sampling: SamplingConfig,
+    ) -> anyhow::Result<Vec<Scores>> {
+        let config = Config::of(Year::Y2025);
+        let n = self.rollouts_per_scenario.get();
+        let mut source = Source::world(world.clone(), sampling, n, run.seed());
+        let progress = run.progress("evaluating", 0, "scenarios");
+        let mut all = Vec::new();
+        for recorded in recordings(path, source.read_options(), |_| true)? {
+            stop_if_interrupted()?;
+            let recorded = recorded?;
+            let rollouts = source.rollouts(run, &recorded, config.mode)?;
+            let reference = Reference::new(&recorded.log, &config)?;
+            all.push(reference.evaluate(&rollouts)?.scores);
+            progress.advance(1);
+        }
+        Ok(all)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_knob_turns_nothing_else() {
+        let base = SamplingConfig::default();
+        let strip = |config: SamplingConfig| SamplingConfig {
+            temperature: base.temperature,
+            ..config
+        };
+        let settings = Knob::Temperature.settings(&base);
+        assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
+        for (_, at, config) in settings {
+            assert_eq!(config.temperature, at);
+            assert_eq!(strip(config), base);
+        }
+        let chunking = Knob::Chunking.settings(&base);
+        assert_eq!(chunking[2].2, base);
+        assert_eq!(chunking[0].2.surrogate, Surrogate::ConstantVelocity);
+    }
+}
