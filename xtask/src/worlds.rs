@@ -189,6 +189,9 @@ pub(crate) struct Draw {
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 1.2]
     #[arg(long, value_name = "X")]
     decay: Option<f64>,
+    /// Draws again at most that often what would run into something, 0 for never [default: 4]
+    #[arg(long, value_name = "N")]
+    redraws: Option<usize>,
 }
 
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
@@ -257,6 +260,7 @@ impl Draw {
             temperature: self.temperature.unwrap_or(default.temperature),
             top_k: self.top_k.unwrap_or(default.top_k),
             decay: self.decay.unwrap_or(default.decay),
+            redraws: self.redraws.unwrap_or(default.redraws),
             ..default
         };
         let wrong = if !(config.temperature > 0.0 && config.temperature.is_finite()) {

@@ -4,11 +4,14 @@
 //! decoded. What does not: the arithmetic (`engine`), the same for other devices (`plain`), and
 //! what becomes of the states (`future`).
 
+use std::convert::Infallible;
+
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::batch::{PlacedSlot, place};
+use crate::clearance::redraw;
 use crate::engine::{Context, Engine, Job, SceneMemory};
 use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
 
@@ -100,7 +103,24 @@ impl Step<'_> {
         let bins = self.engine.sample(&hidden, &requests, self.sampling);
         let mut bins = bins.into_iter();
         let each = self.windows.iter().map(|w| w.next.tracked.len());
-        each.map(|n| bins.by_ref().take(n).collect()).collect()
+        let mut decoded: Vec<Vec<Bins>> = each
+            .clone()
+            .map(|n| bins.by_ref().take(n).collect())
+            .collect();
+        let c = self.engine.width();
+        let firsts: Vec<usize> = each
+            .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
+            .collect();
+        let again = |who: &[(usize, usize)], requests: &[Request]| {
+            let rows = who
+                .iter()
+                .flat_map(|(w, i)| &hidden[(firsts[*w] + i) * c..][..c]);
+            let rows: Vec<f32> = rows.copied().collect();
+            let requests: Vec<&Request> = requests.iter().collect();
+            Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
+        };
+        let Ok(()) = redraw(self.windows, &mut decoded, self.sampling, again);
+        decoded
     }
 
     /// Full autoregression: each object sees the final states of those before it. The windows go

@@ -19,6 +19,7 @@ mod aggregation;
 mod anchor;
 mod batch;
 pub mod checkpoint;
+mod clearance;
 mod closed_loop;
 pub mod config;
 mod decode;

@@ -13,6 +13,7 @@ use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::batch::PlacedSlot;
+use crate::clearance::redraw;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::draw::draw_field;
@@ -145,10 +146,26 @@ impl Group<'_> {
             .collect();
         let mut bins =
             sample_states(passes.network, &keys, &requests, passes.sampling)?.into_iter();
-        Ok(counts
-            .into_iter()
-            .map(|n| bins.by_ref().take(n).collect())
-            .collect())
+        let mut decoded: Vec<Vec<Bins>> = counts
+            .iter()
+            .map(|&n| bins.by_ref().take(n).collect())
+            .collect();
+        let firsts: Vec<usize> = counts
+            .iter()
+            .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
+            .collect();
+        redraw(
+            &self.windows,
+            &mut decoded,
+            passes.sampling,
+            |who, requests| {
+                let rows = who.iter().map(|(w, i)| (firsts[*w] + i) as u32);
+                let rows = Tensor::from_iter(rows, keys.device())?;
+                let keys = keys.index_select(&rows, 0)?;
+                sample_states(passes.network, &keys, requests, passes.sampling)
+            },
+        )?;
+        Ok(decoded)
     }
 
     /// Full autoregression: each object sees the final states of those before it.

@@ -38,6 +38,9 @@ pub struct SamplingConfig {
     /// Whether agents come and leave and lights change as the network says (on a CPU); else those
     /// who are there stay, and lights keep the colour they were seen in.
     pub life: bool,
+    /// How often an object that would run into another within 1.5 s is drawn again at most (paper: 0);
+    /// in partial-AR decoding only.
+    pub redraws: usize,
     /// In which form the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
@@ -53,6 +56,7 @@ impl Default for SamplingConfig {
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
+            redraws: 4,
             precision: Precision::F32,
         }
     }

@@ -114,6 +114,11 @@ impl Engine {
         })
     }
 
+    /// Numbers of a hidden vector.
+    pub(crate) fn width(&self) -> usize {
+        self.width
+    }
+
     /// Multiplications made so far.
     pub(crate) fn products(&self) -> u64 {
         self.products.load(Ordering::Relaxed)
