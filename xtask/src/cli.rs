@@ -10,7 +10,9 @@ use clap::{CommandFactory, Parser, Subcommand};
 use crate::config;
 use crate::run::Run;
 use crate::verbs::ablate::Knob;
-use crate::verbs::{ablate, bench, ci, data, demo, evaluate, plan, simulate, submit, tidy, train};
+use crate::verbs::{
+    ablate, bench, ci, data, demo, evaluate, plan, rl, simulate, submit, tidy, train,
+};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -40,6 +42,9 @@ enum Verb {
     /// Measure on the benchmarks of the field.
     #[command(subcommand)]
     Evaluate(evaluate::Verb),
+    /// Learn to drive in a world, and see how well that went.
+    #[command(subcommand)]
+    Rl(rl::Verb),
     /// Pack results for a challenge, checked against its rules.
     #[command(subcommand)]
     Submit(submit::Verb),
@@ -114,6 +119,15 @@ impl Cli {
             }
             Verb::Evaluate(evaluate::Verb::Merge(args)) => {
                 Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Rl(rl::Verb::Train(args)) => {
+                Run::of("rl train", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Rl(rl::Verb::Evaluate(args)) => {
+                Run::of("rl evaluate", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Rl(rl::Verb::Table(args)) => {
+                Run::of("rl table", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Submit(submit::Verb::Wosac(args)) => {
                 Run::of("submit wosac", &args.common, &args)?.execute(|run| args.execute(run))

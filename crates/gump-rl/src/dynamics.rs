@@ -6,9 +6,11 @@
 use gump_geometry::{DVec2, Pose, angle_difference, dvec2};
 use gump_rollout::dynamics::drive;
 use gump_scene::AgentState;
+use serde::{Deserialize, Serialize};
 
 /// What an action stands for.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Dynamics {
     /// Two numbers, held for the step: acceleration (-1 the hardest braking, 0 none, 1 the hardest
     /// acceleration) and steering (the share of the sharpest turn possible at this speed, positive
@@ -23,7 +25,8 @@ pub enum Dynamics {
 }
 
 /// What a vehicle can do at most.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct BicycleLimits {
     /// Hardest braking, metres per second squared, < 0.
     pub min_acceleration: f64,
@@ -38,7 +41,8 @@ pub struct BicycleLimits {
 }
 
 /// How far a pose can lie from the one before.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct PoseLimits {
     /// Least metres ahead.
     pub min_dx: f64,

@@ -7,11 +7,13 @@
 use gump_geometry::OrientedBox;
 use gump_metrics::{ComfortBounds, Felt};
 use gump_scene::{Agent, AgentKind, AgentState, Frame};
+use serde::{Deserialize, Serialize};
 
 use crate::{Course, Dynamics, RlError};
 
 /// What is driven, for how long and for what.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Rules {
     /// What an action does to the ego.
     pub dynamics: Dynamics,
@@ -36,7 +38,8 @@ impl Default for Rules {
 ///
 /// What happened is measured as [`gump_metrics::Progress`], [`gump_metrics::Collision`],
 /// [`gump_metrics::OffRoad`] and [`gump_metrics::Discomfort`] do.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct RewardWeights {
     /// Per metre of progress along the route.
     pub progress: f64,

@@ -18,6 +18,8 @@ mod dynamics;
 mod env;
 mod episode;
 mod error;
+mod evaluate;
+mod imitation;
 pub mod networks;
 mod observation;
 pub mod sac;
@@ -29,6 +31,10 @@ pub use dynamics::{BicycleLimits, Dynamics, PoseLimits};
 pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling, Traffic};
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
 pub use error::RlError;
+pub use evaluate::{
+    Columns, Drive, Driver, LOGGED_PROGRESS, evaluate, paired_difference, score_by_scenario,
+};
+pub use imitation::demonstrations;
 pub use observation::{
     ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View, expand, observe,
 };

@@ -1,5 +1,6 @@
 //! What can be chosen about an environment.
 
+use serde::{Deserialize, Serialize};
 use std::fmt;
 
 use gump_rollout::WorldModel;
@@ -8,7 +9,8 @@ use super::Sampling;
 use crate::{ObservationSpec, RlError, Rules};
 
 /// How many episodes, and what is seen and done in them.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct EnvConfig {
     /// Episodes side by side, > 0.
     pub n_envs: usize,
@@ -38,7 +40,8 @@ impl Default for EnvConfig {
 /// When a row whose episode ended gets the next one.
 ///
 /// Source: the modes and names of Gymnasium 1.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Autoreset {
     /// Within the step that ends it; what the step led to is in the final observations.
     #[default]

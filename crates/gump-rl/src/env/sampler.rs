@@ -2,9 +2,11 @@
 
 use gump_scene::Seed;
 use rand::Rng as _;
+use serde::{Deserialize, Serialize};
 
 /// How episodes choose their scenarios.
-#[derive(Clone, Copy, Debug, PartialEq, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampling {
     /// Each scenario as often as any other.
     #[default]

@@ -5,6 +5,7 @@ mod raster;
 mod vector;
 
 use gump_scene::Frame;
+use serde::{Deserialize, Serialize};
 
 use crate::{Course, EpisodeState, RlError};
 
@@ -14,7 +15,8 @@ pub use raster::{RASTER_LAYERS, RasterView, expand};
 pub use vector::VectorView;
 
 /// What is seen.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum ObservationSpec {
     /// A short vector of numbers in the ego's frame.
     Vector(VectorView),

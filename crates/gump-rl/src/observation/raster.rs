@@ -6,12 +6,14 @@
 use gump_geometry::{Canvas, DVec2, Pose, dvec2, fill_polygon, stroke_polyline};
 use gump_raster::{Layer, RasterSpec, rasterize};
 use gump_scene::{AgentId, Frame, LightState};
+use serde::{Deserialize, Serialize};
 
 use super::View;
 use crate::Course;
 
 /// Size and scale of a raster observation; the ego is at its centre and faces up.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct RasterView {
     /// Pixels along each side of the square, a positive multiple of 8.
     pub side_px: usize,

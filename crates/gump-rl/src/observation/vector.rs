@@ -2,6 +2,7 @@
 
 use gump_geometry::{DVec2, Polyline, angle_difference, dvec2};
 use gump_scene::{Agent, LightState};
+use serde::{Deserialize, Serialize};
 
 use super::View;
 
@@ -22,7 +23,8 @@ use super::View;
 ///
 /// What is absent is zeros; rays are 1 on maps without road edges. Rays are traced through
 /// [`gump_metrics::Border::clearance`] and so are good to a few decimetres.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct VectorView {
     /// Points of the route ahead.
     pub n_route_points: usize,

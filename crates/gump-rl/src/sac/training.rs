@@ -166,6 +166,11 @@ impl Training {
         self.env_steps
     }
 
+    /// Steps that experts drove.
+    pub fn n_demonstrated(&self) -> usize {
+        self.expert.len()
+    }
+
     /// True once all gradient steps are done.
     pub fn is_done(&self) -> bool {
         self.steps() >= self.config().steps

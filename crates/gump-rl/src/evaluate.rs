@@ -1,0 +1,340 @@
+//! How well a policy drives: every scenario once per seed, and the paper's columns.
+
+use std::sync::Arc;
+
+use gump_metrics::{Interval, interval};
+use gump_scene::Seed;
+use rand::Rng as _;
+
+use crate::{
+    Actor, Autoreset, Course, DrivingEnv, EnvConfig, EpisodeStart, Outcome, RlError, Traffic,
+    VectorEnv,
+};
+
+/// Metres of progress of the logged drivers in the paper's test set, by which progress is divided.
+///
+/// Source: reproduces the paper's scores from its other columns.
+pub const LOGGED_PROGRESS: f64 = 62.0;
+
+/// Who drives.
+#[derive(Clone, Copy, Debug)]
+pub enum Driver<'a> {
+    /// A policy, by the mode of its distribution.
+    Learned(&'a Actor),
+    /// The log, as well as the dynamics can follow it: an oracle.
+    Expert,
+    /// Uniformly random actions.
+    Random,
+    /// One action for ever. Shape: `[action_len]`.
+    Constant(&'a [f32]),
+}
+
+/// How one episode went.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Drive {
+    /// Index of the scenario.
+    pub scenario: usize,
+    /// Which of the seeds.
+    pub repeat: usize,
+    /// True if the ego's box overlapped another.
+    pub collided: bool,
+    /// True if a corner of the ego's box left the road.
+    pub off_road: bool,
+    /// Metres along the route.
+    pub progress: f64,
+    /// True if no comfort bound was broken.
+    pub comfortable: bool,
+    /// Steps made.
+    pub steps: usize,
+}
+
+/// The paper's columns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Columns {
+    /// Share of safe episodes times the mean of their progress over 62 m and their comfort.
+    pub score: f64,
+    /// Share of episodes with a collision.
+    pub collision_rate: f64,
+    /// Share of episodes that left the road.
+    pub offroad_rate: f64,
+    /// Mean progress of safe episodes, metres; `None` if there is none.
+    pub progress: Option<f64>,
+    /// Share of safe episodes in which no comfort bound was broken; `None` if there is none.
+    pub comfort: Option<f64>,
+}
+
+impl Drive {
+    fn new(scenario: usize, repeat: usize, outcome: &Outcome) -> Self {
+        let totals = &outcome.totals;
+        Self {
+            scenario,
+            repeat,
+            collided: totals.collided,
+            off_road: totals.off_road,
+            progress: totals.progress,
+            comfortable: !totals.uncomfortable,
+            steps: outcome.steps,
+        }
+    }
+
+    /// True if the ego neither collided nor left the road.
+    pub fn is_safe(&self) -> bool {
+        !self.collided && !self.off_road
+    }
+
+    /// 0 if not safe, else the mean of progress over [`LOGGED_PROGRESS`], which may exceed 1, and
+    /// comfort.
+    pub fn score(&self) -> f64 {
+        if !self.is_safe() {
+            return 0.0;
+        }
+        let comfort = f64::from(u8::from(self.comfortable));
+        0.5 * (self.progress / LOGGED_PROGRESS + comfort)
+    }
+}
+
+impl Columns {
+    /// Over episodes; `None` of none.
+    pub fn of(drives: &[Drive]) -> Option<Self> {
+        let n = drives.len() as f64;
+        let share = |happened: fn(&Drive) -> bool| {
+            drives.iter().filter(|drive| happened(drive)).count() as f64 / n
+        };
+        let safe: Vec<&Drive> = drives.iter().filter(|drive| drive.is_safe()).collect();
+        let of_safe = |value: fn(&Drive) -> f64| {
+            let sum: f64 = safe.iter().map(|drive| value(drive)).sum();
+            (!safe.is_empty()).then(|| sum / safe.len() as f64)
+        };
+        (!drives.is_empty()).then(|| Self {
+            score: drives.iter().map(Drive::score).sum::<f64>() / n,
+            collision_rate: share(|drive| drive.collided),
+            offroad_rate: share(|drive| drive.off_road),
+            progress: of_safe(|drive| drive.progress),
+            comfort: of_safe(|drive| f64::from(u8::from(drive.comfortable))),
+        })
+    }
+}
+
+/// Lets a driver drive every course `repeats` times, `config.n_envs` side by side.
+///
+/// What a world does depends on the course and the repeat alone, so that drivers are compared in
+/// the same traffic; so do random actions on `seed`. The drives come in the order of the courses,
+/// repeats of a course together.
+///
+/// # Errors
+/// What the environment reports; [`RlError::Shape`] for a driver of other observations or actions.
+pub fn evaluate(
+    courses: &Arc<[Course]>,
+    traffic: Traffic<'_>,
+    config: &EnvConfig,
+    driver: Driver<'_>,
+    (repeats, seed): (usize, Seed),
+) -> Result<Vec<Drive>, RlError> {
+    let of_scenario = |scenario: usize| (0..repeats).map(move |repeat| (scenario, repeat));
+    let all: Vec<_> = (0..courses.len()).flat_map(of_scenario).collect();
+    let mut drives = Vec::with_capacity(all.len());
+    for (chunk, episodes) in all.chunks(config.n_envs.max(1)).enumerate() {
+        let config = EnvConfig {
+            n_envs: episodes.len(),
+            autoreset: Autoreset::SameStep,
+            ..*config
+        };
+        let mut env = DrivingEnv::new(Arc::clone(courses), traffic, config)?;
+        let start = |&(scenario, repeat): &(usize, usize)| EpisodeStart {
+            scenario,
+            seed: seed.fork(scenario as u64).fork(repeat as u64),
+        };
+        env.reset_to(&episodes.iter().map(start).collect::<Vec<_>>())?;
+        let outcomes = drive(&mut env, driver, seed.fork(u64::MAX - chunk as u64))?;
+        let ended = episodes.iter().zip(&outcomes);
+        drives.extend(ended.map(|(&(scenario, repeat), o)| Drive::new(scenario, repeat, o)));
+    }
+    Ok(drives)
+}
+
+/// Drives every row to the end of its first episode.
+fn drive(
+    env: &mut DrivingEnv<'_>,
+    driver: Driver<'_>,
+    seed: Seed,
+) -> Result<Vec<Outcome>, RlError> {
+    let (n, o, a) = (env.n_envs(), env.observation_len(), env.action_len());
+    let mut rng = seed.rng();
+    let mut actions = vec![0.0; n * a];
+    let mut outcomes: Vec<Option<Outcome>> = vec![None; n];
+    while outcomes.contains(&None) {
+        match driver {
+            Driver::Learned(actor) => {
+                check("observations", actor.observation_len(), o)?;
+                check("actions", actor.action_len(), a)?;
+                actions = actor.modes(env.observations());
+            }
+            Driver::Expert => env.expert_actions(&mut actions)?,
+            Driver::Random => actions.fill_with(|| rng.random_range(-1.0..=1.0)),
+            Driver::Constant(action) => {
+                check("actions", action.len(), a)?;
+                actions = action.repeat(n);
+            }
+        }
+        env.step(&actions)?;
+        for (row, outcome) in env.finished() {
+            outcomes[*row].get_or_insert(*outcome);
+        }
+    }
+    Ok(outcomes.into_iter().flatten().collect())
+}
+
+fn check(what: &'static str, expected: usize, found: usize) -> Result<(), RlError> {
+    if expected == found {
+        Ok(())
+    } else {
+        Err(RlError::Shape {
+            what,
+            expected,
+            found,
+        })
+    }
+}
+
+/// Mean score of every scenario over its drives, in the order of the scenarios.
+pub fn score_by_scenario(drives: &[Drive]) -> Vec<f64> {
+    let n = drives.iter().map(|drive| drive.scenario + 1).max();
+    let mut sums = vec![(0.0, 0.0); n.unwrap_or(0)];
+    for drive in drives {
+        let (sum, n) = &mut sums[drive.scenario];
+        *sum += drive.score();
+        *n += 1.0;
+    }
+    let driven = sums.into_iter().filter(|(_, n)| *n > 0.0);
+    driven.map(|(sum, n)| sum / n).collect()
+}
+
+/// How much better `a` is than `b` on the same scenarios, with its 95 % interval; `None` if they
+/// are not of the same scenarios, or of fewer than two.
+pub fn paired_difference(a: &[f64], b: &[f64], seed: Seed) -> Option<(f64, Interval)> {
+    if a.len() != b.len() {
+        return None;
+    }
+    let differences: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
+    let interval = interval(&differences, seed)?;
+    let mean = differences.iter().sum::<f64>() / differences.len() as f64;
+    Some((mean, interval))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use super::*;
+    use crate::sac::SacConfig;
+    use gump_rollout::worlds::Idm;
+    use gump_scene::{Scenario, fixture};
+
+    fn drive(
+        scenario: usize,
+        collided: bool,
+        off_road: bool,
+        progress: f64,
+        comfortable: bool,
+    ) -> Drive {
+        Drive {
+            scenario,
+            repeat: 0,
+            collided,
+            off_road,
+            progress,
+            comfortable,
+            steps: 16,
+        }
+    }
+
+    #[test]
+    fn columns_by_hand() {
+        let drives = [
+            drive(0, false, false, 31.0, true),
+            drive(0, false, false, 93.0, false),
+            drive(1, true, false, 40.0, true),
+            drive(2, false, true, 10.0, true),
+        ];
+        let columns = Columns::of(&drives).unwrap();
+        assert_eq!((columns.collision_rate, columns.offroad_rate), (0.25, 0.25));
+        assert_eq!((columns.progress, columns.comfort), (Some(62.0), Some(0.5)));
+        // From the rates: half of the episodes are safe.
+        assert!((columns.score - 0.5 * 0.5 * (1.0 + 0.5)).abs() < 1e-9);
+        assert_eq!(score_by_scenario(&drives), [0.75, 0.0, 0.0]);
+        assert!(Columns::of(&[]).is_none());
+        let failed = Columns::of(&drives[2..]).unwrap();
+        assert_eq!((failed.score, failed.progress), (0.0, None));
+    }
+
+    #[test]
+    fn differences_are_paired() {
+        let a: Vec<f64> = (0..50).map(f64::from).collect();
+        let b: Vec<f64> = a.iter().map(|x| x - 0.5).collect();
+        let (mean, interval) = paired_difference(&a, &b, Seed(0)).unwrap();
+        assert_eq!((mean, interval.low, interval.high), (0.5, 0.5, 0.5));
+        assert!(paired_difference(&a, &b[1..], Seed(0)).is_none());
+    }
+
+    /// Empty roads of different lengths behind the ego, a recorded ego of constant speed.
+    fn courses() -> Arc<[Course]> {
+        let scene = |speed: f64| -> Scenario {
+            let text = format!(
+                "lane 1: 0,0 400,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity {speed},0"
+            );
+            fixture::scenario(&text).unwrap()
+        };
+        Course::prepare([4.0, 8.0, 12.0].map(scene), 0.5).unwrap()
+    }
+
+    fn run(driver: Driver<'_>, n_envs: usize) -> Vec<Drive> {
+        let config = EnvConfig {
+            n_envs,
+            ..EnvConfig::default()
+        };
+        let world = Idm::default();
+        let traffic = Traffic::World(&world);
+        evaluate(&courses(), traffic, &config, driver, (2, Seed(3))).unwrap()
+    }
+
+    #[test]
+    fn every_scenario_is_driven_once_per_repeat() {
+        let drives = run(Driver::Expert, 4);
+        let order: Vec<_> = drives.iter().map(|d| (d.scenario, d.repeat)).collect();
+        assert_eq!(order, [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)]);
+        for drive in &drives {
+            let expected = [32.0, 64.0, 96.0][drive.scenario];
+            assert!(
+                (drive.progress - expected).abs() < 0.01 * expected,
+                "{drive:?}"
+            );
+            assert!(drive.is_safe() && drive.comfortable, "{drive:?}");
+        }
+    }
+
+    #[test]
+    fn episodes_do_not_depend_on_who_drives_beside_them() {
+        let config = SacConfig {
+            hidden: vec![8],
+            ..SacConfig::default()
+        };
+        let observation = EnvConfig::default().observation.len();
+        let actor = Actor::new(&config, observation, 2, Seed(1));
+        assert_eq!(
+            run(Driver::Learned(&actor), 6),
+            run(Driver::Learned(&actor), 1)
+        );
+        let still = run(Driver::Constant(&[-1.0, 0.0]), 6);
+        assert!(still.iter().all(|drive| drive.progress < 20.0));
+        assert_eq!(run(Driver::Random, 6), run(Driver::Random, 6));
+    }
+
+    #[test]
+    fn policies_of_another_shape_are_refused() {
+        let actor = Actor::new(&SacConfig::default(), 3, 2, Seed(1));
+        let config = EnvConfig::default();
+        let driver = Driver::Learned(&actor);
+        let result = evaluate(&courses(), Traffic::Log, &config, driver, (1, Seed(0)));
+        assert!(matches!(result, Err(RlError::Shape { expected: 3, .. })));
+    }
+}

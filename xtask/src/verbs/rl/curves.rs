@@ -1,0 +1,264 @@
+//! Learning curves: means over windows of gradient steps, as a table and drawn.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::Context as _;
+use gump_rl::sac::{Episode, StepReport};
+use gump_viz::{Chart, Series};
+
+use super::write;
+
+const HEADER: [&str; 13] = [
+    "step",
+    "env_steps",
+    "episodes",
+    "return",
+    "length",
+    "terminated",
+    "critic_loss",
+    "actor_loss",
+    "imitation_loss",
+    "entropy",
+    "alpha",
+    "value",
+    "learning_rate",
+];
+
+/// The curves of a run, one row per window.
+#[derive(Debug)]
+pub(super) struct Curves {
+    window: usize,
+    rows: Vec<[f64; 13]>,
+    open: Vec<StepReport>,
+}
+
+impl Curves {
+    /// Curves with a point every `window` gradient steps.
+    pub(super) fn new(window: usize) -> Self {
+        Self {
+            window: window.max(1),
+            rows: Vec::new(),
+            open: Vec::new(),
+        }
+    }
+
+    /// Reads the rows up to `steps` of an earlier part of the run.
+    ///
+    /// Error: the file is missing or not what [`Self::write`] writes.
+    pub(super) fn read(path: &Path, window: usize, steps: usize) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        let mut curves = Self::new(window);
+        for (number, line) in text.lines().enumerate().skip(1) {
+            let numbers: Vec<f64> = line
+                .split(',')
+                .map(|word| {
+                    if word.is_empty() {
+                        Ok(f64::NAN)
+                    } else {
+                        word.parse()
+                    }
+                })
+                .collect::<Result<_, _>>()
+                .unwrap_or_default();
+            let row = numbers.try_into().ok().with_context(|| {
+                let expected = HEADER.join(",");
+                format!(
+                    "{}, line {}: expected {expected}",
+                    path.display(),
+                    number + 1
+                )
+            })?;
+            curves.rows.push(row);
+        }
+        curves.rows.retain(|row| row[0] <= steps as f64);
+        Ok(curves)
+    }
+
+    /// Adds a gradient step.
+    pub(super) fn push(&mut self, report: StepReport) {
+        let ends_window = report.step.is_multiple_of(self.window);
+        self.open.push(report);
+        if ends_window {
+            self.close();
+        }
+    }
+
+    /// Ends the window.
+    fn close(&mut self) {
+        let Some(last) = self.open.last() else {
+            return;
+        };
+        let n = self.open.len() as f64;
+        let of_updates =
+            |value: fn(&StepReport) -> f64| self.open.iter().map(value).sum::<f64>() / n;
+        let episodes: Vec<&Episode> = self.open.iter().flat_map(|r| &r.episodes).collect();
+        // Not a number where no episode ended.
+        let of_episodes = |value: fn(&Episode) -> f64| {
+            episodes.iter().map(|e| value(e)).sum::<f64>() / episodes.len() as f64
+        };
+        self.rows.push([
+            last.step as f64,
+            last.env_steps as f64,
+            episodes.len() as f64,
+            of_episodes(|e| e.total),
+            of_episodes(|e| e.steps as f64),
+            of_episodes(|e| f64::from(u8::from(e.terminated))),
+            of_updates(|r| r.update.critic_loss),
+            of_updates(|r| r.update.actor_loss),
+            of_updates(|r| r.update.imitation_loss),
+            of_updates(|r| r.update.entropy),
+            of_updates(|r| r.update.alpha),
+            of_updates(|r| r.update.value),
+            last.update.learning_rate,
+        ]);
+        self.open.clear();
+    }
+
+    /// Mean return over the first and the last tenth of the episodes' windows, and how many
+    /// standard errors lie between; `None` without episodes.
+    pub(super) fn gain(&self) -> Option<(f64, f64, f64)> {
+        let returns: Vec<f64> = self
+            .rows
+            .iter()
+            .map(|row| row[3])
+            .filter(|r| r.is_finite())
+            .collect();
+        let n = (returns.len() / 10).max(2);
+        let (first, last) = (returns.get(..n)?, returns.get(returns.len() - n..)?);
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / n as f64;
+        let error = |values: &[f64]| {
+            let m = mean(values);
+            let squares: f64 = values.iter().map(|x| (x - m).powi(2)).sum();
+            squares / (n - 1) as f64 / n as f64
+        };
+        let (a, b) = (mean(first), mean(last));
+        Some((a, b, (b - a) / (error(first) + error(last)).sqrt()))
+    }
+
+    /// Writes the table and the charts into a folder, each whole or not at all.
+    pub(super) fn write(&self, folder: &Path) -> anyhow::Result<()> {
+        let mut text = format!("{}\n", HEADER.join(","));
+        for row in &self.rows {
+            let words = row.map(|x| {
+                if x.is_finite() {
+                    x.to_string()
+                } else {
+                    String::new()
+                }
+            });
+            writeln!(text, "{}", words.join(","))?;
+        }
+        write(&folder.join("curves.csv"), text.as_bytes())?;
+        let returns = [("return", 3)];
+        self.draw(
+            &folder.join("return.svg"),
+            "return of an episode",
+            &returns,
+            false,
+        )?;
+        let losses = [("critic", 6), ("temperature", 10)];
+        self.draw(&folder.join("losses.svg"), "loss", &losses, true)?;
+        let nats = [("entropy", 9), ("imitation", 8)];
+        self.draw(&folder.join("entropy.svg"), "nats", &nats, false)
+    }
+
+    /// Draws columns against gradient steps; nothing where there is nothing to draw.
+    fn draw(
+        &self,
+        path: &Path,
+        y_label: &str,
+        columns: &[(&str, usize)],
+        log_y: bool,
+    ) -> anyhow::Result<()> {
+        let point = |row: &[f64; 13], column: usize| (row[0], row[column]);
+        let drawable = |p: &(f64, f64)| p.1.is_finite() && (!log_y || p.1 > 0.0);
+        let series = columns.iter().map(|&(name, column)| Series {
+            name: name.to_owned(),
+            points: self
+                .rows
+                .iter()
+                .map(|row| point(row, column))
+                .filter(drawable)
+                .collect(),
+        });
+        let series: Vec<Series> = series.filter(|s| !s.points.is_empty()).collect();
+        if series.is_empty() {
+            return Ok(());
+        }
+        let chart = Chart {
+            x_label: "gradient step".into(),
+            y_label: y_label.into(),
+            log_y,
+            series,
+            ..Chart::default()
+        };
+        write(path, chart.to_svg()?.as_bytes())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_rl::sac::UpdateReport;
+
+    fn report(step: usize, returns: &[f64]) -> StepReport {
+        let episode = |&total| Episode {
+            total,
+            steps: 16,
+            terminated: total < 0.0,
+        };
+        StepReport {
+            step,
+            env_steps: 4 * step as u64,
+            update: UpdateReport {
+                critic_loss: step as f64,
+                ..UpdateReport::default()
+            },
+            episodes: returns.iter().map(episode).collect(),
+        }
+    }
+
+    #[test]
+    fn windows_are_means_and_come_back() {
+        let mut curves = Curves::new(2);
+        for step in 1..=40 {
+            let rising = step as f64 / 40.0 + 0.01 * f64::from(step as u32 % 3);
+            curves.push(report(step, &[rising, -1.0][..1 + step % 2]));
+        }
+        assert_eq!(curves.rows.len(), 20);
+        assert_eq!(
+            (curves.rows[0][0], curves.rows[0][2], curves.rows[0][6]),
+            (2.0, 3.0, 1.5)
+        );
+        assert_eq!(curves.rows[0][5], 1.0 / 3.0);
+        let (first, last, errors) = curves.gain().unwrap();
+        assert!(first < last && errors > 3.0);
+        let folder = tempfile::tempdir().unwrap();
+        curves.write(folder.path()).unwrap();
+        let svg = std::fs::read_to_string(folder.path().join("return.svg")).unwrap();
+        assert!(svg.contains("<svg"));
+        let path = folder.path().join("curves.csv");
+        let cut = Curves::read(&path, 2, 10).unwrap();
+        assert_eq!(cut.rows, curves.rows[..5]);
+        std::fs::write(&path, "step\n1,2\n").unwrap();
+        assert!(
+            Curves::read(&path, 2, 10)
+                .unwrap_err()
+                .to_string()
+                .contains("line 2")
+        );
+    }
+
+    #[test]
+    fn windows_without_episodes_are_empty_cells() {
+        let mut curves = Curves::new(1);
+        curves.push(report(1, &[]));
+        let folder = tempfile::tempdir().unwrap();
+        curves.write(folder.path()).unwrap();
+        assert!(!folder.path().join("return.svg").exists());
+        let read = Curves::read(&folder.path().join("curves.csv"), 1, 1).unwrap();
+        assert!(read.rows[0][3].is_nan() && read.gain().is_none());
+    }
+}

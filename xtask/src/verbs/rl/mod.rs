@@ -1,0 +1,218 @@
+//! `rl`: policies that learn to drive, and how well they drive.
+
+pub(crate) mod evaluate;
+pub(crate) mod table;
+pub(crate) mod train;
+
+mod curves;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Context as _;
+use gump_model::{Device, SamplingConfig};
+use gump_rl::sac::SacConfig;
+use gump_rl::{Autoreset, Course, EnvConfig, Traffic};
+use serde::{Deserialize, Serialize};
+use toml::Table;
+
+use crate::cli::WrongArguments;
+use crate::config;
+use crate::dataset::{self, Part, Split};
+use crate::run::Run;
+use crate::worlds::{World, WorldName};
+
+/// Seconds that an action is held: a frame of the world model, as in the paper.
+const STEP: f64 = 0.5;
+
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Verb {
+    /// Learn to drive, by soft actor-critic in a world or by imitation of the log.
+    Train(train::Args),
+    /// Let policies drive and print the paper's columns.
+    Evaluate(evaluate::Args),
+    /// Train all policies of the paper's table and evaluate them, going on where it stopped.
+    Table(table::Args),
+}
+
+/// What a config file may say about reinforcement learning.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Settings {
+    /// What is driven, seen and earned.
+    env: EnvConfig,
+    /// How to learn.
+    sac: SacConfig,
+}
+
+impl Settings {
+    /// Reads the tables of a config file, or the defaults without one.
+    ///
+    /// Error: [`WrongArguments`] for a key that does not exist or does not fit.
+    fn read(path: Option<&Path>) -> anyhow::Result<Self> {
+        let Some(path) = path else {
+            return Ok(Self::default());
+        };
+        let tables = config::tables(path)?;
+        config::check_keys(path, &tables, &known_keys()?)?;
+        let wrong = |error: &dyn std::fmt::Display| {
+            let message = error.to_string().trim().replace('\n', " ");
+            WrongArguments(format!("{}: {message}", path.display()))
+        };
+        let settings: Self =
+            toml::from_str(&tables.to_string()).map_err(|error| wrong(&error.message()))?;
+        settings.sac.check().map_err(|error| wrong(&error))?;
+        if settings.env.autoreset != Autoreset::SameStep {
+            return Err(wrong(&"env.autoreset: learners expect \"same-step\"").into());
+        }
+        Ok(settings)
+    }
+}
+
+/// Keys with a near miss to be told; those of the environment are checked as they are read.
+fn known_keys() -> anyhow::Result<Table> {
+    let sac = SacConfig {
+        huber: Some(1.0),
+        clip: Some(1.0),
+        ..SacConfig::default()
+    };
+    let mut known = Table::new();
+    known.insert("sac".into(), Table::try_from(sac)?.into());
+    known.insert("env".into(), true.into());
+    Ok(known)
+}
+
+/// A world to drive in; the log is no session of its own but what the environment replays.
+enum RlWorld {
+    Log,
+    Imagined(World),
+}
+
+impl RlWorld {
+    /// Loads what the world needs.
+    ///
+    /// Error: weights that cannot be read or do not fit.
+    fn load(device: &Device, name: &WorldName, sampling: &SamplingConfig) -> anyhow::Result<Self> {
+        Ok(match name {
+            WorldName::Log => Self::Log,
+            _ => Self::Imagined(World::without_log(device, name, sampling)?),
+        })
+    }
+
+    fn traffic(&self) -> Traffic<'_> {
+        match self {
+            Self::Log => Traffic::Log,
+            Self::Imagined(world) => Traffic::World(world.model()),
+        }
+    }
+}
+
+/// The scenarios of a path as courses: of a data set with a manifest those of `split`, else all.
+///
+/// Error: nothing there to read, or a scenario that cannot be driven.
+fn courses(
+    run: &Run,
+    path: &Path,
+    split: Split,
+    limit: Option<usize>,
+) -> anyhow::Result<Arc<[Course]>> {
+    let progress = run.progress("reading", 0, "scenarios");
+    let parts = match dataset::Manifest::of(path)? {
+        Some(_) => dataset::parts(path, split)?,
+        None => vec![Part::whole(path)],
+    };
+    let mut scenarios = dataset::read(&parts, &progress)?;
+    scenarios.truncate(limit.unwrap_or(usize::MAX));
+    anyhow::ensure!(!scenarios.is_empty(), "no scenario in {}", path.display());
+    Ok(Course::prepare(scenarios, STEP)?)
+}
+
+/// What a stored policy remembers of how it came about.
+#[derive(Clone, Debug)]
+struct Notes {
+    algorithm: String,
+    train_world: String,
+    env: EnvConfig,
+}
+
+impl Notes {
+    fn to_map(&self) -> anyhow::Result<BTreeMap<String, String>> {
+        Ok(BTreeMap::from([
+            ("algorithm".to_owned(), self.algorithm.clone()),
+            ("train_world".to_owned(), self.train_world.clone()),
+            ("env".to_owned(), toml::to_string(&self.env)?),
+        ]))
+    }
+
+    /// Error: a note that is missing or that nobody could have written.
+    fn from_map(notes: &BTreeMap<String, String>) -> anyhow::Result<Self> {
+        let get = |key: &str| {
+            let note = notes.get(key).cloned();
+            note.with_context(|| format!("its notes have no \"{key}\""))
+        };
+        let env = get("env")?;
+        Ok(Self {
+            algorithm: get("algorithm")?,
+            train_world: get("train_world")?,
+            env: toml::from_str(&env)
+                .map_err(|error| anyhow::anyhow!("its environment: {}", error.message()))?,
+        })
+    }
+}
+
+/// Writes a file whole or not at all.
+fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    use std::io::Write as _;
+    gump_data::write_atomically(path, |file| {
+        file.write_all(bytes)
+            .with_context(|| format!("cannot write {}", path.display()))
+    })
+}
+
+fn read(path: &Path) -> anyhow::Result<Vec<u8>> {
+    std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::machine::repository;
+
+    #[test]
+    fn the_shipped_configuration_is_understood() {
+        let path = repository().join("configs/rl-tiny.toml");
+        let settings = Settings::read(Some(&path)).unwrap();
+        assert_ne!(settings.sac, SacConfig::default());
+    }
+
+    #[test]
+    fn wrong_keys_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("c.toml");
+        let check = |text: &str, expected: &str| {
+            std::fs::write(&path, text).unwrap();
+            let error = Settings::read(Some(&path)).unwrap_err();
+            assert!(error.is::<WrongArguments>());
+            assert!(error.to_string().contains(expected), "{error}");
+        };
+        check("[sac]\nbach = 3", "batch");
+        check("[sac]\nbatch = 0", "batch");
+        check("[env]\nn_env = 3", "n_envs");
+        check("[env]\nautoreset = \"disabled\"", "same-step");
+        check("[env.rules.reward]\nprogres = 3", "progress");
+    }
+
+    #[test]
+    fn notes_come_back() {
+        let notes = Notes {
+            algorithm: "sac".into(),
+            train_world: "model:a.safetensors".into(),
+            env: EnvConfig::default(),
+        };
+        let found = Notes::from_map(&notes.to_map().unwrap()).unwrap();
+        assert_eq!(found.env, notes.env);
+        assert_eq!(found.train_world, notes.train_world);
+        assert!(Notes::from_map(&BTreeMap::new()).is_err());
+    }
+}

@@ -1,0 +1,119 @@
+//! `rl table`: the paper's table in one go, policies first, then their drives.
+
+use std::path::PathBuf;
+
+use gump_scene::Seed;
+use serde::Serialize;
+
+use super::evaluate::{Table, read_policies};
+use super::train::{AlgorithmName, Job};
+use super::{RlWorld, Settings, courses};
+use crate::cli::WrongArguments;
+use crate::dataset::Split;
+use crate::run::{Common, Run};
+use crate::worlds::{Sampling, WorldName};
+
+/// Arguments of `rl table`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// Where to train beside the log: model:WEIGHTS, or any other world
+    #[arg(long, value_name = "W")]
+    world: WorldName,
+    /// Worlds to test in beside the log and --world, such as a model that nobody trained in
+    #[arg(long, value_name = "W", value_delimiter = ',')]
+    test_world: Vec<WorldName>,
+    /// Scenarios to train on: a folder with a manifest.toml, or any file or folder
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// Scenarios to test on [default: the test scenarios of --scenarios]
+    #[arg(long, value_name = "PATH")]
+    test_scenarios: Option<PathBuf>,
+    /// Gradient steps of each policy [default: the configuration's]
+    #[arg(long, value_name = "N")]
+    steps: Option<usize>,
+    /// Policies of each kind, which differ in their seeds
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    policies: u64,
+    /// How often each scenario is driven, each time in other traffic of the same world
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    repeats: usize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        if self.policies == 0 || self.repeats == 0 {
+            let wrong = "--policies and --repeats: expected at least 1, found 0";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        let mut settings = Settings::read(self.common.config.as_deref())?;
+        settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
+        run.setting("env", settings.env)?;
+        run.setting("sac", &settings.sac)?;
+        let files = self.train(run, &settings)?;
+        self.test(run, &settings, &files)
+    }
+
+    /// Trains whatever is not there yet; the files of the policies, kind by kind.
+    fn train(&self, run: &mut Run, settings: &Settings) -> anyhow::Result<Vec<PathBuf>> {
+        let courses = run.phase("read", |run| {
+            courses(run, &self.scenarios, Split::Train, None)
+        })?;
+        let sampling = self.sampling.resolve()?;
+        let device = run.device().clone();
+        let world = run.phase("load", |_| RlWorld::load(&device, &self.world, &sampling))?;
+        let (log_name, log) = (WorldName::Log, RlWorld::Log);
+        let mut files = Vec::new();
+        let mut trained = Vec::new();
+        for (algorithm, world_name, world, name) in [
+            (AlgorithmName::Imitation, &log_name, &log, "imitation"),
+            (AlgorithmName::Sac, &log_name, &log, "sac-log"),
+            (AlgorithmName::Sac, &self.world, &world, "sac-world"),
+        ] {
+            for k in 0..self.policies {
+                let folder = run.path(&format!("{name}-{k}"));
+                std::fs::create_dir_all(&folder)?;
+                let job = Job {
+                    algorithm,
+                    world_name,
+                    world,
+                    courses: &courses,
+                    settings,
+                    seed: Seed(run.seed().0 + k),
+                    resume: folder.join("checkpoint.safetensors").exists(),
+                    folder,
+                    stop_at: usize::MAX,
+                };
+                trained.push(run.phase(name, |run| job.execute(run))?);
+                files.push(job.policy());
+            }
+        }
+        run.result("trained", trained)?;
+        Ok(files)
+    }
+
+    /// Lets all policies, and rules to compare them with, drive everywhere.
+    fn test(&self, run: &mut Run, settings: &Settings, files: &[PathBuf]) -> anyhow::Result<()> {
+        let path = self.test_scenarios.as_ref().unwrap_or(&self.scenarios);
+        let courses = run.phase("read", |run| courses(run, path, Split::Test, None))?;
+        let rules = ["random", "brake", "constant-speed"].map(PathBuf::from);
+        let candidates = read_policies(&[&rules, files].concat())?;
+        let sampling = self.sampling.resolve()?;
+        let device = run.device().clone();
+        let mut table = Table::new(&courses, self.repeats);
+        let worlds = [&WorldName::Log, &self.world].into_iter();
+        for name in worlds.chain(&self.test_world) {
+            let world = run.phase("load", |_| RlWorld::load(&device, name, &sampling))?;
+            let world = (name, &world);
+            run.phase("drive", |run| {
+                table.drive_all(run, &candidates, &settings.env, world)
+            })?;
+        }
+        table.report(run)
+    }
+}

@@ -1,0 +1,292 @@
+//! `rl train`: a policy, from rewards in a world or from the log alone.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use gump_rl::sac::{Algorithm, Training};
+use gump_rl::{Course, DrivingEnv, demonstrations};
+use gump_scene::Seed;
+use serde::Serialize;
+
+use super::curves::Curves;
+use super::{Notes, RlWorld, Settings, courses, read, write};
+use crate::cli::WrongArguments;
+use crate::dataset::Split;
+use crate::run::{self, Common, Run};
+use crate::worlds::{Sampling, WorldName};
+
+/// Time between checkpoints: what a crash may cost.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
+/// Points of the curves per segment.
+const POINTS_PER_SEGMENT: usize = 10;
+
+/// Arguments of `rl train`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// What is learned from
+    #[arg(long, value_enum, default_value_t = AlgorithmName::Sac)]
+    algorithm: AlgorithmName,
+    /// log, idm, constant-velocity or model:WEIGHTS; imitation knows the log alone
+    #[arg(long, value_name = "W", default_value = "log")]
+    train_world: WorldName,
+    /// A folder with a manifest.toml, or any file or folder of scenarios
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// Gradient steps [default: the configuration's]
+    #[arg(long, value_name = "N")]
+    steps: Option<usize>,
+    /// Stop at the first checkpoint from this gradient step on, to go on with --resume
+    #[arg(long, value_name = "N")]
+    stop_at: Option<usize>,
+    /// Go on with the run in --out, with the configuration it began with
+    #[arg(long)]
+    resume: bool,
+    #[command(flatten)]
+    #[serde(flatten)]
+    sampling: Sampling,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// What is learned from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum AlgorithmName {
+    /// Rewards, and a share of expert transitions
+    Sac,
+    /// The log's actions
+    Imitation,
+}
+
+impl AlgorithmName {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Sac => "sac",
+            Self::Imitation => "imitation",
+        }
+    }
+
+    fn resolve(self) -> Algorithm {
+        match self {
+            Self::Sac => Algorithm::Sac,
+            Self::Imitation => Algorithm::Imitation,
+        }
+    }
+}
+
+/// One policy to be trained.
+pub(super) struct Job<'a> {
+    pub(super) algorithm: AlgorithmName,
+    pub(super) world_name: &'a WorldName,
+    pub(super) world: &'a RlWorld,
+    pub(super) courses: &'a Arc<[Course]>,
+    pub(super) settings: &'a Settings,
+    pub(super) seed: Seed,
+    pub(super) folder: PathBuf,
+    /// Whether to go on with what is in the folder.
+    pub(super) resume: bool,
+    /// Gradient steps after which to stop early.
+    pub(super) stop_at: usize,
+}
+
+/// What came of it.
+#[derive(Debug, Serialize)]
+pub(super) struct Trained {
+    algorithm: &'static str,
+    train_world: String,
+    seed: u64,
+    steps: usize,
+    env_steps: u64,
+    /// Gradient steps per environment step.
+    updates_per_env_step: f64,
+    /// Of this part of the run, everything included.
+    steps_per_second: f64,
+    env_steps_per_second: f64,
+    demonstrated_steps: usize,
+    return_first: Option<f64>,
+    return_last: Option<f64>,
+    /// How many standard errors the return rose by.
+    return_gain: Option<f64>,
+    resumed: bool,
+    policy: PathBuf,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let mut settings = Settings::read(self.common.config.as_deref())?;
+        settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
+        if self.algorithm == AlgorithmName::Imitation && self.train_world != WorldName::Log {
+            let wrong = "--train-world: imitation learns from the log, expected log";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        let sampling = self.sampling.resolve()?;
+        let courses = run.phase("read", |run| {
+            courses(run, &self.scenarios, Split::Train, None)
+        })?;
+        let device = run.device().clone();
+        let world = run.phase("load", |_| {
+            RlWorld::load(&device, &self.train_world, &sampling)
+        })?;
+        run.setting("env", settings.env)?;
+        run.setting("sac", &settings.sac)?;
+        let job = Job {
+            algorithm: self.algorithm,
+            world_name: &self.train_world,
+            world: &world,
+            courses: &courses,
+            settings: &settings,
+            seed: run.seed(),
+            folder: run.out().to_owned(),
+            resume: self.resume,
+            stop_at: self.stop_at.unwrap_or(usize::MAX),
+        };
+        let trained = run.phase("train", |run| job.execute(run))?;
+        run.result("scenarios", courses.len())?;
+        let told = serde_json::to_value(&trained)?;
+        for (key, value) in told.as_object().into_iter().flatten() {
+            run.result(key, value)?;
+        }
+        Ok(())
+    }
+}
+
+impl Job<'_> {
+    /// Where the policy is written.
+    pub(super) fn policy(&self) -> PathBuf {
+        self.folder.join("policy.safetensors")
+    }
+
+    /// Trains to the end, to `stop_at` or to Ctrl-C.
+    ///
+    /// Error: what the environment reports, and a folder that cannot be gone on with.
+    pub(super) fn execute(&self, run: &Run) -> anyhow::Result<Trained> {
+        let checkpoint = self.folder.join("checkpoint.safetensors");
+        let notes = Notes {
+            algorithm: self.algorithm.name().into(),
+            train_world: self.world_name.to_string(),
+            env: self.settings.env,
+        };
+        let mut training = if self.resume {
+            self.resumed(&checkpoint, &notes)?
+        } else {
+            let experts = demonstrations(self.courses, &self.settings.env)?;
+            let config = self.settings.sac.clone();
+            Training::new(self.algorithm.resolve(), config, experts, self.seed)?
+        };
+        let window = (training.config().segment / POINTS_PER_SEGMENT).max(1);
+        let mut curves = if self.resume {
+            Curves::read(&self.folder.join("curves.csv"), window, training.steps())?
+        } else {
+            Curves::new(window)
+        };
+        let (steps, env_steps) = (training.steps(), training.env_steps());
+        let began = Instant::now();
+        self.learn(run, &mut training, &mut curves, &notes)?;
+        let seconds = began.elapsed().as_secs_f64();
+        let gain = curves.gain();
+        let n_env_steps = training.env_steps();
+        Ok(Trained {
+            algorithm: self.algorithm.name(),
+            train_world: notes.train_world,
+            seed: training.seed().0,
+            steps: training.steps(),
+            env_steps: n_env_steps,
+            updates_per_env_step: training.steps() as f64 / (n_env_steps as f64).max(1.0),
+            steps_per_second: (training.steps() - steps) as f64 / seconds,
+            env_steps_per_second: (n_env_steps - env_steps) as f64 / seconds,
+            demonstrated_steps: training.n_demonstrated(),
+            return_first: gain.map(|gain| gain.0),
+            return_last: gain.map(|gain| gain.1),
+            return_gain: gain.map(|gain| gain.2),
+            resumed: self.resume,
+            policy: self.policy(),
+        })
+    }
+
+    /// The run in the folder, if it is the run that is asked for.
+    fn resumed(&self, checkpoint: &Path, notes: &Notes) -> anyhow::Result<Training> {
+        let bytes = read(checkpoint)?;
+        let in_file = || checkpoint.display().to_string();
+        let (training, found) = Training::from_bytes(&bytes).with_context(in_file)?;
+        let found = Notes::from_map(&found).with_context(in_file)?;
+        let asked = &self.settings.sac;
+        for (flag, asked, begun) in [
+            ("--algorithm", notes.algorithm.clone(), found.algorithm),
+            (
+                "--train-world",
+                notes.train_world.clone(),
+                found.train_world,
+            ),
+            (
+                "--steps",
+                asked.steps.to_string(),
+                training.config().steps.to_string(),
+            ),
+        ] {
+            if asked != begun {
+                let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
+                return Err(WrongArguments(wrong).into());
+            }
+        }
+        if found.env != notes.env || training.config() != asked {
+            let wrong = "--config: the run to resume began with another configuration";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        Ok(training)
+    }
+
+    fn learn(
+        &self,
+        run: &Run,
+        training: &mut Training,
+        curves: &mut Curves,
+        notes: &Notes,
+    ) -> anyhow::Result<()> {
+        let total = training.config().steps;
+        let label = format!("{} in {}", self.algorithm.name(), self.world_name);
+        let progress = run.progress(&label, total as u64, "steps");
+        progress.advance(training.steps() as u64);
+        let traffic = self.world.traffic();
+        let mut env = DrivingEnv::new(Arc::clone(self.courses), traffic, self.settings.env)?;
+        let mut saved = Instant::now();
+        while training.steps() < total.min(self.stop_at) {
+            let observe = |report| {
+                progress.advance(1);
+                curves.push(report);
+                match run::interrupted() {
+                    true => ControlFlow::Break(()),
+                    false => ControlFlow::Continue(()),
+                }
+            };
+            match self.algorithm {
+                AlgorithmName::Sac => training.segment(&mut env, observe)?,
+                AlgorithmName::Imitation => training.imitation_segment(observe)?,
+            }
+            anyhow::ensure!(
+                !run::interrupted(),
+                "stopped by Ctrl-C after step {} of {total}, go on with --resume from the last \
+                 checkpoint",
+                training.steps()
+            );
+            let is_last = training.steps() >= total.min(self.stop_at);
+            if is_last || saved.elapsed() > CHECKPOINT_EVERY {
+                self.write(training, curves, notes)?;
+                saved = Instant::now();
+            }
+        }
+        Ok(())
+    }
+
+    /// First the curves: rows beyond the checkpoint are cut off when the run is resumed.
+    fn write(&self, training: &Training, curves: &Curves, notes: &Notes) -> anyhow::Result<()> {
+        curves.write(&self.folder)?;
+        let notes = notes.to_map()?;
+        let checkpoint = self.folder.join("checkpoint.safetensors");
+        write(&checkpoint, &training.to_bytes(&notes)?)?;
+        write(&self.policy(), &training.actor().to_bytes(&notes)?)
+    }
+}
