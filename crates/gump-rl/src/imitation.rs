@@ -72,8 +72,8 @@ mod tests {
             );
             fixture::scenario(&text).unwrap()
         };
-        // The second log drives into a parked car after 20 m.
-        let scenes = [scene(""), scene("agent vehicle 1: 34.8,0")];
+        // The second log drives into a parked car after 21 m.
+        let scenes = [scene(""), scene("agent vehicle 1: 35.8,0")];
         let courses = Course::prepare(scenes, 0.5).unwrap();
         let buffer = demonstrations(&courses, &EnvConfig::default()).unwrap();
         let ends: Vec<_> = buffer.iter().filter(|t| t.terminated).collect();
