@@ -49,7 +49,7 @@ pub(crate) struct Args {
 }
 
 /// Who is evaluated.
-struct Candidate {
+pub(super) struct Candidate {
     /// The algorithm, or the name of a fixed rule.
     policy: String,
     train_world: Option<String>,
@@ -99,7 +99,7 @@ impl Args {
         for name in &self.test_world {
             let world = run.phase("load", |_| RlWorld::load(&device, name, &sampling))?;
             run.phase("drive", |run| {
-                table.drive(run, &candidates, &env, name, &world)
+                table.drive(run, &candidates, &env, (name, &world))
             })?;
         }
         table.report(run)
@@ -121,20 +121,11 @@ impl Args {
     }
 }
 
-/// Reads stored policies and the environment of the first.
-pub(super) fn read_policies(files: &[PathBuf]) -> anyhow::Result<Candidates> {
-    let read = files.iter().map(|file| Candidate::read(file).map(|c| c.0));
-    Ok(Candidates(read.collect::<anyhow::Result<_>>()?))
-}
-
-/// Policies to be evaluated side by side.
-pub(super) struct Candidates(Vec<Candidate>);
-
 impl Candidate {
     /// A rule by its name, else a stored policy and the environment it learned in.
     ///
     /// Error: a file that holds no policy.
-    fn read(file: &Path) -> anyhow::Result<(Self, Option<EnvConfig>)> {
+    pub(super) fn read(file: &Path) -> anyhow::Result<(Self, Option<EnvConfig>)> {
         let rule = match file.to_str() {
             Some("expert") => Some(Kind::Expert),
             Some("random") => Some(Kind::Random),
@@ -188,13 +179,12 @@ impl<'a> Table<'a> {
     }
 
     /// Lets all candidates drive in one world.
-    fn drive(
+    pub(super) fn drive(
         &mut self,
         run: &Run,
         candidates: &[Candidate],
         env: &EnvConfig,
-        name: &WorldName,
-        world: &RlWorld,
+        (name, world): (&WorldName, &RlWorld),
     ) -> anyhow::Result<()> {
         let label = format!("driving in {name}");
         let progress = run.progress(&label, candidates.len() as u64, "policies");
@@ -215,17 +205,6 @@ impl<'a> Table<'a> {
             progress.advance(1);
         }
         Ok(())
-    }
-
-    /// As [`Self::drive`], for policies read by [`read_policies`].
-    pub(super) fn drive_all(
-        &mut self,
-        run: &Run,
-        candidates: &Candidates,
-        env: &EnvConfig,
-        (name, world): (&WorldName, &RlWorld),
-    ) -> anyhow::Result<()> {
-        self.drive(run, &candidates.0, env, name, world)
     }
 
     /// The row of a candidate in a world.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use gump_scene::Seed;
 use serde::Serialize;
 
-use super::evaluate::{Table, read_policies};
+use super::evaluate::{Candidate, Table};
 use super::train::{AlgorithmName, Job};
 use super::{RlWorld, Settings, courses};
 use crate::cli::WrongArguments;
@@ -49,6 +49,10 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         if self.policies == 0 || self.repeats == 0 {
             let wrong = "--policies and --repeats: expected at least 1, found 0";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        if self.world == WorldName::Log {
+            let wrong = "--world: the log is trained in anyway, expected another world";
             return Err(WrongArguments(wrong.into()).into());
         }
         let mut settings = Settings::read(self.common.config.as_deref())?;
@@ -102,7 +106,10 @@ impl Args {
         let path = self.test_scenarios.as_ref().unwrap_or(&self.scenarios);
         let courses = run.phase("read", |run| courses(run, path, Split::Test, None))?;
         let rules = ["random", "brake", "constant-speed"].map(PathBuf::from);
-        let candidates = read_policies(&[&rules, files].concat())?;
+        let all = rules.iter().chain(files);
+        let candidates: Vec<Candidate> = all
+            .map(|file| Ok(Candidate::read(file)?.0))
+            .collect::<anyhow::Result<_>>()?;
         let sampling = self.sampling.resolve()?;
         let device = run.device().clone();
         let mut table = Table::new(&courses, self.repeats);
@@ -111,7 +118,7 @@ impl Args {
             let world = run.phase("load", |_| RlWorld::load(&device, name, &sampling))?;
             let world = (name, &world);
             run.phase("drive", |run| {
-                table.drive_all(run, &candidates, &settings.env, world)
+                table.drive(run, &candidates, &settings.env, world)
             })?;
         }
         table.report(run)

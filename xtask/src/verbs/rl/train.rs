@@ -101,8 +101,8 @@ pub(super) struct Trained {
     seed: u64,
     steps: usize,
     env_steps: u64,
-    /// Gradient steps per environment step.
-    updates_per_env_step: f64,
+    /// Gradient steps per environment step; none without an environment.
+    updates_per_env_step: Option<f64>,
     /// Of this part of the run, everything included.
     steps_per_second: f64,
     env_steps_per_second: f64,
@@ -195,7 +195,8 @@ impl Job<'_> {
             seed: training.seed().0,
             steps: training.steps(),
             env_steps: n_env_steps,
-            updates_per_env_step: training.steps() as f64 / (n_env_steps as f64).max(1.0),
+            updates_per_env_step: (n_env_steps > 0)
+                .then(|| training.steps() as f64 / n_env_steps as f64),
             steps_per_second: (training.steps() - steps) as f64 / seconds,
             env_steps_per_second: (n_env_steps - env_steps) as f64 / seconds,
             demonstrated_steps: training.n_demonstrated(),
