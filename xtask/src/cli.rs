@@ -11,7 +11,7 @@ use crate::config;
 use crate::run::Run;
 use crate::verbs::ablate::Knob;
 use crate::verbs::{
-    ablate, bench, ci, data, demo, evaluate, plan, rl, simulate, submit, tidy, train,
+    ablate, bench, ci, data, demo, evaluate, generate, plan, rl, simulate, submit, tidy, train,
 };
 
 /// The generative world model for driving: every pipeline as a verb.
@@ -37,6 +37,8 @@ enum Verb {
     Train(train::Args),
     /// Imagine how a recorded scene goes on, many times over.
     Simulate(simulate::Args),
+    /// Make traffic out of nothing on a map, as a prompt and your wishes say.
+    Generate(generate::Args),
     /// Let a planner drive through a scene and see everything it considered.
     Plan(plan::Args),
     /// Measure on the benchmarks of the field.
@@ -101,6 +103,9 @@ impl Cli {
             Verb::Simulate(args) => {
                 Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Generate(args) => {
+                Run::of("generate", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Evaluate(evaluate::Verb::Motion(args)) => {
                 Run::of("evaluate motion", &args.common, &args)?.execute(|run| args.execute(run))
             }
@@ -109,6 +114,10 @@ impl Cli {
             }
             Verb::Plan(args) => {
                 Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Evaluate(evaluate::Verb::Generation(args)) => {
+                Run::of("evaluate generation", &args.common, &args)?
+                    .execute(|run| args.execute(run))
             }
             Verb::Evaluate(evaluate::Verb::ClosedLoop(args)) => {
                 Run::of("evaluate closed-loop", &args.common, &args)?

@@ -192,6 +192,9 @@ pub(crate) struct Draw {
     /// Draws again at most that often what would run into something, 0 for never [default: 4]
     #[arg(long, value_name = "N")]
     redraws: Option<usize>,
+    /// Agents come and leave and lights change as the model says
+    #[arg(long)]
+    life: bool,
 }
 
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
@@ -257,6 +260,7 @@ impl Draw {
                 CacheName::Growing => CacheMode::Growing,
             },
             precision: self.precision.resolve(),
+            life: self.life,
             temperature: self.temperature.unwrap_or(default.temperature),
             top_k: self.top_k.unwrap_or(default.top_k),
             decay: self.decay.unwrap_or(default.decay),

@@ -5,7 +5,9 @@
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of [`merge::BENCHMARKS`].
 
 mod closed_loop;
+pub(crate) mod generation;
 mod ledger;
+mod long;
 mod merge;
 pub(crate) mod motion;
 mod open_loop;
@@ -22,6 +24,8 @@ pub(crate) enum Verb {
     Motion(motion::Args),
     /// Realism: the Waymo Sim Agents Challenge
     Wosac(wosac::Args),
+    /// Generated scenes: likeness to recorded ones, overlaps, prompts
+    Generation(generation::Args),
     /// How well a planner drives, as nuPlan scores it
     ClosedLoop(closed_loop::Args),
     /// How near a planner's plans are to what was driven

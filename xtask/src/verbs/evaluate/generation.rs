@@ -1,0 +1,405 @@
+//! `evaluate generation`: how like recorded scenes generated ones are, beside simpler ways of
+//! making them.
+//!
+//! Likeness is the maximum mean discrepancy in TrafficGen's protocol, as the GUMP paper has it:
+//! vehicles within 50 m of the recorded ego, which every source is given with as many vehicles as
+//! were recorded. Prompts are judged on scenes of their own.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use gump_metrics::mmd::{MmdMean, MmdProtocol, scene_mmd};
+use gump_metrics::tags::{self, rules};
+use gump_model::generation::baseline::{
+    overlapping_vehicles, random_along_lanes, retrieved, wrong_way,
+};
+use gump_model::generation::constraint::{Bounds, ObjectSpec};
+use gump_model::generation::factory::{Order, make};
+use gump_model::generation::verdict::off_road;
+use gump_model::generation::{Counts, GenerateConfig, GenerateRequest, Placement};
+use gump_model::world::TransformerWorld;
+use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, Seed};
+use rayon::prelude::*;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::long;
+use crate::run::{Common, Run, stop_if_interrupted};
+use crate::verbs::generate;
+
+/// Objects of the scenes that prompts are judged on.
+const PROMPTED: Counts = Counts {
+    vehicles: 10,
+    pedestrians: 4,
+    bicycles: 3,
+};
+/// Seconds imagined of unprompted scenes to see which tags hold.
+const JUDGED_S: f64 = 4.0;
+
+/// Arguments of `evaluate generation`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// A file or folder of scenarios
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// At most so many scenarios that take part [default: all]
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+    /// Recorded vehicles within 50 m that a scenario needs to take part
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    min_vehicles: usize,
+    /// Scenarios on whose maps each tag is asked for; 0 leaves prompts out
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    prompt_maps: usize,
+    /// Scenes made per prompt before the last one counts
+    #[arg(long, value_name = "N", default_value_t = 12)]
+    attempts: usize,
+    /// Made-up scenes that are imagined for 30 s, with and without agents that come and leave
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    long_scenes: usize,
+    /// Weights of the model [default: the shipped ones]
+    #[arg(long, value_name = "FILE")]
+    weights: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+/// Where scenes come from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Source {
+    Model(Placement),
+    Random,
+    Retrieval,
+    Log,
+}
+
+impl Source {
+    const ALL: [Self; 5] = [
+        Self::Model(Placement::Guided),
+        Self::Model(Placement::Free),
+        Self::Random,
+        Self::Retrieval,
+        Self::Log,
+    ];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Model(Placement::Guided) => "model guided",
+            Self::Model(Placement::Free) => "model free",
+            Self::Random => "random along lanes",
+            Self::Retrieval => "retrieval",
+            Self::Log => "log",
+        }
+    }
+}
+
+/// What one source made.
+#[derive(Default)]
+struct Tally {
+    mmd: MmdMean,
+    failed: usize,
+    vehicles: usize,
+    overlapping: usize,
+    off_road: usize,
+    moving: usize,
+    wrong_way: usize,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let world = run.phase("load", |_| generate::world(self.weights.as_ref(), false))?;
+        let protocol = MmdProtocol {
+            min_vehicles: self.min_vehicles,
+            ..MmdProtocol::gump()
+        };
+        let scenarios = run.phase("read", |_| self.read(&protocol))?;
+        anyhow::ensure!(
+            scenarios.len() > 1,
+            "{} scenarios have {} vehicles within 50 m, expected at least 2",
+            scenarios.len(),
+            self.min_vehicles
+        );
+        run.result("scenarios", scenarios.len())?;
+        let seed = run.seed();
+        let mut tallies = Vec::new();
+        for source in Source::ALL {
+            stop_if_interrupted()?;
+            let tally = run.phase(source.name(), |_| {
+                Ok(tally(&world, source, &scenarios, &protocol, seed))
+            })?;
+            tallies.push((source, tally));
+        }
+        let prompts = run.phase("prompts", |run| self.prompts(run, &world, &scenarios))?;
+        let rows = tallies.iter().map(|(source, tally)| {
+            let satisfaction = match source {
+                Source::Model(Placement::Guided) => prompts.satisfaction,
+                Source::Model(Placement::Free) => prompts.unconditional,
+                Source::Log => prompts.logged,
+                Source::Random | Source::Retrieval => None,
+            };
+            row(*source, tally, satisfaction)
+        });
+        run.result("rows", rows.collect::<Vec<_>>())?;
+        run.result("prompts", prompts.rows)?;
+        if self.long_scenes > 0 {
+            let (weights, n) = (self.weights.as_ref(), self.long_scenes);
+            let rows = run.phase("long", |run| long::rows(run, weights, n))?;
+            run.result("life", rows)?;
+        }
+        Ok(())
+    }
+
+    fn read(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
+        let mut scenarios = Vec::new();
+        for record in gump_data::open(&self.scenarios)? {
+            stop_if_interrupted()?;
+            let scenario = record?.scenario;
+            let present = scenario.present();
+            if scene_mmd(&present, present.now(), protocol).is_some() {
+                scenarios.push(scenario);
+            }
+            if self.limit.is_some_and(|limit| scenarios.len() >= limit) {
+                break;
+            }
+        }
+        Ok(scenarios)
+    }
+
+    /// Every decidable tag on some maps, against how often it holds without being asked for.
+    fn prompts(
+        &self,
+        run: &Run,
+        world: &TransformerWorld,
+        scenarios: &[Scenario],
+    ) -> anyhow::Result<Prompts> {
+        let seed = run.seed();
+        let maps: Vec<&Scenario> = scenarios.iter().take(self.prompt_maps).collect();
+        if maps.is_empty() {
+            return Ok(Prompts::default());
+        }
+        let tags: Vec<ScenarioTag> = rules()
+            .iter()
+            .filter(|rule| rule.is_decidable())
+            .map(|rule| rule.tag())
+            .collect();
+        let order = |recorded: &Scenario, tag: Option<ScenarioTag>| Order {
+            request: GenerateRequest {
+                prompts: tag.into_iter().collect(),
+                counts: Some(PROMPTED),
+                ..generate::request(recorded)
+            },
+            roams: tag.is_none(),
+            seconds: JUDGED_S,
+            attempts: if tag.is_none() { 1 } else { self.attempts },
+        };
+        let progress = run.progress("prompts", (tags.len() * maps.len()) as u64, "scenes");
+        let cases: Vec<(usize, usize)> = (0..tags.len())
+            .flat_map(|tag| (0..maps.len()).map(move |map| (tag, map)))
+            .collect();
+        let asked: Vec<(usize, bool, usize)> = cases
+            .par_iter()
+            .map(|&(tag, map)| {
+                let order = order(maps[map], Some(tags[tag]));
+                let number = (tag * maps.len() + map) as u64;
+                let made = make(world, &order, number, seed.fork(7));
+                progress.advance(1);
+                made.map_or((tag, false, self.attempts), |made| {
+                    let holds = tags::holds(tags[tag], &made.scenario) == Some(true);
+                    (tag, holds, made.attempts)
+                })
+            })
+            .collect();
+        // As many unprompted scenes as there are prompted ones per two tags, at least eight.
+        let n = maps.len().max(1) * 8;
+        let unasked: Vec<Vec<ScenarioTag>> = (0..n as u64)
+            .into_par_iter()
+            .filter_map(|i| {
+                let order = order(maps[i as usize % maps.len()], None);
+                let made = make(world, &order, i, seed.fork(8)).ok()?;
+                Some(tags::mine(&made.scenario))
+            })
+            .collect();
+        let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
+        Ok(Prompts::new(&tags, &asked, &unasked, &logged))
+    }
+}
+
+/// How often tags hold.
+#[derive(Default)]
+struct Prompts {
+    satisfaction: Option<f64>,
+    unconditional: Option<f64>,
+    logged: Option<f64>,
+    rows: Vec<Value>,
+}
+
+impl Prompts {
+    fn new(
+        tags: &[ScenarioTag],
+        asked: &[(usize, bool, usize)],
+        unasked: &[Vec<ScenarioTag>],
+        logged: &[Vec<ScenarioTag>],
+    ) -> Self {
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+        let share = |all: &[Vec<ScenarioTag>], tag: &ScenarioTag| {
+            let n = all.iter().filter(|tags| tags.contains(tag)).count();
+            n as f64 / all.len().max(1) as f64
+        };
+        let (mut held, mut free, mut log, mut rows) = (vec![], vec![], vec![], vec![]);
+        for (i, tag) in tags.iter().enumerate() {
+            let own: Vec<_> = asked.iter().filter(|(tag, ..)| *tag == i).collect();
+            let holding = own.iter().filter(|(_, holds, _)| *holds).count();
+            let attempts: usize = own.iter().map(|(.., attempts)| attempts).sum();
+            held.push(holding as f64 / own.len().max(1) as f64);
+            free.push(share(unasked, tag));
+            log.push(share(logged, tag));
+            rows.push(json!({
+                "tag": tag.name(),
+                "satisfaction": held[i],
+                "attempts": attempts as f64 / own.len().max(1) as f64,
+                "unconditional": free[i],
+                "log": log[i],
+            }));
+        }
+        Self {
+            satisfaction: Some(mean(&held)),
+            unconditional: Some(mean(&free)),
+            logged: Some(mean(&log)),
+            rows,
+        }
+    }
+}
+
+fn tally(
+    world: &TransformerWorld,
+    source: Source,
+    scenarios: &[Scenario],
+    protocol: &MmdProtocol,
+    seed: Seed,
+) -> Tally {
+    let made: Vec<Option<Frame>> = (0..scenarios.len())
+        .into_par_iter()
+        .map(|i| scene_of(world, source, scenarios, i, protocol, seed.fork(i as u64)))
+        .collect();
+    let mut tally = Tally::default();
+    for (scenario, frame) in scenarios.iter().zip(made) {
+        let Some(frame) = frame else {
+            tally.failed += 1;
+            continue;
+        };
+        if let Some(mmd) = scene_mmd(&scenario.present(), &frame, protocol) {
+            tally.mmd.add(&mmd);
+        }
+        let (overlapping, vehicles) = overlapping_vehicles(&frame);
+        let (wrong, moving) = wrong_way(&scenario.map, &frame);
+        tally.overlapping += overlapping;
+        tally.vehicles += vehicles;
+        tally.wrong_way += wrong;
+        tally.moving += moving;
+        tally.off_road += off_road(&alone(scenario, frame));
+    }
+    tally
+}
+
+/// The frame as the only one of a scenario.
+fn alone(scenario: &Scenario, frame: Frame) -> Scenario {
+    Scenario {
+        log: vec![frame],
+        now: 0,
+        ..scenario.clone()
+    }
+}
+
+/// The scene that a source makes in place of a recorded one, vehicles only; `None` if it fails.
+fn scene_of(
+    world: &TransformerWorld,
+    source: Source,
+    scenarios: &[Scenario],
+    i: usize,
+    protocol: &MmdProtocol,
+    seed: Seed,
+) -> Option<Frame> {
+    let scenario = &scenarios[i];
+    let present = scenario.present();
+    let ego = present.ego_now();
+    let ego_from_world = ego.state.pose.inverse();
+    let near = |agent: &&gump_scene::Agent| {
+        let place = ego_from_world * agent.state.pose.position;
+        agent.kind == AgentKind::Vehicle
+            && (agent.id == ego.id || place.abs().max_element() <= protocol.half_side)
+    };
+    let recorded: Vec<_> = present
+        .now()
+        .agents()
+        .iter()
+        .filter(near)
+        .copied()
+        .collect();
+    let n = (recorded.len() - 1).min(protocol.max_vehicles);
+    match source {
+        Source::Log => Some(Frame::new(recorded, Vec::new())),
+        Source::Random => Some(random_along_lanes(&present, n, protocol.half_side, seed)),
+        Source::Retrieval => {
+            // Any other scene, but the same for the same seed.
+            let others = scenarios.len() - 1;
+            let pick = (seed.fork(1).0 % others as u64) as usize;
+            let other = &scenarios[if pick < i { pick } else { pick + 1 }];
+            Some(retrieved(&present, &other.present(), n))
+        }
+        Source::Model(placement) => {
+            let side = Some(Bounds::new(-protocol.half_side, protocol.half_side));
+            let object = |i: usize| ObjectSpec {
+                id: format!("vehicle {i}"),
+                x: side,
+                y: side,
+                ..ObjectSpec::default()
+            };
+            let mut request = GenerateRequest {
+                counts: Some(Counts {
+                    vehicles: n,
+                    ..Counts::default()
+                }),
+                objects: (0..n).map(object).collect(),
+                config: GenerateConfig {
+                    placement,
+                    ..GenerateConfig::default()
+                },
+                map: Arc::clone(&scenario.map),
+                ..generate::request(scenario)
+            };
+            request.ego.velocity = Some(ego.state.velocity);
+            let made = world.generate(&request, &[seed]).ok()?;
+            let scene = made.into_iter().next()?.ok()?;
+            // The recorded ego has its own id, by which both scenes are seen.
+            let agents = scene.frame.agents().iter().map(|agent| {
+                let mut agent = *agent;
+                agent.id = match agent.id {
+                    id if id == scene.ego => ego.id,
+                    id => gump_scene::AgentId(ego.id.0.saturating_add(id.0)),
+                };
+                agent
+            });
+            let moving = agents.filter(|agent| agent.kind.is_moving());
+            Some(Frame::new(moving.collect(), Vec::new()))
+        }
+    }
+}
+
+fn row(source: Source, tally: &Tally, prompt_satisfaction: Option<f64>) -> Value {
+    let mean = tally.mmd.mean();
+    let rate = |n: usize, of: usize| n as f64 / of.max(1) as f64;
+    json!({
+        "source": source.name(),
+        "position": mean.position,
+        "heading": mean.heading,
+        "speed": mean.velocity,
+        "size": mean.size,
+        "overlap_rate": rate(tally.overlapping, tally.vehicles),
+        "offroad_rate": rate(tally.off_road, tally.vehicles),
+        "wrong_way_rate": rate(tally.wrong_way, tally.moving),
+        "prompt_satisfaction": prompt_satisfaction,
+        "scenes": tally.mmd.scenes(),
+        "failed": tally.failed,
+    })
+}

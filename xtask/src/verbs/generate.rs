@@ -1,0 +1,357 @@
+//! `generate`: scenes out of nothing, on the map of any scenario.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use gump_data::find;
+use gump_model::generation::constraint::{ObjectSpec, parse_constraints};
+use gump_model::generation::factory::{Made, Order, make_many};
+use gump_model::generation::verdict::{off_road, overlaps};
+use gump_model::generation::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_model::world::TransformerWorld;
+use gump_model::{SamplingConfig, checkpoint};
+use gump_scene::{AgentKind, Scenario, ScenarioTag};
+use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::cli::WrongArguments;
+use crate::futures;
+use crate::run::{Common, Run, stop_if_interrupted};
+use crate::shipped;
+
+/// Scenes made together.
+const BATCH: u64 = 32;
+
+/// Arguments of `generate`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// The scenario whose map and lights are taken: PATH, PATH#INDEX or PATH#SCENARIO_ID
+    #[arg(long, value_name = "S")]
+    map: String,
+    /// What kind of situation it is to be: one of nuPlan's 73 scenario tags, at most four times
+    #[arg(long, value_name = "TAG")]
+    prompt: Vec<String>,
+    /// Vehicles besides the ego; with no number given the model decides
+    #[arg(long, value_name = "N")]
+    vehicles: Option<usize>,
+    /// Bicycles
+    #[arg(long, value_name = "N")]
+    bicycles: Option<usize>,
+    /// People on foot
+    #[arg(long, value_name = "N")]
+    pedestrians: Option<usize>,
+    /// Wishes for single objects
+    #[arg(long, value_name = "FILE.toml")]
+    fix: Option<PathBuf>,
+    /// How many scenes
+    #[arg(long, value_name = "N", default_value = "1")]
+    count: NonZeroUsize,
+    /// How far to imagine every scene's future
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
+    simulate: f64,
+    /// In imagined futures agents come and leave and lights change, as the model says
+    #[arg(long)]
+    life: bool,
+    /// Where the ego starts
+    #[arg(long, value_enum, default_value_t = StartName::Recorded)]
+    start: StartName,
+    /// Where objects may be drawn
+    #[arg(long, value_enum, default_value_t = PlacementName::Guided)]
+    placement: PlacementName,
+    /// Weights of the model [default: the shipped ones]
+    #[arg(long, value_name = "FILE")]
+    weights: Option<PathBuf>,
+    /// Divides the logits; above 1 is bolder
+    #[arg(long, value_name = "X", default_value_t = 1.25)]
+    temperature: f64,
+    /// Bins that may be drawn per field
+    #[arg(long, value_name = "N", default_value = "400")]
+    top_k: NonZeroUsize,
+    /// Scenes made before one is written that is not what the prompt says
+    #[arg(long, value_name = "N", default_value = "20")]
+    attempts: NonZeroUsize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum StartName {
+    /// Where the recorded ego is
+    Recorded,
+    /// On any lane around there
+    Anywhere,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum PlacementName {
+    /// Wherever the model puts them
+    Free,
+    /// Of what the model proposes, only what is on lanes and walkways
+    Guided,
+}
+
+impl PlacementName {
+    pub(crate) fn resolve(self) -> Placement {
+        match self {
+            Self::Free => Placement::Free,
+            Self::Guided => Placement::Guided,
+        }
+    }
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let prompts = tags(&self.prompt)?;
+        self.check_numbers()?;
+        let objects = self.objects()?;
+        let recorded = run.phase("read", |_| Ok(find(&self.map)?))?;
+        let world = run.phase("load", |_| world(self.weights.as_ref(), self.life))?;
+        let order = Order {
+            request: GenerateRequest {
+                prompts,
+                counts: self.counts(),
+                objects,
+                config: self.config(),
+                ..request(&recorded)
+            },
+            roams: self.start == StartName::Anywhere,
+            seconds: self.simulate,
+            attempts: self.attempts.get(),
+        };
+        let (made, elapsed) = run.phase("generate", |run| self.make(run, &world, &order))?;
+        run.phase("write", |run| write(run, &made))?;
+        tell(run, &made, elapsed)
+    }
+
+    fn check_numbers(&self) -> anyhow::Result<()> {
+        let wrong = if !(self.temperature > 0.0 && self.temperature.is_finite()) {
+            format!(
+                "--temperature: expected a number above 0, found {}",
+                self.temperature
+            )
+        } else if !(0.0..=3600.0).contains(&self.simulate) {
+            format!(
+                "--simulate: expected a number from 0 to 3600, found {}",
+                self.simulate
+            )
+        } else {
+            return Ok(());
+        };
+        Err(WrongArguments(wrong).into())
+    }
+
+    fn objects(&self) -> anyhow::Result<Vec<ObjectSpec>> {
+        let Some(path) = &self.fix else {
+            return Ok(Vec::new());
+        };
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        parse_constraints(&text).with_context(|| path.display().to_string())
+    }
+
+    fn counts(&self) -> Option<Counts> {
+        let given = [self.vehicles, self.pedestrians, self.bicycles];
+        given.iter().any(Option::is_some).then(|| Counts {
+            vehicles: self.vehicles.unwrap_or(0),
+            pedestrians: self.pedestrians.unwrap_or(0),
+            bicycles: self.bicycles.unwrap_or(0),
+        })
+    }
+
+    fn config(&self) -> GenerateConfig {
+        GenerateConfig {
+            temperature: self.temperature,
+            top_k: self.top_k.get(),
+            placement: self.placement.resolve(),
+            ..GenerateConfig::default()
+        }
+    }
+
+    /// All scenes, or the first failure; also the wall time of making them.
+    fn make(
+        &self,
+        run: &Run,
+        world: &TransformerWorld,
+        order: &Order,
+    ) -> anyhow::Result<(Vec<Made>, Duration)> {
+        let n = self.count.get() as u64;
+        let progress = run.progress("generating", n, "scenes");
+        let began = Instant::now();
+        let mut all = Vec::new();
+        for first in (0..n).step_by(BATCH as usize) {
+            stop_if_interrupted()?;
+            let numbers = first..(first + BATCH).min(n);
+            for made in make_many(world, order, numbers, run.seed())? {
+                all.push(made?);
+                progress.advance(1);
+            }
+        }
+        Ok((all, began.elapsed()))
+    }
+}
+
+/// The tags with these names.
+///
+/// Error: [`WrongArguments`] with the nearest name there is.
+pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
+    let tag = |name: &String| {
+        name.parse::<ScenarioTag>().map_err(|why| {
+            let nearness = |tag: &ScenarioTag| strsim::jaro_winkler(tag.name(), name);
+            let nearest = ScenarioTag::all()
+                .max_by(|a, b| nearness(a).total_cmp(&nearness(b)))
+                .expect("there are tags");
+            WrongArguments(format!("--prompt: {why}; did you mean \"{nearest}\"?")).into()
+        })
+    };
+    names.iter().map(tag).collect()
+}
+
+/// The world that generates.
+///
+/// Error: weights that cannot be read.
+pub(crate) fn world(weights: Option<&PathBuf>, life: bool) -> anyhow::Result<TransformerWorld> {
+    let path = match weights {
+        Some(path) => path.clone(),
+        None => {
+            shipped::check_weights()?;
+            shipped::weights()
+        }
+    };
+    let network = checkpoint::load(&path, &gump_model::Device::Cpu)?;
+    let sampling = SamplingConfig {
+        life,
+        ..SamplingConfig::default()
+    };
+    Ok(TransformerWorld::new(network, sampling))
+}
+
+/// A request for scenes where a scenario was recorded: its map, lights and fixtures, and its ego,
+/// whose speed is open.
+pub(crate) fn request(recorded: &Scenario) -> GenerateRequest {
+    let present = recorded.present();
+    let ego = present.ego_now();
+    let agents = present.now().agents().iter();
+    GenerateRequest {
+        map: Arc::clone(&recorded.map),
+        ego: EgoStart {
+            pose: ego.state.pose,
+            length: ego.length,
+            width: ego.width,
+            velocity: None,
+        },
+        lights: present.now().lights().to_vec(),
+        fixtures: agents
+            .filter(|agent| !agent.kind.is_moving())
+            .copied()
+            .collect(),
+        prompts: Vec::new(),
+        counts: None,
+        objects: Vec::new(),
+        config: GenerateConfig::default(),
+    }
+}
+
+/// All scenes as Waymo records, the first as JSON, as a picture, and as a film if it moves.
+fn write(run: &Run, made: &[Made]) -> anyhow::Result<()> {
+    let scenarios: Vec<&Scenario> = made.iter().map(|made| &made.scenario).collect();
+    gump_data::womd::write_scenarios(&run.path("scenes.tfrecord"), scenarios.iter().copied())?;
+    let Some(&first) = scenarios.first() else {
+        return Ok(());
+    };
+    gump_data::scenario_json::write_scenario(&run.path("scenario.json"), first)?;
+    let present = first.present();
+    let spec = PictureSpec {
+        legend: true,
+        ..PictureSpec::new(Camera::on_ego(&present, 140.0, 1000, 1000)).with_label(&first.id)
+    };
+    draw_scene(&present, &spec).save_png(&run.path("picture.png"))?;
+    if first.log.len() > 1 {
+        let rollout = log_as_rollout(first);
+        let alone = Scenario {
+            log: first.log[..=first.now].to_vec(),
+            ..first.clone()
+        };
+        futures::film(&alone, &[("generated", &rollout)])?.save(&run.path("film.gif"))?;
+        let mut viewer = Viewer::new(&alone);
+        viewer
+            .note("a generated scene and its imagined future")
+            .future("generated", &rollout);
+        viewer.save(&run.path("viewer.html"))?;
+    }
+    Ok(())
+}
+
+fn tell(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
+    let n = made.len() as f64;
+    let agents: usize = made.iter().map(agents).sum();
+    let vehicles: usize = made
+        .iter()
+        .map(|made| count(made, |kind| kind == AgentKind::Vehicle))
+        .sum();
+    let sum = |of: fn(&Scenario) -> usize| made.iter().map(|m| of(&m.scenario)).sum::<usize>();
+    let (overlapping, off) = (sum(overlaps), sum(off_road));
+    run.result("scenes", made.len())?;
+    run.result("agents", agents)?;
+    run.result("agents_per_scene", agents as f64 / n)?;
+    run.result("overlaps", overlapping)?;
+    run.result("offroad", off)?;
+    run.result("overlap_rate", overlapping as f64 / agents.max(1) as f64)?;
+    run.result("offroad_rate", off as f64 / vehicles.max(1) as f64)?;
+    let holding = made.iter().filter(|made| made.holds()).count();
+    run.result("holding", holding as f64 / n)?;
+    run.result("attempts", made.iter().map(|m| m.attempts).sum::<usize>())?;
+    let redraws: usize = made.iter().map(|made| made.scene.redraws).sum();
+    run.result("redraws", redraws)?;
+    let restarts: usize = made.iter().map(|made| made.scene.restarts).sum();
+    run.result("restarts", restarts)?;
+    run.result("clauses", clauses(made))?;
+    run.result("scenes_per_second", n / elapsed.as_secs_f64().max(1e-9))
+}
+
+fn agents(made: &Made) -> usize {
+    count(made, AgentKind::is_moving)
+}
+
+fn count(made: &Made, wanted: impl Fn(AgentKind) -> bool) -> usize {
+    let agents = made.scene.frame.agents().iter();
+    agents.filter(|agent| wanted(agent.kind)).count()
+}
+
+/// Per clause whether it holds; of several scenes, in all of them, with the share in which it does.
+fn clauses(made: &[Made]) -> Vec<Value> {
+    let first = made.first().map_or(&[][..], |made| &made.clauses);
+    let row = |(i, clause): (usize, &gump_model::generation::verdict::Clause)| {
+        let verdicts: Vec<Option<bool>> = made.iter().map(|made| made.clauses[i].holds).collect();
+        let holding = verdicts
+            .iter()
+            .filter(|holds| **holds == Some(true))
+            .count();
+        let failing = verdicts.contains(&Some(false));
+        json!({
+            "clause": clause.clause,
+            "holds": if failing { Some(false) } else { clause.holds },
+            "share": holding as f64 / made.len() as f64,
+        })
+    };
+    first.iter().enumerate().map(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_tag_gets_its_nearest() {
+        let names = ["behind_bike".to_owned(), "behnd_bike".to_owned()];
+        assert_eq!(tags(&names[..1]).unwrap()[0].name(), "behind_bike");
+        let error = tags(&names).unwrap_err().to_string();
+        assert!(error.contains("did you mean \"behind_bike\"?"), "{error}");
+    }
+}
