@@ -19,13 +19,16 @@ const ROAD: &str = "lane 1: -100,-2 100,-2 width 3.6
      light 1 red: 28,-2
      ego vehicle 0: 0,-2 velocity 8,0";
 
-fn world() -> TransformerWorld {
+fn network() -> Network {
     let mut config = ModelConfig::tiny();
     config.visual.side_px = 104;
     config.visual.metres_per_px = 2.0;
     let device = candle_core::Device::Cpu;
-    let network = Network::random(config, Seed(5), &device).unwrap();
-    TransformerWorld::new(network, SamplingConfig::default())
+    Network::random(config, Seed(5), &device).unwrap()
+}
+
+fn world() -> TransformerWorld {
+    TransformerWorld::new(network(), SamplingConfig::default())
 }
 
 fn request(objects: Vec<ObjectSpec>) -> GenerateRequest {
@@ -151,4 +154,56 @@ fn what_cannot_be_met_is_said() {
     let mut nowhere = request(Vec::new());
     nowhere.map = fixture::scenario("ego vehicle 0: 0,0").unwrap().map;
     assert!(error(&nowhere).contains("no drivable lane"));
+}
+
+#[test]
+fn what_a_prompt_says_is_made_and_judged() {
+    let mut request = request(Vec::new());
+    request.prompts = vec!["behind_bike".parse().unwrap()];
+    let order = factory::Order {
+        request,
+        roams: false,
+        seconds: 0.0,
+        attempts: 20,
+    };
+    let made = factory::make_many(&world(), &order, 0..2, Seed(1)).unwrap();
+    for made in made.into_iter().map(Result::unwrap) {
+        assert_eq!(made.clauses[0].clause, "behind_bike");
+        assert_eq!(made.clauses[0].holds, Some(true), "{:?}", made.clauses);
+        // Judging looks four seconds ahead.
+        assert_eq!(made.scenario.log.len(), 41);
+    }
+}
+
+#[test]
+fn traffic_lives_where_it_is_let() {
+    let scene = &make(&request(Vec::new()), 1)[0];
+    let map = fixture::scenario(ROAD).unwrap().map;
+    let scenario = scene.scenario("made".into(), &map, &[]);
+    let frames = |life: bool| {
+        let sampling = SamplingConfig {
+            life,
+            ..SamplingConfig::default()
+        };
+        let world = TransformerWorld::new(network(), sampling);
+        let start = gump_rollout::Start {
+            scene: scenario.present(),
+            n_futures: 2,
+            seed: Seed(4),
+        };
+        let config = gump_rollout::SimulateConfig {
+            seconds: 6.0,
+            ..gump_rollout::SimulateConfig::default()
+        };
+        let rollouts = gump_rollout::simulate(&world, &[start], None, &config).unwrap();
+        rollouts[0].imagined().to_vec()
+    };
+    let ids = |frame: &Frame| -> Vec<AgentId> { frame.agents().iter().map(|a| a.id).collect() };
+    let still = frames(false);
+    assert!(still.iter().all(|frame| ids(frame) == ids(&scene.frame)));
+    let alive = frames(true);
+    assert!(alive.iter().all(|frame| frame.agent(scene.ego).is_some()));
+    // A network that has learned nothing finds everybody's leaving and coming likely, out there.
+    assert_ne!(ids(&alive[alive.len() - 1]), ids(&scene.frame));
+    assert_eq!(alive, frames(true));
 }
