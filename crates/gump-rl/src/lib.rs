@@ -4,7 +4,8 @@
 //! is a [`VectorEnv`], which is all that learning algorithms ask for. What is driven on is a
 //! [`Course`], what an action does [`Dynamics`], what is seen an [`ObservationSpec`], what is good
 //! [`RewardWeights`]. One episode as pure functions of values is [`Rules`]. [`sac`] learns from
-//! rewards and from experts, and gives an [`Actor`].
+//! rewards and from experts, and gives an [`Actor`]. [`server`] lends environments to other
+//! processes.
 //!
 //! # Terms
 //! * **row**: a place in the batch. **Episode**: what happens in a row from a start to an end.
@@ -23,6 +24,7 @@ mod imitation;
 pub mod networks;
 mod observation;
 pub mod sac;
+pub mod server;
 mod vector_env;
 
 pub use actor::Actor;
