@@ -1,0 +1,134 @@
+//! `rl serve`: environments for Python and others, over a Unix socket.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use gump_model::SamplingConfig;
+use gump_rl::server::{Event, Server};
+use gump_rl::{Course, EnvConfig, Sampling, Traffic};
+use serde::Serialize;
+
+use crate::run::{Common, Run, interrupted};
+use crate::worlds::{World, WorldName};
+
+/// Seconds that an action is held: a frame of the world model, as in the paper.
+const STEP: f64 = 0.5;
+
+/// Arguments of `rl serve`.
+#[derive(Debug, Serialize, clap::Args)]
+pub(crate) struct Args {
+    /// Where to listen
+    #[arg(long, value_name = "PATH")]
+    socket: PathBuf,
+    /// A file or folder of scenarios to drive through
+    #[arg(long, value_name = "PATH")]
+    scenarios: PathBuf,
+    /// Who moves the others: log, idm, constant-velocity or model:WEIGHTS
+    #[arg(long, value_name = "W", default_value = "log")]
+    world: WorldName,
+    /// Read no more scenarios than that
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+    /// Seconds until an episode is cut off
+    #[arg(long, value_name = "S", default_value_t = 8.0)]
+    horizon: f64,
+    /// Drive scenarios that were failed lately more often
+    #[arg(long)]
+    prioritized: bool,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) common: Common,
+}
+
+impl Args {
+    pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let courses = run.phase("read", |_| self.courses())?;
+        let world = run.phase("load", |run| {
+            let sampling = SamplingConfig::default();
+            Ok(match &self.world {
+                WorldName::Log => None,
+                name => Some(World::without_log(run.device(), name, &sampling)?),
+            })
+        })?;
+        let traffic = world
+            .as_ref()
+            .map_or(Traffic::Log, |world| Traffic::World(world.model()));
+        let mut config = EnvConfig::default();
+        config.rules.horizon = self.horizon;
+        if self.prioritized {
+            config.sampling = Sampling::prioritized();
+        }
+        let server = Server::bind(&self.socket)?;
+        run.say(&format!(
+            "serving {} scenarios at {}; Ctrl-C ends it",
+            courses.len(),
+            server.path().display()
+        ));
+        let served = run.phase("serve", |run| serve(run, &server, &courses, traffic, &config))?;
+        run.result("scenarios", courses.len())?;
+        run.result("clients", served.clients.into_inner())?;
+        run.result("episodes", served.episodes.into_inner())?;
+        run.result("episodes_lost", served.lost.into_inner())
+    }
+
+    fn courses(&self) -> anyhow::Result<Arc<[Course]>> {
+        let records = gump_data::open(&self.scenarios)?;
+        let scenarios: Result<Vec<_>, _> = records
+            .take(self.limit.unwrap_or(usize::MAX))
+            .map(|record| record.map(|record| record.scenario))
+            .collect();
+        Ok(Course::prepare(scenarios?, STEP)?)
+    }
+}
+
+/// What was served.
+#[derive(Default)]
+struct Served {
+    clients: AtomicU64,
+    episodes: AtomicU64,
+    lost: AtomicU64,
+}
+
+/// Serves until Ctrl-C.
+fn serve(
+    run: &Run,
+    server: &Server,
+    courses: &Arc<[Course]>,
+    traffic: Traffic<'_>,
+    config: &EnvConfig,
+) -> anyhow::Result<Served> {
+    let served = Served::default();
+    let tell = |event: Event| match event {
+        Event::Came { client } => {
+            served.clients.fetch_add(1, Ordering::Relaxed);
+            run.say(&format!("client {client} came"));
+        }
+        Event::Left { client, farewell } => {
+            let (n, lost) = (farewell.episodes_finished, farewell.episodes_lost as u64);
+            served.episodes.fetch_add(n, Ordering::Relaxed);
+            served.lost.fetch_add(lost, Ordering::Relaxed);
+            let why = farewell.error.map_or_else(
+                || "it said goodbye".to_owned(),
+                |error| error.to_string(),
+            );
+            run.say(&format!(
+                "client {client} left after {n} episodes, {lost} under way: {why}"
+            ));
+        }
+    };
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !interrupted() && !is_over.load(Ordering::Relaxed) {
+                std::thread::sleep(Duration::from_millis(100));
+            }
+            server.stop();
+        });
+        let done = server.run(courses, traffic, config, &tell);
+        is_over.store(true, Ordering::Relaxed);
+        done
+    })?;
+    Ok(served)
+}
