@@ -135,6 +135,9 @@ impl Cli {
             Verb::Rl(rl::Verb::Evaluate(args)) => {
                 Run::of("rl evaluate", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Rl(rl::Verb::Serve(args)) => {
+                Run::of("rl serve", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Rl(rl::Verb::Table(args)) => {
                 Run::of("rl table", &args.common, &args)?.execute(|run| args.execute(run))
             }

@@ -50,9 +50,9 @@ impl Default for SamplingConfig {
         Self {
             mode: Mode::PartialAr,
             cache: CacheMode::Window,
-            temperature: 1.1,
+            temperature: 0.6,
             top_k: 40,
-            decay: 1.2,
+            decay: 0.0,
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,

@@ -1,6 +1,7 @@
 //! `rl`: policies that learn to drive, and how well they drive.
 
 pub(crate) mod evaluate;
+pub(crate) mod serve;
 pub(crate) mod table;
 pub(crate) mod train;
 
@@ -32,6 +33,8 @@ pub(crate) enum Verb {
     Train(train::Args),
     /// Let policies drive and print the paper's columns.
     Evaluate(evaluate::Args),
+    /// Serve environments to Python and others over a Unix socket, until Ctrl-C.
+    Serve(serve::Args),
     /// Train all policies of the paper's table and evaluate them, going on where it stopped.
     Table(table::Args),
 }

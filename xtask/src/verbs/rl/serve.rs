@@ -10,11 +10,10 @@ use gump_rl::server::{Event, Server};
 use gump_rl::{Course, EnvConfig, Sampling, Traffic};
 use serde::Serialize;
 
+use super::{RlWorld, courses};
+use crate::dataset::Split;
 use crate::run::{Common, Run, interrupted};
-use crate::worlds::{World, WorldName};
-
-/// Seconds that an action is held: a frame of the world model, as in the paper.
-const STEP: f64 = 0.5;
+use crate::worlds::WorldName;
 
 /// Arguments of `rl serve`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -22,7 +21,7 @@ pub(crate) struct Args {
     /// Where to listen
     #[arg(long, value_name = "PATH")]
     socket: PathBuf,
-    /// A file or folder of scenarios to drive through
+    /// A file or folder of scenarios to drive through; of a data set those of its train split
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
     /// Who moves the others: log, idm, constant-velocity or model:WEIGHTS
@@ -44,17 +43,12 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let courses = run.phase("read", |_| self.courses())?;
-        let world = run.phase("load", |run| {
-            let sampling = SamplingConfig::default();
-            Ok(match &self.world {
-                WorldName::Log => None,
-                name => Some(World::without_log(run.device(), name, &sampling)?),
-            })
+        let courses = run.phase("read", |run| {
+            courses(run, &self.scenarios, Split::Train, self.limit)
         })?;
-        let traffic = world
-            .as_ref()
-            .map_or(Traffic::Log, |world| Traffic::World(world.model()));
+        let world = run.phase("load", |run| {
+            RlWorld::load(run.device(), &self.world, &SamplingConfig::default())
+        })?;
         let mut config = EnvConfig::default();
         config.rules.horizon = self.horizon;
         if self.prioritized {
@@ -66,20 +60,13 @@ impl Args {
             courses.len(),
             server.path().display()
         ));
-        let served = run.phase("serve", |run| serve(run, &server, &courses, traffic, &config))?;
+        let served = run.phase("serve", |run| {
+            serve(run, &server, &courses, world.traffic(), &config)
+        })?;
         run.result("scenarios", courses.len())?;
         run.result("clients", served.clients.into_inner())?;
         run.result("episodes", served.episodes.into_inner())?;
         run.result("episodes_lost", served.lost.into_inner())
-    }
-
-    fn courses(&self) -> anyhow::Result<Arc<[Course]>> {
-        let records = gump_data::open(&self.scenarios)?;
-        let scenarios: Result<Vec<_>, _> = records
-            .take(self.limit.unwrap_or(usize::MAX))
-            .map(|record| record.map(|record| record.scenario))
-            .collect();
-        Ok(Course::prepare(scenarios?, STEP)?)
     }
 }
 
@@ -109,10 +96,9 @@ fn serve(
             let (n, lost) = (farewell.episodes_finished, farewell.episodes_lost as u64);
             served.episodes.fetch_add(n, Ordering::Relaxed);
             served.lost.fetch_add(lost, Ordering::Relaxed);
-            let why = farewell.error.map_or_else(
-                || "it said goodbye".to_owned(),
-                |error| error.to_string(),
-            );
+            let why = farewell
+                .error
+                .map_or_else(|| "it said goodbye".to_owned(), |error| error.to_string());
             run.say(&format!(
                 "client {client} left after {n} episodes, {lost} under way: {why}"
             ));
