@@ -180,7 +180,10 @@ mod tests {
 
     #[test]
     fn a_knob_turns_nothing_else() {
-        let base = SamplingConfig::default();
+        let base = SamplingConfig {
+            decay: 1.2,
+            ..SamplingConfig::default()
+        };
         let strip = |config: SamplingConfig| SamplingConfig {
             temperature: base.temperature,
             ..config

@@ -149,7 +149,7 @@ mod tests {
         // One drives out of the counted square, one into it; one stays.
         let scenario = fixture::scenario(
             "ego vehicle 0: 0,0\nagent vehicle 1: 70,0 velocity 5,0\n\
-             agent vehicle 2: -90,0 velocity 5,0\nagent pedestrian 3: 5,5\nhistory 1 future 8",
+             agent vehicle 2: -90,0 velocity 5,0\nagent pedestrian 3: 5,5",
         )
         .unwrap();
         let rollout = log_as_rollout(&scenario);
