@@ -4,6 +4,7 @@
 //! no lanes, it is no error.
 
 use std::collections::BTreeMap;
+use std::sync::OnceLock;
 
 use gump_geometry::{BoxIndex, DVec2, PointIndex, Polygon, SegmentIndex, dvec2};
 
@@ -12,7 +13,7 @@ use crate::{
     StopSign,
 };
 
-/// An immutable, indexed map; share it by `Arc`.
+/// An immutable, indexed map; share it by `Arc`, and its indices are built once for all.
 #[derive(Clone, Debug, Default)]
 pub struct MapGraph {
     parts: MapParts,
@@ -20,14 +21,20 @@ pub struct MapGraph {
     roadblock_by_id: BTreeMap<RoadblockId, usize>,
     roadblock_lanes: BTreeMap<RoadblockId, Vec<usize>>,
     lane_areas: BTreeMap<LaneId, Vec<usize>>,
-    lane_segments: SegmentIndex<(usize, usize)>,
-    edge_segments: SegmentIndex<(usize, usize)>,
-    lane_boxes: BoxIndex<usize>,
-    roadblock_boxes: BoxIndex<usize>,
-    area_boxes: BoxIndex<usize>,
-    drivable_boxes: BoxIndex<usize>,
-    elevation_points: PointIndex,
-    elevations: Vec<f64>,
+    places: Places,
+}
+
+/// Indices by place, each built when it is first asked for: to build all takes longer than to read
+/// a map, and few uses ask for all.
+#[derive(Clone, Debug, Default)]
+struct Places {
+    lane_segments: OnceLock<SegmentIndex<(usize, usize)>>,
+    edge_segments: OnceLock<SegmentIndex<(usize, usize)>>,
+    lane_boxes: OnceLock<BoxIndex<usize>>,
+    roadblock_boxes: OnceLock<BoxIndex<usize>>,
+    area_boxes: OnceLock<BoxIndex<usize>>,
+    drivable_boxes: OnceLock<BoxIndex<usize>>,
+    heights: OnceLock<(PointIndex, Vec<f64>)>,
 }
 
 impl MapGraph {
@@ -58,20 +65,12 @@ impl MapGraph {
                 links.retain(|id| roadblock_by_id.contains_key(id));
             }
         }
-        let (elevation_points, elevations) = heights(&parts);
         Ok(Self {
             by_id,
             roadblock_by_id,
             roadblock_lanes: grouped(parts.lanes.iter().map(|lane| lane.roadblock)),
             lane_areas: grouped(parts.areas.iter().map(|area| area.lanes.iter().copied())),
-            lane_segments: segments(parts.lanes.iter().map(|lane| lane.centerline.segments())),
-            edge_segments: segments(parts.road_edges.iter().map(|edge| edge.line.segments())),
-            lane_boxes: boxes(parts.lanes.iter().map(lane_bounds)),
-            roadblock_boxes: boxes(parts.roadblocks.iter().map(|block| block.outline.bounds())),
-            area_boxes: boxes(parts.areas.iter().map(|area| area.polygon.bounds())),
-            drivable_boxes: boxes(parts.drivable.iter().map(Polygon::bounds)),
-            elevation_points,
-            elevations,
+            places: Places::default(),
             parts,
         })
     }
@@ -112,7 +111,7 @@ impl MapGraph {
     /// distance.
     pub fn lanes_near(&self, point: DVec2, radius: f64) -> impl Iterator<Item = (&Lane, f64)> + '_ {
         let mut seen = Vec::new();
-        self.lane_segments
+        self.lane_segments()
             .within(point, radius)
             .filter_map(move |((lane, _), distance)| {
                 if seen.contains(&lane) {
@@ -126,7 +125,7 @@ impl MapGraph {
     /// Lanes whose surface ([`Lane::surface`]) contains `point`, its border excluded, in the order
     /// of [`MapGraph::lanes`].
     pub fn lanes_containing(&self, point: DVec2) -> impl Iterator<Item = &Lane> {
-        sorted(self.lane_boxes.intersecting(point, point))
+        sorted(self.lane_boxes().intersecting(point, point))
             .map(|i| &self.parts.lanes[i])
             .filter(move |lane| lane.surface().is_some_and(|s| s.contains_strictly(point)))
     }
@@ -137,7 +136,7 @@ impl MapGraph {
     /// Source: the proximity query of nuPlan, which asks for a square where others ask for a disc.
     pub fn lanes_in_square(&self, center: DVec2, half: f64) -> impl Iterator<Item = &Lane> {
         let square = square(center, half);
-        sorted(self.lane_boxes.intersecting(center - half, center + half))
+        sorted(self.lane_boxes().intersecting(center - half, center + half))
             .map(|i| &self.parts.lanes[i])
             .filter(move |lane| lane.surface().is_some_and(|s| s.intersects(&square)))
     }
@@ -162,7 +161,7 @@ impl MapGraph {
     /// Roadblocks whose outline contains `point`, its border excluded, in the order of
     /// [`MapGraph::roadblocks`].
     pub fn roadblocks_containing(&self, point: DVec2) -> impl Iterator<Item = &Roadblock> {
-        sorted(self.roadblock_boxes.intersecting(point, point))
+        sorted(self.roadblock_boxes().intersecting(point, point))
             .map(|i| &self.parts.roadblocks[i])
             .filter(move |block| block.outline.contains_strictly(point))
     }
@@ -176,7 +175,7 @@ impl MapGraph {
     ) -> impl Iterator<Item = &Roadblock> {
         let square = square(center, half);
         sorted(
-            self.roadblock_boxes
+            self.roadblock_boxes()
                 .intersecting(center - half, center + half),
         )
         .map(|i| &self.parts.roadblocks[i])
@@ -199,7 +198,7 @@ impl MapGraph {
         &self,
         point: DVec2,
     ) -> impl Iterator<Item = (usize, usize, f64)> + '_ {
-        self.edge_segments
+        self.edge_segments()
             .nearest(point)
             .map(|((edge, segment), distance)| (edge, segment, distance))
     }
@@ -212,7 +211,7 @@ impl MapGraph {
     /// Areas of one kind that contain `point`, their border excluded, in the order of
     /// [`MapGraph::areas`].
     pub fn areas_containing(&self, point: DVec2, kind: AreaKind) -> impl Iterator<Item = &Area> {
-        sorted(self.area_boxes.intersecting(point, point))
+        sorted(self.area_boxes().intersecting(point, point))
             .map(|i| &self.parts.areas[i])
             .filter(move |area| area.kind == kind && area.polygon.contains_strictly(point))
     }
@@ -226,7 +225,7 @@ impl MapGraph {
         kind: AreaKind,
     ) -> impl Iterator<Item = &Area> {
         let square = square(center, half);
-        sorted(self.area_boxes.intersecting(center - half, center + half))
+        sorted(self.area_boxes().intersecting(center - half, center + half))
             .map(|i| &self.parts.areas[i])
             .filter(move |area| area.kind == kind && area.polygon.intersects(&square))
     }
@@ -254,7 +253,7 @@ impl MapGraph {
     pub fn is_drivable(&self, point: DVec2) -> bool {
         self.parts.drivable.is_empty()
             || self
-                .drivable_boxes
+                .drivable_boxes()
                 .intersecting(point, point)
                 .any(|i| self.parts.drivable[i].contains(point))
     }
@@ -262,7 +261,7 @@ impl MapGraph {
     /// Metres from `point` to the nearest drivable surface, 0 on one; `None` for a map without any.
     pub fn drivable_distance(&self, point: DVec2) -> Option<f64> {
         let mut best: Option<f64> = None;
-        for (i, at_least) in self.drivable_boxes.nearest(point) {
+        for (i, at_least) in self.drivable_boxes().nearest(point) {
             if best.is_some_and(|best| best <= at_least) {
                 break;
             }
@@ -276,13 +275,45 @@ impl MapGraph {
     ///
     /// Source: the elevation rule of the GUMP paper's Waymo evaluation.
     pub fn elevation_at(&self, point: DVec2) -> Option<f64> {
-        let (sum, n) = self
-            .elevation_points
-            .nearest(point, 4)
-            .fold((0.0, 0), |(sum, n), (i, _)| {
-                (sum + self.elevations[i], n + 1)
-            });
+        let (points, heights) = self.places.heights.get_or_init(|| heights(&self.parts));
+        let nearest = points.nearest(point, 4);
+        let (sum, n) = nearest.fold((0.0, 0), |(sum, n), (i, _)| (sum + heights[i], n + 1));
         (n > 0).then(|| sum / f64::from(n))
+    }
+}
+
+impl MapGraph {
+    fn lane_segments(&self) -> &SegmentIndex<(usize, usize)> {
+        let lanes = self.parts.lanes.iter();
+        let build = || segments(lanes.map(|lane| lane.centerline.segments()));
+        self.places.lane_segments.get_or_init(build)
+    }
+
+    fn edge_segments(&self) -> &SegmentIndex<(usize, usize)> {
+        let edges = self.parts.road_edges.iter();
+        let build = || segments(edges.map(|edge| edge.line.segments()));
+        self.places.edge_segments.get_or_init(build)
+    }
+
+    fn lane_boxes(&self) -> &BoxIndex<usize> {
+        let build = || boxes(self.parts.lanes.iter().map(lane_bounds));
+        self.places.lane_boxes.get_or_init(build)
+    }
+
+    fn roadblock_boxes(&self) -> &BoxIndex<usize> {
+        let blocks = self.parts.roadblocks.iter();
+        let build = || boxes(blocks.map(|block| block.outline.bounds()));
+        self.places.roadblock_boxes.get_or_init(build)
+    }
+
+    fn area_boxes(&self) -> &BoxIndex<usize> {
+        let build = || boxes(self.parts.areas.iter().map(|area| area.polygon.bounds()));
+        self.places.area_boxes.get_or_init(build)
+    }
+
+    fn drivable_boxes(&self) -> &BoxIndex<usize> {
+        let build = || boxes(self.parts.drivable.iter().map(Polygon::bounds));
+        self.places.drivable_boxes.get_or_init(build)
     }
 }
 
