@@ -28,6 +28,6 @@ mod traffic;
 
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;
-pub use scenario::{synthesize, synthesize_many};
+pub use scenario::{synthesize, synthesize_many, try_synthesize};
 pub use smooth::smooth_motion;
 pub use sumo_demand::{SumoDemand, draw_sumo_demand};

@@ -26,13 +26,17 @@ const TARGET_RANGE: f64 = 60.0;
 /// # Panics
 /// If the extent leaves no room for a vehicle to drive through for the logged time.
 pub fn synthesize(config: &SynthesisConfig, seed: Seed) -> Scenario {
+    try_synthesize(config, seed).expect("the extent leaves room for a vehicle to drive through")
+}
+
+/// As [`synthesize`], but `None` if nobody drives through for the logged time: a matter of luck
+/// where it takes about as long as the extent allows.
+pub fn try_synthesize(config: &SynthesisConfig, seed: Seed) -> Option<Scenario> {
     let family = config
         .family
         .unwrap_or_else(|| RoadFamily::ALL[seed.rng().random_range(0..RoadFamily::ALL.len())]);
     // Scenes that nobody drives through, or in which boxes touch, are drawn again.
-    (0..ATTEMPTS)
-        .find_map(|attempt| draw_scenario(config, family, seed, attempt))
-        .expect("the extent leaves room for a vehicle to drive through")
+    (0..ATTEMPTS).find_map(|attempt| draw_scenario(config, family, seed, attempt))
 }
 
 /// Makes up `n` scenarios on all threads of the pool; scenario `k` comes from `seed.fork(k)`, so

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use gump_model::world::TransformerWorld;
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::{AgentId, Frame, LightState, Scenario, SceneState, Seed};
-use gump_synthesis::{SynthesisConfig, synthesize};
+use gump_synthesis::{SynthesisConfig, try_synthesize};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -39,10 +39,12 @@ pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Re
         ..SynthesisConfig::standard()
     };
     let seed = run.seed();
-    let scenarios: Vec<Scenario> = (0..n as u64)
+    // Few drive through a scene for half a minute, and in some scenes nobody does.
+    let mut scenarios: Vec<Scenario> = (0..2 * n as u64)
         .into_par_iter()
-        .map(|i| synthesize(&config, seed.fork(100 + i)))
+        .filter_map(|i| try_synthesize(&config, seed.fork(100 + i)))
         .collect();
+    scenarios.truncate(n);
     let logged: Vec<Seen> = scenarios
         .iter()
         .map(|scenario| seen(scenario.present(), scenario.future()))
