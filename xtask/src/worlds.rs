@@ -180,13 +180,13 @@ pub(crate) struct Draw {
     /// In which form the weights are multiplied
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
-    /// Divides the logits; above 1 is bolder [default: 0.6]
+    /// Divides the logits; above 1 is bolder [default: 0.5]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
     /// Bins that may be drawn per field [default: 40]
     #[arg(long, value_name = "N")]
     top_k: Option<usize>,
-    /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0]
+    /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
     #[arg(long, value_name = "X")]
     decay: Option<f64>,
     /// Draws again at most that often what would run into something, 0 for never [default: 4]

@@ -50,9 +50,9 @@ impl Default for SamplingConfig {
         Self {
             mode: Mode::PartialAr,
             cache: CacheMode::Window,
-            temperature: 0.6,
+            temperature: 0.5,
             top_k: 40,
-            decay: 0.0,
+            decay: 0.3,
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
