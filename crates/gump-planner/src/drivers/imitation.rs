@@ -1,18 +1,17 @@
 //! The world's own ego as a driver.
 
-use gump_geometry::{DVec2, Pose, dvec2};
+use gump_geometry::{DVec2, Pose};
 use gump_rollout::closed_loop::{Driver, Mission, Moment};
 use gump_rollout::dynamics::Trajectory;
 use gump_rollout::{BoxError, RolloutError, Start, WorldModel};
-use gump_scene::{EgoState, Seed, VehicleParameters};
+use gump_scene::{Seed, VehicleParameters};
 
+use super::planned::follow;
 use crate::considered::{Considered, Explain};
 use crate::{PlanError, Proposal, ProposalKind};
 
 /// Seconds of a plan: what nuPlan's open loop compares.
 const SECONDS: f64 = 8.0;
-/// Seconds between the states of a plan.
-const DT: f64 = 0.1;
 
 /// Plans the mean of what the world has the ego do in several futures.
 ///
@@ -108,17 +107,7 @@ impl Driver for ImitationDriver<'_> {
         }
         let (places, dt) = self.imagine(moment)?;
         let proposal = Proposal::through(ProposalKind::Imitation, &places, dt);
-        let now = moment.scene.ego_now().state;
-        let mut states = vec![*moment.ego];
-        for (i, state) in proposal.resampled(&now, DT).iter().enumerate() {
-            states.push(EgoState {
-                time_us: moment.ego.time_us + (i as i64 + 1) * (DT * 1e6) as i64,
-                rear_axle: vehicle.rear_axle_of(state.pose),
-                velocity: dvec2(state.velocity.dot(state.pose.direction()), 0.0),
-                ..EgoState::default()
-            });
-        }
-        let plan = Trajectory::new(states)?;
+        let plan = follow(&proposal, moment, &vehicle)?;
         self.plan = Some(plan.clone());
         Ok(plan)
     }

@@ -64,7 +64,8 @@ impl<P: Planner> Driver for Planned<P> {
     }
 }
 
-fn follow(
+/// A proposal as the trajectory that a vehicle follows from its present state on.
+pub(super) fn follow(
     proposal: &Proposal,
     moment: &Moment<'_>,
     vehicle: &VehicleParameters,
