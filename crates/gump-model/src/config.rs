@@ -121,7 +121,7 @@ impl ModelConfig {
         }
     }
 
-    /// The size that trains on two CPU cores: 3.0 million parameters.
+    /// The size that trains on two CPU cores: 3.5 million parameters.
     pub fn tiny() -> Self {
         Self {
             width: 128,
