@@ -79,7 +79,8 @@ pub fn groups(files: &[PathBuf]) -> Vec<Range<usize>> {
 /// Converts files into one file `STEM.ENDING` (of [`OutputFormat::ScenarioJson`]: one per scenario,
 /// `STEM-00000.json.gz` and so on), which appears when it is complete; no scenarios make no file.
 ///
-/// `each` sees every scenario that was written and may end the work by an error.
+/// `each` sees every scenario that was written and may end the work by an error. Waymo's messages
+/// state the lights as they were seen, without [`ReadOptions::infer_light_gaps`].
 ///
 /// # Errors
 /// Whatever `each` returns, and [`DataError::Io`] for the output. What is wrong with the input is
@@ -91,6 +92,11 @@ pub fn convert<E: From<DataError>>(
     stem: &Path,
     each: impl FnMut(&Scenario) -> Result<(), E>,
 ) -> Result<Converted, E> {
+    let options = ReadOptions {
+        // Messages state what was seen; what was not is held again by who reads them.
+        infer_light_gaps: options.infer_light_gaps && format != OutputFormat::Waymo,
+        ..options
+    };
     let mut conversion = Conversion {
         reader: open_files(files.to_vec(), options),
         result: Converted::default(),

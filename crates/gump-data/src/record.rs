@@ -103,6 +103,10 @@ pub struct ReadOptions {
     pub infer_edges: bool,
     /// The lane of a light that states only where it is.
     pub infer_light_lanes: bool,
+    /// Colours of lights for up to four seconds between two sightings of the same colour, **the
+    /// later one included**, in recordings that lose sight of lights (Waymo's). Official metrics
+    /// read what was recorded.
+    pub infer_light_gaps: bool,
     /// The ego's route from its logged path, **future included**: it tells where the ego went,
     /// as a navigation system would; it does not tell when or how.
     pub infer_route: bool,
@@ -131,6 +135,7 @@ impl ReadOptions {
         infer_drivable: false,
         infer_edges: false,
         infer_light_lanes: false,
+        infer_light_gaps: false,
         infer_route: false,
         infer_ego: false,
         infer_sizes: false,
@@ -147,6 +152,7 @@ impl ReadOptions {
         infer_drivable: true,
         infer_edges: true,
         infer_light_lanes: true,
+        infer_light_gaps: true,
         infer_route: true,
         infer_ego: true,
         infer_sizes: true,

@@ -11,10 +11,10 @@ use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
 use arrow_array::{Array, RecordBatch};
 use gump_data::{
-    Converted, DataError, OutputFormat, ReadOptions, convert, groups, list_files, open, womd,
-    write_tracks,
+    Converted, DataError, OutputFormat, ReadOptions, convert, groups, list_files, open, open_with,
+    womd, write_tracks,
 };
-use gump_scene::{AgentId, Scenario};
+use gump_scene::{AgentId, Frame, Scenario};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use tempfile::TempDir;
 
@@ -209,4 +209,28 @@ fn tables_are_written_by_conversion_too() {
     );
     assert_eq!(converted.scenarios, 4);
     assert_eq!(table(&converted.files[0]).num_rows(), 4 * 5 * 91);
+}
+
+#[test]
+fn waymo_s_messages_state_the_lights_that_were_seen() {
+    let folder = TempDir::new().unwrap();
+    let mut scenario = common::crossing();
+    for frame in &mut scenario.log[30..40] {
+        *frame = Frame::new(frame.agents().to_vec(), Vec::new());
+    }
+    let from = folder.path().join("seen.tfrecord");
+    womd::write_scenarios(&from, [&scenario]).unwrap();
+    let dark = |format, ending: &str| {
+        let stem = folder.path().join("converted");
+        assert_eq!(run(&from, format, &stem).scenarios, 1);
+        let read = open_with(&stem.with_extension(ending), ReadOptions::STATED);
+        let scenario = read.unwrap().next().unwrap().unwrap().scenario;
+        let dark = scenario
+            .log
+            .iter()
+            .filter(|frame| frame.lights().is_empty());
+        dark.count()
+    };
+    assert_eq!(dark(OutputFormat::Waymo, "tfrecord"), 10);
+    assert_eq!(dark(OutputFormat::Cache, "cache"), 0);
 }

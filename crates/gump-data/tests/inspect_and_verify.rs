@@ -63,7 +63,10 @@ fn impossible_speeds_are_found() {
 fn lights_without_lanes_and_frames_without_lights_are_found() {
     let mut scenario = common::crossing();
     let agents = scenario.log[3].agents().to_vec();
-    scenario.log[3] = Frame::new(agents.clone(), Vec::new());
+    // Longer than a colour is held.
+    for frame in &mut scenario.log[50..] {
+        *frame = Frame::new(frame.agents().to_vec(), Vec::new());
+    }
     let stray = Light {
         lane: LaneId(404),
         state: LightState::Red,
@@ -75,6 +78,41 @@ fn lights_without_lanes_and_frames_without_lights_are_found() {
         &scenario,
         &[("light of an unknown lane", 1), ("missing lights", 1)],
     );
+}
+
+#[test]
+fn lights_out_of_sight_for_a_second_are_held_unless_it_is_turned_off() {
+    let mut scenario = common::crossing();
+    let recorded = scenario.log.clone();
+    for (step, frame) in scenario.log.iter_mut().enumerate().skip(30).take(10) {
+        let unseen = frame.lights().iter().map(|light| Light {
+            state: LightState::Unknown,
+            ..*light
+        });
+        let lights = if step % 2 == 0 {
+            unseen.collect()
+        } else {
+            Vec::new()
+        };
+        *frame = Frame::new(frame.agents().to_vec(), lights);
+    }
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("some.tfrecord");
+    write_scenarios(&path, [&scenario]).unwrap();
+    let read = |options| {
+        let mut reader = open_with(&path, options).expect("the file opens");
+        reader.next().expect("one record").expect("it reads")
+    };
+    let lights = |log: &[Frame]| log.iter().map(|f| f.lights().to_vec()).collect::<Vec<_>>();
+    let held = read(ReadOptions::ALL);
+    assert_eq!(lights(&held.scenario.log), lights(&recorded));
+    let counted = held.report.inferred["colour of a light between two sightings"];
+    assert_eq!(counted, 2 * 10, "two lights, ten frames");
+    let seen = read(ReadOptions {
+        infer_light_gaps: false,
+        ..ReadOptions::ALL
+    });
+    assert_eq!(lights(&seen.scenario.log), lights(&scenario.log));
 }
 
 #[test]

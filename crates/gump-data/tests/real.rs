@@ -5,7 +5,7 @@ mod common;
 use std::collections::BTreeMap;
 
 use gump_data::tfrecord::{TfRecordReader, masked_crc};
-use gump_data::{ReadOptions, inspect, open, verify};
+use gump_data::{ReadOptions, inspect, open, open_with, verify};
 use gump_scene::{AgentId, LightState, Scenario};
 
 fn scenario(name: &str) -> Option<Scenario> {
@@ -77,12 +77,42 @@ fn scenario_a_is_complete() {
     let beside = |lane: &gump_scene::Lane| lane.left_neighbors.len() + lane.right_neighbors.len();
     assert_eq!(links, 193);
     assert_eq!(map.lanes().iter().map(beside).sum::<usize>(), 382);
-    let mut lights = BTreeMap::new();
+    assert_eq!(lights(&scenario), BTreeMap::from(SCENARIO_A_HELD));
+}
+
+/// Lights of all frames by state.
+fn lights(scenario: &Scenario) -> BTreeMap<LightState, usize> {
+    let mut counts = BTreeMap::new();
     for light in scenario.log.iter().flat_map(|frame| frame.lights()) {
-        *lights.entry(light.state).or_insert(0) += 1;
+        *counts.entry(light.state).or_insert(0) += 1;
     }
-    let expected = BTreeMap::from([(LightState::Red, 324 + 228), (LightState::Unknown, 540)]);
-    assert_eq!(lights, expected);
+    counts
+}
+
+/// Four lights are out of sight for 10 frames between reds, two for 6, two for 39 and again for 5.
+const UNSEEN: usize = 4 * 10 + 2 * 6 + 2 * (39 + 5);
+const SCENARIO_A_SEEN: [(LightState, usize); 2] =
+    [(LightState::Red, 324 + 228), (LightState::Unknown, 540)];
+const SCENARIO_A_HELD: [(LightState, usize); 2] = [
+    (LightState::Red, 324 + 228 + UNSEEN),
+    (LightState::Unknown, 540 - UNSEEN),
+];
+
+#[test]
+fn lights_that_are_red_before_and_after_are_red_while_they_are_not_seen() {
+    let Some(path) = common::shared("data/waymo/scenario_a.tfrecord") else {
+        return;
+    };
+    let read = |options| {
+        let mut reader = open_with(&path, options).expect("the file opens");
+        reader.next().expect("there is a record").expect("it reads")
+    };
+    let held = read(ReadOptions::ALL);
+    let reason = "colour of a light between two sightings";
+    assert_eq!(held.report.inferred[reason], UNSEEN);
+    assert_eq!(lights(&held.scenario), BTreeMap::from(SCENARIO_A_HELD));
+    let seen = read(ReadOptions::STATED);
+    assert_eq!(lights(&seen.scenario), BTreeMap::from(SCENARIO_A_SEEN));
 }
 
 #[test]

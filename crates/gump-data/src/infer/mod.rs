@@ -7,6 +7,7 @@ mod drivable;
 mod edges;
 mod intersections;
 mod lane_graph;
+mod light_gaps;
 mod light_lanes;
 mod route;
 mod widths;
@@ -14,7 +15,7 @@ mod widths;
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, distance_to_segment};
-use gump_scene::{LaneKind, Light, MapGraph, MapParts, Scenario};
+use gump_scene::{Frame, LaneKind, Light, MapGraph, MapParts, Scenario};
 
 use crate::{ReadOptions, ReadReport};
 
@@ -73,6 +74,18 @@ pub(crate) fn light_lanes(
 ) {
     if options.infer_light_lanes {
         light_lanes::infer(lights, map, report);
+    }
+}
+
+/// Holds the colours of lights across moments in which they were not seen.
+pub(crate) fn light_gaps(
+    log: &mut [Frame],
+    dt: f64,
+    options: ReadOptions,
+    report: &mut ReadReport,
+) {
+    if options.infer_light_gaps {
+        light_gaps::infer(log, dt, report);
     }
 }
 

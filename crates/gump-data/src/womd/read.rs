@@ -36,7 +36,8 @@ pub fn scenario_from_proto(
     let dt = time_step(&proto.timestamps_seconds)?;
     let ego = ego(proto)?;
     let mut parts = map::parts_from_proto(&proto.map_features, &mut report)?;
-    let log = frames(proto, &mut report)?;
+    let mut log = frames(proto, &mut report)?;
+    infer::light_gaps(&mut log, dt, options, &mut report);
     infer::map(&mut parts, options, &mut report);
     let map = Arc::new(gump_scene::MapGraph::new(parts)?);
     let mut targets = Vec::with_capacity(proto.tracks_to_predict.len());

@@ -1,7 +1,8 @@
 //! Recorded scenarios one at a time, as worlds see them and as the metric does.
 //!
 //! Of Waymo's messages the metric reads more than a scenario keeps: what invalid states hold,
-//! which signals flash, the order of the map. Other formats are scored as scenarios.
+//! which signals flash and when they were not seen, the order of the map. Other formats are scored
+//! as scenarios, with the lights as recorded.
 
 use std::path::{Path, PathBuf};
 
@@ -34,7 +35,11 @@ pub(crate) fn recordings<'a>(
 ) -> anyhow::Result<Box<dyn Iterator<Item = anyhow::Result<Recorded>> + 'a>> {
     let files = waymo_files(path)?;
     if files.is_empty() {
-        let records = gump_data::open_with(path, options)?.enumerate();
+        let recorded_lights = ReadOptions {
+            infer_light_gaps: false,
+            ..options
+        };
+        let records = gump_data::open_with(path, recorded_lights)?.enumerate();
         let records = records.filter(move |(index, _)| wanted(*index));
         return Ok(Box::new(records.map(|(index, record)| {
             let scenario = record?.scenario;
