@@ -189,9 +189,12 @@ pub(crate) struct Draw {
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
     #[arg(long, value_name = "X")]
     decay: Option<f64>,
-    /// Draws again at most that often what would run into something, 0 for never [default: 4]
+    /// Draws again at most that often what would run into something or off the road, 0 for never [default: 12]
     #[arg(long, value_name = "N")]
     redraws: Option<usize>,
+    /// Vehicles and bicycles may turn on the spot and slip sideways as the model says
+    #[arg(long)]
+    no_limits: bool,
     /// Agents come and leave and lights change as the model says
     #[arg(long)]
     life: bool,
@@ -265,6 +268,7 @@ impl Draw {
             top_k: self.top_k.unwrap_or(default.top_k),
             decay: self.decay.unwrap_or(default.decay),
             redraws: self.redraws.unwrap_or(default.redraws),
+            limits: !self.no_limits,
             ..default
         };
         let wrong = if !(config.temperature > 0.0 && config.temperature.is_finite()) {

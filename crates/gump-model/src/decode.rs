@@ -5,6 +5,7 @@
 //! what becomes of the states (`future`).
 
 use std::convert::Infallible;
+use std::sync::Arc;
 
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
@@ -14,6 +15,7 @@ use crate::batch::{PlacedSlot, place};
 use crate::clearance::redraw;
 use crate::engine::{Context, Engine, Job, SceneMemory};
 use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
+use crate::surroundings::Survey;
 
 /// What is known of one future's next frame.
 #[derive(Debug)]
@@ -27,6 +29,8 @@ pub(crate) struct Window {
     pub(crate) next: TokenFrame,
     /// One per tracked agent of `next`.
     pub(crate) requests: Vec<Request>,
+    /// The road of its scene.
+    pub(crate) survey: Arc<Survey>,
 }
 
 /// The slots of a window, up to the last provisional value. The oldest frames give way, whole, if
@@ -158,10 +162,10 @@ impl Step<'_> {
                 .collect();
             let bins = self.engine.sample(&hidden, &requests, self.sampling);
             for ((w, bins), request) in members.into_iter().zip(bins).zip(requests) {
-                let pose = request.settle(&bins, self.sampling);
+                let settled = request.settle(&bins, self.sampling);
                 let slots = &mut self.placed[w];
                 let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
-                slots[value].slot = Slot::Value(request.settled_state(&bins, pose));
+                slots[value].slot = Slot::Value(request.settled_state(&bins, settled));
                 decoded[w].push(bins);
             }
         }

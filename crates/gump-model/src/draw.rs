@@ -168,6 +168,7 @@ mod tests {
             stream: Seed(3),
             near: None,
             ring: Ring::default(),
+            limits: None,
             frame: 0,
             restrict: None,
         }

@@ -2,6 +2,7 @@
 //! present.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use gump_geometry::Pose;
 use gump_scene::{Agent, AgentState, Frame, Seed};
@@ -12,6 +13,7 @@ use crate::anchor::Anchor;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::engine::Context;
+use crate::limits::Limits;
 use crate::sample::TOKEN_DT;
 use crate::sampling::{Bins, CacheMode, Request, SamplingConfig, Surrogate, set_pose};
 use crate::scene::Scene;
@@ -89,6 +91,7 @@ impl Future {
                 } else {
                     self.rings.get(&id).cloned().unwrap_or_default()
                 },
+                limits: self.limits(agent, scene, sampling).filter(|_| !driven),
                 frame: index,
                 restrict: None,
             });
@@ -98,19 +101,37 @@ impl Future {
             history: self.frames.clone(),
             next,
             requests,
+            survey: Arc::clone(&scene.survey),
         }
     }
 
     /// In whose frame the next chunk of `agent`, a token of the last frame, is said: where it is,
     /// not rounded.
     fn anchor(&self, agent: &TokenAgent, scene: &Scene, world: &TransformerWorld) -> Anchor {
-        if !world.network().config().anchored {
-            return Anchor::SCENE;
+        if world.network().config().anchored {
+            Anchor::at(self.pose(agent, scene))
+        } else {
+            Anchor::SCENE
         }
+    }
+
+    /// Where `agent`, a token of the last frame, is, and how it may move from there.
+    fn limits(
+        &self,
+        agent: &TokenAgent,
+        scene: &Scene,
+        sampling: &SamplingConfig,
+    ) -> Option<(Pose, Limits)> {
+        let limits = Limits::of(agent.key.kind).filter(|_| sampling.limits)?;
+        Some((self.pose(agent, scene), limits))
+    }
+
+    /// Where `agent`, a token of the last frame, is, not rounded; scene frame.
+    fn pose(&self, agent: &TokenAgent, scene: &Scene) -> Pose {
         let id = self.identities.agent(agent.key.id);
         let present = self.recent.last().expect("a future has a present");
         let known = id.and_then(|id| present.agent(id));
-        Anchor::at(known.map_or(agent.state.pose(), |known| scene.local(known.state).pose))
+        known.map_or(agent.state.pose(), |known| scene.local(known.state).pose)
     }
 
     /// A provisional state of `agent` for frame `index`.
@@ -159,12 +180,11 @@ impl Future {
                 ring.clear();
             }
             ring.push(self.index, request.anchor.poses(bins));
-            let pose = request.settle(bins, sampling);
-            agent.state = request.settled_state(bins, pose);
-            let velocity = request.anchor.velocity(bins);
+            let settled = request.settle(bins, sampling);
+            agent.state = request.settled_state(bins, settled);
             let state = AgentState {
-                pose: scene.world_from_scene * pose,
-                velocity: scene.world_from_scene.rotate(velocity),
+                pose: scene.world_from_scene * settled.pose,
+                velocity: scene.world_from_scene.rotate(settled.velocity),
             };
             moved.insert(id, if driven { ego.unwrap_or(state) } else { state });
         }

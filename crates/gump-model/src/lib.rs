@@ -32,6 +32,7 @@ mod error;
 mod future;
 pub mod generation;
 mod life;
+mod limits;
 mod loss;
 mod mct;
 mod network;

@@ -278,6 +278,7 @@ impl TransformerSession<'_> {
                     stream: seed.fork(3).fork(i),
                     near: None,
                     ring: Ring::default(),
+                    limits: None,
                     frame: future.index,
                     restrict: Some(Arc::clone(&rules) as _),
                 })

@@ -192,8 +192,8 @@ impl Group<'_> {
             let bins = sample_states(passes.network, &at_key, &requests, passes.sampling)?;
             for (row, bins) in bins.into_iter().enumerate() {
                 let request = &requests[row];
-                let pose = request.settle(&bins, passes.sampling);
-                rows[row][key + 1].slot = Slot::Value(request.settled_state(&bins, pose));
+                let settled = request.settle(&bins, passes.sampling);
+                rows[row][key + 1].slot = Slot::Value(request.settled_state(&bins, settled));
                 decoded[row].push(bins);
             }
         }

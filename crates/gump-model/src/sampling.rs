@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::aggregation::Ring;
 use crate::anchor::Anchor;
 use crate::decoder::STEPS;
+use crate::limits::Limits;
 use crate::ops::panels::Precision;
 
 /// How futures are decoded.
@@ -38,9 +39,11 @@ pub struct SamplingConfig {
     /// Whether agents come and leave and lights change as the network says (on a CPU); else those
     /// who are there stay, and lights keep the colour they were seen in.
     pub life: bool,
-    /// How often an object that would run into another within 1.5 s is drawn again at most (paper: 0);
-    /// in partial-AR decoding only.
+    /// How often an object that would run into another or off the road within 1.5 s is drawn again
+    /// at most (paper: 0); in partial-AR decoding only.
     pub redraws: usize,
+    /// Whether what cannot move by itself or turns too tightly is held back (paper: no).
+    pub limits: bool,
     /// In which form the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
@@ -56,7 +59,8 @@ impl Default for SamplingConfig {
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
-            redraws: 4,
+            redraws: 12,
+            limits: true,
             precision: Precision::F32,
         }
     }
@@ -115,6 +119,8 @@ pub(crate) struct Request {
     pub(crate) near: Option<(DVec2, f64)>,
     /// What earlier chunks say; empty for an object that is driven.
     pub(crate) ring: Ring,
+    /// Where it was and how it may move from there.
+    pub(crate) limits: Option<(Pose, Limits)>,
     /// Number of the frame being decoded.
     pub(crate) frame: usize,
     /// Which bins may be drawn, beyond that.
@@ -129,21 +135,26 @@ pub(crate) trait Restrict: fmt::Debug + Send + Sync {
 }
 
 impl Request {
-    /// The final pose of a decoded object: its sample, aggregated; scene frame, not quantised.
-    pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> Pose {
+    /// The final state of a decoded object: its sample, aggregated, within its limits; scene frame,
+    /// not quantised.
+    pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
         let said = self.anchor.poses(bins)[0];
-        self.ring.aggregate(self.frame, said, config.decay)
+        let pose = self.ring.aggregate(self.frame, said, config.decay);
+        let velocity = self.anchor.velocity(bins);
+        match self.limits {
+            Some((from, limits)) => limits.keep(from, AgentState { pose, velocity }),
+            None => AgentState { pose, velocity },
+        }
     }
 
-    /// The token state of a decoded object whose final pose is `pose`: the one value that embedding,
-    /// sine, geometry and the next surrogate all derive from.
-    pub(crate) fn settled_state(&self, bins: &Bins, pose: Pose) -> QuantizedState {
+    /// The token state of a decoded object whose final state is `settled`: the one value that
+    /// embedding, sine, geometry and the next surrogate all derive from.
+    pub(crate) fn settled_state(&self, bins: &Bins, settled: AgentState) -> QuantizedState {
         let mut state = QuantizedState::default();
         for (field, &bin) in STEPS.iter().zip(bins).take(2) {
             state.set(*field, bin);
         }
-        let velocity = self.anchor.velocity(bins);
-        state.with_motion(&AgentState { pose, velocity })
+        state.with_motion(&settled)
     }
 }
 

@@ -63,6 +63,8 @@ pub(crate) struct Scene {
     /// The same frames in world coordinates; the last is the present.
     pub(crate) recent: Vec<Frame>,
     pub(crate) map: Arc<MapGraph>,
+    /// The map laid out around the scene.
+    pub(crate) survey: Arc<Survey>,
     pub(crate) route: Option<Arc<Route>>,
     /// Where new agents may come, by class; made when first asked for.
     grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
@@ -117,7 +119,7 @@ impl Scene {
         let survey = Arc::new(Survey::new(&map, world_from_scene));
         let memory = world
             .network()
-            .look(std::slice::from_ref(&raster), vec![survey])?;
+            .look(std::slice::from_ref(&raster), vec![Arc::clone(&survey)])?;
         Ok(Self {
             world_from_scene,
             ego,
@@ -131,6 +133,7 @@ impl Scene {
             lights: encoded.lights,
             recent,
             map,
+            survey,
             route,
             grounds: Default::default(),
         })

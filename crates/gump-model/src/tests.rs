@@ -521,6 +521,7 @@ fn window(scenario: &Scenario) -> Window {
         stream: Seed(i as u64),
         near: None,
         ring: Ring::default(),
+        limits: None,
         frame: 3,
         restrict: None,
     };
@@ -530,6 +531,7 @@ fn window(scenario: &Scenario) -> Window {
         history,
         next,
         requests,
+        survey: Arc::default(),
     }
 }
 
@@ -556,7 +558,7 @@ fn surrogates_that_are_right_give_full_autoregression() {
     assert_eq!(full[0], guessed[0], "the first object sees no surrogate");
     let agents = window.next.tracked.iter_mut().zip(&window.requests);
     for ((agent, request), bins) in agents.zip(&full) {
-        agent.state = request.settled_state(bins, request.anchor.poses(bins)[0]);
+        agent.state = request.settled_state(bins, request.settle(bins, &SamplingConfig::default()));
     }
     assert_eq!(run(Mode::PartialAr, &window), full);
 }

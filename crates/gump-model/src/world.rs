@@ -234,6 +234,7 @@ impl TransformerWorld {
                     stream: stream(seed.fork(k as u64), last, *id),
                     near: None,
                     ring: Ring::default(),
+                    limits: None,
                     frame: last,
                     restrict: None,
                 }

@@ -172,6 +172,7 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
         stream: stream.fork(attempt as u64),
         near: None,
         ring: Ring::default(),
+        limits: None,
         frame: 0,
         restrict: Some(rules),
     }

@@ -139,7 +139,7 @@ impl Survey {
     }
 
     /// All points of road edges in the cells within `radius` metres of `position`.
-    pub(super) fn edges_near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = DVec2> {
+    pub(crate) fn edges_near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = DVec2> {
         self.edge_cells
             .near(position, radius)
             .map(|i| self.edges[i as usize])

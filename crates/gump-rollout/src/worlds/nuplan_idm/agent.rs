@@ -17,14 +17,50 @@ const REMEMBERED_LANES: usize = 5;
 #[derive(Debug)]
 pub(super) struct Vehicle {
     agent: Agent,
+    /// Which of the vehicles that were there at first this is.
+    index: usize,
     lanes: VecDeque<LaneId>,
     corridor: Corridor,
+    /// How often the corridor has been renewed.
+    renewals: u32,
     /// Arc length of the box centre on the path, metres.
     progress: f64,
     speed: f64,
     target_speed: f64,
     /// The box and, once it has moved, where it will be in 1.5 s.
     footprint: Footprint,
+}
+
+/// Whose ways meet. Found out once per pair of corridors: they only get shorter until they are
+/// renewed.
+#[derive(Debug, Default)]
+pub(super) struct Encounters {
+    n: usize,
+    /// By pair of vehicles: the renewals of both at which they were looked at, and what was found.
+    known: Vec<Option<(u32, u32, bool)>>,
+}
+
+impl Encounters {
+    /// Among `n` vehicles nothing is known.
+    pub(super) fn among(n: usize) -> Self {
+        Self {
+            n,
+            known: vec![None; n * n],
+        }
+    }
+
+    fn meet(&mut self, own: &Vehicle, other: &Vehicle) -> bool {
+        let known = &mut self.known[own.index * self.n + other.index];
+        match *known {
+            Some((a, b, meet)) if (a, b) == (own.renewals, other.renewals) => meet,
+            _ => {
+                let behind = other.progress - other.agent.length / 2.0;
+                let meet = own.corridor.meets(own.progress, &other.corridor, behind);
+                *known = Some((own.renewals, other.renewals, meet));
+                meet
+            }
+        }
+    }
 }
 
 /// What is ahead, in terms of the path.
@@ -40,7 +76,12 @@ impl Vehicle {
     /// Where lanes overlap the one whose direction is nearest is taken; directions are compared as
     /// plain numbers, as nuPlan does. `target` is the desired speed of the vehicle before, and of
     /// this one if its lane states no limit.
-    pub(super) fn snapped(agent: &Agent, map: &MapGraph, target: &mut f64) -> Option<Self> {
+    pub(super) fn snapped(
+        agent: &Agent,
+        index: usize,
+        map: &MapGraph,
+        target: &mut f64,
+    ) -> Option<Self> {
         let center = agent.state.pose.position;
         let lanes: Vec<&Lane> = map.lanes_containing(center).collect();
         let on_lane = lanes.iter().any(|lane| !lane.in_intersection);
@@ -68,8 +109,10 @@ impl Vehicle {
         };
         let mut vehicle = Self {
             agent: *agent,
+            index,
             lanes: VecDeque::from([lane.id]),
             corridor: Corridor::new(path, agent.width / 2.0),
+            renewals: 0,
             progress: s,
             speed: agent.state.speed(),
             target_speed: *target,
@@ -96,10 +139,11 @@ impl Vehicle {
         &mut self,
         scene: &Scene<'_>,
         others: impl Iterator<Item = &'a Self>,
+        encounters: &mut Encounters,
         dt: f64,
     ) {
         self.extend(scene);
-        let lead = self.lead(scene, others);
+        let lead = self.lead(scene, others, encounters);
         let last = self.lanes.back().and_then(|&id| scene.map.lane(id));
         if let Some(limit) = last.and_then(|lane| lane.speed_limit).filter(|&l| l > 0.0) {
             self.target_speed = limit;
@@ -152,6 +196,7 @@ impl Vehicle {
                 return;
             };
             self.corridor = Corridor::new(path, self.agent.width / 2.0);
+            self.renewals += 1;
             self.progress = 0.0;
             self.lanes.push_back(next.id);
             if self.lanes.len() > REMEMBERED_LANES {
@@ -161,11 +206,19 @@ impl Vehicle {
     }
 
     /// The nearest of all that reaches into the way ahead; its end, where nothing does.
-    fn lead<'a>(&self, scene: &Scene<'_>, others: impl Iterator<Item = &'a Self>) -> Lead {
+    fn lead<'a>(
+        &self,
+        scene: &Scene<'_>,
+        others: impl Iterator<Item = &'a Self>,
+        encounters: &mut Encounters,
+    ) -> Lead {
         let bounds = self.corridor.bounds_from(self.progress);
         let fixed = scene.fixed.iter();
-        let fixed = fixed.map(|fixed| (&fixed.footprint, fixed.heading, fixed.speed));
-        let others = others.map(|other| (&other.footprint, other.pose().heading, other.speed));
+        let fixed = fixed.map(|fixed| (&fixed.footprint, fixed.heading, fixed.speed, None));
+        let others = others.map(|other| {
+            let heading = other.pose().heading;
+            (&other.footprint, heading, other.speed, Some(other))
+        });
         let mut near: Vec<_> = fixed
             .chain(others)
             .filter(|(footprint, ..)| footprint.is_within(bounds))
@@ -174,11 +227,11 @@ impl Vehicle {
             .collect();
         near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let mut nearest: Option<(f64, usize, f64)> = None;
-        for (gap, i, (footprint, heading, speed)) in near {
+        for (gap, i, (footprint, heading, speed, vehicle)) in near {
             if nearest.is_some_and(|(least, ..)| gap > least) {
                 break;
             }
-            if !self.corridor.is_touched(self.progress, footprint) {
+            if !self.is_crossed(footprint, vehicle, encounters) {
                 continue;
             }
             let distance = self.footprint.distance(footprint);
@@ -206,6 +259,24 @@ impl Vehicle {
                 gap: self.corridor.path().length() - self.progress - self.agent.length / 2.0,
                 speed: 0.0,
             },
+        }
+    }
+
+    /// True if a footprint, perhaps that of a vehicle, reaches into the way ahead.
+    fn is_crossed(
+        &self,
+        footprint: &Footprint,
+        vehicle: Option<&Self>,
+        encounters: &mut Encounters,
+    ) -> bool {
+        match vehicle {
+            // All that it sweeps lies on its own way, which does not meet this one.
+            Some(other) if !encounters.meet(self, other) => {
+                let body = &footprint.pieces[..1];
+                self.corridor
+                    .is_touched_by(self.progress, body, body[0].bounds())
+            }
+            _ => self.corridor.is_touched(self.progress, footprint),
         }
     }
 

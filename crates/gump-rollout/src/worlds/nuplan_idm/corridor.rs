@@ -109,34 +109,84 @@ impl Corridor {
 
     /// True if a footprint reaches into the corridor anywhere from arc length `from` on.
     pub(super) fn is_touched(&self, from: f64, footprint: &Footprint) -> bool {
+        self.is_touched_by(from, &footprint.pieces, (footprint.min, footprint.max))
+    }
+
+    /// True if any of `bodies`, which lie within `bounds`, reaches into the corridor anywhere from
+    /// arc length `from` on.
+    pub(super) fn is_touched_by(&self, from: f64, bodies: &[Quad], bounds: (DVec2, DVec2)) -> bool {
         let length = self.path.length();
         let from = from.clamp(0.0, length);
         if from >= length {
             return false;
         }
         let first = self.segment(from);
-        let mut cut = Vec::new();
-        let end = self.path.line().arc_lengths()[first + 1];
-        self.pieces(from, end, &mut cut);
-        if footprint.intersects(&cut) {
+        let touches = |piece: &Quad| {
+            overlap(piece.bounds(), bounds) && bodies.iter().any(|body| body.intersects(piece))
+        };
+        if self
+            .rest_of(first, from)
+            .is_some_and(|piece| touches(&piece))
+        {
             return true;
         }
-        let touches = |piece: &Quad| {
-            let (min, max) = piece.bounds();
-            footprint.is_within((min, max)) && footprint.pieces.iter().any(|p| p.intersects(piece))
-        };
-        for (chunk, bounds) in self.chunks.iter().enumerate().skip((first + 1) / CHUNK) {
-            if !footprint.is_within(*bounds) {
-                continue;
-            }
-            let segments = (chunk * CHUNK).max(first + 1)..self.stretches.len();
-            for i in segments.take_while(|i| *i < (chunk + 1) * CHUNK) {
-                if touches(&self.stretches[i]) || self.joints[i].as_ref().is_some_and(touches) {
-                    return true;
-                }
-            }
+        let start = first + 1;
+        self.chunks(start).any(|(chunk, of_chunk)| {
+            overlap(of_chunk, bounds)
+                && self.segments(chunk, start).any(|i| {
+                    touches(&self.stretches[i]) || self.joints[i].as_ref().is_some_and(touches)
+                })
+        })
+    }
+
+    /// True if what follows arc length `from` shares a point with what follows `other_from` of
+    /// another corridor.
+    pub(super) fn meets(&self, from: f64, other: &Self, other_from: f64) -> bool {
+        let (start, other_start) = (self.segment(from), other.segment(other_from));
+        if !overlap(self.bounds[start], other.bounds[other_start]) {
+            return false;
         }
-        false
+        let bounds = other.bounds[other_start];
+        let mut near = self.chunks(start).filter(|(_, b)| overlap(*b, bounds));
+        near.any(|(chunk, own)| {
+            let mut theirs = other.chunks(other_start).filter(|(_, b)| overlap(*b, own));
+            theirs.any(|(other_chunk, _)| {
+                other.segments(other_chunk, other_start).any(|j| {
+                    let pieces = std::iter::once(&other.stretches[j]).chain(&other.joints[j]);
+                    pieces.into_iter().any(|piece| {
+                        overlap(piece.bounds(), own)
+                            && self.segments(chunk, start).any(|i| {
+                                self.stretches[i].intersects(piece)
+                                    || self.joints[i].as_ref().is_some_and(|p| p.intersects(piece))
+                            })
+                    })
+                })
+            })
+        })
+    }
+
+    /// What arc length `from` leaves of segment `i`.
+    fn rest_of(&self, i: usize, from: f64) -> Option<Quad> {
+        let arc = self.path.line().arc_lengths();
+        if from <= arc[i] {
+            return Some(self.stretches[i]);
+        }
+        let points = self.path.line().points();
+        let (along, step) = (points[i + 1] - points[i], arc[i + 1] - arc[i]);
+        let start = points[i] + along * ((from - arc[i]) / step).clamp(0.0, 1.0);
+        let side = along.perp() * (self.half_width / step);
+        (start != points[i + 1]).then(|| stretch(start, points[i + 1], side))
+    }
+
+    /// The chunks from that of segment `start` on, with their bounds.
+    fn chunks(&self, start: usize) -> impl Iterator<Item = (usize, (DVec2, DVec2))> + '_ {
+        let chunks = self.chunks.iter().copied().enumerate();
+        chunks.skip(start / CHUNK)
+    }
+
+    /// The segments of a chunk from `start` on.
+    fn segments(&self, chunk: usize, start: usize) -> std::ops::Range<usize> {
+        (chunk * CHUNK).max(start)..((chunk + 1) * CHUNK).min(self.stretches.len())
     }
 
     /// Index of the segment that holds arc length `s`.
@@ -146,6 +196,10 @@ impl Corridor {
             .saturating_sub(1)
             .min(self.stretches.len() - 1)
     }
+}
+
+fn overlap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> bool {
+    a.0.cmple(b.1).all() && b.0.cmple(a.1).all()
 }
 
 fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
@@ -180,13 +234,8 @@ impl Footprint {
         }
     }
 
-    pub(super) fn is_within(&self, (min, max): (DVec2, DVec2)) -> bool {
-        self.min.cmple(max).all() && min.cmple(self.max).all()
-    }
-
-    pub(super) fn intersects(&self, pieces: &[Quad]) -> bool {
-        let touches = |piece: &Quad| self.pieces.iter().any(|own| own.intersects(piece));
-        pieces.iter().any(touches)
+    pub(super) fn is_within(&self, bounds: (DVec2, DVec2)) -> bool {
+        overlap((self.min, self.max), bounds)
     }
 
     /// A lower bound of [`Footprint::distance`], metres: the gap between the bounding boxes.
@@ -204,7 +253,8 @@ impl Footprint {
             let gap = (other.min - max).max(min - other.max);
             gap.max(DVec2::ZERO).length() >= least
         };
-        for own in &self.pieces {
+        // From the front, since what counts is mostly ahead: then most pairs are too far to look at.
+        for own in self.pieces.iter().rev() {
             if far(own, least) {
                 continue;
             }
@@ -231,6 +281,12 @@ mod tests {
     use super::*;
     use approx::assert_abs_diff_eq;
     use gump_geometry::{Pose, dvec2, widen};
+
+    fn intersect(a: &Footprint, b: &[Quad]) -> bool {
+        a.pieces
+            .iter()
+            .any(|own| b.iter().any(|piece| own.intersects(piece)))
+    }
 
     fn bend() -> Corridor {
         let poses: Vec<Pose> = (0..=16)
@@ -294,7 +350,7 @@ mod tests {
             for from in [-1.0, 0.0, 3.3, 17.0, 31.0, 99.0] {
                 let mut pieces = Vec::new();
                 corridor.pieces(from, f64::INFINITY, &mut pieces);
-                let slow = footprint.intersects(&pieces);
+                let slow = intersect(&footprint, &pieces);
                 assert_eq!(
                     corridor.is_touched(from, &footprint),
                     slow,
@@ -304,6 +360,30 @@ mod tests {
             }
         }
         assert!(touched > 100 && free > 100);
+    }
+
+    #[test]
+    fn corridors_meet_where_their_pieces_do() {
+        let bend = bend();
+        let mut found = [0, 0];
+        for i in 0..300 {
+            let (x, y) = (f64::from(i % 20) * 2.0 - 9.0, f64::from(i / 20) * 2.0 - 5.0);
+            let a = f64::from(i) * 0.37;
+            let poses = [0.0, 0.7, 5.0, 9.0].map(|s| Pose::new(x, y, a) * Pose::new(s, 0.0, 0.0));
+            let other = Corridor::new(Path::through(&poses).unwrap(), 0.9);
+            for (from, other_from) in [(0.0, 0.0), (12.0, 0.0), (0.0, 5.0), (25.0, 5.0)] {
+                // Segments count whole, so what is behind their starts may be found as well.
+                let start = |c: &Corridor, s| c.path.line().arc_lengths()[c.segment(s)];
+                let (mut own, mut theirs) = (Vec::new(), Vec::new());
+                bend.pieces(start(&bend, from), f64::INFINITY, &mut own);
+                other.pieces(start(&other, other_from), f64::INFINITY, &mut theirs);
+                let slow = intersect(&Footprint::new(own), &theirs);
+                let meets = bend.meets(from, &other, other_from);
+                assert!(meets || !slow, "{i} {from} {other_from}");
+                found[usize::from(meets)] += 1;
+            }
+        }
+        assert!(found[0] > 300 && found[1] > 300, "{found:?}");
     }
 
     #[test]
@@ -317,6 +397,6 @@ mod tests {
         };
         assert_eq!(at(0.0).distance(&at(7.0)), 3.0);
         assert_eq!(at(0.0).distance(&at(4.0)), 0.0);
-        assert!(at(0.0).intersects(&at(4.0).pieces) && !at(0.0).intersects(&at(4.5).pieces));
+        assert!(intersect(&at(0.0), &at(4.0).pieces) && !intersect(&at(0.0), &at(4.5).pieces));
     }
 }

@@ -23,7 +23,7 @@ use gump_scene::{Agent, AgentKind, AreaKind, Frame, LightState, MapGraph};
 use super::IdmConfig;
 use crate::closed_loop::{Others, Recording, Step, Traffic};
 use crate::{BoxError, RolloutError};
-use agent::Vehicle;
+use agent::{Encounters, Vehicle};
 use corridor::Footprint;
 
 /// Parameters of nuPlan's reactive agents.
@@ -64,6 +64,7 @@ pub struct NuplanIdm {
     config: NuplanIdmConfig,
     map: Arc<MapGraph>,
     vehicles: Vec<Vehicle>,
+    encounters: Encounters,
 }
 
 impl NuplanIdm {
@@ -128,7 +129,8 @@ impl Traffic for NuplanIdm {
             if agent.kind != AgentKind::Vehicle || agent.id == scenario.ego {
                 continue;
             }
-            let Some(vehicle) = Vehicle::snapped(agent, &self.map, &mut target) else {
+            let index = self.vehicles.len();
+            let Some(vehicle) = Vehicle::snapped(agent, index, &self.map, &mut target) else {
                 continue;
             };
             let quad = Quad::from(&vehicle.oriented_box());
@@ -137,6 +139,7 @@ impl Traffic for NuplanIdm {
                 self.vehicles.push(vehicle);
             }
         }
+        self.encounters = Encounters::among(self.vehicles.len());
         Ok(self.others(now))
     }
 
@@ -158,7 +161,7 @@ impl Traffic for NuplanIdm {
             let (before, rest) = self.vehicles.split_at_mut(i);
             let (vehicle, after) = rest.split_first_mut().expect("vehicle i exists");
             let others = before.iter().chain(after.iter());
-            vehicle.step(&scene, others, step.dt());
+            vehicle.step(&scene, others, &mut self.encounters, step.dt());
         }
         Ok(self.others(logged))
     }
