@@ -370,7 +370,7 @@ mod tests {
         let braking = moving.brake(&request, &said).expect("it moves");
         let poses = request.anchor.poses(&braking);
         // 8 m/s and 5 m/s^2: 3.4 m after half a second, 6.4 m after 1.6 s for good.
-        for (pose, s) in poses.iter().zip([3.375, 5.5, 6.375, 6.4]) {
+        for (pose, s) in poses.iter().zip([3.375_f64, 5.5, 6.375, 6.4]) {
             let on_arc = DVec2::new(40.0 * (s / 40.0).sin(), 40.0 * (1.0 - (s / 40.0).cos()));
             assert!(pose.position.distance(on_arc) < 0.15, "{pose:?} {on_arc}");
         }

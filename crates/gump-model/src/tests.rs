@@ -267,12 +267,13 @@ fn full_ar_is_the_same_with_and_without_cache() {
 
 #[test]
 fn the_first_object_is_the_same_in_both_modes() {
-    let full = SamplingConfig {
-        mode: Mode::FullAr,
+    let mode = |mode| SamplingConfig {
+        mode,
+        redraws: 0,
         ..SamplingConfig::default()
     };
-    let (a, _) = imagine(full, &scenario(), 3, 1, None);
-    let (b, _) = imagine(SamplingConfig::default(), &scenario(), 3, 1, None);
+    let (a, _) = imagine(mode(Mode::FullAr), &scenario(), 3, 1, None);
+    let (b, _) = imagine(mode(Mode::PartialAr), &scenario(), 3, 1, None);
     for (a, b) in a[0].iter().zip(&b[0]) {
         assert_eq!(a.agent(AgentId(0)), b.agent(AgentId(0)));
     }
@@ -544,6 +545,7 @@ fn surrogates_that_are_right_give_full_autoregression() {
             mode,
             temperature: 0.0,
             decay: 0.0,
+            redraws: 0,
             ..SamplingConfig::default()
         };
         let windows = std::slice::from_ref(window);

@@ -166,6 +166,7 @@ fn a_network_reproduces_the_scene_it_learned() {
         let sampling = SamplingConfig {
             mode,
             temperature: 0.0,
+            redraws: 0,
             ..SamplingConfig::default()
         };
         let world = TransformerWorld::new(checkpoint::load(&path, &Device::Cpu).unwrap(), sampling);
