@@ -4,7 +4,7 @@
 
 use glam::DVec2;
 
-use crate::{OrientedBox, Polygon, distance_to_segment, segments_intersect};
+use crate::{OrientedBox, Polygon, distance_to_segment, project_on_segment, segments_intersect};
 
 /// Four corners of a convex shape, in either direction; corners may coincide.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,13 +70,18 @@ impl Quad {
         if self.intersects(other) {
             return 0.0;
         }
+        // Roots are taken once: the least distance has the least square.
         let one_way = |from: &Self, to: &Self| {
-            let corners = from.corners.iter();
-            corners
-                .flat_map(|&p| to.edges().map(move |(a, b)| distance_to_segment(p, a, b)))
-                .fold(f64::INFINITY, f64::min)
+            let mut least = f64::INFINITY;
+            for (a, b) in to.edges() {
+                for &p in &from.corners {
+                    let foot = a.lerp(b, project_on_segment(p, a, b));
+                    least = least.min(p.distance_squared(foot));
+                }
+            }
+            least
         };
-        one_way(self, other).min(one_way(other, self))
+        one_way(self, other).min(one_way(other, self)).sqrt()
     }
 
     /// Distance in metres, 0 if the shapes intersect.

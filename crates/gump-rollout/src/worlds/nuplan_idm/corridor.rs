@@ -202,6 +202,11 @@ fn overlap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> bool {
     a.0.cmple(b.1).all() && b.0.cmple(a.1).all()
 }
 
+/// Metres between two boxes along the axes.
+fn gap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> f64 {
+    (b.0 - a.1).max(a.0 - b.1).max(DVec2::ZERO).length()
+}
+
 fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
     Quad::new([start + side, end + side, end - side, start - side])
 }
@@ -240,22 +245,20 @@ impl Footprint {
 
     /// A lower bound of [`Footprint::distance`], metres: the gap between the bounding boxes.
     pub(super) fn gap_at_least(&self, other: &Self) -> f64 {
-        let gap = (other.min - self.max).max(self.min - other.max);
-        gap.max(DVec2::ZERO).length()
+        gap((self.min, self.max), (other.min, other.max))
     }
 
     /// Metres between two footprints, 0 if they intersect.
     pub(super) fn distance(&self, other: &Self) -> f64 {
+        // Most that is asked for overlaps, which is found out sooner than how far away it is.
+        if self.intersects(other) {
+            return 0.0;
+        }
+        let bounds = (other.min, other.max);
         let mut least = f64::INFINITY;
-        // Only pieces near the other's bounds can be the nearest.
-        let far = |own: &Quad, least: f64| {
-            let (min, max) = own.bounds();
-            let gap = (other.min - max).max(min - other.max);
-            gap.max(DVec2::ZERO).length() >= least
-        };
         // From the front, since what counts is mostly ahead: then most pairs are too far to look at.
         for own in self.pieces.iter().rev() {
-            if far(own, least) {
+            if gap(own.bounds(), bounds) >= least {
                 continue;
             }
             for piece in &other.pieces {
@@ -265,6 +268,13 @@ impl Footprint {
             }
         }
         least
+    }
+
+    fn intersects(&self, other: &Self) -> bool {
+        let theirs = (other.min, other.max);
+        let near = |own: &&Quad| overlap(own.bounds(), theirs);
+        let meets = |own: &Quad| other.pieces.iter().any(|piece| own.intersects(piece));
+        self.is_within(theirs) && self.pieces.iter().filter(near).any(meets)
     }
 
     pub(super) fn distance_to_polygon(&self, polygon: &Polygon) -> f64 {
@@ -283,9 +293,8 @@ mod tests {
     use gump_geometry::{Pose, dvec2, widen};
 
     fn intersect(a: &Footprint, b: &[Quad]) -> bool {
-        a.pieces
-            .iter()
-            .any(|own| b.iter().any(|piece| own.intersects(piece)))
+        let meets = |own: &Quad| b.iter().any(|piece| own.intersects(piece));
+        a.pieces.iter().any(meets)
     }
 
     fn bend() -> Corridor {
