@@ -1,10 +1,7 @@
-//! Any bytes in a file named `some.xml`: reading them may fail, never panic.
+//! Any bytes as a CommonRoad XML: reading may fail, never panic.
 
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
+mod attack;
 
-#[path = "read.rs"]
-mod read;
-
-fuzz_target!(|bytes: &[u8]| read::read("some.xml", bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| attack::read("commonroad", bytes));

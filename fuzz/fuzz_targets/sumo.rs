@@ -1,10 +1,7 @@
-//! Any bytes in a file named `some.fcd.xml`: reading them may fail, never panic.
+//! Any bytes as floating cars of SUMO: reading may fail, never panic.
 
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
+mod attack;
 
-#[path = "read.rs"]
-mod read;
-
-fuzz_target!(|bytes: &[u8]| read::read("some.fcd.xml", bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| attack::read("sumo", bytes));

@@ -54,6 +54,10 @@ struct OneScenario<D> {
 }
 
 impl<D: Document> Source for OneScenario<D> {
+    fn skip(&mut self) -> Option<Result<(), DataError>> {
+        self.path.take().map(|_| Ok(()))
+    }
+
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,

@@ -64,7 +64,7 @@ pub use convert::{Converted, OutputFormat, convert, groups};
 pub use error::{DataError, Place, Problem};
 pub use files::list as list_files;
 pub use inspect::{Summary, inspect, inspect_with};
-pub use open::{Reader, find, open, open_files, open_with};
+pub use open::{Reader, find, find_record, open, open_files, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
 pub use tracks::write_tracks;
 pub use verify::{

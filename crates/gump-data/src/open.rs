@@ -20,6 +20,12 @@ pub(crate) trait Source: Send {
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,
     ) -> Option<Result<ScenarioRecord, DataError>>;
+
+    /// Passes over the next record, at less cost than reading it where that is possible.
+    fn skip(&mut self) -> Option<Result<(), DataError>> {
+        let record = self.next_wanted(&mut |_| true)?;
+        Some(record.map(drop))
+    }
 }
 
 /// Opens a file, or every file of a directory that holds scenarios, in order of their paths and
@@ -106,16 +112,17 @@ impl Reader {
         &self.skipped
     }
 
-    fn next_wanted(
+    /// What the file being read has for `ask`, or else the first of the files after it that has.
+    fn first_of<T>(
         &mut self,
-        wanted: &mut dyn FnMut(&str) -> bool,
-    ) -> Option<Result<ScenarioRecord, DataError>> {
+        mut ask: impl FnMut(&mut dyn Source) -> Option<Result<T, DataError>>,
+    ) -> Option<Result<T, DataError>> {
         if let Some(error) = self.unopened.take() {
             return Some(Err(error));
         }
         loop {
-            if let Some(record) = self.source.next_wanted(wanted) {
-                return Some(record);
+            if let Some(answer) = ask(self.source.as_mut()) {
+                return Some(answer);
             }
             // A source without records keeps the reader going with the files after a broken one.
             self.source = Box::new(NoRecords);
@@ -153,7 +160,7 @@ impl Iterator for Reader {
     type Item = Result<ScenarioRecord, DataError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        self.next_wanted(&mut |_| true)
+        self.first_of(|source| source.next_wanted(&mut |_| true))
     }
 }
 
@@ -176,6 +183,14 @@ impl Source for NoRecords {
 /// # Errors
 /// [`DataError::NoSuchScenario`], those of [`open`], and those of the record asked for.
 pub fn find(source: &str) -> Result<Scenario, DataError> {
+    find_record(source).map(|record| record.scenario)
+}
+
+/// As [`find`], with the account of what was left out and added.
+///
+/// # Errors
+/// As [`find`].
+pub fn find_record(source: &str) -> Result<ScenarioRecord, DataError> {
     let (path, wanted) = match source.rsplit_once('#') {
         Some((path, wanted)) if !Path::new(source).exists() => (Path::new(path), wanted),
         _ => (Path::new(source), "0"),
@@ -183,36 +198,31 @@ pub fn find(source: &str) -> Result<Scenario, DataError> {
     if let Ok(index) = wanted.parse()
         && let Some(record) = find_index(path, index)?
     {
-        return Ok(record.scenario);
+        return Ok(record);
     }
-    find_id(path, wanted).map(|record| record.scenario)
+    find_id(path, wanted)
 }
 
+/// Records too broken to read count, so that a record keeps its index.
 fn find_index(path: &Path, index: usize) -> Result<Option<ScenarioRecord>, DataError> {
     let mut reader = open(path)?;
-    let (mut position, mut hit) = (0, false);
-    while let Some(next) = reader.next_wanted(&mut |_| {
-        hit = position == index;
-        position += 1;
-        hit
-    }) {
-        match next {
-            Ok(record) => return Ok(Some(record)),
-            // A record too broken to tell its id has not been counted above.
-            Err(error) if hit || position == index => return Err(error),
-            Err(_) => position += 1,
+    for _ in 0..index {
+        if reader.first_of(|source| source.skip()).is_none() {
+            return Ok(None);
         }
     }
-    Ok(None)
+    reader.next().transpose()
 }
 
 fn find_id(path: &Path, wanted: &str) -> Result<ScenarioRecord, DataError> {
     let mut reader = open(path)?;
     let (mut found, mut hit, mut first_error) = (0, false, None);
-    while let Some(next) = reader.next_wanted(&mut |id| {
-        found += 1;
-        hit = id == wanted;
-        hit
+    while let Some(next) = reader.first_of(|source| {
+        source.next_wanted(&mut |id| {
+            found += 1;
+            hit = id == wanted;
+            hit
+        })
     }) {
         match next {
             Ok(record) => return Ok(record),

@@ -78,7 +78,62 @@ impl TfRecordReader {
         }
     }
 
+    /// Passes over the next record: its payload is not looked at and may be damaged.
+    ///
+    /// # Errors
+    /// Those of reading, without that of the payload's checksum.
+    pub fn skip_record(&mut self) -> Option<Result<(), DataError>> {
+        if self.lost {
+            return None;
+        }
+        self.pass_over().transpose()
+    }
+
+    fn pass_over(&mut self) -> Result<Option<()>, DataError> {
+        let Some(length) = self.header()? else {
+            return Ok(None);
+        };
+        let rest = &mut self.stream.by_ref().take(length + 4);
+        let found = io::copy(rest, &mut io::sink()).map(|n| n as usize);
+        self.expect_all("the payload", length + 4, found)?;
+        self.end_record(length);
+        Ok(Some(()))
+    }
+
     fn read(&mut self) -> Result<Option<Payload>, DataError> {
+        let Some(length) = self.header()? else {
+            return Ok(None);
+        };
+        // `take` grows the buffer as bytes arrive: a false length allocates no more than is there.
+        let mut bytes = Vec::new();
+        let found = self.stream.by_ref().take(length).read_to_end(&mut bytes);
+        self.expect_all("the payload", length, found)?;
+        let mut stored = [0; 4];
+        let found = read_full(&mut self.stream, &mut stored);
+        self.expect_all("the payload checksum", 4, found)?;
+        let place = self.place();
+        self.end_record(length);
+        let (expected, found) = (u32::from_le_bytes(stored), masked_crc(&bytes));
+        if expected != found {
+            return Err(DataError::Checksum {
+                part: "the payload",
+                expected,
+                found,
+                place,
+            });
+        }
+        Ok(Some(Payload { bytes, place }))
+    }
+
+    fn end_record(&mut self, length: u64) {
+        self.lost = false;
+        self.record += 1;
+        self.offset += HEADER_BYTES as u64 + length + 4;
+    }
+
+    /// The length of the next payload, checked; `None` at the end. Until [`Self::end_record`] the
+    /// position counts as lost.
+    fn header(&mut self) -> Result<Option<u64>, DataError> {
         if self.at_end()? {
             return Ok(None);
         }
@@ -99,27 +154,7 @@ impl TfRecordReader {
                 place: self.place(),
             });
         }
-        // `take` grows the buffer as bytes arrive: a false length allocates no more than is there.
-        let mut bytes = Vec::new();
-        let found = self.stream.by_ref().take(length).read_to_end(&mut bytes);
-        self.expect_all("the payload", length, found)?;
-        let mut stored = [0; 4];
-        let found = read_full(&mut self.stream, &mut stored);
-        self.expect_all("the payload checksum", 4, found)?;
-        self.lost = false;
-        let place = self.place();
-        self.record += 1;
-        self.offset += HEADER_BYTES as u64 + length + 4;
-        let (expected, found) = (u32::from_le_bytes(stored), masked_crc(&bytes));
-        if expected != found {
-            return Err(DataError::Checksum {
-                part: "the payload",
-                expected,
-                found,
-                place,
-            });
-        }
-        Ok(Some(Payload { bytes, place }))
+        Ok(Some(length))
     }
 
     fn at_end(&mut self) -> Result<bool, DataError> {

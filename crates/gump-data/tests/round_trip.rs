@@ -6,7 +6,7 @@ use std::io::Write;
 use std::path::Path;
 
 use gump_data::womd::write_scenarios;
-use gump_data::{DataError, find, open, write_atomically};
+use gump_data::{DataError, find, find_record, open, write_atomically};
 use gump_scene::{Frame, MapGraph, Scenario};
 use tempfile::TempDir;
 
@@ -130,6 +130,28 @@ fn scenarios_are_found_by_index_and_by_id() {
         error
             .to_string()
             .starts_with("expected a scenario \"nobody\", found 4 others")
+    );
+}
+
+#[test]
+fn earlier_records_are_passed_over_unseen_and_keep_their_index() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("many.tfrecord");
+    write_scenarios(&path, ["a", "b", "c"].map(named)).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    let record = bytes.len() / 3;
+    bytes[record / 2] ^= 1;
+    bytes[record + record / 2] ^= 1;
+    std::fs::write(&path, &bytes).unwrap();
+    let of = |index: usize| find_record(&format!("{}#{index}", path.display()));
+    assert!(matches!(of(1), Err(DataError::Checksum { .. })));
+    let third = of(2).unwrap();
+    assert_eq!(third.scenario.id, "c");
+    assert_eq!(third.offset as usize, 2 * record);
+    assert_eq!(third.report.inferred["route from the ego's log"], 1);
+    assert!(
+        matches!(of(3), Err(DataError::Checksum { .. })),
+        "the first problem on the way"
     );
 }
 

@@ -53,6 +53,25 @@ fn a_recording_beside_its_network_is_opened_by_content() {
 }
 
 #[test]
+fn where_a_network_ends_no_edge_lies_across_the_road() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("ends.net.xml");
+    let text = r#"<net>
+        <edge id="e" from="a" to="b">
+            <lane id="e_0" index="0" speed="13" length="50" shape="0,0 50,0"/>
+            <lane id="e_1" index="1" speed="13" length="50" shape="0,3.2 50,3.2"/>
+        </edge>
+        <junction id="a" type="dead_end" x="0" y="0" shape="0,4.8 0,1.6 0,-1.6"/>
+        <junction id="b" type="dead_end" x="50" y="0" shape="50,-1.6 50,4.8 49.9,1.6"/>
+    </net>"#;
+    std::fs::write(&path, text).unwrap();
+    let roads = Roads::new(&Network::read(&path).unwrap());
+    let edges = &roads.parts().road_edges;
+    let length: f64 = edges.iter().map(|edge| edge.line.length()).sum();
+    assert_eq!((edges.len(), length), (2, 100.0), "only along the sides");
+}
+
+#[test]
 fn all_classes_have_the_sizes_of_their_types() {
     let scenarios = scenarios(&fixture("small.fcd.xml.gz"));
     let agents = || {

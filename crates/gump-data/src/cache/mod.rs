@@ -142,6 +142,12 @@ struct Records {
 }
 
 impl Source for Records {
+    fn skip(&mut self) -> Option<Result<(), DataError>> {
+        let more = self.next < self.shard.records.len();
+        self.next += usize::from(more);
+        more.then_some(Ok(()))
+    }
+
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,

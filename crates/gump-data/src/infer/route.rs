@@ -7,7 +7,7 @@
 //! Source: map matching by a hidden Markov model after Newson and Krumm 2009, solved by Viterbi's
 //! algorithm; the costs are ours.
 
-use gump_geometry::{Polyline, Pose, angle_difference};
+use gump_geometry::{DVec2, Polyline, Pose, SegmentIndex, angle_difference};
 use gump_scene::{Lane, LaneId, MapGraph, Route, Scenario};
 
 /// Metres the ego moves between two samples.
@@ -65,10 +65,11 @@ fn samples(scenario: &Scenario) -> Option<(Vec<Pose>, usize)> {
 
 /// The lane of each sample, `None` where no lane is near; `None` as a whole if none ever is.
 fn match_lanes(map: &MapGraph, samples: &[Pose]) -> Option<Vec<Option<LaneId>>> {
+    let along = Along::new(map, samples);
     let mut steps: Vec<Vec<Candidate<'_>>> = Vec::with_capacity(samples.len());
     let mut last: usize = 0;
     for &pose in samples {
-        let mut candidates = candidates(map, pose);
+        let mut candidates = along.candidates(pose);
         let before = steps.get(last).map_or(&[][..], Vec::as_slice);
         for candidate in &mut candidates {
             let arrive = |b: &Candidate<'_>| b.cost + transition(map, b.lane, candidate.lane);
@@ -102,19 +103,53 @@ struct Candidate<'a> {
     from: Option<(usize, usize)>,
 }
 
-fn candidates(map: &MapGraph, pose: Pose) -> Vec<Candidate<'_>> {
-    map.lanes_near(pose.position, MAX_DISTANCE)
-        .filter_map(|(lane, distance)| {
+/// The lanes along the ego's way. An index of the whole map would take longer to build than all
+/// else that is inferred.
+struct Along<'a> {
+    lanes: &'a [Lane],
+    segments: SegmentIndex<usize>,
+}
+
+impl<'a> Along<'a> {
+    fn new(map: &'a MapGraph, samples: &[Pose]) -> Self {
+        let places = || samples.iter().map(|pose| pose.position);
+        let low = places().fold(DVec2::INFINITY, DVec2::min) - MAX_DISTANCE;
+        let high = places().fold(DVec2::NEG_INFINITY, DVec2::max) + MAX_DISTANCE;
+        let is_near = |a: DVec2, b: DVec2| a.min(b).cmple(high).all() && a.max(b).cmpge(low).all();
+        let mut segments = Vec::new();
+        for (i, lane) in map.lanes().iter().enumerate() {
+            let near = lane.centerline.segments().filter(|&(a, b)| is_near(a, b));
+            segments.extend(near.map(|(a, b)| (a, b, i)));
+        }
+        Self {
+            lanes: map.lanes(),
+            segments: SegmentIndex::new(segments),
+        }
+    }
+
+    /// Lanes near a pose that lead its way.
+    fn candidates(&self, pose: Pose) -> Vec<Candidate<'a>> {
+        let mut seen: Vec<usize> = Vec::new();
+        let mut found = Vec::new();
+        for (i, distance) in self.segments.within(pose.position, MAX_DISTANCE) {
+            if seen.contains(&i) {
+                continue;
+            }
+            seen.push(i);
+            let lane = &self.lanes[i];
             let foot = lane.centerline.project(pose.position).arc_length;
             let direction = lane.centerline.pose_at(foot).heading;
             let turn = angle_difference(pose.heading, direction).abs();
-            (turn <= MAX_TURN).then_some(Candidate {
-                lane,
-                cost: distance * distance + TURN_COST * turn * turn,
-                from: None,
-            })
-        })
-        .collect()
+            if turn <= MAX_TURN {
+                found.push(Candidate {
+                    lane,
+                    cost: distance * distance + TURN_COST * turn * turn,
+                    from: None,
+                });
+            }
+        }
+        found
+    }
 }
 
 fn transition(map: &MapGraph, from: &Lane, to: &Lane) -> f64 {

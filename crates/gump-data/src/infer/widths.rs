@@ -3,7 +3,7 @@
 //! The rules, in order: the distance to what bounds the lane on the left plus that on the right,
 //! where bounds are painted lines, road edges, and the middle between two centre lines of
 //! neighbours; inside an intersection, or without bounds, the mean of the lanes before and after,
-//! as far as that spreads; else the default.
+//! as far as that spreads; else the default. Lanes with an outline have the width it says.
 
 use std::collections::BTreeMap;
 
@@ -24,13 +24,19 @@ const TOLERANCE: f64 = 0.02;
 /// A bound must lie this much across rather than along the lane (cosine of 45 degrees).
 const MIN_ACROSS: f64 = 0.7;
 
-/// Sets the width of every lane that can be measured; the others keep theirs.
+/// Sets the width of every lane without an outline that can be measured; the others keep theirs.
 pub(super) fn infer(parts: &mut MapParts, report: &mut ReadReport) {
-    let bounds = bounds(parts);
     let lanes = &parts.lanes;
     let by_id: BTreeMap<LaneId, &Lane> = lanes.iter().map(|lane| (lane.id, lane)).collect();
-    let mut measured: BTreeMap<LaneId, f64> = BTreeMap::new();
-    for lane in lanes.iter().filter(|lane| !lane.in_intersection) {
+    let outlined = lanes.iter().filter(|lane| lane.outline.is_some());
+    let mut measured: BTreeMap<LaneId, f64> = outlined.map(|lane| (lane.id, lane.width)).collect();
+    let n_outlined = measured.len();
+    if n_outlined == lanes.len() {
+        return;
+    }
+    let bounds = bounds(parts);
+    let unknown = |lane: &&Lane| lane.outline.is_none() && !lane.in_intersection;
+    for lane in lanes.iter().filter(unknown) {
         let neighbors = |ids: &[LaneId]| -> Vec<&Lane> {
             ids.iter().filter_map(|id| by_id.get(id).copied()).collect()
         };
@@ -42,7 +48,7 @@ pub(super) fn infer(parts: &mut MapParts, report: &mut ReadReport) {
     }
     report.infer(
         "lane width from lines, edges and neighbours",
-        measured.len(),
+        measured.len() - n_outlined,
     );
     let n_measured = measured.len();
     while spread(lanes, &mut measured) {}
@@ -169,6 +175,23 @@ mod tests {
             report.inferred["lane width from lines, edges and neighbours"],
             1
         );
+    }
+
+    #[test]
+    fn an_outline_says_how_wide_its_lane_is() {
+        let text = "lane 1: 0,0 50,0 width 2.75 next 2\nlane 2: 50,0 99,0\n\
+                    line: 0,2 99,2\nline: 0,-2 99,-2\nego vehicle 0: 10,0 velocity 5,0";
+        let scenario = gump_scene::fixture::scenario(text).unwrap();
+        let mut parts = MapParts {
+            lanes: scenario.map.lanes().to_vec(),
+            road_lines: scenario.map.road_lines().to_vec(),
+            ..MapParts::default()
+        };
+        parts.lanes[0].outline = parts.lanes[0].centerline.ribbon(2.75);
+        let mut report = ReadReport::default();
+        infer(&mut parts, &mut report);
+        assert_eq!([parts.lanes[0].width, parts.lanes[1].width], [2.75, 4.0]);
+        assert_eq!(report.inferred.values().sum::<usize>(), 1);
     }
 
     #[test]

@@ -155,6 +155,10 @@ impl Scenarios {
 }
 
 impl Source for Scenarios {
+    fn skip(&mut self) -> Option<Result<(), DataError>> {
+        self.events.next().map(|_| Ok(()))
+    }
+
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,

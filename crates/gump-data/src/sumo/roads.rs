@@ -318,7 +318,10 @@ impl<'a> Draft<'a> {
             }
         }
         let n_lanes = polygons.len();
-        for junction in &network.junctions {
+        // Where the network ends the road does not: traffic comes and goes there, and an edge
+        // across would put it off the road.
+        let joined = |junction: &&Junction| junction.kind != "dead_end";
+        for junction in network.junctions.iter().filter(joined) {
             if let Some(ring) = self.carriageway(network, junction) {
                 let mut closed = ring.ring().to_vec();
                 closed.push(closed[0]);

@@ -41,6 +41,10 @@ struct Scenarios {
 }
 
 impl Source for Scenarios {
+    fn skip(&mut self) -> Option<Result<(), DataError>> {
+        self.records.skip_record()
+    }
+
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,

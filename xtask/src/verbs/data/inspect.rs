@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_data::{ReadOptions, ReadReport, Summary, find, inspect_with};
+use gump_data::{ReadOptions, ScenarioRecord, Summary, find, find_record, inspect_with};
 use gump_scene::Scenario;
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde::Serialize;
@@ -28,11 +28,14 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let whole = Path::new(&self.scenario);
         let one = self.scenario.contains('#') && !whole.exists();
-        let summary = run.phase("inspect", |_| {
+        let (summary, shown) = run.phase("inspect", |_| {
             if one {
-                summary_of_one(&self.scenario)
+                let mut record = find_record(&self.scenario)?;
+                add_tags(&mut record.scenario);
+                Ok((summary_of(&record)?, Some(record.scenario)))
             } else {
-                Ok(inspect_with(whole, ReadOptions::ALL, add_tags)?)
+                let summary = inspect_with(whole, ReadOptions::ALL, add_tags)?;
+                anyhow::Ok((summary, None))
             }
         })?;
         let n_unreadable = summary.unreadable.len();
@@ -51,7 +54,7 @@ impl Args {
         }
         if self.picture {
             run.phase("picture", |run| {
-                let scenario = find(&self.scenario)?;
+                let scenario = shown.map_or_else(|| find(&self.scenario), Ok)?;
                 let path = run.path("picture.png");
                 picture(&scenario)
                     .save_png(&path)
@@ -82,18 +85,11 @@ fn add_tags(scenario: &mut Scenario) {
     }
 }
 
-fn summary_of_one(name: &str) -> anyhow::Result<Summary> {
-    let mut wanted = find(name)?;
-    add_tags(&mut wanted);
-    let path = name.rsplit_once('#').map_or(name, |(path, _)| path);
-    let mut reader = gump_data::open(Path::new(path))?;
+fn summary_of(record: &ScenarioRecord) -> anyhow::Result<Summary> {
     let mut summary = Summary {
-        format: reader.format().into(),
+        format: gump_data::open(&record.path)?.format().into(),
         ..Summary::default()
     };
-    // The reader knows what it left out of the record; the scenario alone does not.
-    let record = reader.find_map(|record| record.ok().filter(|r| r.scenario.id == wanted.id));
-    let report = record.map_or_else(ReadReport::default, |record| record.report);
-    summary.add(&wanted, &report);
+    summary.add(&record.scenario, &record.report);
     Ok(summary)
 }
