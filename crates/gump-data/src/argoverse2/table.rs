@@ -65,9 +65,10 @@ fn read_feather(path: &Path) -> Result<Table, DataError> {
     collect(reader, path)
 }
 
-/// What the columns of a Feather file claim to unpack to, bytes; `None` if it has no sound footer.
+/// What the columns of a Feather file claim to unpack to, bytes; `None` if it has no sound footer,
+/// or one that tells of bytes beyond the file.
 ///
-/// The crate that unpacks them allocates what a column claims before it looks at the column.
+/// The crate that unpacks them allocates what a block or a column claims before it looks at it.
 ///
 /// Source: "Arrow columnar format", IPC file format and body compression: the footer lists blocks
 /// of a message and a body; a packed buffer of the body begins with its length, -1 if it is not.
@@ -84,6 +85,8 @@ fn unpacked_bytes(bytes: &[u8]) -> Option<u64> {
         let start = usize::try_from(block.offset()).ok()?;
         let body = start.checked_add(usize::try_from(block.metaDataLength()).ok()?)?;
         let message = bytes.get(start..body)?;
+        let end = body.checked_add(usize::try_from(block.bodyLength()).ok()?)?;
+        bytes.get(body..end)?;
         // Since version 0.15 a marker of four bytes stands before the length.
         let prefix = if message.starts_with(&[0xff; 4]) {
             8
@@ -267,5 +270,20 @@ impl Table {
             }
         }
         Ok(values)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_block_beyond_the_file_is_refused_before_memory_is_taken_for_it() {
+        let sound = include_bytes!("../../tests/hostile/argoverse2_log/seed.feather");
+        assert!(unpacked_bytes(sound).is_some_and(|bytes| bytes < 1 << 20));
+        // Found by the fuzzer: two gigabytes for a file of four kilobytes.
+        let damaged =
+            include_bytes!("../../tests/hostile/argoverse2_log/block_beyond_the_file.feather");
+        assert_eq!(unpacked_bytes(damaged), None);
     }
 }

@@ -3,7 +3,7 @@
 //! One polygon per lane: from its centre half its width to both sides, but never beyond a road
 //! edge, and out to the road edge where only a shoulder lies between. Driveways count as they are.
 
-use gump_geometry::{DVec2, Polygon, SegmentIndex};
+use gump_geometry::{BoxIndex, DVec2, Polygon};
 use gump_scene::{AreaKind, Lane, MapParts};
 
 use super::simplify;
@@ -38,7 +38,7 @@ pub(super) fn infer(parts: &mut MapParts, report: &mut ReadReport) {
 }
 
 /// Road-edge segments with the height of their start.
-struct EdgeIndex(SegmentIndex<(DVec2, DVec2, f64)>);
+struct EdgeIndex(BoxIndex<(DVec2, DVec2, f64)>);
 
 impl EdgeIndex {
     fn new(parts: &MapParts) -> Self {
@@ -48,15 +48,15 @@ impl EdgeIndex {
             let segment = |i: &[usize]| (points[i[0]], points[i[1]], edge.elevation[i[0]]);
             kept.windows(2).map(segment).collect::<Vec<_>>()
         });
-        let segments = segments.map(|(a, b, z)| (a, b, (a, b, z)));
-        Self(SegmentIndex::new(segments))
+        let boxes = segments.map(|(a, b, z)| (a.min(b), a.max(b), (a, b, z)));
+        Self(BoxIndex::new(boxes))
     }
 
     /// Metres from `origin` along the unit vector `direction` to the first edge at this height,
     /// if it is within `reach`.
     fn first_hit(&self, origin: DVec2, z: f64, direction: DVec2, reach: f64) -> Option<f64> {
-        let middle = origin + direction * (reach / 2.0);
-        let near = self.0.within(middle, reach / 2.0).map(|(edge, _)| edge);
+        let end = origin + direction * reach;
+        let near = self.0.intersecting(origin.min(end), origin.max(end));
         near.filter(|(_, _, height)| (height - z).abs() < MAX_STEP)
             .filter_map(|(a, b, _)| hit(origin, direction, a, b))
             .filter(|&distance| distance <= reach)

@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::{DVec2, Pose, SegmentIndex};
+use gump_geometry::{BoxIndex, DVec2, Pose};
 use gump_scene::{Lane, LaneId, LaneKind, MapParts};
 
 use super::simplify;
@@ -75,7 +75,7 @@ fn spread(lanes: &[Lane], known: &mut BTreeMap<LaneId, f64>) -> bool {
     any
 }
 
-type Bounds = SegmentIndex<(DVec2, DVec2)>;
+type Bounds = BoxIndex<(DVec2, DVec2)>;
 
 fn bounds(parts: &MapParts) -> Bounds {
     let lines = parts.road_lines.iter().map(|line| &line.line);
@@ -86,7 +86,7 @@ fn bounds(parts: &MapParts) -> Bounds {
         let segment = |i: &[usize]| (points[i[0]], points[i[1]]);
         kept.windows(2).map(segment).collect::<Vec<_>>()
     });
-    SegmentIndex::new(segments.map(|(a, b)| (a, b, (a, b))))
+    BoxIndex::new(segments.map(|(a, b)| (a.min(b), a.max(b), (a, b))))
 }
 
 /// The median width over the places where both sides are bounded.
@@ -118,10 +118,13 @@ fn plausible(kind: LaneKind, width: f64) -> bool {
 /// Metres to the nearest line or edge on the left and on the right, infinite if there is none.
 fn to_lines(pose: Pose, bounds: &Bounds) -> [f64; 2] {
     let mut sides = [f64::INFINITY; 2];
-    for ((a, b), distance) in bounds.within(pose.position, MAX_REACH) {
+    let (low, high) = (pose.position - MAX_REACH, pose.position + MAX_REACH);
+    for (a, b) in bounds.intersecting(low, high) {
         let foot = a.lerp(b, gump_geometry::project_on_segment(pose.position, a, b));
+        let distance = foot.distance(pose.position);
         let across = pose.direction().perp_dot(foot - pose.position);
-        if across.abs() >= MIN_ACROSS * distance && distance > 0.0 {
+        let is_near = 0.0 < distance && distance <= MAX_REACH;
+        if is_near && across.abs() >= MIN_ACROSS * distance {
             let side = &mut sides[usize::from(across < 0.0)];
             *side = side.min(distance);
         }

@@ -151,7 +151,7 @@ impl Target {
 
 fn unpacked(path: &Path) -> Vec<u8> {
     let bytes = fs::read(path).unwrap();
-    if !path.extension().is_some_and(|ending| ending == "gz") {
+    if path.extension().is_none_or(|ending| ending != "gz") {
         return bytes;
     }
     let mut unpacked = Vec::new();
