@@ -49,10 +49,12 @@ pub mod nuplan;
 mod open;
 mod record;
 mod recording;
+mod rollouts;
 pub mod scenario_json;
 mod stream;
 pub mod submission;
 pub mod sumo;
+mod table;
 pub mod tfrecord;
 mod tracks;
 mod verify;
@@ -66,6 +68,8 @@ pub use files::list as list_files;
 pub use inspect::{Summary, inspect, inspect_with};
 pub use open::{Reader, find, find_record, open, open_files, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
+pub use rollouts::write_rollouts;
+pub use table::Table;
 pub use tracks::write_tracks;
 pub use verify::{
     Finding, FormatCounts, MAX_FINDINGS, Severity, Verification, verify, verify_one_of_many,

@@ -17,19 +17,13 @@
 
 use std::borrow::Borrow;
 use std::collections::BTreeMap;
-use std::io::{self, Write};
+use std::io::Write;
 use std::path::Path;
-use std::sync::Arc;
 
-use arrow_array::{ArrayRef, BooleanArray, Float64Array, Int64Array, RecordBatch, StringArray};
-use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use gump_scene::{Agent, AgentId, Scenario};
-use parquet::arrow::ArrowWriter;
-use parquet::basic::{Compression, ZstdLevel};
-use parquet::file::properties::WriterProperties;
 
-use crate::stream::io_error;
-use crate::{DataError, write_atomically};
+use crate::DataError;
+use crate::table::{Sheet, Table, write_tables};
 
 /// Writes the tracks of scenarios as one table; the file appears when it is complete.
 ///
@@ -39,13 +33,8 @@ pub fn write_tracks<S: Borrow<Scenario>>(
     path: &Path,
     scenarios: impl IntoIterator<Item = S>,
 ) -> Result<(), DataError> {
-    write_atomically(path, |file| {
-        let mut table = TrackTable::begin(file, path)?;
-        for scenario in scenarios {
-            table.write(scenario.borrow())?;
-        }
-        table.finish()
-    })
+    let tables = scenarios.into_iter().map(|s| tracks_of(Some(s.borrow())));
+    write_tables(path, &tracks_of(None), tables)
 }
 
 /// A column of numbers and where they come from: the agent, and seconds from the first frame.
@@ -62,76 +51,49 @@ const NUMBERS: [Number; 8] = [
     ("width", |agent, _| agent.width),
 ];
 
-/// A table being written.
-pub(crate) struct TrackTable<'a, W: Write + Send> {
-    writer: ArrowWriter<W>,
-    schema: SchemaRef,
-    path: &'a Path,
-}
-
-impl<'a, W: Write + Send> TrackTable<'a, W> {
-    /// `path` is for errors only.
-    pub(crate) fn begin(out: W, path: &'a Path) -> Result<Self, DataError> {
-        let mut fields = vec![
-            Field::new("scenario_id", DataType::Utf8, false),
-            Field::new("track_id", DataType::Int64, false),
-            Field::new("class", DataType::Utf8, false),
-            Field::new("is_ego", DataType::Boolean, false),
-        ];
-        let numbers = NUMBERS.iter();
-        fields.extend(numbers.map(|(name, _)| Field::new(*name, DataType::Float64, false)));
-        let schema = Arc::new(Schema::new(fields));
-        let properties = WriterProperties::builder()
-            .set_compression(Compression::ZSTD(ZstdLevel::default()))
-            .build();
-        let writer = ArrowWriter::try_new(out, Arc::clone(&schema), Some(properties));
-        Ok(Self {
-            writer: writer.map_err(|error| failed(error, path))?,
-            schema,
-            path,
-        })
-    }
-
-    /// Adds the tracks of a scenario.
-    pub(crate) fn write(&mut self, scenario: &Scenario) -> Result<(), DataError> {
-        let mut tracks: BTreeMap<AgentId, Vec<(f64, &Agent)>> = BTreeMap::new();
+/// The rows of a scenario; none without one.
+fn tracks_of(scenario: Option<&Scenario>) -> Table {
+    let mut tracks: BTreeMap<AgentId, Vec<(f64, &Agent)>> = BTreeMap::new();
+    let (id, ego) = scenario.map_or(("", None), |s| (s.id.as_str(), Some(s.ego)));
+    if let Some(scenario) = scenario {
         for (step, frame) in scenario.log.iter().enumerate() {
             for agent in frame.agents() {
                 let time = step as f64 * scenario.dt;
                 tracks.entry(agent.id).or_default().push((time, agent));
             }
         }
-        let rows: Vec<(f64, &Agent)> = tracks.into_values().flatten().collect();
-        let agents = || rows.iter().map(|(_, agent)| *agent);
-        let ids = std::iter::repeat_n(scenario.id.as_str(), rows.len());
-        let is_ego: Vec<bool> = agents().map(|agent| agent.id == scenario.ego).collect();
-        let mut columns: Vec<ArrayRef> = vec![
-            Arc::new(StringArray::from_iter_values(ids)),
-            Arc::new(Int64Array::from_iter_values(agents().map(|a| a.id.0))),
-            Arc::new(StringArray::from_iter_values(
-                agents().map(|a| a.kind.name()),
-            )),
-            Arc::new(BooleanArray::from(is_ego)),
-        ];
-        for (_, of) in NUMBERS {
-            let values = rows.iter().map(|(time, agent)| of(agent, *time));
-            columns.push(Arc::new(Float64Array::from_iter_values(values)));
-        }
-        RecordBatch::try_new(Arc::clone(&self.schema), columns)
-            .map_err(|error| failed(error, self.path))
-            .and_then(|batch| {
-                let written = self.writer.write(&batch);
-                written.map_err(|error| failed(error, self.path))
-            })
+    }
+    let rows: Vec<(f64, &Agent)> = tracks.into_values().flatten().collect();
+    let agents = || rows.iter().map(|(_, agent)| *agent);
+    let table = Table::default()
+        .text("scenario_id", agents().map(|_| Some(id)))
+        .integer("track_id", agents().map(|agent| Some(agent.id.0)))
+        .text("class", agents().map(|agent| Some(agent.kind.name())))
+        .truth("is_ego", agents().map(|agent| Some(Some(agent.id) == ego)));
+    NUMBERS.iter().fold(table, |table, (name, of)| {
+        table.number(
+            name,
+            rows.iter().map(|(time, agent)| Some(of(agent, *time))),
+        )
+    })
+}
+
+/// A table of tracks being written.
+pub(crate) struct TrackTable<'a, W: Write + Send>(Sheet<'a, W>);
+
+impl<'a, W: Write + Send> TrackTable<'a, W> {
+    /// `path` is for errors only.
+    pub(crate) fn begin(out: W, path: &'a Path) -> Result<Self, DataError> {
+        Sheet::begin(out, &tracks_of(None), path).map(Self)
+    }
+
+    /// Adds the tracks of a scenario.
+    pub(crate) fn write(&mut self, scenario: &Scenario) -> Result<(), DataError> {
+        self.0.write(tracks_of(Some(scenario)))
     }
 
     /// Writes what is left and the table's footer.
     pub(crate) fn finish(self) -> Result<(), DataError> {
-        let closed = self.writer.close();
-        closed.map(drop).map_err(|error| failed(error, self.path))
+        self.0.finish()
     }
-}
-
-fn failed(error: impl std::error::Error + Send + Sync + 'static, path: &Path) -> DataError {
-    io_error("write the table", io::Error::other(error), path)
 }
