@@ -148,6 +148,33 @@ fn the_dearest_blame_names_agent_and_step() {
 }
 
 #[test]
+fn an_agent_that_keeps_to_the_log_is_more_realistic() {
+    let log = log();
+    let config = year(Year::Y2025);
+    let reference = Reference::new(&log, &config).unwrap();
+    let mut futures = rollouts(&[1.0; 32]);
+    for future in &mut futures.futures {
+        // From 4 s on the one ahead slides sideways in every rollout.
+        for k in 40..80 {
+            future[1].y[k] += 0.4 * (k - 40) as f32;
+        }
+    }
+    let evaluation = reference.evaluate(&futures).unwrap();
+    let found = evaluation.realism();
+    let ids: Vec<_> = found.iter().map(|agent| agent.agent).collect();
+    assert_eq!(ids, reference.features().agents);
+    assert!(found[1].realism < found[0].realism - 0.1, "{found:?}");
+    let mean = |steps: &[Option<f64>]| {
+        let values: Vec<f64> = steps.iter().copied().flatten().collect();
+        assert!(values.iter().all(|v| (0.0..=1.0).contains(v)));
+        values.iter().sum::<f64>() / values.len() as f64
+    };
+    let steps = &found[1].steps;
+    assert_eq!(steps.len(), 80);
+    assert!(mean(&steps[45..]) < mean(&steps[..35]) - 0.1, "{steps:?}");
+}
+
+#[test]
 fn averages_are_of_every_field() {
     let log = log();
     let config = year(Year::Y2025);

@@ -30,7 +30,74 @@ pub struct Blame {
     pub imagined: f64,
 }
 
+/// How likely the log of one agent is under the rollouts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AgentRealism {
+    /// The agent.
+    pub agent: AgentId,
+    /// Weighted mean of its likelihoods in the components that it has, 0 to 1.
+    pub realism: f64,
+    /// The same step by step, of the components that change from step to step; `None` where none
+    /// of them counts.
+    pub steps: Vec<Option<f64>>,
+}
+
+/// A weighted mean under construction.
+#[derive(Clone, Copy, Default)]
+struct Weighted {
+    sum: f64,
+    weight: f64,
+}
+
+impl Weighted {
+    fn add(&mut self, value: f64, weight: f64) {
+        self.sum += weight * value;
+        self.weight += weight;
+    }
+
+    fn mean(self) -> Option<f64> {
+        (self.weight > 0.0).then(|| self.sum / self.weight)
+    }
+}
+
 impl Evaluation<'_> {
+    /// How likely the log of each scored agent is, under the weights of the year; agents without
+    /// any value that counts are left out.
+    pub fn realism(&self) -> Vec<AgentRealism> {
+        let features = self.reference.features();
+        let (n, n_steps) = (features.agents.len(), features.n_steps);
+        let mut whole = vec![Weighted::default(); n];
+        let mut steps = vec![Weighted::default(); n * n_steps];
+        for (component, feature) in self.reference.config.components() {
+            let weight = f64::from(feature.weight);
+            for blame in self.blames(component) {
+                let own = features.agents.iter().position(|id| *id == blame.agent);
+                if let Some(agent) = own {
+                    whole[agent].add(blame.likelihood, weight);
+                }
+            }
+            if component.is_indication() {
+                continue;
+            }
+            let found = self.log_likelihoods[&component].iter();
+            let counted = found.zip(self.reference.mask(component)).zip(&mut steps);
+            for ((likelihood, counts), mean) in counted {
+                if counts {
+                    mean.add(f64::from(*likelihood).exp(), weight);
+                }
+            }
+        }
+        let of_agent = |agent: usize| {
+            let steps = steps[agent * n_steps..][..n_steps].iter();
+            Some(AgentRealism {
+                agent: features.agents[agent],
+                realism: whole[agent].mean()?,
+                steps: steps.map(|mean| mean.mean()).collect(),
+            })
+        };
+        (0..n).filter_map(of_agent).collect()
+    }
+
     /// What each agent costs in each component, dearest first; what costs nothing is left out.
     pub fn explain(&self) -> Vec<Blame> {
         let config = self.reference.config;

@@ -7,7 +7,8 @@
 //!
 //! Start with [`score`] on plain arrays, or with [`Log::of`] and [`Rollouts::of`] on scenes.
 //! [`Reference`] keeps what rollouts are compared with, [`Evaluation`] what the comparison found,
-//! [`Evaluation::explain`] says what lowered the score and when; [`Scores::mean`] averages over
+//! [`Evaluation::explain`] says what lowered the score and when, [`Evaluation::realism`] whose futures
+//! are like the log; [`Scores::mean`] averages over
 //! scenarios, [`crate::interval`] says how sure an average is. A year is a [`Config`], which is a TOML file.
 //! Reading Waymo's messages is the business of `gump-data`, checking a submission too.
 //!
@@ -39,7 +40,7 @@ mod scores;
 pub use config::{Algorithm, Component, Config, Estimator, FeatureConfig, Group, Mode, Year};
 pub use error::WosacError;
 pub use estimate::{Shape, log_likelihoods};
-pub use explain::Blame;
+pub use explain::{AgentRealism, Blame};
 pub use features::Features;
 pub use input::{
     Log, N_FUTURE, N_HISTORY, N_STEPS, Rollouts, Signal, SignalLane, State, Track, Trajectory,
