@@ -14,6 +14,7 @@ use crate::ModelError;
 use crate::batch::{PlacedSlot, place};
 use crate::clearance::redraw;
 use crate::engine::{Context, Engine, Job, SceneMemory};
+use crate::outlook::{Seen, Watch};
 use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
 use crate::surroundings::Survey;
 
@@ -70,20 +71,48 @@ pub(crate) struct Step<'a> {
     pub(crate) windows: &'a [Window],
     /// Their slots, as [`presented`].
     pub(crate) placed: Vec<Vec<PlacedSlot>>,
+    /// What is kept of the distributions.
+    pub(crate) watch: Watch,
+}
+
+/// The next frame of every window.
+pub(crate) struct Decoded {
+    /// One chunk of bins per tracked agent of every window.
+    pub(crate) bins: Vec<Vec<Bins>>,
+    /// Transformer passes that it took.
+    pub(crate) passes: u64,
+    /// Other draws from the same distributions, as far as they are watched.
+    pub(crate) seen: Vec<Seen>,
 }
 
 impl Step<'_> {
-    /// Decodes the next frame of every window, one chunk of bins per tracked agent; also says in
-    /// how many passes. `contexts` are those of the windows.
-    pub(crate) fn decode(self, contexts: &mut [&mut Context]) -> (Vec<Vec<Bins>>, u64) {
+    /// Decodes the next frame of every window; `contexts` are those of the windows.
+    pub(crate) fn decode(self, contexts: &mut [&mut Context]) -> Decoded {
         match self.sampling.mode {
-            Mode::PartialAr => (self.all_at_once(contexts), 1),
+            Mode::PartialAr => self.all_at_once(contexts),
             Mode::FullAr => self.one_by_one(contexts),
         }
     }
 
+    /// Draws again from the distribution of an object, as often as is watched: `hidden` is that at
+    /// its key. The streams are others, so that nothing changes for the draws that count.
+    fn look(&self, window: usize, place: usize, hidden: &[f32]) -> Option<Seen> {
+        let request = &self.windows[window].requests[place];
+        if window >= self.watch.futures || request.is_driven() {
+            return None;
+        }
+        let requests: Vec<Request> = self.watch.requests(request).collect();
+        let requests: Vec<&Request> = requests.iter().collect();
+        let rows = hidden.repeat(requests.len());
+        Some(Seen {
+            window,
+            place,
+            bins: self.engine.sample(&rows, &requests, self.sampling),
+        })
+    }
+
     /// Partial autoregression: one pass with surrogates in place, then every key is decoded.
-    fn all_at_once(&self, contexts: &mut [&mut Context]) -> Vec<Vec<Bins>> {
+    fn all_at_once(&self, contexts: &mut [&mut Context]) -> Decoded {
         let keep = self.sampling.cache == CacheMode::Growing;
         let of_windows = self.windows.iter().zip(&self.placed).zip(contexts);
         let mut jobs: Vec<Job<'_>> = of_windows
@@ -124,15 +153,25 @@ impl Step<'_> {
             Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
         };
         let Ok(()) = redraw(self.windows, &mut decoded, self.sampling, again);
-        decoded
+        let watched = self.windows.iter().take(self.watch.futures).enumerate();
+        let watched =
+            watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
+        let seen =
+            watched.filter_map(|(w, i)| self.look(w, i, &hidden[(firsts[w] + i) * c..][..c]));
+        Decoded {
+            seen: seen.collect(),
+            bins: decoded,
+            passes: 1,
+        }
     }
 
     /// Full autoregression: each object sees the final states of those before it. The windows go
     /// in step, object by object; those with fewer objects are done earlier.
-    fn one_by_one(mut self, contexts: &mut [&mut Context]) -> (Vec<Vec<Bins>>, u64) {
+    fn one_by_one(mut self, contexts: &mut [&mut Context]) -> Decoded {
         let n = |i: usize| self.windows[i].next.tracked.len();
         let most = (0..self.windows.len()).map(n).max().unwrap_or(0);
         let mut decoded: Vec<Vec<Bins>> = vec![Vec::new(); self.windows.len()];
+        let mut seen = Vec::new();
         for i in 0..most {
             let mut members = Vec::new();
             let mut jobs: Vec<Job<'_>> = Vec::new();
@@ -161,6 +200,8 @@ impl Step<'_> {
                 .map(|w| &self.windows[*w].requests[i])
                 .collect();
             let bins = self.engine.sample(&hidden, &requests, self.sampling);
+            let rows = members.iter().zip(hidden.chunks(self.engine.width()));
+            seen.extend(rows.filter_map(|(w, hidden)| self.look(*w, i, hidden)));
             for ((w, bins), request) in members.into_iter().zip(bins).zip(requests) {
                 let settled = request.settle(&bins, self.sampling);
                 let slots = &mut self.placed[w];
@@ -169,7 +210,11 @@ impl Step<'_> {
                 decoded[w].push(bins);
             }
         }
-        (decoded, most as u64)
+        Decoded {
+            bins: decoded,
+            passes: most as u64,
+            seen,
+        }
     }
 }
 

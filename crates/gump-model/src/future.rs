@@ -31,6 +31,8 @@ pub(crate) struct Future {
     pub(crate) frames: Vec<TokenFrame>,
     /// Number of the last frame.
     pub(crate) index: usize,
+    /// What that was at the start.
+    pub(crate) begun: usize,
     pub(crate) rings: BTreeMap<u16, Ring>,
     /// The last `history` frames in world coordinates; the last is the present.
     pub(crate) recent: Vec<Frame>,

@@ -13,6 +13,7 @@
 //! * **surrogate**: a provisional state, from earlier chunks, that lets all objects of a frame be
 //!   decoded in one pass (partial autoregression).
 //! * **aggregation**: averaging what several chunks say of the same instant.
+//! * **outlook**: what an agent might have done next, as draws from its distribution.
 //! * **visual memory**: keys and values of the map, computed once per scene.
 
 mod aggregation;
@@ -38,6 +39,7 @@ mod mct;
 mod network;
 pub mod ops;
 mod optimizer;
+mod outlook;
 mod parameters;
 mod plain;
 mod sample;
@@ -64,6 +66,7 @@ pub use loss::{LossConfig, LossParts};
 pub use network::Network;
 pub use ops::panels::Precision;
 pub use optimizer::OptimizerConfig;
+pub use outlook::{Outlook, Watch};
 pub use parameters::Parameters;
 pub use sample::SampleConfig;
 pub use sampling::{CacheMode, Mode, SamplingConfig, Surrogate};

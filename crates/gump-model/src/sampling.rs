@@ -135,6 +135,11 @@ pub(crate) trait Restrict: fmt::Debug + Send + Sync {
 }
 
 impl Request {
+    /// Whether the state is given, so that nothing is left to draw.
+    pub(crate) fn is_driven(&self) -> bool {
+        self.forced[..7].iter().all(Option::is_some)
+    }
+
     /// The final state of a decoded object: its sample, aggregated, within its limits; scene frame,
     /// not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {

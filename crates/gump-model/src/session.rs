@@ -11,6 +11,7 @@ use crate::decode::{Step, Window, present_all};
 use crate::engine::SceneMemory;
 use crate::future::Future;
 use crate::mct::VisualMemory;
+use crate::outlook::{Outlook, Seen};
 use crate::plain::{Passes, decode};
 use crate::sample::TOKEN_DT;
 use crate::sampling::Bins;
@@ -148,12 +149,42 @@ impl TransformerSession<'_> {
             memories: &memories,
             windows,
             placed,
+            watch: self.world.watch(),
         };
-        let (decoded, passes) = step.decode(&mut contexts);
-        self.world.count_passes(passes);
+        let decoded = step.decode(&mut contexts);
+        self.world.count_passes(decoded.passes);
         let kept = contexts.iter().map(|context| context.bytes()).sum();
         self.world.note_context_bytes(kept);
-        Ok(decoded)
+        let seen = decoded.seen.iter();
+        self.world.keep_outlooks(
+            seen.filter_map(|seen| self.outlook(seen, windows))
+                .collect(),
+        );
+        Ok(decoded.bins)
+    }
+
+    /// Draws of an object in the world frame.
+    fn outlook(&self, seen: &Seen, windows: &[Window]) -> Option<Outlook> {
+        let future = &self.futures[seen.window];
+        let scene = &self.scenes[future.scene];
+        let window = &windows[seen.window];
+        let (object, request) = (
+            &window.next.tracked[seen.place],
+            &window.requests[seen.place],
+        );
+        let draws = seen.bins.iter().map(|bins| {
+            let settled = request.settle(bins, self.world.sampling());
+            AgentState {
+                pose: scene.world_from_scene * settled.pose,
+                velocity: scene.world_from_scene.rotate(settled.velocity),
+            }
+        });
+        Some(Outlook {
+            future: seen.window,
+            step: future.index - future.begun,
+            agent: future.identities.agent(object.key.id)?,
+            draws: draws.collect(),
+        })
     }
 
     /// Drops scenes that no future is in.

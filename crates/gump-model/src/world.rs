@@ -10,8 +10,8 @@
 //! comes into the window is the network's from then on.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 
 use candle_core::Tensor;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
@@ -27,6 +27,7 @@ use crate::decoder::STEPS;
 use crate::engine::{Engine, Job};
 use crate::future::{Future, stream};
 use crate::network::Network;
+use crate::outlook::{Outlook, Watch};
 use crate::plain::sample_states;
 use crate::sampling::{Bins, Request, SamplingConfig};
 use crate::scene::{Memory, Scene};
@@ -34,6 +35,9 @@ use crate::session::TransformerSession;
 
 /// An agent whose surrogate leaves this range gets no tokens any more (released code), metres.
 pub(crate) const KEEP_RANGE_M: f64 = 96.0;
+
+/// Why the list of outlooks can be trusted.
+const WHOLE: &str = "nobody panics between taking and giving back the list";
 
 /// A trained network that imagines traffic.
 #[derive(Debug)]
@@ -45,6 +49,8 @@ pub struct TransformerWorld {
     engine: Option<Engine>,
     passes: AtomicU64,
     context_bytes: AtomicUsize,
+    watch: Watch,
+    outlooks: Mutex<Vec<Outlook>>,
 }
 
 impl TransformerWorld {
@@ -71,7 +77,23 @@ impl TransformerWorld {
             engine: None,
             passes: AtomicU64::new(0),
             context_bytes: AtomicUsize::new(0),
+            watch: Watch::default(),
+            outlooks: Mutex::default(),
         }
+    }
+
+    /// The same world, which keeps what its agents might have done; what they do is the same.
+    ///
+    /// The engine does, so on other devices than a CPU there is nothing to see.
+    #[must_use]
+    pub fn watching(self, watch: Watch) -> Self {
+        Self { watch, ..self }
+    }
+
+    /// Takes what was watched since it was last taken: step by step, futures in their order, and
+    /// agents in the order in which they are decoded.
+    pub fn take_outlooks(&self) -> Vec<Outlook> {
+        std::mem::take(&mut self.outlooks.lock().expect(WHOLE))
     }
 
     /// Transformer passes made so far, whatever their batch; the first of a session reads history.
@@ -117,6 +139,14 @@ impl TransformerWorld {
 
     pub(crate) fn note_context_bytes(&self, bytes: usize) {
         self.context_bytes.fetch_max(bytes, Ordering::Relaxed);
+    }
+
+    pub(crate) fn watch(&self) -> Watch {
+        self.watch
+    }
+
+    pub(crate) fn keep_outlooks(&self, seen: Vec<Outlook>) {
+        self.outlooks.lock().expect(WHOLE).extend(seen);
     }
 
     pub(crate) fn count_passes(&self, n: u64) {
@@ -185,6 +215,7 @@ impl TransformerWorld {
                 seed: seed.fork(k as u64),
                 frames: shared.history.clone(),
                 index: last,
+                begun: last,
                 rings: BTreeMap::new(),
                 recent: shared.recent.clone(),
                 identities: shared.identities.clone(),
