@@ -27,6 +27,8 @@ mod run;
 mod shipped;
 mod sumo;
 mod table;
+mod tables;
+mod told;
 mod verbs;
 mod worlds;
 

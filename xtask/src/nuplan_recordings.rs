@@ -56,8 +56,16 @@ pub(crate) fn open(paths: &[PathBuf]) -> anyhow::Result<Box<dyn Iterator<Item = 
     let mut maps = Maps::default();
     Ok(Box::new(selected.into_iter().map(move |selected| Named {
         id: selected.event.token.to_string(),
+        // A log's name has dots of its own.
+        log_name: stem(logs[selected.log].path()),
+        scenario_type: selected.scenario_type.clone(),
         case: case(&logs[selected.log], &selected, &mut maps),
     })))
+}
+
+fn stem(path: &Path) -> String {
+    let stem = path.file_stem().unwrap_or_default();
+    stem.to_string_lossy().into_owned()
 }
 
 fn case(log: &Log, selected: &Selected, maps: &mut Maps) -> anyhow::Result<Case> {

@@ -23,6 +23,10 @@ pub(crate) struct Case {
 pub(crate) struct Named {
     /// The scenario's id; where it cannot be read, where it was.
     pub(crate) id: String,
+    /// The log it is of: the name of its file, without endings.
+    pub(crate) log_name: String,
+    /// nuPlan's type of scenario; "unknown" for other formats.
+    pub(crate) scenario_type: String,
     /// The case.
     pub(crate) case: anyhow::Result<Case>,
 }
@@ -37,16 +41,24 @@ pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named>
     }
     let place: PathBuf = path.into();
     let records = gump_data::open(path)?.enumerate();
-    Ok(Box::new(records.map(move |(i, record)| match record {
-        Ok(record) => Named {
-            id: record.scenario.id.clone(),
-            case: of_boxes(record.scenario),
-        },
-        Err(error) => Named {
-            id: format!("{}#{i}", place.display()),
-            case: Err(error.into()),
-        },
+    Ok(Box::new(records.map(move |(i, record)| {
+        let (id, case) = match record {
+            Ok(record) => (record.scenario.id.clone(), of_boxes(record.scenario)),
+            Err(error) => (format!("{}#{i}", place.display()), Err(error.into())),
+        };
+        Named {
+            id,
+            log_name: log_name(&place),
+            scenario_type: "unknown".into(),
+            case,
+        }
     })))
+}
+
+/// A file's name without its endings.
+pub(crate) fn log_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.split('.').next().unwrap_or_default().into()
 }
 
 /// One scenario: `PATH`, `PATH#INDEX` or `PATH#ID`.

@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use crate::machine::{self, Machine};
-use crate::table;
+use crate::{table, tables};
 
 /// The report of one run, in the order in which it is written.
 #[derive(Debug, Serialize)]
@@ -74,6 +74,17 @@ impl Report {
             file.write_all(text.as_bytes())
                 .with_context(|| format!("cannot write {}", path.display()))
         })
+    }
+
+    /// Writes every list of objects among the results as `KEY.parquet` into `folder`.
+    pub(crate) fn write_tables(&self, folder: &Path) -> anyhow::Result<()> {
+        for (key, value) in &self.results {
+            let rows = value.as_array().map_or(&[][..], Vec::as_slice);
+            if !rows.is_empty() && rows.iter().all(Value::is_object) {
+                tables::of_rows(rows).write(&folder.join(format!("{key}.parquet")))?;
+            }
+        }
+        Ok(())
     }
 
     /// The results and times as the terminal shows them.

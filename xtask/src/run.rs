@@ -128,7 +128,7 @@ impl Run {
             .num_threads(self.threads)
             .build_global()
             .context("cannot start the worker threads")?;
-        let done = work(&mut self);
+        let done = work(&mut self).and_then(|()| self.report.write_tables(&self.out));
         self.report.add_seconds("total", self.began.elapsed());
         self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
         let path = self.out.join("report.json");

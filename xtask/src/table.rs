@@ -11,6 +11,10 @@ pub(crate) fn text(results: &Value) -> String {
     let mut pairs = Vec::new();
     let mut tables = Vec::new();
     walk("", results, &mut pairs, &mut tables);
+    let pairs: Rows = pairs
+        .into_iter()
+        .map(|(name, value)| vec![name, cell(value)])
+        .collect();
     let mut text = aligned(&pairs);
     for (name, rows) in tables {
         let shown = rows.len().min(MAX_ROWS + 1);
@@ -27,7 +31,12 @@ const MAX_ROWS: usize = 40;
 
 type Rows = Vec<Vec<String>>;
 
-fn walk(name: &str, value: &Value, pairs: &mut Rows, tables: &mut Vec<(String, Rows)>) {
+fn walk<'v>(
+    name: &str,
+    value: &'v Value,
+    pairs: &mut Vec<(String, &'v Value)>,
+    tables: &mut Vec<(String, Rows)>,
+) {
     match value {
         Value::Object(fields) => {
             for (key, value) in fields {
@@ -41,21 +50,19 @@ fn walk(name: &str, value: &Value, pairs: &mut Rows, tables: &mut Vec<(String, R
         Value::Array(rows) if rows.iter().any(Value::is_object) => {
             tables.push((name.into(), table(rows)));
         }
-        value => pairs.push(vec![name.into(), cell(value)]),
+        value => pairs.push((name.into(), value)),
     }
 }
 
-fn table(rows: &[Value]) -> Rows {
-    let mut flat: Vec<Vec<(String, String)>> = Vec::new();
-    for row in rows {
+/// Objects as a table: the names of its columns in order of first appearance, and for each row a
+/// value per column where it has one. Nested keys get dots, lists of objects are left out.
+pub(crate) fn flattened(rows: &[Value]) -> (Vec<String>, Vec<Vec<Option<&Value>>>) {
+    let flat = rows.iter().map(|row| {
         let (mut pairs, mut nested) = (Vec::new(), Vec::new());
         walk("", row, &mut pairs, &mut nested);
-        let cells = pairs.into_iter().filter_map(|pair| {
-            let mut pair = pair.into_iter();
-            Some((pair.next()?, pair.next()?))
-        });
-        flat.push(cells.collect());
-    }
+        pairs
+    });
+    let flat: Vec<Vec<(String, &Value)>> = flat.collect();
     let mut columns: Vec<String> = Vec::new();
     for (column, _) in flat.iter().flatten() {
         if !columns.contains(column) {
@@ -63,13 +70,23 @@ fn table(rows: &[Value]) -> Rows {
         }
     }
     let body = flat.iter().map(|row| {
-        let cell = |column| row.iter().find(|(name, _)| name == column);
+        let value = |column| row.iter().find(|(name, _)| name == column);
         columns
             .iter()
-            .map(|column| cell(column).map_or("-".into(), |(_, text)| text.clone()))
+            .map(|column| value(column).map(|(_, value)| *value))
             .collect()
     });
-    std::iter::once(columns.clone()).chain(body).collect()
+    let body = body.collect();
+    (columns, body)
+}
+
+fn table(rows: &[Value]) -> Rows {
+    let (columns, body) = flattened(rows);
+    let body = body.iter().map(|row| {
+        let cells = row.iter().map(|value| value.map_or("-".into(), cell));
+        cells.collect()
+    });
+    std::iter::once(columns).chain(body).collect()
 }
 
 fn cell(value: &Value) -> String {

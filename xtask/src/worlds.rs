@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use gump_model::world::TransformerWorld;
-use gump_model::{CacheMode, Device, Mode, Precision, SamplingConfig, checkpoint};
+use gump_model::{CacheMode, Device, Mode, Outlook, Precision, SamplingConfig, Watch, checkpoint};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
@@ -118,6 +118,22 @@ impl World {
         match self {
             Self::Rule(world) => &**world,
             Self::Learned(world) => &**world,
+        }
+    }
+
+    /// The same world, which keeps what its agents might have done; rules have nothing to keep.
+    pub(crate) fn watching(self, watch: Watch) -> Self {
+        match self {
+            Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
+            rule => rule,
+        }
+    }
+
+    /// What was watched; `None` of a world that follows rules.
+    pub(crate) fn take_outlooks(&self) -> Option<Vec<Outlook>> {
+        match self {
+            Self::Rule(_) => None,
+            Self::Learned(world) => Some(world.take_outlooks()),
         }
     }
 

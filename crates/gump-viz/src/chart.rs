@@ -1,11 +1,16 @@
-//! Line charts as SVG, in colours that can be read on light and dark ground alike.
+//! Line charts as SVG or pixels, in colours that can be read on light and dark ground alike.
+
+use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
+use tiny_skia::Pixmap;
 
-use crate::VizError;
+use crate::chart_canvas::{ChartCanvas, DENSITY};
+use crate::files::write_whole;
+use crate::{Picture, Theme, VizError};
 
 /// A line chart.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -22,6 +27,9 @@ pub struct Chart {
     pub log_y: bool,
     /// Whether to mark each point with a disc: for few points that were measured.
     pub markers: bool,
+    /// What stands at 1, 2, ... of the horizontal axis, where these are no numbers but ways; empty
+    /// for an axis of numbers.
+    pub ways: Vec<String>,
     /// The curves, in the order of the legend.
     pub series: Vec<Series>,
 }
@@ -33,6 +41,8 @@ pub struct Series {
     pub name: String,
     /// Points from left to right; points that are not finite are left out.
     pub points: Vec<(f64, f64)>,
+    /// How sure they are: x, and from where to where the value may be.
+    pub spans: Vec<(f64, f64, f64)>,
 }
 
 /// Size of the drawing, pixels; SVG scales.
@@ -60,44 +70,99 @@ impl Chart {
     /// [`VizError::EmptyChart`] without a point to draw; [`VizError::Chart`] if the backend
     /// refuses.
     pub fn to_svg(&self) -> Result<String, VizError> {
-        let series: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| self.drawable(s)).collect();
-        let points = || series.iter().flatten();
-        let empty = || VizError::EmptyChart(self.title.clone());
-        let x = range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?;
-        let y = range(points().map(|p| p.1), self.log_y, 0.05).ok_or_else(empty)?;
         let mut svg = String::new();
-        {
-            let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-            let logarithmic = |(low, high): (f64, f64)| {
-                (low..high)
-                    .log_scale()
-                    .with_key_points(log_ticks(low, high))
-            };
-            match (self.log_x, self.log_y) {
-                (false, false) => self.draw(&root, x.0..x.1, y.0..y.1, &series),
-                (true, false) => self.draw(&root, logarithmic(x), y.0..y.1, &series),
-                (false, true) => self.draw(&root, x.0..x.1, logarithmic(y), &series),
-                (true, true) => self.draw(&root, logarithmic(x), logarithmic(y), &series),
-            }
-            .and_then(|()| root.present())
-            .map_err(|error| VizError::Chart {
-                title: self.title.clone(),
-                reason: error.to_string(),
-            })?;
-        }
+        self.draw_on(SVGBackend::with_string(&mut svg, SIZE))?;
         Ok(svg.replace("#010203", "currentColor"))
     }
 
+    /// The chart as pixels, 1520 by 800.
+    ///
+    /// # Errors
+    /// As [`Chart::to_svg`].
+    pub fn to_picture(&self, theme: Theme) -> Result<Picture, VizError> {
+        let colours = theme.colours();
+        let [width, height] = [SIZE.0, SIZE.1].map(|units| (units as f32 * DENSITY) as u32);
+        let mut pixmap = Pixmap::new(width, height).expect("the size of a chart is not 0");
+        let [r, g, b] = colours.ground;
+        pixmap.fill(tiny_skia::Color::from_rgba8(r, g, b, 0xFF));
+        let text = ([TEXT.0, TEXT.1, TEXT.2], colours.text);
+        self.draw_on(ChartCanvas::new(&mut pixmap, text))?;
+        Ok(Picture::from_pixmap(&pixmap))
+    }
+
+    /// Writes `STEM.svg`, and `STEM.png` on light ground.
+    ///
+    /// # Errors
+    /// As [`Chart::to_svg`], and [`VizError::Write`] with the path.
+    pub fn save(&self, stem: &Path) -> Result<(), VizError> {
+        let svg = self.to_svg()?;
+        write_whole(&stem.with_extension("svg"), svg.as_bytes())?;
+        let picture = self.to_picture(Theme::Light)?;
+        picture.save_png(&stem.with_extension("png"))
+    }
+
+    fn draw_on<B: DrawingBackend>(&self, backend: B) -> Result<(), VizError> {
+        let series: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| self.drawable(s)).collect();
+        let points = || series.iter().flatten();
+        let spans = self.series.iter().flat_map(|series| &series.spans);
+        let ends = spans.flat_map(|&(_, low, high)| [low, high]);
+        let ends = ends.filter(|&y| self.fits(y, self.log_y));
+        let empty = || VizError::EmptyChart(self.title.clone());
+        let x = match self.ways.len() {
+            0 => range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?,
+            n => (0.5, n as f64 + 0.5),
+        };
+        let y = points().map(|p| p.1).chain(ends);
+        let y = range(y, self.log_y, 0.05).ok_or_else(empty)?;
+        let root = backend.into_drawing_area();
+        let logarithmic = |(low, high): (f64, f64)| {
+            (low..high)
+                .log_scale()
+                .with_key_points(log_ticks(low, high))
+        };
+        match (self.log_x, self.log_y) {
+            (false, false) => self.draw(&root, x.0..x.1, y.0..y.1, &series),
+            (true, false) => self.draw(&root, logarithmic(x), y.0..y.1, &series),
+            (false, true) => self.draw(&root, x.0..x.1, logarithmic(y), &series),
+            (true, true) => self.draw(&root, logarithmic(x), logarithmic(y), &series),
+        }
+        .and_then(|()| root.present())
+        .map_err(|error| VizError::Chart {
+            title: self.title.clone(),
+            reason: error.to_string(),
+        })
+    }
+
     fn drawable(&self, series: &Series) -> Vec<(f64, f64)> {
-        let fits = |v: f64, is_log: bool| v.is_finite() && (!is_log || v > 0.0);
         let points = series.points.iter().copied();
         points
-            .filter(|&(x, y)| fits(x, self.log_x) && fits(y, self.log_y))
+            .filter(|&(x, y)| self.fits(x, self.log_x) && self.fits(y, self.log_y))
             .collect()
     }
 
-    fn draw<X, Y>(&self, root: &Area<'_>, x: X, y: Y, series: &[Vec<(f64, f64)>]) -> Drawn
+    fn fits(&self, v: f64, is_log: bool) -> bool {
+        v.is_finite() && (!is_log || v > 0.0)
+    }
+
+    /// What stands at a place of the horizontal axis.
+    fn x_tick(&self, x: f64) -> String {
+        if self.ways.is_empty() {
+            return tick(x);
+        }
+        let is_whole = (x - x.round()).abs() < 1e-6 && x >= 1.0;
+        let way = is_whole.then(|| self.ways.get(x.round() as usize - 1));
+        way.flatten().cloned().unwrap_or_default()
+    }
+
+    fn draw<B, X, Y>(
+        &self,
+        root: &DrawingArea<B, Shift>,
+        x: X,
+        y: Y,
+        series: &[Vec<(f64, f64)>],
+    ) -> Result<(), DrawingAreaErrorKind<B::ErrorType>>
     where
+        B: DrawingBackend,
         X: AsRangedCoord<Value = f64>,
         Y: AsRangedCoord<Value = f64>,
         X::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
@@ -123,9 +188,13 @@ impl Chart {
             .configure_mesh()
             .x_desc(self.x_label.as_str())
             .y_desc(self.y_label.as_str())
-            .x_labels(8)
+            .x_labels(if self.ways.is_empty() {
+                8
+            } else {
+                2 * self.ways.len() + 1
+            })
             .y_labels(6)
-            .x_label_formatter(&|v| tick(*v))
+            .x_label_formatter(&|v| self.x_tick(*v))
             .y_label_formatter(&|v| tick(*v))
             .label_style(font(13.0))
             .axis_desc_style(font(13.5))
@@ -140,6 +209,12 @@ impl Chart {
             if !named.name.is_empty() {
                 line.label(named.name.as_str())
                     .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], style));
+            }
+            for &(x, low, high) in &named.spans {
+                if [low, high].iter().all(|&y| self.fits(y, self.log_y)) {
+                    let span = PathElement::new(vec![(x, low), (x, high)], colour.stroke_width(1));
+                    chart.draw_series([span])?;
+                }
             }
             if self.markers || points.len() == 1 {
                 let discs = points.iter().map(|&p| Circle::new(p, 4, colour.filled()));
@@ -157,9 +232,6 @@ impl Chart {
         Ok(())
     }
 }
-
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
 /// The least and greatest value, widened by a share of their distance, and to some width in any
 /// case; `None` without values.
@@ -235,10 +307,12 @@ mod tests {
                 Series {
                     name: "training".into(),
                     points: points(6.0).collect(),
+                    spans: vec![(2000.0, 1.0, 9.0), (3000.0, f64::NAN, 2.0)],
                 },
                 Series {
                     name: "validation".into(),
                     points: points(7.0).chain([(f64::NAN, 1.0)]).collect(),
+                    ..Series::default()
                 },
             ],
             ..Chart::default()
@@ -263,6 +337,33 @@ mod tests {
     }
 
     #[test]
+    fn pixels_show_curves_axes_and_words() {
+        for theme in [Theme::Light, Theme::Dark] {
+            let colours = theme.colours();
+            let with = losses().to_picture(theme).unwrap();
+            assert_eq!((with.width, with.height), (1520, 800));
+            let count = |picture: &Picture, [r, g, b]: [u8; 3]| {
+                let pixels = picture.rgba.chunks_exact(4);
+                pixels.filter(|pixel| pixel[..3] == [r, g, b]).count()
+            };
+            for curve in &CURVES[..2] {
+                assert!(count(&with, [curve.0, curve.1, curve.2]) > 500);
+            }
+            assert_eq!(count(&with, [CURVES[2].0, CURVES[2].1, CURVES[2].2]), 0);
+            let mut bare = losses();
+            (bare.title, bare.x_label, bare.y_label) = Default::default();
+            let bare = bare.to_picture(theme).unwrap();
+            assert!(count(&with, colours.text) > count(&bare, colours.text) + 200);
+            assert_eq!(count(&with, [TEXT.0, TEXT.1, TEXT.2]), 0);
+        }
+        let folder = tempfile::tempdir().unwrap();
+        losses().save(&folder.path().join("loss")).unwrap();
+        let png = std::fs::read(folder.path().join("loss.png")).unwrap();
+        let svg = std::fs::read_to_string(folder.path().join("loss.svg")).unwrap();
+        assert!(png.starts_with(b"\x89PNG") && svg.starts_with("<svg"));
+    }
+
+    #[test]
     fn logarithmic_axes_leave_out_what_they_cannot_show() {
         let mut chart = losses();
         (chart.log_x, chart.log_y) = (true, true);
@@ -283,6 +384,23 @@ mod tests {
         chart.series.truncate(1);
         chart.series[0].points = vec![(3.0, 0.5)];
         assert!(chart.to_svg().unwrap().contains("<circle"));
+    }
+
+    #[test]
+    fn ways_stand_under_their_points() {
+        let mut chart = losses();
+        chart.ways = ["full", "partial"].map(String::from).into();
+        chart.series.truncate(1);
+        chart.series[0].points = vec![(1.0, 0.5), (2.0, 0.75)];
+        chart.series[0].spans = vec![(1.0, 0.4, 0.6)];
+        let svg = chart.to_svg().unwrap();
+        assert!(
+            ["full", "partial"]
+                .iter()
+                .all(|way| svg.matches(way).count() == 1)
+        );
+        assert_eq!(chart.x_tick(1.5), "");
+        assert_eq!((chart.x_tick(0.0), chart.x_tick(3.0)), Default::default());
     }
 
     #[test]

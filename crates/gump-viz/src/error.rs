@@ -20,6 +20,9 @@ pub enum VizError {
     /// A film does not fit its format.
     #[error("could not encode a GIF")]
     Gif(#[from] gif::EncodingError),
+    /// A film does not fit the format of animated PNGs.
+    #[error("could not encode an animated PNG")]
+    Apng(#[from] png::EncodingError),
     /// A side of a picture or film is zero or beyond what its format can hold.
     #[error("{width} x {height} px is not a size of a picture or film")]
     Size {

@@ -1,4 +1,4 @@
-//! Films of futures, as animated GIFs.
+//! Films of futures, as animated GIFs or PNGs.
 //!
 //! The road is drawn once; a frame draws only what moves, and stores only the pixels that differ
 //! from the frame before.
@@ -70,6 +70,22 @@ pub struct Film {
     pub n_frames: usize,
     /// The bytes of a GIF file that repeats for ever.
     pub gif: Vec<u8>,
+    /// Red, green and blue by number.
+    palette: Vec<u8>,
+    patches: Vec<Patch>,
+}
+
+/// The part of a frame that differs from the one before.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Patch {
+    left: usize,
+    top: usize,
+    width: usize,
+    height: usize,
+    /// Colours by number, row by row; [`UNCHANGED`] where nothing changes.
+    pixels: Vec<u8>,
+    /// How long the frame stays, hundredths of a second.
+    delay: u16,
 }
 
 /// A film of several rollouts side by side, row by row.
@@ -114,12 +130,62 @@ pub fn log_as_rollout(scenario: &Scenario) -> Rollout {
 }
 
 impl Film {
-    /// Writes the GIF file; a reader finds the old file or the new one, never half of one.
+    /// Writes the film, as an animated PNG if the file is named so (`.png`, `.apng`), else as a GIF;
+    /// a reader finds the old file or the new one, never half of one.
     ///
     /// # Errors
-    /// [`VizError::Write`] with the path.
+    /// [`VizError::Write`] with the path, and those of [`Film::to_apng`].
     pub fn save(&self, path: &Path) -> Result<(), VizError> {
-        write_whole(path, &self.gif)
+        let ending = path.extension().and_then(|ending| ending.to_str());
+        match ending {
+            Some("png" | "apng") => write_whole(path, &self.to_apng()?),
+            _ => write_whole(path, &self.gif),
+        }
+    }
+
+    /// The bytes of an animated PNG that repeats for ever: the same frames and colours as the GIF,
+    /// by another compression. Whoever knows no animation shows the first frame.
+    ///
+    /// # Errors
+    /// [`VizError::Apng`] if the encoder refuses.
+    pub fn to_apng(&self) -> Result<Vec<u8>, VizError> {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Indexed);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_palette(&self.palette[..]);
+        let mut opacity = vec![0xFF; usize::from(UNCHANGED)];
+        opacity.push(0);
+        encoder.set_trns(opacity);
+        encoder.set_animated(self.n_frames as u32, 0)?;
+        encoder.set_blend_op(png::BlendOp::Over)?;
+        let mut writer = encoder.write_header()?;
+        for patch in &self.patches {
+            writer.set_frame_delay(patch.delay, 100)?;
+            // The old place and the new size may not go together.
+            writer.reset_frame_position()?;
+            writer.set_frame_dimension(patch.width as u32, patch.height as u32)?;
+            writer.set_frame_position(patch.left as u32, patch.top as u32)?;
+            writer.write_image_data(&patch.pixels)?;
+        }
+        writer.finish()?;
+        Ok(bytes)
+    }
+}
+
+impl Patch {
+    fn as_gif(&self) -> GifFrame<'_> {
+        GifFrame {
+            left: self.left as u16,
+            top: self.top as u16,
+            width: self.width as u16,
+            height: self.height as u16,
+            delay: self.delay,
+            transparent: Some(UNCHANGED),
+            dispose: DisposalMethod::Keep,
+            buffer: self.pixels.as_slice().into(),
+            ..GifFrame::default()
+        }
     }
 }
 
@@ -149,10 +215,10 @@ fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
         .fold(0.0, f64::max);
     let n_frames = (duration / spec.frame_s + 1e-9).floor() as usize + 1;
 
-    let mut gif = Vec::new();
-    let (width, height) = layout.size_u16();
-    let mut encoder = Encoder::new(&mut gif, width, height, &palette.bytes())?;
-    encoder.set_repeat(Repeat::Infinite)?;
+    let delay = (spec.frame_s / spec.speed * 100.0)
+        .round()
+        .clamp(2.0, 6000.0) as u16;
+    let mut patches = Vec::with_capacity(n_frames);
     let gap_colour = palette.index(mix(colours.ground, colours.edge, 0.5));
     let mut canvas = vec![gap_colour; layout.width * layout.height];
     let mut shown: Option<Vec<u8>> = None;
@@ -168,25 +234,35 @@ fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
             let place = (0, layout.height - FOOTER);
             palette.blit(&footer, &mut canvas, layout.width, place);
         }
-        let mut frame = difference(shown.as_deref(), &canvas, layout.width);
-        let delay = (spec.frame_s / spec.speed * 100.0)
-            .round()
-            .clamp(2.0, 6000.0) as u16;
-        frame.delay = if i + 1 == n_frames {
+        let delay = if i + 1 == n_frames {
             LAST_DELAY.max(delay)
         } else {
             delay
         };
-        encoder.write_frame(&frame)?;
+        patches.push(difference(shown.as_deref(), &canvas, layout.width, delay));
         shown = Some(canvas.clone());
     }
-    drop(encoder);
+    let palette = palette.bytes();
     Ok(Film {
         width: layout.width,
         height: layout.height,
         n_frames,
-        gif,
+        gif: gif(&layout, &palette, &patches)?,
+        palette,
+        patches,
     })
+}
+
+fn gif(layout: &Layout, palette: &[u8], patches: &[Patch]) -> Result<Vec<u8>, VizError> {
+    let mut bytes = Vec::new();
+    let (width, height) = layout.size_u16();
+    let mut encoder = Encoder::new(&mut bytes, width, height, palette)?;
+    encoder.set_repeat(Repeat::Infinite)?;
+    for patch in patches {
+        encoder.write_frame(&patch.as_gif())?;
+    }
+    drop(encoder);
+    Ok(bytes)
 }
 
 /// Where the panels are.
@@ -299,7 +375,7 @@ fn draw_footer(width: usize, time: f64, duration: f64, colours: &Colours) -> Opt
 }
 
 /// The smallest frame that turns `shown` into `canvas`.
-fn difference(shown: Option<&[u8]>, canvas: &[u8], width: usize) -> GifFrame<'static> {
+fn difference(shown: Option<&[u8]>, canvas: &[u8], width: usize, delay: u16) -> Patch {
     let height = canvas.len() / width;
     let differs = |i: usize| shown.is_none_or(|shown| shown[i] != canvas[i]);
     let (mut left, mut right, mut top, mut bottom) = (width, 0, height, 0);
@@ -316,20 +392,18 @@ fn difference(shown: Option<&[u8]>, canvas: &[u8], width: usize) -> GifFrame<'st
         // Nothing moved: one pixel, unchanged, to carry the delay.
         (left, right, top, bottom) = (0, 1, 0, 1);
     }
-    let mut buffer = Vec::with_capacity((right - left) * (bottom - top));
+    let mut pixels = Vec::with_capacity((right - left) * (bottom - top));
     for row in top..bottom {
         let cells = row * width + left..row * width + right;
-        buffer.extend(cells.map(|i| if differs(i) { canvas[i] } else { UNCHANGED }));
+        pixels.extend(cells.map(|i| if differs(i) { canvas[i] } else { UNCHANGED }));
     }
-    GifFrame {
-        left: left as u16,
-        top: top as u16,
-        width: (right - left) as u16,
-        height: (bottom - top) as u16,
-        transparent: Some(UNCHANGED),
-        dispose: DisposalMethod::Keep,
-        buffer: buffer.into(),
-        ..GifFrame::default()
+    Patch {
+        left,
+        top,
+        width: right - left,
+        height: bottom - top,
+        pixels,
+        delay,
     }
 }
 
@@ -340,21 +414,21 @@ mod tests {
     #[test]
     fn a_frame_holds_only_what_changed() {
         let shown = [1, 2, 3, 4, 5, 6];
-        let first = difference(None, &shown, 3);
+        let first = difference(None, &shown, 3, 2);
         assert_eq!(
-            (first.width, first.height, &first.buffer[..]),
+            (first.width, first.height, &first.pixels[..]),
             (3, 2, &shown[..])
         );
-        let still = difference(Some(&shown), &shown, 3);
+        let still = difference(Some(&shown), &shown, 3, 2);
         assert_eq!(
-            (still.width, still.height, &still.buffer[..]),
+            (still.width, still.height, &still.pixels[..]),
             (1, 1, &[UNCHANGED][..])
         );
-        let moved = difference(Some(&shown), &[1, 9, 3, 4, 5, 8], 3);
+        let moved = difference(Some(&shown), &[1, 9, 3, 4, 5, 8], 3, 2);
         assert_eq!(
             (moved.left, moved.top, moved.width, moved.height),
             (1, 0, 2, 2)
         );
-        assert_eq!(moved.buffer[..], [9, UNCHANGED, UNCHANGED, 8]);
+        assert_eq!(moved.pixels[..], [9, UNCHANGED, UNCHANGED, 8]);
     }
 }

@@ -5,7 +5,7 @@
 //! one that begins with `~` is a smooth curve with its inner points as controls.
 
 use gump_geometry::{DVec2, dvec2};
-use tiny_skia::{LineCap, LineJoin, PathBuilder, Pixmap, Stroke, Transform};
+use tiny_skia::{LineCap, LineJoin, Paint, PathBuilder, Pixmap, Stroke, Transform};
 
 use crate::pen::paint;
 use crate::theme::Rgb;
@@ -16,12 +16,19 @@ const GAP: f64 = 1.7;
 const SPACE: f64 = 2.0;
 
 /// Writes a line of text; `left` and `baseline` are pixels, `height` that of a capital.
-pub(crate) fn write(
+pub(crate) fn write(pixmap: &mut Pixmap, text: &str, at: (f64, f64), height: f64, colour: Rgb) {
+    let ink = paint(colour, 1.0);
+    stroke(pixmap, text, at, height, &ink, Transform::identity());
+}
+
+/// As [`write`], in the units of `placed`.
+pub(crate) fn stroke(
     pixmap: &mut Pixmap,
     text: &str,
     (left, baseline): (f64, f64),
     height: f64,
-    colour: Rgb,
+    ink: &Paint<'_>,
+    placed: Transform,
 ) {
     let unit = height / 6.0;
     let mut builder = PathBuilder::new();
@@ -41,8 +48,7 @@ pub(crate) fn write(
         ..Stroke::default()
     };
     if let Some(path) = builder.finish() {
-        let ink = paint(colour, 1.0);
-        pixmap.stroke_path(&path, &ink, &stroke, Transform::identity(), None);
+        pixmap.stroke_path(&path, ink, &stroke, placed, None);
     }
 }
 
@@ -178,6 +184,15 @@ const GLYPHS: &[(char, &str)] = &[
     ('_', "06 46"),
     ('#', "10 16, 30 36, 02 42, 04 44"),
     ('\'', "20 21"),
+    ('\u{B0}', "~10 00 02 22 20 10"),
+    ('\u{B2}', "~00 10 20 21 03, 03 23"),
+    ('<', "41 04 47"),
+    ('>', "01 44 07"),
+    ('\u{B7}', "24 24"),
+    ('[', "30 10 17 37"),
+    (']', "10 30 37 17"),
+    ('"', "10 12, 30 32"),
+    ('&', "~46 00 30 33 04 06 46, 46 43"),
 ];
 
 #[cfg(test)]

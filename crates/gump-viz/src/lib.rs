@@ -32,6 +32,7 @@
 
 mod camera;
 mod chart;
+mod chart_canvas;
 mod draw_agents;
 mod draw_map;
 mod error;
@@ -55,4 +56,4 @@ pub use film::{Film, FilmSpec, Take, grid_film, log_as_rollout, overlay_film};
 pub use page::{Page, Section};
 pub use picture::{Picture, PictureSpec, draw_futures, draw_raster_layer, draw_scene};
 pub use theme::Theme;
-pub use viewer::{CandidatePath, MetricTrack, Viewer};
+pub use viewer::{CandidatePath, HeatMap, MetricTrack, Viewer};

@@ -234,6 +234,60 @@ fn a_film_of_two_futures_plays_side_by_side() {
     assert!(shows_ego(1, 10.0, 2.85) && !shows_ego(1, 10.0, -0.8));
 }
 
+/// Plays an animated PNG: delays in hundredths of a second, and the last picture.
+fn play_apng(bytes: &[u8]) -> (Vec<u16>, Vec<Rgb>) {
+    let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));
+    decoder.set_transformations(png::Transformations::EXPAND);
+    let mut reader = decoder.read_info().unwrap();
+    let (width, height) = (reader.info().width as usize, reader.info().height as usize);
+    let n_frames = reader.info().animation_control().unwrap().num_frames;
+    let mut screen = vec![[0; 3]; width * height];
+    let mut delays = Vec::new();
+    for _ in 0..n_frames {
+        let mut rgba = vec![0; reader.output_buffer_size().unwrap()];
+        let frame = reader.next_frame(&mut rgba).unwrap();
+        let control = *reader.info().frame_control().unwrap();
+        assert_eq!(control.delay_den, 100);
+        delays.push(control.delay_num);
+        for (i, pixel) in rgba
+            .chunks_exact(4)
+            .take((frame.width * frame.height) as usize)
+            .enumerate()
+        {
+            let (row, column) = (i / frame.width as usize, i % frame.width as usize);
+            if pixel[3] > 0 {
+                let at =
+                    (control.y_offset as usize + row) * width + control.x_offset as usize + column;
+                screen[at] = [pixel[0], pixel[1], pixel[2]];
+            }
+        }
+    }
+    (delays, screen)
+}
+
+#[test]
+fn both_formats_play_the_same_film() {
+    let scenario = street();
+    let (log, swerve) = (log_as_rollout(&scenario), swerving(&scenario));
+    for theme in [Theme::Light, Theme::Dark] {
+        let mut spec = FilmSpec::new(camera(&scenario));
+        spec.theme = theme;
+        let film = overlay_film(&[&log, &swerve], &spec).unwrap();
+        assert_eq!(play(&film.gif), play_apng(&film.to_apng().unwrap()));
+    }
+    let film = overlay_film(&[&log], &FilmSpec::new(camera(&scenario))).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    for (name, start) in [
+        ("film.gif", &b"GIF89a"[..]),
+        ("film.png", b"\x89PNG"),
+        ("film.apng", b"\x89PNG"),
+    ] {
+        let path = folder.path().join(name);
+        film.save(&path).unwrap();
+        assert!(std::fs::read(&path).unwrap().starts_with(start), "{name}");
+    }
+}
+
 #[test]
 fn films_that_cannot_be_are_refused() {
     let scenario = street();
@@ -292,6 +346,7 @@ fn full_page() -> Page {
         series: vec![Series {
             name: "a<b".into(),
             points: vec![(0.0, 1.0), (1.0, 0.5)],
+            ..Series::default()
         }],
         ..Chart::default()
     };

@@ -1,12 +1,14 @@
 //! The viewer: one HTML file in which to play a scene, its log and any number of futures.
 //!
-//! [`Viewer`] gathers what is to be seen; `viewer/pack.rs` makes it small; the page itself is
+//! [`Viewer`] gathers what is to be seen, `viewer/told.rs` what is told of agents beside it;
+//! `viewer/pack.rs` makes it small; the page itself is
 //! `viewer/*.js`, plain script without libraries, put together here. How a page looks is in
 //! `theme.rs` and `palette.css`, which it shares with pictures and pages.
 
 mod pack;
 #[cfg(test)]
 mod tests;
+mod told;
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
@@ -26,6 +28,8 @@ use crate::page::escape;
 use crate::theme::{Colours, Rgb};
 use crate::{Theme, VizError};
 use pack::{CENTI, Class, HEADINGS, Packer, units};
+use told::{CELL, SPEED, TURN_DEG};
+pub use told::{CandidatePath, HeatMap, MetricTrack};
 
 /// How far from any agent the map is kept, metres.
 const MARGIN: f64 = 120.0;
@@ -39,34 +43,10 @@ pub struct Viewer<'a> {
     scenario: &'a Scenario,
     futures: Vec<(String, &'a Rollout)>,
     metrics: Vec<MetricTrack>,
+    heat: Vec<HeatMap>,
+    realism: BTreeMap<AgentId, f64>,
     candidates: Vec<CandidatePath>,
     note: String,
-}
-
-/// A metric of one agent over time.
-#[derive(Clone, Debug, PartialEq)]
-pub struct MetricTrack {
-    /// What it is, with its unit: "time to collision, s".
-    pub name: String,
-    /// Whose it is.
-    pub agent: AgentId,
-    /// The future it is of, in the order added; `None` for the log.
-    pub future: Option<usize>,
-    /// One value per frame of the log, or per imagined frame of the future; `None` where undefined.
-    pub values: Vec<Option<f64>>,
-}
-
-/// What a planner considered.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CandidatePath {
-    /// What it is, in words.
-    pub name: String,
-    /// How it was judged, higher is better; `None` if it was not.
-    pub score: Option<f64>,
-    /// Whether it was the choice.
-    pub is_chosen: bool,
-    /// Box centres of the ego, world frame, metres.
-    pub path: Vec<DVec2>,
 }
 
 /// The log or a future, as the page knows it.
@@ -85,6 +65,8 @@ impl<'a> Viewer<'a> {
             scenario,
             futures: Vec::new(),
             metrics: Vec::new(),
+            heat: Vec::new(),
+            realism: BTreeMap::new(),
             candidates: Vec::new(),
             note: String::new(),
         }
@@ -117,6 +99,18 @@ impl<'a> Viewer<'a> {
         self
     }
 
+    /// Adds what an agent might do next, shown when it is chosen in that future.
+    pub fn heat(&mut self, heat: HeatMap) -> &mut Self {
+        self.heat.push(heat);
+        self
+    }
+
+    /// Says how realistic an agent's futures are, 0 to 1, for a colour.
+    pub fn realism(&mut self, agent: AgentId, realism: f64) -> &mut Self {
+        self.realism.insert(agent, realism);
+        self
+    }
+
     /// Adds what a planner considered.
     pub fn candidate(&mut self, candidate: CandidatePath) -> &mut Self {
         self.candidates.push(candidate);
@@ -136,6 +130,7 @@ impl<'a> Viewer<'a> {
             ("data", BASE64.encode(deflate(&bytes))),
             ("unpack", include_str!("viewer/unpack.js").to_owned()),
             ("draw", include_str!("viewer/draw.js").to_owned()),
+            ("heat", include_str!("viewer/heat.js").to_owned()),
             ("chart", include_str!("viewer/chart.js").to_owned()),
             ("app", include_str!("viewer/app.js").to_owned()),
             ("check", include_str!("viewer/check.js").to_owned()),
@@ -168,16 +163,17 @@ impl<'a> Viewer<'a> {
                 packer.light(light.lane, &take.frames);
             }
         }
+        let place = |id: AgentId| agents.iter().position(|agent| agent.id == id);
+        let names = self.pack_told(&mut packer, origin, &place);
         let local = |p: DVec2| {
             let p = p - origin;
             [units(p.x, CENTI), units(p.y, CENTI)]
         };
-        let ego = agents.iter().position(|agent| agent.id == scenario.ego);
         let facts = json!({
             "id": scenario.id,
             "note": self.note,
             "origin": [origin.x, origin.y],
-            "ego": ego,
+            "ego": place(scenario.ego),
             "centi": CENTI,
             "headings": HEADINGS,
             "features": n_features,
@@ -190,6 +186,7 @@ impl<'a> Viewer<'a> {
                 "kind": a.kind.name(),
                 "length": rounded(a.length),
                 "width": rounded(a.width),
+                "realism": self.realism.get(&a.id).map(|&realism| rounded(realism)),
             })).collect::<Vec<_>>(),
             "lights": lights.iter().map(|&(_, at)| local(at)).collect::<Vec<_>>(),
             "takes": takes.iter().map(|take| json!({
@@ -198,12 +195,10 @@ impl<'a> Viewer<'a> {
                 "dt": take.dt,
                 "frames": take.frames.len(),
             })).collect::<Vec<_>>(),
-            "metrics": self.metrics.iter().map(|track| json!({
-                "name": track.name,
-                "agent": agents.iter().position(|a| a.id == track.agent),
-                "take": track.future.map_or(0, |future| future + 1),
-                "values": track.values.iter().map(|v| v.map(rounded)).collect::<Vec<_>>(),
-            })).collect::<Vec<_>>(),
+            "metrics": names,
+            "cell": CELL,
+            "speedBar": SPEED,
+            "turnBar": TURN_DEG,
             "candidates": self.candidates.iter().map(|c| json!({
                 "name": c.name,
                 "score": c.score,
@@ -212,6 +207,35 @@ impl<'a> Viewer<'a> {
             })).collect::<Vec<_>>(),
         });
         (facts, packer.into_bytes())
+    }
+
+    /// Packs metrics and heat maps, each with their number before them; returns the names of the
+    /// metrics. What is of an agent that no take has is left out.
+    fn pack_told(
+        &self,
+        packer: &mut Packer,
+        origin: DVec2,
+        place: &impl Fn(AgentId) -> Option<usize>,
+    ) -> Vec<&str> {
+        let mut names: Vec<&str> = Vec::new();
+        let of_known = |track: &&MetricTrack| place(track.agent).is_some();
+        let metrics: Vec<_> = self.metrics.iter().filter(of_known).collect();
+        packer.unsigned(metrics.len() as u64);
+        for track in metrics {
+            let known = names.iter().position(|name| *name == track.name);
+            let name = known.unwrap_or_else(|| {
+                names.push(&track.name);
+                names.len() - 1
+            });
+            track.pack(packer, name, place(track.agent).unwrap_or_default());
+        }
+        let heat = self.heat.iter().filter(|heat| place(heat.agent).is_some());
+        let heat: Vec<_> = heat.collect();
+        packer.unsigned(heat.len() as u64);
+        for heat in heat {
+            heat.pack(packer, place(heat.agent).unwrap_or_default(), origin);
+        }
+        names
     }
 
     /// The log, then the futures with the present as their first frame.

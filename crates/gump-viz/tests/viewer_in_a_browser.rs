@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gump_geometry::{dvec2, wrap_angle};
-use gump_scene::{AgentState, Frame, Rollout, Scenario, fixture};
-use gump_viz::{CandidatePath, MetricTrack, Viewer};
+use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario, fixture};
+use gump_viz::{CandidatePath, HeatMap, MetricTrack, Viewer};
 use serde_json::Value;
 
 const BROWSERS: [&str; 5] = [
@@ -68,13 +68,15 @@ fn futures(scenario: &Scenario, n: usize) -> Vec<Rollout> {
     (0..n).map(turned).collect()
 }
 
-/// What the page at `path` says of itself.
-fn report(browser: &Path, path: &Path, profile: &Path, size: &str) -> Value {
+/// What the page at `path` says of itself in a window of a size, on dark ground or on light.
+fn report(browser: &Path, path: &Path, profile: &Path, size: &str, dark: bool) -> Value {
+    let scheme = if dark { 0 } else { 1 };
     let output = Command::new(browser)
         .args(["--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"])
         .args(["--enable-logging=stderr", "--virtual-time-budget=20000"])
         .arg(format!("--user-data-dir={}", profile.display()))
         .arg(format!("--window-size={size}"))
+        .arg(format!("--blink-settings=preferredColorScheme={scheme}"))
         .arg(format!("file://{}#check", path.display()))
         .output()
         .expect("the browser was found on the path");
@@ -115,8 +117,25 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         name: "time to collision, s".into(),
         agent: scenario.ego,
         future: Some(0),
+        first: 1,
         values: (0..40).map(|i| (i > 9).then_some(f64::from(i))).collect(),
     });
+    let draw = |k: usize| {
+        let mut draw = scenario.present().ego_now().state;
+        draw.pose.position += dvec2(4.0 + 0.05 * (k % 16) as f64, 0.1 * (k % 5) as f64);
+        draw.pose.heading += 0.02 * (k % 7) as f64;
+        draw
+    };
+    viewer.heat(HeatMap {
+        agent: scenario.ego,
+        future: 0,
+        from_s: 0.0,
+        ahead_s: 0.5,
+        draws: (0..64).map(draw).collect(),
+    });
+    for (id, realism) in [(0, 0.9), (7, 0.4), (9, 0.1)] {
+        viewer.realism(AgentId(id), realism);
+    }
     for (name, score) in [("slow", Some(0.25)), ("fast", None)] {
         viewer.candidate(CandidatePath {
             name: name.into(),
@@ -128,9 +147,12 @@ fn the_viewer_plays_and_switches_in_a_browser() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("viewer.html");
     viewer.save(&path).expect("a file can be written there");
-    for size in ["1280,800", "390,844"] {
-        let report = report(&browser, &path, &folder.path().join(size), size);
+    let windows = ["1280,800", "390,844"].map(|size| [false, true].map(|dark| (size, dark)));
+    for (size, dark) in windows.into_iter().flatten() {
+        let profile = folder.path().join(format!("{size} {dark}"));
+        let report = report(&browser, &path, &profile, size, dark);
         eprintln!("{size}: {report}");
+        assert_eq!(report["dark"], dark);
         assert_eq!(report["errors"], serde_json::json!([]), "{report}");
         assert!(report.get("error").is_none(), "{report}");
         assert_eq!(report["inflates_alike"], true);
@@ -147,6 +169,15 @@ fn the_viewer_plays_and_switches_in_a_browser() {
             changes.len() == 8 && changes.values().all(|changed| *changed == true),
             "{report}"
         );
+        let heat = report["heat"].as_array().expect("a number per canvas");
+        let is_drawn = |inked: &Value| inked.as_u64().is_some_and(|n| n > 100);
+        assert!(heat.len() == 3 && heat.iter().all(is_drawn), "{report}");
+        assert_eq!(
+            (&report["heat_on_road"], &report["heat_elsewhere"]),
+            (&true.into(), &false.into())
+        );
+        let colours = serde_json::json!([["class", "speed", "realism"], 3]);
+        assert_eq!(report["colours"], colours);
         // Speed, heading, distance from the log and the metric given.
         assert_eq!(
             (&report["charts"], &report["candidates"]),

@@ -14,6 +14,8 @@ use crate::cli::WrongArguments;
 use crate::futures;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
+use crate::tables;
+use crate::told;
 use crate::worlds::{Sampling, World, WorldName};
 
 /// Arguments of `simulate`.
@@ -31,9 +33,12 @@ pub(crate) struct Args {
     /// How far to imagine
     #[arg(long, value_name = "S", default_value_t = 8.0)]
     seconds: f64,
-    /// Also write the futures in this format
-    #[arg(long, value_enum)]
-    format: Option<Format>,
+    /// Also write the futures in these formats
+    #[arg(long, value_enum, value_name = "F", num_args = 1.., value_delimiter = ',')]
+    format: Vec<Format>,
+    /// Show in the viewer what a learned world drew from, for the first N futures [default N: 1]
+    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]
+    heat: Option<NonZeroUsize>,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -42,11 +47,15 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum Format {
     /// A `ScenarioRollouts` message of the Waymo Sim Agents Challenge, rollouts.binproto
     Waymo,
+    /// Tables: futures.parquet, and every metric of every agent in agents.parquet
+    Parquet,
+    /// The film as an animated PNG, film.png
+    Apng,
 }
 
 impl Args {
@@ -55,6 +64,13 @@ impl Args {
             let found = self.seconds;
             let wrong =
                 format!("--seconds: expected a number above 0 and at most 3600, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
+        if self.heat.is_some() && !matches!(self.world, WorldName::Model(_)) {
+            let wrong = format!(
+                "--heat: expected --world model:WEIGHTS, found {}",
+                self.world
+            );
             return Err(WrongArguments(wrong).into());
         }
         let sampling = self.sampling.resolve()?;
@@ -70,21 +86,50 @@ impl Args {
         let summary = run.phase("score", |_| {
             Ok(summarize(&imagined.rollouts, Some(&scenario)))
         })?;
+        let mut viewer = Viewer::new(&scenario);
+        run.phase("look closer", |run| {
+            told::realism(&mut viewer, &scenario, &imagined.rollouts);
+            let n = self
+                .heat
+                .map_or(0, NonZeroUsize::get)
+                .min(self.futures.get());
+            let (scene, seconds) = (scenario.present(), self.seconds);
+            match n {
+                0 => Ok(()),
+                n => told::heat(run, &mut viewer, world, scene, n, seconds),
+            }
+        })?;
         run.phase("write", |run| {
-            self.write(run, &scenario, &imagined.rollouts)
+            self.write(run, &scenario, &imagined.rollouts, viewer)
         })?;
         self.tell(run, &scenario, &imagined, &summary)
     }
 
-    fn write(&self, run: &Run, scenario: &Scenario, rollouts: &[Rollout]) -> anyhow::Result<()> {
+    fn write<'a>(
+        &self,
+        run: &Run,
+        scenario: &Scenario,
+        rollouts: &'a [Rollout],
+        mut viewer: Viewer<'a>,
+    ) -> anyhow::Result<()> {
         futures::save_array(run.out(), scenario, rollouts)?;
-        if let Some(Format::Waymo) = self.format {
+        let wanted = |format| self.format.contains(&format);
+        if wanted(Format::Waymo) {
             submission::write_rollouts(&run.path("rollouts.binproto"), &scenario.id, rollouts)?;
+        }
+        if wanted(Format::Parquet) {
+            let all = [(scenario.id.as_str(), rollouts)];
+            gump_data::write_rollouts(&run.path("futures.parquet"), all)?;
+            let world = self.world.to_string();
+            tables::of_agents(scenario, &world, rollouts).write(&run.path("agents.parquet"))?;
         }
         let label = format!("{} in the world {}", scenario.id, self.world);
         futures::picture(scenario, rollouts, &label).save_png(&run.path("picture.png"))?;
-        futures::film(scenario, &futures::first_few(rollouts))?.save(&run.path("film.gif"))?;
-        let mut viewer = Viewer::new(scenario);
+        let film = futures::film(scenario, &futures::first_few(rollouts))?;
+        film.save(&run.path("film.gif"))?;
+        if wanted(Format::Apng) {
+            film.save(&run.path("film.png"))?;
+        }
         viewer
             .note(format!(
                 "{} futures in the world {}",

@@ -1,9 +1,8 @@
 //! `train`: a world model from scenarios.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::train::StepReport;
 use gump_model::{
@@ -230,18 +229,10 @@ fn write(run: &Run, trainer: &Trainer, losses: &Losses) -> anyhow::Result<()> {
     trainer.save(&run.path("checkpoint.safetensors"))?;
     let weights = run.path("weights.safetensors");
     checkpoint::save(trainer.network(), &weights, Precision::Half)?;
-    if let Some(svg) = losses.chart()? {
-        save_text(&run.path("losses.svg"), &svg)?;
+    if let Some(chart) = losses.chart() {
+        chart.save(&run.path("losses"))?;
     }
     Ok(())
-}
-
-fn save_text(path: &Path, text: &str) -> anyhow::Result<()> {
-    use std::io::Write as _;
-    gump_data::write_atomically(path, |file| {
-        file.write_all(text.as_bytes())
-            .with_context(|| format!("cannot write {}", path.display()))
-    })
 }
 
 /// Loss by part and by field of the state, nats.

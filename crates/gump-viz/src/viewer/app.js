@@ -9,6 +9,9 @@ const dark = window.matchMedia('(prefers-color-scheme: dark)');
 const ui = { t: 0, playing: false, speed: 1, shown: 0, colour: 'class', follow: -1, heading: false, trails: true, selected: -1, candidate: -1, dark: dark.matches };
 let world, scene, span, stale = true, charted = '';
 
+// Ways of colouring that this page has numbers for.
+const COLOURS = ['class', 'speed', ...(facts.agents.some(agent => agent.realism !== null) ? ['realism'] : [])];
+
 const colours = () => facts.themes[ui.dark ? 'dark' : 'light'];
 const redraw = () => { stale = true; };
 const plural = (n, what) => `${n} ${what}${n === 1 ? '' : 's'}`;
@@ -24,6 +27,7 @@ function begin(unpacked) {
   $('note').textContent = facts.note || `${plural(facts.agents.length, 'agent')}, ${n ? plural(n, 'future') : 'the log'}`;
   buildTakes(n);
   buildCandidates();
+  for (const b of document.querySelectorAll('[data-colour]')) b.hidden = !COLOURS.includes(b.dataset.colour);
   listen();
   if (n) ui.shown = 1;
   fit();
@@ -38,7 +42,7 @@ function restore() {
   if (Number.isFinite(Number(said.get('t')))) seek(Number(said.get('t')));
   if (said.get('shown') === 'all' && n > 2) ui.shown = 'all';
   else if (said.has('shown') && world.takes[Number(said.get('shown'))]) ui.shown = Number(said.get('shown'));
-  if (said.get('colour') === 'speed') ui.colour = 'speed';
+  if (COLOURS.includes(said.get('colour'))) ui.colour = said.get('colour');
   if (said.has('agent')) ui.selected = facts.agents.findIndex(agent => agent.id === said.get('agent'));
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
@@ -142,11 +146,12 @@ function dressLegend() {
   const items = ['ego', 'vehicle', 'pedestrian', 'bicycle', 'other'].filter(kind => kinds.has(kind));
   const legend = $('legend');
   legend.replaceChildren();
-  if (ui.colour === 'speed') {
+  if (ui.colour !== 'class') {
     const bar = document.createElement('i');
     bar.className = 'ramp';
     bar.style.background = `linear-gradient(90deg, ${RAMP[ui.dark ? 'dark' : 'light'].join(',')})`;
-    legend.append('0', bar, `${FAST} m/s`);
+    const [low, high] = ui.colour === 'speed' ? ['0', `${FAST} m/s`] : [`realism \u2264 ${UNLIKE}`, '1'];
+    legend.append(low, bar, high);
     return;
   }
   for (const kind of items) {
@@ -174,6 +179,7 @@ function dressAgent() {
   const state = document.createElement('dl');
   state.id = 'state';
   box.append(state);
+  if (world.heat.some(map => map.agent === ui.selected)) buildHeat(box);
   for (const { name } of quantities(world, ui.selected)) {
     const figure = document.createElement('figure'), caption = document.createElement('figcaption'), canvas = document.createElement('canvas');
     caption.textContent = name;
@@ -187,13 +193,47 @@ function dressAgent() {
   }
 }
 
+// Where the agent might be next, then how fast, then how it might turn.
+function buildHeat(box) {
+  const title = document.createElement('h3'), none = document.createElement('p'), holder = document.createElement('div');
+  title.id = 'heat-title'; none.id = 'heat-none'; holder.id = 'heat';
+  for (const name of ['where: + is what came out', 'speed, m/s: the line is what came out', 'turn, degrees, left is +']) {
+    const figure = document.createElement('figure'), caption = document.createElement('figcaption');
+    caption.textContent = name;
+    figure.append(caption, document.createElement('canvas'));
+    holder.append(figure);
+  }
+  box.append(title, none, holder);
+}
+
+function drawHeatPanel() {
+  const holder = $('heat');
+  if (!holder) return;
+  const take = heatTake(ui, world), map = heatAt(world, take, ui.selected, ui.t);
+  holder.hidden = !map; $('heat-none').hidden = Boolean(map);
+  if (!map) {
+    const kept = world.heat.filter(map => map.agent === ui.selected), takes = [...new Set(kept.map(map => world.takes[map.take].name))];
+    $('heat-title').textContent = 'What it might do next';
+    $('heat-none').textContent = `Kept for future ${takes.join(', ')} from the present on.`;
+    return;
+  }
+  $('heat-title').textContent = `What it might do by +${(map.from + map.ahead).toFixed(1)} s, ${map.draws} draws`;
+  const [place, speed, turn] = holder.querySelectorAll('canvas'), went = stateAt(world, take, ui.selected, map.from + map.ahead);
+  const degrees = went ? ((went.heading - map.heading) * 180 / Math.PI % 360 + 540) % 360 - 180 : NaN;
+  drawHeatMap(place, map, went, colours(), ui.dark);
+  drawBars(speed, map.speeds, 0, map.draws, went ? went.speed : NaN, x => x.toFixed(1), colours(), ui.dark);
+  drawBars(turn, map.turns, facts.turnBar / 2, map.draws, degrees, x => `${x.toFixed(0)}\u00b0`, colours(), ui.dark);
+}
+
 function drawAgentPanel() {
   if (ui.selected < 0) return;
-  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width } = facts.agents[ui.selected];
+  drawHeatPanel();
+  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width, realism } = facts.agents[ui.selected];
   const degrees = h => ((h * 180 / Math.PI) % 360 + 540) % 360 - 180;
   const rows = s ? [
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
     ['position', `${(s.x + facts.origin[0]).toFixed(1)}, ${(s.y + facts.origin[1]).toFixed(1)} m`], ['size', `${length.toFixed(1)} \u00d7 ${width.toFixed(1)} m`],
+    ...(realism === null ? [] : [['realism', `${realism.toFixed(2)} of 1`]]),
   ] : [['', 'not there at this time']];
   $('state').replaceChildren(...rows.flatMap(([name, value]) => {
     const dt = document.createElement('dt'), dd = document.createElement('dd');
@@ -201,7 +241,7 @@ function drawAgentPanel() {
     return [dt, dd];
   }));
   const ink = kindColour(ui.selected, colours()), takes = ui.shown === 'all' ? world.takes.map((_, i) => i).slice(1) : [ui.shown];
-  const canvases = $('agent').querySelectorAll('canvas');
+  const canvases = $('agent').querySelectorAll(':scope > figure canvas');
   quantities(world, ui.selected).forEach(({ digits, of }, i) => {
     const curves = [{ points: of(0), colour: colours().text, width: 1.5, alpha: takes[0] === 0 ? 0.9 : 0.5, dash: takes[0] === 0 ? [] : [4, 3] }];
     for (const k of takes) if (k > 0) curves.push({ points: of(k), colour: ink, width: takes.length > 1 ? 1 : 2, alpha: takes.length > 1 ? Math.max(0.15, 1 / Math.sqrt(takes.length)) : 1 });
@@ -234,7 +274,7 @@ function faster(by) {
 const KEYS = {
   ' ': actions.play, ArrowLeft: e => step(e.shiftKey ? -1 / world.takes[0].dt : -1), ArrowRight: e => step(e.shiftKey ? 1 / world.takes[0].dt : 1),
   Home: () => seek(span[0]), End: () => seek(span[1]), ArrowUp: () => nextFuture(-1), ArrowDown: () => nextFuture(1),
-  l: () => show(0), a: () => show(world.takes.length > 2 ? 'all' : world.takes.length - 1), c: () => { ui.colour = ui.colour === 'class' ? 'speed' : 'class'; dress(); },
+  l: () => show(0), a: () => show(world.takes.length > 2 ? 'all' : world.takes.length - 1), c: () => { ui.colour = COLOURS[(COLOURS.indexOf(ui.colour) + 1) % COLOURS.length]; dress(); },
   n: () => nextAgent(1), p: () => nextAgent(-1), e: () => choose(facts.ego), f: actions.follow, h: actions.heading, t: actions.trails,
   '+': actions.nearer, '=': actions.nearer, '-': actions.farther, 0: actions.fit, ',': () => faster(-1), '.': () => faster(1),
   Escape: () => choose(-1), '?': () => { $('keys').open = !$('keys').open; },

@@ -62,11 +62,11 @@ function quantities(world, agent) {
       });
     },
   });
-  for (const name of new Set(facts.metrics.filter(m => m.agent === agent).map(m => m.name))) list.push({
+  const own = world.metrics.filter(track => track.agent === agent);
+  for (const name of facts.metrics.filter(name => own.some(track => track.name === name))) list.push({
     name, digits: 2, of: take => {
-      const track = facts.metrics.find(m => m.name === name && m.agent === agent && m.take === take), { first, dt } = world.takes[take];
-      // A future's first frame is the present, its first value that of the frame after.
-      return track ? track.values.map((v, i) => [first + (i + (take > 0 ? 1 : 0)) * dt, v === null ? NaN : v]) : [];
+      const track = own.find(track => track.name === name && track.take === take), { first, dt } = world.takes[take];
+      return track ? track.values.map((v, i) => [first + (track.first + i) * dt, v]) : [];
     },
   });
   return list;

@@ -14,6 +14,7 @@ if (location.hash === '#check') {
     const packed = fromBase64($('data').textContent), report = {};
     report.inflates_alike = !differs(await inflate(packed), inflateHere(packed));
     report.takes = world.takes.length;
+    report.dark = ui.dark;
     report.agents = facts.agents.length;
     seek(span[0]); play(true);
     // A browser without a window draws when it likes: here the clock is ours.
@@ -26,7 +27,18 @@ if (location.hash === '#check') {
     report.ends = world.takes.map((take, k) => state(k, facts.ego, take.first + (take.frames - 1) * take.dt));
     const changes = keys => { const before = picture(); keys.forEach(press); return picture() !== before; };
     report.changes = { all: changes(['a']), colour: changes(['c']), ego: changes(['e']), follow: changes(['f', 'Home']), heading: changes(['h']), trails: changes(['l', 't']), zoom: changes(['+']), fit: changes(['0']) };
-    report.charts = $('agent').querySelectorAll('canvas').length;
+    seek(0); show(1); choose(facts.ego); paint();
+    // Heat in the panel and on the road; none of another future.
+    const inked = canvas => { const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height); let n = 0; for (let i = 3; i < data.length; i += 4) n += data[i] > 0; return n; };
+    report.heat = [...document.querySelectorAll('#heat canvas')].map(inked);
+    const hot = picture(), kept = world.heat;
+    world.heat = []; report.heat_on_road = picture() !== hot; world.heat = kept;
+    show(2); paint(); report.heat_elsewhere = !$('heat').hidden;
+    show(1);
+    const looks = COLOURS.map(colour => { ui.colour = colour; dress(); return picture(); });
+    report.colours = [COLOURS, new Set(looks).size];
+    press('c'); paint();
+    report.charts = $('agent').querySelectorAll(':scope > figure canvas').length;
     report.candidates = $('candidates').querySelectorAll('li').length;
     report.wide = document.documentElement.scrollWidth > window.innerWidth;
     return report;

@@ -3,6 +3,7 @@
 const KIND = { surface: 0, lane: 1, route: 2, crosswalk: 3, bump: 4, stopLine: 5, brokenWhite: 6, solidWhite: 7, brokenYellow: 8, solidYellow: 9, edge: 10, stopSign: 11, turn: 12 };
 const LIGHTS = [null, 'green', 'yellow', 'red', 'other'];
 const FAST = 20; // m/s, the end of the scale of speeds
+const UNLIKE = 0.5; // the start of the scale of realism, which few agents fall below
 
 // Slow to fast; luminance rises, so that it reads without colour too.
 const RAMP = {
@@ -10,11 +11,22 @@ const RAMP = {
   dark: ['#6a5acd', '#4a7fd0', '#2bb0a6', '#7ad151', '#fde725'],
 };
 
-function speedColour(speed, dark) {
-  const stops = RAMP[dark ? 'dark' : 'light'], x = Math.min(Math.max(speed / FAST, 0), 1) * (stops.length - 1);
+// The colour a share of the way along a ramp, as red, green, blue.
+function rampColour(stops, share) {
+  const x = Math.min(Math.max(share, 0), 1) * (stops.length - 1);
   const i = Math.min(Math.floor(x), stops.length - 2), parse = hex => [1, 3, 5].map(k => parseInt(hex.slice(k, k + 2), 16));
   const [a, b] = [parse(stops[i]), parse(stops[i + 1])];
-  return `rgb(${a.map((c, k) => Math.round(c + (b[k] - c) * (x - i))).join(',')})`;
+  return a.map((c, k) => Math.round(c + (b[k] - c) * (x - i)));
+}
+
+const scaled = (share, dark) => `rgb(${rampColour(RAMP[dark ? 'dark' : 'light'], share).join(',')})`;
+
+// By class, by speed or by realism, as is chosen; what has no such number is grey.
+function agentColour(ui, agent, speed, colours) {
+  const { kind, realism } = facts.agents[agent];
+  if (ui.colour === 'realism') return realism === null ? colours.other : scaled((realism - UNLIKE) / (1 - UNLIKE), ui.dark);
+  if (ui.colour === 'speed' && ['vehicle', 'pedestrian', 'bicycle'].includes(kind)) return scaled(speed / FAST, ui.dark);
+  return kindColour(agent, colours);
 }
 
 function kindColour(agent, colours) {
@@ -33,6 +45,9 @@ function stateAt(world, takeIndex, agent, t) {
   const mix = channel => channel[a] + (channel[b] - channel[a]) * s;
   return { x: mix(take.x), y: mix(take.y), heading: mix(take.heading), speed: mix(take.speed) };
 }
+
+// Of all futures at once the first is told of.
+function heatTake(ui, world) { return ui.shown === 'all' ? Math.min(1, world.takes.length - 1) : ui.shown; }
 
 function lightAt(world, takeIndex, light, t) {
   const take = world.takes[t < 0 ? 0 : takeIndex];
@@ -156,6 +171,8 @@ class Scene {
     this.drawLights(c, ui, shown[0], colours);
     if (shown.length > 1 && ui.t >= 0) this.drawGhosts(c, ui, shown, colours);
     else this.drawAgents(c, ui, shown[0], colours);
+    const heat = heatAt(this.world, heatTake(ui, this.world), ui.selected, ui.t);
+    if (heat) drawHeat(c, heat, ui.dark);
   }
 
   shown(ui) { return ui.shown === 'all' ? this.world.takes.map((_, i) => i).slice(1) : [ui.shown]; }
@@ -204,8 +221,7 @@ class Scene {
     facts.agents.forEach((_, a) => {
       const now = stateAt(this.world, takeIndex, a, ui.t);
       if (!now) return;
-      const colour = ui.colour === 'speed' ? speedColour(now.speed, ui.dark) : kindColour(a, colours);
-      c.strokeStyle = colour;
+      c.strokeStyle = agentColour(ui, a, now.speed, colours);
       c.lineWidth = this.px(0.35, a === ui.selected ? 2 : 1.2);
       const line = (from, to, alpha) => {
         c.globalAlpha = alpha; c.beginPath();
@@ -227,7 +243,7 @@ class Scene {
   // All futures over one another, kept until camera or theme change.
   drawOverlay(ui, colours) {
     const { overlay, canvas } = this, { x, y, scale, angle } = this.camera;
-    const key = [x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected].join();
+    const key = [x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected, ui.colour].join();
     if (overlay.key !== key) {
       overlay.key = key;
       Object.assign(overlay.canvas, { width: canvas.width, height: canvas.height });
@@ -238,7 +254,7 @@ class Scene {
       const fade = Math.max(0.06, 0.6 / Math.sqrt(this.overlayPaths.length));
       for (const paths of this.overlayPaths) paths.forEach((entry, a) => {
         if (!entry) return;
-        c.strokeStyle = kindColour(a, colours);
+        c.strokeStyle = ui.colour === 'realism' ? agentColour(ui, a, 0, colours) : kindColour(a, colours);
         c.globalAlpha = ui.selected < 0 || a === ui.selected ? fade * (a === ui.selected ? 2 : 1) : fade * 0.35;
         c.lineWidth = this.px(0.3, a === facts.ego || a === ui.selected ? 1.6 : 1.1);
         c.stroke(entry);
@@ -279,8 +295,7 @@ class Scene {
       const s = stateAt(this.world, takeIndex, a, ui.t);
       if (!s || !this.sees(s.x, s.y)) return;
       this.box(c, agent, s, 0);
-      const moves = ui.colour === 'speed' && ['vehicle', 'pedestrian', 'bicycle'].includes(agent.kind);
-      c.fillStyle = moves ? speedColour(s.speed, ui.dark) : kindColour(a, colours);
+      c.fillStyle = agentColour(ui, a, s.speed, colours);
       c.fill();
       c.strokeStyle = colours.outline; c.lineWidth = this.px(0.08, 0.8); c.stroke();
       this.wedge(c, agent, s, colours);
@@ -297,7 +312,7 @@ class Scene {
         if (!s || !this.sees(s.x, s.y)) continue;
         this.box(c, agent, s, 0);
         c.globalAlpha = fade;
-        c.fillStyle = ui.colour === 'speed' ? speedColour(s.speed, ui.dark) : kindColour(a, colours);
+        c.fillStyle = agentColour(ui, a, s.speed, colours);
         c.fill();
         if (a === ui.selected) { c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
       }

@@ -60,11 +60,11 @@ impl Packer {
         self.bytes.push(n as u8);
     }
 
-    fn signed(&mut self, n: i64) {
+    pub(super) fn signed(&mut self, n: i64) {
         self.unsigned(((n << 1) ^ (n >> 63)) as u64);
     }
 
-    fn line(&mut self, numbers: impl Iterator<Item = i64>) {
+    pub(super) fn line(&mut self, numbers: impl Iterator<Item = i64>) {
         let (mut last, mut slope) = (0, 0);
         for n in numbers {
             self.signed(n - last - slope);
@@ -125,6 +125,11 @@ pub(super) fn units(x: f64, unit: f64) -> i64 {
     (x / unit).round() as i64
 }
 
+/// The number of steps of a heading nearest to `radians`.
+pub(super) fn heading_units(radians: f64) -> i64 {
+    units(radians, TAU / HEADINGS as f64)
+}
+
 /// 0 is for a light that is not there.
 pub(super) fn colour(state: LightState) -> u64 {
     match state {
@@ -154,7 +159,7 @@ fn stretches<'f>(id: AgentId, frames: &[&'f Frame]) -> Vec<(usize, Vec<&'f Agent
 fn unwound(headings: impl Iterator<Item = f64>) -> impl Iterator<Item = i64> {
     let mut last: i64 = 0;
     headings.map(move |heading| {
-        let turn = units(heading, TAU / HEADINGS as f64) - last;
+        let turn = heading_units(heading) - last;
         last += (turn + HEADINGS / 2).rem_euclid(HEADINGS) - HEADINGS / 2;
         last
     })

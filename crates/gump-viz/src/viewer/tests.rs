@@ -127,9 +127,52 @@ fn what_is_packed_comes_back_to_within_half_a_unit() {
 fn thirty_two_futures_of_a_crowd_stay_under_five_megabytes() {
     let scenario = crossing();
     let futures: Vec<_> = (0..32).map(|k| crowd(128, 80, Seed(k))).collect();
-    let html = Viewer::new(&scenario).futures(&futures).to_html();
+    let mut viewer = Viewer::new(&scenario);
+    viewer.futures(&futures);
+    let alone = viewer.to_html().len() as f64 / 1e6;
+    // And of one future what each of them might do at any of 16 steps, 128 draws each; of 32 agents
+    // three metrics that never rest, in every future.
+    for step in 0..16 {
+        for agent in futures[0].imagined()[5 * step].agents() {
+            let draw = |k: u64| {
+                let noise = ((k * 2_654_435_761 + step as u64 * 977) % 1000) as f64 / 500.0 - 1.0;
+                let mut draw = agent.state;
+                let sideways = draw.pose.direction().perp() * noise.powi(3);
+                draw.pose.position += draw.velocity * (0.5 + 0.2 * noise) + sideways;
+                draw.pose.heading += 0.2 * noise * noise;
+                draw.velocity *= 1.0 + 0.2 * noise;
+                draw
+            };
+            viewer.heat(HeatMap {
+                agent: agent.id,
+                future: 0,
+                from_s: 0.5 * step as f64,
+                ahead_s: 0.5,
+                draws: (0..128).map(draw).collect(),
+            });
+        }
+    }
+    for (k, future) in futures.iter().enumerate() {
+        for (id, name) in (0..32).flat_map(|id| ["a, m", "b, m", "c, s"].map(|name| (id, name))) {
+            let position = |frame: &Frame| Some(frame.agent(AgentId(id))?.state.pose.position);
+            let frames = future.imagined().iter();
+            viewer.metric(MetricTrack {
+                name: name.into(),
+                agent: AgentId(id),
+                future: Some(k),
+                first: 1,
+                values: frames
+                    .map(|frame| position(frame).map(|p| p.length()))
+                    .collect(),
+            });
+        }
+    }
+    let html = viewer.to_html();
     let megabytes = html.len() as f64 / 1e6;
-    eprintln!("32 futures of 128 jittering agents over 80 steps: {megabytes:.2} MB");
+    eprintln!(
+        "32 futures of 128 jittering agents over 80 steps: {alone:.2} MB, with heat maps and \
+         metrics {megabytes:.2} MB"
+    );
     assert!(megabytes < 5.0, "{megabytes} MB");
     // It is all there: nothing of that size is small.
     assert!(unpacked(&html).len() > 32 * 80 * 100 * 4);
@@ -170,7 +213,8 @@ fn the_page_knows_takes_lights_metrics_and_the_road_nearby() {
         name: "time to collision, s".into(),
         agent: AgentId(9),
         future: Some(0),
-        values: vec![Some(1.23456), None],
+        first: 1,
+        values: vec![Some(1.23456), None, Some(-0.5)],
     });
     let html = viewer.to_html();
     let facts: Value = serde_json::from_str(element(&html, "facts")).unwrap();
@@ -179,17 +223,62 @@ fn the_page_knows_takes_lights_metrics_and_the_road_nearby() {
     assert_eq!(facts["takes"][0]["first"], -1.0);
     let take = json!({ "name": "as it was", "first": 0.0, "dt": 0.1, "frames": 81 });
     assert_eq!(facts["takes"][1], take);
-    let metric = json!({
-        "name": "time to collision, s", "agent": 2, "take": 1, "values": [1.235, null],
-    });
-    assert_eq!(facts["metrics"][0], metric);
+    assert_eq!(facts["metrics"], json!(["time to collision, s"]));
     assert_eq!(facts["lights"], json!([[2000, 0]]));
     // Both lanes of the way, their two ribbons of the route and the crosswalk; lane 3 is far away.
     assert_eq!(facts["features"], 5);
 
-    // The last thing in the bytes is the light of the future: one stretch of red.
+    // The last things in the bytes: the light of the future, one stretch of red; one metric, of
+    // agent 2 in take 1 from frame 1 on, two stretches of one value each; no heat map.
     let bytes = unpacked(&html);
-    let mut reader = Reader(&bytes[bytes.len() - 3..]);
     let red = pack::colour(LightState::Red);
-    assert_eq!([(); 3].map(|()| reader.unsigned()), [1, red, 81]);
+    let mut tail = vec![1, red, 81];
+    tail.extend([1, 0, 2, 1, 1, 2, 0, 1, 2 * 123, 1, 1, 2 * 50 - 1, 0]);
+    let n_bytes = tail.len() + 1;
+    let mut reader = Reader(&bytes[bytes.len() - n_bytes..]);
+    let found: Vec<u64> = tail.iter().map(|_| reader.unsigned()).collect();
+    assert_eq!(found, tail);
+    assert!(reader.0.is_empty());
+}
+
+#[test]
+fn a_heat_map_keeps_how_many_draws_are_where() {
+    let scenario = crossing();
+    let log = log_as_rollout(&scenario);
+    // Facing +y: three draws in one cell, one ahead and to the left of them; no draw turns.
+    let draw = |x: f64, y: f64, speed: f64| AgentState {
+        pose: Pose::new(x, y, TAU / 4.0),
+        velocity: dvec2(0.0, speed),
+    };
+    let draws = vec![
+        draw(40.16, 4.0, 4.0),
+        draw(40.16, 4.0, 4.0),
+        draw(40.16, 4.0, 4.2),
+        draw(39.92, 5.0, 5.1),
+    ];
+    let mut viewer = Viewer::new(&scenario);
+    let heat = HeatMap {
+        agent: AgentId(7),
+        future: 0,
+        from_s: 0.5,
+        ahead_s: 0.5,
+        draws,
+    };
+    let elsewhere = HeatMap {
+        agent: AgentId(77),
+        ..heat.clone()
+    };
+    viewer.future("1", &log).heat(heat).heat(elsewhere);
+    let bytes = unpacked(&viewer.to_html());
+    // No metric, one heat map: agent 1, take 1, 500 ms, 500 ms, 4 draws; mean (30.1, 4.25) off the
+    // ego, a quarter turn; two cells; speeds from bar 8 on; turns in bar 0.
+    let zigzag = |n: i64| ((n << 1) ^ (n >> 63)) as u64;
+    let mut tail = vec![0, 1, 1, 1, 500, 500, 4];
+    tail.extend([zigzag(3010), zigzag(425), zigzag(2048), 2]);
+    tail.extend([zigzag(-1), zigzag(-3), 3, zigzag(2), zigzag(10), 1]);
+    tail.extend([zigzag(8), 3, 3, 0, 1, zigzag(0), 1, 4]);
+    let n_bytes: usize = tail.iter().map(|&n| if n < 0x80 { 1 } else { 2 }).sum();
+    let mut reader = Reader(&bytes[bytes.len() - n_bytes..]);
+    let found: Vec<u64> = tail.iter().map(|_| reader.unsigned()).collect();
+    assert_eq!(found, tail);
 }

@@ -86,7 +86,7 @@ function inflateHere(bytes) {
 }
 
 // Road and traffic: features [{class, width, xs, ys}], takes with one row of frames per agent
-// (NaN where it is absent) and per light.
+// (NaN where it is absent) and per light, metrics over time, and what agents might do next.
 function unpack(bytes) {
   let at = 0;
   // Products instead of shifts: numbers may have more than 32 bits.
@@ -134,6 +134,24 @@ function unpack(bytes) {
     }
     return take;
   });
+  const metrics = Array.from({ length: unsigned() }, () => {
+    const track = { name: facts.metrics[unsigned()], agent: unsigned(), take: unsigned(), first: unsigned(), values: [] };
+    for (let runs = unsigned(); runs > 0; runs--) {
+      for (let gap = unsigned(); gap > 0; gap--) track.values.push(NaN);
+      const n = unsigned();
+      line(track.values, track.values.length, n, facts.centi);
+    }
+    return track;
+  });
+  const bars = unit => ({ unit, first: signed(), counts: Array.from({ length: unsigned() }, unsigned) });
+  const heat = Array.from({ length: unsigned() }, () => {
+    const map = { agent: unsigned(), take: unsigned(), from: unsigned() / 1000, ahead: unsigned() / 1000, draws: unsigned(), cells: [] };
+    if (!map.draws) return map;
+    Object.assign(map, { x: signed() * facts.centi, y: signed() * facts.centi, heading: signed() * 2 * Math.PI / facts.headings });
+    let left = 0, ahead = 0;
+    for (let n = unsigned(); n > 0; n--) map.cells.push({ left: left += signed(), ahead: ahead += signed(), count: unsigned() });
+    return Object.assign(map, { speeds: bars(facts.speedBar), turns: bars(facts.turnBar) });
+  });
   if (at !== bytes.length) throw new Error(`read ${at} of ${bytes.length} bytes`);
-  return { features, takes };
+  return { features, takes, metrics, heat };
 }

@@ -60,8 +60,13 @@ impl Knob {
             Self::Temperature => "temperature",
             Self::Decay => "decay (0: no averaging)",
             Self::History => "frames of history, half a second apart",
-            Self::Chunking => "1: one pose, 2: surrogates from chunks, 3: chunks averaged",
+            Self::Chunking => "what is made of the four poses of a chunk",
         }
+    }
+
+    /// Whether its settings are numbers, and not ways.
+    fn is_numeric(self) -> bool {
+        !matches!(self, Self::Chunking)
     }
 
     fn settings(self, base: &SamplingConfig) -> Vec<Setting> {
@@ -113,14 +118,17 @@ impl Args {
         run.setting("scenarios", path.display().to_string())?;
         let settings = knob.settings(&self.draw.resolve(Mode::PartialAr)?);
         let mut rows = Vec::new();
-        let mut curve = Vec::new();
+        let (mut curve, mut ways) = (Series::default(), Vec::new());
         for (name, at, sampling) in settings {
             let scores = run.phase(&name, |run| self.score(run, &path, &world, sampling))?;
             let mean = Scores::mean(&scores)
                 .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
             let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
             let interval = interval(&metametrics, Seed(0));
-            curve.push((at, mean.metametric));
+            curve.points.push((at, mean.metametric));
+            let span = interval.map(|interval| (at, interval.low, interval.high));
+            curve.spans.extend(span);
+            ways.push(name.clone());
             rows.push(json!({
                 "setting": name,
                 "metametric": mean.metametric,
@@ -138,16 +146,13 @@ impl Args {
         run.result("rows", rows)?;
         let chart = Chart {
             x_label: knob.label().into(),
-            y_label: "realism meta-metric of 2025".into(),
+            y_label: "realism (2025), mean and 95 % interval".into(),
             markers: true,
-            series: vec![Series {
-                name: String::new(),
-                points: curve,
-            }],
+            ways: if knob.is_numeric() { Vec::new() } else { ways },
+            series: vec![curve],
             ..Chart::default()
         };
-        std::fs::write(run.path("realism.svg"), chart.to_svg()?)?;
-        Ok(())
+        Ok(chart.save(&run.path("realism"))?)
     }
 
     fn score(

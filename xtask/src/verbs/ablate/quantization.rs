@@ -11,10 +11,11 @@ use gump_metrics::{Part, summarize};
 use gump_model::{Mode, Precision, SamplingConfig, checkpoint, world::TransformerWorld};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::Scenario;
+use gump_viz::{Chart, Series};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::RATES;
+use super::{RATES, Rate};
 use crate::cli::WrongArguments;
 use crate::dataset::{self, Split};
 use crate::machine::cpu_seconds;
@@ -92,7 +93,32 @@ impl Args {
             }
             Value::Object(row)
         });
-        run.result("rows", rows.collect::<Vec<_>>())
+        run.result("rows", rows.collect::<Vec<_>>())?;
+        let parts = || outcomes.iter().map(|(.., outcome)| &outcome.part);
+        let curve = |name: &str, of: Rate| Series {
+            name: name.into(),
+            points: (1..)
+                .zip(parts())
+                .filter_map(|(i, part)| Some((f64::from(i), of(part)?)))
+                .collect(),
+            ..Series::default()
+        };
+        let chart = Chart {
+            x_label: "form of the weights".into(),
+            y_label: "displacement from the log, m".into(),
+            markers: true,
+            ways: PRECISIONS.map(|(name, _)| name.into()).into(),
+            series: vec![
+                curve("average (ADE)", Part::ade),
+                curve("best future (min ADE)", Part::min_ade),
+            ],
+            ..Chart::default()
+        };
+        // Scenes without a log to compare with leave nothing to draw.
+        if chart.series.iter().any(|curve| !curve.points.is_empty()) {
+            chart.save(&run.path("displacement"))?;
+        }
+        Ok(())
     }
 
     fn read(&self, run: &Run) -> anyhow::Result<Vec<Scenario>> {

@@ -19,7 +19,7 @@ use crate::worlds::{World, WorldName};
 /// Futures per world.
 const FUTURES: usize = 32;
 /// How far, seconds.
-const SECONDS: f64 = 8.0;
+pub(super) const SECONDS: f64 = 8.0;
 /// Futures per proposal of the planner.
 const PLANNED: usize = 2;
 

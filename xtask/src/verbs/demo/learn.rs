@@ -74,7 +74,7 @@ pub(super) fn train(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let before = trainer.validate(&validation, VALIDATED)?.total;
     let mut curve = Series {
         name: "loss".into(),
-        points: Vec::new(),
+        ..Series::default()
     };
     let progress = run.progress("training", STEPS as u64, "steps");
     while trainer.steps_done() < STEPS {

@@ -17,6 +17,8 @@ use serde_json::Value;
 use crate::machine;
 use crate::run::{Common, Run};
 use crate::shipped;
+use crate::told;
+use crate::worlds::World;
 
 /// Arguments of `demo`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -121,6 +123,10 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
             demo.futures.len()
         ))
         .futures(&demo.futures);
+    told::realism(&mut viewer, &demo.scenario, &demo.futures);
+    let world = World::build(&shipped::world(), &demo.scenario, &demo.sampling)?;
+    let scene = demo.scenario.present();
+    told::heat(run, &mut viewer, world, scene, 1, imagine::SECONDS)?;
     for candidate in &demo.candidates {
         viewer.candidate(candidate.clone());
     }

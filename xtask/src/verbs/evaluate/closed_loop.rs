@@ -21,6 +21,7 @@ use crate::futures;
 use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run, interrupted};
+use crate::tables;
 use crate::worlds::{Sampling, WorldName};
 
 /// Columns of the table, by nuPlan's names of the metrics.
@@ -141,6 +142,8 @@ pub(crate) struct Finished {
 #[derive(Clone)]
 pub(super) struct Entry {
     id: String,
+    log_name: String,
+    scenario_type: String,
     outcome: Result<(f64, MetricScores, f64), String>,
 }
 
@@ -198,6 +201,9 @@ impl Args {
             scenarios.extend(entries);
             worlds.push((world.to_string(), drives));
         }
+        run.phase("write", |run| {
+            Ok(nuplan_table(&worlds).write(&run.path("nuplan.parquet"))?)
+        })?;
         run.result("imagination", imagination)?;
         run.result("rows", rows)?;
         ranking::tell(run, &worlds)?;
@@ -296,6 +302,8 @@ impl Drive<'_> {
             progress.advance(1);
             Entry {
                 id: named.id,
+                log_name: named.log_name,
+                scenario_type: named.scenario_type,
                 outcome: match finished {
                     Ok(f) => Ok((f.scored.score, f.scored.metrics.scores(), f.milliseconds)),
                     Err(error) => Err(format!("{error:#}")),
@@ -410,6 +418,27 @@ impl Entry {
         }
         told
     }
+}
+
+/// Every drive that reached its end, as nuPlan's own tables show it.
+fn nuplan_table(worlds: &[(String, Vec<Drives>)]) -> gump_data::Table {
+    let mut nuplan = tables::NuPlan::default();
+    for (world, drives) in worlds {
+        for Drives { planner, entries } in drives {
+            let driven = entries.iter().filter_map(|entry| {
+                let (score, metrics, _) = entry.outcome.as_ref().ok()?;
+                Some(tables::Driven {
+                    scenario: &entry.id,
+                    log_name: &entry.log_name,
+                    scenario_type: &entry.scenario_type,
+                    score: *score,
+                    metrics,
+                })
+            });
+            nuplan.add(planner, world, &driven.collect::<Vec<_>>());
+        }
+    }
+    nuplan.table()
 }
 
 /// Means over the scenarios that were driven to the end; how many were not stands beside them.

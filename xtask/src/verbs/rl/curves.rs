@@ -153,21 +153,21 @@ impl Curves {
         write(&folder.join("curves.csv"), text.as_bytes())?;
         let returns = [("return", 3)];
         self.draw(
-            &folder.join("return.svg"),
+            &folder.join("return"),
             "return of an episode",
             &returns,
             false,
         )?;
         let losses = [("critic", 6), ("temperature", 10)];
-        self.draw(&folder.join("losses.svg"), "loss", &losses, true)?;
+        self.draw(&folder.join("losses"), "loss", &losses, true)?;
         let nats = [("entropy", 9), ("imitation", 8)];
-        self.draw(&folder.join("entropy.svg"), "nats", &nats, false)
+        self.draw(&folder.join("entropy"), "nats", &nats, false)
     }
 
     /// Draws columns against gradient steps; nothing where there is nothing to draw.
     fn draw(
         &self,
-        path: &Path,
+        stem: &Path,
         y_label: &str,
         columns: &[(&str, usize)],
         log_y: bool,
@@ -182,6 +182,7 @@ impl Curves {
                 .map(|row| point(row, column))
                 .filter(drawable)
                 .collect(),
+            ..Series::default()
         });
         let series: Vec<Series> = series.filter(|s| !s.points.is_empty()).collect();
         if series.is_empty() {
@@ -194,7 +195,7 @@ impl Curves {
             series,
             ..Chart::default()
         };
-        write(path, chart.to_svg()?.as_bytes())
+        Ok(chart.save(stem)?)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gump_data::Table;
 use gump_metrics::interval;
 use gump_metrics::wosac::{Component, Scores};
 use gump_scene::Seed;
@@ -9,6 +10,7 @@ use serde_json::{Map, Value, json};
 
 use super::{Scored, Settings};
 use crate::run::Run;
+use crate::tables;
 use crate::verbs::evaluate::ledger::{self, Entry};
 
 /// The name of the log as a world.
@@ -39,6 +41,7 @@ pub(crate) fn tell(
     if settings.world != CONSTANT_VELOCITY {
         worlds.push((CONSTANT_VELOCITY, of(|scored| &scored.constant_velocity)));
     }
+    per_scenario(settings, entries, &worlds).write(&run.path("scores.parquet"))?;
     run.result("scenarios", entries.len())?;
     let rows = worlds.iter().filter_map(|(world, scores)| {
         let mean = Scores::mean(scores)?;
@@ -81,6 +84,23 @@ fn row(world: &str, year: &str, scenarios: usize, scores: &Scores) -> Value {
         "traffic_light_violation_rate": scores.traffic_light_violation_rate,
         "components": components,
     })
+}
+
+/// A row per world and scenario, in the order of the worlds.
+fn per_scenario(
+    settings: &Settings,
+    entries: &[Entry<Scored>],
+    worlds: &[(&str, Vec<Scores>)],
+) -> Table {
+    let rows = worlds.iter().flat_map(|(world, scores)| {
+        entries.iter().zip(scores).map(move |(entry, scores)| {
+            let mut told = row(world, &settings.year, 1, scores);
+            told["scenario_id"] = json!(entry.id);
+            told["index"] = json!(entry.index);
+            told
+        })
+    });
+    tables::of_rows(&rows.collect::<Vec<_>>())
 }
 
 /// One line per number: mean and 95 % interval over scenarios for every world.
