@@ -203,6 +203,9 @@ impl Chart {
             .light_line_style(TEXT.mix(0.0))
             .draw()?;
         for (i, (points, named)) in series.iter().zip(&self.series).enumerate() {
+            if points.is_empty() {
+                continue;
+            }
             let colour = CURVES[i % CURVES.len()];
             let style = colour.stroke_width(2);
             let line = chart.draw_series(LineSeries::new(points.iter().copied(), style))?;
@@ -379,11 +382,14 @@ mod tests {
     }
 
     #[test]
-    fn a_single_point_is_drawn() {
+    fn a_single_point_is_drawn_and_none_is_not() {
         let mut chart = losses();
-        chart.series.truncate(1);
         chart.series[0].points = vec![(3.0, 0.5)];
-        assert!(chart.to_svg().unwrap().contains("<circle"));
+        chart.series[1].points.clear();
+        let svg = chart.to_svg().unwrap();
+        assert!(svg.contains("<circle"));
+        // What has no points has no line in the legend either.
+        assert!(svg.contains("training") && !svg.contains("validation"));
     }
 
     #[test]
