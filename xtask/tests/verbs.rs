@@ -124,6 +124,7 @@ fn wrong_arguments_exit_with_2() {
         "simulate --scenario s --world idm --futures 0",
         "simulate --scenario s --world idm --seconds 0",
         "simulate --scenario s --world idm --temperature 0",
+        "simulate --scenario s --world idm --heat",
         "simulate --scenario s --world idm --device cuda",
         "data synthesize --scenes 1 --family cul-de-sac",
         "tidy --seed many",
@@ -373,8 +374,14 @@ fn simulate_writes_futures_in_every_world() {
         "log",
         &format!("model:{weights}"),
     ] {
+        let heat = if world.starts_with("model") {
+            "--heat"
+        } else {
+            ""
+        };
         let words = format!(
-            "simulate --scenario {scene} --world {world} --futures 2 --seconds 2 --format waymo"
+            "simulate --scenario {scene} --world {world} --futures 2 --seconds 2 \
+             --format waymo,parquet,apng {heat}"
         );
         let results = &place.report(&words)["results"];
         let counts = ["futures", "steps", "agents"].map(|key| results[key].as_u64().unwrap());
@@ -393,9 +400,13 @@ fn simulate_writes_futures_in_every_world() {
         }
         assert_eq!(results["digest"].as_str().unwrap().len(), 64);
         let files = [
+            "agents.parquet",
+            "by_class.parquet",
             "film.gif",
+            "film.png",
             "futures.json",
             "futures.npy",
+            "futures.parquet",
             "picture.png",
             "report.json",
             "rollouts.binproto",
@@ -639,6 +650,10 @@ fn planners_are_judged_in_three_worlds_by_one_command() {
     }
     let pairs = results["comparisons"].as_array().unwrap();
     assert_eq!(pairs.len(), 3 * 15);
+    let files = place.files();
+    for name in ["nuplan.parquet", "rows.parquet", "scenarios.parquet"] {
+        assert!(files.contains(&name.to_owned()), "{files:?}");
+    }
     assert!(results["ranking_changes"].is_array());
     place.fails(&format!("{words} --limit 0"), 2, &["--limit"]);
     let words = format!("evaluate open-loop --scenarios {scenes} --planner model --world idm");
@@ -733,7 +748,10 @@ fn evaluate_wosac_scores_beside_oracle_and_baseline() {
         assert!(of("idm low") <= of("idm") && of("idm") <= of("idm high"));
         assert!(results["seconds_per_scenario"].as_f64().unwrap() > 0.0);
         assert!(results["explain"][0]["cost"].as_f64().unwrap() > 0.0);
-        assert!(place.files().contains(&"explain.jsonl".to_owned()));
+        let files = place.files();
+        for name in ["explain.jsonl", "rows.parquet", "scores.parquet"] {
+            assert!(files.contains(&name.to_owned()), "{files:?}");
+        }
     }
 }
 
