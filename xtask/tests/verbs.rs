@@ -374,14 +374,13 @@ fn simulate_writes_futures_in_every_world() {
         "log",
         &format!("model:{weights}"),
     ] {
-        let heat = if world.starts_with("model") {
-            "--heat"
-        } else {
-            ""
+        let heat = match world.starts_with("model") {
+            true => " --heat",
+            false => "",
         };
         let words = format!(
             "simulate --scenario {scene} --world {world} --futures 2 --seconds 2 \
-             --format waymo,parquet,apng {heat}"
+             --format waymo,parquet,apng{heat}"
         );
         let results = &place.report(&words)["results"];
         let counts = ["futures", "steps", "agents"].map(|key| results[key].as_u64().unwrap());
@@ -508,6 +507,7 @@ fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
     let names = [
         "checkpoint.safetensors",
         "losses.csv",
+        "losses.png",
         "losses.svg",
         "report.json",
         "weights.safetensors",

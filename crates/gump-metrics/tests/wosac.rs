@@ -169,9 +169,9 @@ fn an_agent_that_keeps_to_the_log_is_more_realistic() {
         assert!(values.iter().all(|v| (0.0..=1.0).contains(v)));
         values.iter().sum::<f64>() / values.len() as f64
     };
-    let steps = &found[1].steps;
-    assert_eq!(steps.len(), 80);
-    assert!(mean(&steps[45..]) < mean(&steps[..35]) - 0.1, "{steps:?}");
+    // The year pools all steps into one histogram: a step is as likely as what was logged then.
+    assert_eq!(found[1].steps.len(), 80);
+    assert!(mean(&found[1].steps) < mean(&found[0].steps), "{found:?}");
 }
 
 #[test]

@@ -34,7 +34,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S", default_value_t = 8.0)]
     seconds: f64,
     /// Also write the futures in these formats
-    #[arg(long, value_enum, value_name = "F", num_args = 1.., value_delimiter = ',')]
+    #[arg(long, value_enum, value_name = "F", value_delimiter = ',')]
     format: Vec<Format>,
     /// Show in the viewer what a learned world drew from, for the first N futures [default N: 1]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]

@@ -37,8 +37,8 @@ pub struct AgentRealism {
     pub agent: AgentId,
     /// Weighted mean of its likelihoods in the components that it has, 0 to 1.
     pub realism: f64,
-    /// The same step by step, of the components that change from step to step; `None` where none
-    /// of them counts.
+    /// How likely what was logged at each step is, by the components that change from step to
+    /// step; `None` where none of them counts.
     pub steps: Vec<Option<f64>>,
 }
 

@@ -217,7 +217,8 @@ function drawHeatPanel() {
     $('heat-none').textContent = `Kept for future ${takes.join(', ')} from the present on.`;
     return;
   }
-  $('heat-title').textContent = `What it might do by +${(map.from + map.ahead).toFixed(1)} s, ${map.draws} draws`;
+  const where = ui.shown === 'all' ? `future ${world.takes[take].name}, ` : '';
+  $('heat-title').textContent = `What it might do by +${(map.from + map.ahead).toFixed(1)} s: ${where}${map.draws} draws`;
   const [place, speed, turn] = holder.querySelectorAll('canvas'), went = stateAt(world, take, ui.selected, map.from + map.ahead);
   const degrees = went ? ((went.heading - map.heading) * 180 / Math.PI % 360 + 540) % 360 - 180 : NaN;
   drawHeatMap(place, map, went, colours(), ui.dark);
