@@ -112,7 +112,8 @@ fn the_viewer_plays_and_switches_in_a_browser() {
     let scenario = scenario();
     let futures = futures(&scenario, 4);
     let mut viewer = Viewer::new(&scenario);
-    viewer.futures(&futures);
+    viewer.futures(&futures[..3]);
+    viewer.future("slow ahead", &futures[3]);
     viewer.metric(MetricTrack {
         name: "time to collision, s".into(),
         agent: scenario.ego,
@@ -136,7 +137,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
     for (id, realism) in [(0, 0.9), (7, 0.4), (9, 0.1)] {
         viewer.realism(AgentId(id), realism);
     }
-    for (name, score) in [("slow", Some(0.25)), ("fast", None)] {
+    for (name, score) in [("slow ahead", Some(0.25)), ("fast", None)] {
         viewer.candidate(CandidatePath {
             name: name.into(),
             score,
@@ -183,6 +184,9 @@ fn the_viewer_plays_and_switches_in_a_browser() {
             (&report["charts"], &report["candidates"]),
             (&4.into(), &2.into())
         );
+        // A candidate brings its future along.
+        let shown = serde_json::json!([0, 4, "Futures: slow ahead"]);
+        assert_eq!(report["candidate_shows"], shown);
         assert_eq!(report["wide"], false, "the page is wider than its window");
         let ends = report["ends"].as_array().expect("one state per take");
         let last = std::iter::once(&scenario.log[scenario.log.len() - 1])

@@ -47,6 +47,8 @@ function restore() {
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
 
+const isLong = name => name.length > 4;
+
 function button(text, title, act) {
   const b = document.createElement('button');
   Object.assign(b, { textContent: text, title, onclick: act });
@@ -62,14 +64,15 @@ function buildTakes(n) {
   add('shown', 'log', 'What was recorded (L)', 0);
   if (n) add('shown', n > 1 ? `all ${n} futures` : 'the future', 'All over one another (A)', n > 1 ? 'all' : 1);
   $('futures-title').hidden = $('futures').hidden = n < 2;
-  if (n > 1) for (let i = 1; i <= n; i++) add('futures', world.takes[i].name, `Future ${world.takes[i].name}`, i);
+  // A long name is told of when it is shown; its button has its number.
+  if (n > 1) for (let i = 1; i <= n; i++) add('futures', isLong(world.takes[i].name) ? i : world.takes[i].name, `Future ${world.takes[i].name}`, i);
 }
 
 function buildCandidates() {
   $('candidates').hidden = !facts.candidates.length;
   const best = facts.candidates.map((c, i) => ({ ...c, i })).sort((a, b) => (b.score ?? -Infinity) - (a.score ?? -Infinity));
   for (const { name, score, chosen, i } of best) {
-    const item = document.createElement('li'), b = button('', 'Show it on the road', () => { ui.candidate = ui.candidate === i ? -1 : i; dress(); });
+    const item = document.createElement('li'), b = button('', 'Show it on the road', () => chooseCandidate(i));
     const words = document.createElement('span'), number = document.createElement('b');
     words.textContent = name + (chosen ? ' (chosen)' : '');
     number.textContent = score === null ? '-' : score.toFixed(3);
@@ -78,6 +81,14 @@ function buildCandidates() {
     item.append(b);
     $('candidates').querySelector('ol').append(item);
   }
+}
+
+// With the future of the same name, if there is one.
+function chooseCandidate(i) {
+  ui.candidate = ui.candidate === i ? -1 : i;
+  const take = world.takes.findIndex((take, k) => k > 0 && take.name === facts.candidates[i].name);
+  if (ui.candidate >= 0 && take > 0) ui.shown = take;
+  dress();
 }
 
 function show(shown) { ui.shown = shown; dress(); }
@@ -130,6 +141,8 @@ function dress() {
   for (const b of document.querySelectorAll('[data-colour]')) press(b, b.dataset.colour === ui.colour);
   for (const b of document.querySelectorAll('[data-candidate]')) press(b, b.dataset.candidate === String(ui.candidate));
   for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails]]) press(document.querySelector(`[data-do=${name}]`), on);
+  const named = ui.shown > 0 && isLong(world.takes[ui.shown].name);
+  $('futures-title').textContent = named ? `Futures: ${world.takes[ui.shown].name}` : 'Futures';
   $('play').classList.toggle('on', ui.playing);
   $('play').setAttribute('aria-label', ui.playing ? 'Pause' : 'Play');
   $('speed').value = String(ui.speed);

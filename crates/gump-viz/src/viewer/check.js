@@ -39,6 +39,8 @@ if (location.hash === '#check') {
     report.colours = [COLOURS, new Set(looks).size];
     press('c'); paint();
     report.charts = $('agent').querySelectorAll(':scope > figure canvas').length;
+    $('candidates').querySelector('button').click();
+    report.candidate_shows = [ui.candidate, ui.shown, $('futures-title').textContent];
     report.candidates = $('candidates').querySelectorAll('li').length;
     report.wide = document.documentElement.scrollWidth > window.innerWidth;
     return report;
