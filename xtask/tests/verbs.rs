@@ -749,7 +749,12 @@ fn evaluate_wosac_scores_beside_oracle_and_baseline() {
         assert!(results["seconds_per_scenario"].as_f64().unwrap() > 0.0);
         assert!(results["explain"][0]["cost"].as_f64().unwrap() > 0.0);
         let files = place.files();
-        for name in ["explain.jsonl", "rows.parquet", "scores.parquet"] {
+        for name in [
+            "agents.parquet",
+            "explain.jsonl",
+            "rows.parquet",
+            "scores.parquet",
+        ] {
             assert!(files.contains(&name.to_owned()), "{files:?}");
         }
     }

@@ -3,6 +3,7 @@
 //! Opened with `#check` the page tries itself (`viewer/check.js`) and reports into the document,
 //! which the browser prints.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -106,7 +107,12 @@ fn report(browser: &Path, path: &Path, profile: &Path, size: &str, dark: bool) -
 #[test]
 fn the_viewer_plays_and_switches_in_a_browser() {
     let Some(browser) = browser() else {
-        eprintln!("skipped: no browser on the path, looked for {BROWSERS:?}");
+        // Past the capture of output, so that it is seen without a flag.
+        let told = writeln!(
+            std::io::stderr(),
+            "SKIPPED, the viewer was not tried: no browser on the path, looked for {BROWSERS:?}"
+        );
+        told.expect("standard error can be written to");
         return;
     };
     let scenario = scenario();

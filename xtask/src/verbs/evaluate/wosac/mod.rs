@@ -24,6 +24,7 @@ use super::ledger::{Entry, Header, Ledger};
 use super::shard::Shard;
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
+use crate::tables;
 use crate::worlds::{Sampling, WorldName};
 pub(crate) use recording::{Recorded, recordings};
 pub(crate) use rollouts::Source;
@@ -53,7 +54,8 @@ pub(crate) struct Args {
     /// Evaluate part K of N; put the parts together with `evaluate merge`
     #[arg(long, value_name = "K/N")]
     shard: Option<Shard>,
-    /// Also say what lowered the scores and when, in explain.jsonl and the dearest in the report
+    /// Also say what lowered the scores and when, in explain.jsonl, agents.parquet and the dearest in
+    /// the report
     #[arg(long)]
     explain: bool,
     #[command(flatten)]
@@ -207,6 +209,7 @@ impl Args {
         tell::tell(run, &settings, &entries)?;
         if self.explain {
             run.result("explain", &explained)?;
+            tabulate(run)?;
         }
         Ok(())
     }
@@ -314,6 +317,14 @@ fn note(
     dearest.sort_by(|a, b| b.cost.total_cmp(&a.cost));
     dearest.truncate(N_EXPLAINED);
     Ok(())
+}
+
+/// Writes all that was noted as a table.
+fn tabulate(run: &Run) -> anyhow::Result<()> {
+    let noted = std::fs::read_to_string(run.path("explain.jsonl"))?;
+    let rows = noted.lines().map(serde_json::from_str);
+    let rows = rows.collect::<Result<Vec<_>, _>>()?;
+    Ok(tables::of_rows(&rows).write(&run.path("agents.parquet"))?)
 }
 
 /// Which gaps of a format matter to a world.
