@@ -1,27 +1,25 @@
 //! Futures of a scene in a learned world, as a film.
 //!
-//! `cargo run -p examples --example simulate -- WEIGHTS [FILE#INDEX]` writes `out/simulate.gif`.
-//! Weights are what `cargo xtask train` writes, or the shipped ones in `datasets/weights`.
+//! `cargo run -p examples --example simulate [WEIGHTS] [FILE#INDEX]` writes `out/simulate.gif`.
+//! Weights are what `cargo xtask train` writes; the shipped ones unless told otherwise.
 
 use std::path::Path;
 
-use anyhow::Context as _;
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::Seed;
 use gump_viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};
 
-const SHIPPED: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../datasets/mini/procedural.tfrecord.gz#22"
-);
+const DATASETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../datasets");
 
 fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
-    let weights = arguments.next().context("expected a file of weights")?;
-    let scenario = gump_data::find(&arguments.next().unwrap_or_else(|| SHIPPED.into()))?;
+    let mut next = |shipped| arguments.next().unwrap_or(format!("{DATASETS}/{shipped}"));
+    let weights = next("weights/gump-tiny.safetensors");
+    let scenario = gump_data::find(&next("mini/procedural.tfrecord.gz#22"))?;
     let scene = scenario.present();
 
+    // ANCHOR: imagine
     // A file of weights holds its configuration and needs nothing else. From here on the network
     // is a world like any other: whatever takes `&dyn WorldModel` takes it.
     let network = checkpoint::load(Path::new(&weights), &Device::Cpu)?;
@@ -33,6 +31,7 @@ fn main() -> anyhow::Result<()> {
     };
     let futures = simulate(&world, &[start], None, &SimulateConfig::default())
         .map_err(anyhow::Error::from_boxed)?;
+    // ANCHOR_END: imagine
 
     // The log, in the form in which futures come, and the futures beside it.
     let log = log_as_rollout(&scenario);

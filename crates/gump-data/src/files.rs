@@ -15,6 +15,7 @@ use crate::{
     womd,
 };
 
+// ANCHOR: format
 /// A format that content can be recognised as.
 pub(crate) struct Format {
     /// Its name in reports and errors.
@@ -25,6 +26,7 @@ pub(crate) struct Format {
     /// Starts reading a file.
     pub(crate) open: fn(&Path, ReadOptions) -> Result<BoxedSource, DataError>,
 }
+// ANCHOR_END: format
 
 /// The formats that hold scenarios; the first that recognises a file has it.
 static FORMATS: [Format; 9] = [

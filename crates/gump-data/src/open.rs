@@ -11,6 +11,7 @@ use crate::{DataError, ReadOptions, ScenarioRecord};
 /// How a format hands over its scenarios.
 pub(crate) type BoxedSource = Box<dyn Source>;
 
+// ANCHOR: source
 /// The scenarios of one file, in order.
 pub(crate) trait Source: Send {
     /// The next scenario whose id is `wanted`; the others are skipped at less cost. `wanted` is
@@ -27,6 +28,7 @@ pub(crate) trait Source: Send {
         Some(record.map(drop))
     }
 }
+// ANCHOR_END: source
 
 /// Opens a file, or every file of a directory that holds scenarios, in order of their paths and
 /// whatever their formats, filling gaps with [`ReadOptions::ALL`].

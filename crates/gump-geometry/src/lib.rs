@@ -10,6 +10,20 @@
 //! * **heading**: radians, counter-clockwise from +x, wrapped to [-π, π).
 //! * **arc length**: metres along a polyline from its first point.
 //! * **lateral**: signed metres to the left (+) or right (-) of a polyline's direction.
+//!
+//! ```
+//! use gump_geometry::{OrientedBox, Polyline, Pose, dvec2};
+//!
+//! let lane = Polyline::new(vec![dvec2(0.0, 0.0), dvec2(30.0, 40.0)]).unwrap();
+//! let car = OrientedBox { pose: lane.pose_at(10.0), length: 4.8, width: 2.0 };
+//! let ahead = OrientedBox { pose: lane.pose_at(20.0), ..car };
+//! // Bumper to bumper; then where the first car's front is, and how far along the lane that is.
+//! assert!((car.signed_distance(&ahead) - 5.2).abs() < 1e-9);
+//! let world_from_car: Pose = car.pose;
+//! let front = world_from_car * dvec2(2.4, 0.0);
+//! let projection = lane.project(front);
+//! assert!((projection.arc_length - 12.4).abs() < 1e-9 && projection.lateral.abs() < 1e-9);
+//! ```
 
 mod distance;
 mod fast;

@@ -15,6 +15,25 @@
 //! * **aggregation**: averaging what several chunks say of the same instant.
 //! * **outlook**: what an agent might have done next, as draws from its distribution.
 //! * **visual memory**: keys and values of the map, computed once per scene.
+//!
+//! ```
+//! use gump_model::{Device, ModelConfig, Network, SamplingConfig, world::TransformerWorld};
+//! use gump_rollout::{SimulateConfig, Start, simulate};
+//! use gump_scene::Seed;
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 200,0 speed 15
+//!      ego vehicle 0: 10,0 velocity 8,0",
+//! )?;
+//! // Untrained; `checkpoint::load` reads the shipped weights or one's own.
+//! let network = Network::random(ModelConfig::tiny(), Seed(0), &Device::Cpu)?;
+//! let world = TransformerWorld::new(network, SamplingConfig::default());
+//! let start = Start { scene: scenario.present(), n_futures: 2, seed: Seed(0) };
+//! let config = SimulateConfig { seconds: 1.0, ..SimulateConfig::default() };
+//! let futures = simulate(&world, &[start], None, &config)?;
+//! assert_eq!((futures.len(), futures[0].steps()), (2, 10));
+//! # Ok::<(), gump_rollout::BoxError>(())
+//! ```
 
 mod aggregation;
 mod anchor;

@@ -1,12 +1,14 @@
 //! Closed-loop evaluation: drive, score, over and over.
 //!
-//! [`drive_and_score`] does one recording, [`evaluate`] many at once. What fails is an error of its
+//! [`drive_scenario`] does one scenario, [`drive_and_score`] one recording, [`evaluate`] many at once. What fails is an error of its
 //! recording; nothing here averages.
 
 use gump_metrics::nuplan::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
 use gump_metrics::nuplan::{open_loop, score};
-use gump_rollout::closed_loop::{DriveConfig, Driven, Driver, Recording, Tracking, Traffic, drive};
-use gump_scene::{EgoState, MapGraph};
+use gump_rollout::closed_loop::{
+    DriveConfig, Driven, Driver, Recording, Tracking, Traffic, derive_roadblocks, drive,
+};
+use gump_scene::{EgoState, MapGraph, Scenario};
 use rayon::prelude::*;
 
 use crate::PlanError;
@@ -46,6 +48,25 @@ pub fn drive_and_score(
         metrics,
         driven,
     })
+}
+
+/// As [`drive_and_score`], for a scenario of lanes and boxes as most datasets have them.
+///
+/// What nuPlan's drivers ask for besides, roadblocks and a rear axle, is derived for driving
+/// ([`derive_roadblocks`], [`Recording::of_boxes`]); the drive is judged on the map as stated.
+///
+/// # Errors
+/// As [`drive_and_score`].
+pub fn drive_scenario(
+    scenario: &Scenario,
+    traffic: &mut dyn Traffic,
+    driver: &mut dyn Driver,
+    config: &DriveConfig,
+) -> Result<Scored, PlanError> {
+    let mut driven = scenario.clone();
+    derive_roadblocks(&mut driven);
+    let recording = Recording::of_boxes(driven)?;
+    drive_and_score(&recording, &scenario.map, traffic, driver, config)
 }
 
 /// Lets a driver plan along the log without being followed, and compares its plans with what was

@@ -36,26 +36,22 @@
 //! ```
 //!
 //! # Scoring a planner
-//! A planner of one's own takes the place of `PdmClosed` by implementing `Driver`: a name, a start,
-//! and a trajectory per step; `examples/score_a_planner.rs` has one.
+//! A planner of one's own takes the place of `PdmClosed` by implementing `Driver`: a name, and a
+//! trajectory per step; `examples/score_a_planner.rs` has one.
 //! ```
-//! use gump_planner::{PdmClosed, closed_loop::drive_and_score};
-//! use gump_rollout::closed_loop::{DriveConfig, Recording, derive_roadblocks};
-//! use gump_rollout::worlds::NuplanIdm;
+//! use gump_planner::{PdmClosed, closed_loop::drive_scenario};
+//! use gump_rollout::{closed_loop::DriveConfig, worlds::NuplanIdm};
 //!
-//! let mut scenario = gump_scene::fixture::scenario(
+//! let scenario = gump_scene::fixture::scenario(
 //!     "lane 1: 0,0 300,0 speed 12
 //!      drivable: -10,-2 300,-2 300,2 -10,2
 //!      route 1
 //!      ego vehicle 0: 10,0 velocity 8,0 size 5.176,2.297
 //!      agent vehicle 1: 60,0 velocity 8,0",
 //! ).unwrap();
-//! let map = scenario.map.clone();
-//! derive_roadblocks(&mut scenario);
-//! let recording = Recording::of_boxes(scenario).unwrap();
 //! let (mut traffic, mut driver) = (NuplanIdm::default(), PdmClosed::default());
 //! let config = DriveConfig::default();
-//! let scored = drive_and_score(&recording, &map, &mut traffic, &mut driver, &config).unwrap();
+//! let scored = drive_scenario(&scenario, &mut traffic, &mut driver, &config).unwrap();
 //! assert_eq!(scored.metrics.collisions.score, 1.0);
 //! assert!(scored.score > 0.5);
 //! ```

@@ -12,6 +12,23 @@
 //! * **terminated**: ended by failure, nothing comes after. **Truncated**: cut off, more would
 //!   have come, so a value must be bootstrapped.
 //! * **step**: what an action lasts, half a second; one or more frames of a world.
+//!
+//! ```
+//! use gump_rl::{Course, DrivingEnv, EnvConfig, Traffic, VectorEnv};
+//! use gump_scene::Seed;
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 300,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 8,0",
+//! ).unwrap();
+//! let courses = Course::prepare([scenario], 0.5).unwrap();
+//! let config = EnvConfig { n_envs: 4, ..EnvConfig::default() };
+//! let mut env = DrivingEnv::new(courses, Traffic::Log, config).unwrap();
+//! env.reset(Seed(0)).unwrap();
+//! // Half of the hardest acceleration, straight ahead.
+//! env.step(&[0.5, 0.0].repeat(4)).unwrap();
+//! assert!(env.rewards().iter().all(|reward| *reward > 0.4));
+//! assert!(!env.terminated()[0] && !env.truncated()[0]);
+//! ```
 
 mod actor;
 mod course;

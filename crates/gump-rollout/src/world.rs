@@ -11,6 +11,60 @@ pub type BoxError = Box<dyn Error + Send + Sync>;
 ///
 /// Implementations see a [`SceneState`] and so cannot see the logged future; one that needs the log
 /// is an oracle and takes a `Scenario` in its constructor.
+///
+/// A world of one's own, in which everyone rolls to a halt:
+///
+/// ```
+/// use gump_rollout::{BoxError, Session, SimulateConfig, Start, WorldModel, simulate};
+/// use gump_scene::{Agent, AgentState, Frame, Rollout, Seed};
+///
+/// struct RollToAHalt;
+/// /// The futures so far, whose last frames are the present.
+/// struct Rolling(Vec<Rollout>);
+///
+/// impl WorldModel for RollToAHalt {
+///     fn name(&self) -> &str {
+///         "roll-to-a-halt"
+///     }
+///     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+///         let futures = |start: &Start<'_>| vec![Rollout::begin(start.scene); start.n_futures];
+///         Ok(Box::new(Rolling(starts.iter().flat_map(futures).collect())))
+///     }
+/// }
+///
+/// impl Session for Rolling {
+///     fn dt(&self) -> f64 {
+///         self.0.first().map_or(0.1, Rollout::dt)
+///     }
+///     fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+///         for (i, future) in self.0.iter_mut().enumerate() {
+///             let (scene, dt) = (future.last(), future.dt());
+///             let next = |agent: &Agent| match ego {
+///                 Some(driven) if agent.id == scene.ego => agent.with_state(driven[i]),
+///                 _ => {
+///                     let mut state = agent.state;
+///                     state.velocity *= 1.0 - 0.5 * dt;
+///                     state.pose.position += state.velocity * dt;
+///                     agent.with_state(state)
+///                 }
+///             };
+///             let agents = scene.now().agents().iter().map(next).collect();
+///             let lights = scene.now().lights().to_vec();
+///             future.push(Frame::new(agents, lights));
+///         }
+///         Ok(self.0.iter().map(|future| future.last().now().clone()).collect())
+///     }
+///     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+///         self.0[future] = Rollout::begin(start.scene);
+///         Ok(())
+///     }
+/// }
+///
+/// let scenario = gump_scene::fixture::scenario("ego vehicle 0: 0,0 velocity 8,0").unwrap();
+/// let start = Start { scene: scenario.present(), n_futures: 2, seed: Seed(0) };
+/// let futures = simulate(&RollToAHalt, &[start], None, &SimulateConfig::default()).unwrap();
+/// assert!(futures[1].last().ego_now().state.speed() < 0.2);
+/// ```
 pub trait WorldModel: Send + Sync {
     /// A short name for tables and reports.
     fn name(&self) -> &str;

@@ -1,6 +1,6 @@
 //! The recorded driver, an oracle.
 
-use gump_rollout::closed_loop::{Driver, Mission, Moment, Recording};
+use gump_rollout::closed_loop::{Driver, Moment, Recording};
 use gump_rollout::dynamics::Trajectory;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::EgoState;
@@ -34,10 +34,6 @@ impl LogDriver {
 impl Driver for LogDriver {
     fn name(&self) -> &str {
         "log"
-    }
-
-    fn start(&mut self, _: &Mission<'_>) -> Result<(), BoxError> {
-        Ok(())
     }
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {

@@ -34,24 +34,7 @@ const ROWS_PER_TASK: usize = 8;
 /// After [`VectorEnv::reset`] row `i` has the seed `seed.fork(i)`.
 ///
 /// With [`Autoreset::SameStep`], which is the default, it does what [`VectorEnv`] promises; the
-/// other modes are Gymnasium's.
-///
-/// ```
-/// use gump_rl::{Course, DrivingEnv, EnvConfig, Traffic, VectorEnv};
-/// use gump_scene::Seed;
-///
-/// let scenario = gump_scene::fixture::scenario(
-///     "lane 1: 0,0 300,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 8,0",
-/// ).unwrap();
-/// let courses = Course::prepare([scenario], 0.5).unwrap();
-/// let config = EnvConfig { n_envs: 4, ..EnvConfig::default() };
-/// let mut env = DrivingEnv::new(courses, Traffic::Log, config).unwrap();
-/// env.reset(Seed(0)).unwrap();
-/// // Half of the hardest acceleration, straight ahead.
-/// env.step(&[0.5, 0.0].repeat(4)).unwrap();
-/// assert!(env.rewards().iter().all(|reward| *reward > 0.4));
-/// assert!(!env.terminated()[0] && !env.truncated()[0]);
-/// ```
+/// other modes are Gymnasium's. The front page of the crate has an example.
 pub struct DrivingEnv<'w> {
     courses: Arc<[Course]>,
     others: Others<'w>,

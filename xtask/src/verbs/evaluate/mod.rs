@@ -2,7 +2,7 @@
 //!
 //! What they share: [`shard`] says which scenarios are this machine's, [`ledger`] keeps what each
 //! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
-//! file, a variant of [`Verb`] and, if it can be sharded, a row of [`merge::BENCHMARKS`].
+//! file, a variant of [`Verb`] and, if it can be sharded, a row of `BENCHMARKS` in [`merge`].
 
 mod closed_loop;
 pub(crate) mod generation;

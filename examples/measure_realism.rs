@@ -1,0 +1,51 @@
+//! How real a world is, by Waymo's measure, and what costs it most: `gump-metrics` on scenes.
+//!
+//! `cargo run -p examples --example measure_realism [FILE]`
+
+use std::path::PathBuf;
+
+use gump_metrics::wosac::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
+use gump_rollout::worlds::{ConstantVelocity, Idm};
+use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
+use gump_scene::Seed;
+
+const SHIPPED: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../datasets/mini/sumo-hamburg.tfrecord.gz"
+);
+
+fn main() -> anyhow::Result<()> {
+    let path = PathBuf::from(std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into()));
+    let config = Config::of(Year::Y2025);
+    let (straight_on, reactive) = (ConstantVelocity, Idm::default());
+    let worlds: [&dyn WorldModel; 2] = [&straight_on, &reactive];
+    for world in worlds {
+        let (mut scores, mut dearest) = (Vec::new(), None);
+        for record in gump_data::open(&path)?.take(3) {
+            let scenario = record?.scenario;
+            let start = Start {
+                scene: scenario.present(),
+                n_futures: 32,
+                seed: Seed(0),
+            };
+            let futures = simulate(world, &[start], None, &SimulateConfig::default())
+                .map_err(anyhow::Error::from_boxed)?;
+
+            // ANCHOR: score
+            let log = Log::of(&scenario)?;
+            let reference = Reference::new(&log, &config)?;
+            let rollouts = Rollouts::of(&scenario.id, &futures, Mode::SimAgents)?;
+            let evaluation = reference.evaluate(&rollouts)?;
+            scores.push(evaluation.scores.clone());
+            // ANCHOR_END: score
+            let blame = evaluation.explain().into_iter().next();
+            dearest = dearest.or(blame.map(|blame| (scenario.id.clone(), blame)));
+        }
+        if let (Some(mean), Some((id, blame))) = (Scores::mean(&scores), dearest) {
+            println!("{}: realism {:.3}", world.name(), mean.metametric);
+            let what = blame.component.name().replace('_', " ");
+            println!("  costs most in {id}: {what} of agent {}", blame.agent);
+        }
+    }
+    Ok(())
+}
