@@ -1,0 +1,260 @@
+//! The guide is true: its commands run, what it shows of their output is there, the code it quotes
+//! exists, and commands that cannot run here at least have flags that exist.
+//!
+//! What the fences of a chapter mean:
+//!
+//! | fence | meaning |
+//! |---|---|
+//! | `console` | `$ cargo xtask ...` is run, in order, in a folder of the chapter's own; every other line occurs in the output of the command above it, spaces aside |
+//! | `LANGUAGE FILE` | written to that folder under this name |
+//! | `sh`, `yaml` | not run: a cluster, a long job, data of one's own. Flags of `cargo xtask` are checked, shell syntax too |
+//! | others | for reading |
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A fenced block of a chapter.
+struct Block {
+    /// What stands after the fence, `console` for instance.
+    info: String,
+    /// Number of its first line, from 1.
+    line: usize,
+    lines: Vec<String>,
+}
+
+#[test]
+fn every_command_runs() {
+    let mut n_commands = 0;
+    for chapter in chapters() {
+        let place = tempfile::tempdir().unwrap();
+        for shipped in ["datasets", "configs"] {
+            symlink(root().join(shipped), place.path().join(shipped)).unwrap();
+        }
+        for block in blocks(&chapter) {
+            if let Some((_, file)) = block.info.split_once(' ') {
+                fs::write(place.path().join(file), block.lines.join("\n") + "\n").unwrap();
+            } else if block.info == "console" {
+                n_commands += run_session(&chapter, &block, place.path());
+            }
+        }
+    }
+    assert!(n_commands >= 10, "only {n_commands} commands found");
+}
+
+/// Runs the commands of a block and looks for the lines below them; how many commands there were.
+fn run_session(chapter: &Path, block: &Block, place: &Path) -> usize {
+    let (mut said, mut n_commands) = (String::new(), 0);
+    for (i, line) in block.lines.iter().enumerate() {
+        let at = format!("{}:{}", chapter.display(), block.line + i);
+        if let Some(command) = line.strip_prefix("$ ") {
+            let words = command.strip_prefix("cargo xtask ");
+            let words = words.unwrap_or_else(|| panic!("{at}: expected `$ cargo xtask ...`"));
+            let output = xtask(words.split_whitespace(), place);
+            let error = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(output.status.success(), "{at}: {command}: {error}");
+            said = squeezed(&(String::from_utf8_lossy(&output.stdout) + &*error));
+            n_commands += 1;
+        } else {
+            let expected = squeezed(line);
+            assert!(
+                said.contains(&expected),
+                "{at}: {expected} does not occur in:\n{said}"
+            );
+        }
+    }
+    n_commands
+}
+
+/// The text with one space wherever there were several.
+fn squeezed(text: &str) -> String {
+    let lines = text
+        .lines()
+        .map(|line| line.split_whitespace().collect::<Vec<_>>().join(" "));
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn commands_that_are_not_run_have_flags_that_exist() {
+    let mut flags = BTreeMap::new();
+    let mut n_commands = 0;
+    let mut pages = chapters();
+    pages.extend(
+        ["README.md", "CONTRIBUTING.md", "datasets/README.md"].map(|page| root().join(page)),
+    );
+    for page in pages {
+        for block in blocks(&page)
+            .iter()
+            .filter(|block| ["sh", "yaml"].contains(&&*block.info))
+        {
+            for command in commands(block) {
+                let words: Vec<&str> = command.split_whitespace().collect();
+                let n_verbs = words.iter().take_while(|word| is_verb(word)).count();
+                let known = flags
+                    .entry(words[..n_verbs].join(" "))
+                    .or_insert_with_key(|verb| flags_of(verb));
+                let at = format!("{}:{}: {command}", page.display(), block.line);
+                assert!(!known.is_empty(), "{at}: expected a verb");
+                for flag in words.iter().filter(|word| word.starts_with("--")) {
+                    let flag = flag.split('=').next().unwrap();
+                    assert!(known.contains(flag), "{at}: there is no {flag}");
+                }
+                n_commands += 1;
+            }
+            if block.info == "sh" {
+                let script = block.lines.join("\n");
+                let checked = Command::new("bash")
+                    .args(["-n", "-c", &script])
+                    .output()
+                    .unwrap();
+                let error = String::from_utf8_lossy(&checked.stderr);
+                assert!(
+                    checked.status.success(),
+                    "{}:{}: {error}",
+                    page.display(),
+                    block.line
+                );
+            }
+        }
+    }
+    assert!(n_commands >= 20, "only {n_commands} commands found");
+}
+
+/// The words after `cargo xtask`, or after the executable, of every command in a block.
+fn commands(block: &Block) -> Vec<String> {
+    let text = block.lines.join("\n").replace("\\\n", " ");
+    let joined = if block.info == "yaml" {
+        text.replace('\n', " ")
+    } else {
+        text
+    };
+    let mut commands = Vec::new();
+    for line in joined.lines() {
+        let starts = ["cargo xtask ", "\"$XTASK\" ", " xtask "];
+        for start in starts {
+            commands.extend(line.split(start).skip(1).map(|rest| {
+                let end = rest.split([';', '|', '\'']).next().unwrap_or_default();
+                end.split(" #").next().unwrap_or_default().trim().to_owned()
+            }));
+        }
+    }
+    commands.retain(|command| !command.is_empty());
+    commands
+}
+
+/// True for what may name a verb: small letters and hyphens alone, no flag.
+fn is_verb(word: &str) -> bool {
+    !word.starts_with('-') && word.chars().all(|c| c.is_ascii_lowercase() || c == '-')
+}
+
+/// The flags that the help of a verb names; none if there is no such verb.
+fn flags_of(verb: &str) -> BTreeSet<String> {
+    let place = tempfile::tempdir().unwrap();
+    let output = xtask(verb.split_whitespace().chain(["--help"]), place.path());
+    if !output.status.success() {
+        return BTreeSet::new();
+    }
+    let help = String::from_utf8(output.stdout).unwrap();
+    let words = help.split(|c: char| !c.is_ascii_alphanumeric() && c != '-');
+    words
+        .filter(|word| word.starts_with("--"))
+        .map(str::to_owned)
+        .collect()
+}
+
+#[test]
+fn quoted_code_exists() {
+    let mut n_quotes = 0;
+    for chapter in chapters() {
+        for block in blocks(&chapter) {
+            for quote in block
+                .lines
+                .iter()
+                .filter_map(|line| line.strip_prefix("{{#include "))
+            {
+                let quote = quote.strip_suffix("}}").unwrap();
+                let (file, anchor) = quote.split_once(':').unwrap_or((quote, ""));
+                let path = chapter.with_file_name(file);
+                let text = fs::read_to_string(&path).unwrap_or_default();
+                let at = format!("{}:{}: {quote}", chapter.display(), block.line);
+                assert!(!text.is_empty(), "{at}: expected such a file");
+                let marks = ["ANCHOR: ", "ANCHOR_END: "].map(|mark| format!("// {mark}{anchor}\n"));
+                let marked = marks.iter().all(|mark| text.matches(&**mark).count() == 1);
+                assert!(
+                    anchor.is_empty() || marked,
+                    "{at}: expected it to be marked there"
+                );
+                n_quotes += 1;
+            }
+        }
+    }
+    assert!(n_quotes >= 5, "only {n_quotes} quotes found");
+}
+
+#[test]
+fn every_chapter_is_in_the_summary() {
+    let listed: BTreeSet<PathBuf> = chapters().into_iter().collect();
+    let pages = fs::read_dir(book())
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
+    let pages = pages.filter(|path| path.extension().is_some_and(|extension| extension == "md"));
+    let there: BTreeSet<PathBuf> = pages.filter(|path| !path.ends_with("SUMMARY.md")).collect();
+    assert_eq!(listed, there);
+}
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .unwrap()
+        .to_owned()
+}
+
+fn book() -> PathBuf {
+    root().join("docs/guide/src")
+}
+
+/// The chapters in the order of the summary.
+fn chapters() -> Vec<PathBuf> {
+    let summary = fs::read_to_string(book().join("SUMMARY.md")).unwrap();
+    let links = summary.split("](").skip(1);
+    links
+        .map(|rest| book().join(rest.split(')').next().unwrap()))
+        .collect()
+}
+
+/// The fenced blocks of a page.
+fn blocks(page: &Path) -> Vec<Block> {
+    let text =
+        fs::read_to_string(page).unwrap_or_else(|error| panic!("{}: {error}", page.display()));
+    let mut blocks = Vec::new();
+    let mut open: Option<Block> = None;
+    for (i, line) in text.lines().enumerate() {
+        match (line.strip_prefix("```"), &mut open) {
+            (Some(info), None) => {
+                let info = info.to_owned();
+                open = Some(Block {
+                    info,
+                    line: i + 2,
+                    lines: Vec::new(),
+                });
+            }
+            (Some(_), Some(_)) => blocks.extend(open.take()),
+            (None, Some(block)) => block.lines.push(line.to_owned()),
+            (None, None) => {}
+        }
+    }
+    assert!(open.is_none(), "{}: a block does not end", page.display());
+    blocks
+}
+
+fn xtask<'a>(words: impl Iterator<Item = &'a str>, place: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_xtask"))
+        .args(words)
+        .current_dir(place)
+        .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap()
+}
