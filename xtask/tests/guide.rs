@@ -126,19 +126,15 @@ fn commands_that_are_not_run_have_flags_that_exist() {
 /// The words after `cargo xtask`, or after the executable, of every command in a block.
 fn commands(block: &Block) -> Vec<String> {
     let text = block.lines.join("\n").replace("\\\n", " ");
-    let joined = if block.info == "yaml" {
-        text.replace('\n', " ")
-    } else {
-        text
+    let (text, starts) = match &*block.info {
+        "yaml" => (text.replace('\n', " "), vec![" xtask "]),
+        _ => (text, vec!["cargo xtask ", "\"$XTASK\" "]),
     };
     let mut commands = Vec::new();
-    for line in joined.lines() {
-        let starts = ["cargo xtask ", "\"$XTASK\" ", " xtask "];
-        for start in starts {
-            commands.extend(line.split(start).skip(1).map(|rest| {
-                let end = rest.split([';', '|', '\'']).next().unwrap_or_default();
-                end.split(" #").next().unwrap_or_default().trim().to_owned()
-            }));
+    for start in starts {
+        for rest in text.lines().flat_map(|line| line.split(start).skip(1)) {
+            let end = rest.split([';', '|', '\'']).next().unwrap_or_default();
+            commands.push(end.split(" #").next().unwrap_or_default().trim().to_owned());
         }
     }
     commands.retain(|command| !command.is_empty());
