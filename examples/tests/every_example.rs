@@ -135,11 +135,9 @@ fn run(name: &str, source: &Path) -> Option<String> {
     }
     let text = fs::read_to_string(source).unwrap();
     let announced = text.lines().take_while(|line| line.starts_with("//!"));
-    let files = announced
+    let mut files = announced
         .flat_map(|line| line.split('`'))
         .filter(|word| word.starts_with("out/"));
-    let lacking = files
-        .filter(|file| !place.path().join(file).is_file())
-        .next();
+    let lacking = files.find(|file| !place.path().join(file).is_file());
     lacking.and_then(|file| wrong(format!("expected it to write {file}, found no such file")))
 }
