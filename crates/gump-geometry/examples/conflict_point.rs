@@ -27,7 +27,7 @@ impl Car {
             footprint.is_some_and(|footprint| footprint.intersects(area))
         });
         let first = inside.next()?;
-        Some((first, inside.last().unwrap_or(first)))
+        Some((first, inside.next_back().unwrap_or(first)))
     }
 }
 
