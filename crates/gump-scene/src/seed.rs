@@ -36,7 +36,20 @@ mod tests {
     #[test]
     fn streams_are_fixed_for_all_time() {
         // A change here silently changes every published result.
-        assert_eq!(Seed(0).rng().next_u64(), Seed(0).rng().next_u64());
+        let first = |seed: Seed| seed.rng().next_u64();
+        let drawn = [
+            first(Seed(0)),
+            first(Seed(7).fork(3)),
+            first(Seed(7).fork(3).fork(1)),
+        ];
+        assert_eq!(
+            drawn,
+            [
+                13_080_132_717_333_068_652,
+                7_941_459_258_118_491_366,
+                2_178_939_649_372_751_364
+            ]
+        );
         assert_ne!(Seed(0).fork(0), Seed(0).fork(1));
         assert_ne!(Seed(0).fork(0), Seed(1).fork(0));
         assert_ne!(Seed(0).fork(1).fork(0), Seed(0).fork(0).fork(1));
