@@ -4,18 +4,17 @@
 
 mod common;
 
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 
+use arrow_array::Array;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
-use arrow_array::{Array, RecordBatch};
 use gump_data::{
     Converted, DataError, OutputFormat, ReadOptions, convert, groups, list_files, open, open_with,
     womd, write_tracks,
 };
 use gump_scene::{AgentId, Frame, Scenario};
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use tempfile::TempDir;
 
 fn named(id: &str) -> Scenario {
@@ -133,21 +132,13 @@ fn groups_hold_every_file_once_and_in_order() {
     assert!(gump_data::groups(&[]).is_empty());
 }
 
-fn table(path: &Path) -> RecordBatch {
-    let builder = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap();
-    let mut batches = builder.with_batch_size(1 << 20).build().unwrap();
-    let all = batches.next().unwrap().unwrap();
-    assert!(batches.next().is_none());
-    all
-}
-
 #[test]
 fn a_table_of_tracks_reads_back() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("tracks.parquet");
     let scenarios = ["a", "b"].map(named);
     write_tracks(&path, &scenarios).unwrap();
-    let table = table(&path);
+    let table = common::table(&path);
     let names: Vec<_> = table
         .schema()
         .fields()
@@ -208,7 +199,7 @@ fn tables_are_written_by_conversion_too() {
         &to.path().join("tracks"),
     );
     assert_eq!(converted.scenarios, 4);
-    assert_eq!(table(&converted.files[0]).num_rows(), 4 * 5 * 91);
+    assert_eq!(common::table(&converted.files[0]).num_rows(), 4 * 5 * 91);
 }
 
 #[test]

@@ -2,16 +2,15 @@
 
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
-use std::collections::BTreeSet;
-use std::fs::File;
-use std::path::Path;
+mod common;
 
+use std::collections::BTreeSet;
+
+use arrow_array::Array;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
-use arrow_array::{Array, RecordBatch};
 use gump_data::{Table, write_rollouts};
 use gump_scene::{AgentId, Frame, Rollout, Scenario, fixture};
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 const STEPS: usize = 6;
 
@@ -48,21 +47,13 @@ fn futures() -> (Scenario, Vec<Rollout>) {
     (scenario, futures)
 }
 
-fn read(path: &Path) -> RecordBatch {
-    let builder = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap();
-    let mut batches = builder.with_batch_size(1 << 20).build().unwrap();
-    let all = batches.next().unwrap().unwrap();
-    assert!(batches.next().is_none());
-    all
-}
-
 #[test]
 fn rollouts_stand_in_the_table_to_the_bit() {
     let (scenario, futures) = futures();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("futures.parquet");
     write_rollouts(&path, [("one", &futures[..]), ("two", &futures[..1])]).unwrap();
-    let table = read(&path);
+    let table = common::table(&path);
     // A full grid: three tracks in each of the three futures of the first, two in the second.
     let n_first = 3 * 3 * (STEPS + 1);
     assert_eq!(table.num_rows(), n_first + 2 * (STEPS + 1));
@@ -136,7 +127,7 @@ fn what_is_undefined_is_missing() {
     ];
     assert_eq!((columns, table.n_rows()), (expected.to_vec(), 3));
     table.write(&path).unwrap();
-    let table = read(&path);
+    let table = common::table(&path);
     let nulls: Vec<_> = table.columns().iter().map(|c| c.null_count()).collect();
     assert_eq!(nulls, [1, 1, 2, 1]);
     let n = table.column(1).as_primitive::<Int64Type>();

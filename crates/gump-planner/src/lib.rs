@@ -36,11 +36,27 @@
 //! ```
 //!
 //! # Scoring a planner
-//! A planner of one's own takes the place of `PdmClosed` by implementing `Driver`: a name, and a
-//! trajectory per step; `examples/score_a_planner.rs` has one.
+//! A planner of one's own is a `Driver`: a name, and a trajectory per step.
+//! `examples/score_a_planner.rs` judges this one in three worlds.
 //! ```
-//! use gump_planner::{PdmClosed, closed_loop::drive_scenario};
-//! use gump_rollout::{closed_loop::DriveConfig, worlds::NuplanIdm};
+//! use gump_planner::closed_loop::drive_scenario;
+//! use gump_rollout::{BoxError, closed_loop::*, dynamics::Trajectory, worlds::NuplanIdm};
+//! use gump_scene::EgoState;
+//!
+//! /// Goes on straight at the speed it has.
+//! struct Cruise;
+//! impl Driver for Cruise {
+//!     fn name(&self) -> &str { "cruise" }
+//!     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+//!         let (ego, step) = (*moment.ego, 0.1 * moment.ego.speed());
+//!         let states = (0..=40).map(|i| EgoState {
+//!             time_us: ego.time_us + 100_000 * i,
+//!             rear_axle: ego.rear_axle * gump_geometry::Pose::new(step * i as f64, 0.0, 0.0),
+//!             ..ego
+//!         });
+//!         Ok(Trajectory::new(states.collect())?)
+//!     }
+//! }
 //!
 //! let scenario = gump_scene::fixture::scenario(
 //!     "lane 1: 0,0 300,0 speed 12
@@ -49,9 +65,8 @@
 //!      ego vehicle 0: 10,0 velocity 8,0 size 5.176,2.297
 //!      agent vehicle 1: 60,0 velocity 8,0",
 //! ).unwrap();
-//! let (mut traffic, mut driver) = (NuplanIdm::default(), PdmClosed::default());
-//! let config = DriveConfig::default();
-//! let scored = drive_scenario(&scenario, &mut traffic, &mut driver, &config).unwrap();
+//! let (mut traffic, config) = (NuplanIdm::default(), DriveConfig::default());
+//! let scored = drive_scenario(&scenario, &mut traffic, &mut Cruise, &config).unwrap();
 //! assert_eq!(scored.metrics.collisions.score, 1.0);
 //! assert!(scored.score > 0.5);
 //! ```

@@ -2,9 +2,22 @@
 
 #![allow(dead_code, reason = "each test file uses a part of this")]
 
-use std::path::PathBuf;
+use std::fs::File;
+use std::path::{Path, PathBuf};
 
+use arrow_array::RecordBatch;
 use gump_scene::Scenario;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+/// A Parquet file whose rows fit into one batch.
+pub(crate) fn table(path: &Path) -> RecordBatch {
+    let file = File::open(path).expect("the file was just written");
+    let builder = ParquetRecordBatchReaderBuilder::try_new(file).expect("a Parquet file");
+    let mut batches = builder.with_batch_size(1 << 20).build().expect("a reader");
+    let all = batches.next().expect("one batch").expect("a whole batch");
+    assert!(batches.next().is_none());
+    all
+}
 
 /// A file of the shared data beside the repository; says so and yields `None` if it is absent.
 pub(crate) fn shared(name: &str) -> Option<PathBuf> {
