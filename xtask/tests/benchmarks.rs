@@ -157,6 +157,18 @@ fn largest_difference(rows: &Value, official: &Value) -> f64 {
 }
 
 #[test]
+fn a_planner_that_takes_too_long_is_named_when_nothing_is_left() {
+    let folder = TempDir::new().unwrap();
+    let words = format!(
+        "evaluate closed-loop --scenarios {} --limit 1 --world log --planner simple \
+         --budget-ms 1e-6",
+        mini()
+    );
+    let part = "every scenario failed, the first because: iteration 0: simple: took";
+    fails(&folder, &words, 1, part);
+}
+
+#[test]
 fn motion_numbers_are_the_official_ones() {
     for set in ["gt", "cv", "noise8", "joint8"] {
         let golden = format!("golden/wosac/motion/submission_{set}.binproto");

@@ -33,3 +33,15 @@ pub(crate) enum Verb {
     /// Put the shards of one evaluation together
     Merge(merge::Args),
 }
+
+/// Fails with the first error if no scenario of a report went through.
+fn any_succeeded(scenarios: &[serde_json::Value]) -> anyhow::Result<()> {
+    let errors = scenarios.iter().map(|entry| entry["error"].as_str());
+    match errors.collect::<Option<Vec<&str>>>() {
+        None => Ok(()),
+        Some(errors) => anyhow::bail!(
+            "every scenario failed, the first because: {}",
+            errors.first().unwrap_or(&"there was none")
+        ),
+    }
+}
