@@ -14,11 +14,13 @@ from gump_env import GumpEnv, GumpError, GumpVectorEnv
 
 try:
     import stable_baselines3
+    from gump_sb3 import GumpSb3VecEnv
 except ImportError:
     stable_baselines3 = None
 
 SOCKET = ""
 without_gymnasium = unittest.skipIf(gump_env.gymnasium is None, "no gymnasium here")
+without_sb3 = unittest.skipIf(stable_baselines3 is None, "no stable-baselines3 here")
 
 
 def roam(env, n, seed=0):
@@ -155,7 +157,7 @@ class Env(unittest.TestCase):
 
         check_env(self.env(), skip_render_check=True)
 
-    @unittest.skipIf(stable_baselines3 is None, "no stable-baselines3 here")
+    @without_sb3
     def test_a_known_library_trains(self):
         from stable_baselines3.common.env_checker import check_env
 
@@ -164,6 +166,43 @@ class Env(unittest.TestCase):
         model = stable_baselines3.SAC("MlpPolicy", env, learning_starts=100, seed=0, device="cpu")
         model.learn(300)
         self.assertEqual(model.num_timesteps, 300)
+
+
+class Sb3VecEnv(unittest.TestCase):
+    @without_sb3
+    def test_rows_end_as_the_library_expects(self):
+        env = GumpSb3VecEnv(SOCKET, 3)
+        self.addCleanup(env.close)
+        same = GumpVectorEnv(SOCKET, 3, "same_step")
+        self.addCleanup(same.close)
+        env.seed(7)
+        expected, _ = same.reset(seed=7)
+        self.assertTrue(np.array_equal(env.reset(), expected))
+        ended = 0
+        for _ in range(40):
+            actions = same.sample_actions()
+            observations, rewards, dones, infos = env.step(actions)
+            expected = same.step(actions)
+            self.assertTrue(np.array_equal(observations, expected[0]))
+            self.assertTrue(np.allclose(rewards, expected[1]))
+            self.assertTrue(np.array_equal(dones, expected[2] | expected[3]))
+            for row in np.flatnonzero(dones):
+                last = expected[4]["final_obs"][row]
+                self.assertTrue(np.array_equal(infos[row]["terminal_observation"], last))
+                self.assertEqual(infos[row]["TimeLimit.truncated"], bool(expected[3][row]))
+                ended += 1
+        self.assertGreater(ended, 2)
+
+    @without_sb3
+    def test_a_known_library_trains_on_many_rows(self):
+        env = GumpSb3VecEnv(SOCKET, 4)
+        self.addCleanup(env.close)
+        model = stable_baselines3.PPO("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
+        before = model.policy.action_net.weight.detach().clone()
+        model.learn(512)
+        self.assertEqual(model.num_timesteps, 512)
+        self.assertFalse(bool((before == model.policy.action_net.weight).all()))
+        self.assertGreater(len(model.ep_info_buffer), 0)
 
 
 if __name__ == "__main__":
