@@ -14,6 +14,9 @@ use gump_tokenizer::Field;
 use crate::decoder::STEPS;
 use crate::sampling::{Request, SamplingConfig};
 
+/// Bins that a draw is among, with their logits and then their weights.
+pub(crate) type Candidates = Vec<(usize, f32)>;
+
 /// Draws the bin of a step; `logits` are those of its field's bins, `drawn` the bins of the steps
 /// before, `room` is memory to work in.
 pub(crate) fn draw_field(
@@ -22,7 +25,7 @@ pub(crate) fn draw_field(
     drawn: &[u16],
     request: &Request,
     config: &SamplingConfig,
-    room: &mut Vec<f32>,
+    room: &mut Candidates,
 ) -> u16 {
     let field = STEPS[step];
     debug_assert_eq!(logits.len(), field.n_bins());
@@ -62,7 +65,7 @@ fn draw_masked(
     mask: &[bool],
     uniform: f64,
     config: &SamplingConfig,
-    room: &mut Vec<f32>,
+    room: &mut Candidates,
 ) -> usize {
     let places: Vec<usize> = (0..logits.len()).filter(|i| mask[*i]).collect();
     let left: Vec<f32> = places.iter().map(|i| logits[*i]).collect();
@@ -70,44 +73,44 @@ fn draw_masked(
 }
 
 /// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
-fn draw(logits: &[f32], uniform: f64, config: &SamplingConfig, room: &mut Vec<f32>) -> usize {
-    let best = (0..logits.len()).fold(0, |best, i| if logits[i] > logits[best] { i } else { best });
+fn draw(logits: &[f32], uniform: f64, config: &SamplingConfig, room: &mut Candidates) -> usize {
+    let peak = crate::ops::wide(
+        #[inline(always)]
+        || crate::ops::max(logits),
+    );
+    let best = || logits.iter().position(|l| *l == peak).unwrap_or(0);
     if config.temperature <= 0.0 || config.top_k <= 1 {
-        return best;
+        return best();
     }
-    let (threshold, mut spare) = threshold(logits, config.top_k);
-    // Of equal logits at the threshold the first few are in.
-    let mut chosen = |logit: f32| {
-        if logit == threshold {
-            spare = spare.saturating_sub(1);
-            return spare > 0;
-        }
-        logit > threshold
-    };
-    let peak = logits[best];
-    let inverse = 1.0 / config.temperature;
+    let (threshold, mut spare) = threshold(logits, peak, config.top_k);
     room.clear();
-    room.extend(logits.iter().map(|&logit| {
-        if chosen(logit) {
-            (f64::from(logit - peak) * inverse).exp() as f32
-        } else {
-            0.0
+    for (i, &logit) in logits.iter().enumerate() {
+        if logit == threshold {
+            // Of equal logits at the threshold the first few are in.
+            spare = spare.saturating_sub(1);
         }
-    }));
-    let total: f64 = room.iter().copied().map(f64::from).sum();
+        if logit > threshold || (logit == threshold && spare > 0) {
+            room.push((i, logit));
+        }
+    }
+    let inverse = 1.0 / config.temperature;
+    for (_, logit) in room.iter_mut() {
+        *logit = (f64::from(*logit - peak) * inverse).exp() as f32;
+    }
+    let total: f64 = room.iter().map(|(_, weight)| f64::from(*weight)).sum();
     let mut left = uniform * total;
-    for (i, weight) in room.iter().enumerate() {
+    for (i, weight) in room.iter() {
         left -= f64::from(*weight);
         if left < 0.0 {
-            return i;
+            return *i;
         }
     }
-    best
+    best()
 }
 
 /// The `k`-th largest logit, and one more than how many logits equal to it belong to the `k`
 /// largest; minus infinity where there are no more than `k`.
-fn threshold(logits: &[f32], k: usize) -> (f32, usize) {
+fn threshold(logits: &[f32], peak: f32, k: usize) -> (f32, usize) {
     if k >= logits.len() {
         return (f32::NEG_INFINITY, usize::MAX);
     }
@@ -115,10 +118,6 @@ fn threshold(logits: &[f32], k: usize) -> (f32, usize) {
     let reaches = |key: i32| crate::ops::count_from(logits, float_of(key)) >= k;
     let (mut low, mut high) = (key_of(f32::NEG_INFINITY), key_of(f32::INFINITY));
     // A few steps over the range that logits really have spare most of those over all floats.
-    let peak = crate::ops::wide(
-        #[inline(always)]
-        || crate::ops::max(logits),
-    );
     for reach in [1.0f32, 4.0, 16.0, 64.0] {
         if reaches(key_of(peak - reach)) {
             low = key_of(peak - reach);

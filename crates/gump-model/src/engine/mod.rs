@@ -33,6 +33,7 @@ use self::successor::Successors;
 use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
 use crate::ModelError;
 use crate::batch::PlacedSlot;
+use crate::draw::Candidates;
 use crate::mct::VisualMemory;
 use crate::network::Network;
 use crate::ops::panels::{Panels, Precision, Room};
@@ -366,10 +367,10 @@ impl Engine {
             let at = first * c..(first + group.len()) * c;
             let (q, out) = (&q[at.clone()], &mut attended[at]);
             let visible = |i: usize| keys(&group[i]).1;
-            if group.len() == 1 {
-                attend::<1>(self.heads, pages, q, visible, out, scores);
-            } else {
-                attend::<4>(self.heads, pages, q, visible, out, scores);
+            match group.len() {
+                1 => attend::<1>(self.heads, pages, q, visible, out, scores),
+                2..=4 => attend::<4>(self.heads, pages, q, visible, out, scores),
+                _ => attend::<8>(self.heads, pages, q, visible, out, scores),
             }
             first += group.len();
         }
@@ -420,7 +421,7 @@ fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], k
 /// what lies between two products to stay in the second-level cache.
 fn chunk_rows(rows: usize) -> usize {
     let each = rows.div_ceil(2 * rayon::current_num_threads());
-    each.next_multiple_of(4).clamp(4, 64)
+    each.next_multiple_of(8).clamp(8, 64)
 }
 
 /// Memory that one task works in.
@@ -429,7 +430,7 @@ pub(crate) struct Workroom {
     buffers: [Vec<f32>; 4],
     products: Room,
     /// Candidates of a draw.
-    draws: Vec<f32>,
+    draws: Candidates,
 }
 
 /// What a wave works in: its vectors, `[R, C]`, and their keys and values, `[R, 2C]`.

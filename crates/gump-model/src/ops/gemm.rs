@@ -259,42 +259,38 @@ fn tile_plain<'a, const N: usize>(
     sums
 }
 
+// Vectors are made from arrays by value: loads through pointers are checked in builds with
+// assertions, at every step of the innermost loop.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 fn tile_v4<'a, const N: usize>(
     rows: [&[f32]; N],
     blocks: impl Iterator<Item = &'a [f32]>,
 ) -> [[f32; PANEL]; N] {
-    use std::arch::x86_64::{
-        _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps, _mm512_setzero_ps, _mm512_storeu_ps,
-    };
+    use std::arch::x86_64::{__m512, _mm512_fmadd_ps, _mm512_set1_ps, _mm512_setzero_ps};
     let mut sums = [[_mm512_setzero_ps(); 2]; N];
     let mut at = 0;
     for block in blocks {
-        let depth = block.len() / PANEL;
-        let rows = rows.map(|row| row[at..at + depth].as_ptr());
-        for i in 0..depth {
-            // SAFETY: row i of the block is 32 numbers, and every row was cut to `depth`.
-            unsafe {
-                let b = block.as_ptr().add(i * PANEL);
-                let (low, high) = (_mm512_loadu_ps(b), _mm512_loadu_ps(b.add(PANEL / 2)));
-                for (sums, row) in sums.iter_mut().zip(rows) {
-                    let a = _mm512_set1_ps(*row.add(i));
-                    sums[0] = _mm512_fmadd_ps(a, low, sums[0]);
-                    sums[1] = _mm512_fmadd_ps(a, high, sums[1]);
-                }
+        let block = block.as_chunks::<PANEL>().0;
+        let mut cut = rows;
+        for row in &mut cut {
+            *row = &row[at..at + block.len()];
+        }
+        for (i, b) in block.iter().enumerate() {
+            // SAFETY: 32 numbers are two vectors of 16, and any bits are numbers.
+            let [low, high] = unsafe { std::mem::transmute::<[f32; PANEL], [__m512; 2]>(*b) };
+            for (sums, row) in sums.iter_mut().zip(cut) {
+                let a = _mm512_set1_ps(row[i]);
+                sums[0] = _mm512_fmadd_ps(a, low, sums[0]);
+                sums[1] = _mm512_fmadd_ps(a, high, sums[1]);
             }
         }
-        at += depth;
+        at += block.len();
     }
     let mut out = [[0f32; PANEL]; N];
     for (out, sums) in out.iter_mut().zip(sums) {
-        let (low, high) = out.split_at_mut(PANEL / 2);
-        // SAFETY: each half is 16 numbers of 32 bits.
-        unsafe {
-            _mm512_storeu_ps(low.as_mut_ptr(), sums[0]);
-            _mm512_storeu_ps(high.as_mut_ptr(), sums[1]);
-        }
+        // SAFETY: as above.
+        *out = unsafe { std::mem::transmute::<[__m512; 2], [f32; PANEL]>(sums) };
     }
     out
 }
@@ -311,7 +307,7 @@ pub(super) fn byte_tile<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32
     #[cfg(target_arch = "x86_64")]
     {
         if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni") {
-            // SAFETY: the two features were just detected, the lengths just checked.
+            // SAFETY: the two features were just detected.
             return unsafe { byte_tile_vnni(rows, panel) };
         }
     }
@@ -337,37 +333,31 @@ fn byte_tile_plain<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PAN
     sums
 }
 
-/// SAFETY: rows are as long as the panel is deep, and that is a multiple of 4.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512vnni")]
-unsafe fn byte_tile_vnni<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PANEL]; N] {
+fn byte_tile_vnni<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32; PANEL]; N] {
     use std::arch::x86_64::{
-        _mm512_dpbusd_epi32, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_si512,
-        _mm512_storeu_si512,
+        __m512i, _mm512_dpbusd_epi32, _mm512_set1_epi32, _mm512_setzero_si512,
     };
+    let (groups, _) = panel.as_chunks::<{ 4 * PANEL }>();
+    let mut cut = [&[][..]; N];
+    for (cut, row) in cut.iter_mut().zip(rows) {
+        *cut = &row.as_chunks::<4>().0[..groups.len()];
+    }
     let mut sums = [[_mm512_setzero_si512(); 2]; N];
-    for i in 0..panel.len() / (4 * PANEL) {
-        // SAFETY: group i of the panel is 128 bytes, group i of each row 4, and both exist.
-        unsafe {
-            let group = panel.as_ptr().add(4 * PANEL * i);
-            let low = _mm512_loadu_si512(group.cast());
-            let high = _mm512_loadu_si512(group.add(64).cast());
-            for (sums, row) in sums.iter_mut().zip(rows) {
-                let x = row.as_ptr().add(4 * i).cast::<i32>().read_unaligned();
-                let x = _mm512_set1_epi32(x);
-                sums[0] = _mm512_dpbusd_epi32(sums[0], x, low);
-                sums[1] = _mm512_dpbusd_epi32(sums[1], x, high);
-            }
+    for (i, group) in groups.iter().enumerate() {
+        // SAFETY: 128 bytes are two vectors of 64, and any bits are bytes.
+        let [low, high] = unsafe { std::mem::transmute::<[i8; 4 * PANEL], [__m512i; 2]>(*group) };
+        for (sums, row) in sums.iter_mut().zip(cut) {
+            let x = _mm512_set1_epi32(i32::from_ne_bytes(row[i]));
+            sums[0] = _mm512_dpbusd_epi32(sums[0], x, low);
+            sums[1] = _mm512_dpbusd_epi32(sums[1], x, high);
         }
     }
     let mut out = [[0i32; PANEL]; N];
     for (out, sums) in out.iter_mut().zip(sums) {
-        let (low, high) = out.split_at_mut(PANEL / 2);
-        // SAFETY: each half is 16 numbers of 32 bits.
-        unsafe {
-            _mm512_storeu_si512(low.as_mut_ptr().cast(), sums[0]);
-            _mm512_storeu_si512(high.as_mut_ptr().cast(), sums[1]);
-        }
+        // SAFETY: two vectors are 32 integers.
+        *out = unsafe { std::mem::transmute::<[__m512i; 2], [i32; PANEL]>(sums) };
     }
     out
 }

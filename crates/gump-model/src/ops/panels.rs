@@ -15,8 +15,11 @@ use super::gemm::{byte_tile, tile, wide};
 /// Columns of a panel: two vectors of 512 bits.
 pub(crate) const PANEL: usize = 32;
 
-/// Rows multiplied together.
-const ROWS: usize = 4;
+/// Rows multiplied together: 16 sums in flight hide how long a multiply-add takes.
+const ROWS: usize = 8;
+
+/// Rows that are multiplied together where fewer are left.
+const FEW_ROWS: usize = 4;
 
 /// In which form the weights of linear layers are kept and multiplied.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -166,16 +169,16 @@ impl Panels {
         let Weights::F32(weights) = &self.weights else {
             return self.apply(x, y, room);
         };
-        if rows > ROWS || weights.len() < FEW_WEIGHTS || rayon::current_num_threads() == 1 {
+        if rows > FEW_ROWS || weights.len() < FEW_WEIGHTS || rayon::current_num_threads() == 1 {
             return self.apply(x, y, room);
         }
         let depth = self.n_in * PANEL;
-        let sums: Vec<[[f32; PANEL]; ROWS]> = weights
+        let sums: Vec<[[f32; PANEL]; FEW_ROWS]> = weights
             .par_chunks_exact(depth)
             .with_min_len(FEW_WEIGHTS / (4 * depth))
             .map(|panel| {
                 let row = |r: usize| &x[r.min(rows - 1) * self.n_in..][..self.n_in];
-                tile::<ROWS>(std::array::from_fn(row), std::iter::once(panel))
+                tile::<FEW_ROWS>(std::array::from_fn(row), std::iter::once(panel))
             })
             .collect();
         for (p, sums) in sums.iter().enumerate() {
@@ -197,19 +200,24 @@ impl Panels {
     /// The columns of one panel.
     fn panel_product(&self, x: &[f32], p: usize, panel: &[f32], y: &mut [f32]) {
         let (k, n) = (self.n_in, self.n_out);
-        let rows = x.len() / k;
-        let whole = rows / ROWS * ROWS;
-        for first in (0..whole).step_by(ROWS) {
-            let group = std::array::from_fn(|r| &x[(first + r) * k..][..k]);
-            let sums = tile::<ROWS>(group, std::iter::once(panel));
-            for (r, sums) in sums.iter().enumerate() {
-                self.store(sums, p, &mut y[(first + r) * n..][..n]);
+        let row = |r: usize| &x[r * k..][..k];
+        let panel = || std::iter::once(panel);
+        let mut store = |r: usize, sums: &[f32; PANEL]| self.store(sums, p, &mut y[r * n..][..n]);
+        in_groups(x.len() / k, |group| match group {
+            Group::Many(rows) => {
+                let sums = tile::<ROWS>(rows.map(row), panel());
+                rows.into_iter()
+                    .zip(&sums)
+                    .for_each(|(r, sums)| store(r, sums));
             }
-        }
-        for row in whole..rows {
-            let [sums] = tile::<1>([&x[row * k..][..k]], std::iter::once(panel));
-            self.store(&sums, p, &mut y[row * n..][..n]);
-        }
+            Group::Few(rows) => {
+                let sums = tile::<FEW_ROWS>(rows.map(row), panel());
+                rows.into_iter()
+                    .zip(&sums)
+                    .for_each(|(r, sums)| store(r, sums));
+            }
+            Group::One(r) => store(r, &tile::<1>([row(r)], panel())[0]),
+        });
     }
 
     fn byte_product(
@@ -249,15 +257,45 @@ impl Panels {
                     },
                 );
             };
-            let whole = rows / ROWS * ROWS;
-            for first in (0..whole).step_by(ROWS) {
-                let sums = byte_tile::<ROWS>(std::array::from_fn(|r| row(first + r)), panel);
-                (0..ROWS).for_each(|r| store(first + r, &sums[r]));
-            }
-            for r in whole..rows {
-                store(r, &byte_tile::<1>([row(r)], panel)[0]);
-            }
+            in_groups(rows, |group| match group {
+                Group::Many(rows) => {
+                    let sums = byte_tile::<ROWS>(rows.map(row), panel);
+                    rows.into_iter()
+                        .zip(&sums)
+                        .for_each(|(r, sums)| store(r, sums));
+                }
+                Group::Few(rows) => {
+                    let sums = byte_tile::<FEW_ROWS>(rows.map(row), panel);
+                    rows.into_iter()
+                        .zip(&sums)
+                        .for_each(|(r, sums)| store(r, sums));
+                }
+                Group::One(r) => store(r, &byte_tile::<1>([row(r)], panel)[0]),
+            });
         }
+    }
+}
+
+/// Rows that go through a kernel together; the last of them may stand there several times.
+enum Group {
+    Many([usize; ROWS]),
+    Few([usize; FEW_ROWS]),
+    One(usize),
+}
+
+/// All rows in as few groups as their number allows.
+#[inline(always)]
+fn in_groups(rows: usize, mut work: impl FnMut(Group)) {
+    let mut first = 0;
+    while first < rows {
+        let row = |r: usize| (first + r).min(rows - 1);
+        let (group, n) = match rows - first {
+            1 => (Group::One(first), 1),
+            2..=FEW_ROWS => (Group::Few(std::array::from_fn(row)), FEW_ROWS),
+            _ => (Group::Many(std::array::from_fn(row)), ROWS),
+        };
+        work(group);
+        first += n;
     }
 }
 

@@ -46,6 +46,10 @@ pub(crate) struct Args {
         default_value = "1,32"
     )]
     futures: Vec<usize>,
+    /// Only these ways of decoding, as `ORDER/CACHE`, `partial-ar/growing` for instance; all
+    /// others are left out
+    #[arg(long, value_name = "WAY,...", value_delimiter = ',')]
+    only: Vec<String>,
     /// In which form the weights are multiplied
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
@@ -158,6 +162,10 @@ impl Args {
         for &n_futures in &self.futures {
             for way in &WAYS {
                 stop_if_interrupted()?;
+                let is = |only: &String| *only == format!("{}/{}", way.name, way.cache);
+                if !self.only.is_empty() && !self.only.iter().any(is) {
+                    continue;
+                }
                 // Without a shared prefix to gain from, 32 uncached futures cost 32 times one.
                 let tedious = way.mode == Mode::FullAr && n_futures > 1;
                 if tedious && (self.quick || way.kept == CacheMode::None) {
