@@ -149,7 +149,7 @@ impl Cli {
             }
             Verb::Ablate(ablate::Verb::Quantization(args)) => {
                 Run::of("ablate quantization", &args.common, &args)?
-                    .execute(|run| args.execute(run))
+                    .execute(|run| args.execute(run, Knob::Precision))
             }
             Verb::Ablate(ablate::Verb::Temperature(args)) => {
                 Run::of("ablate temperature", &args.common, &args)?

@@ -166,11 +166,12 @@ impl Surroundings {
     ///
     /// Error: weights that cannot be read.
     pub(crate) fn load(
+        device: &Device,
         name: &WorldName,
         sampling: &gump_model::SamplingConfig,
     ) -> anyhow::Result<Self> {
         let learned = match name {
-            WorldName::Model(_) => Some(World::without_log(&Device::Cpu, name, sampling)?),
+            WorldName::Model(_) => Some(World::without_log(device, name, sampling)?),
             _ => None,
         };
         Ok(Self {
@@ -185,6 +186,7 @@ impl Surroundings {
     ///
     /// Error: weights that cannot be read.
     pub(crate) fn load_imagination(
+        device: &Device,
         name: &WorldName,
         sampling: &gump_model::SamplingConfig,
     ) -> anyhow::Result<Self> {
@@ -192,7 +194,7 @@ impl Surroundings {
             cache: gump_model::CacheMode::Growing,
             ..sampling.clone()
         };
-        Self::load(name, &growing)
+        Self::load(device, name, &growing)
     }
 
     /// A world to imagine in: the network where there is one, else reactive rules.

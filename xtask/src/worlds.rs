@@ -68,21 +68,11 @@ pub(crate) enum World {
 }
 
 impl World {
-    /// Builds the world on the CPU; only `log` looks at more than the present of the scenario.
+    /// Builds the world, a network on `device`; only `log` looks at more than the present of the
+    /// scenario.
     ///
     /// Error: weights that cannot be read or do not fit.
     pub(crate) fn build(
-        name: &WorldName,
-        scenario: &Scenario,
-        sampling: &SamplingConfig,
-    ) -> anyhow::Result<Self> {
-        Self::build_on(&Device::Cpu, name, scenario, sampling)
-    }
-
-    /// As [`World::build`], with a network on `device`.
-    ///
-    /// Error: weights that cannot be read or do not fit.
-    pub(crate) fn build_on(
         device: &Device,
         name: &WorldName,
         scenario: &Scenario,
@@ -149,6 +139,7 @@ impl World {
 /// One world for many scenarios: loaded once, but for the log, which is another world in every
 /// scenario.
 pub(crate) struct Worlds<'a> {
+    device: Device,
     name: &'a WorldName,
     sampling: SamplingConfig,
     loaded: Option<World>,
@@ -156,8 +147,9 @@ pub(crate) struct Worlds<'a> {
 
 impl<'a> Worlds<'a> {
     /// Names a world; nothing is loaded yet.
-    pub(crate) fn new(name: &'a WorldName, sampling: SamplingConfig) -> Self {
+    pub(crate) fn new(device: &Device, name: &'a WorldName, sampling: SamplingConfig) -> Self {
         Self {
+            device: device.clone(),
             name,
             sampling,
             loaded: None,
@@ -170,7 +162,7 @@ impl<'a> Worlds<'a> {
     pub(crate) fn of(&mut self, scenario: &Scenario) -> anyhow::Result<&World> {
         let world = match self.loaded.take() {
             Some(world) if *self.name != WorldName::Log => world,
-            _ => World::build(self.name, scenario, &self.sampling)?,
+            _ => World::build(&self.device, self.name, scenario, &self.sampling)?,
         };
         Ok(self.loaded.insert(world))
     }

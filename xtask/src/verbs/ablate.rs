@@ -1,7 +1,6 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
 mod decoding;
-mod quantization;
 
 use std::num::NonZeroUsize;
 
@@ -26,7 +25,7 @@ pub(crate) enum Verb {
     /// Decoding one agent after another (full-AR) against all at once (partial-AR)
     Nar(Args),
     /// Weights in 32, 16 and 8 bits
-    Quantization(quantization::Args),
+    Quantization(decoding::Args),
     /// Realism over the temperature of the draws
     Temperature(decoding::Args),
     /// Realism over the weight of earlier predictions
@@ -112,7 +111,7 @@ impl Args {
             matches!(world, WorldName::Model(_)),
             "--world: expected model:WEIGHTS, since rules decode nothing, found {world}"
         );
-        let world = World::build(&world, scenario, &self.draw.resolve(mode)?)?;
+        let world = World::build(run.device(), &world, scenario, &self.draw.resolve(mode)?)?;
         run.phase(phase, |run| {
             let (n, seed) = (self.futures.get(), run.seed());
             imagine(run, &world, scenario.present(), n, self.seconds, seed)

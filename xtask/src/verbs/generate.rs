@@ -12,7 +12,7 @@ use gump_model::generation::factory::{Made, Order, make_many};
 use gump_model::generation::verdict::{off_road, overlaps};
 use gump_model::generation::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
 use gump_model::world::TransformerWorld;
-use gump_model::{SamplingConfig, checkpoint};
+use gump_model::{Device, SamplingConfig, checkpoint};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
 use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
 use serde::Serialize;
@@ -112,7 +112,9 @@ impl Args {
         self.check_numbers()?;
         let objects = self.objects()?;
         let recorded = run.phase("read", |_| Ok(find(&self.map)?))?;
-        let world = run.phase("load", |_| world(self.weights.as_ref(), self.life))?;
+        let world = run.phase("load", |run| {
+            world(run.device(), self.weights.as_ref(), self.life)
+        })?;
         let order = Order {
             request: GenerateRequest {
                 prompts,
@@ -216,7 +218,11 @@ pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
 /// The world that generates.
 ///
 /// Error: weights that cannot be read.
-pub(crate) fn world(weights: Option<&PathBuf>, life: bool) -> anyhow::Result<TransformerWorld> {
+pub(crate) fn world(
+    device: &Device,
+    weights: Option<&PathBuf>,
+    life: bool,
+) -> anyhow::Result<TransformerWorld> {
     let path = match weights {
         Some(path) => path.clone(),
         None => {
@@ -224,7 +230,7 @@ pub(crate) fn world(weights: Option<&PathBuf>, life: bool) -> anyhow::Result<Tra
             shipped::weights()
         }
     };
-    let network = checkpoint::load(&path, &gump_model::Device::Cpu)?;
+    let network = checkpoint::load(&path, device)?;
     let sampling = SamplingConfig {
         life,
         ..SamplingConfig::default()

@@ -82,10 +82,12 @@ impl Args {
         self.driving.check()?;
         let sampling = self.sampling.resolve()?;
         let case = run.phase("read", |_| recordings::find(&self.scenario))?;
-        let surroundings = run.phase("load", |_| Surroundings::load(&self.world, &sampling))?;
+        let surroundings = run.phase("load", |run| {
+            Surroundings::load(run.device(), &self.world, &sampling)
+        })?;
         let seed = run.seed();
-        let imagined = run.phase("load", |_| {
-            Surroundings::load_imagination(&self.world, &sampling)
+        let imagined = run.phase("load", |run| {
+            Surroundings::load_imagination(run.device(), &self.world, &sampling)
         })?;
         let imagination = imagined.imagination();
         let inner = self

@@ -76,7 +76,7 @@ impl Args {
         let sampling = self.sampling.resolve()?;
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
         let world = run.phase("load", |run| {
-            World::build_on(run.device(), &self.world, &scenario, &sampling)
+            World::build(run.device(), &self.world, &scenario, &sampling)
         })?;
         let imagined = run.phase("imagine", |run| {
             let (n, seed) = (self.futures.get(), run.seed());

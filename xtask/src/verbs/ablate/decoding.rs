@@ -1,21 +1,24 @@
-//! `ablate temperature|decay|history|chunking`: how decoding changes realism.
+//! `ablate temperature|decay|history|chunking|quantization`: how decoding changes realism, and what
+//! it costs.
 //!
 //! One knob at a time; scenes, seeds and weights stay. Realism is that of the Waymo Sim Agents
 //! Challenge, since displacements alone would reward timid futures.
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_metrics::interval;
 use gump_metrics::wosac::{Config, Reference, Scores, Year};
-use gump_model::{Mode, SamplingConfig, Surrogate};
+use gump_model::{Mode, Precision, SamplingConfig, Surrogate};
 use gump_scene::Seed;
 use gump_viz::{Chart, Series};
 use serde::Serialize;
 use serde_json::json;
 
 use crate::cli::WrongArguments;
+use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
 use crate::verbs::evaluate::wosac::{Source, recordings};
@@ -48,6 +51,18 @@ pub(crate) enum Knob {
     Decay,
     History,
     Chunking,
+    Precision,
+}
+
+/// Frames of a rollout: 8 s, half a second apart.
+const FRAMES: f64 = 16.0;
+
+/// Seconds that a frame of one future takes, opening the session included.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cost {
+    wall: f64,
+    /// Of processor time.
+    cpu: f64,
 }
 
 /// One setting of a knob: what the table calls it, its place on the axis, how to decode.
@@ -61,12 +76,13 @@ impl Knob {
             Self::Decay => "decay (0: no averaging)",
             Self::History => "frames of history, half a second apart",
             Self::Chunking => "what is made of the four poses of a chunk",
+            Self::Precision => "form of the weights",
         }
     }
 
     /// Whether its settings are numbers, and not ways.
     fn is_numeric(self) -> bool {
-        !matches!(self, Self::Chunking)
+        !matches!(self, Self::Chunking | Self::Precision)
     }
 
     fn settings(self, base: &SamplingConfig) -> Vec<Setting> {
@@ -102,6 +118,21 @@ impl Knob {
                 };
                 ways.into_iter().enumerate().map(setting).collect()
             }
+            Self::Precision => {
+                let forms = [
+                    ("f32", Precision::F32),
+                    ("bf16", Precision::Bf16),
+                    ("int8", Precision::Int8),
+                ];
+                let setting = |(i, (name, precision)): (usize, (&str, _))| {
+                    let config = SamplingConfig {
+                        precision,
+                        ..base.clone()
+                    };
+                    (name.to_owned(), (i + 1) as f64, config)
+                };
+                forms.into_iter().enumerate().map(setting).collect()
+            }
         }
     }
 }
@@ -117,10 +148,12 @@ impl Args {
         let path = self.scenarios.clone().unwrap_or_else(procedural);
         run.setting("scenarios", path.display().to_string())?;
         let settings = knob.settings(&self.draw.resolve(Mode::PartialAr)?);
-        let mut rows = Vec::new();
+        let (mut rows, mut first) = (Vec::new(), None);
         let (mut curve, mut ways) = (Series::default(), Vec::new());
         for (name, at, sampling) in settings {
-            let scores = run.phase(&name, |run| self.score(run, &path, &world, sampling))?;
+            let bits = sampling.precision.bits();
+            let (scores, cost) =
+                run.phase(&name, |run| self.score(run, &path, &world, sampling))?;
             let mean = Scores::mean(&scores)
                 .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
             let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
@@ -141,6 +174,10 @@ impl Args {
                 "ade": mean.ade,
                 "collision_rate": mean.collision_rate,
                 "offroad_rate": mean.offroad_rate,
+                "bits": bits,
+                "ratio": *first.get_or_insert(cost.cpu) / cost.cpu,
+                "frames_per_second": 1.0 / cost.wall,
+                "cpu_milliseconds_per_frame": 1e3 * cost.cpu,
             }));
         }
         run.result("rows", rows)?;
@@ -161,21 +198,29 @@ impl Args {
         path: &std::path::Path,
         world: &WorldName,
         sampling: SamplingConfig,
-    ) -> anyhow::Result<Vec<Scores>> {
+    ) -> anyhow::Result<(Vec<Scores>, Cost)> {
         let config = Config::of(Year::Y2025);
         let n = self.rollouts_per_scenario.get();
         let mut source = Source::world(world.clone(), sampling, n, run.seed());
         let progress = run.progress("evaluating", 0, "scenarios");
-        let mut all = Vec::new();
+        let (mut all, mut cost, mut frames) = (Vec::new(), Cost::default(), 0.0);
         for recorded in recordings(path, source.read_options(), |_| true)? {
             stop_if_interrupted()?;
             let recorded = recorded?;
+            let (cpu, began) = (cpu_seconds(), Instant::now());
             let rollouts = source.rollouts(run, &recorded, config.mode)?;
+            let wall = began.elapsed().as_secs_f64();
+            let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
+            cost.cpu += cpu.map_or(wall, spent);
+            cost.wall += wall;
+            frames += n as f64 * FRAMES;
             let reference = Reference::new(&recorded.log, &config)?;
             all.push(reference.evaluate(&rollouts)?.scores);
             progress.advance(1);
         }
-        Ok(all)
+        cost.cpu /= frames;
+        cost.wall /= frames;
+        Ok((all, cost))
     }
 }
 

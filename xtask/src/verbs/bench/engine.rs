@@ -215,7 +215,7 @@ impl Args {
             precision: self.precision.resolve(),
             ..SamplingConfig::default()
         };
-        let network = Network::random(config, run.seed(), &gump_model::Device::Cpu)?;
+        let network = Network::random(config, run.seed(), run.device())?;
         Ok(if way.engine {
             TransformerWorld::new(network, sampling)
         } else {

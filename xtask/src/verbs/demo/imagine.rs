@@ -1,8 +1,7 @@
 //! What comes of it: futures in every world, their metrics, and a plan.
 
 use gump_metrics::summarize;
-use gump_model::checkpoint;
-use gump_model::{Device, world::TransformerWorld};
+use gump_model::{checkpoint, world::TransformerWorld};
 use gump_planner::{Interactive, InteractiveConfig, Plan, Planner as _};
 use gump_scene::{Rollout, SceneState};
 use gump_viz::{Camera, CandidatePath, FilmSpec, overlay_film};
@@ -36,7 +35,7 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         if world == WorldName::Log && scenario.future().is_empty() {
             continue;
         }
-        let world = World::build(&world, scenario, &demo.sampling)?;
+        let world = World::build(run.device(), &world, scenario, &demo.sampling)?;
         let imagined = imagine(
             run,
             &world,
@@ -118,7 +117,7 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
 }
 
 pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
-    let network = checkpoint::load(&shipped::weights(), &Device::Cpu)?;
+    let network = checkpoint::load(&shipped::weights(), run.device())?;
     let world = TransformerWorld::new(network, demo.sampling.clone());
     let config = InteractiveConfig {
         n_futures: PLANNED,

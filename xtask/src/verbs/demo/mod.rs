@@ -124,7 +124,12 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
         ))
         .futures(&demo.futures);
     told::realism(&mut viewer, &demo.scenario, &demo.futures);
-    let world = World::build(&shipped::world(), &demo.scenario, &demo.sampling)?;
+    let world = World::build(
+        run.device(),
+        &shipped::world(),
+        &demo.scenario,
+        &demo.sampling,
+    )?;
     let scene = demo.scenario.present();
     told::heat(run, &mut viewer, world, scene, 1, imagine::SECONDS)?;
     for candidate in &demo.candidates {

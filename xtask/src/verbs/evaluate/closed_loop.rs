@@ -172,13 +172,15 @@ impl Args {
             .as_ref()
             .or_else(|| self.world.iter().find(learned));
         let imagination = imagination.unwrap_or(&WorldName::Idm);
-        let imagined = run.phase("load", |_| {
-            Surroundings::load_imagination(imagination, &sampling)
+        let imagined = run.phase("load", |run| {
+            Surroundings::load_imagination(run.device(), imagination, &sampling)
         })?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         let mut worlds = Vec::new();
         for world in &self.world {
-            let surroundings = run.phase("load", |_| Surroundings::load(world, &sampling))?;
+            let surroundings = run.phase("load", |run| {
+                Surroundings::load(run.device(), world, &sampling)
+            })?;
             let mut drives = Vec::new();
             for &planner in &self.planner {
                 let drive = Drive {

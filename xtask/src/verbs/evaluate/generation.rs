@@ -108,7 +108,9 @@ struct Tally {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let world = run.phase("load", |_| generate::world(self.weights.as_ref(), false))?;
+        let world = run.phase("load", |run| {
+            generate::world(run.device(), self.weights.as_ref(), false)
+        })?;
         let protocol = MmdProtocol {
             min_vehicles: self.min_vehicles,
             ..MmdProtocol::gump()

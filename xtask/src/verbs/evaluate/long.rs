@@ -52,7 +52,7 @@ pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Re
     let mut rows = vec![row("log", &logged, &logged)];
     for (name, life) in [("those who are there", false), ("life", true)] {
         stop_if_interrupted()?;
-        let world = generate::world(weights, life)?;
+        let world = generate::world(run.device(), weights, life)?;
         let imagined = imagined(&world, &scenarios, seed)?;
         rows.push(row(name, &imagined, &logged));
     }

@@ -50,8 +50,8 @@ type Outcome = (String, anyhow::Result<OpenLoop>);
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let sampling = self.sampling.resolve()?;
-        let surroundings = run.phase("load", |_| {
-            Surroundings::load_imagination(&self.world, &sampling)
+        let surroundings = run.phase("load", |run| {
+            Surroundings::load_imagination(run.device(), &self.world, &sampling)
         })?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         for &planner in &self.planner {

@@ -175,7 +175,7 @@ impl Args {
             }
         }
         if let Some(world) = &self.source.world {
-            let mut worlds = Worlds::new(world, self.sampling.resolve()?);
+            let mut worlds = Worlds::new(run.device(), world, self.sampling.resolve()?);
             let scenarios = open_with(&self.scenarios, ReadOptions::ALL)?;
             for (index, record) in scenarios.enumerate() {
                 let scenario = record?.scenario;

@@ -13,6 +13,7 @@ use gump_data::{ReadOptions, open_with};
 use gump_metrics::motion::{
     MotionConfig, PredictionScore, ShapeRules, evaluate_predictions, forecast,
 };
+use gump_model::Device;
 use gump_scene::{Prediction, Scenario};
 use serde::{Deserialize, Serialize};
 
@@ -94,7 +95,7 @@ impl Shapes {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
-        let mut forecaster = run.phase("load", |_| self.forecaster())?;
+        let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
         let header = self.header(run)?;
         let mut ledger = Ledger::open(run.out(), &header)?;
         let mut ids = BTreeSet::new();
@@ -134,11 +135,11 @@ impl Args {
         Ok(open_with(&self.scenarios, options)?)
     }
 
-    fn forecaster(&self) -> anyhow::Result<Forecaster<'_>> {
+    fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
         Ok(match (&self.source.rollouts, &self.source.world) {
             (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
             (None, Some(name)) => Forecaster::World {
-                worlds: Worlds::new(name, self.sampling.resolve()?),
+                worlds: Worlds::new(device, name, self.sampling.resolve()?),
                 n_futures: self.futures.get(),
             },
             (None, None) => anyhow::bail!("expected --rollouts or --world"),

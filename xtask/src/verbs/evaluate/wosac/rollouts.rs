@@ -127,7 +127,7 @@ impl Source {
                 built,
             } => {
                 if built.is_none() || *name == WorldName::Log {
-                    *built = Some(World::build(name, scenario, sampling)?);
+                    *built = Some(World::build(run.device(), name, scenario, sampling)?);
                 }
                 let world = built.as_ref().context("the world has just been built")?;
                 // Worlds without chance imagine one future; it stands for all.
