@@ -3,7 +3,8 @@
 //! Objects of a frame are drawn independently, given surrogates of each other, so two of them may
 //! choose the same place. Who would overlap another within the next second and a half is drawn
 //! again, a few times at most, and the draw that stays clear longest is kept; so is a vehicle that
-//! would cross the edge of the road. Who finds no clear way brakes, if that helps. The paper does
+//! would cross the edge of the road. Who finds no clear way brakes, if that helps. In full
+//! autoregression, objects give way to those drawn before them. The paper does
 //! none of this; without it, chance alone makes collisions that no driver of the log would have had.
 
 use std::borrow::Borrow;
@@ -25,56 +26,80 @@ const BRAKING: f64 = 5.0;
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
 
-/// Draws again, up to `config.redraws` times, what is not clear. `draw` decodes the objects that
-/// it is given, each by its window and its place there.
-pub(crate) fn redraw<E>(
-    windows: &[impl Borrow<Window> + Sync],
-    decoded: &mut [Vec<Bins>],
-    config: &SamplingConfig,
-    mut draw: impl FnMut(&[(usize, usize)], &[Request]) -> Result<Vec<Bins>, E>,
-) -> Result<(), E> {
-    if config.redraws == 0 {
-        return Ok(());
+/// The objects of some windows as far as they have been drawn.
+pub(crate) struct Clearance<'a, W> {
+    windows: &'a [W],
+    config: &'a SamplingConfig,
+    crowds: Vec<Crowd>,
+}
+
+impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
+    /// Nothing has been drawn yet.
+    pub(crate) fn new(windows: &'a [W], config: &'a SamplingConfig) -> Self {
+        Self {
+            windows,
+            config,
+            crowds: windows.iter().map(|_| Crowd::default()).collect(),
+        }
     }
-    let mut crowds: Vec<Crowd> = windows
-        .par_iter()
-        .zip(decoded.par_iter())
-        .map(|(window, bins)| Crowd::new(window.borrow(), bins, config))
-        .collect();
-    for attempt in 0..config.redraws {
-        let unclear = crowds.par_iter().enumerate().flat_map_iter(|(w, crowd)| {
-            let unclear = crowd.unclear();
-            unclear.into_iter().map(move |i| (w, i))
-        });
-        let unclear: Vec<(usize, usize)> = unclear.collect();
-        if unclear.is_empty() {
+
+    /// Draws again, up to `config.redraws` times, what is not clear among the objects of `decoded`
+    /// that have come since the last call; those before them stay. `draw` decodes the objects that
+    /// it is given, each by its window and its place there.
+    pub(crate) fn settle<E>(
+        &mut self,
+        decoded: &mut [Vec<Bins>],
+        mut draw: impl FnMut(&[(usize, usize)], &[Request]) -> Result<Vec<Bins>, E>,
+    ) -> Result<(), E> {
+        let Self {
+            windows,
+            config,
+            crowds,
+        } = self;
+        if config.redraws == 0 {
             return Ok(());
         }
-        let again = |&(w, i): &(usize, usize)| {
-            let request = windows[w].borrow().requests[i].clone();
-            let stream = request.stream.fork(REDRAW + attempt as u64);
-            Request { stream, ..request }
-        };
-        let requests: Vec<Request> = unclear.iter().map(again).collect();
-        let draws = draw(&unclear, &requests)?;
-        for ((&(w, i), request), bins) in unclear.iter().zip(&requests).zip(draws) {
-            if crowds[w].improve(i, foreseen(request, &bins, config)) {
-                decoded[w][i] = bins;
+        let firsts: Vec<usize> = crowds.iter().map(|crowd| crowd.members.len()).collect();
+        crowds
+            .par_iter_mut()
+            .zip(windows.par_iter())
+            .zip(decoded.par_iter())
+            .for_each(|((crowd, window), bins)| crowd.admit(window.borrow(), bins, config));
+        for attempt in 0..config.redraws {
+            let unclear = crowds.par_iter().enumerate().flat_map_iter(|(w, crowd)| {
+                let unclear = crowd.unclear(firsts[w]);
+                unclear.into_iter().map(move |i| (w, i))
+            });
+            let unclear: Vec<(usize, usize)> = unclear.collect();
+            if unclear.is_empty() {
+                return Ok(());
             }
-        }
-    }
-    for ((window, crowd), decoded) in windows.iter().zip(&mut crowds).zip(decoded) {
-        for i in crowd.unclear() {
-            let request = &window.borrow().requests[i];
-            let Some(bins) = crowd.members[i].brake(request, &decoded[i]) else {
-                continue;
+            let again = |&(w, i): &(usize, usize)| {
+                let request = windows[w].borrow().requests[i].clone();
+                let stream = request.stream.fork(REDRAW + attempt as u64);
+                Request { stream, ..request }
             };
-            if crowd.improve(i, foreseen(request, &bins, config)) {
-                decoded[i] = bins;
+            let requests: Vec<Request> = unclear.iter().map(again).collect();
+            let draws = draw(&unclear, &requests)?;
+            for ((&(w, i), request), bins) in unclear.iter().zip(&requests).zip(draws) {
+                if crowds[w].improve(i, foreseen(request, &bins, config)) {
+                    decoded[w][i] = bins;
+                }
             }
         }
+        for ((w, crowd), decoded) in crowds.iter_mut().enumerate().zip(decoded) {
+            for i in crowd.unclear(firsts[w]) {
+                let request = &windows[w].borrow().requests[i];
+                let Some(bins) = crowd.members[i].brake(request, &decoded[i]) else {
+                    continue;
+                };
+                if crowd.improve(i, foreseen(request, &bins, config)) {
+                    decoded[i] = bins;
+                }
+            }
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// Where an object will be, scene frame.
@@ -87,6 +112,7 @@ fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> [Pose; P
 }
 
 /// The objects of a window.
+#[derive(Default)]
 struct Crowd {
     members: Vec<Member>,
 }
@@ -162,7 +188,8 @@ impl Member {
 }
 
 impl Crowd {
-    fn new(window: &Window, decoded: &[Bins], config: &SamplingConfig) -> Self {
+    /// Takes in the objects that `decoded` has more.
+    fn admit(&mut self, window: &Window, decoded: &[Bins], config: &SamplingConfig) {
         let last = window.history.last();
         let of_last = |id: u16| -> Option<&QuantizedState> {
             let agent = last?.agents().find(|agent| agent.key.id == id)?;
@@ -173,7 +200,8 @@ impl Crowd {
             .tracked
             .iter()
             .zip(&window.requests)
-            .zip(decoded);
+            .zip(decoded)
+            .skip(self.members.len());
         let member =
             |((agent, request), bins): ((&gump_tokenizer::TokenAgent, &Request), &Bins)| {
                 let size = |field: Field| field.dequantize(agent.state.get(field));
@@ -194,27 +222,27 @@ impl Crowd {
                 }
                 member
             };
-        Self {
-            members: members.map(member).collect(),
-        }
+        let new: Vec<Member> = members.map(member).collect();
+        self.members.extend(new);
     }
 
-    /// Who should be drawn again: who leaves the road, and of two that get into each other's way the
-    /// one that moves more.
-    fn unclear(&self) -> Vec<usize> {
+    /// Who of those from `first` on should be drawn again: who leaves the road, and of two that get
+    /// into each other's way the one that moves more, unless only the other may be.
+    fn unclear(&self, first: usize) -> Vec<usize> {
         let leaves = |member: &Member| member.poses_on_road(&member.ahead) < POSES;
         let mut unclear: Vec<bool> = self.members.iter().map(leaves).collect();
         for (i, a) in self.members.iter().enumerate() {
-            for (j, b) in self.members.iter().enumerate().skip(i + 1) {
+            for (j, b) in self.members.iter().enumerate().skip(first.max(i + 1)) {
                 if clear_poses(a, &a.ahead, b) == POSES {
                     continue;
                 }
-                let a_gives_way = b.is_driven || (!a.is_driven && a.moves() > b.moves());
+                let a_gives_way =
+                    i >= first && (b.is_driven || (!a.is_driven && a.moves() > b.moves()));
                 unclear[if a_gives_way { i } else { j }] = true;
             }
         }
         let driven = |i: &usize| self.members[*i].is_driven;
-        (0..unclear.len())
+        (first..unclear.len())
             .filter(|i| unclear[*i] && !driven(i))
             .collect()
     }
@@ -293,13 +321,13 @@ mod tests {
         let mut crowd = Crowd {
             members: vec![member(10.0, 0.0), member(0.0, 5.0), member(-20.0, 1.0)],
         };
-        assert_eq!(crowd.unclear(), [1]);
+        assert_eq!(crowd.unclear(0), [1]);
         // Into the other at the second pose: no better than before. At the third: better.
         assert!(!crowd.improve(1, member(0.0, 4.0).ahead));
         assert!(crowd.improve(1, member(0.0, 2.5).ahead));
-        assert_eq!(crowd.unclear(), [1]);
+        assert_eq!(crowd.unclear(0), [1]);
         assert!(crowd.improve(1, member(0.0, 1.0).ahead));
-        assert!(crowd.unclear().is_empty());
+        assert!(crowd.unclear(0).is_empty());
     }
 
     #[test]
@@ -311,11 +339,19 @@ mod tests {
         let crowd = Crowd {
             members: vec![member(10.0, 0.0), driven],
         };
-        assert_eq!(crowd.unclear(), [0]);
+        assert_eq!(crowd.unclear(0), [0]);
+        let yielding = Crowd {
+            members: vec![member(0.0, 5.0), member(10.0, 0.0)],
+        };
+        // The first is settled, so the other must find another way.
+        assert_eq!(
+            (yielding.unclear(0), yielding.unclear(1)),
+            (vec![0], vec![1])
+        );
         let touching = Crowd {
             members: vec![member(3.0, 0.0), member(0.0, 1.0)],
         };
-        assert!(touching.unclear().is_empty());
+        assert!(touching.unclear(0).is_empty());
     }
 
     #[test]
@@ -333,10 +369,10 @@ mod tests {
             crowd.members[0].poses_on_road(&crowd.members[0].ahead),
             POSES - 1
         );
-        assert_eq!(crowd.unclear(), [0]);
+        assert_eq!(crowd.unclear(0), [0]);
         assert!(!crowd.improve(0, member(0.0, 5.0).ahead));
         assert!(crowd.improve(0, member(0.0, 2.0).ahead));
-        assert!(crowd.unclear().is_empty());
+        assert!(crowd.unclear(0).is_empty());
     }
 
     #[test]

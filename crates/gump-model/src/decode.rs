@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::batch::{PlacedSlot, place};
-use crate::clearance::redraw;
+use crate::clearance::Clearance;
 use crate::engine::{Context, Engine, Job, SceneMemory};
 use crate::outlook::{Seen, Watch};
 use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
@@ -152,7 +152,7 @@ impl Step<'_> {
             let requests: Vec<&Request> = requests.iter().collect();
             Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
         };
-        let Ok(()) = redraw(self.windows, &mut decoded, self.sampling, again);
+        let Ok(()) = Clearance::new(self.windows, self.sampling).settle(&mut decoded, again);
         let watched = self.windows.iter().take(self.watch.futures).enumerate();
         let watched =
             watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
@@ -172,6 +172,7 @@ impl Step<'_> {
         let most = (0..self.windows.len()).map(n).max().unwrap_or(0);
         let mut decoded: Vec<Vec<Bins>> = vec![Vec::new(); self.windows.len()];
         let mut seen = Vec::new();
+        let mut clearance = Clearance::new(self.windows, self.sampling);
         for i in 0..most {
             let mut members = Vec::new();
             let mut jobs: Vec<Job<'_>> = Vec::new();
@@ -202,12 +203,24 @@ impl Step<'_> {
             let bins = self.engine.sample(&hidden, &requests, self.sampling);
             let rows = members.iter().zip(hidden.chunks(self.engine.width()));
             seen.extend(rows.filter_map(|(w, hidden)| self.look(*w, i, hidden)));
-            for ((w, bins), request) in members.into_iter().zip(bins).zip(requests) {
-                let settled = request.settle(&bins, self.sampling);
+            for (w, bins) in members.iter().zip(bins) {
+                decoded[*w].push(bins);
+            }
+            let again = |who: &[(usize, usize)], requests: &[Request]| {
+                let row = |(w, _): &(usize, usize)| members.partition_point(|member| member < w);
+                let c = self.engine.width();
+                let rows = who.iter().flat_map(|who| &hidden[row(who) * c..][..c]);
+                let rows: Vec<f32> = rows.copied().collect();
+                let requests: Vec<&Request> = requests.iter().collect();
+                Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
+            };
+            let Ok(()) = clearance.settle(&mut decoded, again);
+            for (&w, request) in members.iter().zip(requests) {
+                let bins = &decoded[w][i];
+                let settled = request.settle(bins, self.sampling);
                 let slots = &mut self.placed[w];
                 let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
-                slots[value].slot = Slot::Value(request.settled_state(&bins, settled));
-                decoded[w].push(bins);
+                slots[value].slot = Slot::Value(request.settled_state(bins, settled));
             }
         }
         Decoded {

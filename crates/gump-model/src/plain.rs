@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::batch::PlacedSlot;
-use crate::clearance::redraw;
+use crate::clearance::Clearance;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::draw::draw_field;
@@ -154,17 +154,13 @@ impl Group<'_> {
             .iter()
             .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
             .collect();
-        redraw(
-            &self.windows,
-            &mut decoded,
-            passes.sampling,
-            |who, requests| {
-                let rows = who.iter().map(|(w, i)| (firsts[*w] + i) as u32);
-                let rows = Tensor::from_iter(rows, keys.device())?;
-                let keys = keys.index_select(&rows, 0)?;
-                sample_states(passes.network, &keys, requests, passes.sampling)
-            },
-        )?;
+        let mut clearance = Clearance::new(&self.windows, passes.sampling);
+        clearance.settle(&mut decoded, |who, requests| {
+            let rows = who.iter().map(|(w, i)| (firsts[*w] + i) as u32);
+            let rows = Tensor::from_iter(rows, keys.device())?;
+            let keys = keys.index_select(&rows, 0)?;
+            sample_states(passes.network, &keys, requests, passes.sampling)
+        })?;
         Ok(decoded)
     }
 
@@ -181,6 +177,7 @@ impl Group<'_> {
         let mut rows: Vec<Vec<PlacedSlot>> =
             self.slots.iter().map(|slots| slots.to_vec()).collect();
         let mut decoded = vec![Vec::with_capacity(n); rows.len()];
+        let mut clearance = Clearance::new(&self.windows, passes.sampling);
         for i in 0..n {
             let key = first + 2 * i;
             let from = cache.as_ref().map_or(0, Cache::len);
@@ -190,11 +187,18 @@ impl Group<'_> {
             let requests: Vec<Request> =
                 self.windows.iter().map(|w| w.requests[i].clone()).collect();
             let bins = sample_states(passes.network, &at_key, &requests, passes.sampling)?;
-            for (row, bins) in bins.into_iter().enumerate() {
-                let request = &requests[row];
-                let settled = request.settle(&bins, passes.sampling);
-                rows[row][key + 1].slot = Slot::Value(request.settled_state(&bins, settled));
-                decoded[row].push(bins);
+            for (decoded, bins) in decoded.iter_mut().zip(bins) {
+                decoded.push(bins);
+            }
+            clearance.settle(&mut decoded, |who, requests| {
+                let rows = who.iter().map(|(row, _)| *row as u32);
+                let rows = Tensor::from_iter(rows, at_key.device())?;
+                let at_key = at_key.index_select(&rows, 0)?;
+                sample_states(passes.network, &at_key, requests, passes.sampling)
+            })?;
+            for ((row, decoded), request) in rows.iter_mut().zip(&decoded).zip(&requests) {
+                let settled = request.settle(&decoded[i], passes.sampling);
+                row[key + 1].slot = Slot::Value(request.settled_state(&decoded[i], settled));
             }
         }
         Ok(decoded)

@@ -417,11 +417,14 @@ fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], k
     });
 }
 
-/// Rows that one task takes through a layer: few enough for every thread to have some and for
-/// what lies between two products to stay in the second-level cache.
+/// Rows that one task takes through a layer: equal shares for all threads, as many as possible, for
+/// every task reads all weights, but so few that what lies between two products stays in the
+/// second-level cache.
 fn chunk_rows(rows: usize) -> usize {
-    let each = rows.div_ceil(2 * rayon::current_num_threads());
-    each.next_multiple_of(8).clamp(8, 64)
+    const MOST: usize = 128;
+    let each = rows.div_ceil(rayon::current_num_threads());
+    let tasks = each.div_ceil(MOST).max(1);
+    each.div_ceil(tasks).next_multiple_of(8).max(8)
 }
 
 /// Memory that one task works in.
