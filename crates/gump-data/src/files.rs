@@ -12,7 +12,7 @@ use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
 use crate::{
     DataError, ReadOptions, argoverse2, cache, commonroad, gpudrive, nuplan, scenario_json, sumo,
-    womd,
+    taf_bw, womd,
 };
 
 // ANCHOR: format
@@ -29,7 +29,7 @@ pub(crate) struct Format {
 // ANCHOR_END: format
 
 /// The formats that hold scenarios; the first that recognises a file has it.
-static FORMATS: [Format; 9] = [
+static FORMATS: [Format; 10] = [
     cache::FORMAT,
     womd::FORMAT,
     gpudrive::FORMAT,
@@ -39,6 +39,7 @@ static FORMATS: [Format; 9] = [
     scenario_json::FORMAT,
     sumo::FORMAT,
     nuplan::FORMAT,
+    taf_bw::FORMAT,
 ];
 
 /// A kind of file without scenarios of its own.
@@ -50,7 +51,7 @@ pub(crate) struct Companion {
 }
 
 /// Files that belong to some format but hold no scenarios.
-static COMPANIONS: [Companion; 6] = [
+static COMPANIONS: [Companion; 7] = [
     Companion {
         what: "Argoverse 2 map",
         recognises: argoverse2::is_map,
@@ -69,6 +70,7 @@ static COMPANIONS: [Companion; 6] = [
     },
     nuplan::MAP,
     nuplan::OTHER,
+    taf_bw::MAP,
 ];
 
 /// How much of the content a recogniser sees.

@@ -211,7 +211,7 @@ impl File {
             now: PRESENT.min(steps.saturating_sub(1)),
             ego,
             lights: lights(&self.tl_states, report),
-            targets,
+            targets: Some(targets),
             objects_of_interest: self
                 .metadata
                 .map(|m| m.objects_of_interest)

@@ -55,6 +55,7 @@ mod stream;
 pub mod submission;
 pub mod sumo;
 mod table;
+mod taf_bw;
 pub mod tfrecord;
 mod tracks;
 mod verify;

@@ -113,6 +113,9 @@ pub struct ReadOptions {
     /// Who the ego is, where a format does not say; otherwise such a record has no ego and is
     /// refused.
     pub infer_ego: bool,
+    /// Whom to predict, in formats that have no such list: up to eight moving agents near the ego
+    /// that stay for at least half of the future; otherwise nobody.
+    pub infer_targets: bool,
     /// Sizes of agents by their class; otherwise agents without a size are left out.
     pub infer_sizes: bool,
     /// Velocities from positions and headings from velocities; otherwise states without them are
@@ -138,6 +141,7 @@ impl ReadOptions {
         infer_light_gaps: false,
         infer_route: false,
         infer_ego: false,
+        infer_targets: false,
         infer_sizes: false,
         infer_motion: false,
         infer_elevation: false,
@@ -155,6 +159,7 @@ impl ReadOptions {
         infer_light_gaps: true,
         infer_route: true,
         infer_ego: true,
+        infer_targets: true,
         infer_sizes: true,
         infer_motion: true,
         infer_elevation: true,

@@ -34,7 +34,8 @@ pub(crate) struct Recording {
     pub(crate) tracks: Vec<Track>,
     /// Lights with their step.
     pub(crate) lights: Vec<(usize, Light)>,
-    pub(crate) targets: Vec<i64>,
+    /// Whom to predict; `None` where the format has no list of them.
+    pub(crate) targets: Option<Vec<i64>>,
     pub(crate) objects_of_interest: Vec<i64>,
     pub(crate) tags: Vec<ScenarioTag>,
     pub(crate) route: Option<Route>,
@@ -157,7 +158,8 @@ pub(crate) fn assemble(
     let ego = AgentId(ego.ok_or(Problem::NoEgo)?);
     infer::light_lanes(&mut recording.lights, &map, options, report);
     let ids = |ids: Vec<i64>| ids.into_iter().map(AgentId).collect::<Vec<_>>();
-    let mut targets = ids(recording.targets);
+    let asks = recording.targets.is_some();
+    let mut targets = ids(recording.targets.unwrap_or_default());
     targets.sort_unstable();
     targets.dedup();
     let mut scenario = Scenario {
@@ -173,6 +175,9 @@ pub(crate) fn assemble(
         tags: recording.tags,
     };
     scenario.validate()?;
+    if !asks {
+        infer::targets(&mut scenario, options, report);
+    }
     infer::route(&mut scenario, options, report);
     Ok(scenario)
 }

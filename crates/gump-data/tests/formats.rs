@@ -9,7 +9,7 @@ use gump_data::{
     DataError, ReadOptions, ScenarioRecord, list_files, open, open_with, scenario_json, verify,
 };
 use gump_geometry::dvec2;
-use gump_scene::{Agent, AgentId, Frame, LaneId, LightState};
+use gump_scene::{Agent, AgentId, AgentKind, Frame, LaneId, LightState};
 use tempfile::TempDir;
 
 fn data(name: &str) -> PathBuf {
@@ -108,6 +108,47 @@ fn commonroad_lanelets_are_lanes() {
     assert!(
         scenario.map.is_drivable(dvec2(25.0, 1.9)) && !scenario.map.is_drivable(dvec2(25.0, -2.1))
     );
+}
+
+#[test]
+fn taf_bw_tracks_drive_on_lanelets() {
+    let tracks = "recorded_trackfiles/here/vehicle_tracks_000.csv";
+    let record = only(&data("taf_bw").join(tracks));
+    let (scenario, report) = (&record.scenario, &record.report);
+    assert_eq!((scenario.id.as_str(), scenario.log.len()), ("here-000", 3));
+    let lane = |id| scenario.map.lane(LaneId(id)).unwrap();
+    // Bounds are given in any direction; the map's own metres are recovered from degrees.
+    assert!(
+        (lane(31).width - 4.0).abs() < 1e-3 && (lane(31).centerline.length() - 50.0).abs() < 1e-3
+    );
+    assert!(lane(31).centerline.points()[0].distance(dvec2(0.0, 0.0)) < 1e-3);
+    assert!((lane(31).speed_limit.unwrap() - 60.0 / 3.6).abs() < 1e-9);
+    assert_eq!(lane(32).speed_limit, Some(10.0), "that of the place");
+    assert_eq!(lane(31).successors, [LaneId(32)]);
+    assert_eq!(lane(31).left_neighbors, [LaneId(33)]);
+    assert_eq!(lane(33).right_neighbors, [LaneId(31)]);
+    assert_eq!(scenario.map.areas().len(), 1, "a crossing");
+    let agent = |id| *scenario.log[2].agent(AgentId(id)).unwrap();
+    assert_eq!(agent(7).state.pose.position, dvec2(12.0, 0.0));
+    assert_eq!(agent(8).kind, AgentKind::Pedestrian);
+    assert!((agent(8).state.velocity - dvec2(0.0, 1.0)).length() < 1e-9);
+    assert_eq!(agent(9).kind, AgentKind::Bicycle);
+    assert_eq!(scenario.ego, AgentId(7));
+    assert_eq!(scenario.targets, [7, 8, 9].map(AgentId));
+    assert_eq!(report.dropped["state between two time steps"], 1);
+    assert_eq!(report.inferred["agent to predict"], 3);
+    let folder = TempDir::new().unwrap();
+    let alone = folder.path().join("vehicle_tracks_000.csv");
+    fs::copy(data("taf_bw").join(tracks), &alone).unwrap();
+    let error = open(&alone).unwrap().next().unwrap().unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("meta_data.csv beside it, found none"),
+        "{error}"
+    );
+    let verification = verify(&data("taf_bw")).unwrap();
+    assert_eq!(verification.skipped["Lanelet2 or OpenStreetMap map"], 1);
 }
 
 #[test]

@@ -68,8 +68,7 @@ fn rounds(file: &Path, bytes: &[u8]) -> usize {
     match bytes.len() {
         _ if !seed => 0,
         0..10_000 => 600,
-        10_000..100_000 => 100,
-        _ => 12,
+        _ => 100,
     }
 }
 

@@ -154,7 +154,7 @@ impl File {
             now,
             ego,
             lights: Vec::new(),
-            targets,
+            targets: Some(targets),
             objects_of_interest: Vec::new(),
             tags: Vec::new(),
             route: None,

@@ -220,7 +220,7 @@ impl File {
             now: recording::usual_present(steps, DT),
             ego: Some(0),
             lights: Vec::new(),
-            targets: Vec::new(),
+            targets: None,
             objects_of_interest: Vec::new(),
             tags: Vec::new(),
             route: None,

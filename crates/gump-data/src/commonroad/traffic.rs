@@ -50,7 +50,7 @@ pub(super) fn recording(
         } else {
             Vec::new()
         },
-        targets: Vec::new(),
+        targets: None,
         objects_of_interest: Vec::new(),
         tags: Vec::new(),
         route: None,

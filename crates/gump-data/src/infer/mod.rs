@@ -10,6 +10,7 @@ mod lane_graph;
 mod light_gaps;
 mod light_lanes;
 mod route;
+mod targets;
 mod widths;
 
 use std::sync::Arc;
@@ -18,6 +19,7 @@ use gump_geometry::{DVec2, distance_to_segment};
 use gump_scene::{Frame, LaneKind, Light, MapGraph, MapParts, Scenario};
 
 use crate::{ReadOptions, ReadReport};
+pub(crate) use targets::choose as choose_targets;
 
 /// The width of a lane of this kind about which nothing is known, metres.
 ///
@@ -86,6 +88,14 @@ pub(crate) fn light_gaps(
 ) {
     if options.infer_light_gaps {
         light_gaps::infer(log, dt, report);
+    }
+}
+
+/// Chooses whom to predict, for a format that does not say.
+pub(crate) fn targets(scenario: &mut Scenario, options: ReadOptions, report: &mut ReadReport) {
+    if options.infer_targets {
+        scenario.targets = choose_targets(&scenario.log, scenario.now, scenario.ego);
+        report.infer("agent to predict", scenario.targets.len());
     }
 }
 

@@ -252,7 +252,7 @@ impl File {
                 .as_ref()
                 .and_then(|name| names.of(name)),
             lights,
-            targets,
+            targets: Some(targets),
             objects_of_interest: interesting.filter_map(|name| names.of(name)).collect(),
             tags: Vec::new(),
             route: None,

@@ -1,6 +1,6 @@
 //! Cutting scenarios out of a long recording: a window of time, an ego, what is around it.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -14,10 +14,6 @@ use super::signals::Signals;
 use crate::open::Source;
 use crate::{DataError, Place, Problem, ReadOptions, ScenarioRecord, infer};
 
-/// Agents asked to predict, at most; as many as Waymo's benchmark has.
-const MAX_TARGETS: usize = 8;
-/// Metres around the ego in which agents are worth predicting.
-const TARGET_RANGE: f64 = 60.0;
 /// Metres around a vehicle in which others make it an interesting ego.
 const INTEREST_RANGE: f64 = 50.0;
 /// More neighbours than this make no ego more interesting.
@@ -131,23 +127,18 @@ impl Scenes {
                 continue;
             }
             self.window.push(snapshot);
-            if let [first, .., before, last] = &self.window[..] {
-                let dt = self.window[1].time - first.time;
-                let found = last.time - before.time;
-                if !((found - dt).abs() <= TIME_TOLERANCE && dt > TIME_TOLERANCE) {
-                    // A gap begins a new window.
-                    let last = self.window.pop();
-                    self.window.clear();
-                    self.window.extend(last);
-                    wanted = 2;
-                    continue;
-                }
-            }
-            if let [first, second, ..] = &self.window[..] {
-                let dt = second.time - first.time;
-                if dt > TIME_TOLERANCE {
-                    wanted = self.now(dt) + (self.cut.future_s / dt).round() as usize + 1;
-                }
+            let [first, second, ..] = &self.window[..] else {
+                continue;
+            };
+            let dt = second.time - first.time;
+            if self.is_steady(dt) {
+                wanted = self.now(dt) + (self.cut.future_s / dt).round() as usize + 1;
+            } else {
+                // A gap, or a time that comes again, begins a new window.
+                let last = self.window.pop();
+                self.window.clear();
+                self.window.extend(last);
+                wanted = 2;
             }
         }
         if self.n_windows == 0 && !self.is_on_roads() {
@@ -159,6 +150,15 @@ impl Scenes {
         self.skip_until = last + self.cut.pause_s;
         self.n_windows += 1;
         Ok(true)
+    }
+
+    /// True if the last two snapshots are one time step apart.
+    fn is_steady(&self, dt: f64) -> bool {
+        let [.., before, last] = &self.window[..] else {
+            return false;
+        };
+        let found = last.time - before.time;
+        (found - dt).abs() <= TIME_TOLERANCE && dt > TIME_TOLERANCE
     }
 
     /// False if most of what moves is outside of the network: it belongs to another recording.
@@ -264,7 +264,7 @@ impl Scenes {
         if self.cut.without_overlaps && has_overlap(&log[now]) {
             return Ok(None);
         }
-        let targets = targets(&log, now, AgentId(ego));
+        let targets = infer::choose_targets(&log, now, AgentId(ego));
         let mut scenario = Scenario {
             id: id.to_owned(),
             map: Arc::new(map),
@@ -390,25 +390,4 @@ fn has_overlap(frame: &Frame) -> bool {
             a.overlaps(&b) && -a.signed_distance(&b) > crate::verify::OVERLAP_TOLERANCE
         })
     })
-}
-
-/// The agents nearest to the ego that stay for at least half of the future, sorted by id.
-fn targets(log: &[Frame], now: usize, ego: AgentId) -> Vec<AgentId> {
-    let mut stays: BTreeMap<AgentId, usize> = BTreeMap::new();
-    for agent in log[now..].iter().flat_map(|frame| frame.agents()) {
-        *stays.entry(agent.id).or_default() += 1;
-    }
-    let Some(here) = log[now].agent(ego).map(|ego| ego.state.pose.position) else {
-        return Vec::new();
-    };
-    let mut near: Vec<(f64, AgentId)> = log[now]
-        .agents()
-        .iter()
-        .map(|agent| (agent.state.pose.position.distance(here), agent.id))
-        .filter(|(distance, id)| *distance < TARGET_RANGE && 2 * stays[id] >= log.len() - now)
-        .collect();
-    near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    let mut ids: Vec<_> = near.iter().take(MAX_TARGETS).map(|(_, id)| *id).collect();
-    ids.sort_unstable();
-    ids
 }

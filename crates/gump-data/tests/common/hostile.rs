@@ -7,7 +7,6 @@
 #![allow(clippy::unwrap_used, reason = "what is committed can be read")]
 
 use std::fs;
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
@@ -46,12 +45,21 @@ const AV2_POSES: (&str, &str) = (
     "hostile/argoverse2_log/city_SE3_egovehicle.feather",
 );
 const NETWORK: (&str, &str) = ("some.net.xml", "hostile/sumo_network/seed.net.xml");
-const CARS: (&str, &str) = ("some.fcd.xml", "hostile/sumo/seed.fcd.xml");
-const LOG: (&str, &str) = ("log.db", "data/nuplan/log.db.gz");
-const MAP: (&str, &str) = ("map.gpkg", "data/nuplan/map.gpkg.gz");
+const CARS: (&str, &str) = ("some.fcd.xml", "hostile/sumo/seed-coarse.fcd.xml");
+const LOG: (&str, &str) = ("log.db", "hostile/nuplan/seed.db");
+const TAF_TRACKS: (&str, &str) = (
+    "recorded_trackfiles/here/vehicle_tracks_000.csv",
+    "hostile/taf_bw/seed.csv",
+);
+const TAF_META: (&str, &str) = (
+    "recorded_trackfiles/here/meta_data.csv",
+    "data/taf_bw/recorded_trackfiles/here/meta_data.csv",
+);
+const TAF_MAP: (&str, &str) = ("maps/here.osm", "hostile/taf_bw_map/seed.osm");
+const MAP: (&str, &str) = ("map.gpkg", "hostile/nuplan_map/seed.gpkg");
 
 /// Every reader, and every part of one that has a file or a checksum of its own.
-pub(crate) static TARGETS: [Target; 14] = [
+pub(crate) static TARGETS: [Target; 16] = [
     alone("womd", "some.tfrecord"),
     Target {
         seal: tfrecord,
@@ -92,6 +100,15 @@ pub(crate) static TARGETS: [Target; 14] = [
         ..alone("nuplan_map", MAP.0)
     },
     Target {
+        beside: &[TAF_META, TAF_MAP],
+        ..alone("taf_bw", TAF_TRACKS.0)
+    },
+    Target {
+        opened: Some(TAF_TRACKS.0),
+        beside: &[TAF_META, TAF_TRACKS],
+        ..alone("taf_bw_map", TAF_MAP.0)
+    },
+    Target {
         seal: shard_of_one,
         ..alone("cache", "some.cache")
     },
@@ -116,8 +133,12 @@ impl Target {
     /// A folder with what must lie beside.
     pub(crate) fn folder(&self) -> TempDir {
         let folder = tempfile::tempdir().unwrap();
+        let place = |name: &str| folder.path().join(name);
+        for (name, _) in self.beside.iter().chain([&(self.file, "")]) {
+            fs::create_dir_all(place(name).parent().unwrap()).unwrap();
+        }
         for (name, from) in self.beside {
-            fs::write(folder.path().join(name), unpacked(&tests().join(from))).unwrap();
+            fs::copy(tests().join(from), place(name)).unwrap();
         }
         folder
     }
@@ -132,33 +153,13 @@ impl Target {
 
     /// Seeds and what once broke a reader, in order of their names.
     pub(crate) fn corpus(&self) -> Vec<(PathBuf, Vec<u8>)> {
-        let mut files: Vec<PathBuf> = match self.name {
-            "nuplan" => vec![tests().join(LOG.1)],
-            "nuplan_map" => vec![tests().join(MAP.1)],
-            _ => Vec::new(),
-        };
         let folder = tests().join("hostile").join(self.name);
-        if let Ok(entries) = fs::read_dir(folder) {
-            files.extend(entries.map(|entry| entry.unwrap().path()));
-        }
+        let entries = fs::read_dir(folder).unwrap();
+        let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
         files.sort();
-        files
-            .into_iter()
-            .map(|file| (file.clone(), unpacked(&file)))
-            .collect()
+        let read = |file: PathBuf| (file.clone(), fs::read(&file).unwrap());
+        files.into_iter().map(read).collect()
     }
-}
-
-fn unpacked(path: &Path) -> Vec<u8> {
-    let bytes = fs::read(path).unwrap();
-    if path.extension().is_none_or(|ending| ending != "gz") {
-        return bytes;
-    }
-    let mut unpacked = Vec::new();
-    flate2::read::GzDecoder::new(bytes.as_slice())
-        .read_to_end(&mut unpacked)
-        .unwrap();
-    unpacked
 }
 
 fn tfrecord(message: &[u8]) -> Vec<u8> {
