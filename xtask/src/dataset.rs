@@ -241,7 +241,7 @@ mod tests {
             let is_ours = file.licence.is_none() || file.licence.as_deref() == Some("Apache-2.0");
             assert!(is_ours || file.notice.is_some(), "{}", file.path.display());
             let made = file.provenance.as_ref();
-            assert!(made.is_none_or(|how| how.starts_with("cargo xtask data synthesize")));
+            assert!(made.is_none_or(|how| how.starts_with("cargo xtask data ")));
             let path = folder.join(&file.path);
             let digest = Sha256::digest(std::fs::read(&path).unwrap());
             let digest: String = digest.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -254,9 +254,12 @@ mod tests {
             scenes.into_iter().map(|scene| scene.id).collect::<Vec<_>>()
         };
         let [train, validation, test] = [Split::Train, Split::Validation, Split::Test].map(of);
-        assert_eq!((train.len(), validation.len(), test.len()), (66, 12, 24));
-        // The ids of SUMO's scenes are NETWORK-RUN-WINDOW-EGO.
+        assert_eq!((train.len(), validation.len(), test.len()), (71, 16, 26));
+        // The ids of SUMO's scenes are NETWORK-RUN-WINDOW-EGO, those of NGSIM USA_NETWORK-PLACE_...
         let network = |id: &String| {
+            if let Some((name, _)) = id.strip_prefix("USA_").and_then(|id| id.split_once('-')) {
+                return Some(name.to_lowercase());
+            }
             let mut parts = id.rsplitn(4, '-');
             let is_numbered = parts.by_ref().take(3).all(|p| p.parse::<u32>().is_ok());
             let name = parts.next().filter(|_| is_numbered);
@@ -265,11 +268,12 @@ mod tests {
         let networks = |ids: &[String]| ids.iter().filter_map(network).collect::<BTreeSet<_>>();
         let [a, b, c] = [&train, &validation, &test].map(|ids| networks(ids));
         assert!(a.contains("berlin-doerpfeldstr") && c.contains("tavf-hamburg"));
+        assert!(a.contains("us101") && b.contains("lanker") && c.contains("peach"));
         for (one, other) in [(&a, &b), (&a, &c), (&b, &c)] {
             assert!(one.is_disjoint(other), "{one:?} and {other:?}");
         }
         let all: BTreeSet<_> = train.iter().chain(&validation).chain(&test).collect();
-        assert_eq!(all.len(), 102, "every scene has an id of its own");
+        assert_eq!(all.len(), 113, "every scene has an id of its own");
     }
 
     #[test]

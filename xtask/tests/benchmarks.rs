@@ -169,6 +169,38 @@ fn a_planner_that_takes_too_long_is_named_when_nothing_is_left() {
 }
 
 #[test]
+fn recordings_of_another_length_are_left_out_by_name_and_egos_chosen_where_none_is_stated() {
+    let folder = TempDir::new().unwrap();
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let realism = |path: &str| {
+        let path = repository.join(path);
+        format!(
+            "evaluate wosac --scenarios {} --world log --rollouts-per-scenario 2",
+            path.display()
+        )
+    };
+    let words = realism("datasets/mini/ngsim-peachtree.tfrecord.gz");
+    let found = results(&folder, &words, "out");
+    assert_eq!(found["scenarios"], 1);
+    let left_out = found["left_out"].as_array().unwrap();
+    assert_eq!(left_out.len(), 1);
+    let why = left_out[0].as_str().unwrap();
+    assert!(
+        why.contains("USA_Peach-4_8_T-1: expected at least"),
+        "{why}"
+    );
+    // CommonRoad states no ego, and this one lasts three steps of half a second.
+    let words = realism("crates/gump-data/tests/data/commonroad.xml");
+    let why = "none of 1 scenarios has the length and the rate of the benchmark";
+    fails(&folder, &words, 1, why);
+    let path = repository.join("datasets/mini/ngsim-us101.tfrecord.gz");
+    let words = format!("evaluate motion --scenarios {} --world log", path.display());
+    let found = results(&folder, &words, "motion");
+    assert_eq!(found["scenarios"], 3);
+    assert_eq!(found["left_out"].as_array().unwrap().len(), 2);
+}
+
+#[test]
 fn motion_numbers_are_the_official_ones() {
     for set in ["gt", "cv", "noise8", "joint8"] {
         let golden = format!("golden/wosac/motion/submission_{set}.binproto");

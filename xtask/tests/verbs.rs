@@ -327,6 +327,13 @@ fn convert_makes_a_cache_that_goes_on_where_it_stopped() {
         2,
         &["another format"],
     );
+    place.fails(&format!("{all} --smooth"), 2, &["another --smooth"]);
+    let smooth = results("data convert --from in --to smooth --smooth --format parquet");
+    assert_eq!(
+        smooth["inferred"]["smoothed state"],
+        Value::Null,
+        "Waymo's are smooth"
+    );
     place.fails(
         "data convert --from cache --to in",
         2,

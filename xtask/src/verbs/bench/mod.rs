@@ -2,6 +2,7 @@
 //!
 //! A new bench is a file here and a variant of [`Verb`]; Criterion benches live in the crates.
 
+mod decision;
 pub(crate) mod device;
 pub(crate) mod engine;
 mod planning;
@@ -18,7 +19,8 @@ pub(crate) enum Verb {
     Device(device::Args),
     /// Scoring the realism of 32 rollouts, against the official evaluator
     Wosac(wosac::Args),
-    /// PDM-Closed, reactive traffic and a whole scored drive, against nuPlan's own times
+    /// PDM-Closed, reactive traffic and a whole scored drive, against nuPlan's own times; a decision
+    /// among learned drivers
     Planning(planning::Args),
 }
 

@@ -1,4 +1,4 @@
-//! `bench planning`: planner, traffic and a whole scored drive on one core.
+//! `bench planning`: planner, traffic and a whole scored drive, and a decision among learned drivers.
 
 use std::fmt::Write as _;
 use std::time::Instant;
@@ -11,8 +11,10 @@ use gump_rollout::worlds::NuplanIdm;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::decision;
 use crate::planners::Timed;
 use crate::run::{Common, Run};
+use crate::worlds::PrecisionName;
 
 /// Milliseconds of a PDM-Closed step in its authors' Python.
 ///
@@ -35,6 +37,12 @@ pub(crate) struct Args {
     /// Vehicles besides the ego
     #[arg(long, value_name = "N", default_value_t = 50)]
     agents: usize,
+    /// Decisions of the interactive planner among learned drivers to take the time of
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    decisions: usize,
+    /// In which form the weights of the learned drivers are multiplied
+    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
+    precision: PrecisionName,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -95,6 +103,10 @@ impl Args {
                     devkit_agent_steps,
                 ),
             ],
+        )?;
+        run.result(
+            "decision",
+            decision::rows(run, self.decisions, self.precision.resolve())?,
         )
     }
 }

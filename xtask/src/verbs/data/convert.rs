@@ -29,6 +29,10 @@ pub(crate) struct Args {
     /// What to write
     #[arg(long, value_enum, default_value_t = Format::Cache)]
     format: Format,
+    /// Smooth the tracks of noisy recordings, such as NGSIM's, with velocities that fit; those of
+    /// Waymo, nuPlan, SUMO and the cache stay as they are
+    #[arg(long)]
+    smooth: bool,
     /// Exit status 1 if anything could not be converted
     #[arg(long)]
     strict: bool,
@@ -97,6 +101,10 @@ impl Args {
         }
         let ledger = Mutex::new(ledger);
         let began = Instant::now();
+        let options = ReadOptions {
+            smooth: self.smooth,
+            ..ReadOptions::ALL
+        };
         let converted = run.phase("convert", |run| {
             let progress = run.progress("converting", 0, "scenes");
             groups.par_iter().enumerate().try_for_each(|(i, range)| {
@@ -106,7 +114,7 @@ impl Args {
                 let stem = self.to.join(format!("scenes-{i:05}"));
                 let converted = convert(
                     &files[range.clone()],
-                    ReadOptions::ALL,
+                    options,
                     self.format.into(),
                     &stem,
                     |_| {
@@ -169,7 +177,7 @@ impl Args {
         }
         std::fs::create_dir_all(&self.to)
             .with_context(|| format!("cannot create the folder {}", self.to.display()))?;
-        let source = fingerprint(self.format, files)?;
+        let source = self.fingerprint(files)?;
         let Ok(text) = std::fs::read_to_string(self.to.join(LEDGER)) else {
             let others = list_files(&self.to)?.len();
             if others > 0 {
@@ -185,7 +193,7 @@ impl Args {
             .with_context(|| format!("expected a ledger: {}", self.to.join(LEDGER).display()))?;
         if ledger.source != source {
             return Err(wrong(format!(
-                "--to {} holds the conversion of other files or to another format",
+                "--to {} holds the conversion of other files, to another format or with another --smooth",
                 self.to.display()
             )));
         }
@@ -194,6 +202,22 @@ impl Args {
             .groups
             .retain(|_, group| group.files.iter().all(is_there));
         Ok(ledger)
+    }
+
+    /// What a conversion depends on.
+    fn fingerprint(&self, files: &[PathBuf]) -> anyhow::Result<String> {
+        let mut hash = Sha256::new();
+        hash.update(serde_json::to_string(&self.format)?);
+        if self.smooth {
+            hash.update("smooth");
+        }
+        for file in files {
+            let size = |path: &Path| path.metadata().map(|metadata| metadata.len());
+            let bytes = size(file).with_context(|| format!("cannot read {}", file.display()))?;
+            hash.update(format!("{}\0{bytes}\0", file.display()));
+        }
+        let digest = hash.finalize();
+        Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
     }
 
     fn save(&self, ledger: &Ledger) -> anyhow::Result<()> {
@@ -212,19 +236,6 @@ fn lock(ledger: &Mutex<Ledger>) -> std::sync::MutexGuard<'_, Ledger> {
     ledger
         .lock()
         .unwrap_or_else(std::sync::PoisonError::into_inner)
-}
-
-/// What a conversion depends on.
-fn fingerprint(format: Format, files: &[PathBuf]) -> anyhow::Result<String> {
-    let mut hash = Sha256::new();
-    hash.update(serde_json::to_string(&format)?);
-    for file in files {
-        let size = |path: &Path| path.metadata().map(|metadata| metadata.len());
-        let bytes = size(file).with_context(|| format!("cannot read {}", file.display()))?;
-        hash.update(format!("{}\0{bytes}\0", file.display()));
-    }
-    let digest = hash.finalize();
-    Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
 impl Group {

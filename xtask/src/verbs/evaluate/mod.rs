@@ -7,6 +7,7 @@
 mod closed_loop;
 pub(crate) mod generation;
 mod ledger;
+mod left_out;
 mod long;
 mod merge;
 pub(crate) mod motion;

@@ -11,7 +11,8 @@ use std::path::{Path, PathBuf};
 
 use gump_data::{ReadOptions, open_with};
 use gump_metrics::motion::{
-    MotionConfig, PredictionScore, ShapeRules, evaluate_predictions, forecast,
+    MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
+    forecast,
 };
 use gump_model::Device;
 use gump_scene::{Prediction, Scenario};
@@ -20,6 +21,7 @@ use serde::{Deserialize, Serialize};
 use self::scores::Scores;
 use self::source::Predictions;
 use super::ledger::{Entry, Header, Ledger};
+use super::left_out::LeftOut;
 use super::shard::Shard;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
@@ -98,7 +100,7 @@ impl Args {
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
         let header = self.header(run)?;
         let mut ledger = Ledger::open(run.out(), &header)?;
-        let mut ids = BTreeSet::new();
+        let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
         let mut records = self.open()?.enumerate();
         while let Some((index, record)) = run.phase("read", |_| Ok(records.next()))? {
@@ -111,10 +113,17 @@ impl Args {
             let absent = forecaster.drop_absent(&mut scenario);
             let predictions = run.phase("predict", |run| {
                 forecaster.predict(run, &scenario, &config, index)
-            })?;
-            let scores: Vec<PredictionScore> = run.phase("score", |_| {
-                Ok(evaluate_predictions(&scenario, &predictions, &config)?)
-            })?;
+            });
+            let scores = predictions.and_then(|predictions| {
+                run.phase("score", |_| {
+                    Ok(evaluate_predictions(&scenario, &predictions, &config)?)
+                })
+            });
+            let scores: Option<Vec<PredictionScore>> =
+                left_out.sift(scores, is_of_another_length)?;
+            let Some(scores) = scores else {
+                continue;
+            };
             let scores = Scores::new(&scores, absent);
             let id = scenario.id;
             ledger.enter(Entry { index, id, scores })?;
@@ -123,6 +132,7 @@ impl Args {
         drop(progress);
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
+        left_out.tell(run, entries.len())?;
         tell::tell(run, &entries, &config)
     }
 
@@ -167,6 +177,15 @@ impl Args {
             settings,
         })
     }
+}
+
+/// True if the recording does not reach as far as the benchmark looks, or not in its steps.
+fn is_of_another_length(error: &anyhow::Error) -> bool {
+    let found = error.downcast_ref::<MotionError>();
+    matches!(
+        found.map(|error| &error.problem),
+        Some(MotionProblem::ShortLog { .. } | MotionProblem::TimeStep { .. })
+    )
 }
 
 /// Where predictions come from.

@@ -15,12 +15,13 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
-use gump_metrics::wosac::{Blame, Config, Mode, Reference, Scores, Year};
+use gump_metrics::wosac::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, simulate};
 use serde::{Deserialize, Serialize};
 
 use super::ledger::{Entry, Header, Ledger};
+use super::left_out::LeftOut;
 use super::shard::Shard;
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
@@ -169,7 +170,7 @@ impl Args {
             }
         };
         let mut ledger = Ledger::open(run.out(), &header)?;
-        let mut explained = Vec::new();
+        let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
         run.phase("evaluate", |run| {
             let mut log = match self.explain {
                 true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
@@ -179,8 +180,14 @@ impl Args {
             let kept = ledger.indices();
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
             for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
-                let recorded = recorded?;
-                let (entry, blames) = self.evaluate(run, &config, &recorded, &mut source)?;
+                let scored = recorded.and_then(|recorded| {
+                    let scored = self.evaluate(run, &config, &recorded, &mut source)?;
+                    Ok((recorded, scored))
+                });
+                let scored = left_out.sift(scored, is_of_another_length)?;
+                let Some((recorded, (entry, blames))) = scored else {
+                    continue;
+                };
                 ledger.enter(entry)?;
                 if let Some(log) = &mut log {
                     note(
@@ -201,6 +208,7 @@ impl Args {
             Ok(())
         })?;
         let entries = ledger.close()?;
+        left_out.tell(run, entries.len())?;
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {shard}, found none: {}",
@@ -327,7 +335,13 @@ fn tabulate(run: &Run) -> anyhow::Result<()> {
     Ok(tables::of_rows(&rows).write(&run.path("agents.parquet"))?)
 }
 
-/// Which gaps of a format matter to a world.
+/// True if the challenge's second of past and eight of future are not what the log has.
+fn is_of_another_length(error: &anyhow::Error) -> bool {
+    let found = error.downcast_ref::<WosacError>();
+    matches!(found, Some(WosacError::Clock { .. }))
+}
+
+/// Which gaps of Waymo's messages matter to a world.
 fn read_options(world: &WorldName) -> ReadOptions {
     match world {
         WorldName::Log | WorldName::ConstantVelocity => ReadOptions::STATED,

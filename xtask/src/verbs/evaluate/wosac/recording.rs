@@ -11,7 +11,7 @@ use gump_data::ReadOptions;
 use gump_data::tfrecord::TfRecordReader;
 use gump_data::womd::proto::{self, FeatureData, LaneType, ObjectType, SignalState};
 use gump_data::womd::scenario_from_proto;
-use gump_metrics::wosac::{Log, Signal, SignalLane, State, Track};
+use gump_metrics::wosac::{Log, N_HISTORY, N_STEPS, Signal, SignalLane, State, Track};
 use gump_scene::{AgentId, AgentKind, Scenario};
 use prost::Message as _;
 
@@ -27,6 +27,9 @@ pub(crate) struct Recorded {
 
 /// The `wanted` scenarios of a file or directory in order; holds one at a time.
 ///
+/// Waymo's messages are filled as `options` say, other formats as far as can be: some state
+/// neither an ego nor whom to predict nor edges of the road.
+///
 /// Error: a path without scenarios; of single scenarios the iterator tells.
 pub(crate) fn recordings<'a>(
     path: &Path,
@@ -37,7 +40,7 @@ pub(crate) fn recordings<'a>(
     if files.is_empty() {
         let recorded_lights = ReadOptions {
             infer_light_gaps: false,
-            ..options
+            ..ReadOptions::ALL
         };
         let records = gump_data::open_with(path, recorded_lights)?.enumerate();
         let records = records.filter(move |(index, _)| wanted(*index));
@@ -95,13 +98,11 @@ fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> anyhow::Result<
     let id = message.scenario_id();
     let (scenario, _) =
         scenario_from_proto(&message, options).with_context(|| format!("scenario {id}"))?;
-    // Roles have been checked with the scenario; the metric's clock is its own.
-    anyhow::ensure!(
-        scenario.now == 10,
-        "scenario {id}: expected the present at step 10, found it at {}",
-        scenario.now
-    );
-    let log = log(&message, &scenario);
+    // Waymo's own messages all have this clock; others are scored as scenarios.
+    let log = match (scenario.now + 1, scenario.log.len()) {
+        (N_HISTORY, N_STEPS) => log(&message, &scenario),
+        _ => Log::of(&scenario)?,
+    };
     Ok(Recorded {
         index,
         scenario,

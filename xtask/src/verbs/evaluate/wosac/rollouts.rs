@@ -100,7 +100,7 @@ impl Source {
         })
     }
 
-    /// Which gaps of a format matter.
+    /// Which gaps of Waymo's messages matter.
     pub(crate) fn read_options(&self) -> ReadOptions {
         match self {
             Self::World { name, .. } => super::read_options(name),
