@@ -59,7 +59,7 @@ pub(super) fn recording(
             report.drop_damaged("row without the number of a track", || row(i));
             continue;
         };
-        if !(ms.abs() <= 1e15) {
+        if ms.is_nan() || ms.abs() > 1e15 {
             report.drop_damaged("row without a time", || row(i));
             continue;
         }
@@ -95,12 +95,14 @@ pub(super) fn recording(
         });
         track.states.push(State { step, ..state });
     }
-    let dt = 1.0 / rate_hz;
-    let now = recording::usual_present(steps.min(MAX_STEPS), dt);
-    report.infer("present one second in, or at the start", 1);
+    let now = present(tracks.values(), steps.min(MAX_STEPS), rate_hz);
+    report.infer(
+        "present one second after the vehicle seen longest appears",
+        1,
+    );
     Ok(Recording {
         id,
-        dt,
+        dt: 1.0 / rate_hz,
         steps,
         now,
         ego: None,
@@ -111,6 +113,26 @@ pub(super) fn recording(
         tags: Vec::new(),
         route: None,
     })
+}
+
+/// One second after the vehicle that is seen longest appears: roadside cameras often see none at
+/// first. A second in where there is no vehicle.
+fn present<'t>(tracks: impl Iterator<Item = &'t Track>, steps: usize, rate_hz: f64) -> usize {
+    let usual = recording::usual_present(steps, 1.0 / rate_hz);
+    let vehicles = tracks.filter(|track| track.kind == AgentKind::Vehicle);
+    let seen: Vec<Vec<usize>> = vehicles
+        .map(|track| {
+            let mut seen: Vec<usize> = track.states.iter().map(|state| state.step).collect();
+            seen.sort_unstable();
+            seen
+        })
+        .collect();
+    let longest = seen.iter().rev().max_by_key(|seen| seen.len());
+    let later = |seen: &Vec<usize>| {
+        let second_in = seen.partition_point(|&step| step < seen[0] + usual);
+        seen.get(second_in).or(seen.last()).copied()
+    };
+    longest.and_then(later).unwrap_or(usual)
 }
 
 /// Rows as editors count them: the header is the first.

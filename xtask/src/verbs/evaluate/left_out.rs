@@ -25,13 +25,13 @@ impl LeftOut {
         }
     }
 
-    /// Puts the reasons into the report and says how many there are.
+    /// Puts the reasons, if there are any, into the report and says how many they are.
     ///
     /// Error: all were left out.
     pub(crate) fn tell(&self, run: &mut Run, n_scored: usize) -> anyhow::Result<()> {
-        run.result("left_out", &self.0)?;
         let n = self.0.len();
         if let Some(first) = self.0.first() {
+            run.result("left_out", &self.0)?;
             anyhow::ensure!(
                 n_scored > 0,
                 "none of {n} scenarios has the length and the rate of the benchmark: {first}"
