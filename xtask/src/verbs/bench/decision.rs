@@ -54,7 +54,7 @@ pub(crate) fn rows(run: &Run, n: usize, precision: Precision) -> anyhow::Result<
         precision,
         ..SamplingConfig::default()
     };
-    let world = Surroundings::load_imagination(&shipped::world(), &sampling)?;
+    let world = Surroundings::load_imagination(run.device(), &shipped::world(), &sampling)?;
     let config = InteractiveDriverConfig {
         replan_every: 1,
         seed: run.seed(),
