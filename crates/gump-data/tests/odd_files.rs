@@ -1,6 +1,8 @@
 //! Files that are huge, many, misnamed or filled in without care: what is sound is delivered, what
 //! is not is named with its place and counted.
 
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 mod common;
 
 #[path = "common/hostile.rs"]
@@ -8,7 +10,6 @@ mod hostile;
 
 use std::fs;
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 use gump_data::{
     DataError, OutputFormat, ReadOptions, ScenarioRecord, convert, list_files, open, verify, womd,
@@ -80,11 +81,8 @@ fn ten_gigabytes_of_any_format_are_told_without_holding_them() {
             eprintln!("SKIPPED: no sparse file of 10 GB can be made here: {error}");
             return;
         }
-        let began = Instant::now();
         let count = open(&path).map_or(0, |reader| reader.take(1000).count());
         assert!(count < 1000, "{}: goes on for ever", target.name);
-        let took = began.elapsed();
-        assert!(took < Duration::from_secs(60), "{}: {took:?}", target.name);
         fs::remove_file(&path).unwrap();
     }
     if let Some((before, after)) = before.zip(peak_memory()) {
