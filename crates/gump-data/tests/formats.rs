@@ -351,4 +351,5 @@ fn real_files_hold_what_an_independent_count_finds() {
     check("data/gpudrive/validation", [23, 867, 2093, 2269]);
     check("data/argoverse2", [4, 441, 579, 631]);
     check("data/commonroad_ngsim", [77, 2454, 5189, 3210]);
+    check("data/taf_bw", [27, 424, 8876, 951]);
 }

@@ -1,6 +1,7 @@
 //! `bench planning`: planner, traffic and a whole scored drive, and a decision among learned drivers.
 
 use std::fmt::Write as _;
+use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use anyhow::Context as _;
@@ -38,8 +39,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 50)]
     agents: usize,
     /// Decisions of the interactive planner among learned drivers to take the time of
-    #[arg(long, value_name = "N", default_value_t = 5)]
-    decisions: usize,
+    #[arg(long, value_name = "N", default_value = "5")]
+    decisions: NonZeroUsize,
     /// In which form the weights of the learned drivers are multiplied
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
@@ -106,7 +107,7 @@ impl Args {
         )?;
         run.result(
             "decision",
-            decision::rows(run, self.decisions, self.precision.resolve())?,
+            decision::rows(run, self.decisions.get(), self.precision.resolve())?,
         )
     }
 }
