@@ -1,5 +1,6 @@
 //! The guide is true: its commands run, what it shows of their output is there, the code it quotes
-//! exists, and commands that cannot run here at least have flags that exist.
+//! exists, its links lead somewhere in the book, and commands that cannot run here at least have
+//! flags that exist.
 //!
 //! What the fences of a chapter mean:
 //!
@@ -188,6 +189,36 @@ fn quoted_code_exists() {
         }
     }
     assert!(n_quotes >= 5, "only {n_quotes} quotes found");
+}
+
+#[test]
+fn links_stay_inside_the_book() {
+    // Beyond the folder of the book there is nothing in its built pages.
+    let inside = book().canonicalize().unwrap();
+    let mut n_links = 0;
+    for page in chapters().into_iter().chain([book().join("SUMMARY.md")]) {
+        let text = fs::read_to_string(&page).unwrap();
+        let code: BTreeSet<usize> = blocks(&page)
+            .iter()
+            .flat_map(|block| block.line..block.line + block.lines.len())
+            .collect();
+        let prose = text.lines().enumerate().map(|(i, line)| (i + 1, line));
+        for (number, line) in prose.filter(|(number, _)| !code.contains(number)) {
+            for target in line.split("](").skip(1) {
+                let target = target.split(')').next().unwrap();
+                let file = target.split('#').next().unwrap();
+                if target.contains("://") || file.is_empty() {
+                    continue;
+                }
+                let at = format!("{}:{number}: {target}", page.display());
+                let file = page.with_file_name(file).canonicalize();
+                let file = file.unwrap_or_else(|error| panic!("{at}: {error}"));
+                assert!(file.starts_with(&inside), "{at} is outside of the book");
+                n_links += 1;
+            }
+        }
+    }
+    assert!(n_links >= 12, "only {n_links} links found");
 }
 
 #[test]

@@ -133,6 +133,13 @@ fn wrong_arguments_exit_with_2() {
     }
 }
 
+#[cfg(not(feature = "rerun"))]
+#[test]
+fn a_format_that_is_not_built_in_names_its_feature() {
+    let words = "simulate --scenario s --world idm --format rerun";
+    Workplace::new().fails(words, 2, &["--format rerun", "--features rerun"]);
+}
+
 #[test]
 fn unknown_keys_of_a_config_file_are_refused_with_the_nearest() {
     let place = Workplace::new();

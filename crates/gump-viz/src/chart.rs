@@ -6,10 +6,8 @@ use plotters::coord::Shift;
 use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
-use tiny_skia::Pixmap;
 
-use crate::chart_canvas::{ChartCanvas, DENSITY};
-use crate::files::write_whole;
+use crate::plot::{COLOURS, Plot, TEXT, font, tick};
 use crate::{Picture, Theme, VizError};
 
 /// A line chart.
@@ -48,21 +46,6 @@ pub struct Series {
 /// Size of the drawing, pixels; SVG scales.
 const SIZE: (u32, u32) = (760, 400);
 
-/// Stands for "the colour of the text around"; plotters knows only fixed colours, so this one is
-/// replaced by `currentColor` when the drawing is done. No curve may use it.
-const TEXT: RGBColor = RGBColor(1, 2, 3);
-
-/// Curves in the order of Okabe and Ito, without their black and yellow, which vanish on dark or
-/// light ground.
-const CURVES: [RGBColor; 6] = [
-    RGBColor(0x2A, 0x8F, 0xD0),
-    RGBColor(0xE6, 0x9F, 0x00),
-    RGBColor(0x00, 0x9E, 0x73),
-    RGBColor(0xD5, 0x5E, 0x00),
-    RGBColor(0xCC, 0x79, 0xA7),
-    RGBColor(0x56, 0xB4, 0xE9),
-];
-
 impl Chart {
     /// The chart as an SVG element; put inline into a page, it takes the page's text colour.
     ///
@@ -70,9 +53,7 @@ impl Chart {
     /// [`VizError::EmptyChart`] without a point to draw; [`VizError::Chart`] if the backend
     /// refuses.
     pub fn to_svg(&self) -> Result<String, VizError> {
-        let mut svg = String::new();
-        self.draw_on(SVGBackend::with_string(&mut svg, SIZE))?;
-        Ok(svg.replace("#010203", "currentColor"))
+        self.svg()
     }
 
     /// The chart as pixels, 1520 by 800.
@@ -80,14 +61,7 @@ impl Chart {
     /// # Errors
     /// As [`Chart::to_svg`].
     pub fn to_picture(&self, theme: Theme) -> Result<Picture, VizError> {
-        let colours = theme.colours();
-        let [width, height] = [SIZE.0, SIZE.1].map(|units| (units as f32 * DENSITY) as u32);
-        let mut pixmap = Pixmap::new(width, height).expect("the size of a chart is not 0");
-        let [r, g, b] = colours.ground;
-        pixmap.fill(tiny_skia::Color::from_rgba8(r, g, b, 0xFF));
-        let text = ([TEXT.0, TEXT.1, TEXT.2], colours.text);
-        self.draw_on(ChartCanvas::new(&mut pixmap, text))?;
-        Ok(Picture::from_pixmap(&pixmap))
+        self.picture(theme)
     }
 
     /// Writes `STEM.svg`, and `STEM.png` on light ground.
@@ -95,42 +69,7 @@ impl Chart {
     /// # Errors
     /// As [`Chart::to_svg`], and [`VizError::Write`] with the path.
     pub fn save(&self, stem: &Path) -> Result<(), VizError> {
-        let svg = self.to_svg()?;
-        write_whole(&stem.with_extension("svg"), svg.as_bytes())?;
-        let picture = self.to_picture(Theme::Light)?;
-        picture.save_png(&stem.with_extension("png"))
-    }
-
-    fn draw_on<B: DrawingBackend>(&self, backend: B) -> Result<(), VizError> {
-        let series: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| self.drawable(s)).collect();
-        let points = || series.iter().flatten();
-        let spans = self.series.iter().flat_map(|series| &series.spans);
-        let ends = spans.flat_map(|&(_, low, high)| [low, high]);
-        let ends = ends.filter(|&y| self.fits(y, self.log_y));
-        let empty = || VizError::EmptyChart(self.title.clone());
-        let x = match self.ways.len() {
-            0 => range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?,
-            n => (0.5, n as f64 + 0.5),
-        };
-        let y = points().map(|p| p.1).chain(ends);
-        let y = range(y, self.log_y, 0.05).ok_or_else(empty)?;
-        let root = backend.into_drawing_area();
-        let logarithmic = |(low, high): (f64, f64)| {
-            (low..high)
-                .log_scale()
-                .with_key_points(log_ticks(low, high))
-        };
-        match (self.log_x, self.log_y) {
-            (false, false) => self.draw(&root, x.0..x.1, y.0..y.1, &series),
-            (true, false) => self.draw(&root, logarithmic(x), y.0..y.1, &series),
-            (false, true) => self.draw(&root, x.0..x.1, logarithmic(y), &series),
-            (true, true) => self.draw(&root, logarithmic(x), logarithmic(y), &series),
-        }
-        .and_then(|()| root.present())
-        .map_err(|error| VizError::Chart {
-            title: self.title.clone(),
-            reason: error.to_string(),
-        })
+        self.write(stem)
     }
 
     fn drawable(&self, series: &Series) -> Vec<(f64, f64)> {
@@ -168,12 +107,6 @@ impl Chart {
         X::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
         Y::CoordDescType: ValueFormatter<f64> + Ranged<ValueType = f64>,
     {
-        // The backend writes 1/1.24 of the size it is given.
-        let font = |px: f64| {
-            ("system-ui, sans-serif", px * 1.24)
-                .into_font()
-                .color(&TEXT)
-        };
         let mut builder = ChartBuilder::on(root);
         builder
             .margin(12)
@@ -206,7 +139,7 @@ impl Chart {
             if points.is_empty() {
                 continue;
             }
-            let colour = CURVES[i % CURVES.len()];
+            let colour = COLOURS[i % COLOURS.len()];
             let style = colour.stroke_width(2);
             let line = chart.draw_series(LineSeries::new(points.iter().copied(), style))?;
             if !named.name.is_empty() {
@@ -233,6 +166,44 @@ impl Chart {
                 .draw()?;
         }
         Ok(())
+    }
+}
+
+impl Plot for Chart {
+    fn size(&self) -> (u32, u32) {
+        SIZE
+    }
+
+    fn draw_on<B: DrawingBackend>(&self, backend: B) -> Result<(), VizError> {
+        let series: Vec<Vec<(f64, f64)>> = self.series.iter().map(|s| self.drawable(s)).collect();
+        let points = || series.iter().flatten();
+        let spans = self.series.iter().flat_map(|series| &series.spans);
+        let ends = spans.flat_map(|&(_, low, high)| [low, high]);
+        let ends = ends.filter(|&y| self.fits(y, self.log_y));
+        let empty = || VizError::EmptyChart(self.title.clone());
+        let x = match self.ways.len() {
+            0 => range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?,
+            n => (0.5, n as f64 + 0.5),
+        };
+        let y = points().map(|p| p.1).chain(ends);
+        let y = range(y, self.log_y, 0.05).ok_or_else(empty)?;
+        let root = backend.into_drawing_area();
+        let logarithmic = |(low, high): (f64, f64)| {
+            (low..high)
+                .log_scale()
+                .with_key_points(log_ticks(low, high))
+        };
+        match (self.log_x, self.log_y) {
+            (false, false) => self.draw(&root, x.0..x.1, y.0..y.1, &series),
+            (true, false) => self.draw(&root, logarithmic(x), y.0..y.1, &series),
+            (false, true) => self.draw(&root, x.0..x.1, logarithmic(y), &series),
+            (true, true) => self.draw(&root, logarithmic(x), logarithmic(y), &series),
+        }
+        .and_then(|()| root.present())
+        .map_err(|error| VizError::Chart {
+            title: self.title.clone(),
+            reason: error.to_string(),
+        })
     }
 }
 
@@ -272,27 +243,6 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     (0..4)
         .map(|i| low + (high - low) * f64::from(i) / 3.0)
         .collect()
-}
-
-/// A number as short as it can be without lying: `0.25`, `1500`, `2M`, `3e-5`.
-fn tick(value: f64) -> String {
-    let size = value.abs();
-    if size == 0.0 || size < 1e-12 {
-        return "0".into();
-    }
-    if (1e6..1e12).contains(&size) {
-        let (unit, name) = if size >= 1e9 { (1e9, "G") } else { (1e6, "M") };
-        return format!("{}{name}", trimmed(value / unit));
-    }
-    if !(1e-3..1e12).contains(&size) {
-        return format!("{value:.0e}");
-    }
-    trimmed(value)
-}
-
-fn trimmed(value: f64) -> String {
-    let text = format!("{value:.4}");
-    text.trim_end_matches('0').trim_end_matches('.').to_string()
 }
 
 #[cfg(test)]
@@ -349,10 +299,10 @@ mod tests {
                 let pixels = picture.rgba.chunks_exact(4);
                 pixels.filter(|pixel| pixel[..3] == [r, g, b]).count()
             };
-            for curve in &CURVES[..2] {
+            for curve in &COLOURS[..2] {
                 assert!(count(&with, [curve.0, curve.1, curve.2]) > 500);
             }
-            assert_eq!(count(&with, [CURVES[2].0, CURVES[2].1, CURVES[2].2]), 0);
+            assert_eq!(count(&with, [COLOURS[2].0, COLOURS[2].1, COLOURS[2].2]), 0);
             let mut bare = losses();
             (bare.title, bare.x_label, bare.y_label) = Default::default();
             let bare = bare.to_picture(theme).unwrap();
@@ -415,16 +365,5 @@ mod tests {
         assert_eq!(log_ticks(1.2, 30.0), [2.0, 5.0, 10.0, 20.0]);
         assert_eq!(log_ticks(1.2, 3.0), [1.5, 2.0, 3.0]);
         assert_eq!(log_ticks(1.0, 1.3).len(), 4);
-    }
-
-    #[test]
-    fn ticks_are_short() {
-        let check = |value, expected: &str| assert_eq!(tick(value), expected);
-        check(0.0, "0");
-        check(0.25, "0.25");
-        check(-1500.0, "-1500");
-        check(2e6, "2M");
-        check(1.5e9, "1.5G");
-        check(2e-4, "2e-4");
     }
 }

@@ -45,4 +45,8 @@ pub enum VizError {
         /// What the backend says.
         reason: String,
     },
+    /// Rerun's library refused.
+    #[cfg(feature = "rerun")]
+    #[error("could not encode a recording for Rerun")]
+    Rerun(#[source] Box<dyn std::error::Error + Send + Sync>),
 }

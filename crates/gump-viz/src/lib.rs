@@ -1,7 +1,7 @@
 //! Pictures, films, charts and pages: everything a person looks at.
 //!
 //! Start with [`draw_scene`] for a still, [`grid_film`] and [`overlay_film`] for futures in
-//! motion, [`Chart`] for curves and [`Page`] to put them all into one file that needs no network.
+//! motion, [`Chart`] for curves, [`Bars`] for tables and [`Page`] to put them all into one file that needs no network.
 //! [`Viewer`] writes a page of another sort: a scene to play, turn over and click into.
 //!
 //! # Terms
@@ -30,6 +30,7 @@
 //! # Ok::<(), gump_viz::VizError>(())
 //! ```
 
+mod bars;
 mod camera;
 mod chart;
 mod chart_canvas;
@@ -43,12 +44,14 @@ mod lettering;
 mod page;
 mod pen;
 mod picture;
+mod plot;
 mod theme;
 mod viewer;
 
 #[cfg(test)]
 mod tests;
 
+pub use bars::{Bar, BarGroup, Bars};
 pub use camera::Camera;
 pub use chart::{Chart, Series};
 pub use error::VizError;

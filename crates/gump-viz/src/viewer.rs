@@ -6,6 +6,8 @@
 //! `theme.rs` and `palette.css`, which it shares with pictures and pages.
 
 mod pack;
+#[cfg(feature = "rerun")]
+mod recording;
 #[cfg(test)]
 mod tests;
 mod told;

@@ -56,6 +56,8 @@ enum Format {
     Parquet,
     /// The film as an animated PNG, film.png
     Apng,
+    /// A recording for the Rerun viewer, scene.rrd; in a build with the feature `rerun`
+    Rerun,
 }
 
 impl Args {
@@ -72,6 +74,11 @@ impl Args {
                 self.world
             );
             return Err(WrongArguments(wrong).into());
+        }
+        if self.format.contains(&Format::Rerun) && !cfg!(feature = "rerun") {
+            let wrong = "--format rerun: expected a build with the feature rerun, found one without; \
+                         use cargo run -p xtask --features rerun -- simulate";
+            return Err(WrongArguments(wrong.into()).into());
         }
         let sampling = self.sampling.resolve()?;
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
@@ -138,6 +145,10 @@ impl Args {
             ))
             .futures(rollouts);
         viewer.save(&run.path("viewer.html"))?;
+        #[cfg(feature = "rerun")]
+        if wanted(Format::Rerun) {
+            viewer.save_rerun(&run.path("scene.rrd"))?;
+        }
         Ok(())
     }
 

@@ -12,10 +12,12 @@ use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
 use gump_rollout::WorldModel;
 use gump_rollout::closed_loop::{DriveConfig, Tracking};
 use gump_scene::Seed;
+use gump_viz::Bars;
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::ranking;
+use crate::charts;
 use crate::cli::WrongArguments;
 use crate::futures;
 use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
@@ -207,6 +209,8 @@ impl Args {
             Ok(nuplan_table(&worlds).write(&run.path("nuplan.parquet"))?)
         })?;
         run.result("imagination", imagination)?;
+        let names: Vec<String> = self.world.iter().map(ToString::to_string).collect();
+        charts::save(run, "scores", &chart(&rows, &names))?;
         run.result("rows", rows)?;
         ranking::tell(run, &worlds)?;
         run.result("scenarios", &scenarios)?;
@@ -465,6 +469,24 @@ fn row(drives: &Drives, world: &WorldName, seed: Seed) -> Value {
     let times: Vec<f64> = done.iter().map(|(.., ms)| *ms).collect();
     row["milliseconds_per_step"] = json!(mean(&times));
     row
+}
+
+/// The score of every planner in every world.
+fn chart(rows: &[Value], worlds: &[String]) -> Bars {
+    let mut planners: Vec<&Value> = Vec::new();
+    for row in rows.iter().filter(|row| row["world"] == worlds[0]) {
+        planners.push(&row["planner"]);
+    }
+    let names = planners.iter().filter_map(|planner| planner.as_str());
+    let names = names.map(String::from).collect();
+    let legend = worlds.iter().map(|world| charts::legend(world)).collect();
+    let label = "nuPlan score, 0 to 1, with 95 % intervals over scenarios";
+    charts::bars(label, names, legend, |planner, world| {
+        let is =
+            |row: &&Value| row["planner"] == *planners[planner] && row["world"] == worlds[world];
+        let row = rows.iter().find(is)?;
+        charts::bar(&row["score"], &row["low"], &row["high"])
+    })
 }
 
 /// Mean; `None` of nothing.

@@ -19,11 +19,13 @@ use gump_model::generation::verdict::off_road;
 use gump_model::generation::{Counts, GenerateConfig, GenerateRequest, Placement};
 use gump_model::world::TransformerWorld;
 use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, Seed};
+use gump_viz::Bars;
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::long;
+use crate::charts;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::verbs::generate;
 
@@ -142,11 +144,14 @@ impl Args {
             };
             row(*source, tally, satisfaction)
         });
-        run.result("rows", rows.collect::<Vec<_>>())?;
+        let rows: Vec<Value> = rows.collect();
+        charts::save(run, "likeness", &chart(&rows))?;
+        run.result("rows", rows)?;
         run.result("prompts", prompts.rows)?;
         if self.long_scenes > 0 {
             let (weights, n) = (self.weights.as_ref(), self.long_scenes);
             let rows = run.phase("long", |run| long::rows(run, weights, n))?;
+            charts::save(run, "life", &long::chart(&rows))?;
             run.result("life", rows)?;
         }
         Ok(())
@@ -386,6 +391,23 @@ fn scene_of(
             Some(Frame::new(moving.collect(), Vec::new()))
         }
     }
+}
+
+/// The discrepancy of every source on every attribute; the log's is none.
+fn chart(rows: &[Value]) -> Bars {
+    let attributes = ["position", "heading", "speed", "size"];
+    let rows: Vec<&Value> = rows.iter().filter(|row| row["source"] != "log").collect();
+    let sources = rows.iter().filter_map(|row| row["source"].as_str());
+    let legend = sources.map(String::from).collect();
+    let label = "maximum mean discrepancy from recorded scenes, lower is nearer";
+    let names = attributes.map(String::from).into();
+    charts::bars(label, names, legend, |attribute, source| {
+        charts::bar(
+            &rows[source][attributes[attribute]],
+            &Value::Null,
+            &Value::Null,
+        )
+    })
 }
 
 fn row(source: Source, tally: &Tally, prompt_satisfaction: Option<f64>) -> Value {

@@ -5,17 +5,21 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use gump_model::world::TransformerWorld;
-use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_rollout::{BoxError, Start, WorldModel as _};
 use gump_scene::{AgentId, Frame, LightState, Scenario, SceneState, Seed};
 use gump_synthesis::{SynthesisConfig, try_synthesize};
+use gump_viz::Bars;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
+use crate::charts;
 use crate::run::{Run, stop_if_interrupted};
 use crate::verbs::generate;
 
 /// How far ahead is imagined.
 const SECONDS: f64 = 30.0;
+/// Worlds are looked at as often as networks step, seconds.
+const DT: f64 = 0.5;
 /// Agents are counted up to this distance from the ego along either axis of the world, metres.
 const COUNTED_M: f64 = 80.0;
 
@@ -47,7 +51,7 @@ pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Re
     scenarios.truncate(n);
     let logged: Vec<Seen> = scenarios
         .iter()
-        .map(|scenario| seen(scenario.present(), scenario.future()))
+        .map(|scenario| seen(scenario.present(), &strided(scenario, DT)))
         .collect();
     let mut rows = vec![row("log", &logged, &logged)];
     for (name, life) in [("those who are there", false), ("life", true)] {
@@ -59,26 +63,41 @@ pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Re
     Ok(rows)
 }
 
+/// What each scene shows when its ego drives as it was recorded: how many are around it depends on
+/// where it goes first of all.
 fn imagined(
     world: &TransformerWorld,
     scenarios: &[Scenario],
     seed: Seed,
 ) -> anyhow::Result<Vec<Seen>> {
-    let config = SimulateConfig {
-        seconds: SECONDS,
-        ..SimulateConfig::default()
-    };
     let one = |(i, scenario): (usize, &Scenario)| {
         let start = Start {
             scene: scenario.present(),
             n_futures: 1,
             seed: seed.fork(i as u64),
         };
-        let rollouts = simulate(world, &[start], None, &config);
-        let rollouts = rollouts.map_err(|error| anyhow::anyhow!(error))?;
-        Ok(seen(scenario.present(), rollouts[0].imagined()))
+        let imagine = || {
+            let mut session = world.open(&[start])?;
+            let mut frames = Vec::new();
+            for recorded in strided(scenario, DT) {
+                let ego = recorded.agent(scenario.ego).map(|ego| ego.state);
+                let ego = ego.map(|state| vec![state]);
+                frames.extend(session.step(ego.as_deref())?);
+            }
+            Ok(frames)
+        };
+        let frames: Result<Vec<Frame>, BoxError> = imagine();
+        let frames = frames.map_err(|error| anyhow::anyhow!(error))?;
+        Ok(seen(scenario.present(), &frames))
     };
     scenarios.par_iter().enumerate().map(one).collect()
+}
+
+/// The recorded future, a frame every `dt` seconds.
+fn strided(scenario: &Scenario, dt: f64) -> Vec<Frame> {
+    let stride = (dt / scenario.dt).round().max(1.0) as usize;
+    let frames = scenario.future().iter().skip(stride - 1);
+    frames.step_by(stride).cloned().collect()
 }
 
 /// What frames after a present show.
@@ -137,6 +156,24 @@ fn row(world: &str, seen: &[Seen], logged: &[Seen]) -> Value {
         "exits": sum(|s| s.exits) / n,
         "exit_distance_m": sum(|s| s.exit_m) / sum(|s| s.exits).max(1.0),
         "changes_per_light": sum(|s| s.light_changes) / sum(|s| s.lights).max(1.0),
+    })
+}
+
+/// What changes in half a minute, in every world.
+pub(super) fn chart(rows: &[Value]) -> Bars {
+    let counts = [
+        ("agents at 30 s", "agents_at_30_s"),
+        ("error of the count", "agent_count_error"),
+        ("entries", "entries"),
+        ("exits", "exits"),
+        ("changes per light", "changes_per_light"),
+    ];
+    let worlds = rows.iter().filter_map(|row| row["world"].as_str());
+    let legend = worlds.map(String::from).collect();
+    let label = "within 80 m of the ego, mean over scenes";
+    let names = counts.map(|(name, _)| name.into()).into();
+    charts::bars(label, names, legend, |count, world| {
+        charts::bar(&rows[world][counts[count].1], &Value::Null, &Value::Null)
     })
 }
 

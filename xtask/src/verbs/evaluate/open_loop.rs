@@ -11,6 +11,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
+use crate::charts;
 use crate::planners::{PlannerName, Surroundings, Thinking};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run};
@@ -59,6 +60,15 @@ impl Args {
             rows.push(row(planner.name(), &outcomes, run));
             scenarios.extend(outcomes.iter().map(|outcome| tell(planner.name(), outcome)));
         }
+        let scores = |row: usize, _| {
+            let row: &Value = &rows[row];
+            charts::bar(&row["score"], &row["low"], &row["high"])
+        };
+        let names = rows.iter().filter_map(|row| row["planner"].as_str());
+        let label = "open-loop score, 0 to 1, with 95 % intervals over scenarios";
+        let names = names.map(String::from).collect();
+        let chart = charts::bars(label, names, vec!["score".into()], scores);
+        charts::save(run, "scores", &chart)?;
         run.result("rows", rows)?;
         run.result("scenarios", &scenarios)?;
         super::any_succeeded(&scenarios)

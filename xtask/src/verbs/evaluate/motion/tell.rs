@@ -6,16 +6,28 @@ use anyhow::Context as _;
 use gump_metrics::motion::{MotionConfig, MotionRow, MotionTally};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
+use gump_viz::Bars;
 use serde::Deserialize as _;
 use serde_json::{Map, Value, json};
 
 use super::scores::Scores;
 use super::{NAME, Shapes};
+use crate::charts;
 use crate::run::Run;
 use crate::verbs::evaluate::ledger::{self, Entry};
 
 /// Draws of scenarios for an interval; its ends move by a tenth of its width with the seed.
 const DRAWS: usize = 200;
+
+/// Charts: file, what is measured, and the numbers of a row that are.
+const CHARTS: [(&str, &str, &[&str]); 2] = [
+    ("distances", "displacement, m", &["min_ade", "min_fde"]),
+    (
+        "rates",
+        "share, 0 to 1",
+        &["miss_rate", "overlap_rate", "map", "soft_map"],
+    ),
+];
 
 /// Fills the report of a run.
 pub(super) fn tell(
@@ -41,8 +53,12 @@ pub(super) fn tell(
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
     let table: Vec<Value> = rows.iter().map(|row| Value::Object(line(row))).collect();
+    let intervals = interval_lines(&rows, &spans);
+    for (stem, label, columns) in CHARTS {
+        charts::save(run, stem, &chart(label, columns, &table, &intervals))?;
+    }
     run.result("rows", table)?;
-    run.result("intervals", interval_lines(&rows, &spans))
+    run.result("intervals", intervals)
 }
 
 /// Fills the report of shards put together.
@@ -104,6 +120,31 @@ fn head(row: &MotionRow) -> Map<String, Value> {
     );
     head.insert("horizon_s".into(), row.seconds.into());
     head
+}
+
+/// Some numbers of every class and horizon.
+fn chart(label: &str, columns: &[&str], rows: &[Value], intervals: &[Value]) -> Bars {
+    let name = |row: &Value| {
+        let class = row["class"].as_str().unwrap_or_default();
+        match row["horizon_s"].as_f64() {
+            Some(seconds) => format!("{class}, {seconds} s"),
+            None => format!("{class}, mean"),
+        }
+    };
+    let legend = columns.iter().map(|column| column.replace('_', " "));
+    let label = format!("{label}, with 95 % intervals over scenarios");
+    charts::bars(
+        &label,
+        rows.iter().map(name).collect(),
+        legend.collect(),
+        |row, column| {
+            let (value, span) = (
+                &rows[row][columns[column]],
+                &intervals[row][columns[column]],
+            );
+            charts::bar(value, &span[0], &span[1])
+        },
+    )
 }
 
 /// 95 % intervals over scenarios, [low, high] of every number of every row.

@@ -6,9 +6,11 @@ use gump_data::Table;
 use gump_metrics::interval;
 use gump_metrics::wosac::{Component, Scores};
 use gump_scene::Seed;
+use gump_viz::Bars;
 use serde_json::{Map, Value, json};
 
 use super::{Scored, Settings};
+use crate::charts;
 use crate::run::Run;
 use crate::tables;
 use crate::verbs::evaluate::ledger::{self, Entry};
@@ -48,7 +50,10 @@ pub(crate) fn tell(
         Some(row(world, &settings.year, scores.len(), &mean))
     });
     run.result("rows", rows.collect::<Vec<_>>())?;
-    run.result("intervals", intervals(&worlds))?;
+    let intervals = intervals(&worlds);
+    let names: Vec<&str> = worlds.iter().map(|(world, _)| *world).collect();
+    charts::save(run, "realism", &chart(&intervals, &names))?;
+    run.result("intervals", intervals)?;
     let undefined = entries
         .iter()
         .filter(|e| e.scores.evaluated.metametric.is_nan());
@@ -101,6 +106,22 @@ fn per_scenario(
         })
     });
     tables::of_rows(&rows.collect::<Vec<_>>())
+}
+
+/// Every likelihood of every world; distances are in other units.
+fn chart(intervals: &[Value], worlds: &[&str]) -> Bars {
+    let is_likelihood =
+        |line: &&Value| !["min_ade", "ade"].iter().any(|name| line["score"] == *name);
+    let lines: Vec<&Value> = intervals.iter().filter(is_likelihood).collect();
+    let names = lines.iter().filter_map(|line| line["score"].as_str());
+    let names = names.map(|name| name.replace('_', " ")).collect();
+    let legend = worlds.iter().map(|world| charts::legend(world)).collect();
+    let label = "realism, 0 to 1, with 95 % intervals over scenarios";
+    charts::bars(label, names, legend, |row, column| {
+        let (line, world) = (lines[row], worlds[column]);
+        let end = |end: &str| &line[format!("{world} {end}")];
+        charts::bar(&line[world], end("low"), end("high"))
+    })
 }
 
 /// One line per number: mean and 95 % interval over scenarios for every world.
