@@ -88,6 +88,6 @@ pub use optimizer::OptimizerConfig;
 pub use outlook::{Outlook, Watch};
 pub use parameters::Parameters;
 pub use sample::SampleConfig;
-pub use sampling::{CacheMode, Mode, SamplingConfig, Surrogate};
+pub use sampling::{CacheMode, Mode, Pace, SamplingConfig, Surrogate};
 pub use scenes::Scenes;
 pub use train::{RunConfig, TrainConfig, Trainer};

@@ -1,9 +1,16 @@
 //! Traffic that lives: who leaves, who comes, what the lights show, in futures of any length.
 //!
 //! All three are read off the network. Before the agents of a frame are decoded, its lights are
-//! drawn one after another, and every tracked agent is asked whether it is still there; once they
-//! are decoded, new ones come as long as the network wants more. Agents that leave the window are
-//! gone. Both happen away from the ego only. Switched on by `SamplingConfig::life`; what is benchmarked on given agents leaves it off.
+//! drawn one after another, and whoever is where the map ends is asked whether it is still there;
+//! once they are decoded, new ones come as long as the network wants more. Agents that leave the
+//! window are gone.
+//!
+//! Nobody vanishes in sight and nobody appears there: agents come over the border of the window,
+//! nearing the ego, or from where a lane of the map begins, and leave likewise, away from the ego.
+//! A network that is unsure says births and departures of everybody, and training shows false ones
+//! wherever a sample leaves agents out. How often they come and how often lights change is set to
+//! what recordings have by [`Pace`](crate::Pace). Switched on by `SamplingConfig::life`; what is
+//! benchmarked on given agents leaves it off.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -17,7 +24,7 @@ use crate::aggregation::Ring;
 use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::decode::{Window, present_all};
-use crate::decoder::STEPS;
+use crate::decoder::{N_LIGHT_STATES, STEPS};
 use crate::draw::uniform;
 use crate::engine::{Context, Engine, Job};
 use crate::future::{Future, stream};
@@ -33,8 +40,7 @@ use crate::session::TransformerSession;
 const MOST_BIRTHS: usize = 4;
 /// Draws of a new agent before it stays away.
 const TRIES: u64 = 6;
-/// Nobody comes or leaves nearer to the ego than this, metres: that happens at the edge of what is
-/// seen, and a network that is unsure says it of everybody.
+/// Nobody comes or leaves nearer to the ego than this, metres.
 const SEEN_M: f64 = 50.0;
 
 /// States of a light in the order of their tokens.
@@ -86,9 +92,9 @@ impl TransformerSession<'_> {
             for (&w, said) in members.iter().zip(engine.say(&hidden)) {
                 let future = &self.futures[w];
                 let seed = future.decision(About::Lights).fork(light as u64);
-                let peak = said.lights.iter().copied().fold(f32::MIN, f32::max);
-                let weights = said.lights.map(|logit| f64::from((logit - peak).exp()));
-                let state = LIGHT_STATES[pick(&weights, uniform(seed)).unwrap_or(0)];
+                let shown = windows[w].next.lights[light].state;
+                let changes = self.world.sampling().pace.light_changes;
+                let state = next_light(&said.lights, shown, changes, uniform(seed));
                 windows[w].next.lights[light].state = state;
                 let slot = first_slot(&windows[w], &placed[w]) + light + 1;
                 placed[w][slot].slot = Slot::Light(windows[w].next.lights[light]);
@@ -96,7 +102,7 @@ impl TransformerSession<'_> {
         }
     }
 
-    /// Asks before every tracked agent but the ego whether it is the next.
+    /// Asks before every tracked agent but the ego whether it is the next; who is in sight is.
     fn take_out(
         &self,
         engine: &Engine,
@@ -119,16 +125,21 @@ impl TransformerSession<'_> {
         let mut said = engine.say(&hidden).into_iter();
         for &w in &members {
             let window = &mut windows[w];
+            let scene = &self.scenes[window.scene];
             let ids: Vec<u16> = window.next.tracked.iter().map(|a| a.key.id).collect();
             let seed = self.futures[w].decision(About::Leaving);
             let places = window.next.tracked.iter();
-            let places: Vec<_> = places.map(|a| a.state.pose().position).collect();
+            let places: Vec<_> = places
+                .map(|a| (a.state.pose().position, a.key.kind))
+                .collect();
             let mut kept = vec![true];
             for (i, &id) in ids.iter().enumerate().skip(1) {
                 let said = said.next().expect("one word per tracked agent");
                 let stay = stays(&said, id, &ids[i + 1..]);
-                let is_seen = places[i].distance(places[0]) < SEEN_M;
-                kept.push(is_seen || uniform(seed.fork(u64::from(id))) < stay);
+                let (place, kind) = places[i];
+                let is_far = place.distance(places[0].0) >= SEEN_M;
+                let may_leave = is_far && scene.ground(kind).ends_at(place);
+                kept.push(!may_leave || uniform(seed.fork(u64::from(id))) < stay);
             }
             let mut of_agents = kept.iter();
             let mut of_requests = kept.iter();
@@ -181,6 +192,7 @@ impl TransformerSession<'_> {
             *frame = future.without_the_gone(frame, scene);
         }
         let engine = self.world.engine().expect("checked before decoding");
+        let arrivals = self.world.sampling().pace.arrivals;
         let mut open: Vec<usize> = (0..self.futures.len()).collect();
         let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
         for birth in 0..MOST_BIRTHS {
@@ -199,7 +211,8 @@ impl TransformerSession<'_> {
                 let has_room = last.len_slots() + 2 <= longest;
                 let used: BTreeSet<u16> = future.identities.iter().map(|(id, _)| id).collect();
                 let before = last.newborn.last().map(|agent| agent.key);
-                match next_key(&said, BEGIN_AT, &used, before, seed).filter(|_| has_room) {
+                let key = next_key(&said, BEGIN_AT, &used, before, seed, arrivals);
+                match key.filter(|_| has_room) {
                     Some(key) => coming.push((f, key.kind, seed)),
                     None => open.retain(|open| *open != f),
                 }
@@ -254,7 +267,13 @@ impl TransformerSession<'_> {
         let mut arriving = Vec::new();
         for (f, kind, seed) in coming {
             let future = &mut self.futures[f];
-            if let Some((id, agent)) = future.identities.newborn() {
+            let may_come = !self.scenes[future.scene].entries(kind).is_closed();
+            // Who drifted in stands in the list already, perhaps with an id above the lowest free.
+            let newborn = future.frames.last().and_then(|now| now.newborn.last());
+            let last = newborn.filter(|last| last.key.kind == kind);
+            let last = last.map_or(0, |last| last.key.id);
+            let newborn = may_come.then(|| future.identities.newborn_after(last));
+            if let Some((id, agent)) = newborn.flatten() {
                 arriving.push((f, Key { id, kind }, agent, seed));
             } else {
                 open.retain(|open| *open != f);
@@ -295,6 +314,7 @@ impl TransformerSession<'_> {
                 let ego = ego.map_or_else(Default::default, |ego| ego.state.pose().position);
                 let is_far = state.pose().position.distance(ego) >= SEEN_M;
                 is_far
+                    && rules.enters(&state)
                     && rules
                         .broken(&state, &scene.map, scene.world_from_scene)
                         .is_none()
@@ -329,6 +349,26 @@ impl TransformerSession<'_> {
         }
         Ok(())
     }
+}
+
+/// The next state of a light that shows `shown`, from the logits of all; the odds of any other are
+/// multiplied by `changes`.
+fn next_light(
+    logits: &[f32; N_LIGHT_STATES],
+    shown: LightState,
+    changes: f64,
+    uniform: f64,
+) -> LightState {
+    let peak = logits.iter().copied().fold(f32::MIN, f32::max);
+    let weights: Vec<f64> = LIGHT_STATES
+        .iter()
+        .zip(logits)
+        .map(|(state, logit)| {
+            let factor = if *state == shown { 1.0 } else { changes };
+            factor * f64::from((logit - peak).exp())
+        })
+        .collect();
+    pick(&weights, uniform).map_or(shown, |state| LIGHT_STATES[state])
 }
 
 /// Index of BEGIN of a window's next frame; its lights follow.
@@ -405,17 +445,44 @@ impl Future {
         Ok(slots)
     }
 
-    /// What a new agent keeps to: lanes or walkways, and clear of everybody.
+    /// What a new agent keeps to: where lanes or walkways come into what is seen, and clear of
+    /// everybody.
     fn rules(&self, kind: AgentKind, scene: &Scene) -> Rules {
         let now = self.frames.last().into_iter().flat_map(TokenFrame::agents);
         let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();
+        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        let ego = ego.map(|ego| (ego.state.pose().position, ego.state.velocity()));
         Rules {
             kind,
             spec: ObjectSpec::default(),
-            ground: Some(scene.ground(kind)).filter(|ground| !ground.is_closed()),
+            ground: Some(scene.entries(kind)),
             rows: Vec::new(),
             taken,
+            comes_to: ego,
             is_guided: true,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lights_change_with_the_odds_of_the_network_times_their_pace() {
+        // The network gives red, which shows, as much as green.
+        let logits = [0.0, -30.0, 0.0, -30.0];
+        let share = |pace: f64| {
+            let draws = (0..4000).map(|i| uniform(Seed(i)));
+            let states = draws.map(|u| next_light(&logits, LightState::Red, pace, u));
+            states.filter(|state| *state == LightState::Green).count() as f64 / 4000.0
+        };
+        // Standard deviations are below 0.008.
+        assert!((share(1.0) - 0.5).abs() < 0.03);
+        assert!((share(0.25) - 0.2).abs() < 0.03);
+        assert_eq!(share(0.0), 0.0);
+        let sure = [-90.0, -90.0, -90.0, 0.0];
+        let told = next_light(&sure, LightState::Red, 0.25, 0.5);
+        assert_eq!(told, LightState::Unknown);
     }
 }

@@ -39,6 +39,8 @@ pub struct SamplingConfig {
     /// Whether agents come and leave and lights change as the network says (on a CPU); else those
     /// who are there stay, and lights keep the colour they were seen in.
     pub life: bool,
+    /// How fast that goes.
+    pub pace: Pace,
     /// How often an object that would run into another or off the road within 1.5 s is drawn again
     /// at most (paper: 0); in partial-AR decoding only.
     pub redraws: usize,
@@ -59,9 +61,32 @@ impl Default for SamplingConfig {
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
+            pace: Pace::default(),
             redraws: 12,
             limits: true,
             precision: Precision::F32,
+        }
+    }
+}
+
+/// Factors on the odds that the network gives to what happens in a frame of living traffic; 1 is what
+/// it says.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Pace {
+    /// That a further agent comes.
+    pub arrivals: f64,
+    /// That a light changes.
+    pub light_changes: f64,
+}
+
+impl Default for Pace {
+    /// What makes half a minute of made-up scenes with the shipped weights as lively as the same
+    /// scenes simulated by rules (docs/results/0012-generation.md).
+    fn default() -> Self {
+        Self {
+            arrivals: 1.0,
+            light_changes: 0.3,
         }
     }
 }

@@ -66,8 +66,10 @@ pub(crate) struct Scene {
     /// The map laid out around the scene.
     pub(crate) survey: Arc<Survey>,
     pub(crate) route: Option<Arc<Route>>,
-    /// Where new agents may come, by class; made when first asked for.
+    /// Where agents may be, by class; made when first asked for.
     grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
+    /// The part of them that leads into what is seen.
+    entries: [OnceLock<Arc<Ground>>; N_CLASSES],
 }
 
 impl Scene {
@@ -136,6 +138,7 @@ impl Scene {
             survey,
             route,
             grounds: Default::default(),
+            entries: Default::default(),
         })
     }
 
@@ -163,11 +166,17 @@ impl Scene {
         like.with_motion(&self.local(state))
     }
 
-    /// Where agents of a class may come.
+    /// Where agents of a class may be.
     pub(crate) fn ground(&self, kind: AgentKind) -> Arc<Ground> {
         let ground = &self.grounds[class_index(kind)];
         let make = || Arc::new(Ground::of_class(&self.map, self.world_from_scene, kind));
         Arc::clone(ground.get_or_init(make))
+    }
+
+    /// Where agents of a class may come into what is seen.
+    pub(crate) fn entries(&self, kind: AgentKind) -> Arc<Ground> {
+        let make = || Arc::new(self.ground(kind).entries());
+        Arc::clone(self.entries[class_index(kind)].get_or_init(make))
     }
 
     /// A world state in the scene frame.

@@ -21,6 +21,9 @@ use crate::world::TransformerWorld;
 /// An ego farther than this from the origin of its scene gets a new scene around it, metres. Training
 /// shows windows up to 85 m away.
 const RECENTRE_M: f64 = 60.0;
+/// The same where agents come and leave: they do so at the border of the window, which must not come
+/// near.
+const RECENTRE_ALIVE_M: f64 = 20.0;
 
 pub(crate) struct TransformerSession<'a> {
     pub(crate) world: &'a TransformerWorld,
@@ -102,8 +105,12 @@ impl TransformerSession<'_> {
     /// Gives every future whose ego nears the edge of its window a scene around the ego's present,
     /// map and tokens alike; such a future shares its visual memory with no other any more.
     fn recentre(&mut self) -> Result<(), ModelError> {
+        let reach = match self.world.sampling().life {
+            true => RECENTRE_ALIVE_M,
+            false => RECENTRE_M,
+        };
         let far: Vec<usize> = (0..self.futures.len())
-            .filter(|i| self.futures[*i].ego_reach() >= RECENTRE_M)
+            .filter(|i| self.futures[*i].ego_reach() >= reach)
             .collect();
         let around = |i: &usize| {
             let future = &self.futures[*i];

@@ -74,8 +74,16 @@ impl Identities {
 
     /// A new agent that no frame has had, with the lowest free id; `None` if all are taken.
     pub fn newborn(&mut self) -> Option<(u16, AgentId)> {
+        self.newborn_after(0)
+    }
+
+    /// The same with the lowest free id above `id`, for a list in which ids ascend.
+    pub fn newborn_after(&mut self, id: u16) -> Option<(u16, AgentId)> {
         let agent = AgentId(self.next_agent);
-        self.allocate(agent).map(|id| (id, agent))
+        let mut ids = AGENT_KEYS.map(|id| id as u16);
+        let free = ids.find(|free| *free > id && !self.agents.contains_key(free))?;
+        self.insert(agent, free);
+        Some((free, agent))
     }
 
     /// Frees the ids for which `keep` is false. They must occur in no frame that is still read.

@@ -18,19 +18,21 @@ pub(crate) const NEWBORN_AT: usize = CONTROL_KEYS + 1;
 ///
 /// `stop` is the mark that ends the list, `used` the ids that are taken, `last` the key before in
 /// the list. Classes ascend within a list, and ids within a class, so what may still come shrinks.
+/// The odds of a further one are multiplied by `pace`.
 pub(crate) fn next_key(
     said: &Successor,
     stop: usize,
     used: &BTreeSet<u16>,
     last: Option<Key>,
     seed: Seed,
+    pace: f64,
 ) -> Option<Key> {
     let peak = said.control.iter().copied().fold(f32::MIN, f32::max);
     let weight = |i: usize| f64::from((said.control[i] - peak).exp());
     let free = AGENT_KEYS
         .map(|id| id as u16)
         .filter(|id| !used.contains(id));
-    let fresh: f64 = free.map(|id| weight(usize::from(id))).sum();
+    let fresh: f64 = pace * free.map(|id| weight(usize::from(id))).sum::<f64>();
     if uniform(seed.fork(0)) * (fresh + weight(stop)) < weight(stop) {
         return None;
     }
@@ -111,14 +113,22 @@ mod tests {
     fn the_end_and_new_keys_have_their_shares() {
         let said = said(&[(BEGIN_AT, 0.0), (7, 3f32.ln())]);
         let none = BTreeSet::new();
-        let drawn: Vec<Option<Key>> = (0..4000)
-            .map(|i| next_key(&said, BEGIN_AT, &none, None, Seed(i)))
-            .collect();
+        let draw = |pace: f64| -> Vec<Option<Key>> {
+            let seeds = (0..4000).map(Seed);
+            seeds
+                .map(|seed| next_key(&said, BEGIN_AT, &none, None, seed, pace))
+                .collect()
+        };
+        let drawn = draw(1.0);
         let n = |f: &dyn Fn(&Key) -> bool| drawn.iter().flatten().filter(|k| f(k)).count() as i64;
         // Three quarters come, half of them on foot; standard deviations are below 32.
         assert!((n(&|k| k.id == 7) - 3000).abs() < 130);
         assert!((n(&|k| k.kind == AgentKind::Pedestrian) - 1500).abs() < 130);
         assert_eq!(n(&|k| k.kind == AgentKind::Bicycle), 0);
+        // At a third of the odds of three to one, one half comes.
+        let slow = draw(1.0 / 3.0).iter().flatten().count() as i64;
+        assert!((slow - 2000).abs() < 130, "{slow}");
+        assert_eq!(draw(0.0).iter().flatten().count(), 0);
     }
 
     #[test]
@@ -126,7 +136,7 @@ mod tests {
         let said = said(&[(7, 5.0), (3, 5.0), (9, 0.0)]);
         let used = BTreeSet::from([7]);
         for i in 0..200 {
-            let key = next_key(&said, BEGIN_AT, &used, Some(vehicle(5)), Seed(i)).unwrap();
+            let key = next_key(&said, BEGIN_AT, &used, Some(vehicle(5)), Seed(i), 1.0).unwrap();
             assert!(vehicle(5) < key && key.id != 7, "{key}");
         }
     }

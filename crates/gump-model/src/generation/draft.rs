@@ -96,7 +96,7 @@ impl<'a> Draft<'a> {
         let last = self.agents.last().map(|agent| agent.key);
         let last = last.filter(|key| !key.is_ego());
         let seed = self.stream(2 * self.agents.len() as u64 + 1);
-        let drawn = births::next_key(said, NEWBORN_AT, &used, last, seed);
+        let drawn = births::next_key(said, NEWBORN_AT, &used, last, seed, 1.0);
         let Some(due) = self.wished.front().map(|object| object.class.kind()) else {
             return drawn;
         };

@@ -10,12 +10,18 @@ use gump_geometry::{DVec2, Pose, angle_difference, dvec2};
 use gump_scene::{AgentKind, AreaKind, Lane, LaneId, LaneKind, MapGraph};
 use gump_tokenizer::Field;
 
+use crate::world::KEEP_RANGE_M;
+
 /// Cells along each side.
 pub(crate) const CELLS: usize = 200;
 /// Half the side of the square, metres.
 const REACH: f64 = 100.0;
 /// Two ways less than this apart are one, radians.
 const SAME_WAY: f64 = 0.15;
+/// Whoever is nearer than this to the border of what is seen along an axis may pass it, metres.
+const RIM: f64 = 12.0;
+/// Whoever is nearer than this to where a map's lane begins or ends may come or leave there, metres.
+const GATE: f64 = 8.0;
 /// Slower things have no direction of motion, metres per second.
 pub(crate) const SLOW: f64 = 0.75;
 /// Sectors in which ways are listed.
@@ -36,6 +42,22 @@ pub(crate) struct Cell {
     pub(crate) is_open: bool,
     /// Headings that things have there, scene frame; none where any will do.
     pub(crate) ways: Vec<f32>,
+    /// How somebody may come there into what is seen.
+    pub(crate) entry: Entry,
+    /// Whether a lane of the map ends there.
+    pub(crate) is_end: bool,
+}
+
+/// How somebody comes into what is seen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Entry {
+    /// Not there.
+    #[default]
+    Closed,
+    /// Over the border, nearing the ego.
+    Border,
+    /// From where the map ends.
+    Gate,
 }
 
 impl Ground {
@@ -45,23 +67,43 @@ impl Ground {
         let scene_from_world = world_from_scene.inverse();
         let near = |lane: &&Lane| is_near(lane, world_from_scene.position);
         for lane in map.lanes().iter().filter(near) {
-            match (kind, lane.kind) {
-                (AgentKind::Vehicle, LaneKind::BikeLane) => {}
-                (AgentKind::Vehicle, _) => ground.open_lane(lane, 0.0, scene_from_world),
-                (AgentKind::Bicycle, LaneKind::BikeLane) => {
-                    ground.open_lane(lane, 0.0, scene_from_world);
-                }
+            let offset = match (kind, lane.kind) {
+                (AgentKind::Vehicle, LaneKind::BikeLane) => continue,
+                (AgentKind::Vehicle, _) | (AgentKind::Bicycle, LaneKind::BikeLane) => 0.0,
                 (AgentKind::Bicycle, LaneKind::SurfaceStreet | LaneKind::Undefined) => {
-                    let side = (lane.width / 2.0 - 0.8).max(0.0);
-                    ground.open_lane(lane, -side, scene_from_world);
+                    -(lane.width / 2.0 - 0.8).max(0.0)
                 }
-                _ => {}
-            }
+                _ => continue,
+            };
+            ground.open_lane(lane, offset, scene_from_world);
+            ground.mark_gates(map, lane, offset, scene_from_world);
         }
         if kind == AgentKind::Pedestrian {
             ground.open_walks(map, scene_from_world);
         }
         ground.finish()
+    }
+
+    /// The part of the ground on which somebody may come into what is seen.
+    pub(crate) fn entries(&self) -> Self {
+        let cells = self.cells.iter().map(|cell| Cell {
+            is_open: cell.is_open && cell.entry != Entry::Closed,
+            ways: match cell.entry {
+                Entry::Closed => Vec::new(),
+                _ => cell.ways.clone(),
+            },
+            ..*cell
+        });
+        let ground = Self {
+            cells: cells.collect(),
+            velocities: Vec::new(),
+        };
+        ground.finish()
+    }
+
+    /// Whether a lane of the map ends around a point.
+    pub(crate) fn ends_at(&self, point: DVec2) -> bool {
+        self.cell(point).is_some_and(|cell| cell.is_end)
     }
 
     /// The ground of one lane; none if there is no such lane.
@@ -104,6 +146,11 @@ impl Ground {
     }
 
     fn finish(mut self) -> Self {
+        for (i, cell) in self.cells.iter_mut().enumerate() {
+            if cell.entry == Entry::Closed && is_rim(centre(i / CELLS, i % CELLS)) {
+                cell.entry = Entry::Border;
+            }
+        }
         let mut sectors: [Option<f32>; SECTORS] = [None; SECTORS];
         for way in self.cells.iter().flat_map(|cell| &cell.ways) {
             let sector = (f64::from(*way).rem_euclid(TAU) / TAU * SECTORS as f64) as usize;
@@ -132,6 +179,25 @@ impl Ground {
             cell.is_open = true;
             if cell.ways.is_empty() || !goes(&cell.ways, pose.heading, SAME_WAY) {
                 cell.ways.push(pose.heading as f32);
+            }
+        }
+    }
+
+    /// Marks where a lane begins without one before it, or ends without one after it.
+    fn mark_gates(&mut self, map: &MapGraph, lane: &Lane, offset: f64, scene_from_world: Pose) {
+        let line = lane.centerline.offset(offset);
+        let (begins, ends) = (
+            map.predecessors(lane.id).next().is_none(),
+            map.successors(lane.id).next().is_none(),
+        );
+        for i in 0..=GATE as usize {
+            let along = (i as f64).min(line.length());
+            let place = |along: f64| index(scene_from_world * line.pose_at(along).position);
+            if let Some(i) = place(along).filter(|_| begins) {
+                self.cells[i].entry = Entry::Gate;
+            }
+            if let Some(i) = place(line.length() - along).filter(|_| ends) {
+                self.cells[i].is_end = true;
             }
         }
     }
@@ -191,6 +257,11 @@ fn is_near(lane: &Lane, centre: DVec2) -> bool {
     (low - reach).cmple(centre).all() && (high + reach).cmpge(centre).all()
 }
 
+/// Whether a point of the scene frame is near the border of what is seen.
+fn is_rim(point: DVec2) -> bool {
+    point.abs().max_element() >= KEEP_RANGE_M - RIM
+}
+
 fn index(point: DVec2) -> Option<usize> {
     let cell = (point + REACH).floor();
     let inside = 0.0 <= cell.min_element() && cell.max_element() < CELLS as f64;
@@ -224,6 +295,21 @@ mod tests {
         let walk = ground(AgentKind::Pedestrian);
         assert!(walk.cell(dvec2(10.2, -3.7)).unwrap().is_open);
         assert!(!walk.cell(dvec2(10.2, 0.3)).unwrap().is_open);
+    }
+
+    #[test]
+    fn things_come_over_the_border_and_from_where_the_map_ends() {
+        // One lane goes on beyond the window, one begins and ends in it.
+        let scenario =
+            fixture::scenario("lane 1: -150,0 150,0\nlane 2: -40,30 40,30\nego vehicle 0: 0,0")
+                .unwrap();
+        let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
+        let entries = ground.entries();
+        let open = |x: f64, y: f64| entries.cell(dvec2(x, y)).unwrap().is_open;
+        assert!(open(-90.0, 0.3) && open(90.0, 0.3) && !open(0.0, 0.3));
+        assert!(open(-38.0, 30.3) && !open(0.0, 30.3) && !open(38.0, 30.3));
+        assert!(!ground.ends_at(dvec2(90.0, 0.3)) && ground.ends_at(dvec2(38.0, 30.3)));
+        assert!(entries.admits(dvec2(9.0, 0.0)) && !entries.admits(dvec2(0.0, 9.0)));
     }
 
     #[test]

@@ -157,6 +157,7 @@ impl<'a> Prepared<'a> {
             ground: of_lane.or_else(of_class),
             taken: taken.to_vec(),
             rows,
+            comes_to: None,
             is_guided,
         }
     }

@@ -13,12 +13,14 @@ use gump_scene::{AgentKind, MapGraph};
 use gump_tokenizer::{Field, QuantizedState};
 
 use super::constraint::{Bounds, ObjectSpec};
-use super::ground::{CELLS, Ground, SLOW, goes};
+use super::ground::{CELLS, Cell, Entry, Ground, SLOW, goes};
 use crate::decoder::STEPS;
 use crate::sampling::{Bins, Restrict};
 
 /// Gap that boxes keep, metres.
 const CLEARANCE: f64 = 0.2;
+/// Whoever comes over the border nears the ego at least so fast, metres per second.
+const CLOSING: f64 = 0.5;
 /// A gap in a row is met to this, metres: half a step of the grid along each axis and some turn.
 const ROW_SLACK: f64 = 0.5;
 
@@ -33,6 +35,9 @@ pub(crate) struct Rules {
     pub(crate) rows: Vec<(bool, OrientedBox, f64)>,
     /// Boxes that are there already, scene frame.
     pub(crate) taken: Vec<OrientedBox>,
+    /// Where the ego is and how fast, for one that comes into what it sees; scene frame,
+    /// metres and metres per second.
+    pub(crate) comes_to: Option<(DVec2, DVec2)>,
     /// Whether sizes and speeds keep to what is common in the class.
     pub(crate) is_guided: bool,
 }
@@ -100,13 +105,20 @@ impl Rules {
         None
     }
 
+    /// True for a state in which somebody may come into what is seen.
+    pub(crate) fn enters(&self, state: &QuantizedState) -> bool {
+        let at = state.pose().position;
+        let cell = self.ground.as_ref().and_then(|ground| ground.cell(at));
+        cell.is_some_and(|cell| cell.is_open && self.nears(at, cell, state.velocity()))
+    }
+
     /// True if some cell is open to it, whatever its size and speed; without ground all places are.
     pub(crate) fn has_place(&self) -> bool {
         let Some(ground) = &self.ground else {
             return true;
         };
         let mut columns = (0..CELLS).flat_map(|x| ground.column(x));
-        columns.any(|(at, cell)| self.fits(at, &cell.ways, DVec2::ZERO, DVec2::ZERO))
+        columns.any(|(at, cell)| self.fits(at, cell, DVec2::ZERO, DVec2::ZERO))
     }
 
     /// The first clause of its description that a state does not meet.
@@ -224,20 +236,15 @@ impl Rules {
         }
         let open: Option<[bool; CELLS]> = ground.map(|ground| {
             let mut open = [false; CELLS];
-            let fits = |(at, ways): (DVec2, &[f32])| self.fits(at, ways, size, velocity);
-            let cells = |x: usize| {
-                ground
-                    .column(x)
-                    .map(|(at, cell)| (at, cell.ways.as_slice()))
-            };
+            let fits = |(at, cell): &(DVec2, &Cell)| self.fits(*at, cell, size, velocity);
             if field == Field::X {
                 for (x, open) in open.iter_mut().enumerate() {
-                    *open = cells(x).any(fits);
+                    *open = ground.column(x).any(|cell| fits(&cell));
                 }
             } else {
                 let x = ((value(4) + 100.0).floor().max(0.0) as usize).min(CELLS - 1);
-                for cell in cells(x).filter(|cell| fits(*cell)) {
-                    open[(cell.0.y + 100.0).floor() as usize] = true;
+                for (at, _) in ground.column(x).filter(fits) {
+                    open[(at.y + 100.0).floor() as usize] = true;
                 }
             }
             open
@@ -252,8 +259,12 @@ impl Rules {
     }
 
     /// Whether the object could stand on a cell: inside its bounds, the way it moves, clear of
-    /// others.
-    fn fits(&self, at: DVec2, ways: &[f32], size: DVec2, velocity: DVec2) -> bool {
+    /// others, and nearing the ego if it comes over the border of what that sees.
+    fn fits(&self, at: DVec2, cell: &Cell, size: DVec2, velocity: DVec2) -> bool {
+        let ways = &cell.ways;
+        if !self.nears(at, cell, velocity) {
+            return false;
+        }
         let within = |bounds: Option<Bounds>, value: f64| {
             bounds.is_none_or(|bounds| bounds.admit(value, 0.6))
         };
@@ -281,6 +292,14 @@ impl Rules {
             width: size.y + CLEARANCE,
         };
         !self.taken.iter().any(|other| own.overlaps(other))
+    }
+
+    /// False for what comes over the border of what the ego sees without nearing it.
+    fn nears(&self, at: DVec2, cell: &Cell, velocity: DVec2) -> bool {
+        let bordering = self.comes_to.filter(|_| cell.entry == Entry::Border);
+        bordering.is_none_or(|(ego, moving)| {
+            (ego - at).normalize_or_zero().dot(velocity - moving) >= CLOSING
+        })
     }
 
     fn admits_heading(&self, heading: f64, at: DVec2, velocity: DVec2) -> bool {
@@ -338,6 +357,7 @@ mod tests {
             ground: None,
             rows: Vec::new(),
             taken: Vec::new(),
+            comes_to: None,
             is_guided: false,
         }
     }
@@ -367,6 +387,7 @@ mod tests {
         let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
         let rules = Rules {
             ground: Some(Arc::new(ground)),
+            comes_to: None,
             is_guided: true,
             ..rules(ObjectSpec::default())
         };
