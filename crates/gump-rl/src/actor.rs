@@ -1,27 +1,62 @@
 //! The policy that is learned: from observations to a distribution of actions.
 
+use std::borrow::Cow;
+
 use gump_scene::{Rng, Seed};
 
-use crate::networks::{Mlp, Normalizer, Pass, standard_normal};
+use crate::ObservationForm;
+use crate::networks::{ConvNet, ConvPass, Mlp, Normalizer, Pass, standard_normal};
 use crate::sac::{SacConfig, Squashed};
 
-/// A normalizer and a network that gives two numbers, mean and log standard deviation, per number
-/// of an action.
+/// What an observation goes through first, and a network that gives two numbers, mean and log
+/// standard deviation, per number of an action.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Actor {
-    pub(crate) normalizer: Normalizer,
+    pub(crate) perception: Perception,
     pub(crate) network: Mlp,
     pub(crate) log_std_bounds: [f64; 2],
 }
 
+/// How an observation becomes what dense networks take in.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Perception {
+    /// Number by number.
+    Scaled(Normalizer),
+    /// As a picture.
+    Encoded(ConvNet),
+}
+
 impl Actor {
     /// An actor that has learned nothing.
-    pub fn new(config: &SacConfig, observation_len: usize, action_len: usize, seed: Seed) -> Self {
-        let mut sizes = vec![observation_len];
+    ///
+    /// # Panics
+    /// For an encoder of pictures over numbers; see [`SacConfig::check_form`].
+    pub fn new(
+        config: &SacConfig,
+        form: impl Into<ObservationForm>,
+        action_len: usize,
+        seed: Seed,
+    ) -> Self {
+        let form = form.into();
+        let (perception, n_features) = match (config.encoder, form) {
+            (None, form) => {
+                let scale = Normalizer::identity(form.len());
+                (Perception::Scaled(scale), form.len())
+            }
+            (Some(architecture), ObservationForm::Bits(picture)) => {
+                let encoder = ConvNet::new(architecture, picture, &mut seed.fork(0).rng());
+                let n_features = encoder.n_features();
+                (Perception::Encoded(encoder), n_features)
+            }
+            (Some(_), ObservationForm::Numbers(len)) => {
+                panic!("an encoder of pictures over {len} numbers")
+            }
+        };
+        let mut sizes = vec![n_features];
         sizes.extend(&config.hidden);
         sizes.push(2 * action_len);
         Self {
-            normalizer: Normalizer::identity(observation_len),
+            perception,
             network: Mlp::new(&sizes, config.head_gain, &mut seed.rng()),
             log_std_bounds: config.log_std_bounds,
         }
@@ -29,12 +64,43 @@ impl Actor {
 
     /// Numbers in an observation.
     pub fn observation_len(&self) -> usize {
+        match &self.perception {
+            Perception::Scaled(_) => self.n_features(),
+            Perception::Encoded(encoder) => encoder.picture().len(),
+        }
+    }
+
+    /// Numbers that the dense network takes in.
+    pub(crate) fn n_features(&self) -> usize {
         self.network.sizes()[0]
     }
 
     /// Numbers in an action.
     pub fn action_len(&self) -> usize {
         self.network.sizes().last().map_or(0, |outputs| outputs / 2)
+    }
+
+    /// What scales observations, if they are numbers.
+    pub(crate) fn normalizer(&self) -> Option<&Normalizer> {
+        match &self.perception {
+            Perception::Scaled(normalizer) => Some(normalizer),
+            Perception::Encoded(_) => None,
+        }
+    }
+
+    /// What makes features of observations, if they are pictures.
+    pub fn encoder(&self) -> Option<&ConvNet> {
+        match &self.perception {
+            Perception::Scaled(_) => None,
+            Perception::Encoded(encoder) => Some(encoder),
+        }
+    }
+
+    pub(crate) fn encoder_mut(&mut self) -> Option<&mut ConvNet> {
+        match &mut self.perception {
+            Perception::Scaled(_) => None,
+            Perception::Encoded(encoder) => Some(encoder),
+        }
     }
 
     /// The most likely actions before squashing: what to do when not exploring.
@@ -58,8 +124,18 @@ impl Actor {
     }
 
     fn act(&self, observations: &[f32], mut choose: impl FnMut(Squashed) -> f64) -> Vec<f32> {
-        let mut input = observations.to_vec();
-        self.normalizer.apply(&mut input);
+        let mut seen = ConvPass::default();
+        let input = match &self.perception {
+            Perception::Scaled(normalizer) => {
+                let mut input = observations.to_vec();
+                normalizer.apply(&mut input);
+                Cow::Owned(input)
+            }
+            Perception::Encoded(encoder) => {
+                encoder.forward(observations, &mut seen);
+                Cow::Borrowed(seen.output())
+            }
+        };
         let mut pass = Pass::default();
         self.network.forward(&input, &mut pass);
         let dimensions = pass.output().chunks_exact(2);

@@ -112,6 +112,12 @@ pub enum RlError {
         /// The environment's.
         found: usize,
     },
+    /// A convolutional encoder over observations that are no pictures.
+    #[error("an encoder of pictures was asked for, but observations are {found} numbers")]
+    NoPicture {
+        /// How many.
+        found: usize,
+    },
     /// Learning left the realm of numbers.
     #[error("learning diverged at gradient step {step}: a loss is not a finite number")]
     Diverged {

@@ -34,7 +34,7 @@ pub fn demonstrations(
     env.reset_to(&(0..n).map(start).collect::<Vec<_>>())?;
     let (o, a) = (env.observation_len(), env.action_len());
     let longest = courses.iter().map(Course::logged_steps).max().unwrap_or(0);
-    let mut buffer = ReplayBuffer::new((n * longest).max(1), o, a)?;
+    let mut buffer = ReplayBuffer::new((n * longest).max(1), config.observation.form(), a)?;
     let mut actions = vec![0.0; n * a];
     let mut is_driving = vec![true; n];
     while is_driving.contains(&true) {
@@ -43,10 +43,10 @@ pub fn demonstrations(
         env.step(&actions)?;
         for i in (0..n).filter(|&i| is_driving[i]) {
             buffer.push(Transition {
-                observation: &before[i * o..][..o],
+                observation: before[i * o..][..o].into(),
                 action: &actions[i * a..][..a],
                 reward: env.rewards()[i],
-                next: &env.final_observations()[i * o..][..o],
+                next: env.final_observations()[i * o..][..o].into(),
                 terminated: env.terminated()[i],
             });
         }

@@ -55,6 +55,6 @@ pub use evaluate::{
 };
 pub use imitation::demonstrations;
 pub use observation::{
-    ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View, expand, observe,
+    ObservationForm, ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View, expand, observe,
 };
 pub use vector_env::VectorEnv;

@@ -190,12 +190,12 @@ impl<'w> DrivingEnv<'w> {
     /// [`VectorEnv::observations`] of rasters with a bit per pixel, for memories; empty for
     /// vectors. Shape: `[n_envs, packed_len]`.
     pub fn packed_observations(&self) -> &[u8] {
-        &self.observations.packed
+        self.observations.packed()
     }
 
     /// [`VectorEnv::final_observations`] in the same form.
     pub fn packed_final_observations(&self) -> &[u8] {
-        &self.finals.packed
+        self.finals.packed()
     }
 
     /// The configuration.
@@ -403,7 +403,7 @@ impl VectorEnv for DrivingEnv<'_> {
     }
 
     fn observations(&self) -> &[f32] {
-        &self.observations.numbers
+        self.observations.numbers()
     }
 
     fn rewards(&self) -> &[f32] {
@@ -419,6 +419,6 @@ impl VectorEnv for DrivingEnv<'_> {
     }
 
     fn final_observations(&self) -> &[f32] {
-        &self.finals.numbers
+        self.finals.numbers()
     }
 }

@@ -35,7 +35,8 @@ impl Pass {
         self.rows
     }
 
-    /// The gradient of the input after [`Mlp::backward_to_input`]. Shape: `[rows, inputs]`.
+    /// The gradient of the input after [`Mlp::backward_to_input`] or [`Mlp::backward_through`].
+    /// Shape: `[rows, inputs]`.
     pub fn input_gradient(&self) -> &[f32] {
         &self.delta
     }
@@ -146,7 +147,15 @@ impl Mlp {
     /// # Panics
     /// If the sizes do not fit the last [`Mlp::forward`] into `pass`.
     pub fn backward(&self, output_gradient: &[f32], pass: &mut Pass, gradient: &mut [f32]) {
-        self.back(output_gradient, pass, Some(gradient));
+        self.back(output_gradient, pass, Some(gradient), false);
+    }
+
+    /// [`Mlp::backward`] and [`Mlp::backward_to_input`] at once.
+    ///
+    /// # Panics
+    /// If the sizes do not fit the last [`Mlp::forward`] into `pass`.
+    pub fn backward_through(&self, output_gradient: &[f32], pass: &mut Pass, gradient: &mut [f32]) {
+        self.back(output_gradient, pass, Some(gradient), true);
     }
 
     /// Leaves the gradient of the input in `pass`, given that of the output.
@@ -154,10 +163,16 @@ impl Mlp {
     /// # Panics
     /// If the sizes do not fit the last [`Mlp::forward`] into `pass`.
     pub fn backward_to_input(&self, output_gradient: &[f32], pass: &mut Pass) {
-        self.back(output_gradient, pass, None);
+        self.back(output_gradient, pass, None, true);
     }
 
-    fn back(&self, output_gradient: &[f32], pass: &mut Pass, mut gradient: Option<&mut [f32]>) {
+    fn back(
+        &self,
+        output_gradient: &[f32],
+        pass: &mut Pass,
+        mut gradient: Option<&mut [f32]>,
+        to_input: bool,
+    ) {
         let Pass {
             rows,
             layers,
@@ -185,9 +200,9 @@ impl Mlp {
                         *sum += x;
                     }
                 }
-                if layer == 0 {
-                    return;
-                }
+            }
+            if layer == 0 && !to_input {
+                return;
             }
             delta_before.clear();
             delta_before.resize(rows * inputs, 0.0);
@@ -268,11 +283,16 @@ mod tests {
             loss(&moved, &INPUT).0
         });
         network.backward_to_input(&weights, &mut pass);
-        check(pass.input_gradient(), |i, h| {
+        let of_input = pass.input_gradient().to_vec();
+        check(&of_input, |i, h| {
             let mut moved = INPUT;
             moved[i] += h;
             loss(&network, &moved).0
         });
+        let mut both = vec![0.0; gradient.len()];
+        network.backward_through(&weights, &mut pass, &mut both);
+        assert_eq!(both, gradient);
+        assert_eq!(pass.input_gradient(), of_input);
     }
 
     #[test]

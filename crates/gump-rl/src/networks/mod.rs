@@ -1,15 +1,24 @@
-//! Small dense networks with gradients written out, their optimiser, and what stands before them.
+//! Small networks with gradients written out, their optimiser, and what stands before them.
 //!
 //! A learner's step is a dozen products of matrices of a few hundred rows; recording a graph for
 //! each would cost more than some of them. [`Mlp`] is the network, [`Pass`] its memory of one
-//! batch, [`Adam`] changes its parameters, [`Normalizer`] brings its input to one scale.
+//! batch, [`Adam`] changes its parameters, [`Normalizer`] brings numbers to one scale, [`ConvNet`]
+//! makes numbers of pictures.
 
 mod adam;
+mod conv_layers;
+mod conv_net;
+mod convolution;
+mod group_norm;
 mod mlp;
 mod normalizer;
 mod product;
 
+#[cfg(test)]
+mod conv_net_tests;
+
 pub use adam::{Adam, clip};
+pub use conv_net::{Architecture, ConvNet, ConvPass, Picture};
 pub use mlp::{Mlp, Pass};
 pub use normalizer::Normalizer;
 

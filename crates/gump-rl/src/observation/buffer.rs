@@ -1,12 +1,20 @@
 //! Observations of many rows in one allocation.
 
-use super::ObservationSpec;
+use std::sync::OnceLock;
 
-/// Observations of all rows, `[row, number]`, and packed where they are rasters.
+use rayon::prelude::*;
+
+use super::{ObservationSpec, expand};
+
+/// Observations of all rows, `[row, number]`: numbers of vectors, bits of rasters.
 #[derive(Clone, Debug)]
 pub(crate) struct Observed {
-    pub(crate) numbers: Vec<f32>,
-    pub(crate) packed: Vec<u8>,
+    /// Empty for rasters.
+    numbers: Vec<f32>,
+    /// Empty for vectors.
+    packed: Vec<u8>,
+    /// The bits as numbers, once somebody asks for them: 32 times as much to write.
+    expanded: OnceLock<Vec<f32>>,
     n_rows: usize,
 }
 
@@ -19,40 +27,62 @@ pub(crate) struct ObservedRow<'a> {
 
 impl Observed {
     pub(crate) fn new(spec: &ObservationSpec, n_rows: usize) -> Self {
+        let packed_len = spec.packed_len();
+        let len = if packed_len == 0 { spec.len() } else { 0 };
         Self {
-            numbers: vec![0.0; n_rows * spec.len()],
-            packed: vec![0; n_rows * spec.packed_len()],
+            numbers: vec![0.0; n_rows * len],
+            packed: vec![0; n_rows * packed_len],
+            expanded: OnceLock::new(),
             n_rows,
         }
     }
 
+    /// Shape: `[n_rows, len]`.
+    pub(crate) fn numbers(&self) -> &[f32] {
+        if self.packed.is_empty() {
+            return &self.numbers;
+        }
+        self.expanded.get_or_init(|| {
+            let mut numbers = vec![0.0; self.packed.len() * 8];
+            let rows = numbers.par_chunks_mut(self.packed.len() / self.n_rows * 8);
+            rows.zip(self.packed.par_chunks(self.packed.len() / self.n_rows))
+                .for_each(|(numbers, packed)| expand(packed, numbers));
+            numbers
+        })
+    }
+
+    /// Shape: `[n_rows, packed_len]`.
+    pub(crate) fn packed(&self) -> &[u8] {
+        &self.packed
+    }
+
     /// All rows at once, to be filled by many threads.
     pub(crate) fn rows_mut(&mut self) -> Vec<ObservedRow<'_>> {
-        let (len, packed_len) = (
-            self.numbers.len() / self.n_rows,
-            self.packed.len() / self.n_rows,
-        );
-        let mut packed = self.packed.as_mut_slice();
-        self.numbers
-            .chunks_exact_mut(len)
-            .map(|numbers| {
-                let (own, rest) = std::mem::take(&mut packed).split_at_mut(packed_len);
-                packed = rest;
-                ObservedRow {
-                    numbers,
-                    packed: own,
-                }
-            })
-            .collect()
+        self.expanded.take();
+        let (mut numbers, mut packed) = (self.numbers.as_mut_slice(), self.packed.as_mut_slice());
+        let (len, packed_len) = (numbers.len() / self.n_rows, packed.len() / self.n_rows);
+        let row = |_| ObservedRow {
+            numbers: first(&mut numbers, len),
+            packed: first(&mut packed, packed_len),
+        };
+        (0..self.n_rows).map(row).collect()
     }
 
     /// Takes one row of another buffer of the same shape.
     pub(crate) fn copy_row(&mut self, row: usize, from: &Self) {
+        self.expanded.take();
         let part = |len: usize| row * len / self.n_rows..(row + 1) * len / self.n_rows;
         let (numbers, packed) = (part(self.numbers.len()), part(self.packed.len()));
         self.numbers[numbers.clone()].copy_from_slice(&from.numbers[numbers]);
         self.packed[packed.clone()].copy_from_slice(&from.packed[packed]);
     }
+}
+
+/// Takes the first `len` values off.
+fn first<'a, T>(values: &mut &'a mut [T], len: usize) -> &'a mut [T] {
+    let (first, rest) = std::mem::take(values).split_at_mut(len);
+    *values = rest;
+    first
 }
 
 impl ObservedRow<'_> {

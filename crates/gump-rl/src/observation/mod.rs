@@ -7,11 +7,12 @@ mod vector;
 use gump_scene::Frame;
 use serde::{Deserialize, Serialize};
 
+use crate::networks::Picture;
 use crate::{Course, EpisodeState, RlError};
 
 pub(crate) use buffer::{Observed, ObservedRow};
-pub(crate) use raster::Texture;
 pub use raster::{RASTER_LAYERS, RasterView, expand};
+pub(crate) use raster::{Texture, pack};
 pub use vector::VectorView;
 
 /// What is seen.
@@ -36,6 +37,17 @@ impl ObservationSpec {
         match self {
             Self::Vector(view) => vec![view.len()],
             Self::Raster(view) => vec![RASTER_LAYERS.len(), view.side_px, view.side_px],
+        }
+    }
+
+    /// How memories keep it and networks take it in.
+    pub fn form(&self) -> ObservationForm {
+        match self {
+            Self::Vector(view) => ObservationForm::Numbers(view.len()),
+            Self::Raster(view) => ObservationForm::Bits(Picture {
+                layers: RASTER_LAYERS.len(),
+                side: view.side_px,
+            }),
         }
     }
 
@@ -90,6 +102,39 @@ impl ObservationSpec {
     }
 }
 
+/// What learners know of an observation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ObservationForm {
+    /// So many numbers of any size.
+    Numbers(usize),
+    /// A picture of numbers that are 0 or 1.
+    Bits(Picture),
+}
+
+impl ObservationForm {
+    /// Numbers in an observation.
+    #[allow(clippy::len_without_is_empty, reason = "as of `ObservationSpec`")]
+    pub fn len(&self) -> usize {
+        match self {
+            Self::Numbers(len) => *len,
+            Self::Bits(picture) => picture.len(),
+        }
+    }
+}
+
+impl From<usize> for ObservationForm {
+    fn from(len: usize) -> Self {
+        Self::Numbers(len)
+    }
+}
+
+impl From<Picture> for ObservationForm {
+    fn from(picture: Picture) -> Self {
+        Self::Bits(picture)
+    }
+}
+
 /// An episode at one instant, as an observer finds it.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
@@ -105,7 +150,8 @@ pub struct View<'a> {
 
 /// Describes an episode as `spec` says.
 ///
-/// Shape: `numbers` is `[spec.len()]`, `packed` is `[spec.packed_len()]`; both are overwritten.
+/// Shape: `numbers` is `[spec.len()]`, or nothing where the bits of a raster are enough; `packed` is
+/// `[spec.packed_len()]`; both are overwritten.
 pub fn observe(spec: &ObservationSpec, view: &View<'_>, numbers: &mut [f32], packed: &mut [u8]) {
     match spec {
         ObservationSpec::Vector(vector) => vector.observe(view, numbers),

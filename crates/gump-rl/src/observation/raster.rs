@@ -5,7 +5,7 @@
 
 use gump_geometry::{Canvas, DVec2, Pose, dvec2, fill_polygon, stroke_polyline};
 use gump_raster::{Layer, RasterSpec, rasterize};
-use gump_scene::{AgentId, Frame, LightState};
+use gump_scene::{AgentId, Frame, Light, LightState};
 use serde::{Deserialize, Serialize};
 
 use super::View;
@@ -74,23 +74,29 @@ impl RasterView {
         let pose = view.state.ego.state.pose;
         self.look_up(texture, pose, map);
 
-        let mut planes = moving.chunks_exact_mut(self.plane_len());
-        let mut draw = |paint: &dyn Fn(&mut Plane<'_>)| {
-            let mut pixels = vec![0.0; self.side_px * self.side_px];
-            paint(&mut Plane::new(self, pose, &mut pixels));
-            let plane = planes.next().expect("there are four layers of what moves");
-            pack(&pixels, plane);
-        };
         let ego = view.state.ego.id;
-        draw(&|plane| plane.red_lights(course, view.now));
-        draw(&|plane| plane.agents(view.now, ego));
-        draw(&|plane| {
+        let mut planes = moving.chunks_exact_mut(self.plane_len());
+        let mut pixels = vec![0.0; self.side_px * self.side_px];
+        let mut draw = |has_any: bool, paint: &dyn Fn(&mut Plane<'_>)| {
+            let bits = planes.next().expect("there are four layers of what moves");
+            bits.fill(0);
+            if has_any {
+                pixels.fill(0.0);
+                paint(&mut Plane::new(self, pose, &mut pixels));
+                pack(&pixels, bits);
+            }
+        };
+        let is_red = |light: &Light| light.state == LightState::Red;
+        let has_red = view.now.lights().iter().any(is_red);
+        draw(has_red, &|plane| plane.red_lights(course, view.now));
+        draw(true, &|plane| plane.agents(view.now, ego));
+        draw(view.before.is_some(), &|plane| {
             if let Some(before) = view.before {
                 plane.agents(before, ego);
             }
         });
-        let speed = view.state.ego.state.speed() / FULL_SPEED;
-        draw(&|plane| plane.bar(speed));
+        let bar = planes.next().expect("the last layer is the speed");
+        fill_bits(bar, view.state.ego.state.speed() / FULL_SPEED);
     }
 
     /// Fills the map's planes for an ego at `pose`.
@@ -101,13 +107,23 @@ impl RasterView {
         let first = (first - texture.corner) / TEXEL;
         let (down, right) = (down / TEXEL, right / TEXEL);
         let (row_len, plane_len) = (self.side_px / 8, self.plane_len());
+        let step = [right.x, right.y].map(fixed);
         for row in 0..self.side_px {
             let start = first + down * row as f64;
+            let end = start + right * (self.side_px - 1) as f64;
+            let is_inside = texture.holds(start) && texture.holds(end);
+            let mut at = [start.x, start.y].map(fixed);
             for group in 0..row_len {
                 let mut masks = 0u64;
                 for i in 0..8 {
-                    let at = start + right * (group * 8 + i) as f64;
-                    masks |= u64::from(texture.at(at)) << (8 * i);
+                    let [column, row] = at.map(|x| x >> FRACTION);
+                    // A straight line between two places inside stays inside.
+                    let mask = match is_inside {
+                        true => texture.masks[row as usize * TEXTURE_SIDE + column as usize],
+                        false => texture.at(column, row),
+                    };
+                    masks |= u64::from(mask) << (8 * i);
+                    at = [at[0] + step[0], at[1] + step[1]];
                 }
                 for layer in 0..MAP_LAYERS.len() {
                     // Gathers the lowest bits of eight bytes in one: bit 8 i goes to bit 56 + i.
@@ -120,20 +136,38 @@ impl RasterView {
     }
 }
 
+/// Bits behind the point of a place in texels.
+const FRACTION: u32 = 32;
+
+/// A place in texels with a fixed point: one addition leads to the next pixel.
+fn fixed(place: f64) -> i64 {
+    (place * (1u64 << FRACTION) as f64).round() as i64
+}
+
+/// Sets a share of the bits, from the first on.
+fn fill_bits(bytes: &mut [u8], share: f64) {
+    let n = (share.clamp(0.0, 1.0) * (8 * bytes.len()) as f64).round() as usize;
+    bytes.fill(0);
+    bytes[..n / 8].fill(0xFF);
+    if let Some(byte) = bytes.get_mut(n / 8) {
+        *byte = (1 << (n % 8)) - 1;
+    }
+}
+
 /// Writes a packed observation as numbers, 0 or 1.
 ///
-/// Shape: `numbers` is eight times as long as `packed`.
+/// Shape: `numbers` is eight times as long as `packed`, less what the last byte has left over.
 pub fn expand(packed: &[u8], numbers: &mut [f32]) {
-    for (byte, numbers) in packed.iter().zip(numbers.chunks_exact_mut(8)) {
+    for (byte, numbers) in packed.iter().zip(numbers.chunks_mut(8)) {
         for (i, number) in numbers.iter_mut().enumerate() {
             *number = f32::from((byte >> i) & 1);
         }
     }
 }
 
-/// Packs pixels that are 0 or positive.
-fn pack(pixels: &[f32], packed: &mut [u8]) {
-    for (byte, pixels) in packed.iter_mut().zip(pixels.chunks_exact(8)) {
+/// Packs pixels that are 0 or positive. Shape: as [`expand`].
+pub(crate) fn pack(pixels: &[f32], packed: &mut [u8]) {
+    for (byte, pixels) in packed.iter_mut().zip(pixels.chunks(8)) {
         let bits = pixels.iter().enumerate();
         *byte = bits.fold(0, |byte, (i, v)| byte | (u8::from(*v > 0.0) << i));
     }
@@ -187,18 +221,21 @@ impl Texture {
         }
     }
 
-    /// The layers at a place in texels; none outside.
-    fn at(&self, place: DVec2) -> u8 {
+    /// The layers of a texel; none outside.
+    fn at(&self, column: i64, row: i64) -> u8 {
         // Negative places wrap round to huge ones.
-        let (column, row) = (
-            place.x.floor() as i64 as usize,
-            place.y.floor() as i64 as usize,
-        );
+        let (column, row) = (column as usize, row as usize);
         if column < TEXTURE_SIDE && row < TEXTURE_SIDE {
             self.masks[row * TEXTURE_SIDE + column]
         } else {
             0
         }
+    }
+
+    /// True for a place that rounding does not move outside.
+    fn holds(&self, place: DVec2) -> bool {
+        let inside = 1.0..TEXTURE_SIDE as f64 - 1.0;
+        inside.contains(&place.x) && inside.contains(&place.y)
     }
 }
 
@@ -254,16 +291,6 @@ impl<'a> Plane<'a> {
                 let points: Vec<DVec2> = points.collect();
                 stroke_polyline(&mut self.canvas, &points, 1.0);
             }
-        }
-    }
-
-    /// Fills a share of the plane, from the first row on.
-    fn bar(&mut self, share: f64) {
-        let area = self.side_px * self.side_px;
-        let n = (share.clamp(0.0, 1.0) * area as f64).round() as usize;
-        for i in 0..n {
-            let (row, column) = (i / self.side_px, i % self.side_px);
-            self.canvas.set(column as i64, row as i64, 1.0);
         }
     }
 }

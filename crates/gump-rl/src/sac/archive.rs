@@ -2,22 +2,19 @@
 //!
 //! Where the bytes are kept is the caller's business.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use gump_scene::Seed;
-use safetensors::SafeTensors;
-use safetensors::tensor::{Dtype, TensorView};
-use serde::de::DeserializeOwned;
+use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
-use super::replay_buffer::ReplayBuffer;
+use super::replay_buffer::{ReplayBuffer, Store};
+use super::tensors::{Reader, Writer, check_len, wrong};
 use super::training::{Algorithm, Training};
 use super::{Learner, SacConfig};
-use crate::networks::{Adam, Mlp, Normalizer};
-use crate::{Actor, RlError};
-
-/// The header entry that everything but tensors is in.
-const HEADER: &str = "gump";
+use crate::actor::Perception;
+use crate::networks::{Architecture, ConvNet, Mlp, Normalizer, Picture};
+use crate::{Actor, ObservationForm, RlError};
 
 /// Version of the layout.
 const FORMAT: &str = "gump-rl-1";
@@ -28,9 +25,18 @@ struct PolicyHeader {
     format: String,
     /// Layer sizes of the network, input first.
     sizes: Vec<usize>,
+    /// What stands before it if observations are pictures.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    encoder: Option<EncoderHeader>,
     log_std_bounds: [f64; 2],
     /// What the caller wants to find again.
     notes: BTreeMap<String, String>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct EncoderHeader {
+    architecture: Architecture,
+    picture: Picture,
 }
 
 /// What a run is beside its numbers.
@@ -43,6 +49,9 @@ struct RunHeader {
     steps: usize,
     env_steps: u64,
     optimizer_steps: [u64; 4],
+    /// Of the actor's encoder and the critics' own, where there are any.
+    #[serde(default)]
+    encoder_steps: [u64; 2],
     buffers: [BufferHeader; 2],
 }
 
@@ -51,7 +60,32 @@ struct BufferHeader {
     capacity: usize,
     head: usize,
     observation_len: usize,
+    /// If observations are bits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    picture: Option<Picture>,
     action_len: usize,
+}
+
+impl BufferHeader {
+    fn of(buffer: &ReplayBuffer) -> Self {
+        Self {
+            capacity: buffer.capacity,
+            head: buffer.head,
+            observation_len: buffer.form.len(),
+            picture: match buffer.form {
+                ObservationForm::Numbers(_) => None,
+                ObservationForm::Bits(picture) => Some(picture),
+            },
+            action_len: buffer.action_len,
+        }
+    }
+
+    fn form(&self) -> ObservationForm {
+        match self.picture {
+            Some(picture) => picture.into(),
+            None => self.observation_len.into(),
+        }
+    }
 }
 
 impl Actor {
@@ -94,12 +128,17 @@ impl Training {
         for (buffer, name) in [(&self.replay, "replay"), (&self.expert, "expert")] {
             writer.buffer(name, buffer);
         }
-        let buffer = |buffer: &ReplayBuffer| BufferHeader {
-            capacity: buffer.capacity,
-            head: buffer.head,
-            observation_len: buffer.observation_len,
-            action_len: buffer.action_len,
-        };
+        let mut encoder_steps = [0; 2];
+        if let Some(vision) = &learner.vision {
+            writer.adam("actor.encoder", &vision.training.optimizer);
+            writer.floats("critics.encoder.target", vision.target.parameters());
+            encoder_steps[0] = vision.training.optimizer.steps;
+            if let Some((encoder, training)) = &vision.separate {
+                writer.floats("critics.encoder", encoder.parameters());
+                writer.adam("critics.encoder", &training.optimizer);
+                encoder_steps[1] = training.optimizer.steps;
+            }
+        }
         let [first, second] = &learner.critics;
         let adams = [
             &learner.actor_optimizer,
@@ -117,7 +156,8 @@ impl Training {
                 steps: learner.steps,
                 env_steps: self.env_steps,
                 optimizer_steps: [a, b, c, learner.alpha_optimizer.steps],
-                buffers: [buffer(&self.replay), buffer(&self.expert)],
+                encoder_steps,
+                buffers: [&self.replay, &self.expert].map(BufferHeader::of),
             },
         )?;
         writer.finish()
@@ -139,13 +179,21 @@ impl Training {
             reader.buffer("replay", replay)?,
             reader.buffer("expert", expert)?,
         ];
-        let (o, a) = (actor.observation_len(), actor.action_len());
-        let fits = |b: &ReplayBuffer| (b.observation_len, b.action_len) == (o, a);
-        if !buffers.iter().all(fits) {
+        let (form, a) = (buffers[0].form, actor.action_len());
+        config.check_form(form)?;
+        let fits = |b: &ReplayBuffer| (b.form, b.action_len) == (form, a);
+        if !buffers.iter().all(fits) || form.len() != actor.observation_len() {
             return Err(wrong("its buffers do not fit its policy"));
         }
-        let mut learner = Learner::new(config, o, a, Seed(0));
-        if learner.actor.network.sizes() != actor.network.sizes() {
+        let mut learner = Learner::new(config, form, a, Seed(0));
+        let kind = |actor: &Actor| {
+            let encoder = actor.encoder();
+            (
+                actor.network.sizes().to_vec(),
+                encoder.map(|e| (e.architecture(), e.picture())),
+            )
+        };
+        if kind(&learner.actor) != kind(&actor) {
             return Err(wrong("its policy does not fit its configuration"));
         }
         learner.actor = actor;
@@ -161,6 +209,15 @@ impl Training {
             reader.fill(&format!("{name}.target"), critic.target.parameters_mut())?;
             reader.adam(name, &mut critic.optimizer, steps)?;
         }
+        if let Some(vision) = &mut learner.vision {
+            let [of_actors, of_critics] = header.encoder_steps;
+            reader.adam("actor.encoder", &mut vision.training.optimizer, of_actors)?;
+            reader.fill("critics.encoder.target", vision.target.parameters_mut())?;
+            if let Some((encoder, training)) = &mut vision.separate {
+                reader.fill("critics.encoder", encoder.parameters_mut())?;
+                reader.adam("critics.encoder", &mut training.optimizer, of_critics)?;
+            }
+        }
         reader.fill("log_alpha", std::slice::from_mut(&mut learner.log_alpha))?;
         reader.adam("log_alpha", &mut learner.alpha_optimizer, of_alpha)?;
         let origin = (header.algorithm, Seed(header.seed));
@@ -169,141 +226,57 @@ impl Training {
     }
 }
 
-fn wrong(what: impl Into<String>) -> RlError {
-    RlError::Archive { what: what.into() }
-}
-
-/// Tensors and header entries to be written.
-#[derive(Default)]
-struct Writer {
-    tensors: BTreeMap<String, (Dtype, Vec<u8>)>,
-    /// One JSON object, so that the bytes do not depend on the order of a hash map.
-    header: serde_json::Map<String, serde_json::Value>,
-}
-
 impl Writer {
-    fn floats(&mut self, name: &str, values: &[f32]) {
-        let bytes = values.iter().flat_map(|x| x.to_le_bytes()).collect();
-        self.tensors.insert(name.to_owned(), (Dtype::F32, bytes));
-    }
-
-    fn adam(&mut self, name: &str, adam: &Adam) {
-        self.floats(&format!("{name}.adam.mean"), &adam.mean);
-        self.floats(&format!("{name}.adam.square"), &adam.square);
-    }
-
     fn buffer(&mut self, name: &str, buffer: &ReplayBuffer) {
-        self.floats(&format!("{name}.observations"), &buffer.observations);
+        self.store(&format!("{name}.observations"), &buffer.observations);
         self.floats(&format!("{name}.actions"), &buffer.actions);
         self.floats(&format!("{name}.rewards"), &buffer.rewards);
-        self.floats(&format!("{name}.nexts"), &buffer.nexts);
+        self.store(&format!("{name}.nexts"), &buffer.nexts);
         let terminated = buffer.terminated.iter().map(|&t| u8::from(t)).collect();
         self.tensors
             .insert(format!("{name}.terminated"), (Dtype::U8, terminated));
     }
 
-    fn header(&mut self, name: &str, value: &impl Serialize) -> Result<(), RlError> {
-        let value = serde_json::to_value(value).map_err(|error| wrong(error.to_string()))?;
-        self.header.insert(name.to_owned(), value);
-        Ok(())
-    }
-
     fn actor(&mut self, actor: &Actor, notes: &BTreeMap<String, String>) -> Result<(), RlError> {
         self.floats("actor.parameters", actor.network.parameters());
-        self.floats("actor.shift", &actor.normalizer.shift);
-        self.floats("actor.scale", &actor.normalizer.scale);
+        let encoder = match &actor.perception {
+            Perception::Scaled(normalizer) => {
+                self.floats("actor.shift", &normalizer.shift);
+                self.floats("actor.scale", &normalizer.scale);
+                None
+            }
+            Perception::Encoded(encoder) => {
+                self.floats("actor.encoder", encoder.parameters());
+                Some(EncoderHeader {
+                    architecture: encoder.architecture(),
+                    picture: encoder.picture(),
+                })
+            }
+        };
         let header = PolicyHeader {
             format: FORMAT.to_owned(),
             sizes: actor.network.sizes().to_vec(),
+            encoder,
             log_std_bounds: actor.log_std_bounds,
             notes: notes.clone(),
         };
         self.header("policy", &header)
     }
-
-    fn finish(self) -> Result<Vec<u8>, RlError> {
-        let mut views = Vec::with_capacity(self.tensors.len());
-        for (name, (kind, bytes)) in &self.tensors {
-            let width = if *kind == Dtype::F32 { 4 } else { 1 };
-            let view = TensorView::new(*kind, vec![bytes.len() / width], bytes);
-            views.push((name, view.map_err(|error| wrong(error.to_string()))?));
-        }
-        let header = serde_json::Value::Object(self.header).to_string();
-        let header = HashMap::from([(HEADER.to_owned(), header)]);
-        safetensors::serialize(views, Some(header)).map_err(|error| wrong(error.to_string()))
-    }
 }
 
-/// A file being read.
-struct Reader<'a> {
-    tensors: SafeTensors<'a>,
-    header: serde_json::Map<String, serde_json::Value>,
-}
-
-impl<'a> Reader<'a> {
-    fn new(bytes: &'a [u8]) -> Result<Self, RlError> {
-        let tensors = SafeTensors::deserialize(bytes).map_err(|error| {
-            wrong(format!(
-                "expected a safetensors file, found something else ({error})"
-            ))
-        })?;
-        let (_, metadata) =
-            SafeTensors::read_metadata(bytes).map_err(|error| wrong(error.to_string()))?;
-        let header = metadata.metadata().as_ref().and_then(|m| m.get(HEADER));
-        let header = header.ok_or_else(|| wrong(format!("its header has no \"{HEADER}\"")))?;
-        let header = serde_json::from_str(header)
-            .map_err(|error| wrong(format!("its header is not valid ({error})")))?;
-        Ok(Self { tensors, header })
-    }
-
-    fn header<T: DeserializeOwned>(&mut self, name: &str) -> Result<T, RlError> {
-        let value = self.header.remove(name);
-        let value = value.ok_or_else(|| wrong(format!("it holds no {name}")))?;
-        serde_json::from_value(value)
-            .map_err(|error| wrong(format!("its {name} is not valid ({error})")))
-    }
-
-    fn bytes(&self, name: &str, kind: Dtype) -> Result<&'a [u8], RlError> {
-        let tensor = self.tensors.tensor(name);
-        let tensor = tensor.map_err(|_| wrong(format!("it has no tensor \"{name}\"")))?;
-        if tensor.dtype() == kind {
-            Ok(tensor.data())
-        } else {
-            let found = tensor.dtype();
-            let what = format!("tensor \"{name}\" has type {found:?}, expected {kind:?}");
-            Err(wrong(what))
-        }
-    }
-
-    fn floats(&self, name: &str) -> Result<Vec<f32>, RlError> {
-        let bytes = self.bytes(name, Dtype::F32)?.chunks_exact(4);
-        Ok(bytes
-            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-            .collect())
-    }
-
-    /// As many numbers as there is room for.
-    fn fill(&self, name: &str, room: &mut [f32]) -> Result<(), RlError> {
-        let values = self.floats(name)?;
-        check_len(name, room.len(), values.len())?;
-        room.copy_from_slice(&values);
-        Ok(())
-    }
-
-    fn adam(&self, name: &str, adam: &mut Adam, steps: u64) -> Result<(), RlError> {
-        adam.steps = steps;
-        self.fill(&format!("{name}.adam.mean"), &mut adam.mean)?;
-        self.fill(&format!("{name}.adam.square"), &mut adam.square)
-    }
-
+impl Reader<'_> {
     fn buffer(&self, name: &str, header: &BufferHeader) -> Result<ReplayBuffer, RlError> {
         let BufferHeader {
             capacity,
             head,
-            observation_len,
             action_len,
+            ..
         } = *header;
-        let mut buffer = ReplayBuffer::new(capacity, observation_len, action_len)?;
+        let (form, len) = (header.form(), header.form().len());
+        if len != header.observation_len {
+            return Err(wrong(format!("its {name} has pictures of another size")));
+        }
+        let mut buffer = ReplayBuffer::new(capacity, form, action_len)?;
         let part = |part: &str| self.floats(&format!("{name}.{part}"));
         buffer.rewards = part("rewards")?;
         let n = buffer.rewards.len();
@@ -313,19 +286,30 @@ impl<'a> Reader<'a> {
             )));
         }
         buffer.head = head;
-        buffer.observations = part("observations")?;
+        let store = |part: &str| {
+            let name = format!("{name}.{part}");
+            let (store, expected, found) = match form {
+                ObservationForm::Numbers(_) => {
+                    let numbers = self.floats(&name)?;
+                    let found = numbers.len();
+                    (Store::Numbers(numbers), n * len, found)
+                }
+                ObservationForm::Bits(_) => {
+                    let bytes = self.bytes(&name, Dtype::U8)?.to_vec();
+                    let found = bytes.len();
+                    (Store::Bits(bytes), n * len.div_ceil(8), found)
+                }
+            };
+            check_len(&name, expected, found)?;
+            Ok(store)
+        };
+        buffer.observations = store("observations")?;
+        buffer.nexts = store("nexts")?;
         buffer.actions = part("actions")?;
-        buffer.nexts = part("nexts")?;
         let terminated = self.bytes(&format!("{name}.terminated"), Dtype::U8)?;
         buffer.terminated = terminated.iter().map(|&t| t != 0).collect();
         for (part, expected, found) in [
-            (
-                "observations",
-                n * observation_len,
-                buffer.observations.len(),
-            ),
             ("actions", n * action_len, buffer.actions.len()),
-            ("nexts", n * observation_len, buffer.nexts.len()),
             ("terminated", n, buffer.terminated.len()),
         ] {
             check_len(&format!("{name}.{part}"), expected, found)?;
@@ -344,28 +328,35 @@ impl<'a> Reader<'a> {
         let is_policy = !sizes.contains(&0) && sizes.last().is_some_and(|n| n.is_multiple_of(2));
         let network = Mlp::from_parameters(sizes, parameters).filter(|_| is_policy);
         let network = network.ok_or_else(|| wrong("its policy does not fit its layer sizes"))?;
-        let mut normalizer = Normalizer::identity(network.sizes()[0]);
-        self.fill("actor.shift", &mut normalizer.shift)?;
-        self.fill("actor.scale", &mut normalizer.scale)?;
+        let n_features = network.sizes()[0];
+        let perception = match header.encoder {
+            Some(EncoderHeader {
+                architecture,
+                picture,
+            }) => {
+                let parameters = self.floats("actor.encoder")?;
+                let encoder = ConvNet::from_parameters(architecture, picture, parameters)
+                    .filter(|encoder| encoder.n_features() == n_features);
+                let encoder =
+                    encoder.ok_or_else(|| wrong("its encoder does not fit its policy"))?;
+                Perception::Encoded(encoder)
+            }
+            None => {
+                let mut normalizer = Normalizer::identity(n_features);
+                self.fill("actor.shift", &mut normalizer.shift)?;
+                self.fill("actor.scale", &mut normalizer.scale)?;
+                Perception::Scaled(normalizer)
+            }
+        };
         let [lowest, highest] = header.log_std_bounds;
         if lowest >= highest {
             return Err(wrong("its bounds of the standard deviation are reversed"));
         }
         let actor = Actor {
-            normalizer,
+            perception,
             network,
             log_std_bounds: header.log_std_bounds,
         };
         Ok((actor, header.notes))
-    }
-}
-
-fn check_len(name: &str, expected: usize, found: usize) -> Result<(), RlError> {
-    if expected == found {
-        Ok(())
-    } else {
-        Err(wrong(format!(
-            "tensor \"{name}\" has {found} numbers, expected {expected}"
-        )))
     }
 }

@@ -47,7 +47,7 @@ impl Batch {
         &mut self,
         (replay, n_own): (&ReplayBuffer, usize),
         (expert, n_imitated): (&ReplayBuffer, usize),
-        normalizer: &Normalizer,
+        normalizer: Option<&Normalizer>,
         rng: &mut Rng,
     ) -> Result<(), RlError> {
         self.observations.clear();
@@ -62,15 +62,17 @@ impl Batch {
             }
             for index in buffer.sample(n, rng)? {
                 let transition = buffer.get(index);
-                self.observations.extend_from_slice(transition.observation);
+                self.observations.extend_from_slice(&transition.observation);
                 self.actions.extend_from_slice(transition.action);
                 self.rewards.push(transition.reward);
-                self.nexts.extend_from_slice(transition.next);
+                self.nexts.extend_from_slice(&transition.next);
                 self.terminated.push(transition.terminated);
             }
         }
-        normalizer.apply(&mut self.observations);
-        normalizer.apply(&mut self.nexts);
+        if let Some(normalizer) = normalizer {
+            normalizer.apply(&mut self.observations);
+            normalizer.apply(&mut self.nexts);
+        }
         Ok(())
     }
 }

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::RlError;
+use crate::networks::Architecture;
+use crate::{ObservationForm, RlError};
 
 /// How to learn.
 ///
@@ -17,6 +18,12 @@ pub struct SacConfig {
     pub batch: usize,
     /// Sizes of the hidden layers of actor and critics (ours: 256 twice).
     pub hidden: Vec<usize>,
+    /// What makes features of pictures for actor and critics (paper: ResNet-18); without it they
+    /// see the observation as it is.
+    pub encoder: Option<Architecture>,
+    /// Whether actor and critics have an encoder each, trained by their own loss, instead of one
+    /// that the critics' loss alone trains (ALF: one).
+    pub separate_encoders: bool,
     /// Learning rate of everything at first (paper: 1e-4).
     pub learning_rate: f64,
     /// Learning rate after the drop (paper: 2e-5).
@@ -61,8 +68,8 @@ pub struct SacConfig {
     pub imitation_share: f64,
     /// Weight of the imitation loss in the actor's (ours: 1).
     pub imitation_weight: f64,
-    /// Whether observations are brought to mean 0 and variance 1, by those that are known when
-    /// learning begins (ours: yes, as they are in metres; the paper's are pictures).
+    /// Whether observations of numbers are brought to mean 0 and variance 1, by those that are
+    /// known when learning begins (ours: yes, as they are in metres). Pictures stay as they are.
     pub normalize: bool,
     /// Gradient steps between checkpoints. All episodes start afresh at each, so that a run that
     /// is resumed there goes on like one that never stopped (ours: 1000).
@@ -76,6 +83,8 @@ impl Default for SacConfig {
             steps: 40_000,
             batch: 2048,
             hidden: vec![256, 256],
+            encoder: None,
+            separate_encoders: false,
             learning_rate: 1e-4,
             final_learning_rate: 2e-5,
             drop_at: 0.7,
@@ -195,6 +204,17 @@ impl SacConfig {
             }
         }
         Ok(())
+    }
+
+    /// Refuses observations that the networks cannot take in.
+    ///
+    /// # Errors
+    /// [`RlError::NoPicture`].
+    pub fn check_form(&self, form: ObservationForm) -> Result<(), RlError> {
+        match (self.encoder, form) {
+            (Some(_), ObservationForm::Numbers(found)) => Err(RlError::NoPicture { found }),
+            _ => Ok(()),
+        }
     }
 
     /// The learning rate of a gradient step (0-based).

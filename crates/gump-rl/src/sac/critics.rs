@@ -2,7 +2,6 @@
 
 use gump_scene::Seed;
 
-use super::Batch;
 use crate::networks::{Adam, Mlp, Pass, clip};
 
 /// What an action in a state is worth.
@@ -76,11 +75,12 @@ impl Critic {
         pass.output().to_vec()
     }
 
-    /// Values of what was done, and by the target of what would be done next.
-    pub(super) fn run(&mut self, batch: &Batch, next_actions: &[f32]) {
-        let taken = self.join(&batch.observations, &batch.actions);
+    /// Values of what was done, and by the target of what would be done next: observations and
+    /// actions each.
+    pub(super) fn run(&mut self, taken: (&[f32], &[f32]), next: (&[f32], &[f32])) {
+        let taken = self.join(taken.0, taken.1);
         self.online.forward(&taken, &mut self.taken);
-        let next = self.join(&batch.nexts, next_actions);
+        let next = self.join(next.0, next.1);
         self.target.forward(&next, &mut self.future);
     }
 
@@ -102,15 +102,21 @@ impl Critic {
         self.judged.output()
     }
 
-    /// Takes the gradient of the mean of `loss(row, value)`; that mean.
-    pub(super) fn learn(&mut self, loss: impl Fn(usize, f32) -> (f64, f64)) -> f64 {
+    /// Takes the gradient of the mean of `loss(row, value)`, also by what was seen if `through`;
+    /// that mean.
+    pub(super) fn learn(&mut self, through: bool, loss: impl Fn(usize, f32) -> (f64, f64)) -> f64 {
         let rows = self.taken.rows() as f64;
         let values = self.taken.output().iter().enumerate();
         let losses: Vec<_> = values.map(|(i, &q)| loss(i, q)).collect();
         let output_gradient: Vec<f32> = losses.iter().map(|l| (l.1 / rows) as f32).collect();
         self.gradient.fill(0.0);
-        self.online
-            .backward(&output_gradient, &mut self.taken, &mut self.gradient);
+        let (pass, gradient) = (&mut self.taken, &mut self.gradient);
+        if through {
+            self.online
+                .backward_through(&output_gradient, pass, gradient);
+        } else {
+            self.online.backward(&output_gradient, pass, gradient);
+        }
         losses.iter().map(|l| l.0).sum::<f64>() / rows
     }
 
@@ -122,7 +128,14 @@ impl Critic {
             .backward_to_input(&output_gradient, &mut self.judged);
     }
 
-    /// The part of that gradient that is by the actions, row after row.
+    /// The part of a gradient [`Critic::learn`] took that is by the observations, row after row.
+    pub(super) fn taken_by_observation(&self) -> impl Iterator<Item = f32> {
+        let rows = self.taken.input_gradient();
+        let rows = rows.chunks_exact(self.online.sizes()[0]);
+        rows.flat_map(|row| row[..self.observation_len].iter().copied())
+    }
+
+    /// The part of the judged values' gradient that is by the actions, row after row.
     pub(super) fn judged_by_action(&self) -> impl Iterator<Item = f32> {
         let rows = self.judged.input_gradient();
         let rows = rows.chunks_exact(self.online.sizes()[0]);

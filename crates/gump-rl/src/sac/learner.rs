@@ -7,7 +7,9 @@
 use gump_scene::Seed;
 
 use super::critics::{Critic, critic_loss, soft_target};
+use super::vision::{Seen, Vision};
 use super::{Batch, SacConfig};
+use crate::ObservationForm;
 use crate::actor::Actor;
 use crate::networks::{Adam, Pass, clip, standard_normal};
 
@@ -18,6 +20,8 @@ pub struct Learner {
     pub(crate) actor: Actor,
     pub(crate) actor_optimizer: Adam,
     pub(crate) critics: [Critic; 2],
+    /// None where observations are numbers.
+    pub(crate) vision: Option<Vision>,
     pub(crate) log_alpha: f32,
     pub(crate) alpha_optimizer: Adam,
     pub(crate) steps: usize,
@@ -69,14 +73,19 @@ impl Learner {
     /// A learner that knows nothing.
     ///
     /// # Panics
-    /// For a configuration without hidden layers or with empty ones; see [`SacConfig::check`].
-    pub fn new(config: SacConfig, observation_len: usize, action_len: usize, seed: Seed) -> Self {
-        let actor = Actor::new(&config, observation_len, action_len, seed.fork(0));
-        let critic = |k| {
-            let seed = seed.fork(k);
-            Critic::new(&config.hidden, observation_len, action_len, seed)
-        };
+    /// For a configuration without hidden layers or with empty ones, and for an encoder over
+    /// numbers; see [`SacConfig::check`] and [`SacConfig::check_form`].
+    pub fn new(
+        config: SacConfig,
+        form: impl Into<ObservationForm>,
+        action_len: usize,
+        seed: Seed,
+    ) -> Self {
+        let actor = Actor::new(&config, form, action_len, seed.fork(0));
+        let n_features = actor.n_features();
+        let critic = |k| Critic::new(&config.hidden, n_features, action_len, seed.fork(k));
         Self {
+            vision: Vision::new(&config, &actor, seed.fork(3)),
             actor_optimizer: Adam::new(actor.network.parameters().len()),
             actor,
             critics: [critic(1), critic(2)],
@@ -123,25 +132,33 @@ impl Learner {
     pub fn update(&mut self, batch: &Batch, seed: Seed) -> UpdateReport {
         let alpha = self.alpha();
         let (actor, work) = (&self.actor, &mut self.work);
+        let sight = self.vision.as_mut().zip(actor.encoder());
+        let seen = match sight {
+            Some((vision, encoder)) => vision.see(encoder, batch),
+            None => Seen::unchanged(batch),
+        };
+        let [by_actor, next_by_actor] = &seen.by_actor;
         rayon::join(
-            || actor.network.forward(&batch.observations, &mut work.now),
-            || actor.network.forward(&batch.nexts, &mut work.next),
+            || actor.network.forward(by_actor, &mut work.now),
+            || actor.network.forward(next_by_actor, &mut work.next),
         );
         let now = draw(actor, &work.now, seed.fork(0));
         let next = draw(actor, &work.next, seed.fork(1));
 
         // The rows the actor learns from: what the learner drove, perhaps also what it saw next.
-        let (n_own, observation_len) = (batch.n_own(), actor.observation_len());
+        let (n_own, n_features) = (batch.n_own(), actor.n_features());
         let own = n_own * actor.action_len();
-        let mut seen = batch.observations[..n_own * observation_len].to_vec();
+        let [by_critics, next_by_critics] = seen.by_critics();
+        let mut judged = by_critics[..n_own * n_features].to_vec();
         let mut acted = now.actions[..own].to_vec();
         if self.config.actor_on_next {
-            seen.extend_from_slice(&batch.nexts[..n_own * observation_len]);
+            judged.extend_from_slice(&next_by_critics[..n_own * n_features]);
             acted.extend_from_slice(&next.actions[..own]);
         }
         both(&mut self.critics, |_, critic| {
-            critic.run(batch, &next.actions);
-            critic.judge(&seen, &acted);
+            let taken = (by_critics.as_ref(), batch.actions.as_slice());
+            critic.run(taken, (&seen.by_targets, &next.actions));
+            critic.judge(&judged, &acted);
         });
 
         let [first, second] = &self.critics;
@@ -165,15 +182,23 @@ impl Learner {
             .collect();
         let judged = lower(first.judged(), second.judged());
         let value = mean(first.value().iter().map(|&q| f64::from(q)));
-        let huber = self.config.huber;
+        let (huber, has_vision) = (self.config.huber, self.vision.is_some());
         let losses = both(&mut self.critics, |k, critic| {
-            let loss = critic.learn(|i, q| critic_loss(f64::from(q) - targets[i], huber));
+            let loss = |i: usize, q| critic_loss(f64::from(q) - targets[i], huber);
+            let loss = critic.learn(has_vision, loss);
             critic.gradient_of_judged(|i| judged[i].1 == k);
             loss
         });
+        let [first, second] = &self.critics;
+        if let Some((vision, encoder)) = self.vision.as_mut().zip(self.actor.encoder()) {
+            let pairs = first
+                .taken_by_observation()
+                .zip(second.taken_by_observation());
+            let by_features: Vec<f32> = pairs.map(|(a, b)| a + b).collect();
+            vision.learn_from_critics(encoder, &by_features);
+        }
 
         // d (lower value) / d action, for the rows judged.
-        let [first, second] = &self.critics;
         let value_by_action: Vec<f64> = first
             .judged_by_action()
             .zip(second.judged_by_action())
@@ -207,7 +232,13 @@ impl Learner {
     pub fn imitate(&mut self, batch: &Batch) -> UpdateReport {
         let rate = self.config.rate(self.steps);
         let (actor, work) = (&self.actor, &mut self.work);
-        actor.network.forward(&batch.observations, &mut work.now);
+        match self.vision.as_mut().zip(actor.encoder()) {
+            Some((vision, encoder)) => {
+                let features = vision.see_now(encoder, batch);
+                actor.network.forward(features, &mut work.now);
+            }
+            None => actor.network.forward(&batch.observations, &mut work.now),
+        }
         let loss = imitation_gradient(
             actor,
             work.now.output(),
@@ -222,8 +253,15 @@ impl Learner {
             gradient,
             ..
         } = work;
-        actor.network.backward(now_gradient, now, gradient);
+        match self.vision.as_mut().zip(actor.encoder()) {
+            Some((vision, encoder)) => {
+                actor.network.backward_through(now_gradient, now, gradient);
+                vision.learn_from_actor(encoder, now.input_gradient(), None);
+            }
+            None => actor.network.backward(now_gradient, now, gradient),
+        }
         self.step_actor(rate);
+        self.step_actors_encoder(rate);
         self.steps += 1;
         UpdateReport {
             imitation_loss: loss,
@@ -274,19 +312,38 @@ impl Learner {
             imitated,
         );
         reset(gradient, actor.network.parameters().len());
-        actor.network.backward(now_gradient, now, gradient);
-        if self.config.actor_on_next {
-            actor.network.backward(next_gradient, next, gradient);
-        }
+        let separate = self.vision.as_mut().filter(|vision| vision.is_separate());
+        let Some((vision, encoder)) = separate.zip(actor.encoder()) else {
+            actor.network.backward(now_gradient, now, gradient);
+            if self.config.actor_on_next {
+                actor.network.backward(next_gradient, next, gradient);
+            }
+            return;
+        };
+        actor.network.backward_through(now_gradient, now, gradient);
+        let by_next = self.config.actor_on_next.then(|| {
+            actor
+                .network
+                .backward_through(next_gradient, next, gradient);
+            next.input_gradient()
+        });
+        vision.learn_from_actor(encoder, now.input_gradient(), by_next);
     }
 
     /// Moves everything by its gradient, then the targets.
     fn apply(&mut self, report: &UpdateReport, learns_alpha: bool) {
         let rate = report.learning_rate;
         self.step_actor(rate);
+        self.step_actors_encoder(rate);
         self.steps += 1;
         let moves_target = self.steps.is_multiple_of(self.config.target_period);
         let (limit, tau) = (self.config.clip, self.config.tau as f32);
+        if let Some((vision, encoder)) = self.vision.as_mut().zip(self.actor.encoder()) {
+            vision.step_critics(rate, limit);
+            if moves_target {
+                vision.move_target(encoder, tau);
+            }
+        }
         both(&mut self.critics, |_, critic| {
             critic.step(rate, limit);
             if moves_target {
@@ -313,6 +370,13 @@ impl Learner {
         clip(gradient, self.config.clip);
         let parameters = self.actor.network.parameters_mut();
         self.actor_optimizer.step(parameters, gradient, rate);
+    }
+
+    fn step_actors_encoder(&mut self, rate: f64) {
+        let sight = self.vision.as_mut().zip(self.actor.encoder_mut());
+        if let Some((vision, encoder)) = sight {
+            vision.step_actors(encoder, rate, self.config.clip);
+        }
     }
 }
 

@@ -7,8 +7,9 @@ use std::ops::ControlFlow;
 use gump_scene::Seed;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
-use super::toys::{Bandit, Clock, Identity, Pendulum, Problem, Reach, Regulator, Toy};
+use super::toys::{Bandit, Clock, Identity, Pendulum, Problem, Reach, Regulator, SeenReach, Toy};
 use super::{Algorithm, SacConfig, StepReport, Training};
+use crate::networks::Architecture;
 
 /// Small networks and large steps, as small problems want them.
 fn config(steps: usize) -> SacConfig {
@@ -33,7 +34,7 @@ fn learn<P: Problem>(
     config: SacConfig,
 ) -> (Training, Toy<P>, Vec<StepReport>) {
     let mut env = Toy::new(problem, n);
-    let nothing = ReplayBuffer::new(1, P::OBSERVATION, P::ACTION).unwrap();
+    let nothing = ReplayBuffer::new(1, P::form(), P::ACTION).unwrap();
     let mut training = Training::new(Algorithm::Sac, config, nothing, Seed(7)).unwrap();
     let mut reports = Vec::new();
     while !training.is_done() {
@@ -177,6 +178,21 @@ fn a_regulator_is_learned_to_its_gain() {
 }
 
 /// Mean return over 20 starts after so many steps of one environment.
+#[test]
+fn the_origin_is_reached_by_sight() {
+    let config = SacConfig {
+        encoder: Some(Architecture::SmallConv),
+        ..config(1500)
+    };
+    let (training, mut env, _) = learn(SeenReach, 8, config);
+    // Staying costs 15; a pixel is as wide as a step, so that the last one cannot be seen.
+    let learned = env.play(Seed(1), |seen| training.actor().modes(seen));
+    assert!(learned > -4.0, "{learned}");
+    let blind = vec![0.0; 8 * SeenReach::OBSERVATION];
+    let blind = env.play(Seed(1), |_| training.actor().modes(&blind));
+    assert!(blind < learned - 4.0, "{blind}, {learned}");
+}
+
 fn swing_up(steps: usize, seed: u64) -> f64 {
     let config = SacConfig {
         batch: 64,
@@ -216,10 +232,10 @@ fn experts_are_imitated() {
         let seen = i as f32 / 250.0 - 1.0;
         let noise = 0.05 * crate::networks::standard_normal(&mut rng) as f32;
         expert.push(Transition {
-            observation: &[seen],
+            observation: (&[seen]).into(),
             action: &[(0.5 * seen + noise).clamp(-1.0, 1.0)],
             reward: 0.0,
-            next: &[seen],
+            next: (&[seen]).into(),
             terminated: true,
         });
     }
@@ -249,10 +265,10 @@ fn a_share_of_experts_pulls_towards_them() {
     // The bandit pays for 0.3; the expert insists on -0.5 and is heavier.
     let mut expert = ReplayBuffer::new(1, 1, 1).unwrap();
     expert.push(Transition {
-        observation: &[1.0],
+        observation: (&[1.0]).into(),
         action: &[-0.5],
         reward: -0.64,
-        next: &[1.0],
+        next: (&[1.0]).into(),
         terminated: true,
     });
     let config = SacConfig {

@@ -10,7 +10,9 @@ mod critics;
 mod learner;
 mod replay_buffer;
 mod squashed;
+mod tensors;
 mod training;
+mod vision;
 
 #[cfg(test)]
 mod learning_tests;
@@ -18,6 +20,8 @@ mod learning_tests;
 mod tests;
 #[cfg(test)]
 mod toys;
+#[cfg(test)]
+mod vision_tests;
 
 pub use batch::Batch;
 pub use config::SacConfig;

@@ -1,21 +1,24 @@
 //! What happened lately, to learn from again.
 
+use std::borrow::Cow;
+
 use gump_scene::Rng;
 use rand::Rng as _;
 
-use crate::RlError;
+use crate::observation::pack;
+use crate::{ObservationForm, RlError, expand};
 
 /// One step of one episode.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Transition<'a> {
     /// What was seen.
-    pub observation: &'a [f32],
+    pub observation: Cow<'a, [f32]>,
     /// What was done, in [-1, 1].
     pub action: &'a [f32],
     /// What it earned.
     pub reward: f32,
     /// What was seen next, in the same episode also where that ended.
-    pub next: &'a [f32],
+    pub next: Cow<'a, [f32]>,
     /// Whether it ended for good, so that no value comes after; being cut off is no such end.
     pub terminated: bool,
 }
@@ -23,18 +26,70 @@ pub struct Transition<'a> {
 /// Keeps the latest transitions, the oldest giving way, and draws from them at random.
 ///
 /// Flat arrays that grow up to the capacity: two observations, an action and five bytes each.
+/// Observations of bits take a bit per pixel: 4 kB for eight layers of 64 x 64.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReplayBuffer {
-    pub(crate) observation_len: usize,
+    pub(crate) form: ObservationForm,
     pub(crate) action_len: usize,
     pub(crate) capacity: usize,
     /// Where the next transition goes once the buffer is full.
     pub(crate) head: usize,
-    pub(crate) observations: Vec<f32>,
+    pub(crate) observations: Store,
     pub(crate) actions: Vec<f32>,
     pub(crate) rewards: Vec<f32>,
-    pub(crate) nexts: Vec<f32>,
+    pub(crate) nexts: Store,
     pub(crate) terminated: Vec<bool>,
+}
+
+/// Observations one after another, in as little room as their form allows.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Store {
+    Numbers(Vec<f32>),
+    /// Whole bytes per observation.
+    Bits(Vec<u8>),
+}
+
+impl Store {
+    fn new(form: ObservationForm) -> Self {
+        match form {
+            ObservationForm::Numbers(_) => Self::Numbers(Vec::new()),
+            ObservationForm::Bits(_) => Self::Bits(Vec::new()),
+        }
+    }
+
+    /// Puts an observation in place `index`, at most one behind the last.
+    fn put(&mut self, index: usize, observation: &[f32]) {
+        match self {
+            Self::Numbers(numbers) => {
+                room(numbers, index, observation.len()).copy_from_slice(observation);
+            }
+            Self::Bits(bytes) => {
+                let n_bytes = observation.len().div_ceil(8);
+                pack(observation, room(bytes, index, n_bytes));
+            }
+        }
+    }
+
+    /// The observation of `len` numbers in place `index`.
+    fn get(&self, index: usize, len: usize) -> Cow<'_, [f32]> {
+        match self {
+            Self::Numbers(numbers) => numbers[index * len..][..len].into(),
+            Self::Bits(bytes) => {
+                let n_bytes = len.div_ceil(8);
+                let mut numbers = vec![0.0; len];
+                expand(&bytes[index * n_bytes..][..n_bytes], &mut numbers);
+                numbers.into()
+            }
+        }
+    }
+}
+
+/// Place `index` of values of `len` each, made if it is one behind the last.
+fn room<T: Clone + Default>(values: &mut Vec<T>, index: usize, len: usize) -> &mut [T] {
+    if values.len() == index * len {
+        values.resize(values.len() + len, T::default());
+    }
+    &mut values[index * len..][..len]
 }
 
 impl ReplayBuffer {
@@ -44,7 +99,7 @@ impl ReplayBuffer {
     /// [`RlError::Parameter`] for a capacity of 0.
     pub fn new(
         capacity: usize,
-        observation_len: usize,
+        form: impl Into<ObservationForm>,
         action_len: usize,
     ) -> Result<Self, RlError> {
         if capacity == 0 {
@@ -54,20 +109,22 @@ impl ReplayBuffer {
                 expected: "at least one transition",
             });
         }
+        let form = form.into();
         Ok(Self {
-            observation_len,
+            form,
             action_len,
             capacity,
             head: 0,
-            observations: Vec::new(),
+            observations: Store::new(form),
             actions: Vec::new(),
             rewards: Vec::new(),
-            nexts: Vec::new(),
+            nexts: Store::new(form),
             terminated: Vec::new(),
         })
     }
 
-    /// Adds a transition, replacing the oldest if the buffer is full.
+    /// Adds a transition, replacing the oldest if the buffer is full. Of bits, what is not positive
+    /// is kept as 0 and the rest as 1.
     ///
     /// # Panics
     /// If observations or action have another length than the buffer's.
@@ -80,24 +137,20 @@ impl ReplayBuffer {
             terminated,
         } = transition;
         let lengths = [observation.len(), action.len(), next.len()];
-        let expected = [self.observation_len, self.action_len, self.observation_len];
+        let expected = [self.form.len(), self.action_len, self.form.len()];
         assert_eq!(lengths, expected, "lengths of observation, action, next");
-        if self.len() < self.capacity {
-            self.observations.extend_from_slice(observation);
-            self.actions.extend_from_slice(action);
-            self.rewards.push(reward);
-            self.nexts.extend_from_slice(next);
-            self.terminated.push(terminated);
-            return;
-        }
-        let i = self.head;
-        let (o, a) = (self.observation_len, self.action_len);
-        self.observations[i * o..][..o].copy_from_slice(observation);
-        self.actions[i * a..][..a].copy_from_slice(action);
-        self.rewards[i] = reward;
-        self.nexts[i * o..][..o].copy_from_slice(next);
-        self.terminated[i] = terminated;
-        self.head = (i + 1) % self.capacity;
+        let index = if self.len() < self.capacity {
+            self.len()
+        } else {
+            let oldest = self.head;
+            self.head = (oldest + 1) % self.capacity;
+            oldest
+        };
+        self.observations.put(index, &observation);
+        self.nexts.put(index, &next);
+        room(&mut self.actions, index, self.action_len).copy_from_slice(action);
+        room(&mut self.rewards, index, 1)[0] = reward;
+        room(&mut self.terminated, index, 1)[0] = terminated;
     }
 
     /// Draws the indices of `n` transitions, each uniformly and with replacement.
@@ -116,12 +169,12 @@ impl ReplayBuffer {
     /// # Panics
     /// At any other index.
     pub fn get(&self, index: usize) -> Transition<'_> {
-        let (o, a) = (self.observation_len, self.action_len);
+        let (o, a) = (self.form.len(), self.action_len);
         Transition {
-            observation: &self.observations[index * o..][..o],
+            observation: self.observations.get(index, o),
             action: &self.actions[index * a..][..a],
             reward: self.rewards[index],
-            next: &self.nexts[index * o..][..o],
+            next: self.nexts.get(index, o),
             terminated: self.terminated[index],
         }
     }
@@ -132,9 +185,18 @@ impl ReplayBuffer {
         newest_last.map(|index| self.get(index))
     }
 
-    /// All observations held, in no promised order. Shape: `[len, observation_len]`.
-    pub fn observations(&self) -> &[f32] {
-        &self.observations
+    /// All observations held, in no promised order; none if they are kept as bits. Shape:
+    /// `[len, observation_len]`.
+    pub fn numbers(&self) -> &[f32] {
+        match &self.observations {
+            Store::Numbers(numbers) => numbers,
+            Store::Bits(_) => &[],
+        }
+    }
+
+    /// What observations look like.
+    pub fn form(&self) -> ObservationForm {
+        self.form
     }
 
     /// Number of transitions held.
@@ -156,6 +218,7 @@ impl ReplayBuffer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::networks::Picture;
     use gump_scene::Seed;
 
     /// Transition `i` of a stream: every part of it tells `i`.
@@ -164,10 +227,10 @@ mod tests {
         for i in 0..n {
             let x = i as f32;
             buffer.push(Transition {
-                observation: &[x, -x],
+                observation: (&[x, -x]).into(),
                 action: &[x / 10.0],
                 reward: x,
-                next: &[x + 1.0, -x - 1.0],
+                next: (&[x + 1.0, -x - 1.0]).into(),
                 terminated: i.is_multiple_of(3),
             });
         }
@@ -195,9 +258,9 @@ mod tests {
         let buffer = filled(10, 25);
         for t in buffer.iter() {
             let x = t.reward;
-            assert_eq!(t.observation, [x, -x]);
+            assert_eq!(*t.observation, [x, -x]);
             assert_eq!(t.action, [x / 10.0]);
-            assert_eq!(t.next, [x + 1.0, -x - 1.0]);
+            assert_eq!(*t.next, [x + 1.0, -x - 1.0]);
             assert_eq!(t.terminated, (x as usize).is_multiple_of(3));
         }
         assert_eq!(buffer.iter().count(), 10);
@@ -214,6 +277,29 @@ mod tests {
         let counts = (0..10).map(|i| drawn.iter().filter(|&&index| index == i).count());
         let chi_square: f64 = counts.map(|n| (n as f64 - 500.0).powi(2) / 500.0).sum();
         assert!(chi_square < 27.9, "{chi_square}");
+    }
+
+    #[test]
+    fn pictures_take_a_bit_per_pixel() {
+        let picture = Picture { layers: 1, side: 3 };
+        let mut buffer = ReplayBuffer::new(2, picture, 1).unwrap();
+        let pixels = |i: u16| (0..9).map(|k| f32::from((i >> k) & 1)).collect::<Vec<_>>();
+        for i in [7, 300, 511] {
+            buffer.push(Transition {
+                observation: pixels(i).into(),
+                action: &[0.0],
+                reward: f32::from(i),
+                next: pixels(i / 2).into(),
+                terminated: false,
+            });
+        }
+        let held: Vec<_> = buffer.iter().collect();
+        for (t, i) in held.iter().zip([300, 511]) {
+            assert_eq!(t.reward, f32::from(i));
+            assert_eq!((&*t.observation, &*t.next), (&*pixels(i), &*pixels(i / 2)));
+        }
+        assert!(matches!(&buffer.nexts, Store::Bits(bytes) if bytes.len() == 2 * 2));
+        assert_eq!(buffer.numbers(), [0.0; 0]);
     }
 
     #[test]

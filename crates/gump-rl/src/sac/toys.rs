@@ -7,7 +7,8 @@ use std::f64::consts::PI;
 use gump_scene::{Rng, Seed};
 use rand::Rng as _;
 
-use crate::{RlError, VectorEnv};
+use crate::networks::Picture;
+use crate::{ObservationForm, RlError, VectorEnv};
 
 /// A problem of one environment; states are a few numbers, the last of them may count steps.
 pub(super) trait Problem {
@@ -15,6 +16,10 @@ pub(super) trait Problem {
     const ACTION: usize;
     /// Steps until an episode is cut off.
     const HORIZON: usize;
+
+    fn form() -> ObservationForm {
+        Self::OBSERVATION.into()
+    }
 
     fn start(&self, rng: &mut Rng) -> Vec<f64>;
     fn observe(&self, state: &[f64]) -> Vec<f32>;
@@ -175,6 +180,45 @@ impl Problem for Reach {
             *x += 0.2 * f64::from(a);
         }
         (-state[0].hypot(state[1]), false)
+    }
+}
+
+/// [`Reach`], seen from above: a square of four pixels, and nothing else.
+pub(super) struct SeenReach;
+
+impl SeenReach {
+    /// Pixels of 0.2.
+    const PICTURE: Picture = Picture {
+        layers: 1,
+        side: 16,
+    };
+}
+
+impl Problem for SeenReach {
+    const OBSERVATION: usize = 16 * 16;
+    const ACTION: usize = 2;
+    const HORIZON: usize = 20;
+
+    fn form() -> ObservationForm {
+        Self::PICTURE.into()
+    }
+
+    fn start(&self, rng: &mut Rng) -> Vec<f64> {
+        Reach.start(rng)
+    }
+
+    fn observe(&self, state: &[f64]) -> Vec<f32> {
+        let side = Self::PICTURE.side;
+        let corner = |x: f64| (x / 0.2 + 7.0).round().clamp(0.0, 14.0) as usize;
+        let mut pixels = vec![0.0; side * side];
+        for (x, y) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            pixels[(corner(state[1]) + y) * side + corner(state[0]) + x] = 1.0;
+        }
+        pixels
+    }
+
+    fn step(&self, state: &mut Vec<f64>, action: &[f32]) -> (f64, bool) {
+        Reach.step(state, action)
     }
 }
 

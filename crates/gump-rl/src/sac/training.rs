@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use super::replay_buffer::{ReplayBuffer, Transition};
 use super::{Batch, Learner, SacConfig, UpdateReport};
+use crate::actor::Perception;
 use crate::networks::Normalizer;
-use crate::{Actor, RlError, VectorEnv};
+use crate::{Actor, ObservationForm, RlError, VectorEnv};
 
 /// What is learned from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,8 +79,8 @@ impl Training {
     /// A run that is to begin; `expert` holds what experts did, perhaps nothing.
     ///
     /// # Errors
-    /// [`RlError::Parameter`] for a configuration out of range; [`RlError::EmptyBuffer`] for
-    /// imitation without experts.
+    /// [`RlError::Parameter`] for a configuration out of range; [`RlError::NoPicture`] for an
+    /// encoder of pictures over numbers; [`RlError::EmptyBuffer`] for imitation without experts.
     pub fn new(
         algorithm: Algorithm,
         config: SacConfig,
@@ -92,13 +93,14 @@ impl Training {
                 asked: config.batch,
             });
         }
-        let [o, a] = [expert.observation_len, expert.action_len];
+        let (form, a) = (expert.form(), expert.action_len);
+        config.check_form(form)?;
         let networks = fork(seed, Purpose::Networks, 0);
         let mut training = Self {
             algorithm,
             seed,
-            replay: ReplayBuffer::new(config.replay_capacity, o, a)?,
-            learner: Learner::new(config, o, a, networks),
+            replay: ReplayBuffer::new(config.replay_capacity, form, a)?,
+            learner: Learner::new(config, form, a, networks),
             expert,
             env_steps: 0,
             batch: Batch::default(),
@@ -254,10 +256,10 @@ impl Training {
         for i in 0..env.n_envs() {
             let (reward, terminated) = (env.rewards()[i], env.terminated()[i]);
             self.replay.push(Transition {
-                observation: &before[i * o..][..o],
+                observation: before[i * o..][..o].into(),
                 action: &actions[i * a..][..a],
                 reward,
-                next: &env.final_observations()[i * o..][..o],
+                next: env.final_observations()[i * o..][..o].into(),
                 terminated,
             });
             let episode = &mut self.running[i];
@@ -285,7 +287,7 @@ impl Training {
         batch.draw(
             (&self.replay, n - n_imitated),
             (&self.expert, n_imitated),
-            &learner.actor.normalizer,
+            learner.actor.normalizer(),
             &mut fork(self.seed, Purpose::Batch, step).rng(),
         )?;
         let update = match self.algorithm {
@@ -305,10 +307,10 @@ impl Training {
 
     /// Fixes the scale of observations by all that is known.
     fn fit_normalizer(&mut self) {
-        if self.config().normalize {
-            let pieces = [self.replay.observations(), self.expert.observations()];
-            let len = self.actor().observation_len();
-            self.learner.actor.normalizer = Normalizer::fitted(len, &pieces);
+        if let (true, ObservationForm::Numbers(len)) = (self.config().normalize, self.replay.form())
+        {
+            let pieces = [self.replay.numbers(), self.expert.numbers()];
+            self.learner.actor.perception = Perception::Scaled(Normalizer::fitted(len, &pieces));
         }
     }
 }

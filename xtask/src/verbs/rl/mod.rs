@@ -13,6 +13,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use gump_model::{Device, SamplingConfig};
+use gump_rl::networks::Architecture;
 use gump_rl::sac::SacConfig;
 use gump_rl::{Autoreset, Course, EnvConfig, Traffic};
 use serde::{Deserialize, Serialize};
@@ -66,6 +67,8 @@ impl Settings {
         let settings: Self =
             toml::from_str(&tables.to_string()).map_err(|error| wrong(&error.message()))?;
         settings.sac.check().map_err(|error| wrong(&error))?;
+        let fits = settings.sac.check_form(settings.env.observation.form());
+        fits.map_err(|error| wrong(&format!("sac.encoder: {error}")))?;
         if settings.env.autoreset != Autoreset::SameStep {
             return Err(wrong(&"env.autoreset: learners expect \"same-step\"").into());
         }
@@ -76,6 +79,7 @@ impl Settings {
 /// Keys with a near miss to be told; those of the environment are checked as they are read.
 fn known_keys() -> anyhow::Result<Table> {
     let sac = SacConfig {
+        encoder: Some(Architecture::SmallConv),
         huber: Some(1.0),
         clip: Some(1.0),
         ..SacConfig::default()
@@ -183,10 +187,13 @@ mod tests {
     use crate::machine::repository;
 
     #[test]
-    fn the_shipped_configuration_is_understood() {
-        let path = repository().join("configs/rl-tiny.toml");
-        let settings = Settings::read(Some(&path)).unwrap();
-        assert_ne!(settings.sac, SacConfig::default());
+    fn the_shipped_configurations_are_understood() {
+        for name in ["rl-tiny", "rl-raster"] {
+            let path = repository().join(format!("configs/{name}.toml"));
+            let Settings { env, sac } = Settings::read(Some(&path)).unwrap();
+            assert_ne!(sac, SacConfig::default());
+            assert_eq!(sac.encoder.is_some(), env.observation.packed_len() > 0);
+        }
     }
 
     #[test]
@@ -204,6 +211,8 @@ mod tests {
         check("[env]\nn_env = 3", "n_envs");
         check("[env]\nautoreset = \"disabled\"", "same-step");
         check("[env.rules.reward]\nprogres = 3", "progress");
+        check("[sac]\nencoder = \"small-conv\"", "sac.encoder");
+        check("[sac]\nencoder = \"resnet50\"", "resnet18");
     }
 
     #[test]
