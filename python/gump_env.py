@@ -11,7 +11,8 @@ have the same methods.
         observations, infos = env.reset(seed=0)
         observations, rewards, terminated, truncated, infos = env.step(env.sample_actions())
 
-The protocol is described in `crates/gump-rl/src/server/mod.rs`.
+The protocol is described in `crates/gump-rl/src/server/mod.rs`; `gump_sb3.py` beside this file
+brings all rows to Stable-Baselines3.
 """
 
 import socket

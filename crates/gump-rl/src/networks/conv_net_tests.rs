@@ -7,7 +7,9 @@ use rand::Rng as _;
 
 use super::Adam;
 use super::conv_layers::Layer;
-use super::conv_net::*;
+use super::conv_net::{
+    Architecture, ConvNet, ConvPass, Picture, ROWS_PER_PIECE, layers, n_parameters,
+};
 
 const PICTURE: Picture = Picture {
     layers: 2,
@@ -32,8 +34,11 @@ fn features(network: &ConvNet, pictures: &[f32]) -> Vec<f32> {
 
 #[test]
 fn parameters_are_as_many_as_the_papers() {
-    let count = |architecture, layers| {
-        let picture = Picture { layers, side: 64 };
+    let count = |architecture, n_layers| {
+        let picture = Picture {
+            layers: n_layers,
+            side: 64,
+        };
         n_parameters(&layers(architecture, picture))
     };
     // ResNet-18 for colours, 11,689,512, less its last layer of 512 x 1000 + 1000.

@@ -125,6 +125,22 @@ fn entropy_above_its_target_lowers_the_temperature() {
     check(2.0, false);
 }
 
+#[test]
+fn targets_move_once_per_period() {
+    let config = SacConfig {
+        target_period: 2,
+        ..config()
+    };
+    let mut learner = Learner::new(config, 2, 1, Seed(0));
+    let mut before = learner.critics[0].target.clone();
+    for moves in [false, true, false, true] {
+        learner.update(&batch(0), Seed(1));
+        let after = learner.critics[0].target.clone();
+        assert_eq!(after != before, moves);
+        before = after;
+    }
+}
+
 /// Finite differences of a loss by some parameters, one of so many. ReLU has kinks, on which the two sides
 /// disagree: where much, they are few and left out; the gradient lies between them.
 pub(super) fn check_gradient(found: &[f32], every: usize, loss: impl Fn(usize, f32) -> f64) {

@@ -2,7 +2,8 @@
 //!
 //! [`Server::bind`], then [`Server::run`]. Every client that connects gets an environment of its
 //! own; courses and world are shared. What a client does wrong is answered, at worst it is let go:
-//! the server and the other clients live on. `python/gump_env.py` is a client.
+//! the server and the other clients live on. `python/gump_env.py` is a client, and
+//! `python/gump_sb3.py` brings it to Stable-Baselines3.
 //!
 //! # Protocol, version 1
 //! Client and server take turns: one request, one answer. A frame is
