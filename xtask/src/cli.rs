@@ -167,6 +167,9 @@ impl Cli {
                 Run::of("ablate chunking", &args.common, &args)?
                     .execute(|run| args.execute(run, Knob::Chunking))
             }
+            Verb::Ablate(ablate::Verb::Scaling(args)) => {
+                Run::of("ablate scaling", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Bench(bench::Verb::Engine(args)) => {
                 Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))
             }

@@ -1,6 +1,7 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
 mod decoding;
+mod scaling;
 
 use std::num::NonZeroUsize;
 
@@ -34,6 +35,8 @@ pub(crate) enum Verb {
     History(decoding::Args),
     /// One pose at a time against chunks of four, without and with averaging
     Chunking(decoding::Args),
+    /// Three sizes trained on the same samples: loss against tokens with a fitted law, and realism
+    Scaling(scaling::Args),
 }
 
 /// Arguments of `ablate nar`.

@@ -5,7 +5,7 @@
 //! Challenge, since displacements alone would reward timid futures.
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
@@ -59,7 +59,7 @@ const FRAMES: f64 = 16.0;
 
 /// Seconds that a frame of one future takes, opening the session included.
 #[derive(Clone, Copy, Debug, Default)]
-struct Cost {
+pub(super) struct Cost {
     wall: f64,
     /// Of processor time.
     cpu: f64,
@@ -152,8 +152,8 @@ impl Args {
         let (mut curve, mut ways) = (Series::default(), Vec::new());
         for (name, at, sampling) in settings {
             let bits = sampling.precision.bits();
-            let (scores, cost) =
-                run.phase(&name, |run| self.score(run, &path, &world, sampling))?;
+            let n = self.rollouts_per_scenario.get();
+            let (scores, cost) = run.phase(&name, |run| score(run, &path, &world, sampling, n))?;
             let mean = Scores::mean(&scores)
                 .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
             let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
@@ -191,37 +191,39 @@ impl Args {
         };
         Ok(chart.save(&run.path("realism"))?)
     }
+}
 
-    fn score(
-        &self,
-        run: &Run,
-        path: &std::path::Path,
-        world: &WorldName,
-        sampling: SamplingConfig,
-    ) -> anyhow::Result<(Vec<Scores>, Cost)> {
-        let config = Config::of(Year::Y2025);
-        let n = self.rollouts_per_scenario.get();
-        let mut source = Source::world(world.clone(), sampling, n, run.seed());
-        let progress = run.progress("evaluating", 0, "scenarios");
-        let (mut all, mut cost, mut frames) = (Vec::new(), Cost::default(), 0.0);
-        for recorded in recordings(path, source.read_options(), |_| true)? {
-            stop_if_interrupted()?;
-            let recorded = recorded?;
-            let (cpu, began) = (cpu_seconds(), Instant::now());
-            let rollouts = source.rollouts(run, &recorded, config.mode)?;
-            let wall = began.elapsed().as_secs_f64();
-            let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
-            cost.cpu += cpu.map_or(wall, spent);
-            cost.wall += wall;
-            frames += n as f64 * FRAMES;
-            let reference = Reference::new(&recorded.log, &config)?;
-            all.push(reference.evaluate(&rollouts)?.scores);
-            progress.advance(1);
-        }
-        cost.cpu /= frames;
-        cost.wall /= frames;
-        Ok((all, cost))
+/// The realism of 2025 of `n` rollouts of each scenario, and what they cost.
+///
+/// Error: scenarios that cannot be read, a world that cannot imagine them, or Ctrl-C.
+pub(super) fn score(
+    run: &Run,
+    scenarios: &Path,
+    world: &WorldName,
+    sampling: SamplingConfig,
+    n: usize,
+) -> anyhow::Result<(Vec<Scores>, Cost)> {
+    let config = Config::of(Year::Y2025);
+    let mut source = Source::world(world.clone(), sampling, n, run.seed());
+    let progress = run.progress("evaluating", 0, "scenarios");
+    let (mut all, mut cost, mut frames) = (Vec::new(), Cost::default(), 0.0);
+    for recorded in recordings(scenarios, source.read_options(), |_| true)? {
+        stop_if_interrupted()?;
+        let recorded = recorded?;
+        let (cpu, began) = (cpu_seconds(), Instant::now());
+        let rollouts = source.rollouts(run, &recorded, config.mode)?;
+        let wall = began.elapsed().as_secs_f64();
+        let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
+        cost.cpu += cpu.map_or(wall, spent);
+        cost.wall += wall;
+        frames += n as f64 * FRAMES;
+        let reference = Reference::new(&recorded.log, &config)?;
+        all.push(reference.evaluate(&rollouts)?.scores);
+        progress.advance(1);
     }
+    cost.cpu /= frames;
+    cost.wall /= frames;
+    Ok((all, cost))
 }
 
 #[cfg(test)]
