@@ -2,7 +2,7 @@
 //!
 //! Every scalar key at the top of the file is a long flag of the verb, so clap checks its value
 //! and a flag on the command line overrides it. Tables belong to the verb itself, which reads them
-//! with [`tables`] and checks them with [`check_keys`].
+//! with [`tables`] and checks them with [`check_keys`]; so do lists of tables.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -34,8 +34,17 @@ pub(crate) fn splice(
 /// The tables of a config file, without the keys that are flags.
 pub(crate) fn tables(path: &Path) -> anyhow::Result<Table> {
     let mut table = read(path)?;
-    table.retain(|_, value| value.is_table());
+    table.retain(|_, value| holds_keys(value));
     Ok(table)
+}
+
+/// True for a table and for a list of tables, which are the verb's own.
+fn holds_keys(value: &Value) -> bool {
+    match value {
+        Value::Table(_) => true,
+        Value::Array(items) => !items.is_empty() && items.iter().all(Value::is_table),
+        _ => false,
+    }
 }
 
 /// Refuses keys of `given` that `known` does not have, at any depth.
@@ -107,15 +116,18 @@ fn flags(path: &Path, table: &Table, verb: &Command) -> anyhow::Result<Vec<OsStr
     for (key, value) in table {
         // TOML habit writes top_k where a flag is --top-k; both are understood.
         let name = key.replace('_', "-");
-        if !value.is_table() && !known.contains(&name.as_str()) {
+        if holds_keys(value) {
+            continue;
+        }
+        if !known.contains(&name.as_str()) {
             return Err(unknown_key(path, key, known.iter().copied()));
         }
         match value {
-            Value::Table(_) | Value::Boolean(false) => {}
+            Value::Boolean(false) => {}
             Value::Boolean(true) => flags.push(format!("--{name}").into()),
             Value::String(text) => flags.push(format!("--{name}={text}").into()),
             Value::Integer(_) | Value::Float(_) => flags.push(format!("--{name}={value}").into()),
-            Value::Array(_) | Value::Datetime(_) => {
+            Value::Table(_) | Value::Array(_) | Value::Datetime(_) => {
                 let found = value.type_str();
                 return Err(WrongArguments(format!(
                     "{}: {key} is a {found}, expected a number, a string or true/false",

@@ -19,6 +19,7 @@ mod imagine;
 mod losses;
 mod machine;
 mod nuplan_recordings;
+mod peers;
 mod planners;
 mod progress;
 mod recordings;

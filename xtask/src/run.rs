@@ -81,6 +81,8 @@ pub(crate) struct Run {
     quiet: bool,
     threads: usize,
     device: gump_model::Device,
+    /// False for a process that helps another one, which tells and writes for both.
+    leads: bool,
     report: Report,
     began: Instant,
 }
@@ -110,6 +112,7 @@ impl Run {
                 .threads
                 .map_or_else(machine::cores, NonZeroUsize::get),
             device,
+            leads: true,
             report: Report::begin(verb, seed, config, common.device.name()),
             began: Instant::now(),
             out,
@@ -128,7 +131,11 @@ impl Run {
             .num_threads(self.threads)
             .build_global()
             .context("cannot start the worker threads")?;
-        let done = work(&mut self).and_then(|()| self.report.write_tables(&self.out));
+        let mut done = work(&mut self);
+        if !self.leads {
+            return done;
+        }
+        done = done.and_then(|()| self.report.write_tables(&self.out));
         self.report.add_seconds("total", self.began.elapsed());
         self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
         let path = self.out.join("report.json");
@@ -170,6 +177,12 @@ impl Run {
             .with_context(|| format!("the result {key} cannot be written as JSON"))?;
         self.report.results.insert(key.into(), value);
         Ok(())
+    }
+
+    /// From here on this process only helps another one, which tells and writes for both.
+    pub(crate) fn follow(&mut self) {
+        self.leads = false;
+        self.quiet = true;
     }
 
     /// Takes the seed from elsewhere, where `--seed` is not given.

@@ -34,8 +34,10 @@ pub enum Precision {
 pub(crate) const OPTIMIZER: &str = "optimizer.";
 /// Before the names of the weights that drove the scenes of closed-loop training.
 pub(crate) const DRIVER: &str = "driver.";
+/// Before the names of the weights being trained, where their moving average is what is shipped.
+pub(crate) const TRAINED: &str = "trained.";
 /// What a run's checkpoint holds beside the weights.
-const PREFIXES: [&str; 2] = [OPTIMIZER, DRIVER];
+const PREFIXES: [&str; 3] = [OPTIMIZER, DRIVER, TRAINED];
 
 /// Tensors and header entries of a file.
 #[derive(Debug)]

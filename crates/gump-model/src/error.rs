@@ -61,6 +61,9 @@ pub enum ModelError {
         /// Frames a sample needs.
         frames: usize,
     },
+    /// Processes that train together lost each other.
+    #[error("processes that train together: {0}")]
+    Peers(String),
     /// A scene cannot be imagined by this model.
     #[error("scene: {0}")]
     Scene(String),

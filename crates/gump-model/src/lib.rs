@@ -70,8 +70,6 @@ mod surroundings;
 #[cfg(test)]
 mod tests;
 pub mod train;
-#[cfg(test)]
-mod train_tests;
 mod trajectory;
 mod visual;
 pub mod world;

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::backprop::GradStore;
-use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor};
+use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
 use crate::parameters::Parameters;
+use crate::train::Gradients;
 
 /// Step size and its schedule.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,14 +57,15 @@ const EPS: f64 = 1e-8;
 /// First and second moments of every trainable parameter.
 #[derive(Debug)]
 pub(crate) struct AdamW {
-    moments: BTreeMap<String, (Tensor, Tensor)>,
+    moments: BTreeMap<String, (Var, Var)>,
     steps: usize,
 }
 
 impl AdamW {
     pub(crate) fn new(parameters: &Parameters) -> Result<Self> {
-        let zeros = |(name, var): (&str, &candle_core::Var)| {
-            Ok((name.to_owned(), (var.zeros_like()?, var.zeros_like()?)))
+        let zeros = |(name, var): (&str, &Var)| {
+            let zeros = || Var::from_tensor(&var.zeros_like()?);
+            Ok((name.to_owned(), (zeros()?, zeros()?)))
         };
         Ok(Self {
             moments: parameters.trainable().map(zeros).collect::<Result<_>>()?,
@@ -76,8 +77,8 @@ impl AdamW {
     pub(crate) fn state(&self) -> impl Iterator<Item = (String, &Tensor)> {
         self.moments.iter().flat_map(|(name, (m, v))| {
             [
-                (format!("optimizer.m.{name}"), m),
-                (format!("optimizer.v.{name}"), v),
+                (format!("optimizer.m.{name}"), m.as_tensor()),
+                (format!("optimizer.v.{name}"), v.as_tensor()),
             ]
         })
     }
@@ -101,8 +102,7 @@ impl AdamW {
                         found,
                     });
                 }
-                // A copy of its own: the update writes in place.
-                Ok(tensor.to_device(var.device())?.copy()?)
+                Ok(Var::from_tensor(&tensor.to_device(var.device())?)?)
             };
             moments.insert(name.to_owned(), (moment("m")?, moment("v")?));
         }
@@ -113,15 +113,13 @@ impl AdamW {
     pub(crate) fn step(
         &mut self,
         parameters: &Parameters,
-        gradients: &GradStore,
+        gradients: &Gradients,
         config: &OptimizerConfig,
         rate: f64,
     ) -> Result<f64> {
         let mut squares = 0.0;
-        for (_, var) in parameters.trainable() {
-            if let Some(gradient) = gradients.get(var) {
-                squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
-            }
+        for gradient in gradients.values() {
+            squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
         }
         let norm = squares.sqrt();
         let scale = if norm > config.clip {
@@ -133,27 +131,18 @@ impl AdamW {
         let correction1 = 1.0 - BETA1.powi(self.steps as i32);
         let correction2 = 1.0 - BETA2.powi(self.steps as i32);
         for (name, var) in parameters.trainable() {
-            let Some(gradient) = gradients.get(var) else {
+            let Some(gradient) = gradients.get(name) else {
                 continue;
             };
             let gradient = gradient.contiguous()?;
             let (m, v) = &self.moments[name];
-            m.inplace_op2(
-                &gradient,
-                &Moment {
-                    beta: BETA1,
-                    scale,
-                    squared: false,
-                },
-            )?;
-            v.inplace_op2(
-                &gradient,
-                &Moment {
-                    beta: BETA2,
-                    scale,
-                    squared: true,
-                },
-            )?;
+            let moment = |beta, squared| Moment {
+                beta,
+                scale,
+                squared,
+            };
+            moment(BETA1, false).take_in(m, &gradient)?;
+            moment(BETA2, true).take_in(v, &gradient)?;
             let decay = if decays(name, var) {
                 config.weight_decay
             } else {
@@ -165,10 +154,27 @@ impl AdamW {
                 correction1,
                 correction2,
             };
-            var.as_tensor().inplace_op3(m, v, &update)?;
+            update.apply(var, m, v)?;
         }
         Ok(norm)
     }
+}
+
+/// Moves averages towards the parameters: `share` of the old stays. Running statistics, which are
+/// averages already, are taken as they are.
+pub(crate) fn move_average(average: &Parameters, now: &Parameters, share: f64) -> Result<()> {
+    let moving = Moment {
+        beta: share,
+        scale: 1.0,
+        squared: false,
+    };
+    for ((_, old), (_, new)) in average.trainable().zip(now.trainable()) {
+        moving.take_in(old, new.as_tensor())?;
+    }
+    for ((_, old), (_, new)) in average.statistics().zip(now.statistics()) {
+        old.set(new.as_tensor())?;
+    }
+    Ok(())
 }
 
 /// Matrices and kernels decay; vectors, gates and embedding tables do not.
@@ -176,11 +182,28 @@ fn decays(name: &str, tensor: &Tensor) -> bool {
     tensor.rank() >= 2 && !name.ends_with("tables") && !name.ends_with("slots")
 }
 
-/// An exponential moving average of the gradient or of its square.
+/// An exponential moving average of the gradient or of its square, or of a parameter.
 struct Moment {
     beta: f64,
     scale: f64,
     squared: bool,
+}
+
+impl Moment {
+    /// Moves the average, in one pass over memory where that is a CPU's.
+    fn take_in(&self, average: &Var, new: &Tensor) -> Result<()> {
+        if average.device().is_cpu() {
+            return average.as_tensor().inplace_op2(new, self);
+        }
+        self.take_in_by_tensors(average, new)
+    }
+
+    fn take_in_by_tensors(&self, average: &Var, new: &Tensor) -> Result<()> {
+        let new = (new.detach() * self.scale)?;
+        let new = if self.squared { new.sqr()? } else { new };
+        let kept = (average.as_tensor().detach() * self.beta)?;
+        average.set(&(kept + (new * (1.0 - self.beta))?)?)
+    }
 }
 
 impl InplaceOp2 for Moment {
@@ -214,6 +237,24 @@ struct Update {
     decay: f64,
     correction1: f64,
     correction2: f64,
+}
+
+impl Update {
+    /// Moves the parameter, in one pass over memory where that is a CPU's.
+    fn apply(&self, parameter: &Var, m: &Var, v: &Var) -> Result<()> {
+        let (m, v) = (m.as_tensor(), v.as_tensor());
+        if parameter.device().is_cpu() {
+            return parameter.as_tensor().inplace_op3(m, v, self);
+        }
+        self.apply_by_tensors(parameter, m, v)
+    }
+
+    fn apply_by_tensors(&self, parameter: &Var, m: &Tensor, v: &Tensor) -> Result<()> {
+        let deviation = ((v.detach() / self.correction2)?.sqrt()? + EPS)?;
+        let change = ((m.detach() * (self.rate / self.correction1))? / deviation)?;
+        let kept = (parameter.as_tensor().detach() * (1.0 - self.decay))?;
+        parameter.set(&(kept - change)?)
+    }
 }
 
 impl InplaceOp3 for Update {
@@ -254,6 +295,45 @@ fn floats(storage: &mut CpuStorage) -> Result<&mut [f32]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use candle_core::Device;
+
+    /// What devices other than a CPU compute is what a CPU computes.
+    #[test]
+    fn one_pass_is_what_tensors_say() {
+        let var = |salt: f32| {
+            let numbers: Vec<f32> = (0..50).map(|i| (i as f32 * salt).sin()).collect();
+            Var::from_vec(numbers, 50, &Device::Cpu).unwrap()
+        };
+        let assert_alike = |a: &Var, b: &Var| {
+            let [a, b] = [a, b].map(|v| v.to_vec1::<f32>().unwrap());
+            for (a, b) in a.iter().zip(&b) {
+                assert!((a - b).abs() < 1e-6, "{a} against {b}");
+            }
+        };
+        let gradient = var(0.7);
+        for squared in [false, true] {
+            let moment = Moment {
+                beta: 0.9,
+                scale: 0.5,
+                squared,
+            };
+            let (fused, plain) = (var(0.3), var(0.3));
+            moment.take_in(&fused, &gradient).unwrap();
+            moment.take_in_by_tensors(&plain, &gradient).unwrap();
+            assert_alike(&fused, &plain);
+        }
+        let update = Update {
+            rate: 0.01,
+            decay: 1e-3,
+            correction1: 0.1,
+            correction2: 0.02,
+        };
+        let second = Var::from_tensor(&var(0.4).sqr().unwrap()).unwrap();
+        let (fused, plain, first) = (var(0.3), var(0.3), var(0.9));
+        update.apply(&fused, &first, &second).unwrap();
+        update.apply_by_tensors(&plain, &first, &second).unwrap();
+        assert_alike(&fused, &plain);
+    }
 
     #[test]
     fn the_schedule_warms_up_and_falls() {

@@ -67,6 +67,11 @@ impl Parameters {
             .map(|(name, var)| (name.as_str(), var))
     }
 
+    /// The running statistics, which training does not differentiate, sorted by name.
+    pub(crate) fn statistics(&self) -> impl Iterator<Item = (&str, &Var)> {
+        self.all().filter(|(name, _)| !self.trainable[*name])
+    }
+
     /// Everything a checkpoint holds, running statistics included, sorted by name.
     pub fn all(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.variables

@@ -44,7 +44,8 @@ pub(crate) const LONGEST_ROLLOUT: usize = 16;
 pub struct SampleConfig {
     /// Consecutive frames at 2 Hz a sample presents.
     pub frames: usize,
-    /// Samples keep at most this many agents, those nearest to the centre.
+    /// Samples keep at most this many agents, those nearest to the centre, and fewer where the
+    /// frames would not fit the network's block.
     pub max_agents: usize,
     /// True takes any frame of the log as the present, not only the scenario's own.
     pub any_present: bool,
@@ -143,6 +144,8 @@ pub(crate) struct Reader {
     pub(crate) tokenizer: Tokenizer,
     /// True asks for chunks in the frames of their objects.
     pub(crate) anchored: bool,
+    /// Longest sequence of tokens.
+    pub(crate) block_size: usize,
 }
 
 impl Reader {
@@ -152,7 +155,15 @@ impl Reader {
             spec: network.raster_spec().clone(),
             tokenizer: Tokenizer::new(TokenizerConfig::default()),
             anchored: network.config().anchored,
+            block_size: network.config().block_size,
         }
+    }
+
+    /// Agents of a frame that fit the block beside as many other frames: two tokens each, after
+    /// prompts, lights and the three marks of a frame.
+    fn room(&self, frame: &Frame, n_frames: usize) -> usize {
+        let tokens = self.block_size.saturating_sub(MAX_PROMPTS) / n_frames.max(1);
+        tokens.saturating_sub(3 + frame.lights().len()) / 2
     }
 }
 
@@ -186,7 +197,11 @@ pub(crate) fn draw(
         window.driven = Some(Driven { drive, slack });
     }
     let frames: Vec<Frame> = (0..config.frames)
-        .filter_map(|i| Some(thin(window.seen(i, 0)?, &window, config)))
+        .filter_map(|i| {
+            let frame = window.seen(i, 0)?;
+            let most = config.max_agents.min(reader.room(frame, config.frames));
+            Some(thin(frame, &window, most))
+        })
         .collect();
     let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
@@ -225,10 +240,10 @@ pub(crate) fn draw(
     Some(sample)
 }
 
-/// The frame with only its nearest `max_agents` agents.
-fn thin(frame: &Frame, window: &Window<'_>, config: &SampleConfig) -> Frame {
+/// The frame with only its nearest `most` agents.
+fn thin(frame: &Frame, window: &Window<'_>, most: usize) -> Frame {
     let mut agents = frame.agents().to_vec();
-    if agents.len() > config.max_agents {
+    if agents.len() > most {
         let centre = window.world_from_scene.position;
         agents.sort_by(|a, b| {
             let key = |agent: &Agent| {
@@ -240,7 +255,7 @@ fn thin(frame: &Frame, window: &Window<'_>, config: &SampleConfig) -> Frame {
             };
             key(a).total_cmp(&key(b)).then(a.id.cmp(&b.id))
         });
-        agents.truncate(config.max_agents);
+        agents.truncate(most);
     }
     Frame::new(agents, frame.lights().to_vec())
 }

@@ -10,6 +10,7 @@ fn reader() -> Reader {
     Reader {
         spec: RasterSpec::full(16, 12.0),
         tokenizer: Tokenizer::new(TokenizerConfig::default()),
+        block_size: 2048,
         anchored: false,
     }
 }

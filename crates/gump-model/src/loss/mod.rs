@@ -1,21 +1,28 @@
 //! What training minimises: cross-entropy of states and successors, trajectories, reconstruction.
 //!
-//! Every mean is over valid targets only; an ignored target has no value and no gradient.
+//! Every mean is over valid targets only; an ignored target has no value and no gradient. A batch
+//! may come in parts: each mean is over the targets of the whole batch, so the parts' losses and
+//! gradients add up to those of the batch.
 //!
 //! Source: GUMP's loss with separate means for values and keys, winner-takes-all trajectories.
 
+mod counts;
+mod trajectory;
+
 use std::sync::Arc;
 
-use candle_core::{D, Device, Tensor};
+use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
+pub(crate) use self::counts::Counts;
+use self::counts::weight;
+use self::trajectory::{at_agents, trajectory_loss, trajectory_targets};
 use crate::ModelError;
 use crate::decoder::STEPS;
 use crate::mct::Dropout;
 use crate::network::Network;
 use crate::ops::{self, OrdinalSmoothing};
-use crate::sample::{ControlTarget, Sample, StateTarget, TrajectoryTarget};
-use crate::trajectory::{FUTURE, MODES, PAST, POSE, Trajectories};
+use crate::sample::{ControlTarget, Sample};
 
 /// Weights of the parts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,7 +47,7 @@ pub struct LossConfig {
     /// Width of the label smoothing over neighbouring bins, as a standard deviation in bins; 0 is
     /// none (paper).
     pub smoothing_bins: f64,
-    /// Most agents per batch that a trajectory head is asked about (released code: 512).
+    /// Most agents per sample that a trajectory head is asked about (released code: 512 per batch).
     pub max_trajectories: usize,
 }
 
@@ -55,13 +62,13 @@ impl Default for LossConfig {
             reconstruction: 1.0,
             unknown: 1.0,
             smoothing_bins: 0.0,
-            max_trajectories: 512,
+            max_trajectories: 128,
         }
     }
 }
 
 /// The parts of a loss as numbers.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LossParts {
     /// What was minimised.
     pub total: f64,
@@ -83,7 +90,65 @@ pub struct LossParts {
     pub reconstruction: f64,
 }
 
+impl Default for LossParts {
+    fn default() -> Self {
+        Self {
+            total: 0.0,
+            state: 0.0,
+            fields: vec![0.0; STEPS.len()],
+            control: 0.0,
+            lights: 0.0,
+            classes: 0.0,
+            trajectory: 0.0,
+            reconstruction: 0.0,
+        }
+    }
+}
+
 impl LossParts {
+    /// Adds another part of the same batch.
+    pub(crate) fn add(&mut self, part: &Self) {
+        self.total += part.total;
+        self.state += part.state;
+        self.control += part.control;
+        self.lights += part.lights;
+        self.classes += part.classes;
+        self.trajectory += part.trajectory;
+        self.reconstruction += part.reconstruction;
+        let fields = self.fields.iter_mut().zip(&part.fields);
+        fields.for_each(|(sum, part)| *sum += part);
+    }
+
+    /// All numbers in a row, for another process.
+    pub(crate) fn numbers(&self) -> Vec<f32> {
+        let parts = [
+            self.total,
+            self.state,
+            self.control,
+            self.lights,
+            self.classes,
+            self.trajectory,
+            self.reconstruction,
+        ];
+        let all = parts.iter().chain(&self.fields);
+        all.map(|&number| number as f32).collect()
+    }
+
+    /// What [`Self::numbers`] told.
+    pub(crate) fn of_numbers(numbers: &[f32]) -> Self {
+        let number = |i: usize| f64::from(numbers[i]);
+        Self {
+            total: number(0),
+            state: number(1),
+            control: number(2),
+            lights: number(3),
+            classes: number(4),
+            trajectory: number(5),
+            reconstruction: number(6),
+            fields: (7..numbers.len()).map(number).collect(),
+        }
+    }
+
     /// The first part that is not a finite number.
     pub fn first_not_finite(&self) -> Option<String> {
         let named = [
@@ -106,13 +171,15 @@ impl LossParts {
     }
 }
 
-/// One forward pass over samples: the loss to differentiate and its parts.
+/// One forward pass over samples of a batch that has `whole` targets: their part of its loss, to
+/// differentiate, and as numbers.
 ///
 /// With `dropout` the pass is a training pass; without, an evaluation.
 pub(crate) fn loss(
     network: &Network,
     samples: &[Sample],
     config: &LossConfig,
+    whole: &Counts,
     training: bool,
     dropout: Option<&Dropout>,
 ) -> Result<(Tensor, LossParts), ModelError> {
@@ -134,9 +201,10 @@ pub(crate) fn loss(
     let passed = network.mct.forward(&batch, &memory, None, dropout)?;
     let flat = passed.hidden.reshape((b * t, width))?;
 
+    let own = Counts::of(samples, config);
     let mut parts = LossParts::default();
     let mut total = Tensor::zeros((), candle_core::DType::F32, device)?;
-    if let Some(state) = state_loss(network, samples, t, &flat, config, &mut parts)? {
+    if let Some(state) = state_loss(network, samples, t, &flat, config, whole, &mut parts)? {
         total = (total + state)?;
     }
     let decoder = &network.decoder;
@@ -164,15 +232,21 @@ pub(crate) fn loss(
         )?,
     ];
     let weights = [config.control, config.lights, config.classes];
+    let shares = [
+        own.control / whole.control,
+        own.lights / whole.lights,
+        own.classes / whole.classes,
+    ];
     let said = [&mut parts.control, &mut parts.lights, &mut parts.classes];
-    for ((loss, weight), said) in spoken.into_iter().zip(weights).zip(said) {
+    for (((loss, weight), share), said) in spoken.into_iter().zip(weights).zip(shares).zip(said) {
         if let Some(loss) = loss {
-            *said = scalar(&loss)?;
-            total = (total + (loss * weight)?)?;
+            *said = share * scalar(&loss)?;
+            total = (total + (loss * (share * weight))?)?;
         }
     }
     let targets = trajectory_targets(samples, t, config.max_trajectories);
     if !targets.is_empty() {
+        let share = own.trajectories / whole.trajectories;
         let weights =
             &config.trajectory[config.trajectory.len().saturating_sub(passed.levels.len())..];
         for ((level, head), weight) in passed
@@ -183,7 +257,8 @@ pub(crate) fn loss(
         {
             let level = level.reshape((b * t, width))?;
             let predicted = head.forward(&at_agents(&level, &targets, device)?)?;
-            let part = (trajectory_loss(&predicted, &targets, config.past, device)? * *weight)?;
+            let part = trajectory_loss(&predicted, &targets, config.past, device)?;
+            let part = (part * (share * weight))?;
             parts.trajectory += scalar(&part)?;
             total = (total + part)?;
         }
@@ -193,9 +268,10 @@ pub(crate) fn loss(
         .reconstruction()
         .filter(|_| config.reconstruction > 0.0)
     {
+        let share = own.scenes / whole.scenes;
         let part = decoder.loss(&features, &raster)?;
-        parts.reconstruction = scalar(&part)?;
-        total = (total + (part * config.reconstruction)?)?;
+        parts.reconstruction = share * scalar(&part)?;
+        total = (total + (part * (share * config.reconstruction))?)?;
     }
     parts.total = scalar(&total)?;
     Ok((total, parts))
@@ -205,13 +281,14 @@ fn scalar(tensor: &Tensor) -> candle_core::Result<f64> {
     Ok(f64::from(tensor.to_scalar::<f32>()?))
 }
 
-/// Mean cross-entropy of all state targets; fills the per-step parts.
+/// The samples' part of the mean cross-entropy of all state targets; fills the per-step parts.
 fn state_loss(
     network: &Network,
     samples: &[Sample],
     t: usize,
     flat: &Tensor,
     config: &LossConfig,
+    whole: &Counts,
     parts: &mut LossParts,
 ) -> Result<Option<Tensor>, ModelError> {
     let device = network.device();
@@ -237,15 +314,7 @@ fn state_loss(
         &tokens,
     )?;
 
-    let weight = |target: &StateTarget, step: usize| match target.bins[step] {
-        None => 0.0,
-        Some(_) if target.is_known => 1.0,
-        Some(_) => config.unknown,
-    };
-    let weights: Vec<f64> = (0..STEPS.len())
-        .map(|step| targets.iter().map(|target| weight(target, step)).sum())
-        .collect();
-    let n: f64 = weights.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+    let all = whole.states();
     let mut total = None;
     for (step, field) in STEPS.into_iter().enumerate() {
         let bins: Vec<u32> = targets
@@ -254,8 +323,9 @@ fn state_loss(
             .collect();
         let valid: Vec<f32> = targets
             .iter()
-            .map(|target| weight(target, step) as f32)
+            .map(|target| weight(target, step, config) as f32)
             .collect();
+        let own: f64 = targets.iter().map(|t| weight(t, step, config)).sum();
         let logits = network.decoder.logits(&outputs.get(step)?, field)?; // [K, bins]
         let smoothing = (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
             sigma_bins: config.smoothing_bins as f32,
@@ -267,10 +337,10 @@ fn state_loss(
             &Tensor::from_vec(valid, k, device)?,
             smoothing,
         )?;
-        parts.fields.push(scalar(&mean)?);
-        let share = weights[step] / n;
-        parts.state += share * parts.fields[step];
-        let part = (mean * share)?;
+        let sum = own * scalar(&mean)?;
+        parts.fields[step] = sum / whole.steps[step].max(f64::MIN_POSITIVE);
+        parts.state += sum / all;
+        let part = (mean * (own / all))?;
         total = Some(match total {
             None => part,
             Some(total) => (part + total)?,
@@ -311,161 +381,27 @@ fn successor_loss(
     )?))
 }
 
-/// Up to `limit` targets spread evenly over the batch, with the flat index of their key.
-fn trajectory_targets(samples: &[Sample], t: usize, limit: usize) -> Vec<(u32, &TrajectoryTarget)> {
-    let all: Vec<_> = samples
-        .iter()
-        .enumerate()
-        .flat_map(|(row, sample)| {
-            sample
-                .trajectories
-                .iter()
-                .map(move |target| ((row * t + target.key) as u32, target))
-        })
-        .collect();
-    let stride = all.len().div_ceil(limit.max(1)).max(1);
-    all.into_iter().step_by(stride).collect()
-}
-
-/// Features at key and value side by side, [A, 2C].
-fn at_agents(
-    level: &Tensor,
-    targets: &[(u32, &TrajectoryTarget)],
-    device: &Device,
-) -> candle_core::Result<Tensor> {
-    let pick = |offset: u32| {
-        let rows: Vec<u32> = targets.iter().map(|(key, _)| key + offset).collect();
-        level.index_select(&Tensor::new(rows, device)?, 0)
-    };
-    Tensor::cat(&[pick(0)?, pick(1)?], 1)
-}
-
-/// Best-of-modes regression plus classification of the best mode, plus recalling the past.
-pub(crate) fn trajectory_loss(
-    predicted: &Trajectories,
-    targets: &[(u32, &TrajectoryTarget)],
-    past_weight: f64,
-    device: &Device,
-) -> candle_core::Result<Tensor> {
-    let a = targets.len();
-    let (future, future_share) =
-        pose_tensors::<FUTURE>(targets.iter().map(|t| &t.1.future), device)?;
-    let (past, past_share) = pose_tensors::<PAST>(targets.iter().map(|t| &t.1.past), device)?;
-
-    let off = predicted
-        .future
-        .broadcast_sub(&future.reshape((a, 1, FUTURE, POSE))?)?;
-    let distance = (off.narrow(3, 0, 2)?.sqr()?.sum(3)? + 1e-5)?.sqrt()?; // [A, MODES, FUTURE]
-    let turn = off.narrow(3, 2, 2)?.abs()?.sum(3)?;
-    let share = future_share.reshape((a, 1, FUTURE))?;
-    let error = (distance + (turn * 2.0)?)?.broadcast_mul(&share)?.sum(2)?; // [A, MODES]
-
-    // The winner is picked outside the graph: no gradient flows through the choice.
-    let errors = error.to_vec2::<f32>()?;
-    let winners = errors.iter().flat_map(|row| {
-        let best = (0..MODES)
-            .min_by(|&i, &j| row[i].total_cmp(&row[j]))
-            .expect("there are modes");
-        (0..MODES).map(move |mode| f32::from(u8::from(mode == best)))
-    });
-    let winners = Tensor::from_vec(winners.collect::<Vec<f32>>(), (a, MODES), device)?;
-    let log_share = candle_nn::ops::log_softmax(&predicted.modes, D::Minus1)?;
-    let regression = (&error * &winners)?.sum_all()?;
-    let classification = (log_share * &winners)?.sum_all()?.neg()?;
-
-    let off = (&predicted.past - past)?.abs()?;
-    let recall = (off.narrow(2, 0, 2)?.sum(2)? + (off.narrow(2, 2, 2)?.sum(2)? * 2.0)?)?;
-    let recall = (recall * past_share)?.sum_all()?;
-    ((regression + classification)? + (recall * past_weight)?)? / a as f64
-}
-
-/// Poses [A, N, POSE] with zeros where missing, and per step 1 / (valid steps) or 0, [A, N].
-fn pose_tensors<'a, const N: usize>(
-    rows: impl Iterator<Item = &'a [Option<[f32; POSE]>; N]>,
-    device: &Device,
-) -> candle_core::Result<(Tensor, Tensor)> {
-    let (mut poses, mut shares) = (Vec::new(), Vec::new());
-    for row in rows {
-        let valid = row.iter().flatten().count().max(1) as f32;
-        for pose in row {
-            poses.extend(pose.unwrap_or([0.0; POSE]));
-            shares.push(if pose.is_some() { 1.0 / valid } else { 0.0 });
-        }
-    }
-    let a = shares.len() / N;
-    Ok((
-        Tensor::from_vec(poses, (a, N, POSE), device)?,
-        Tensor::from_vec(shares, (a, N), device)?,
-    ))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn target(future: [Option<[f32; POSE]>; FUTURE]) -> TrajectoryTarget {
-        TrajectoryTarget {
-            key: 0,
-            past: [None; PAST],
-            future,
-        }
-    }
-
-    /// The loss of one agent whose modes all predict standing still, and its gradient on the
-    /// future.
-    fn check(target: &TrajectoryTarget) -> (f32, Vec<f32>) {
-        let device = Device::Cpu;
-        let future =
-            candle_core::Var::zeros((1, MODES, FUTURE, POSE), candle_core::DType::F32, &device)
-                .unwrap();
-        let predicted = Trajectories {
-            past: Tensor::zeros((1, PAST, POSE), candle_core::DType::F32, &device).unwrap(),
-            future: future.as_tensor().clone(),
-            modes: Tensor::zeros((1, MODES), candle_core::DType::F32, &device).unwrap(),
-        };
-        let loss = trajectory_loss(&predicted, &[(0, target)], 1.0, &device).unwrap();
-        let gradient = loss
-            .backward()
-            .unwrap()
-            .get(&future)
-            .unwrap()
-            .flatten_all()
-            .unwrap();
-        (loss.to_scalar().unwrap(), gradient.to_vec1().unwrap())
-    }
-
-    #[test]
-    fn equal_modes_cost_ln_6_and_masked_steps_nothing() {
-        let (loss, gradient) = check(&target([None; FUTURE]));
-        assert!((loss - 6f32.ln()).abs() < 1e-5, "{loss}");
-        assert!(gradient.iter().all(|&g| g == 0.0));
-    }
-
-    #[test]
-    fn only_the_winning_mode_and_valid_steps_learn() {
-        let mut future = [None; FUTURE];
-        future[3] = Some([3.0, 4.0, 0.6, 0.8]);
-        let (loss, gradient) = check(&target(future));
-        // One valid step, 5 m and 0.6 + 0.8 in sine and cosine off: its share is one.
-        assert!(
-            (loss - (6f32.ln() + 5.0 + 2.0 * 1.4)).abs() < 1e-4,
-            "{loss}"
-        );
-        let moved: Vec<usize> = (0..gradient.len())
-            .filter(|&i| gradient[i] != 0.0)
-            .collect();
-        assert_eq!(moved, [12, 13, 14, 15]);
-    }
-
     #[test]
     fn the_first_part_that_is_not_a_number_is_named() {
-        let mut parts = LossParts {
-            fields: vec![0.5; STEPS.len()],
-            ..LossParts::default()
-        };
+        let mut parts = LossParts::default();
         assert_eq!(parts.first_not_finite(), None);
         parts.total = f64::NAN;
         parts.fields[4] = f64::INFINITY;
         assert_eq!(parts.first_not_finite().unwrap(), "step 4 X");
+    }
+
+    #[test]
+    fn numbers_in_a_row_are_the_parts_again() {
+        let row: Vec<f32> = (0..7 + STEPS.len()).map(|i| i as f32).collect();
+        let parts = LossParts::of_numbers(&row);
+        assert_eq!(parts.numbers(), row);
+        let mut twice = parts.clone();
+        twice.add(&parts);
+        let doubled: Vec<f32> = row.iter().map(|number| 2.0 * number).collect();
+        assert_eq!(twice.numbers(), doubled);
     }
 }

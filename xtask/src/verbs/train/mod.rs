@@ -1,22 +1,23 @@
-//! `train`: a world model from scenarios.
+//! `train`: a world model from scenarios, in one stage or several, by one process or several.
 
-use std::path::PathBuf;
+mod stages;
+
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use gump_model::checkpoint::{self, Precision};
-use gump_model::train::StepReport;
-use gump_model::{
-    ClosedLoopConfig, Device, LossParts, ModelConfig, RunConfig, TrainConfig, Trainer,
-};
+use gump_model::train::{Peers as _, StepReport};
+use gump_model::{Device, LossParts, Network, RunConfig, Trainer};
 use gump_scene::Scenario;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
-use toml::Table;
 
+use self::stages::Stage;
 use crate::cli::WrongArguments;
-use crate::config;
 use crate::dataset::{self, Part, Split, Training};
 use crate::losses::Losses;
+use crate::peers::{Processes, together};
 use crate::run::{self, Common, Run};
 
 /// Time between checkpoints: what a crash may cost.
@@ -27,6 +28,11 @@ const VALIDATIONS: usize = 10;
 const VALIDATION_SAMPLES: usize = 64;
 /// Steps over which the first and the last loss are averaged.
 const WINDOW: usize = 20;
+
+/// What a stage writes.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+const WEIGHTS: &str = "weights.safetensors";
+const LOSSES: &str = "losses.csv";
 
 /// Arguments of `train`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -61,49 +67,101 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
+/// How a stage begins.
+enum Begin {
+    New,
+    From(Box<Network>),
+    Resume,
+}
+
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let config = self.config()?;
-        let (training, validation) = run.phase("read", |run| self.read(run))?;
-        let checkpoint = run.path("checkpoint.safetensors");
-        let mut losses = Losses::default();
-        let mut trainer = if self.resume {
-            let trainer = Trainer::resume(&checkpoint, training, &Device::Cpu)?;
-            self.check_resumed(trainer.config())?;
-            losses = Losses::read(&run.path("losses.csv"), trainer.steps_done())?;
-            trainer
-        } else if let Some(weights) = &self.from {
-            let network = checkpoint::load(weights, &Device::Cpu)?;
-            if *network.config() != config.model()? {
-                let wrong = format!(
-                    "{} holds another model than the configuration",
-                    weights.display()
-                );
-                return Err(WrongArguments(wrong).into());
+        let stages = self.stages()?;
+        together(|processes| {
+            if processes.rank() > 0 {
+                run.follow();
             }
-            run.phase("drive", |_| {
-                let trainer = Trainer::continuing(network, config.train.clone(), training);
-                trainer.map_err(anyhow::Error::from)
-            })?
-        } else {
-            Trainer::new(
-                config.model()?,
-                config.train.clone(),
-                training,
-                &Device::Cpu,
-            )?
+            self.learn_in(&stages, run, processes)
+        })
+    }
+
+    /// One stage after the other; a resumed run begins with the last that was begun.
+    fn learn_in(
+        &self,
+        stages: &[Stage],
+        run: &mut Run,
+        processes: &Processes,
+    ) -> anyhow::Result<()> {
+        let was_begun = |stage: &Stage| run.path(&stage.path(CHECKPOINT)).is_file();
+        let mut resume = self.resume;
+        let first = match self.resume {
+            true => stages.iter().rposition(was_begun).unwrap_or(0),
+            false => 0,
         };
+        let mut network = match &self.from {
+            Some(weights) => Some(load(weights, &stages[0], run.device())?),
+            None => None,
+        };
+        for stage in &stages[first..] {
+            let begin = match (resume, network) {
+                (true, _) => Begin::Resume,
+                (false, Some(network)) => Begin::From(Box::new(network)),
+                (false, None) => Begin::New,
+            };
+            network = Some(self.learn(stage, begin, run, processes)?);
+            resume = false;
+        }
+        let weights = run.path(WEIGHTS);
+        if let Some(network) = network.filter(|_| stages.len() > 1 && processes.rank() == 0) {
+            checkpoint::save(&network, &weights, Precision::Half)?;
+        }
+        run.result("resumed", self.resume)?;
+        run.result("weights", weights)
+    }
+
+    /// One stage; the network it ends with.
+    fn learn(
+        &self,
+        stage: &Stage,
+        begin: Begin,
+        run: &mut Run,
+        processes: &Processes,
+    ) -> anyhow::Result<Network> {
+        let (training, validation) = run.phase("read", |run| self.read(run, stage))?;
+        let checkpoint = run.path(&stage.path(CHECKPOINT));
+        let config = stage.config.train.clone();
+        let mut losses = Losses::default();
+        let trainer = match begin {
+            Begin::New => Trainer::new(stage.config.model()?, config, training, run.device())?,
+            Begin::From(network) => run.phase("drive", |_| {
+                Ok(Trainer::continuing(*network, config, training)?)
+            })?,
+            Begin::Resume => {
+                let trainer = Trainer::resume(&checkpoint, training, run.device())?;
+                self.check_resumed(&trainer, &stage.config)?;
+                losses = Losses::read(&run.path(&stage.path(LOSSES)), trainer.steps_done())?;
+                trainer
+            }
+        };
+        let mut trainer = trainer.among(processes.clone())?;
         run.setting("model", trainer.network().config())?;
         run.setting("train", trainer.config())?;
         run.reseed(trainer.config().seed);
         let resumed_at = trainer.steps_done();
+        let writes = processes.rank() == 0;
+        if writes {
+            let folder = run.path(&stage.path(""));
+            std::fs::create_dir_all(&folder)
+                .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        }
         let began = Instant::now();
         let trained = run.phase("train", |run| {
-            let stop_at = self.stop_at.unwrap_or(usize::MAX);
-            learn(run, &mut trainer, &mut losses, &validation, stop_at)
+            learn(run, stage, &mut trainer, &mut losses, &validation, writes)
         });
         // A failed step changes nothing, so what was learned before it is worth keeping.
-        run.phase("write", |run| write(run, &trainer, &losses))?;
+        if writes {
+            run.phase("write", |run| write(run, stage, &trainer, &losses))?;
+        }
         trained?;
         run.result("parameters", trainer.network().parameters().count())?;
         let tokens = losses.tokens_since(resumed_at);
@@ -115,42 +173,15 @@ impl Args {
         run.result("loss_first", losses.mean_of_first(WINDOW))?;
         run.result("loss_last", losses.mean_of_last(WINDOW))?;
         run.result("validation_loss", losses.last_validation())?;
-        run.result("resumed", self.resume)?;
         if let Some(last) = losses.last() {
             run.result("loss_per_field", per_field(last))?;
         }
-        run.result("weights", run.path("weights.safetensors"))
+        Ok(trainer.into_network())
     }
 
-    /// The run as flags and file describe it.
-    ///
-    /// Error: [`WrongArguments`] for a key that does not exist or does not fit.
-    fn config(&self) -> anyhow::Result<RunConfig> {
-        let mut table = match &self.common.config {
-            Some(path) => {
-                let tables = config::tables(path)?;
-                config::check_keys(path, &tables, &known_keys()?)?;
-                tables
-            }
-            None => Table::new(),
-        };
-        if let Some(name) = &self.model {
-            table.insert("model".into(), name.clone().into());
-        }
-        table.entry("model").or_insert_with(|| "tiny".into());
-        let wrong = |error: String| WrongArguments(error.trim().replace('\n', " "));
-        let mut config =
-            RunConfig::from_toml(&table.to_string()).map_err(|error| wrong(error.to_string()))?;
-        config.train.steps = self.steps.unwrap_or(config.train.steps);
-        config.train.batch = self.batch.unwrap_or(config.train.batch);
-        config.train.seed = self.common.seed.unwrap_or(config.train.seed);
-        let model = config.model().map_err(|error| wrong(error.to_string()))?;
-        model.validate().map_err(|error| wrong(error.to_string()))?;
-        Ok(config)
-    }
-
-    /// A run keeps the schedule it began with; asking for another one is a mistake.
-    fn check_resumed(&self, begun: &TrainConfig) -> anyhow::Result<()> {
+    /// A run keeps the configuration it began with; asking for another one is a mistake.
+    fn check_resumed(&self, trainer: &Trainer, asked: &RunConfig) -> anyhow::Result<()> {
+        let begun = trainer.config();
         for (flag, asked, begun) in [
             ("--steps", self.steps, begun.steps),
             ("--batch", self.batch, begun.batch),
@@ -160,49 +191,65 @@ impl Args {
                 return Err(WrongArguments(wrong).into());
             }
         }
-        Ok(())
+        let Some(path) = &self.common.config else {
+            return Ok(());
+        };
+        let wrong = if *trainer.network().config() != asked.model()? {
+            Some("another model than that of the run to resume".to_owned())
+        } else {
+            stages::difference(&asked.train, begun)?
+        };
+        match wrong {
+            Some(wrong) => Err(WrongArguments(format!("{}: {wrong}", path.display())).into()),
+            None => Ok(()),
+        }
     }
 
-    fn read(&self, run: &Run) -> anyhow::Result<(Training, Vec<Scenario>)> {
+    fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
-        let training = Training::open(&dataset::parts(&self.data, Split::Train)?, &progress)?;
+        let training = Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?;
         let validation = match &self.validation {
             Some(path) => vec![Part::whole(path)],
-            None => dataset::parts(&self.data, Split::Validation)?,
+            None => dataset::parts(&stage.data, Split::Validation)?,
         };
         let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
         Ok((training, validation))
     }
 }
 
-fn known_keys() -> anyhow::Result<Table> {
-    let mut known = Table::new();
-    known.insert("model".into(), Table::try_from(ModelConfig::tiny())?.into());
-    let train = TrainConfig {
-        closed_loop: Some(ClosedLoopConfig::default()),
-        ..TrainConfig::default()
-    };
-    known.insert("train".into(), Table::try_from(train)?.into());
-    Ok(known)
+/// The weights to go on from.
+///
+/// Error: [`WrongArguments`] if they are of another model than the configuration.
+fn load(weights: &Path, stage: &Stage, device: &Device) -> anyhow::Result<Network> {
+    let network = checkpoint::load(weights, device)?;
+    if *network.config() != stage.config.model()? {
+        let wrong = format!(
+            "{} holds another model than the configuration",
+            weights.display()
+        );
+        return Err(WrongArguments(wrong).into());
+    }
+    Ok(network)
 }
 
 /// Steps until the run is done, it is to stop, or Ctrl-C.
 fn learn(
     run: &Run,
+    stage: &Stage,
     trainer: &mut Trainer,
     losses: &mut Losses,
     validation: &[Scenario],
-    stop_at: usize,
+    writes: bool,
 ) -> anyhow::Result<()> {
     let total = trainer.config().steps;
     let progress = run.progress("training", total as u64, "steps");
     progress.advance(trainer.steps_done() as u64);
     let validate_every = (total / VALIDATIONS).max(1);
     let mut saved = Instant::now();
-    while trainer.steps_done() < total.min(stop_at) {
+    while trainer.steps_done() < total.min(stage.stop_at) {
         let step = trainer.steps_done();
         anyhow::ensure!(
-            !run::interrupted(),
+            !trainer.any(run::interrupted())?,
             "stopped by Ctrl-C after step {step} of {total}, go on with --resume"
         );
         let report = trainer.step()?;
@@ -214,8 +261,8 @@ fn learn(
             let loss = trainer.validate(validation, VALIDATION_SAMPLES)?;
             losses.push_validation(done, loss.total);
         }
-        if saved.elapsed() > CHECKPOINT_EVERY {
-            write(run, trainer, losses)?;
+        if writes && saved.elapsed() > CHECKPOINT_EVERY {
+            write(run, stage, trainer, losses)?;
             saved = Instant::now();
         }
     }
@@ -223,14 +270,14 @@ fn learn(
 }
 
 /// The checkpoint to resume from, the weights to use, and the losses as data and as a picture.
-fn write(run: &Run, trainer: &Trainer, losses: &Losses) -> anyhow::Result<()> {
+fn write(run: &Run, stage: &Stage, trainer: &Trainer, losses: &Losses) -> anyhow::Result<()> {
+    let path = |name: &str| run.path(&stage.path(name));
     // First the losses: rows beyond the checkpoint are cut off when the run is resumed.
-    losses.write(&run.path("losses.csv"))?;
-    trainer.save(&run.path("checkpoint.safetensors"))?;
-    let weights = run.path("weights.safetensors");
-    checkpoint::save(trainer.network(), &weights, Precision::Half)?;
+    losses.write(&path(LOSSES))?;
+    trainer.save(&path(CHECKPOINT))?;
+    checkpoint::save(trainer.network(), &path(WEIGHTS), Precision::Half)?;
     if let Some(chart) = losses.chart() {
-        chart.save(&run.path("losses"))?;
+        chart.save(&path("losses"))?;
     }
     Ok(())
 }

@@ -1,0 +1,96 @@
+//! What the parts of a batch found, added up over parts and processes.
+
+use std::collections::BTreeMap;
+
+use candle_core::backprop::GradStore;
+use candle_core::{Result, Tensor};
+
+use super::peers::Peers;
+use crate::ModelError;
+use crate::loss::LossParts;
+use crate::parameters::Parameters;
+
+/// Gradients by the names of their parameters; one that nothing reached is not there.
+pub(crate) type Gradients = BTreeMap<String, Tensor>;
+
+/// The loss of a batch, its gradients, and how much was presented.
+#[derive(Default)]
+pub(super) struct Found {
+    pub(super) gradients: Gradients,
+    pub(super) loss: LossParts,
+    pub(super) tokens: usize,
+}
+
+impl Found {
+    /// Adds what a part of the batch found.
+    pub(super) fn add(
+        &mut self,
+        parameters: &Parameters,
+        gradients: &GradStore,
+        loss: &LossParts,
+        tokens: usize,
+    ) -> Result<()> {
+        for (name, var) in parameters.trainable() {
+            let Some(gradient) = gradients.get(var) else {
+                continue;
+            };
+            let sum = match self.gradients.get(name) {
+                Some(sum) => (sum + gradient)?,
+                None => gradient.clone(),
+            };
+            self.gradients.insert(name.to_owned(), sum);
+        }
+        self.loss.add(loss);
+        self.tokens += tokens;
+        Ok(())
+    }
+
+    /// Sums what all processes found, and lets their running statistics meet in the middle.
+    pub(super) fn share(
+        &mut self,
+        parameters: &Parameters,
+        peers: &dyn Peers,
+    ) -> std::result::Result<(), ModelError> {
+        if peers.size() == 1 {
+            return Ok(());
+        }
+        let mut numbers = self.loss.numbers();
+        numbers.push(self.tokens as f32);
+        let n_told = numbers.len();
+        for (name, var) in parameters.trainable() {
+            // Each gradient after whether there is one.
+            match self.gradients.get(name) {
+                Some(gradient) => {
+                    numbers.push(1.0);
+                    numbers.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
+                }
+                None => numbers.resize(numbers.len() + 1 + var.elem_count(), 0.0),
+            }
+        }
+        for (_, var) in parameters.statistics() {
+            numbers.extend(var.flatten_all()?.to_vec1::<f32>()?);
+        }
+        peers.sum(&mut numbers)?;
+        let (told, mut rest) = numbers.split_at(n_told);
+        self.tokens = told[n_told - 1].round() as usize;
+        self.loss = LossParts::of_numbers(&told[..n_told - 1]);
+        let mut take = |n: usize| {
+            let (taken, left) = rest.split_at(n);
+            rest = left;
+            taken
+        };
+        for (name, var) in parameters.trainable() {
+            let is_there = take(1)[0] > 0.0;
+            let gradient = take(var.elem_count());
+            if is_there {
+                let gradient = Tensor::from_slice(gradient, var.shape(), var.device())?;
+                self.gradients.insert(name.to_owned(), gradient);
+            }
+        }
+        for (_, var) in parameters.statistics() {
+            let sum = Tensor::from_slice(take(var.elem_count()), var.shape(), var.device())?;
+            var.set(&(sum / peers.size() as f64)?)?;
+        }
+        Ok(())
+    }
+}

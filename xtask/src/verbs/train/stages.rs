@@ -1,0 +1,197 @@
+//! What is to be trained: a run of one stage, or of several that go on from each other.
+//!
+//! In the file, `[train]` holds for all stages, and each `[[stage]]` says what it does otherwise:
+//! `data` (a folder in `--data`), `stop_at` and its own `[stage.train]`.
+
+use std::path::{Path, PathBuf};
+
+use gump_model::{ClosedLoopConfig, ModelConfig, RunConfig, TrainConfig};
+use toml::{Table, Value};
+
+use super::Args;
+use crate::cli::WrongArguments;
+use crate::config;
+
+/// A part of a run with a schedule of its own.
+#[derive(Debug)]
+pub(super) struct Stage {
+    pub(super) config: RunConfig,
+    pub(super) data: PathBuf,
+    /// The step to stop after.
+    pub(super) stop_at: usize,
+    /// Where its files go, from the folder of the run.
+    pub(super) folder: PathBuf,
+}
+
+impl Stage {
+    /// A file of the stage, from the folder of the run.
+    pub(super) fn path(&self, name: &str) -> String {
+        self.folder.join(name).display().to_string()
+    }
+}
+
+impl Args {
+    /// The stages as flags and file describe them.
+    ///
+    /// Error: [`WrongArguments`] for a key that does not exist or does not fit.
+    pub(super) fn stages(&self) -> anyhow::Result<Vec<Stage>> {
+        let mut table = match &self.common.config {
+            Some(path) => config::tables(path)?,
+            None => Table::new(),
+        };
+        let stages = match table.remove("stage") {
+            Some(Value::Array(stages)) => stages,
+            _ => Vec::new(),
+        };
+        let path = self.common.config.as_deref().unwrap_or(Path::new(""));
+        config::check_keys(path, &table, &known_keys()?)?;
+        if let Some(name) = &self.model {
+            table.insert("model".into(), name.clone().into());
+        }
+        table.entry("model").or_insert_with(|| "tiny".into());
+        if stages.is_empty() {
+            return Ok(vec![Stage {
+                config: self.config(&table)?,
+                data: self.data.clone(),
+                stop_at: self.stop_at.unwrap_or(usize::MAX),
+                folder: PathBuf::new(),
+            }]);
+        }
+        if self.stop_at.is_some() {
+            let wrong = "--stop-at: the configuration says where each of its stages stops";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        let known = known_stage()?;
+        let stages = stages.into_iter().enumerate().map(|(i, stage)| {
+            let Value::Table(mut stage) = stage else {
+                unreachable!("the file was checked to hold tables")
+            };
+            config::check_keys(path, &stage, &known)?;
+            let mut table = table.clone();
+            if let Some(train) = stage.remove("train") {
+                merge(&mut table, Table::from_iter([("train".to_owned(), train)]));
+            }
+            Ok(Stage {
+                config: self.config(&table)?,
+                data: match stage.get("data") {
+                    Some(Value::String(folder)) => self.data.join(folder),
+                    None => self.data.clone(),
+                    Some(other) => return Err(wrong(path, "data", "a folder", other)),
+                },
+                stop_at: match stage.get("stop_at") {
+                    Some(Value::Integer(step)) if *step > 0 => *step as usize,
+                    None => usize::MAX,
+                    Some(other) => return Err(wrong(path, "stop_at", "a step", other)),
+                },
+                folder: format!("stage-{}", i + 1).into(),
+            })
+        });
+        stages.collect()
+    }
+
+    fn config(&self, table: &Table) -> anyhow::Result<RunConfig> {
+        let wrong = |error: String| WrongArguments(error.trim().replace('\n', " "));
+        let mut config =
+            RunConfig::from_toml(&table.to_string()).map_err(|error| wrong(error.to_string()))?;
+        config.train.steps = self.steps.unwrap_or(config.train.steps);
+        config.train.batch = self.batch.unwrap_or(config.train.batch);
+        config.train.seed = self.common.seed.unwrap_or(config.train.seed);
+        let checked = config.model().and_then(|model| model.validate());
+        checked
+            .and_then(|()| config.train.validate(1))
+            .map_err(|error| wrong(error.to_string()))?;
+        Ok(config)
+    }
+}
+
+fn wrong(path: &Path, key: &str, expected: &str, found: &Value) -> anyhow::Error {
+    let what = format!("{}: {key} is {found}, expected {expected}", path.display());
+    WrongArguments(what).into()
+}
+
+/// Puts the keys of `changes` into `table`, at any depth.
+fn merge(table: &mut Table, changes: Table) {
+    for (key, change) in changes {
+        match (table.get_mut(&key), change) {
+            (Some(Value::Table(old)), Value::Table(new)) => merge(old, new),
+            (_, change) => {
+                table.insert(key, change);
+            }
+        }
+    }
+}
+
+fn known_keys() -> anyhow::Result<Table> {
+    let mut known = Table::new();
+    known.insert("model".into(), Table::try_from(ModelConfig::tiny())?.into());
+    let train = TrainConfig {
+        ema: Some(0.0),
+        closed_loop: Some(ClosedLoopConfig::default()),
+        ..TrainConfig::default()
+    };
+    known.insert("train".into(), Table::try_from(train)?.into());
+    Ok(known)
+}
+
+fn known_stage() -> anyhow::Result<Table> {
+    let mut known = known_keys()?;
+    known.remove("model");
+    known.insert("data".into(), "".into());
+    known.insert("stop_at".into(), 1.into());
+    Ok(known)
+}
+
+/// The first key in which two configurations differ, with both values.
+pub(super) fn difference(
+    asked: &TrainConfig,
+    begun: &TrainConfig,
+) -> anyhow::Result<Option<String>> {
+    // Through JSON, as a checkpoint holds it, so that no number differs by its last digit.
+    let asked: TrainConfig = serde_json::from_str(&serde_json::to_string(asked)?)?;
+    let tables = [Table::try_from(&asked)?, Table::try_from(begun)?];
+    Ok(first_difference(&tables[0], &tables[1]))
+}
+
+fn first_difference(asked: &Table, begun: &Table) -> Option<String> {
+    let keys = asked.keys().chain(begun.keys());
+    let mut differ = keys.filter(|&key| asked.get(key) != begun.get(key));
+    let key = differ.next()?;
+    let told = |value: Option<&Value>| value.map_or("nothing".into(), Value::to_string);
+    match (asked.get(key), begun.get(key)) {
+        (Some(Value::Table(asked)), Some(Value::Table(begun))) => first_difference(asked, begun),
+        (asked, begun) => Some(format!(
+            "{key} is {}, the run to resume began with {}",
+            told(asked),
+            told(begun)
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn changes_go_as_deep_as_they_are() {
+        let mut table: Table = "[train]\nbatch = 4\n[train.sample]\nsway = 0.6\nframes = 5"
+            .parse()
+            .unwrap();
+        merge(&mut table, "[train.sample]\nsway = 0.0".parse().unwrap());
+        let expected = "[train]\nbatch = 4\n[train.sample]\nsway = 0.0\nframes = 5";
+        assert_eq!(table, expected.parse().unwrap());
+    }
+
+    #[test]
+    fn the_first_difference_is_named() {
+        let begun = TrainConfig::default();
+        let mut asked = begun.clone();
+        assert_eq!(difference(&asked, &begun).unwrap(), None);
+        asked.sample.sway = 0.5;
+        let told = difference(&asked, &begun).unwrap().unwrap();
+        assert_eq!(told, "sway is 0.5, the run to resume began with 0.0");
+        asked = begun.clone();
+        asked.ema = Some(0.9);
+        let told = difference(&asked, &begun).unwrap().unwrap();
+        assert_eq!(told, "ema is 0.9, the run to resume began with nothing");
+    }
+}

@@ -1,0 +1,294 @@
+//! `train` from the outside: stages, several processes, and what must survive a full disk or a kill.
+#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::fs;
+use std::os::unix::process::ExitStatusExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use gump_model::checkpoint::{self, Precision};
+use gump_model::train::ModelChoice;
+use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
+use gump_scene::Seed;
+use serde_json::Value;
+
+/// Folders of scenes, and the configuration of a very small model.
+struct Workplace {
+    folder: tempfile::TempDir,
+}
+
+impl Workplace {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = |speed: f64, name: &str| {
+            let text = format!(
+                "lane 1: -50,0 350,0 speed 15 width 3.5
+                 ego vehicle 0: 0,0 velocity 8,0
+                 agent vehicle 1: 30,0 velocity {speed},0
+                 history 1.0 future 4.0 dt 0.1"
+            );
+            let mut scene = gump_scene::fixture::scenario(&text).unwrap();
+            scene.id = name.into();
+            let path = folder.path().join(format!("data/{name}/scene.tfrecord"));
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            gump_data::womd::write_scenarios(&path, [scene]).unwrap();
+        };
+        scene(6.0, "first");
+        scene(2.0, "more");
+        let place = Self { folder };
+        fs::write(place.path("c.toml"), place.config()).unwrap();
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn config(&self) -> String {
+        let mut model = ModelConfig {
+            width: 32,
+            layers: 1,
+            heads: 2,
+            trajectory_heads: vec![0],
+            reconstruction: false,
+            ..ModelConfig::tiny()
+        };
+        model.visual.side_px = 64;
+        model.visual.metres_per_px = 2.0;
+        let train = TrainConfig {
+            steps: 6,
+            batch: 4,
+            ema: Some(0.9),
+            accumulate: 2,
+            ..TrainConfig::default()
+        };
+        let model = ModelChoice::Config(Box::new(model));
+        toml::to_string(&RunConfig { model, train }).unwrap()
+    }
+
+    fn command(&self, program: &str) -> Command {
+        let mut command = Command::new(program);
+        command
+            .current_dir(self.folder.path())
+            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"));
+        command
+    }
+
+    fn run(&self, words: &str) -> Output {
+        let words = format!("train --data data --quiet --config {words}");
+        let mut command = self.command(env!("CARGO_BIN_EXE_xtask"));
+        command.args(words.split(' ')).output().unwrap()
+    }
+
+    fn results(&self, words: &str, out: &str) -> Value {
+        let output = self.run(&format!("{words} --out {out}"));
+        assert!(output.status.success(), "{words}: {}", stderr(&output));
+        let report = fs::read_to_string(self.path(out).join("report.json")).unwrap();
+        serde_json::from_str::<Value>(&report).unwrap()["results"].take()
+    }
+
+    fn fails(&self, words: &str, status: i32, parts: &[&str]) {
+        let output = self.run(words);
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(status), "{words}: {error}");
+        for part in parts {
+            assert!(error.contains(part), "{words}: {error}");
+        }
+    }
+
+    /// Goes on with the run in `out` where no file may grow beyond a megabyte, which a checkpoint
+    /// does.
+    fn resume_where_disks_are_small(&self, out: &str, before: &str) -> Output {
+        let xtask = env!("CARGO_BIN_EXE_xtask");
+        let words = format!("train --data data --quiet --config c.toml --out {out} --resume");
+        let script = format!("ulimit -c 0; ulimit -f 1000; {before} exec {xtask} {words}");
+        self.command("bash").args(["-c", &script]).output().unwrap()
+    }
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn losses(folder: &Path) -> String {
+    fs::read_to_string(folder.join("losses.csv")).unwrap()
+}
+
+fn numbers(network: &Network) -> Vec<Vec<f32>> {
+    let all = network.parameters().all();
+    all.map(|(_, var)| var.flatten_all().unwrap().to_vec1().unwrap())
+        .collect()
+}
+
+#[test]
+fn a_full_disk_and_a_kill_leave_the_last_checkpoint() {
+    let place = Workplace::new();
+    place.results("c.toml", "whole");
+    place.results("c.toml --stop-at 3", "broken");
+    let [checkpoint, partial] = ["checkpoint.safetensors", "checkpoint.safetensors.partial"]
+        .map(|name| place.path("broken").join(name));
+    let kept = fs::read(&checkpoint).unwrap();
+
+    // A write that fails, as on a full disk.
+    let output = place.resume_where_disks_are_small("broken", "trap '' XFSZ;");
+    let error = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert!(error.contains("writing weights") && error.contains("checkpoint.safetensors"));
+    assert!(fs::read(&checkpoint).unwrap() == kept && !partial.exists());
+
+    // The same, but the system kills the process in the middle of writing.
+    let output = place.resume_where_disks_are_small("broken", "");
+    assert!(output.status.signal().is_some(), "{}", stderr(&output));
+    assert!(fs::read(&checkpoint).unwrap() == kept && partial.exists());
+
+    let resumed = place.results("c.toml --resume", "broken");
+    assert_eq!(resumed["steps"], 6);
+    assert!(!partial.exists());
+    assert_eq!(losses(&place.path("broken")), losses(&place.path("whole")));
+    let weights = |out: &str| checkpoint::load(&place.path(out), &Device::Cpu).unwrap();
+    let [a, b] = ["broken", "whole"].map(|out| weights(&format!("{out}/weights.safetensors")));
+    assert!(numbers(&a) == numbers(&b));
+}
+
+#[test]
+fn a_configuration_that_contradicts_what_was_begun_is_refused() {
+    let place = Workplace::new();
+    place.results("c.toml --stop-at 1", "out");
+    let changed = |from: &str, to: &str| {
+        let config = place.config();
+        assert!(config.contains(from), "{config}");
+        fs::write(place.path("other.toml"), config.replace(from, to)).unwrap();
+    };
+    changed("ema = 0.9", "ema = 0.5");
+    place.fails("other.toml --out out --resume", 2, &["ema is 0.5", "0.9"]);
+    changed("width = 32", "width = 64");
+    place.fails("other.toml --out out --resume", 2, &["another model"]);
+    let words = "other.toml --out fresh --from out/weights.safetensors";
+    place.fails(words, 2, &["weights.safetensors holds another model"]);
+    changed("accumulate = 2", "accumulate = 5");
+    place.fails("other.toml", 2, &["a batch of 4 cannot be shared"]);
+}
+
+#[test]
+fn a_run_in_stages_goes_on_from_stage_to_stage() {
+    let place = Workplace::new();
+    let stages = "
+        [[stage]]
+        data = 'first'
+        stop_at = 2
+        [[stage]]
+        [stage.train]
+        steps = 3
+        seed = 7
+        [stage.train.optimizer]
+        learning_rate = 1e-4
+        ";
+    fs::write(place.path("s.toml"), place.config() + stages).unwrap();
+    let whole = place.results("s.toml", "out");
+    assert_eq!(whole["steps"], 3);
+    let steps = |stage: &str| losses(&place.path("out").join(stage)).lines().count() - 1;
+    assert_eq!((steps("stage-1"), steps("stage-2")), (2, 3));
+    let weights = fs::read(place.path("out/stage-2/weights.safetensors")).unwrap();
+
+    // By hand: the second stage goes on from the first one's network, in full precision.
+    fs::remove_dir_all(place.path("out/stage-2")).unwrap();
+    let resumed = place.results("s.toml --resume", "out");
+    assert_eq!(resumed["loss_last"], whole["loss_last"]);
+    let load = |name: &str| checkpoint::load(&place.path(name), &Device::Cpu).unwrap();
+    fs::write(place.path("before.safetensors"), weights).unwrap();
+    let before = numbers(&load("before.safetensors"));
+    assert!(numbers(&load("out/weights.safetensors")) == before);
+
+    place.fails("s.toml --stop-at 2", 2, &["--stop-at"]);
+    for (wrong, parts) in [
+        ("[[stage]]\nstop_at = 'soon'", ["stop_at", "a step"]),
+        ("[[stage]]\nstop_after = 2", ["stop_after", "stop_at"]),
+    ] {
+        fs::write(place.path("wrong.toml"), place.config() + wrong).unwrap();
+        place.fails("wrong.toml", 2, &parts);
+    }
+}
+
+#[test]
+fn the_recorded_stages_of_the_shipped_weights_can_be_run() {
+    let place = Workplace::new();
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/shipped.toml");
+    let results = place.results(&format!("{} --steps 1", config.display()), "out");
+    for stage in 1..=3 {
+        let weights = place.path(&format!("out/stage-{stage}/weights.safetensors"));
+        assert!(weights.is_file(), "{stage}");
+    }
+    let network = checkpoint::load(&place.path("out/weights.safetensors"), &Device::Cpu).unwrap();
+    let shipped = Network::random(ModelConfig::tiny(), Seed(0), &Device::Cpu).unwrap();
+    assert_eq!(network.config(), shipped.config());
+    assert_eq!(results["parameters"], shipped.parameters().count());
+    // What is shipped is half of that precision.
+    let small = place.path("small.safetensors");
+    checkpoint::save(&network, &small, Precision::Half).unwrap();
+    assert!(fs::metadata(small).unwrap().len() < 12_000_000);
+}
+
+#[cfg(not(feature = "mpi"))]
+#[test]
+fn processes_that_know_nothing_of_each_other_are_refused() {
+    let place = Workplace::new();
+    let mut command = place.command(env!("CARGO_BIN_EXE_xtask"));
+    command.args(["train", "--data", "data", "--config", "c.toml"]);
+    let output = command.env("OMPI_COMM_WORLD_SIZE", "2").output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(
+        stderr(&output).contains("--features mpi"),
+        "{}",
+        stderr(&output)
+    );
+}
+
+#[cfg(feature = "mpi")]
+#[test]
+fn two_processes_learn_what_one_learns() {
+    if Command::new("mpirun").arg("--version").output().is_err() {
+        eprintln!("skipped: there is no mpirun");
+        return;
+    }
+    let place = Workplace::new();
+    place.results("c.toml --validation data/more", "one");
+    let words = "train --data data --quiet --config c.toml --validation data/more --out two";
+    let mut command = place.command("mpirun");
+    command.args(["-n", "2", "--allow-run-as-root", "--oversubscribe"]);
+    command
+        .arg(env!("CARGO_BIN_EXE_xtask"))
+        .args(words.split(' '));
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+    let [one, two] = ["one", "two"].map(|out| losses(&place.path(out)));
+    assert_eq!(one.lines().count(), two.lines().count());
+    for (one, two) in one.lines().zip(two.lines()).skip(1) {
+        for (a, b) in one.split(',').zip(two.split(',')) {
+            let [a, b]: [f64; 2] = [a, b].map(|cell| cell.parse().unwrap_or(0.0));
+            assert!(
+                (a - b).abs() <= 1e-5 * (1.0 + a.abs()),
+                "{one} against {two}"
+            );
+        }
+    }
+    // One writer: what is left is what one process leaves.
+    let names = |out: &str| {
+        let entries = fs::read_dir(place.path(out)).unwrap();
+        let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!(names("one"), names("two"));
+    let mut command = place.command("mpirun");
+    command.args(["-n", "8", "--allow-run-as-root", "--oversubscribe"]);
+    command
+        .arg(env!("CARGO_BIN_EXE_xtask"))
+        .args(words.split(' '));
+    let output = command.output().unwrap();
+    assert!(!output.status.success());
+    let error = stderr(&output);
+    assert!(
+        error.contains("a batch of 4 cannot be shared among 8"),
+        "{error}"
+    );
+}
