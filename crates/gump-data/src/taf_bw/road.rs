@@ -1,6 +1,6 @@
 //! A Lanelet2 map: nodes, ways between them, lanelets between ways.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use gump_geometry::{DVec3, dvec3};
 use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapParts, RoadLineKind};
@@ -12,6 +12,9 @@ use crate::{ReadReport, features, lanelet};
 /// Semi-major axis of the WGS 84 ellipsoid, metres.
 const EARTH: f64 = 6_378_137.0;
 const METERS_PER_SECOND_IN_KMH: f64 = 1.0 / 3.6;
+
+/// The most points of all bounds together: lanelets share ways, so a small file can ask for many.
+const MAX_POINTS: usize = 4_000_000;
 
 /// A way: its nodes in order.
 type Way = Vec<i64>;
@@ -35,6 +38,7 @@ pub(super) fn parts(root: &Element, meta: &Meta, report: &mut ReadReport) -> Map
         ways.insert(id, way);
     }
     let mut bounds: Vec<(LaneId, [Way; 2])> = Vec::new();
+    let (mut ids, mut room) = (BTreeSet::new(), MAX_POINTS);
     let relations = root.all("relation");
     for element in relations.filter(|relation| tag(relation, "type") == Some("lanelet")) {
         let member = |role: &str| {
@@ -43,10 +47,9 @@ pub(super) fn parts(root: &Element, meta: &Meta, report: &mut ReadReport) -> Map
                 .find(|member| member.attribute("role") == Some(role));
             ways.get(&found?.id("ref")?)
         };
-        let (Some(id), Some(left), Some(right)) =
-            (element.id("id"), member("left"), member("right"))
-        else {
-            report.drop_damaged("lanelet without two bounds", || {
+        let own = element.id("id").filter(|id| ids.insert(*id));
+        let (Some(id), Some(left), Some(right)) = (own, member("left"), member("right")) else {
+            report.drop_damaged("lanelet without two bounds or an id of its own", || {
                 format!(
                     "lanelet {}",
                     element.attribute("id").unwrap_or("without id")
@@ -54,6 +57,14 @@ pub(super) fn parts(root: &Element, meta: &Meta, report: &mut ReadReport) -> Map
             });
             continue;
         };
+        let n_points = left.len() + right.len();
+        if n_points > room {
+            report.drop_damaged("lanelet beyond what a map may hold", || {
+                format!("lanelet {id}")
+            });
+            continue;
+        }
+        room -= n_points;
         let [left, right] = directed(left, right, &nodes);
         let [a, b] = [&left, &right].map(|way| points(way, &nodes));
         let kind = match tag(element, "subtype") {
@@ -133,26 +144,38 @@ fn directed(left: &Way, right: &Way, nodes: &BTreeMap<i64, DVec3>) -> [Way; 2] {
     [left, right]
 }
 
+/// The most lanes that one lane is linked with in one way: a damaged file may lay thousands upon each
+/// other.
+const MAX_LINKS: usize = 16;
+
 /// Lanes go on where bounds end at the nodes at which others begin; they lie side by side where they
 /// share a bound and its direction.
 fn link(lanes: &mut [Lane], bounds: &[(LaneId, [Way; 2])]) {
-    let ends = |[left, right]: &[Way; 2]| (left.last().copied(), right.last().copied());
-    let starts = |[left, right]: &[Way; 2]| (left.first().copied(), right.first().copied());
-    for (lane, (_, own)) in lanes.iter_mut().zip(bounds) {
-        for (id, other) in bounds.iter().filter(|(id, _)| *id != lane.id) {
-            if starts(other) == ends(own) {
-                lane.successors.push(*id);
-            }
-            if ends(other) == starts(own) {
-                lane.predecessors.push(*id);
-            }
-            if other[1] == own[0] {
-                lane.left_neighbors.push(*id);
-            }
-            if other[0] == own[1] {
-                lane.right_neighbors.push(*id);
-            }
-        }
+    type Ends = [Option<i64>; 2];
+    let starts =
+        |[left, right]: &[Way; 2]| -> Ends { [left.first(), right.first()].map(|n| n.copied()) };
+    let ends =
+        |[left, right]: &[Way; 2]| -> Ends { [left.last(), right.last()].map(|n| n.copied()) };
+    let (mut starting, mut ending) = (BTreeMap::new(), BTreeMap::new());
+    let (mut on_left, mut on_right) = (BTreeMap::new(), BTreeMap::new());
+    for (id, own) in bounds {
+        starting
+            .entry(starts(own))
+            .or_insert_with(Vec::new)
+            .push(*id);
+        ending.entry(ends(own)).or_insert_with(Vec::new).push(*id);
+        on_left.entry(&own[0]).or_insert_with(Vec::new).push(*id);
+        on_right.entry(&own[1]).or_insert_with(Vec::new).push(*id);
+    }
+    for (lane, (id, own)) in lanes.iter_mut().zip(bounds) {
+        let others = |found: Option<&Vec<LaneId>>| -> Vec<LaneId> {
+            let found = found.into_iter().flatten().copied();
+            found.filter(|other| other != id).take(MAX_LINKS).collect()
+        };
+        lane.successors = others(starting.get(&ends(own)));
+        lane.predecessors = others(ending.get(&starts(own)));
+        lane.left_neighbors = others(on_right.get(&own[0]));
+        lane.right_neighbors = others(on_left.get(&own[1]));
     }
 }
 
@@ -171,5 +194,58 @@ fn add_line(
     let painted = matches!(tag(element, "type"), Some("line_thin" | "line_thick"));
     if painted && points.len() > 1 {
         features::add_road_line(parts, id, kind, points, report);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::xml;
+    use std::fmt::Write as _;
+
+    #[test]
+    fn lanelets_that_share_ways_do_not_multiply_without_end() {
+        let mut text = String::from("<osm version='0.6'>");
+        for way in [1, 2] {
+            let longitude = 8.4 + 5e-5 * f64::from(way);
+            for i in 0..1000 {
+                let (node, latitude) = (1000 * way + i, 49.0 + 1e-6 * f64::from(i));
+                write!(
+                    text,
+                    "<node id='{node}' lat='{latitude}' lon='{longitude}'/>"
+                )
+                .unwrap();
+            }
+            write!(text, "<way id='{way}'>").unwrap();
+            for i in 0..1000 {
+                write!(text, "<nd ref='{}'/>", 1000 * way + i).unwrap();
+            }
+            text += "</way>";
+        }
+        let most = MAX_POINTS / 2000;
+        // One too many, and one whose id was there before.
+        for id in (0..=most).chain([0]) {
+            write!(
+                text,
+                "<relation id='{id}'><member role='left' ref='1'/><member role='right' ref='2'/>\
+                 <tag k='type' v='lanelet'/></relation>"
+            )
+            .unwrap();
+        }
+        text += "</osm>";
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("some.osm");
+        std::fs::write(&path, text).unwrap();
+        let meta = Meta {
+            rate_hz: 10.0,
+            origin: [49.0, 8.4],
+            speed_limit_kmh: 50.0,
+        };
+        let mut report = ReadReport::default();
+        let parts = parts(&xml::read(&path, "a map").unwrap(), &meta, &mut report);
+        assert_eq!(parts.lanes.len(), most);
+        assert_eq!(report.dropped["lanelet beyond what a map may hold"], 1);
+        let twice = "lanelet without two bounds or an id of its own";
+        assert_eq!(report.dropped[twice], 1);
     }
 }
