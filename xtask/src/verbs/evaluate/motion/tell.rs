@@ -131,7 +131,9 @@ fn chart(label: &str, columns: &[&str], rows: &[Value], intervals: &[Value]) -> 
             None => format!("{class}, mean"),
         }
     };
-    let legend = columns.iter().map(|column| column.replace('_', " "));
+    let legend = columns
+        .iter()
+        .map(|column| column.replace('_', " ").replace("map", "mAP"));
     let label = format!("{label}, with 95 % intervals over scenarios");
     charts::bars(
         &label,
