@@ -233,15 +233,32 @@ impl ResNet {
             .1
             .forward(&self.stem.0.forward(x)?, training)?
             .relu()?;
-        // The input is not negative after the ReLU, so padding with zeros is padding with -∞.
-        let x = x
-            .pad_with_zeros(2, 1, 1)?
-            .pad_with_zeros(3, 1, 1)?
-            .max_pool2d_with_stride(3, 2)?;
+        let x = largest_of_three(&largest_of_three(&x, 2)?, 3)?;
         self.blocks
             .iter()
             .try_fold(x, |x, block| block.forward(&x, training))
     }
+}
+
+/// The largest of three neighbours along a dimension of even length, around every second: half of
+/// pooling, of which the tensor library differentiates no overlapping kind.
+///
+/// `x` is not negative, so that zeros beyond the border are never the largest alone.
+fn largest_of_three(x: &Tensor, dim: usize) -> Result<Tensor> {
+    let n = x.dim(dim)? / 2;
+    let padded = x.pad_with_zeros(dim, 1, 1)?;
+    let mut dims = padded.dims().to_vec();
+    dims[dim] = n + 1;
+    dims.insert(dim + 1, 2);
+    let pairs = padded.reshape(dims)?;
+    let every_second = |i| pairs.narrow(dim + 1, i, 1)?.squeeze(dim + 1);
+    let (even, odd) = (every_second(0)?, every_second(1)?);
+    let (left, middle, right) = (
+        even.narrow(dim, 0, n)?,
+        odd.narrow(dim, 0, n)?,
+        even.narrow(dim, 1, n)?,
+    );
+    left.maximum(&middle)?.maximum(&right)
 }
 
 /// The encoder for CPUs: patches of 4 px, then halved once; no batch statistics, so a scene's
@@ -410,5 +427,23 @@ impl Reconstruction {
             .permute(vec![0, 2, 4, 1, 3, 5])?
             .reshape((scenes, n * n, self.planes * self.stride * self.stride))?;
         (drawn - patches)?.abs()?.mean_all()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::Device;
+
+    #[test]
+    fn two_halves_of_pooling_are_pooling() {
+        let numbers: Vec<f32> = (0..2 * 3 * 8 * 6).map(|i| (i as f32).sin().abs()).collect();
+        let x = Tensor::from_vec(numbers, (2, 3, 8, 6), &Device::Cpu).unwrap();
+        let ours = largest_of_three(&largest_of_three(&x, 2).unwrap(), 3).unwrap();
+        let padded = x.pad_with_zeros(2, 1, 1).unwrap().pad_with_zeros(3, 1, 1);
+        let pooled = padded.unwrap().max_pool2d_with_stride(3, 2).unwrap();
+        assert_eq!(ours.dims(), [2, 3, 4, 3]);
+        let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(flat(&ours), flat(&pooled));
     }
 }

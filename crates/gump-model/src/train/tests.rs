@@ -10,7 +10,7 @@ use gump_rollout::{Start, WorldModel};
 use gump_scene::{Scenario, Seed, fixture};
 
 use crate::closed_loop::ClosedLoopConfig;
-use crate::config::{ModelConfig, VisualConfig};
+use crate::config::{Encoder, ModelConfig, VisualConfig};
 use crate::sample::SampleConfig;
 use crate::sampling::{Mode, SamplingConfig};
 use crate::train::{Found, Peers, TrainConfig, Trainer};
@@ -301,6 +301,29 @@ fn processes_learn_what_one_learns_and_stay_alike() {
             together[0].0
         );
     }
+}
+
+#[test]
+fn processes_share_the_statistics_of_a_resnet() {
+    let mut resnet = model();
+    resnet.visual.encoder = Encoder::Resnet18;
+    (resnet.visual.side_px, resnet.visual.metres_per_px) = (64, 3.25);
+    let folder = tempfile::tempdir().unwrap();
+    let together = among(2, |peers| {
+        let path = folder.path().join(peers.rank.to_string());
+        let scenes = vec![scenario(4.0)];
+        let run = Trainer::new(resnet.clone(), varied(4, 1), scenes, &Device::Cpu).unwrap();
+        let mut run = run.among(peers).unwrap();
+        let losses = [0, 1].map(|_| run.step().unwrap().loss.total);
+        assert!(losses.iter().all(|loss| loss.is_finite()));
+        run.save(&path).unwrap();
+        bits(&path)
+    });
+    let moved = |name: &str| name.contains("running_mean");
+    let means = together[0].iter().filter(|(name, _)| moved(name));
+    assert!(means.clone().count() > 0);
+    assert!(means.flat_map(|(_, bits)| bits).any(|&bits| bits != 0));
+    assert!(together[0] == together[1]);
 }
 
 #[test]
