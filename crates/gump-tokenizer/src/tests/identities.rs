@@ -117,5 +117,8 @@ fn an_id_is_never_handed_on_unless_freed() {
     );
     identities.retain(|id| id != 3 && id != 0);
     check(&identities, "0:0 2:1 3:2 5:4 1:5 41:6 42:7 40:8");
+    // Where ids must ascend, the one that is free below is passed over.
+    let later = identities.clone().newborn_after(4);
+    assert_eq!(later, Some((9, AgentId(43))));
     assert_eq!(identities.newborn(), Some((3, AgentId(43))));
 }
