@@ -12,6 +12,7 @@ mod long;
 mod merge;
 pub(crate) mod motion;
 mod open_loop;
+mod prompts;
 mod ranking;
 mod shard;
 pub(crate) mod wosac;
