@@ -256,9 +256,10 @@ fn decode(c: &mut Criterion) {
             || linear(&x, &w, &bias),
         );
     }
-    let (x, h) = (var(&[32, 576], 1.0).detach(), var(&[32, 192], 1.0).detach());
-    c.bench_function("gru_cell_32x192", |b| {
-        b.iter(|| ops::gru_cell(&x, &x, &h).expect("shapes fit"));
+    let (x, h) = (var(&[16, 150, 576], 1.0), var(&[150, 192], 1.0));
+    let (w, bias) = (var(&[576, 192], 0.1), var(&[576], 0.1));
+    c.bench_function("gru_16x150x192", |b| {
+        b.iter(|| learn(&ops::gru(&x, &h, &w, &bias).expect("shapes fit")).expect("it learns"));
     });
 }
 

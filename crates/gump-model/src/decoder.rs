@@ -5,6 +5,8 @@
 //!
 //! Shapes: `K` keys, `C` width, `N` bins of a field.
 
+use std::ops::Range;
+
 use candle_core::{Device, Result, Tensor};
 use gump_tokenizer::Field;
 
@@ -69,6 +71,13 @@ const VOCABULARY_ORDER: [Field; 7] = [
     Field::Length,
 ];
 
+/// Rows of a table that are the fields' bins.
+fn field_rows() -> Range<usize> {
+    let first = VOCABULARY_ORDER[0].first_token() as usize;
+    let n: usize = VOCABULARY_ORDER.iter().map(|field| field.n_bins()).sum();
+    first..first + n
+}
+
 impl SmoothBins {
     fn new(
         mut scope: Scope<'_>,
@@ -104,15 +113,22 @@ impl SmoothBins {
 
     /// `table` [TABLE_ROWS, C] with the fields' rows raised.
     fn raise(&self, table: &Tensor) -> Result<Tensor> {
-        let first = VOCABULARY_ORDER[0].first_token() as usize;
-        let mut parts = vec![table.narrow(0, 0, first)?];
-        for ((field, sines), map) in VOCABULARY_ORDER.iter().zip(&self.sines).zip(&self.input) {
-            let rows = table.narrow(0, field.first_token() as usize, field.n_bins())?;
-            parts.push((rows + map.forward(sines)?)?);
+        let (rows, width) = table.dims2()?;
+        let flat = |rows: usize| Tensor::zeros((rows, width), table.dtype(), table.device());
+        let fields = field_rows();
+        let mut parts = vec![flat(fields.start)?];
+        for (sines, map) in self.sines.iter().zip(&self.input) {
+            parts.push(map.forward(sines)?);
         }
-        let end = gump_tokenizer::BEGIN as usize;
-        parts.push(table.narrow(0, end, table.dim(0)? - end)?);
-        Tensor::cat(&parts, 0)
+        parts.push(flat(rows - fields.end)?);
+        table + Tensor::cat(&parts, 0)?
+    }
+
+    /// What is added to the rows of the output matrix for all fields, [all bins, C].
+    fn outputs(&self) -> Result<Tensor> {
+        let maps = self.output.iter().zip(&self.sines);
+        let parts = maps.map(|(map, sines)| map.forward(sines));
+        Tensor::cat(&parts.collect::<Result<Vec<_>>>()?, 0)
     }
 
     /// Rows of the output matrix for a field, [bins, C].
@@ -129,6 +145,15 @@ impl SmoothBins {
 struct GruLayer {
     input: Linear,
     hidden: Linear,
+}
+
+impl GruLayer {
+    /// The states after each step, [S, K, C], from the input's gates [S, K, 3C] and the state
+    /// before.
+    fn states(&self, gates: &Tensor, before: &Tensor) -> Result<Tensor> {
+        let bias = self.hidden.bias().expect("it was built with one");
+        ops::gru(gates, before, self.hidden.weight(), bias)
+    }
 }
 
 impl StateDecoder {
@@ -217,13 +242,7 @@ impl StateDecoder {
         for layer in &self.layers {
             // The input side of all steps is one matrix product; only the hidden side is a chain.
             let gates = layer.input.forward(&inputs)?; // [STEPS, K, 3C]
-            let mut state = hidden.clone();
-            let mut outputs = Vec::with_capacity(n);
-            for step in 0..n {
-                state = ops::gru_cell(&gates.get(step)?, &layer.hidden.forward(&state)?, &state)?;
-                outputs.push(state.clone());
-            }
-            inputs = Tensor::stack(&outputs, 0)?;
+            inputs = layer.states(&gates, hidden)?;
         }
         Ok(inputs)
     }
@@ -249,8 +268,8 @@ impl StateDecoder {
             None => slot.broadcast_as((k, c))?.contiguous()?,
         };
         for (layer, state) in self.layers.iter().zip(states) {
-            let gates = layer.input.forward(&input)?;
-            *state = ops::gru_cell(&gates, &layer.hidden.forward(state)?, state)?;
+            let gates = layer.input.forward(&input)?.unsqueeze(0)?;
+            *state = layer.states(&gates, state)?.squeeze(0)?;
             input = state.clone();
         }
         Ok(input)
@@ -260,6 +279,23 @@ impl StateDecoder {
     /// which is exact because nothing outside the field may be sampled.
     pub(crate) fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
         ops::linear(output, &self.output_rows(field)?, None)
+    }
+
+    /// Rows of the output matrix for the bins of all fields, [all bins, C]; see
+    /// [`StateDecoder::rows_of`].
+    pub(crate) fn all_output_rows(&self) -> Result<Tensor> {
+        let fields = field_rows();
+        let rows = self.head.weight().narrow(0, fields.start, fields.len())?;
+        match &self.smooth {
+            Some(smooth) => rows + smooth.outputs()?,
+            None => Ok(rows),
+        }
+    }
+
+    /// Which of [`StateDecoder::all_output_rows`] are the bins of a field.
+    pub(crate) fn rows_of(field: Field) -> Range<usize> {
+        let first = field.first_token() as usize - field_rows().start;
+        first..first + field.n_bins()
     }
 
     /// Rows of the output matrix for the bins of a field, [bins, C].

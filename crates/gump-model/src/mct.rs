@@ -103,6 +103,11 @@ impl Linear {
     pub(crate) fn weight(&self) -> &Tensor {
         &self.weight
     }
+
+    /// What is added, `[out]`, if anything is.
+    pub(crate) fn bias(&self) -> Option<&Tensor> {
+        self.bias.as_ref()
+    }
 }
 
 /// Seeded dropout: absent at inference.
@@ -187,19 +192,22 @@ impl Block {
     ) -> Result<Tensor> {
         let c = x.dim(2)?;
         let qkv = self.qkv.forward(&self.norm_attention.forward(x)?)?; // [B, T, 3C]
-        let q = qkv.narrow(2, 0, c)?;
-        let mut k = qkv.narrow(2, c, c)?;
-        let mut v = qkv.narrow(2, 2 * c, c)?;
-        let mut offset = 0;
-        if let Some(past) = cache {
-            if let Some((past_k, past_v)) = past.as_ref() {
-                offset = past_k.dim(1)?;
-                k = Tensor::cat(&[past_k, &k], 1)?;
-                v = Tensor::cat(&[past_v, &v], 1)?;
+        let attended = match cache {
+            None => ops::causal_self_attention(&qkv, self.heads)?,
+            Some(past) => {
+                let q = qkv.narrow(2, 0, c)?;
+                let mut k = qkv.narrow(2, c, c)?;
+                let mut v = qkv.narrow(2, 2 * c, c)?;
+                let mut offset = 0;
+                if let Some((past_k, past_v)) = past.as_ref() {
+                    offset = past_k.dim(1)?;
+                    k = Tensor::cat(&[past_k, &k], 1)?;
+                    v = Tensor::cat(&[past_v, &v], 1)?;
+                }
+                *past = Some((k.contiguous()?, v.contiguous()?));
+                ops::causal_attention(&q, &k, &v, self.heads, offset, None)?
             }
-            *past = Some((k.contiguous()?, v.contiguous()?));
-        }
-        let attended = ops::causal_attention(&q, &k, &v, self.heads, offset, None)?; // [B, T, C]
+        }; // [B, T, C]
         let x = (x + drop_out(self.attention_out.forward(&attended)?, dropout)?)?;
         let hidden = ops::gelu(&self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?)?; // [B, T, 4C]
         &x + drop_out(self.mlp_out.forward(&hidden)?, dropout)?

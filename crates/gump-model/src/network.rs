@@ -86,6 +86,17 @@ impl Network {
         &self.raster_spec
     }
 
+    /// How many of `n` samples are best differentiated as one batch: a processor's threads share
+    /// them out one by one, which a device's do not, and batch statistics need all.
+    pub(crate) fn samples_together(&self, n: usize) -> usize {
+        let is_free = self.parameters.statistics().next().is_none();
+        if is_free && self.device().is_cpu() {
+            1
+        } else {
+            n.max(1)
+        }
+    }
+
     /// Where it lives.
     pub fn device(&self) -> &Device {
         self.parameters.device()

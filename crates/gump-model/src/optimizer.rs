@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor, Var};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -117,11 +118,14 @@ impl AdamW {
         config: &OptimizerConfig,
         rate: f64,
     ) -> Result<f64> {
-        let mut squares = 0.0;
-        for gradient in gradients.values() {
-            squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
-        }
-        let norm = squares.sqrt();
+        // Each tensor on a thread of its own; the sum over tensors keeps their order.
+        let all: Vec<&Tensor> = gradients.values().collect();
+        let squares = all.into_par_iter().map(|gradient| {
+            let sum = gradient.sqr()?.sum_all()?.to_scalar::<f32>()?;
+            Ok(f64::from(sum))
+        });
+        let squares: Vec<f64> = squares.collect::<Result<_>>()?;
+        let norm = squares.iter().sum::<f64>().sqrt();
         let scale = if norm > config.clip {
             config.clip / norm
         } else {
@@ -130,9 +134,10 @@ impl AdamW {
         self.steps += 1;
         let correction1 = 1.0 - BETA1.powi(self.steps as i32);
         let correction2 = 1.0 - BETA2.powi(self.steps as i32);
-        for (name, var) in parameters.trainable() {
+        let trainable: Vec<_> = parameters.trainable().collect();
+        let moves = trainable.into_par_iter().map(|(name, var): (_, &Var)| {
             let Some(gradient) = gradients.get(name) else {
-                continue;
+                return Ok(());
             };
             let gradient = gradient.contiguous()?;
             let (m, v) = &self.moments[name];
@@ -154,8 +159,9 @@ impl AdamW {
                 correction1,
                 correction2,
             };
-            update.apply(var, m, v)?;
-        }
+            update.apply(var, m, v)
+        });
+        moves.collect::<Result<()>>()?;
         Ok(norm)
     }
 }

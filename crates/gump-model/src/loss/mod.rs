@@ -18,10 +18,10 @@ pub(crate) use self::counts::Counts;
 use self::counts::weight;
 use self::trajectory::{at_agents, trajectory_loss, trajectory_targets};
 use crate::ModelError;
-use crate::decoder::STEPS;
+use crate::decoder::{STEPS, StateDecoder};
 use crate::mct::Dropout;
 use crate::network::Network;
-use crate::ops::{self, OrdinalSmoothing};
+use crate::ops::{self, OrdinalSmoothing, Targets};
 use crate::sample::{ControlTarget, Sample};
 
 /// Weights of the parts.
@@ -314,39 +314,32 @@ fn state_loss(
         &tokens,
     )?;
 
+    let asked = STEPS.into_iter().enumerate().map(|(step, field)| {
+        let bins = targets.iter().map(|t| t.bins[step].map_or(0, u32::from));
+        let weights = targets.iter().map(|t| weight(t, step, config) as f32);
+        let asked = Targets {
+            bins: bins.collect(),
+            weights: weights.collect(),
+            smoothing: (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
+                sigma_bins: config.smoothing_bins as f32,
+                circular: field.is_circular(),
+            }),
+        };
+        (StateDecoder::rows_of(field), asked)
+    });
+    let matrix = network.decoder.all_output_rows()?;
+    let means = ops::linear_cross_entropy(&outputs, &matrix, asked.collect())?; // [STEPS]
     let all = whole.states();
-    let mut total = None;
-    for (step, field) in STEPS.into_iter().enumerate() {
-        let bins: Vec<u32> = targets
-            .iter()
-            .map(|t| t.bins[step].map_or(0, u32::from))
-            .collect();
-        let valid: Vec<f32> = targets
-            .iter()
-            .map(|target| weight(target, step, config) as f32)
-            .collect();
+    let mut shares = Vec::with_capacity(STEPS.len());
+    for (step, mean) in means.to_vec1::<f32>()?.into_iter().enumerate() {
         let own: f64 = targets.iter().map(|t| weight(t, step, config)).sum();
-        let logits = network.decoder.logits(&outputs.get(step)?, field)?; // [K, bins]
-        let smoothing = (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
-            sigma_bins: config.smoothing_bins as f32,
-            circular: field.is_circular(),
-        });
-        let mean = ops::masked_cross_entropy(
-            &logits,
-            &Tensor::from_vec(bins, k, device)?,
-            &Tensor::from_vec(valid, k, device)?,
-            smoothing,
-        )?;
-        let sum = own * scalar(&mean)?;
+        let sum = own * f64::from(mean);
         parts.fields[step] = sum / whole.steps[step].max(f64::MIN_POSITIVE);
         parts.state += sum / all;
-        let part = (mean * (own / all))?;
-        total = Some(match total {
-            None => part,
-            Some(total) => (part + total)?,
-        });
+        shares.push((own / all) as f32);
     }
-    Ok(total)
+    let shares = Tensor::new(shares, device)?;
+    Ok(Some((means * shares)?.sum_all()?))
 }
 
 /// Mean cross-entropy of what is said of the successors of some slots.

@@ -7,7 +7,9 @@
 
 use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp3, D, DType, Layout, Result, Shape, Tensor, bail};
+use candle_core::{
+    CpuStorage, CustomOp1, CustomOp3, D, DType, Layout, Result, Shape, Tensor, bail,
+};
 
 use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
 use super::rows::{
@@ -87,16 +89,44 @@ fn shared_keys(
     attention(&q, k, v, view)?.reshape((b, tq, c)) // [B, Tq, C]
 }
 
+/// [`causal_attention`] of a whole sequence, whose queries, keys and values lie side by side as one
+/// product left them.
+///
+/// Shape: `qkv` `[B, T, 3C]`; the result `[B, T, C]`.
+///
+/// Error: when `3 n_heads` does not divide the last dimension.
+pub fn causal_self_attention(qkv: &Tensor, n_heads: usize) -> Result<Tensor> {
+    let (b, t, width) = qkv.dims3()?;
+    if n_heads == 0 || width % (3 * n_heads) != 0 {
+        bail!(
+            "causal_self_attention: qkv {:?}, {n_heads} heads",
+            qkv.shape()
+        );
+    }
+    let c = width / 3;
+    let view = View {
+        b,
+        tq: t,
+        tk: t,
+        n_heads,
+        d: c / n_heads,
+        causal_offset: Some(0),
+        key_lengths: None,
+        strides: [3 * c; 2],
+    };
+    if fusible(&[qkv]) {
+        return qkv.contiguous()?.apply_op1(Attention::new(view));
+    }
+    let third = |i: usize| qkv.narrow(2, i * c, c);
+    composed(&third(0)?, &third(1)?, &third(2)?, &view)
+}
+
 fn attention(q: &Tensor, k: &Tensor, v: &Tensor, view: View) -> Result<Tensor> {
     if !fusible(&[q, k, v]) {
         return composed(q, k, v, &view);
     }
-    let op = Attention {
-        view,
-        log_sums: OnceLock::new(),
-    };
     q.contiguous()?
-        .apply_op3(&k.contiguous()?, &v.contiguous()?, op)
+        .apply_op3(&k.contiguous()?, &v.contiguous()?, Attention::new(view))
 }
 
 fn composed(q: &Tensor, k: &Tensor, v: &Tensor, view: &View) -> Result<Tensor> {
@@ -149,6 +179,8 @@ struct View {
     d: usize,
     causal_offset: Option<usize>,
     key_lengths: Option<Vec<usize>>,
+    /// Elements from a row of the queries to the next, and of the keys and values.
+    strides: [usize; 2],
 }
 
 impl View {
@@ -184,6 +216,7 @@ impl View {
             d: c / n_heads,
             causal_offset,
             key_lengths: key_lengths.map(<[usize]>::to_vec),
+            strides: [c; 2],
         })
     }
 
@@ -226,6 +259,78 @@ struct Attention {
     log_sums: OnceLock<Vec<f32>>,
 }
 
+impl Attention {
+    fn new(view: View) -> Self {
+        Self {
+            view,
+            log_sums: OnceLock::new(),
+        }
+    }
+
+    /// The result `[B, Tq, C]`; the three slices begin at their first rows.
+    fn forward(&self, inputs: [&[f32]; 3]) -> Vec<f32> {
+        let &View {
+            b, tq, n_heads, d, ..
+        } = &self.view;
+        let mut heads = vec![0.0; b * n_heads * tq * d]; // [B, H, Tq, d]
+        let mut log_sums = vec![0.0; b * n_heads * tq];
+        let per_task = self.view.heads_per_task();
+        for_pieces2(
+            (&mut heads, per_task * tq * d),
+            (&mut log_sums, per_task * tq),
+            |task, out, log_sums| {
+                let mut scores = Vec::new();
+                let outs = out.chunks_exact_mut(tq * d);
+                for (i, (out, log_sums)) in outs.zip(log_sums.chunks_exact_mut(tq)).enumerate() {
+                    let head = task * per_task + i;
+                    self.forward_head(head, inputs, out, log_sums, &mut scores);
+                }
+            },
+        );
+        let _ = self.log_sums.set(log_sums);
+        let mut out = vec![0.0; heads.len()];
+        interleave(&mut out, [&heads], (n_heads, tq, d));
+        out
+    }
+
+    /// Gradients of queries `[B, H, Tq, d]`, keys and values `[B, H, Tk, d]`.
+    fn backward(&self, inputs: &Inputs<'_>) -> [Vec<f32>; 3] {
+        let &View {
+            b,
+            tq,
+            tk,
+            n_heads,
+            d,
+            ..
+        } = &self.view;
+        let mut dq = vec![0.0; b * n_heads * tq * d];
+        let mut dk = vec![0.0; b * n_heads * tk * d];
+        let mut dv = vec![0.0; b * n_heads * tk * d];
+        let per_task = self.view.heads_per_task();
+        for_pieces3(
+            (&mut dq, per_task * tq * d),
+            (&mut dk, per_task * tk * d),
+            (&mut dv, per_task * tk * d),
+            |task, dq, dk, dv| {
+                let mut scratch = (Vec::new(), Vec::new());
+                for (i, ((dq, dk), dv)) in dq
+                    .chunks_exact_mut(tq * d)
+                    .zip(dk.chunks_exact_mut(tk * d))
+                    .zip(dv.chunks_exact_mut(tk * d))
+                    .enumerate()
+                {
+                    self.backward_head(task * per_task + i, inputs, dq, dk, dv, &mut scratch);
+                }
+            },
+        );
+        [dq, dk, dv]
+    }
+
+    fn kept_log_sums(&self) -> &[f32] {
+        self.log_sums.get().expect("forward ran before backward")
+    }
+}
+
 impl CustomOp3 for Attention {
     fn name(&self) -> &'static str {
         "attention"
@@ -242,27 +347,7 @@ impl CustomOp3 for Attention {
     ) -> Result<(CpuStorage, Shape)> {
         let (q, k) = (elements(q, q_layout)?, elements(k, k_layout)?);
         let v = elements(v, v_layout)?;
-        let &View {
-            b, tq, n_heads, d, ..
-        } = &self.view;
-        let mut heads = vec![0.0; b * n_heads * tq * d]; // [B, H, Tq, d]
-        let mut log_sums = vec![0.0; b * n_heads * tq];
-        let per_task = self.view.heads_per_task();
-        for_pieces2(
-            (&mut heads, per_task * tq * d),
-            (&mut log_sums, per_task * tq),
-            |task, out, log_sums| {
-                let mut scores = Vec::new();
-                let outs = out.chunks_exact_mut(tq * d);
-                for (i, (out, log_sums)) in outs.zip(log_sums.chunks_exact_mut(tq)).enumerate() {
-                    let head = task * per_task + i;
-                    self.forward_head(head, [q, k, v], out, log_sums, &mut scores);
-                }
-            },
-        );
-        let _ = self.log_sums.set(log_sums);
-        let out = interleave(&heads, n_heads, tq, d);
-        Ok(output(out, q_layout.shape()))
+        Ok(output(self.forward([q, k, v]), q_layout.shape()))
     }
 
     fn bwd(
@@ -282,47 +367,71 @@ impl CustomOp3 for Attention {
             Host::new(&d_out)?,
         ];
         let [q_all, k_all, v_all, out, d_out] = &hosts;
-        let inputs = Inputs {
+        let [dq, dk, dv] = self.backward(&Inputs {
             q: q_all.slice()?,
             k: k_all.slice()?,
             v: v_all.slice()?,
             out: out.slice()?,
             d_out: d_out.slice()?,
-            log_sums: self.log_sums.get().expect("forward ran before backward"),
-        };
+            log_sums: self.kept_log_sums(),
+        });
         let &View {
-            b,
-            tq,
-            tk,
-            n_heads,
-            d,
-            ..
+            tq, tk, n_heads, d, ..
         } = &self.view;
-        let mut dq = vec![0.0; b * n_heads * tq * d]; // [B, H, Tq, d]
-        let mut dk = vec![0.0; b * n_heads * tk * d]; // [B, H, Tk, d]
-        let mut dv = vec![0.0; b * n_heads * tk * d];
-        let per_task = self.view.heads_per_task();
-        for_pieces3(
-            (&mut dq, per_task * tq * d),
-            (&mut dk, per_task * tk * d),
-            (&mut dv, per_task * tk * d),
-            |task, dq, dk, dv| {
-                let mut scratch = (Vec::new(), Vec::new());
-                for (i, ((dq, dk), dv)) in dq
-                    .chunks_exact_mut(tq * d)
-                    .zip(dk.chunks_exact_mut(tk * d))
-                    .zip(dv.chunks_exact_mut(tk * d))
-                    .enumerate()
-                {
-                    self.backward_head(task * per_task + i, &inputs, dq, dk, dv, &mut scratch);
-                }
-            },
-        );
+        let joined = |heads: &[f32], t: usize, like: &Tensor| {
+            let mut out = vec![0.0; heads.len()];
+            interleave(&mut out, [heads], (n_heads, t, d));
+            gradient(out, like).map(Some)
+        };
         Ok((
-            Some(gradient(interleave(&dq, n_heads, tq, d), q)?),
-            Some(gradient(interleave(&dk, n_heads, tk, d), k)?),
-            Some(gradient(interleave(&dv, n_heads, tk, d), v)?),
+            joined(&dq, tq, q)?,
+            joined(&dk, tk, k)?,
+            joined(&dv, tk, v)?,
         ))
+    }
+}
+
+/// Over one tensor `[B, T, 3C]` that holds queries, keys and values.
+impl CustomOp1 for Attention {
+    fn name(&self) -> &'static str {
+        "self-attention"
+    }
+
+    fn cpu_fwd(&self, qkv: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let qkv = elements(qkv, layout)?;
+        let &View {
+            b, tq, n_heads, d, ..
+        } = &self.view;
+        let c = n_heads * d;
+        let out = if qkv.is_empty() {
+            Vec::new()
+        } else {
+            self.forward([qkv, &qkv[c..], &qkv[2 * c..]])
+        };
+        Ok(output(out, (b, tq, c)))
+    }
+
+    fn bwd(&self, qkv: &Tensor, out: &Tensor, d_out: &Tensor) -> Result<Option<Tensor>> {
+        let d_out = d_out.contiguous()?;
+        let hosts = [Host::new(qkv)?, Host::new(out)?, Host::new(&d_out)?];
+        let [all, out, d_out] = &hosts;
+        let all = all.slice::<f32>()?;
+        let &View { tq, n_heads, d, .. } = &self.view;
+        let c = n_heads * d;
+        let mut joined = vec![0.0; all.len()];
+        if !all.is_empty() {
+            let thirds = self.backward(&Inputs {
+                q: all,
+                k: &all[c..],
+                v: &all[2 * c..],
+                out: out.slice()?,
+                d_out: d_out.slice()?,
+                log_sums: self.kept_log_sums(),
+            });
+            let thirds = thirds.each_ref().map(Vec::as_slice);
+            interleave(&mut joined, thirds, (n_heads, tq, d));
+        }
+        Ok(Some(gradient(joined, qkv)?))
     }
 }
 
@@ -347,9 +456,9 @@ impl Attention {
         scores: &mut Vec<f32>,
     ) {
         let view = &self.view;
-        let (c, d) = (view.n_heads * view.d, view.d);
+        let (d, [of_queries, of_keys]) = (view.d, view.strides);
         let (b, column) = (head / view.n_heads, head % view.n_heads * d);
-        let keys = b * view.tk * c + column;
+        let keys = b * view.tk * of_keys + column;
         let block = view.block();
         for start in (0..view.tq).step_by(block) {
             let rows = block.min(view.tq - start);
@@ -359,13 +468,13 @@ impl Attention {
             }
             scores.resize(block * view.tk, 0.0);
             let scores = &mut scores[..rows * n];
-            let queries = (b * view.tq + start) * c + column;
+            let queries = (b * view.tq + start) * of_queries + column;
             gemm(
                 MatMut::new(scores, rows, n),
                 Store::Replace,
                 view.scale(),
-                Mat::strided(&q[queries..], rows, d, c),
-                Mat::strided(&k[keys..], n, d, c).t(),
+                Mat::strided(&q[queries..], rows, d, of_queries),
+                Mat::strided(&k[keys..], n, d, of_keys).t(),
                 Threads::One,
             );
             let mut reciprocals = [0.0; 64];
@@ -390,7 +499,7 @@ impl Attention {
                 Store::Replace,
                 1.0,
                 Mat::new(scores, rows, n),
-                Mat::strided(&v[keys..], n, d, c),
+                Mat::strided(&v[keys..], n, d, of_keys),
                 Threads::One,
             );
             for (row, reciprocal) in out.chunks_exact_mut(d).zip(reciprocals) {
@@ -413,8 +522,9 @@ impl Attention {
     ) {
         let view = &self.view;
         let (c, d) = (view.n_heads * view.d, view.d);
+        let [of_queries, of_keys] = view.strides;
         let (b, column) = (head / view.n_heads, head % view.n_heads * d);
-        let keys = b * view.tk * c + column;
+        let keys = b * view.tk * of_keys + column;
         let log_sums = &inputs.log_sums[head * view.tq..];
         let block = view.block();
         for start in (0..view.tq).step_by(block) {
@@ -426,11 +536,12 @@ impl Attention {
             p.resize(block * view.tk, 0.0);
             ds.resize(block * view.tk, 0.0);
             let (p, ds) = (&mut p[..rows * n], &mut ds[..rows * n]);
-            let queries = (b * view.tq + start) * c + column;
-            let q = Mat::strided(&inputs.q[queries..], rows, d, c);
-            let d_out = Mat::strided(&inputs.d_out[queries..], rows, d, c);
-            let k = Mat::strided(&inputs.k[keys..], n, d, c);
-            let v = Mat::strided(&inputs.v[keys..], n, d, c);
+            let queries = (b * view.tq + start) * of_queries + column;
+            let results = (b * view.tq + start) * c + column;
+            let q = Mat::strided(&inputs.q[queries..], rows, d, of_queries);
+            let d_out = Mat::strided(&inputs.d_out[results..], rows, d, c);
+            let k = Mat::strided(&inputs.k[keys..], n, d, of_keys);
+            let v = Mat::strided(&inputs.v[keys..], n, d, of_keys);
             let scale = view.scale();
             let one = Threads::One;
             // Scores, and the gradient that reaches the probabilities.
@@ -455,7 +566,7 @@ impl Attention {
                 || {
                     let pairs = p.chunks_exact_mut(n).zip(ds.chunks_exact_mut(n));
                     for (i, (p, ds)) in pairs.enumerate() {
-                        let at = queries + i * c;
+                        let at = results + i * c;
                         let level = dot(&inputs.d_out[at..at + d], &inputs.out[at..at + d]);
                         let log_sum = log_sums[start + i];
                         let seen = view.visible(b, start + i);
@@ -477,21 +588,26 @@ impl Attention {
     }
 }
 
-/// Moves `[B, H, T, d]` to `[B, T, H * d]`.
-fn interleave(heads: &[f32], n_heads: usize, t: usize, d: usize) -> Vec<f32> {
-    let c = n_heads * d;
-    let mut out = vec![0.0; heads.len()];
-    let step = rows_per_task(c);
-    for_pieces(&mut out, step * c, |piece, out| {
-        for (i, row) in out.chunks_exact_mut(c).enumerate() {
+/// Lays heads `[B, H, T, d]` side by side in the rows of `out`, `[B, T, N * H * d]`, one part after
+/// the other.
+fn interleave<const N: usize>(
+    out: &mut [f32],
+    parts: [&[f32]; N],
+    (n_heads, t, d): (usize, usize, usize),
+) {
+    let width = N * n_heads * d;
+    let step = rows_per_task(width);
+    for_pieces(out, step * width, |piece, out| {
+        for (i, row) in out.chunks_exact_mut(width).enumerate() {
             let (b, t_idx) = ((piece * step + i) / t, (piece * step + i) % t);
-            for (h, out) in row.chunks_exact_mut(d).enumerate() {
-                let at = ((b * n_heads + h) * t + t_idx) * d;
-                out.copy_from_slice(&heads[at..at + d]);
+            for (part, row) in parts.iter().zip(row.chunks_exact_mut(n_heads * d)) {
+                for (h, out) in row.chunks_exact_mut(d).enumerate() {
+                    let at = ((b * n_heads + h) * t + t_idx) * d;
+                    out.copy_from_slice(&part[at..at + d]);
+                }
             }
         }
     });
-    out
 }
 
 #[cfg(test)]
@@ -527,6 +643,24 @@ mod tests {
         check_causal([2, 1, 33, 32, 2], 32, None);
         // Fewer keys than the offset would reach, and queries beyond the last key.
         check_causal([1, 4, 3, 8, 2], 1, None);
+    }
+
+    #[test]
+    fn side_by_side_agrees_with_the_composition() {
+        for [b, t, c, n_heads] in [[1, 1, 4, 1], [2, 5, 6, 3], [2, 131, 24, 2]] {
+            let qkv = var(&[b, t, 3 * c], 1);
+            let third = |i: usize| qkv.narrow(2, i * c, c);
+            check(
+                &[&qkv],
+                || causal_self_attention(&qkv, n_heads),
+                || {
+                    let (q, k, v) = (third(0)?, third(1)?, third(2)?);
+                    let view = View::new(&q, &k, &v, n_heads, Some(0), None)?;
+                    composed(&q, &k, &v, &view)
+                },
+            );
+        }
+        assert!(causal_self_attention(&var(&[1, 2, 8], 1), 2).is_err());
     }
 
     #[test]

@@ -1,119 +1,198 @@
-//! One step of a gated recurrent unit.
+//! A gated recurrent unit over a whole sequence.
 //!
-//! What lives here: the gates, fused. What does not: the two products before them, which are
-//! `linear`, and the stacking of layers, which is the network's.
+//! What lives here: the chain of hidden states, with its products, as one operation. What does not:
+//! the product over the inputs of all steps, which is one `linear`, and the stacking of layers,
+//! which is the network's.
 
 use candle_core::{CpuStorage, CustomOp3, D, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::wide;
-use super::rows::{exp, for_pieces, for_pieces3, rows_per_task};
+use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::rows::{column_sums, exp, for_pieces, for_pieces3, rows_per_task};
 use super::{Host, elements, fusible, gradient, output};
 
-/// The next hidden state of a gated recurrent unit, as in PyTorch:
-/// `r = sigmoid(x_r + h_r)`, `z = sigmoid(x_z + h_z)`, `n = tanh(x_n + r * h_n)`,
-/// `h' = (1 - z) * n + z * h`.
+/// All hidden states of a gated recurrent unit, as in PyTorch; at each step, with
+/// `g = weight h + bias`: `r = sigmoid(x_r + g_r)`, `z = sigmoid(x_z + g_z)`,
+/// `n = tanh(x_n + r * g_n)`, `h' = (1 - z) * n + z * h`.
 ///
-/// Shape: `x_gates` `[N, 3C]` is the input's product plus its bias, `h_gates` `[N, 3C]` the hidden
-/// state's, both with columns reset, update, candidate; `h` and the result `[N, C]`.
+/// Shape: `x_gates` `[S, N, 3C]` are the inputs' products plus their bias, with columns reset,
+/// update, candidate; `h` `[N, C]` is the state before the first step; `weight` `[3C, C]`, `bias`
+/// `[3C]`; the result `[S, N, C]`, the states after each step.
 ///
 /// Error: when the shapes do not fit.
-pub fn gru_cell(x_gates: &Tensor, h_gates: &Tensor, h: &Tensor) -> Result<Tensor> {
+pub fn gru(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     let (n, c) = h.dims2()?;
-    if x_gates.dims() != [n, 3 * c] || h_gates.dims() != [n, 3 * c] {
+    let fits = x_gates
+        .dims3()
+        .is_ok_and(|(_, rows, cols)| (rows, cols) == (n, 3 * c))
+        && weight.dims() == [3 * c, c]
+        && bias.dims() == [3 * c];
+    if !fits {
         bail!(
-            "gru_cell: x_gates {:?}, h_gates {:?}, h {:?}",
+            "gru: x_gates {:?}, h {:?}, weight {:?}, bias {:?}",
             x_gates.shape(),
-            h_gates.shape(),
-            h.shape()
+            h.shape(),
+            weight.shape(),
+            bias.shape()
         );
     }
-    if !fusible(&[x_gates, h_gates, h]) {
-        return composed(x_gates, h_gates, h);
+    if !fusible(&[x_gates, h, weight, bias]) {
+        return composed(x_gates, h, weight, bias);
     }
+    // An operation takes three tensors: the bias is the last column of the matrix.
+    let affine = Tensor::cat(&[weight, &bias.unsqueeze(1)?], 1)?; // [3C, C + 1]
     x_gates
         .contiguous()?
-        .apply_op3(&h_gates.contiguous()?, &h.contiguous()?, GruCell)
+        .apply_op3(&h.contiguous()?, &affine, Gru)
 }
 
-fn composed(x_gates: &Tensor, h_gates: &Tensor, h: &Tensor) -> Result<Tensor> {
+fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     let sigmoid = |x: Tensor| (x.neg()?.exp()? + 1.0)?.recip();
-    let x = x_gates.chunk(3, D::Minus1)?;
-    let g = h_gates.chunk(3, D::Minus1)?;
-    let r = sigmoid((&x[0] + &g[0])?)?;
-    let z = sigmoid((&x[1] + &g[1])?)?;
-    let n = (&x[2] + (r * &g[2])?)?.tanh()?;
-    (&n - (&z * &n)?)? + (&z * h)?
+    let mut h = h.clone();
+    let mut states = Vec::new();
+    for step in 0..x_gates.dim(0)? {
+        let x = x_gates.get(step)?.chunk(3, D::Minus1)?;
+        let g = h.matmul(&weight.t()?)?.broadcast_add(bias)?;
+        let g = g.chunk(3, D::Minus1)?;
+        let r = sigmoid((&x[0] + &g[0])?)?;
+        let z = sigmoid((&x[1] + &g[1])?)?;
+        let n = (&x[2] + (r * &g[2])?)?.tanh()?;
+        h = ((&n - (&z * &n)?)? + (&z * &h)?)?;
+        states.push(h.clone());
+    }
+    Tensor::stack(&states, 0)
 }
 
-struct GruCell;
+struct Gru;
 
-impl CustomOp3 for GruCell {
+/// Sizes of a sequence: steps, rows, channels.
+type Sizes = (usize, usize, usize);
+
+/// The matrix and the bias of `[3C, C + 1]`.
+fn halves(affine: &[f32], c: usize) -> (Mat<'_>, Vec<f32>) {
+    let bias = affine.chunks_exact(c + 1).map(|row| row[c]).collect();
+    (Mat::strided(affine, 3 * c, c, c + 1), bias)
+}
+
+/// `out = h weight^T + bias`, `[N, 3C]`.
+fn hidden_gates(out: &mut [f32], h: &[f32], (weight, bias): (Mat<'_>, &[f32]), c: usize) {
+    for row in out.chunks_exact_mut(3 * c) {
+        row.copy_from_slice(bias);
+    }
+    let n = h.len() / c;
+    let (dst, h) = (MatMut::new(out, n, 3 * c), Mat::new(h, n, c));
+    gemm(dst, Store::Add, 1.0, h, weight.t(), Threads::Pool);
+}
+
+impl CustomOp3 for Gru {
     fn name(&self) -> &'static str {
-        "gru-cell"
+        "gru"
     }
 
     fn cpu_fwd(
         &self,
         x: &CpuStorage,
         x_layout: &Layout,
-        g: &CpuStorage,
-        g_layout: &Layout,
         h: &CpuStorage,
         h_layout: &Layout,
+        affine: &CpuStorage,
+        affine_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (x, g) = (elements(x, x_layout)?, elements(g, g_layout)?);
-        let h = elements(h, h_layout)?;
-        let (_, c) = h_layout.shape().dims2()?;
-        let step = rows_per_task(4 * c);
-        let mut out = vec![0.0; h.len()];
-        for_pieces(&mut out, step * c, |piece, out| {
-            wide(
-                #[inline(always)]
-                || {
-                    for (i, out) in out.chunks_exact_mut(c).enumerate() {
-                        let row = piece * step + i;
-                        let (x, g) = (gates(x, row, c), gates(g, row, c));
-                        let h = &h[row * c..(row + 1) * c];
-                        for j in 0..c {
-                            let [_, z, n] = cell(x, g, j);
-                            out[j] = (1.0 - z) * n + z * h[j];
+        let (x, first) = (elements(x, x_layout)?, elements(h, h_layout)?);
+        let (n, c) = h_layout.shape().dims2()?;
+        let steps = x_layout.dims()[0];
+        let (weight, bias) = halves(elements(affine, affine_layout)?, c);
+        let mut states = vec![0.0; steps * n * c];
+        let mut g = vec![0.0; n * 3 * c];
+        let piece = rows_per_task(4 * c);
+        for step in 0..steps {
+            let (before, states) = states.split_at_mut(step * n * c);
+            let h = if step == 0 {
+                first
+            } else {
+                &before[(step - 1) * n * c..]
+            };
+            hidden_gates(&mut g, h, (weight, &bias), c);
+            let (x, g) = (&x[step * n * 3 * c..], &g);
+            for_pieces(&mut states[..n * c], piece * c, |i, out| {
+                let at = i * piece * c..i * piece * c + out.len();
+                out.copy_from_slice(&h[at]);
+                wide(
+                    #[inline(always)]
+                    || {
+                        for (row, h) in out.chunks_exact_mut(c).enumerate() {
+                            let row = i * piece + row;
+                            gru_row(&x[row * 3 * c..], &g[row * 3 * c..], h);
                         }
-                    }
-                },
-            );
-        });
-        Ok(output(out, h_layout.shape()))
+                    },
+                );
+            });
+        }
+        Ok(output(states, (steps, n, c)))
     }
 
     fn bwd(
         &self,
         x: &Tensor,
-        g: &Tensor,
         h: &Tensor,
-        _out: &Tensor,
-        d_out: &Tensor,
+        affine: &Tensor,
+        states: &Tensor,
+        d_states: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let d_out = d_out.contiguous()?;
+        let d_states = d_states.contiguous()?;
+        let sizes = states.dims3()?;
         let hosts = [
             Host::new(x)?,
-            Host::new(g)?,
             Host::new(h)?,
-            Host::new(&d_out)?,
+            Host::new(affine)?,
+            Host::new(states)?,
+            Host::new(&d_states)?,
         ];
-        let x_all = hosts[0].slice::<f32>()?;
-        let g_all = hosts[1].slice::<f32>()?;
-        let h_all = hosts[2].slice::<f32>()?;
-        let d_all = hosts[3].slice::<f32>()?;
-        let (n, c) = h.dims2()?;
-        let step = rows_per_task(8 * c);
-        let mut dx = vec![0.0; n * 3 * c];
-        let mut dg = vec![0.0; n * 3 * c];
-        let mut dh = vec![0.0; n * c];
+        let [x_all, first, weights, states, d_states] = &hosts;
+        let (dx, dh, d_affine) = backward(
+            sizes,
+            x_all.slice()?,
+            first.slice()?,
+            weights.slice()?,
+            states.slice()?,
+            d_states.slice()?,
+        );
+        Ok((
+            Some(gradient(dx, x)?),
+            Some(gradient(dh, h)?),
+            Some(gradient(d_affine, affine)?),
+        ))
+    }
+}
+
+/// Gradients of the gates, of the first state and of the matrix with its bias.
+fn backward(
+    (steps, n, c): Sizes,
+    x: &[f32],
+    first: &[f32],
+    affine: &[f32],
+    states: &[f32],
+    d_states: &[f32],
+) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+    let (weight, bias) = halves(affine, c);
+    let mut dx = vec![0.0; steps * n * 3 * c];
+    let mut dg = vec![0.0; steps * n * 3 * c];
+    let mut dh = vec![0.0; n * c];
+    let mut g = vec![0.0; n * 3 * c];
+    let piece = rows_per_task(8 * c);
+    for step in (0..steps).rev() {
+        let before = if step == 0 {
+            first
+        } else {
+            &states[(step - 1) * n * c..step * n * c]
+        };
+        hidden_gates(&mut g, before, (weight, &bias), c);
+        let (x, d_states) = (&x[step * n * 3 * c..], &d_states[step * n * c..]);
+        let of_step = step * n * 3 * c..(step + 1) * n * 3 * c;
         for_pieces3(
-            (&mut dx, step * 3 * c),
-            (&mut dg, step * 3 * c),
-            (&mut dh, step * c),
-            |piece, dx, dg, dh| {
+            (&mut dx[of_step.clone()], piece * 3 * c),
+            (&mut dg[of_step.clone()], piece * 3 * c),
+            (&mut dh, piece * c),
+            |i, dx, dg, dh| {
                 wide(
                     #[inline(always)]
                     || {
@@ -121,32 +200,39 @@ impl CustomOp3 for GruCell {
                             .chunks_exact_mut(3 * c)
                             .zip(dg.chunks_exact_mut(3 * c))
                             .zip(dh.chunks_exact_mut(c));
-                        for (i, ((dx, dg), dh)) in rows.enumerate() {
-                            let row = piece * step + i;
-                            let at = row * c..(row + 1) * c;
-                            backward_row(
-                                gates(x_all, row, c),
-                                gates(g_all, row, c),
-                                &h_all[at.clone()],
-                                &d_all[at],
-                                dx,
-                                dg,
-                                dh,
-                            );
+                        for (row, ((dx, dg), dh)) in rows.enumerate() {
+                            let row = i * piece + row;
+                            for (dh, d) in dh.iter_mut().zip(&d_states[row * c..]) {
+                                *dh += d;
+                            }
+                            let (x, g) = (gates(x, row, c), gates(&g, row, c));
+                            backward_row(x, g, &before[row * c..(row + 1) * c], dx, dg, dh);
                         }
                     },
                 );
             },
         );
-        Ok((
-            Some(gradient(dx, x)?),
-            Some(gradient(dg, g)?),
-            Some(gradient(dh, h)?),
-        ))
+        // What reaches the state before through the gates.
+        let dg = Mat::new(&dg[of_step], n, 3 * c);
+        let dst = MatMut::new(&mut dh, n, c);
+        gemm(dst, Store::Add, 1.0, dg, weight, Threads::Pool);
     }
+    let mut d_affine = vec![0.0; 3 * c * (c + 1)];
+    let sums = column_sums(&dg, 3 * c);
+    for (row, sum) in d_affine.chunks_exact_mut(c + 1).zip(sums) {
+        row[c] = sum;
+    }
+    let (dg_first, dg_rest) = dg.split_at((n * 3 * c).min(dg.len()));
+    for (dg, before) in [(dg_first, first), (dg_rest, states)] {
+        let rows = dg.len() / (3 * c);
+        let dst = MatMut::strided(&mut d_affine, 3 * c, c, c + 1);
+        let (dg, before) = (Mat::new(dg, rows, 3 * c), Mat::new(before, rows, c));
+        gemm(dst, Store::Add, 1.0, dg.t(), before, Threads::Pool);
+    }
+    (dx, dh, d_affine)
 }
 
-/// One step of one row in place: `h` becomes the next state; gates `[3C]` as in [`gru_cell`].
+/// One step of one row in place: `h` becomes the next state; gates `[3C]` as in [`gru`].
 #[inline(always)]
 pub(crate) fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
     let c = h.len();
@@ -178,12 +264,13 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
+/// `dh` comes as the gradient of the state after the step and leaves as what reaches the state
+/// before directly.
 #[inline(always)]
 fn backward_row(
     x: [&[f32]; 3],
     g: [&[f32]; 3],
     h: &[f32],
-    d_out: &[f32],
     dx: &mut [f32],
     dg: &mut [f32],
     dh: &mut [f32],
@@ -193,11 +280,10 @@ fn backward_row(
     let (dx_z, dx_n) = dx.split_at_mut(c);
     let (dg_r, dg) = dg.split_at_mut(c);
     let (dg_z, dg_n) = dg.split_at_mut(c);
-    let (d_out, dx_n) = (&d_out[..c], &mut dx_n[..c]);
-    let (dg_n, dh) = (&mut dg_n[..c], &mut dh[..c]);
+    let (dx_n, dg_n, dh) = (&mut dx_n[..c], &mut dg_n[..c], &mut dh[..c]);
     for j in 0..c {
         let [r, z, n] = cell(x, g, j);
-        let d = d_out[j];
+        let d = dh[j];
         let d_candidate = d * (1.0 - z) * (1.0 - n * n);
         let d_update = d * (h[j] - n) * z * (1.0 - z);
         let d_reset = d_candidate * g[2][j] * r * (1.0 - r);
@@ -218,20 +304,25 @@ mod tests {
 
     #[test]
     fn agrees_with_the_composition() {
-        for (n, c) in [(1, 1), (3, 17), (700, 40)] {
-            let (x, g) = (var(&[n, 3 * c], 1), var(&[n, 3 * c], 2));
-            let h = var(&[n, c], 3);
+        for (steps, n, c) in [(1, 1, 1), (3, 3, 17), (16, 150, 24), (2, 700, 40)] {
+            let (x, h) = (var(&[steps, n, 3 * c], 1), var(&[n, c], 2));
+            let (weight, bias) = (var(&[3 * c, c], 3), var(&[3 * c], 4));
+            let strong = || x.affine(4.0, 0.0);
             check(
-                &[&x, &g, &h],
-                || gru_cell(&x.affine(4.0, 0.0)?, &g, &h),
-                || composed(&x.affine(4.0, 0.0)?, &g, &h),
+                &[&x, &h, &weight, &bias],
+                || gru(&strong()?, &h, &weight, &bias),
+                || composed(&strong()?, &h, &weight, &bias),
             );
         }
     }
 
     #[test]
     fn shapes_that_do_not_fit_are_errors() {
-        let (x, h) = (var(&[2, 9], 1), var(&[2, 4], 2));
-        assert!(gru_cell(&x, &x, &h).is_err());
+        let (x, h) = (var(&[1, 2, 9], 1), var(&[2, 4], 2));
+        let (weight, bias) = (var(&[12, 4], 3), var(&[12], 4));
+        assert!(gru(&x, &h, &weight, &bias).is_err());
+        let x = var(&[1, 2, 12], 1);
+        assert!(gru(&x, &h, &weight, &bias).is_ok());
+        assert!(gru(&x, &h, &bias, &weight).is_err());
     }
 }

@@ -1,15 +1,19 @@
 //! Cross-entropy over token logits.
 //!
-//! What lives here: the masked, optionally smoothed loss. What does not: which positions count and
-//! how much, which training decides through the weights.
+//! What lives here: the masked, optionally smoothed loss, of logits and of what a matrix makes
+//! into logits. What does not: which positions count and how much, which training decides through
+//! the weights.
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp1, D, DType, Device, Layout, Result, Shape, Tensor, bail};
+use candle_core::{
+    CpuStorage, CustomOp1, CustomOp2, D, DType, Device, Layout, Result, Shape, Tensor, bail,
+};
 
-use super::gemm::wide;
+use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
 use super::rows::{exp, for_pieces, for_pieces2, max, rows_per_task, sum_exp_shifted};
-use super::{Host, elements, fusible, gradient, output};
+use super::{Host, elements, fusible, gradient, linear, output};
 
 /// Spreads a target over its neighbours on an ordered scale of bins, as a discrete normal
 /// distribution cut at four deviations and scaled to sum 1.
@@ -81,28 +85,109 @@ pub fn masked_cross_entropy(
             weights.shape()
         );
     }
-    if smoothing.is_some_and(|s| !(s.sigma_bins > 0.0 && s.sigma_bins.is_finite())) {
-        bail!("masked_cross_entropy: {smoothing:?}");
-    }
     if !fusible(&[logits, weights]) {
         return composed(logits, targets, weights, smoothing);
     }
-    let targets = targets.to_device(&Device::Cpu)?.to_vec1::<u32>()?;
-    let weights = weights.to_vec1::<f32>()?;
-    for (i, (&t, &w)) in targets.iter().zip(&weights).enumerate() {
-        if w != 0.0 && t as usize >= v {
-            bail!("masked_cross_entropy: target {t} of row {i} is not below {v}");
-        }
-    }
-    let total = weights.iter().map(|&w| f64::from(w)).sum::<f64>();
-    let op = CrossEntropy {
-        targets,
-        scale: 1.0 / total.max(1e-9),
-        weights,
+    let asked = Targets {
+        bins: targets.to_device(&Device::Cpu)?.to_vec1::<u32>()?,
+        weights: weights.to_vec1::<f32>()?,
         smoothing,
+    };
+    asked.check(n, v)?;
+    let op = CrossEntropy {
+        scale: asked.scale(),
+        asked,
         log_sums: OnceLock::new(),
     };
     logits.contiguous()?.apply_op1(op)
+}
+
+/// What rows of logits should say.
+#[derive(Clone, Debug)]
+pub struct Targets {
+    /// The class of each row.
+    pub bins: Vec<u32>,
+    /// How much each row counts; one of weight 0 counts for nothing, whatever its class.
+    pub weights: Vec<f32>,
+    /// How each class is spread over its neighbours, if it is.
+    pub smoothing: Option<OrdinalSmoothing>,
+}
+
+impl Targets {
+    /// Error: unless there are `n` rows of classes below `v`, and a deviation above 0.
+    fn check(&self, n: usize, v: usize) -> Result<()> {
+        if self.bins.len() != n || self.weights.len() != n {
+            let (bins, weights) = (self.bins.len(), self.weights.len());
+            bail!("cross entropy of {n} rows: {bins} targets, {weights} weights");
+        }
+        let is_wrong = |s: OrdinalSmoothing| !(s.sigma_bins > 0.0 && s.sigma_bins.is_finite());
+        if self.smoothing.is_some_and(is_wrong) {
+            bail!("cross entropy: {:?}", self.smoothing);
+        }
+        for (i, (&t, &w)) in self.bins.iter().zip(&self.weights).enumerate() {
+            if w != 0.0 && t as usize >= v {
+                bail!("cross entropy: target {t} of row {i} is not below {v}");
+            }
+        }
+        Ok(())
+    }
+
+    /// One over the sum of the weights.
+    fn scale(&self) -> f64 {
+        let total = self.weights.iter().map(|&w| f64::from(w)).sum::<f64>();
+        1.0 / total.max(1e-9)
+    }
+
+    fn spread(&self, row: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
+        let target = self.bins[row] as usize;
+        match self.smoothing {
+            Some(s) => s.spread(target, v, bins),
+            None => {
+                bins.clear();
+                bins.push((target, 1.0));
+            }
+        }
+    }
+
+    /// The weighted loss of a row and the logarithm of its softmax sum; `bins` is scratch.
+    #[inline(always)]
+    fn loss(&self, row: usize, logits: &[f32], bins: &mut Vec<(usize, f32)>) -> (f32, f32) {
+        let log_sum = wide(
+            #[inline(always)]
+            || {
+                let peak = max(logits);
+                peak + sum_exp_shifted(logits, peak).ln()
+            },
+        );
+        self.spread(row, logits.len(), bins);
+        let terms = bins.iter().map(|&(bin, p)| p * (log_sum - logits[bin]));
+        (self.weights[row] * terms.sum::<f32>(), log_sum)
+    }
+
+    /// Takes the logits of a row, in `d`, to their gradient, `factor` times the weighted loss's.
+    #[inline(always)]
+    fn slope(
+        &self,
+        row: usize,
+        d: &mut [f32],
+        log_sum: f32,
+        factor: f32,
+        bins: &mut Vec<(usize, f32)>,
+    ) {
+        let factor = self.weights[row] * factor;
+        wide(
+            #[inline(always)]
+            || {
+                for d in d.iter_mut() {
+                    *d = factor * exp(*d - log_sum);
+                }
+            },
+        );
+        self.spread(row, d.len(), bins);
+        for &(bin, p) in &*bins {
+            d[bin] -= factor * p;
+        }
+    }
 }
 
 fn composed(
@@ -141,26 +226,11 @@ fn composed(
 }
 
 struct CrossEntropy {
-    targets: Vec<u32>,
-    weights: Vec<f32>,
+    asked: Targets,
     /// One over the sum of the weights.
     scale: f64,
-    smoothing: Option<OrdinalSmoothing>,
     /// Logarithm of the softmax sum of each row, kept for the gradient.
     log_sums: OnceLock<Vec<f32>>,
-}
-
-impl CrossEntropy {
-    fn target_bins(&self, row: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
-        let target = self.targets[row] as usize;
-        match self.smoothing {
-            Some(s) => s.spread(target, v, bins),
-            None => {
-                bins.clear();
-                bins.push((target, 1.0));
-            }
-        }
-    }
 }
 
 impl CustomOp1 for CrossEntropy {
@@ -181,23 +251,10 @@ impl CustomOp1 for CrossEntropy {
                 let mut bins = Vec::new();
                 for (j, (loss, log_sum)) in losses.iter_mut().zip(log_sums).enumerate() {
                     let row = i * step + j;
-                    if self.weights[row] == 0.0 {
-                        continue;
+                    if self.asked.weights[row] != 0.0 {
+                        let logits = &logits[row * v..(row + 1) * v];
+                        (*loss, *log_sum) = self.asked.loss(row, logits, &mut bins);
                     }
-                    let logits = &logits[row * v..(row + 1) * v];
-                    *log_sum = wide(
-                        #[inline(always)]
-                        || {
-                            let peak = max(logits);
-                            peak + sum_exp_shifted(logits, peak).ln()
-                        },
-                    );
-                    self.target_bins(row, v, &mut bins);
-                    let hit: f32 = bins
-                        .iter()
-                        .map(|&(bin, p)| p * (*log_sum - logits[bin]))
-                        .sum();
-                    *loss = self.weights[row] * hit;
                 }
             },
         );
@@ -207,7 +264,7 @@ impl CustomOp1 for CrossEntropy {
     }
 
     fn bwd(&self, logits: &Tensor, _loss: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        let scale = grad.to_scalar::<f32>()? * self.scale as f32;
+        let factor = grad.to_scalar::<f32>()? * self.scale as f32;
         let (_, v) = logits.dims2()?;
         let host = Host::new(logits)?;
         let all = host.slice::<f32>()?;
@@ -218,26 +275,177 @@ impl CustomOp1 for CrossEntropy {
             let mut bins = Vec::new();
             for (j, d) in d.chunks_exact_mut(v).enumerate() {
                 let row = i * step + j;
-                if self.weights[row] == 0.0 {
-                    continue;
-                }
-                let factor = self.weights[row] * scale;
-                let (logits, log_sum) = (&all[row * v..(row + 1) * v], log_sums[row]);
-                wide(
-                    #[inline(always)]
-                    || {
-                        for (d, logit) in d.iter_mut().zip(logits) {
-                            *d = factor * exp(logit - log_sum);
-                        }
-                    },
-                );
-                self.target_bins(row, v, &mut bins);
-                for &(bin, p) in &bins {
-                    d[bin] -= factor * p;
+                if self.asked.weights[row] != 0.0 {
+                    d.copy_from_slice(&all[row * v..(row + 1) * v]);
+                    self.asked.slope(row, d, log_sums[row], factor, &mut bins);
                 }
             }
         });
         Ok(Some(gradient(d, logits)?))
+    }
+}
+
+/// [`masked_cross_entropy`] of several steps at once, each over its own rows of one matrix: step `s`
+/// has the logits `x[s] weight[rows]^T`. Logits are never held for all steps twice, and rows that
+/// several steps share are not copied.
+///
+/// Shape: `x` `[S, N, C]`; `weight` `[R, C]`; `asked` per step its rows of the matrix and the
+/// targets of the `N` rows; the result `[S]`, a mean per step.
+///
+/// Error: when the shapes do not fit, or as [`masked_cross_entropy`].
+pub fn linear_cross_entropy(
+    x: &Tensor,
+    weight: &Tensor,
+    asked: Vec<(Range<usize>, Targets)>,
+) -> Result<Tensor> {
+    let (steps, n, c) = x.dims3()?;
+    let (n_rows, width) = weight.dims2()?;
+    let is_inside = |rows: &Range<usize>| !rows.is_empty() && rows.end <= n_rows;
+    if asked.len() != steps || width != c || !asked.iter().all(|(rows, _)| is_inside(rows)) {
+        let rows: Vec<_> = asked.iter().map(|(rows, _)| rows).collect();
+        let (x, weight) = (x.shape(), weight.shape());
+        bail!("linear_cross_entropy: x {x:?}, weight {weight:?}, rows {rows:?}");
+    }
+    for (rows, asked) in &asked {
+        asked.check(n, rows.len())?;
+    }
+    if !fusible(&[x, weight]) {
+        return composed_steps(x, weight, &asked);
+    }
+    let op = LinearCrossEntropy {
+        asked,
+        learns: x.track_op() || weight.track_op(),
+        slopes: OnceLock::new(),
+    };
+    x.contiguous()?.apply_op2(&weight.contiguous()?, op)
+}
+
+fn composed_steps(
+    x: &Tensor,
+    weight: &Tensor,
+    asked: &[(Range<usize>, Targets)],
+) -> Result<Tensor> {
+    let step = |(step, (rows, asked)): (usize, &(Range<usize>, Targets))| {
+        let rows = weight.narrow(0, rows.start, rows.len())?;
+        let bins = Tensor::from_slice(&asked.bins, asked.bins.len(), x.device())?;
+        let weights = Tensor::from_slice(&asked.weights, asked.weights.len(), x.device())?;
+        masked_cross_entropy(
+            &linear(&x.get(step)?, &rows, None)?,
+            &bins,
+            &weights,
+            asked.smoothing,
+        )
+    };
+    let losses = asked.iter().enumerate().map(step);
+    Tensor::stack(&losses.collect::<Result<Vec<_>>>()?, 0)
+}
+
+struct LinearCrossEntropy {
+    asked: Vec<(Range<usize>, Targets)>,
+    /// Whether anything asks for gradients.
+    learns: bool,
+    /// Gradients of the logits per step, `[N, V]`, as they are where the loss itself is asked for.
+    slopes: OnceLock<Vec<Vec<f32>>>,
+}
+
+impl CustomOp2 for LinearCrossEntropy {
+    fn name(&self) -> &'static str {
+        "linear-cross-entropy"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        x_layout: &Layout,
+        weight: &CpuStorage,
+        weight_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (x, weight) = (elements(x, x_layout)?, elements(weight, weight_layout)?);
+        let (_, n, c) = x_layout.shape().dims3()?;
+        let mut means = Vec::new();
+        let mut slopes = Vec::new();
+        for (step, (rows, asked)) in self.asked.iter().enumerate() {
+            let v = rows.len();
+            let mut logits = vec![0.0; n * v];
+            let weight = Mat::new(&weight[rows.start * c..rows.end * c], v, c);
+            gemm(
+                MatMut::new(&mut logits, n, v),
+                Store::Replace,
+                1.0,
+                Mat::new(&x[step * n * c..(step + 1) * n * c], n, c),
+                weight.t(),
+                Threads::Pool,
+            );
+            let scale = asked.scale();
+            let mut losses = vec![0.0; n];
+            let piece = rows_per_task(v);
+            for_pieces2(
+                (&mut logits, piece * v),
+                (&mut losses, piece),
+                |i, logits, losses| {
+                    let mut bins = Vec::new();
+                    let rows = logits.chunks_exact_mut(v).zip(losses);
+                    for (j, (logits, loss)) in rows.enumerate() {
+                        let row = i * piece + j;
+                        if asked.weights[row] == 0.0 {
+                            logits.fill(0.0);
+                            continue;
+                        }
+                        let log_sum;
+                        (*loss, log_sum) = asked.loss(row, logits, &mut bins);
+                        if self.learns {
+                            asked.slope(row, logits, log_sum, scale as f32, &mut bins);
+                        }
+                    }
+                },
+            );
+            let sum = losses.iter().map(|&l| f64::from(l)).sum::<f64>();
+            means.push((sum * scale) as f32);
+            slopes.push(logits);
+        }
+        if self.learns {
+            let _ = self.slopes.set(slopes);
+        }
+        let steps = means.len();
+        Ok(output(means, steps))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        weight: &Tensor,
+        _means: &Tensor,
+        grad: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let grad = grad.to_vec1::<f32>()?;
+        let (_, n, c) = x.dims3()?;
+        let hosts = [Host::new(x)?, Host::new(weight)?];
+        let (x_all, w) = (hosts[0].slice::<f32>()?, hosts[1].slice::<f32>()?);
+        let slopes = self.slopes.get().expect("forward ran before backward");
+        let mut dx = vec![0.0; x_all.len()];
+        let mut dw = vec![0.0; w.len()];
+        for (step, ((rows, _), slope)) in self.asked.iter().zip(slopes).enumerate() {
+            let v = rows.len();
+            let (at, of_rows) = (step * n * c, rows.start * c..rows.end * c);
+            let slope = Mat::new(slope, n, v);
+            gemm(
+                MatMut::new(&mut dx[at..at + n * c], n, c),
+                Store::Replace,
+                grad[step],
+                slope,
+                Mat::new(&w[of_rows.clone()], v, c),
+                Threads::Pool,
+            );
+            gemm(
+                MatMut::new(&mut dw[of_rows], v, c),
+                Store::Add,
+                grad[step],
+                slope.t(),
+                Mat::new(&x_all[at..at + n * c], n, c),
+                Threads::Pool,
+            );
+        }
+        Ok((Some(gradient(dx, x)?), Some(gradient(dw, weight)?)))
     }
 }
 
@@ -279,6 +487,36 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn steps_over_one_matrix_agree_with_the_composition() {
+        let (x, weight) = (var(&[3, 33, 12], 5), var(&[40, 12], 6));
+        let asked = |of: Range<usize>, smoothing| {
+            let (bins, weights) = rows(33, of.len());
+            let asked = Targets {
+                bins: bins.to_vec1().unwrap(),
+                weights: weights.to_vec1().unwrap(),
+                smoothing,
+            };
+            (of, asked)
+        };
+        let asked = vec![
+            asked(0..13, Some(SPEED)),
+            asked(13..40, Some(HEADING)),
+            asked(0..13, None),
+        ];
+        let sharp = || x.affine(8.0, -3.0);
+        check(
+            &[&x, &weight],
+            || linear_cross_entropy(&sharp()?, &weight, asked.clone()),
+            || composed_steps(&sharp()?, &weight, &asked),
+        );
+        let short = asked[..2].to_vec();
+        assert!(linear_cross_entropy(&x, &weight, short).is_err());
+        let mut outside = asked;
+        outside[1].0 = 20..41;
+        assert!(linear_cross_entropy(&x, &weight, outside).is_err());
     }
 
     #[test]

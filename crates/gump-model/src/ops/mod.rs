@@ -22,13 +22,15 @@ mod norm;
 pub(crate) mod panels;
 mod rows;
 
-pub use attention::{causal_attention, cross_attention, cross_attention_padded};
+pub use attention::{
+    causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
+};
 pub use conv::conv2d;
 pub use gelu::gelu;
 pub use gemm::square_product;
-pub use gru::gru_cell;
+pub use gru::gru;
 pub use linear::linear;
-pub use loss::{OrdinalSmoothing, masked_cross_entropy};
+pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
 
 pub(crate) use gelu::gelu_row;

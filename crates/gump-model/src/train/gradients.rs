@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor};
+use rayon::prelude::*;
 
 use super::peers::Peers;
 use crate::ModelError;
@@ -22,26 +23,29 @@ pub(super) struct Found {
 }
 
 impl Found {
-    /// Adds what a part of the batch found.
+    /// Adds what parts of the batch found, in their order.
     pub(super) fn add(
         &mut self,
         parameters: &Parameters,
-        gradients: &GradStore,
-        loss: &LossParts,
-        tokens: usize,
+        parts: &[(GradStore, LossParts, usize)],
     ) -> Result<()> {
-        for (name, var) in parameters.trainable() {
-            let Some(gradient) = gradients.get(var) else {
-                continue;
-            };
-            let sum = match self.gradients.get(name) {
-                Some(sum) => (sum + gradient)?,
-                None => gradient.clone(),
-            };
-            self.gradients.insert(name.to_owned(), sum);
+        let trainable: Vec<_> = parameters.trainable().collect();
+        let sums = trainable.into_par_iter().map(|(name, var)| {
+            let mut sum = self.gradients.get(name).cloned();
+            for gradient in parts.iter().filter_map(|(store, ..)| store.get(var)) {
+                sum = Some(match sum {
+                    Some(sum) => (sum + gradient)?,
+                    None => gradient.clone(),
+                });
+            }
+            Ok(sum.map(|sum| (name.to_owned(), sum)))
+        });
+        let sums: Vec<_> = sums.collect::<Result<_>>()?;
+        self.gradients = sums.into_iter().flatten().collect();
+        for (_, loss, tokens) in parts {
+            self.loss.add(loss);
+            self.tokens += tokens;
         }
-        self.loss.add(loss);
-        self.tokens += tokens;
         Ok(())
     }
 

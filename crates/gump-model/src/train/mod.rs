@@ -190,7 +190,7 @@ impl Trainer {
 
     /// Loss and gradients of a batch, of which these are this process's samples.
     fn differentiate(&self, samples: &[Sample]) -> Result<Found, ModelError> {
-        let network = &self.learner.network;
+        let (network, config) = (&self.learner.network, &self.config.loss);
         let whole = self.total(Counts::of(samples, &self.config.loss))?;
         let seed = Seed(self.config.seed).fork(2);
         let seed = seed.fork(self.learner.step as u64);
@@ -198,17 +198,16 @@ impl Trainer {
         let part = samples.len().div_ceil(self.config.accumulate).max(1);
         for (i, samples) in samples.chunks(part).enumerate() {
             let seed = seed.fork((i * self.peers.size() + self.peers.rank()) as u64);
-            let dropout = Dropout::new(network.config().dropout, seed);
-            let (total, parts) = loss(
-                network,
-                samples,
-                &self.config.loss,
-                &whole,
-                true,
-                dropout.as_ref(),
-            )?;
-            let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
-            found.add(network.parameters(), &total.backward()?, &parts, tokens)?;
+            let alone = network.samples_together(samples.len());
+            let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
+                let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
+                let (total, parts) =
+                    loss(network, samples, config, &whole, true, dropout.as_ref())?;
+                let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
+                Ok((total.backward()?, parts, tokens))
+            });
+            let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+            found.add(network.parameters(), &parts)?;
         }
         found.share(network.parameters(), &*self.peers)?;
         Ok(found)
