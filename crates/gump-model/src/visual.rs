@@ -84,27 +84,19 @@ impl BatchNorm {
 
     /// `x` is [S, channels, H, W].
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor> {
+        if training {
+            let (y, [mean, variance]) = ops::batch_norm(x, &self.weight, &self.bias)?;
+            for (running, batch) in [(&self.mean, mean), (&self.variance, variance)] {
+                running.set(&((running.as_tensor() * 0.9)? + (batch * 0.1)?)?)?;
+            }
+            return Ok(y);
+        }
         let channels = x.dim(1)?;
         let spread = |t: &Tensor| t.reshape((1, channels, 1, 1));
-        let (mean, variance) = if training {
-            let mean = x.mean_keepdim((0, 2, 3))?; // [1, channels, 1, 1]
-            let variance = x.broadcast_sub(&mean)?.sqr()?.mean_keepdim((0, 2, 3))?;
-            let update = |running: &Var, batch: &Tensor| {
-                let batch = batch.detach().flatten_all()?;
-                running.set(&((running.as_tensor() * 0.9)? + (batch * 0.1)?)?)
-            };
-            update(&self.mean, &mean)?;
-            update(&self.variance, &variance)?;
-            (mean, variance)
-        } else {
-            (
-                spread(&self.mean.as_tensor().detach())?,
-                spread(&self.variance.as_tensor().detach())?,
-            )
-        };
+        let (mean, variance) = (self.mean.as_tensor(), self.variance.as_tensor());
         let normal = x
-            .broadcast_sub(&mean)?
-            .broadcast_div(&(variance + 1e-5)?.sqrt()?)?;
+            .broadcast_sub(&spread(&mean.detach())?)?
+            .broadcast_div(&(spread(&variance.detach())? + 1e-5)?.sqrt()?)?;
         normal
             .broadcast_mul(&spread(&self.weight)?)?
             .broadcast_add(&spread(&self.bias)?)

@@ -12,6 +12,7 @@
 //! are added in a fixed order. Gradients cannot be differentiated again.
 
 mod attention;
+mod batch_norm;
 mod conv;
 mod gelu;
 mod gemm;
@@ -25,6 +26,7 @@ mod rows;
 pub use attention::{
     causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
 };
+pub use batch_norm::batch_norm;
 pub use conv::conv2d;
 pub use gelu::gelu;
 pub use gemm::square_product;

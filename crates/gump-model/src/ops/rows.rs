@@ -184,16 +184,22 @@ pub(super) fn sum_squares_from(x: &[f32], centre: f32) -> f32 {
 /// Inner product of two rows of one length.
 #[inline(always)]
 pub(super) fn dot(x: &[f32], y: &[f32]) -> f32 {
+    dot_from(x, 0.0, y)
+}
+
+/// Inner product of the distances from `centre` with another row.
+#[inline(always)]
+pub(super) fn dot_from(x: &[f32], centre: f32, y: &[f32]) -> f32 {
     let mut lanes = [0.0; LANES];
     let (xs, ys) = (x.chunks_exact(LANES), y.chunks_exact(LANES));
     let (x_tail, y_tail) = (xs.remainder(), ys.remainder());
     for (a, b) in xs.zip(ys) {
         for i in 0..LANES {
-            lanes[i] += a[i] * b[i];
+            lanes[i] += (a[i] - centre) * b[i];
         }
     }
     for ((lane, a), b) in lanes.iter_mut().zip(x_tail).zip(y_tail) {
-        *lane += a * b;
+        *lane += (a - centre) * b;
     }
     fold_lanes(&lanes)
 }
