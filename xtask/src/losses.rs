@@ -5,6 +5,7 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_metrics::wosac::Scores;
 use gump_model::train::StepReport;
 use gump_viz::{Chart, Series};
 
@@ -23,7 +24,16 @@ struct Row {
     learning_rate: f64,
     gradient_norm: f64,
     tokens: usize,
-    validation: Option<f64>,
+    validation: Option<Validation>,
+}
+
+/// What held-out scenes said after a step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Validation {
+    loss: f64,
+    /// Where they were imagined: realism (2025), and the distance of the best future from the log in
+    /// metres.
+    imagined: Option<(f64, f64)>,
 }
 
 /// The curves of a run.
@@ -34,7 +44,7 @@ pub(crate) struct Losses {
 }
 
 const HEADER: &str = "step,total,state,control,trajectory,reconstruction,learning_rate,\
-                      gradient_norm,tokens,validation";
+                      gradient_norm,tokens,validation,realism,min_ade";
 
 impl Losses {
     /// Reads the rows up to `steps` of an earlier part of the run.
@@ -71,10 +81,11 @@ impl Losses {
         self.last = Some(report);
     }
 
-    /// Notes the validation loss after the last step.
-    pub(crate) fn push_validation(&mut self, step: usize, loss: f64) {
+    /// Notes the validation loss after the last step, and the scores of what was imagined.
+    pub(crate) fn push_validation(&mut self, step: usize, loss: f64, scores: Option<&Scores>) {
         if let Some(row) = self.rows.last_mut().filter(|row| row.step == step) {
-            row.validation = Some(loss);
+            let imagined = scores.map(|scores| (scores.metametric, scores.min_ade));
+            row.validation = Some(Validation { loss, imagined });
         }
     }
 
@@ -95,7 +106,14 @@ impl Losses {
 
     /// The latest validation loss.
     pub(crate) fn last_validation(&self) -> Option<f64> {
-        self.rows.iter().rev().find_map(|row| row.validation)
+        let mut rows = self.rows.iter().rev();
+        rows.find_map(|row| Some(row.validation?.loss))
+    }
+
+    /// The latest realism of held-out scenes.
+    pub(crate) fn last_realism(&self) -> Option<f64> {
+        let mut rows = self.rows.iter().rev();
+        rows.find_map(|row| Some(row.validation?.imagined?.0))
     }
 
     /// Tokens presented after `step`.
@@ -130,16 +148,33 @@ impl Losses {
                 self.curve("control", |row| row.control),
                 Series {
                     name: "validation".into(),
-                    points: self
-                        .rows
-                        .iter()
-                        .filter_map(|row| Some((row.step as f64, row.validation?)))
-                        .collect(),
+                    points: self.validations(|validation| Some(validation.loss)),
                     ..Series::default()
                 },
             ],
             ..Chart::default()
         })
+    }
+
+    /// Realism over the run; `None` where nothing was imagined.
+    pub(crate) fn realism_chart(&self) -> Option<Chart> {
+        let points = self.validations(|validation| Some(validation.imagined?.0));
+        (!points.is_empty()).then(|| Chart {
+            x_label: "step".into(),
+            y_label: "realism (2025) of held-out scenes".into(),
+            series: vec![Series {
+                name: "realism".into(),
+                points,
+                ..Series::default()
+            }],
+            ..Chart::default()
+        })
+    }
+
+    fn validations(&self, of: impl Fn(&Validation) -> Option<f64>) -> Vec<(f64, f64)> {
+        let rows = self.rows.iter();
+        rows.filter_map(|row| Some((row.step as f64, of(row.validation.as_ref()?)?)))
+            .collect()
     }
 
     /// A curve of means over equal runs of steps.
@@ -172,6 +207,8 @@ impl Row {
             norm,
             tokens,
             validation,
+            realism,
+            min_ade,
         ] = cells.as_slice()
         else {
             return None;
@@ -186,9 +223,15 @@ impl Row {
             learning_rate: rate.parse().ok()?,
             gradient_norm: norm.parse().ok()?,
             tokens: tokens.parse().ok()?,
-            validation: match *validation {
-                "" => None,
-                number => Some(number.parse().ok()?),
+            validation: match (*validation, *realism, *min_ade) {
+                ("", "", "") => None,
+                (loss, realism, min_ade) => Some(Validation {
+                    loss: loss.parse().ok()?,
+                    imagined: match realism {
+                        "" => None,
+                        realism => Some((realism.parse().ok()?, min_ade.parse().ok()?)),
+                    },
+                }),
             },
         })
     }
@@ -206,11 +249,14 @@ impl Row {
             tokens,
             validation,
         } = self;
-        let validation = validation.map_or(String::new(), |loss| loss.to_string());
+        let (realism, min_ade) = validation.and_then(|said| said.imagined).unzip();
+        let told = |number: Option<f64>| number.map_or(String::new(), |number| number.to_string());
+        let [validation, realism, min_ade] =
+            [validation.map(|said| said.loss), realism, min_ade].map(told);
         writeln!(
             text,
             "{step},{total},{state},{control},{trajectory},{reconstruction},{learning_rate},\
-             {gradient_norm},{tokens},{validation}"
+             {gradient_norm},{tokens},{validation},{realism},{min_ade}"
         )
         .expect("writing to a string cannot fail");
     }
@@ -234,6 +280,9 @@ mod tests {
     use super::*;
     use gump_model::LossParts;
 
+    const IMAGINED: (f64, f64) = (0.8, 2.5);
+
+    /// With a validation at the end, and one where futures were imagined in the middle.
     fn losses(n: usize) -> Losses {
         let mut losses = Losses::default();
         for step in 1..=n {
@@ -249,7 +298,11 @@ mod tests {
                 tokens: 10,
             });
         }
-        losses.push_validation(n, 0.25);
+        losses.push_validation(n, 0.25, None);
+        losses.rows[n / 2].validation = Some(Validation {
+            loss: 0.5,
+            imagined: Some(IMAGINED),
+        });
         losses
     }
 
@@ -263,6 +316,10 @@ mod tests {
         let cut = Losses::read(&path, 3).unwrap();
         assert_eq!((cut.rows.len(), cut.last_validation()), (3, None));
         assert_eq!(written.tokens_since(3), 40);
+        assert_eq!(written.last_validation(), Some(0.25));
+        assert_eq!(written.last_realism(), Some(IMAGINED.0));
+        assert_eq!(written.realism_chart().unwrap().series[0].points.len(), 1);
+        assert!(cut.realism_chart().is_none());
     }
 
     #[test]

@@ -20,21 +20,23 @@ struct Workplace {
 impl Workplace {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let scene = |speed: f64, name: &str| {
+        let scene = |speed: f64, future_s: f64, name: &str| {
             let text = format!(
                 "lane 1: -50,0 350,0 speed 15 width 3.5
+                 edge: -50,-5 350,-5
                  ego vehicle 0: 0,0 velocity 8,0
                  agent vehicle 1: 30,0 velocity {speed},0
-                 history 1.0 future 4.0 dt 0.1"
+                 history 1.0 future {future_s} dt 0.1"
             );
             let mut scene = gump_scene::fixture::scenario(&text).unwrap();
-            scene.id = name.into();
-            let path = folder.path().join(format!("data/{name}/scene.tfrecord"));
+            scene.id = name.replace('/', "-");
+            let path = folder.path().join(format!("{name}/scene.tfrecord"));
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             gump_data::womd::write_scenarios(&path, [scene]).unwrap();
         };
-        scene(6.0, "first");
-        scene(2.0, "more");
+        scene(6.0, 4.0, "data/first");
+        scene(2.0, 4.0, "data/more");
+        scene(4.0, 8.0, "held-out");
         let place = Self { folder };
         fs::write(place.path("c.toml"), place.config()).unwrap();
         place
@@ -148,6 +150,28 @@ fn a_full_disk_and_a_kill_leave_the_last_checkpoint() {
     let weights = |out: &str| checkpoint::load(&place.path(out), &Device::Cpu).unwrap();
     let [a, b] = ["broken", "whole"].map(|out| weights(&format!("{out}/weights.safetensors")));
     assert!(numbers(&a) == numbers(&b));
+}
+
+#[test]
+fn realism_is_told_of_scenes_on_which_it_is_defined() {
+    let place = Workplace::new();
+    let words = "c.toml --steps 2 --realism-rollouts 1";
+    let results = place.results(&format!("{words} --validation held-out"), "out");
+    let realism = results["validation_realism"].as_f64().unwrap();
+    assert!(realism > 0.0 && realism < 1.0, "{realism}");
+    let losses = losses(&place.path("out"));
+    let last: Vec<&str> = losses.lines().last().unwrap().split(',').collect();
+    let written: f64 = last[last.len() - 2].parse().unwrap();
+    assert!((written - realism).abs() < 1e-12, "{losses}");
+    assert!(place.path("out/realism.svg").is_file());
+    // The same again: what is imagined changes nothing that is learned.
+    let alone = "c.toml --steps 2 --realism-rollouts 0 --validation held-out";
+    let without = place.results(alone, "without");
+    assert_eq!(without["validation_loss"], results["validation_loss"]);
+    assert!(without["validation_realism"].is_null());
+    // Four seconds of future are too few.
+    let short = place.results(&format!("{words} --validation data/more"), "short");
+    assert!(short["validation_loss"].is_f64() && short["validation_realism"].is_null());
 }
 
 #[test]

@@ -11,7 +11,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{Result, Tensor};
+use candle_core::{DType, Result, Tensor};
 use gump_scene::Seed;
 use gump_tokenizer::N_CLASSES;
 
@@ -57,6 +57,8 @@ impl LayerNorm {
 pub(crate) struct Linear {
     weight: Tensor,
     bias: Option<Tensor>,
+    /// In what the product is computed.
+    product: DType,
 }
 
 impl Linear {
@@ -89,6 +91,7 @@ impl Linear {
         let weight = scope.get("weight", (outputs, inputs), weight)?;
         Ok(Self {
             weight,
+            product: scope.products(),
             bias: bias
                 .map(|init| scope.get("bias", outputs, init))
                 .transpose()?,
@@ -96,6 +99,9 @@ impl Linear {
     }
 
     pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        if self.product != DType::F32 {
+            return ops::reduced_linear(x, &self.weight, self.bias.as_ref(), self.product);
+        }
         ops::linear(x, &self.weight, self.bias.as_ref())
     }
 

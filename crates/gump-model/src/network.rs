@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use gump_raster::{Raster, RasterSpec};
 use gump_scene::Seed;
 
@@ -69,6 +69,15 @@ impl Network {
             visual,
             trajectory_heads,
         })
+    }
+
+    /// The same network, whose matrices are multiplied in another type; its parameters and all else
+    /// keep theirs.
+    pub(crate) fn multiplying_in(self, products: DType) -> Result<Self, ModelError> {
+        let all = self.parameters.all();
+        let tensors = all.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
+        let parameters = Parameters::loaded(tensors.collect(), self.device());
+        Self::build(self.config, parameters.multiplied_in(products))
     }
 
     /// The shape it was built from.

@@ -20,6 +20,11 @@ pub struct OptimizerConfig {
     pub warmup: usize,
     /// Learning rate at the end of the cosine, as a fraction of the peak.
     pub final_fraction: f64,
+    /// Where in the run, as fractions of it, the rate is multiplied by `drop`; with any, the rate is
+    /// constant between them and there is no cosine.
+    pub milestones: Vec<f64>,
+    /// What the rate is multiplied by at each milestone.
+    pub drop: f64,
     /// Decoupled weight decay of matrices (paper: 1e-3); norms, biases, tables and gates have none.
     pub weight_decay: f64,
     /// Largest gradient norm; larger ones are scaled down (released code: 5).
@@ -32,6 +37,8 @@ impl Default for OptimizerConfig {
             learning_rate: 2e-4,
             warmup: 200,
             final_fraction: 0.05,
+            milestones: Vec::new(),
+            drop: 0.1,
             weight_decay: 1e-3,
             clip: 5.0,
         }
@@ -44,10 +51,35 @@ impl OptimizerConfig {
         if step < self.warmup {
             return self.learning_rate * (step + 1) as f64 / self.warmup as f64;
         }
+        if !self.milestones.is_empty() {
+            let is_passed = |at: &&f64| step as f64 >= **at * total as f64;
+            let passed = self.milestones.iter().filter(is_passed).count();
+            return self.learning_rate * self.drop.powi(passed as i32);
+        }
         let span = total.saturating_sub(self.warmup).max(1);
         let t = ((step - self.warmup) as f64 / span as f64).min(1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * t).cos());
         self.learning_rate * (self.final_fraction + (1.0 - self.final_fraction) * cosine)
+    }
+
+    /// Checks the numbers that mean nothing outside of a range.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming the first.
+    pub(crate) fn validate(&self) -> std::result::Result<(), ModelError> {
+        let is_inside = |share: &f64| *share > 0.0 && *share < 1.0;
+        let ascend = self.milestones.is_sorted_by(|a, b| a < b);
+        if !ascend || !self.milestones.iter().all(is_inside) {
+            return Err(ModelError::Config(format!(
+                "milestones are {:?}, expected ascending fractions of the run between 0 and 1",
+                self.milestones
+            )));
+        }
+        if !(self.drop > 0.0 && self.drop <= 1.0) {
+            let drop = self.drop;
+            return Err(ModelError::Config(format!("drop {drop} is not in 0..1")));
+        }
+        Ok(())
     }
 }
 

@@ -32,6 +32,8 @@ pub struct Parameters {
     loaded: Option<BTreeMap<String, Tensor>>,
     device: Device,
     seed: Seed,
+    /// In what the network's matrices are multiplied.
+    products: DType,
 }
 
 impl Parameters {
@@ -43,6 +45,7 @@ impl Parameters {
             loaded: None,
             device: device.clone(),
             seed,
+            products: DType::F32,
         }
     }
 
@@ -52,6 +55,11 @@ impl Parameters {
             loaded: Some(tensors),
             ..Self::random(Seed(0), device)
         }
+    }
+
+    /// The same store, for a network whose matrices are multiplied in this type.
+    pub(crate) fn multiplied_in(self, products: DType) -> Self {
+        Self { products, ..self }
     }
 
     /// Where the parameters live.
@@ -166,6 +174,11 @@ impl Scope<'_> {
             store: self.store,
             prefix,
         }
+    }
+
+    /// In what matrices are multiplied.
+    pub(crate) fn products(&self) -> DType {
+        self.store.products
     }
 
     /// A trainable parameter.

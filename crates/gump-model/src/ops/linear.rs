@@ -3,7 +3,7 @@
 //! What lives here: the fused operation, whose gradients never copy a transposed matrix. What does
 //! not: the parameters, which the network holds.
 
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, Layout, Result, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, DType, Layout, Result, Shape, Tensor};
 
 use super::gemm::{Mat, MatMut, Store, Threads, gemm};
 use super::rows::{column_sums, for_pieces, rows_per_task};
@@ -31,6 +31,24 @@ pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tens
         }
         None if fusible(&[x, weight]) => x.contiguous()?.apply_op2(&weight.contiguous()?, Linear),
         _ => composed(x, weight, bias),
+    }
+}
+
+/// [`linear`] whose product, forward and backward, is computed in a shorter type; the bias is added
+/// in that of `x`, which the result has.
+///
+/// Error: as [`linear`], or a product that the device does not have.
+pub fn reduced_linear(
+    x: &Tensor,
+    weight: &Tensor,
+    bias: Option<&Tensor>,
+    product: DType,
+) -> Result<Tensor> {
+    let y = composed(&x.to_dtype(product)?, &weight.to_dtype(product)?, None)?;
+    let y = y.to_dtype(x.dtype())?;
+    match bias {
+        Some(bias) => y.broadcast_add(bias),
+        None => Ok(y),
     }
 }
 

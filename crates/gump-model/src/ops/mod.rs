@@ -31,7 +31,7 @@ pub use conv::conv2d;
 pub use gelu::gelu;
 pub use gemm::square_product;
 pub use gru::gru;
-pub use linear::linear;
+pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
 

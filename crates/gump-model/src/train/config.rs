@@ -27,6 +27,9 @@ pub struct TrainConfig {
     /// forgets where it began.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema: Option<f64>,
+    /// Whether a device multiplies the network's matrices in bfloat16; parameters, sums, norms and
+    /// the optimiser stay in 32 bits. Not for a processor, which would gain nothing.
+    pub mixed_precision: bool,
     /// How samples are drawn.
     pub sample: SampleConfig,
     /// What is minimised.
@@ -47,6 +50,7 @@ impl Default for TrainConfig {
             accumulate: 1,
             seed: 0,
             ema: None,
+            mixed_precision: false,
             sample: SampleConfig::default(),
             loss: LossConfig::default(),
             optimizer: OptimizerConfig::default(),
@@ -71,6 +75,7 @@ impl TrainConfig {
                 self.batch, self.accumulate
             ));
         }
+        self.optimizer.validate()?;
         match self.ema {
             Some(ema) if !(0.0..1.0).contains(&ema) => fail(format!("ema {ema} is not in 0..1")),
             _ => Ok(()),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 
 use super::config::TrainConfig;
 use super::gradients::Gradients;
@@ -116,6 +116,29 @@ impl Learner {
     /// Ends the run and keeps the network to ship.
     pub(super) fn into_shipped(self) -> Network {
         self.average.unwrap_or(self.network)
+    }
+
+    /// Lets a device multiply in fewer bits, if the run is to.
+    ///
+    /// Error: [`ModelError::Config`] on a processor.
+    pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, ModelError> {
+        if !config.mixed_precision {
+            return Ok(self);
+        }
+        if self.network.device().is_cpu() {
+            let what = "mixed_precision needs a device that multiplies bfloat16, and a processor \
+                        does not: leave it away, or use --device cuda";
+            return Err(ModelError::Config(what.into()));
+        }
+        Ok(Self {
+            network: self.network.multiplying_in(DType::BF16)?,
+            ..self
+        })
+    }
+
+    /// A copy of the network to ship.
+    pub(super) fn snapshot(&self) -> Result<Network, ModelError> {
+        build_like(self.shipped(), copies(self.shipped())?)
     }
 
     /// The network that drives the scenes of closed-loop training.

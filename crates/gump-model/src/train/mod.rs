@@ -111,6 +111,7 @@ impl Trainer {
         scenarios: Box<dyn Scenes>,
     ) -> Result<Self, ModelError> {
         config.validate(1)?;
+        let learner = learner.in_precision_of(&config)?;
         if scenarios.is_empty() {
             return Err(ModelError::NoData {
                 frames: config.sample.frames,
@@ -301,6 +302,14 @@ impl Trainer {
     /// The network to use, as it is now: the moving average where one is kept.
     pub fn network(&self) -> &Network {
         self.learner.shipped()
+    }
+
+    /// A copy of that network, for a world that imagines while training goes on.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn snapshot(&self) -> Result<Network, ModelError> {
+        self.learner.snapshot()
     }
 
     /// Ends the run and keeps the network to use.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Barrier, Mutex};
 
-use candle_core::Device;
+use candle_core::{DType, Device};
 use gump_rollout::{Start, WorldModel};
 use gump_scene::{Scenario, Seed, fixture};
 
@@ -110,6 +110,59 @@ fn check_resumed(config: &TrainConfig) {
 #[test]
 fn a_resumed_run_is_the_unbroken_run() {
     check_resumed(&config(6));
+}
+
+#[test]
+fn half_the_bits_find_the_same_gradient() {
+    let mut trainer = trainer(4, 2.0);
+    let samples = trainer.next.recv().unwrap().unwrap();
+    let whole = trainer.differentiate(&samples).unwrap();
+    let network = trainer.learner.snapshot().unwrap();
+    // A processor has products in float16, a device in bfloat16; the way is the same.
+    trainer.learner.network = network.multiplying_in(DType::F16).unwrap();
+    let half = trainer.differentiate(&samples).unwrap();
+    let [a, b] = [&whole, &half].map(|found| found.loss.total);
+    assert!(a != b && (a - b).abs() < 0.01 * a, "{a} and {b}");
+    let numbers = |found: &Found| -> Vec<f64> {
+        let all = found.gradients.values();
+        all.flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+            .map(f64::from)
+            .collect()
+    };
+    let (a, b) = (numbers(&whole), numbers(&half));
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let cosine = dot(&a, &b) / (dot(&a, &a) * dot(&b, &b)).sqrt();
+    assert!(cosine > 0.999, "{cosine}");
+}
+
+#[test]
+fn a_processor_mixes_no_precisions() {
+    let config = TrainConfig {
+        mixed_precision: true,
+        ..config(4)
+    };
+    let refused = Trainer::new(model(), config, vec![scenario(1.0)], &Device::Cpu);
+    let error = refused.err().unwrap().to_string();
+    assert!(error.contains("--device cuda"), "{error}");
+}
+
+#[test]
+fn rates_fall_at_milestones() {
+    let optimizer = OptimizerConfig {
+        learning_rate: 1.0,
+        warmup: 2,
+        milestones: vec![0.5, 0.8],
+        drop: 0.5,
+        ..OptimizerConfig::default()
+    };
+    let rates: Vec<f64> = (0..10).map(|step| optimizer.rate(step, 10)).collect();
+    assert_eq!(rates, [0.5, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.25, 0.25]);
+    for milestones in [vec![0.8, 0.5], vec![0.0], vec![0.5, 1.0]] {
+        let mut wrong = config(4);
+        wrong.optimizer.milestones = milestones;
+        let error = wrong.validate(1).unwrap_err().to_string();
+        assert!(error.contains("milestones"), "{error}");
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! `train`: a world model from scenarios, in one stage or several, by one process or several.
 
+mod realism;
 mod stages;
 
 use std::path::{Path, PathBuf};
@@ -9,10 +10,11 @@ use anyhow::Context as _;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::train::{Peers as _, StepReport};
 use gump_model::{Device, LossParts, Network, RunConfig, Trainer};
-use gump_scene::Scenario;
+use gump_scene::{Scenario, Seed};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
+use self::realism::Judge;
 use self::stages::Stage;
 use crate::cli::WrongArguments;
 use crate::dataset::{self, Part, Split, Training};
@@ -62,6 +64,10 @@ pub(crate) struct Args {
     /// Go on with the run in --out, with the configuration it began with
     #[arg(long)]
     resume: bool,
+    /// Futures of each of up to 8 validation scenes, whose realism is told ten times in a run; 0
+    /// tells the loss alone
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    realism_rollouts: usize,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -154,9 +160,15 @@ impl Args {
             std::fs::create_dir_all(&folder)
                 .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         }
+        let seed = Seed(trainer.config().seed).fork(9);
+        let judge = Judge::new(&validation, self.realism_rollouts, seed).filter(|_| writes);
+        let held_out = HeldOut {
+            scenarios: &validation,
+            judge,
+        };
         let began = Instant::now();
         let trained = run.phase("train", |run| {
-            learn(run, stage, &mut trainer, &mut losses, &validation, writes)
+            learn(run, stage, &mut trainer, &mut losses, &held_out, writes)
         });
         // A failed step changes nothing, so what was learned before it is worth keeping.
         if writes {
@@ -173,6 +185,9 @@ impl Args {
         run.result("loss_first", losses.mean_of_first(WINDOW))?;
         run.result("loss_last", losses.mean_of_last(WINDOW))?;
         run.result("validation_loss", losses.last_validation())?;
+        run.result("validation_realism", losses.last_realism())?;
+        let judged = held_out.judge.as_ref().map_or(0, Judge::scenes);
+        run.setting("realism_scenes", judged)?;
         if let Some(last) = losses.last() {
             run.result("loss_per_field", per_field(last))?;
         }
@@ -232,13 +247,20 @@ fn load(weights: &Path, stage: &Stage, device: &Device) -> anyhow::Result<Networ
     Ok(network)
 }
 
+/// What a stage is validated on.
+struct HeldOut<'a> {
+    scenarios: &'a [Scenario],
+    /// Scores what the network imagines of them, where this process does and it can be scored.
+    judge: Option<Judge<'a>>,
+}
+
 /// Steps until the run is done, it is to stop, or Ctrl-C.
 fn learn(
     run: &Run,
     stage: &Stage,
     trainer: &mut Trainer,
     losses: &mut Losses,
-    validation: &[Scenario],
+    held_out: &HeldOut<'_>,
     writes: bool,
 ) -> anyhow::Result<()> {
     let total = trainer.config().steps;
@@ -257,9 +279,14 @@ fn learn(
         progress.advance(1);
         let done = report.step;
         losses.push(report);
-        if !validation.is_empty() && (done.is_multiple_of(validate_every) || done == total) {
-            let loss = trainer.validate(validation, VALIDATION_SAMPLES)?;
-            losses.push_validation(done, loss.total);
+        let is_due = done.is_multiple_of(validate_every) || done == total;
+        if is_due && !held_out.scenarios.is_empty() {
+            let loss = trainer.validate(held_out.scenarios, VALIDATION_SAMPLES)?;
+            let scores = match &held_out.judge {
+                Some(judge) => judge.score(trainer)?,
+                None => None,
+            };
+            losses.push_validation(done, loss.total, scores.as_ref());
         }
         if writes && saved.elapsed() > CHECKPOINT_EVERY {
             write(run, stage, trainer, losses)?;
@@ -278,6 +305,9 @@ fn write(run: &Run, stage: &Stage, trainer: &Trainer, losses: &Losses) -> anyhow
     checkpoint::save(trainer.network(), &path(WEIGHTS), Precision::Half)?;
     if let Some(chart) = losses.chart() {
         chart.save(&path("losses"))?;
+    }
+    if let Some(chart) = losses.realism_chart() {
+        chart.save(&path("realism"))?;
     }
     Ok(())
 }

@@ -1,0 +1,77 @@
+//! Realism while training: the network as it is imagines held-out scenes, which are scored as in
+//! the Waymo Sim Agents Challenge of 2025.
+
+use gump_metrics::wosac::{Config, Log, Reference, Rollouts, Scores, Year};
+use gump_model::world::TransformerWorld;
+use gump_model::{SamplingConfig, Trainer};
+use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_scene::{Scenario, Seed};
+
+use crate::run::stop_if_interrupted;
+
+/// Scenes that are imagined, at most: what is told between two steps has to be quick.
+const SCENES: usize = 8;
+/// Seconds that the challenge asks for.
+const HORIZON_S: f64 = 8.0;
+
+/// Held-out scenes that can be scored.
+pub(super) struct Judge<'a> {
+    scenes: Vec<(&'a Scenario, Log)>,
+    config: Config,
+    rollouts: usize,
+    seed: Seed,
+}
+
+impl<'a> Judge<'a> {
+    /// The first of the scenes on which the challenge is defined, with so many rollouts of each;
+    /// none if there is no such scene or no rollout is asked for.
+    pub(super) fn new(scenes: &'a [Scenario], rollouts: usize, seed: Seed) -> Option<Self> {
+        let config = Config::of(Year::Y2025);
+        let scored = scenes.iter().filter_map(|scenario| {
+            let log = Log::of(scenario).ok()?;
+            let is_defined = Reference::new(&log, &config).is_ok();
+            is_defined.then_some((scenario, log))
+        });
+        let scenes: Vec<_> = scored.take(if rollouts > 0 { SCENES } else { 0 }).collect();
+        (!scenes.is_empty()).then_some(Self {
+            scenes,
+            config,
+            rollouts,
+            seed,
+        })
+    }
+
+    /// How many scenes there are.
+    pub(super) fn scenes(&self) -> usize {
+        self.scenes.len()
+    }
+
+    /// Mean scores over the scenes.
+    ///
+    /// Error: what the world reports, or Ctrl-C.
+    pub(super) fn score(&self, trainer: &Trainer) -> anyhow::Result<Option<Scores>> {
+        let world = TransformerWorld::new(trainer.snapshot()?, SamplingConfig::default());
+        let mut all = Vec::with_capacity(self.scenes.len());
+        for (i, (scenario, log)) in self.scenes.iter().enumerate() {
+            stop_if_interrupted()?;
+            let start = Start {
+                scene: scenario.present(),
+                n_futures: self.rollouts,
+                seed: self.seed.fork(i as u64),
+            };
+            let config = SimulateConfig {
+                seconds: HORIZON_S,
+                ..SimulateConfig::default()
+            };
+            let imagined = simulate(&world, &[start], None, &config)
+                .map_err(|error| anyhow::anyhow!("{}: {error}", scenario.id))?;
+            let rollouts = Rollouts::of(&scenario.id, &imagined, self.config.mode)?;
+            all.push(
+                Reference::new(log, &self.config)?
+                    .evaluate(&rollouts)?
+                    .scores,
+            );
+        }
+        Ok(Scores::mean(&all))
+    }
+}
