@@ -313,6 +313,8 @@ fn tell(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
     let holding = made.iter().filter(|made| made.holds()).count();
     run.result("holding", holding as f64 / n)?;
     run.result("attempts", made.iter().map(|m| m.attempts).sum::<usize>())?;
+    let steered = made.iter().filter(|made| made.is_steered).count();
+    run.result("steered", steered as f64 / n)?;
     let redraws: usize = made.iter().map(|made| made.scene.redraws).sum();
     run.result("redraws", redraws)?;
     let restarts: usize = made.iter().map(|made| made.scene.restarts).sum();
@@ -326,7 +328,8 @@ fn agents(made: &Made) -> usize {
 }
 
 fn count(made: &Made, wanted: impl Fn(AgentKind) -> bool) -> usize {
-    let agents = made.scene.frame.agents().iter();
+    let present = made.scenario.present();
+    let agents = present.now().agents().iter();
     agents.filter(|agent| wanted(agent.kind)).count()
 }
 

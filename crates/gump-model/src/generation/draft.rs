@@ -133,8 +133,11 @@ impl<'a> Draft<'a> {
             (spec.x, spec.y, spec.heading) = (Some(zero), Some(zero), Some(zero));
             (spec.behind, spec.ahead_of) = (None, None);
         }
-        self.prepared
-            .rules(key.kind, &spec, &self.boxes, &self.named)
+        let mut taken = self.boxes.clone();
+        if !key.is_ego() {
+            taken.extend_from_slice(&self.prepared.fixtures);
+        }
+        self.prepared.rules(key.kind, &spec, &taken, &self.named)
     }
 
     /// What is given of the ego, per step of the decoder.

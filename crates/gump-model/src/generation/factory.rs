@@ -1,20 +1,20 @@
-//! Scenes that hold what was asked: made, imagined a little further, judged, and made again.
+//! Scenes that hold what was asked: put where that can be, made, imagined a little further, judged,
+//! and made again.
+//!
+//! A prompt is looked for first in what the world makes of the scene by itself, and then in a drive
+//! of the ego that is what the prompt says (`drive`), to which the world makes the others react.
 
 use std::ops::Range;
-use std::sync::Arc;
 
-use gump_rollout::{SimulateConfig, Start, simulate};
-use gump_scene::{Rollout, Scenario, Seed};
+use gump_metrics::tags;
+use gump_scene::{Scenario, ScenarioTag, Seed};
 use rayon::prelude::*;
 
 use super::prompt::Cast;
+use super::stage::{Search, Stage, any_start};
 use super::verdict::{Clause, verdict};
-use super::{GenerateError, GenerateRequest, GeneratedScene, Placement};
-use crate::ModelError;
+use super::{GenerateError, GenerateRequest, GeneratedScene, Placement, takes};
 use crate::world::TransformerWorld;
-
-/// Seconds that are imagined to judge a prompt about what is beginning.
-const JUDGED_S: f64 = 4.0;
 
 /// What a factory makes.
 #[derive(Clone, Debug)]
@@ -33,14 +33,19 @@ pub struct Order {
 /// A scene that was ordered.
 #[derive(Clone, Debug)]
 pub struct Made {
-    /// The scene.
+    /// The scene that was made first.
     pub scene: GeneratedScene,
-    /// It and what was imagined of its future, at 10 Hz.
+    /// What was imagined of its future, at 10 Hz. The present is the moment that is what the prompts
+    /// say, at most two seconds later; up to a second before it is kept.
     pub scenario: Scenario,
-    /// The verdict on it.
+    /// The verdict on the present.
     pub clauses: Vec<Clause>,
     /// Scenes made until this one; it is the last, whether it holds or not.
     pub attempts: usize,
+    /// Whether the ego was driven as the prompts say, rather than by the world.
+    pub is_steered: bool,
+    /// Seconds from the scene that was made to the present.
+    pub moment_s: f64,
 }
 
 impl Made {
@@ -76,16 +81,31 @@ pub fn make_many(
     let numbered: Vec<_> = numbers.zip(scenes).collect();
     let made = numbered.into_par_iter().map(|(number, scene)| {
         let scene = scene?;
-        let seed = stream(number).fork(2);
-        let scenario = imagined(world, order, request, &scene, number, seed)?;
+        let mut scenario = scene.scenario(name(number), &request.map, &[]);
+        takes::extend(world, &mut scenario, order.seconds, stream(number).fork(2))?;
         Ok(Made {
             clauses: verdict(&scenario, &[], request.counts.as_ref()),
             scene,
             scenario,
             attempts: 1,
+            is_steered: false,
+            moment_s: 0.0,
         })
     });
     Ok(made.collect())
+}
+
+/// Whether a map admits the prompts of a request: somewhere within 150 m of the request's ego, one
+/// alone with those whom the prompts are about, driving along lanes, is what they say.
+///
+/// That needs no network, and says nothing of whether a scene will hold them.
+pub fn admits(request: &GenerateRequest, seed: Seed) -> bool {
+    let search = Search {
+        cast: &Cast::of(&request.prompts),
+        request,
+        prompts: &request.prompts,
+    };
+    search.anywhere(seed).is_some()
 }
 
 /// Makes scene number `number` of an order.
@@ -99,26 +119,12 @@ pub fn make(
     seed: Seed,
 ) -> Result<Made, GenerateError> {
     let seed = seed.fork(number);
-    let request = &order.request;
-    let is_guided = request.config.placement == Placement::Guided;
-    let cast = Cast::of(&request.prompts);
+    let mut place = Place::new(order);
     let mut failure = None;
     let mut last: Option<Made> = None;
     for attempt in 0..order.attempts.max(1) {
         let stream = seed.fork(attempt as u64);
-        let mut request = request.clone();
-        let searches = is_guided && !request.prompts.is_empty();
-        // The place asked for goes first, if the prompt needs no other.
-        if order.roams || (searches && attempt > 0) {
-            let (map, lights) = (Arc::clone(&request.map), request.lights.clone());
-            let (prompts, around) = (request.prompts.clone(), request.ego);
-            request.ego = cast.start(&map, &lights, &prompts, around, stream.fork(0));
-        }
-        if searches {
-            request.objects = cast.with(&request.objects);
-            let map = Arc::clone(&request.map);
-            cast.on_crosswalk(&map, request.ego.pose, &mut request.objects);
-        }
+        let (request, stage) = place.next(attempt, stream.fork(0));
         let made = world.generate(&request, &[stream.fork(1)]);
         let scene = match made.map(|mut scenes| scenes.remove(0)) {
             Ok(Ok(scene)) => scene,
@@ -131,14 +137,15 @@ pub fn make(
                 _ => return Err(error),
             },
         };
-        let scenario = imagined(world, order, &request, &scene, number, stream.fork(2))?;
-        let clauses = verdict(&scenario, &request.prompts, request.counts.as_ref());
         let made = Made {
+            scenario: scene.scenario(name(number), &request.map, &request.prompts),
             scene,
-            scenario,
-            clauses,
+            clauses: Vec::new(),
             attempts: attempt + 1,
+            is_steered: false,
+            moment_s: 0.0,
         };
+        let made = judged(world, order, made, stage.as_ref(), stream)?;
         if made.holds() {
             return Ok(made);
         }
@@ -151,40 +158,90 @@ pub fn make(
     }
 }
 
-/// The scene with as much of its future as is asked for or needed to judge it.
-fn imagined(
+/// Where the scenes of an order are put, attempt by attempt.
+struct Place<'a> {
+    order: &'a Order,
+    cast: Cast,
+    /// Whether a place is looked for that fits the prompts.
+    searches: bool,
+}
+
+impl<'a> Place<'a> {
+    fn new(order: &'a Order) -> Self {
+        let request = &order.request;
+        let is_guided = request.config.placement == Placement::Guided;
+        Self {
+            order,
+            cast: Cast::of(&request.prompts),
+            searches: is_guided && !request.prompts.is_empty(),
+        }
+    }
+
+    /// The request of an attempt, and the stage it is put on if one was found.
+    fn next(&mut self, attempt: usize, seed: Seed) -> (GenerateRequest, Option<Stage>) {
+        let (request, roams) = (&self.order.request, self.order.roams);
+        if self.searches {
+            let search = Search {
+                cast: &self.cast,
+                request,
+                prompts: &request.prompts,
+            };
+            // The place asked for goes first, if the prompt needs no other.
+            let here = (attempt == 0 && !roams).then(|| search.here(seed.fork(0)));
+            let stage = here.flatten().or_else(|| search.anywhere(seed.fork(1)));
+            if let Some(stage) = stage {
+                return (stage.direct(request), Some(stage));
+            }
+            // A map on which the prompts can hold nowhere is not searched again.
+            self.searches = false;
+        }
+        let mut request = request.clone();
+        if roams {
+            request.ego = any_start(&request.map, request.ego, seed);
+        }
+        (request, None)
+    }
+}
+
+/// The scene with as much of its future as is asked for or needed to judge it, and the verdict.
+fn judged(
     world: &TransformerWorld,
     order: &Order,
-    request: &GenerateRequest,
-    scene: &GeneratedScene,
-    number: u64,
-    seed: Seed,
-) -> Result<Scenario, GenerateError> {
-    let mut scenario = scene.scenario(
-        format!("generated-{number:06}"),
-        &request.map,
-        &request.prompts,
-    );
-    let judged = if request.prompts.is_empty() {
-        0.0
-    } else {
-        JUDGED_S
+    mut made: Made,
+    stage: Option<&Stage>,
+    stream: Seed,
+) -> Result<Made, GenerateError> {
+    let (prompts, counts) = (&order.request.prompts, order.request.counts.as_ref());
+    let is_tag = |scenario: &Scenario| {
+        let fails = |tag: &ScenarioTag| tags::holds(*tag, scenario) == Some(false);
+        !prompts.iter().any(fails)
     };
-    let seconds = order.seconds.max(judged);
-    if seconds > 0.0 {
-        let start = Start {
-            scene: scenario.present(),
-            n_futures: 1,
-            seed,
-        };
-        let config = SimulateConfig {
-            seconds,
-            ..SimulateConfig::default()
-        };
-        let rollouts = simulate(world, &[start], None, &config)
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
-        let future = rollouts.first().map_or(&[][..], Rollout::imagined);
-        scenario.log.extend_from_slice(future);
+    let holds = |scenario: &Scenario| {
+        let clauses = || verdict(scenario, &[], counts);
+        is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
+    };
+    if !prompts.is_empty() {
+        let mut found = takes::moment(takes::free(world, &made.scenario, stream.fork(2))?, holds);
+        if let (None, Some(stage)) = (&found, stage) {
+            let drive = stage.drive_from(made.scenario.present().ego_now());
+            let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;
+            found = takes::moment(steered, holds);
+            made.is_steered = found.is_some();
+        }
+        if let Some((scenario, seconds)) = found {
+            (made.scenario, made.moment_s) = (scenario, seconds);
+        }
     }
-    Ok(scenario)
+    let seconds = if prompts.is_empty() {
+        order.seconds
+    } else {
+        order.seconds.max(takes::JUDGED_S)
+    };
+    takes::extend(world, &mut made.scenario, seconds, stream.fork(4))?;
+    made.clauses = verdict(&made.scenario, prompts, counts);
+    Ok(made)
+}
+
+fn name(number: u64) -> String {
+    format!("generated-{number:06}")
 }

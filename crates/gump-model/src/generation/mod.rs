@@ -15,11 +15,15 @@ pub mod baseline;
 pub(crate) mod births;
 pub mod constraint;
 mod draft;
+mod drive;
 pub mod factory;
 pub(crate) mod ground;
 mod prepared;
 mod prompt;
+mod roadside;
 pub(crate) mod rules;
+mod stage;
+mod takes;
 #[cfg(test)]
 mod tests;
 pub mod verdict;

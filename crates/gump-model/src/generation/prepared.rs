@@ -30,6 +30,8 @@ pub(crate) struct Prepared<'a> {
     pub(super) objects: Vec<ObjectSpec>,
     grounds: BTreeMap<AgentKind, Arc<Ground>>,
     lanes: BTreeMap<i64, Arc<Ground>>,
+    /// Boxes of what stands around, scene frame.
+    pub(super) fixtures: Vec<OrientedBox>,
     pub(super) sampling: SamplingConfig,
 }
 
@@ -53,9 +55,17 @@ impl<'a> Prepared<'a> {
         let lanes = lane_grounds(request)?;
         let prompts = request.prompts.iter().copied().map(Some).collect();
         let scene = scene_of_ego(world, request)?;
+        let scene_from_world = scene.world_from_scene.inverse();
+        let fixtures = request.fixtures.iter().map(|agent| {
+            let mut own = agent.oriented_box();
+            own.pose = scene_from_world * own.pose;
+            own
+        });
+        let fixtures = fixtures.collect();
         let prepared = Self {
             request,
             scene,
+            fixtures,
             prompts,
             objects,
             grounds,

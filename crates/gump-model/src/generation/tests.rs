@@ -170,8 +170,8 @@ fn what_a_prompt_says_is_made_and_judged() {
     for made in made.into_iter().map(Result::unwrap) {
         assert_eq!(made.clauses[0].clause, "behind_bike");
         assert_eq!(made.clauses[0].holds, Some(true), "{:?}", made.clauses);
-        // Judging looks four seconds ahead.
-        assert_eq!(made.scenario.log.len(), 41);
+        // Judging looks four seconds ahead, and histories are a second long at most.
+        assert!(made.scenario.future().len() >= 40 && made.scenario.now <= 10);
     }
 }
 

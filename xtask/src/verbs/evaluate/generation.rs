@@ -39,7 +39,7 @@ pub(crate) struct Args {
     /// Recorded vehicles within 50 m that a scenario needs to take part
     #[arg(long, value_name = "N", default_value_t = 8)]
     min_vehicles: usize,
-    /// Scenarios on whose maps each tag is asked for; 0 leaves prompts out
+    /// Maps that each tag is asked for on, among those that admit it; 0 leaves prompts out
     #[arg(long, value_name = "N", default_value_t = 2)]
     prompt_maps: usize,
     /// Scenes made per prompt before the last one counts

@@ -1,14 +1,18 @@
 //! The prompts part of `evaluate generation`: how often scenes are what their prompt says.
+//!
+//! A tag is asked for on maps that admit it, which is found out without the network; a tag that no
+//! map given admits (a car park, an all-way stop) is listed and does not count.
 
 use gump_metrics::tags::{self, rules};
-use gump_model::generation::factory::{Order, make};
+use gump_model::generation::factory::{Order, admits, make};
 use gump_model::generation::{Counts, GenerateRequest};
 use gump_model::world::TransformerWorld;
-use gump_scene::{Scenario, ScenarioTag};
+use gump_scene::{Scenario, ScenarioTag, Seed};
+use rand::seq::SliceRandom as _;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use crate::run::Run;
+use crate::run::{Run, stop_if_interrupted};
 use crate::verbs::generate;
 
 /// Objects of the scenes that prompts are judged on.
@@ -19,26 +23,96 @@ const PROMPTED: Counts = Counts {
 };
 /// Seconds imagined of unprompted scenes to see which tags hold.
 const JUDGED_S: f64 = 4.0;
+/// Unprompted scenes per map that a tag is asked for on.
+const UNPROMPTED: usize = 16;
 
-/// Every decidable tag on some maps, against how often it holds without being asked for.
+/// How often tags hold: the mean over those that some map admits.
+#[derive(Default)]
+pub(super) struct Prompts {
+    /// Asked for, with every other clause.
+    pub(super) satisfaction: Option<f64>,
+    /// In scenes of the model that were not asked for anything.
+    pub(super) unconditional: Option<f64>,
+    /// In what was recorded.
+    pub(super) logged: Option<f64>,
+    /// One per tag.
+    pub(super) rows: Vec<Value>,
+}
+
+/// A scene that was asked for.
+struct Asked {
+    tag: usize,
+    holds: bool,
+    is_tag: bool,
+    attempts: usize,
+    is_steered: bool,
+    moment_s: f64,
+}
+
+/// Every decidable tag on up to `n_maps` maps that admit it, against how often it holds without
+/// being asked for.
 pub(super) fn satisfaction(
     run: &Run,
     world: &TransformerWorld,
     scenarios: &[Scenario],
-    prompt_maps: usize,
-    most_attempts: usize,
+    n_maps: usize,
+    attempts: usize,
 ) -> anyhow::Result<Prompts> {
-    let seed = run.seed();
-    let maps: Vec<&Scenario> = scenarios.iter().take(prompt_maps).collect();
-    if maps.is_empty() {
+    if n_maps == 0 {
         return Ok(Prompts::default());
     }
-    let tags: Vec<ScenarioTag> = rules()
-        .iter()
-        .filter(|rule| rule.is_decidable())
-        .map(|rule| rule.tag())
+    let seed = run.seed();
+    let decidable = rules().iter().filter(|rule| rule.is_decidable());
+    let tags: Vec<ScenarioTag> = decidable.map(|rule| rule.tag()).collect();
+    let mut shuffled: Vec<&Scenario> = scenarios.iter().collect();
+    shuffled.shuffle(&mut seed.fork(9).rng());
+    let places: Vec<Vec<&Scenario>> = tags
+        .par_iter()
+        .map(|tag| admitting(&shuffled, *tag, n_maps, seed.fork(10)))
         .collect();
-    let order = |recorded: &Scenario, tag: Option<ScenarioTag>| Order {
+    stop_if_interrupted()?;
+    let cases: Vec<(usize, &Scenario)> = (0..tags.len())
+        .flat_map(|tag| places[tag].iter().map(move |place| (tag, *place)))
+        .collect();
+    let progress = run.progress("prompts", cases.len() as u64, "scenes");
+    let asked: Vec<Asked> = (0..cases.len())
+        .into_par_iter()
+        .map(|number| {
+            let (tag, recorded) = cases[number];
+            let order = order(recorded, Some(tags[tag]), attempts);
+            let asked = ask(world, &order, tag, number as u64, seed.fork(7));
+            progress.advance(1);
+            asked
+        })
+        .collect();
+    let unasked: Vec<Vec<ScenarioTag>> = (0..n_maps * UNPROMPTED)
+        .into_par_iter()
+        .filter_map(|i| {
+            let order = order(shuffled[i % shuffled.len()], None, 1);
+            let made = make(world, &order, i as u64, seed.fork(8)).ok()?;
+            Some(tags::mine(&made.scenario))
+        })
+        .collect();
+    let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
+    Ok(summed(&tags, &asked, &unasked, &logged))
+}
+
+/// The first scenes whose maps admit a tag.
+fn admitting<'a>(
+    scenarios: &[&'a Scenario],
+    tag: ScenarioTag,
+    n: usize,
+    seed: Seed,
+) -> Vec<&'a Scenario> {
+    let admitting = scenarios.iter().copied().filter(|recorded| {
+        let order = order(recorded, Some(tag), 1);
+        admits(&order.request, seed)
+    });
+    admitting.take(n).collect()
+}
+
+fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Order {
+    Order {
         request: GenerateRequest {
             prompts: tag.into_iter().collect(),
             counts: Some(PROMPTED),
@@ -46,81 +120,105 @@ pub(super) fn satisfaction(
         },
         roams: tag.is_none(),
         seconds: JUDGED_S,
-        attempts: if tag.is_none() { 1 } else { most_attempts },
+        attempts,
+    }
+}
+
+fn ask(world: &TransformerWorld, order: &Order, tag: usize, number: u64, seed: Seed) -> Asked {
+    let prompt = order.request.prompts[0];
+    match make(world, order, number, seed) {
+        Ok(made) => Asked {
+            tag,
+            holds: made.holds(),
+            is_tag: tags::holds(prompt, &made.scenario) == Some(true),
+            attempts: made.attempts,
+            is_steered: made.is_steered,
+            moment_s: made.moment_s,
+        },
+        Err(_) => Asked {
+            tag,
+            holds: false,
+            is_tag: false,
+            attempts: order.attempts,
+            is_steered: false,
+            moment_s: 0.0,
+        },
+    }
+}
+
+fn summed(
+    tags: &[ScenarioTag],
+    asked: &[Asked],
+    unasked: &[Vec<ScenarioTag>],
+    logged: &[Vec<ScenarioTag>],
+) -> Prompts {
+    let share = |all: &[Vec<ScenarioTag>], tag: &ScenarioTag| {
+        let n = all.iter().filter(|tags| tags.contains(tag)).count();
+        n as f64 / all.len().max(1) as f64
     };
-    let progress = run.progress("prompts", (tags.len() * maps.len()) as u64, "scenes");
-    let cases: Vec<(usize, usize)> = (0..tags.len())
-        .flat_map(|tag| (0..maps.len()).map(move |map| (tag, map)))
-        .collect();
-    let asked: Vec<(usize, bool, usize)> = cases
-        .par_iter()
-        .map(|&(tag, map)| {
-            let order = order(maps[map], Some(tags[tag]));
-            let number = (tag * maps.len() + map) as u64;
-            let made = make(world, &order, number, seed.fork(7));
-            progress.advance(1);
-            made.map_or((tag, false, most_attempts), |made| {
-                let holds = tags::holds(tags[tag], &made.scenario) == Some(true);
-                (tag, holds, made.attempts)
-            })
-        })
-        .collect();
-    // As many unprompted scenes as there are prompted ones per two tags, at least eight.
-    let n = maps.len().max(1) * 8;
-    let unasked: Vec<Vec<ScenarioTag>> = (0..n as u64)
-        .into_par_iter()
-        .filter_map(|i| {
-            let order = order(maps[i as usize % maps.len()], None);
-            let made = make(world, &order, i, seed.fork(8)).ok()?;
-            Some(tags::mine(&made.scenario))
-        })
-        .collect();
-    let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
-    Ok(Prompts::new(&tags, &asked, &unasked, &logged))
-}
-
-/// How often tags hold.
-#[derive(Default)]
-pub(super) struct Prompts {
-    pub(super) satisfaction: Option<f64>,
-    pub(super) unconditional: Option<f64>,
-    pub(super) logged: Option<f64>,
-    pub(super) rows: Vec<Value>,
-}
-
-impl Prompts {
-    fn new(
-        tags: &[ScenarioTag],
-        asked: &[(usize, bool, usize)],
-        unasked: &[Vec<ScenarioTag>],
-        logged: &[Vec<ScenarioTag>],
-    ) -> Self {
-        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-        let share = |all: &[Vec<ScenarioTag>], tag: &ScenarioTag| {
-            let n = all.iter().filter(|tags| tags.contains(tag)).count();
-            n as f64 / all.len().max(1) as f64
+    let (mut held, mut free, mut log, mut rows) = (vec![], vec![], vec![], vec![]);
+    for (i, tag) in tags.iter().enumerate() {
+        let own: Vec<&Asked> = asked.iter().filter(|asked| asked.tag == i).collect();
+        let of = |value: &dyn Fn(&Asked) -> f64| {
+            let sum: f64 = own.iter().map(|asked| value(asked)).sum();
+            (!own.is_empty()).then(|| sum / own.len() as f64)
         };
-        let (mut held, mut free, mut log, mut rows) = (vec![], vec![], vec![], vec![]);
-        for (i, tag) in tags.iter().enumerate() {
-            let own: Vec<_> = asked.iter().filter(|(tag, ..)| *tag == i).collect();
-            let holding = own.iter().filter(|(_, holds, _)| *holds).count();
-            let attempts: usize = own.iter().map(|(.., attempts)| attempts).sum();
-            held.push(holding as f64 / own.len().max(1) as f64);
+        let satisfaction = of(&|asked| f64::from(asked.holds));
+        if let Some(satisfaction) = satisfaction {
+            held.push(satisfaction);
             free.push(share(unasked, tag));
             log.push(share(logged, tag));
-            rows.push(json!({
-                "tag": tag.name(),
-                "satisfaction": held[i],
-                "attempts": attempts as f64 / own.len().max(1) as f64,
-                "unconditional": free[i],
-                "log": log[i],
-            }));
         }
-        Self {
-            satisfaction: Some(mean(&held)),
-            unconditional: Some(mean(&free)),
-            logged: Some(mean(&log)),
-            rows,
-        }
+        rows.push(json!({
+            "tag": tag.name(),
+            "maps": own.len(),
+            "satisfaction": satisfaction,
+            "tag_alone": of(&|asked| f64::from(asked.is_tag)),
+            "attempts": of(&|asked| asked.attempts as f64),
+            "steered": of(&|asked| f64::from(asked.is_steered)),
+            "moment_s": of(&|asked| asked.moment_s),
+            "unconditional": share(unasked, tag),
+            "log": share(logged, tag),
+        }));
+    }
+    let mean = |values: &[f64]| {
+        let sum: f64 = values.iter().sum();
+        (!values.is_empty()).then(|| sum / values.len() as f64)
+    };
+    Prompts {
+        satisfaction: mean(&held),
+        unconditional: mean(&free),
+        logged: mean(&log),
+        rows,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tags_that_no_map_admits_do_not_count() {
+        let tags: Vec<ScenarioTag> = ScenarioTag::all().take(3).collect();
+        let asked = |tag, holds| Asked {
+            tag,
+            holds,
+            is_tag: true,
+            attempts: 3,
+            is_steered: holds,
+            moment_s: 0.5,
+        };
+        let asked = [asked(0, true), asked(0, false), asked(2, true)];
+        let unasked = [vec![tags[0], tags[1]], vec![tags[0]]];
+        let prompts = summed(&tags, &asked, &unasked, &[]);
+        assert_eq!(prompts.satisfaction, Some(0.75));
+        assert_eq!(prompts.unconditional, Some(0.5));
+        assert_eq!(prompts.rows[0]["satisfaction"], 0.5);
+        assert_eq!(prompts.rows[0]["tag_alone"], 1.0);
+        assert_eq!(
+            (&prompts.rows[1]["maps"], &prompts.rows[1]["satisfaction"]),
+            (&json!(0), &Value::Null)
+        );
+        assert_eq!(summed(&tags, &[], &[], &[]).satisfaction, None);
     }
 }
