@@ -135,7 +135,7 @@ impl Drive {
     }
 
     /// True if the ego does something that is not there from the first moment.
-    pub(crate) fn is_maneuver(&self) -> bool {
+    pub(crate) fn takes_time(&self) -> bool {
         self.maneuver.jolts || self.maneuver.change.is_some()
     }
 

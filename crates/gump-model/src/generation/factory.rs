@@ -11,7 +11,8 @@ use gump_scene::{Scenario, ScenarioTag, Seed};
 use rayon::prelude::*;
 
 use super::prompt::Cast;
-use super::stage::{Search, Stage, any_start};
+use super::search::{Search, any_start};
+use super::stage::Stage;
 use super::verdict::{Clause, verdict};
 use super::{GenerateError, GenerateRequest, GeneratedScene, Placement, takes};
 use crate::world::TransformerWorld;

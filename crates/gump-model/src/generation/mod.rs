@@ -22,6 +22,7 @@ mod prepared;
 mod prompt;
 mod roadside;
 pub(crate) mod rules;
+mod search;
 mod stage;
 mod takes;
 #[cfg(test)]

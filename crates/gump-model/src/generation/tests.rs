@@ -176,6 +176,79 @@ fn what_a_prompt_says_is_made_and_judged() {
 }
 
 #[test]
+fn prompted_scenes_do_not_depend_on_the_threads() {
+    let order = |tag: &str| factory::Order {
+        request: GenerateRequest {
+            prompts: vec![tag.parse().unwrap()],
+            ..request(Vec::new())
+        },
+        roams: false,
+        seconds: 5.0,
+        attempts: 20,
+    };
+    let order = order("stopping_with_lead");
+    let made_by = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        let made = || factory::make_many(&world(), &order, 0..3, Seed(1)).unwrap();
+        pool.build().unwrap().install(made)
+    };
+    let made: Vec<_> = made_by(1).into_iter().map(Result::unwrap).collect();
+    assert!(made.iter().all(factory::Made::holds));
+    assert!(made.iter().all(|made| made.scenario.future().len() >= 50));
+    for (one, two) in made.iter().zip(made_by(2)) {
+        assert_eq!(one.scenario.log, two.unwrap().scenario.log);
+    }
+}
+
+#[test]
+fn a_steered_ego_is_where_its_drive_says() {
+    let scene = &make(&request(Vec::new()), 1)[0];
+    let map = &request(Vec::new()).map;
+    let scenario = scene.scenario("made".into(), map, &[]);
+    let maneuver = drive::Maneuver {
+        acceleration: -1.5,
+        ..drive::Maneuver::default()
+    };
+    let rng = &mut Seed(2).rng();
+    let lane = (&map.lanes()[0], 100.0);
+    let drive = drive::Drive::along(map, lane, 0.0, 3.0, maneuver, rng).unwrap();
+    let takes = takes::steered(&world(), &scenario, &drive, Seed(4)).unwrap();
+    assert!(!takes.is_empty());
+    for take in takes {
+        // Steered for four seconds, then imagined for two more.
+        assert_eq!(take.log.len(), 61);
+        for (frame, seconds) in [(10, 1.0), (20, 2.0), (40, 4.0)] {
+            let ego = take.log[frame].agent(take.ego).unwrap().state.pose.position;
+            let there = drive.state_after(seconds).pose.position;
+            assert!(ego.distance(there) < 0.05, "{ego} instead of {there}");
+        }
+    }
+}
+
+#[test]
+fn cones_stand_clear_of_everybody() {
+    let mut request = request(Vec::new());
+    request.prompts = vec!["near_trafficcone_on_driveable".parse().unwrap()];
+    let order = factory::Order {
+        request,
+        roams: false,
+        seconds: 0.0,
+        attempts: 20,
+    };
+    let made = factory::make(&world(), &order, 0, Seed(1)).unwrap();
+    assert!(made.holds(), "{:?}", made.clauses);
+    let present = made.scenario.present();
+    let agents = present.now().agents().iter();
+    let cones: Vec<&Agent> = agents
+        .filter(|agent| agent.kind == AgentKind::TrafficCone)
+        .collect();
+    assert!(cones.len() >= 3);
+    for cone in cones {
+        assert_eq!(overlapping(present.now(), cone).count(), 0);
+    }
+}
+
+#[test]
 fn traffic_lives_where_it_is_let() {
     let scene = &make(&request(Vec::new()), 1)[0];
     let map = fixture::scenario(ROAD).unwrap().map;
