@@ -4,6 +4,7 @@
 //! tokenized, so that map and agents cannot fall out of register. Which frames are shown is said in
 //! `window`, what is asked in `targets`.
 
+mod mirror;
 mod targets;
 #[cfg(test)]
 mod tests;
@@ -75,6 +76,8 @@ pub struct SampleConfig {
     pub prompt_dropout: f64,
     /// Probability that the window begins with the frame of reference, as a scene to generate does.
     pub from_reference: f64,
+    /// Probability that left and right are exchanged.
+    pub mirror: f64,
 }
 
 impl Default for SampleConfig {
@@ -95,6 +98,7 @@ impl Default for SampleConfig {
             shuffle_ids: true,
             prompt_dropout: 0.5,
             from_reference: 0.25,
+            mirror: 0.0,
         }
     }
 }
@@ -237,6 +241,7 @@ pub(crate) fn draw(
     }
     sample.slots = slots;
     blank_frames(&mut sample, config, &mut rng);
+    mirror::mirror(&mut sample, config.mirror, &mut rng);
     Some(sample)
 }
 
