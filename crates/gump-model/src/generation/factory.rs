@@ -125,7 +125,11 @@ pub fn make(
     let mut last: Option<Made> = None;
     for attempt in 0..order.attempts.max(1) {
         let stream = seed.fork(attempt as u64);
-        let (request, stage) = place.next(attempt, stream.fork(0));
+        let (request, stage) = match place.next(attempt, stream.fork(0)) {
+            // What was possible at first is not called impossible afterwards.
+            Err(_) if attempt > 0 => break,
+            next => next?,
+        };
         let made = world.generate(&request, &[stream.fork(1)]);
         let scene = match made.map(|mut scenes| scenes.remove(0)) {
             Ok(Ok(scene)) => scene,
@@ -155,7 +159,7 @@ pub fn make(
     match (last, failure) {
         (Some(made), _) => Ok(made),
         (None, Some(error)) => Err(error),
-        (None, None) => unreachable!("there is at least one attempt"),
+        (None, None) => unreachable!("the first attempt makes a scene or fails"),
     }
 }
 
@@ -163,44 +167,53 @@ pub fn make(
 struct Place<'a> {
     order: &'a Order,
     cast: Cast,
-    /// Whether a place is looked for that fits the prompts.
+    /// Whether places other than the one asked for may be looked for.
     searches: bool,
 }
 
 impl<'a> Place<'a> {
     fn new(order: &'a Order) -> Self {
-        let request = &order.request;
-        let is_guided = request.config.placement == Placement::Guided;
         Self {
             order,
-            cast: Cast::of(&request.prompts),
-            searches: is_guided && !request.prompts.is_empty(),
+            cast: Cast::of(&order.request.prompts),
+            searches: true,
         }
     }
 
-    /// The request of an attempt, and the stage it is put on if one was found.
-    fn next(&mut self, attempt: usize, seed: Seed) -> (GenerateRequest, Option<Stage>) {
+    /// The request of an attempt, and the stage it is put on if prompts need one.
+    fn next(
+        &mut self,
+        attempt: usize,
+        seed: Seed,
+    ) -> Result<(GenerateRequest, Option<Stage>), GenerateError> {
         let (request, roams) = (&self.order.request, self.order.roams);
-        if self.searches {
-            let search = Search {
-                cast: &self.cast,
-                request,
-                prompts: &request.prompts,
-            };
-            // The place asked for goes first, if the prompt needs no other.
-            let here = (attempt == 0 && !roams).then(|| search.here(seed.fork(0)));
-            let stage = here.flatten().or_else(|| search.anywhere(seed.fork(1)));
-            if let Some(stage) = stage {
-                return (stage.direct(request), Some(stage));
+        if request.prompts.is_empty() || request.config.placement != Placement::Guided {
+            let mut request = request.clone();
+            if roams {
+                request.ego = any_start(&request.map, request.ego, seed);
             }
-            // A map on which the prompts can hold nowhere is not searched again.
-            self.searches = false;
+            return Ok((request, None));
         }
-        let mut request = request.clone();
-        if roams {
-            request.ego = any_start(&request.map, request.ego, seed);
+        let search = Search {
+            cast: &self.cast,
+            request,
+            prompts: &request.prompts,
+        };
+        // The place asked for goes first if it will do, and alone if no other does.
+        let here = || search.here(seed.fork(0)).filter(|_| !roams);
+        let anywhere = || search.anywhere(seed.fork(1));
+        let mut stage = if attempt == 0 { here() } else { None };
+        if stage.is_none() && self.searches {
+            stage = anywhere();
+            self.searches = stage.is_some();
         }
-        (request, None)
+        let stage = stage.or_else(here).ok_or_else(|| {
+            let names: Vec<&str> = request.prompts.iter().map(|tag| tag.name()).collect();
+            GenerateError::NoStage {
+                prompts: names.join(" and "),
+            }
+        })?;
+        Ok((stage.direct(request), Some(stage)))
     }
 }
 

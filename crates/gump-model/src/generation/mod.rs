@@ -191,6 +191,15 @@ pub enum GenerateError {
     /// Nothing can drive on the map.
     #[error("the map has no drivable lane within 100 m of the ego")]
     NoLane,
+    /// Prompts for which the map has no place.
+    #[error(
+        "prompts: no place within 150 m of the ego can hold {prompts}; the map may lack a crosswalk, \
+         a stop sign, a lit light or a way that it needs"
+    )]
+    NoStage {
+        /// Their names.
+        prompts: String,
+    },
     /// More objects than there are keys or room for.
     #[error("{asked} objects are more than the {most} that a scene of this model holds")]
     TooMany {

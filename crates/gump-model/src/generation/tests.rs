@@ -201,6 +201,27 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
 }
 
 #[test]
+fn a_prompt_that_the_map_cannot_hold_is_an_error() {
+    let order = |tag: &str, placement| {
+        let mut request = request(Vec::new());
+        request.prompts = vec![tag.parse().unwrap()];
+        request.config.placement = placement;
+        factory::Order {
+            request,
+            roams: false,
+            seconds: 0.0,
+            attempts: 2,
+        }
+    };
+    let make = |order: &factory::Order| factory::make(&world(), order, 0, Seed(1));
+    let error = make(&order("on_carpark", Placement::Guided)).unwrap_err();
+    assert!(error.to_string().contains("can hold on_carpark"), "{error}");
+    // Where the network has its way nothing is looked for, and the verdict says what is wrong.
+    let made = make(&order("on_carpark", Placement::Free));
+    assert!(!matches!(made, Err(GenerateError::NoStage { .. })));
+}
+
+#[test]
 fn a_steered_ego_is_where_its_drive_says() {
     let scene = &make(&request(Vec::new()), 1)[0];
     let map = &request(Vec::new()).map;

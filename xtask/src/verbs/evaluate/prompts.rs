@@ -66,13 +66,13 @@ pub(super) fn satisfaction(
     let tags: Vec<ScenarioTag> = decidable.map(|rule| rule.tag()).collect();
     let mut shuffled: Vec<&Scenario> = scenarios.iter().collect();
     shuffled.shuffle(&mut seed.fork(9).rng());
-    let places: Vec<Vec<&Scenario>> = tags
+    let places: Vec<Places<'_>> = tags
         .par_iter()
         .map(|tag| admitting(&shuffled, *tag, n_maps, seed.fork(10)))
         .collect();
     stop_if_interrupted()?;
     let cases: Vec<(usize, &Scenario)> = (0..tags.len())
-        .flat_map(|tag| places[tag].iter().map(move |place| (tag, *place)))
+        .flat_map(|tag| places[tag].found.iter().map(move |place| (tag, *place)))
         .collect();
     let progress = run.progress("prompts", cases.len() as u64, "scenes");
     let asked: Vec<Asked> = (0..cases.len())
@@ -94,21 +94,28 @@ pub(super) fn satisfaction(
         })
         .collect();
     let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
-    Ok(summed(&tags, &asked, &unasked, &logged))
+    Ok(summed(&tags, &places, &asked, &unasked, &logged))
 }
 
-/// The first scenes whose maps admit a tag.
-fn admitting<'a>(
-    scenarios: &[&'a Scenario],
-    tag: ScenarioTag,
-    n: usize,
-    seed: Seed,
-) -> Vec<&'a Scenario> {
-    let admitting = scenarios.iter().copied().filter(|recorded| {
-        let order = order(recorded, Some(tag), 1);
-        admits(&order.request, seed)
-    });
-    admitting.take(n).collect()
+/// The first scenes whose maps admit a tag, and how many were looked at until then.
+#[derive(Default)]
+struct Places<'a> {
+    found: Vec<&'a Scenario>,
+    looked_at: usize,
+}
+
+fn admitting<'a>(scenarios: &[&'a Scenario], tag: ScenarioTag, n: usize, seed: Seed) -> Places<'a> {
+    let mut places = Places::default();
+    for &recorded in scenarios {
+        if places.found.len() == n {
+            break;
+        }
+        places.looked_at += 1;
+        if admits(&order(recorded, Some(tag), 1).request, seed) {
+            places.found.push(recorded);
+        }
+    }
+    places
 }
 
 fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Order {
@@ -148,6 +155,7 @@ fn ask(world: &TransformerWorld, order: &Order, tag: usize, number: u64, seed: S
 
 fn summed(
     tags: &[ScenarioTag],
+    places: &[Places<'_>],
     asked: &[Asked],
     unasked: &[Vec<ScenarioTag>],
     logged: &[Vec<ScenarioTag>],
@@ -172,6 +180,7 @@ fn summed(
         rows.push(json!({
             "tag": tag.name(),
             "maps": own.len(),
+            "looked_at": places[i].looked_at,
             "satisfaction": satisfaction,
             "tag_alone": of(&|asked| f64::from(asked.is_tag)),
             "attempts": of(&|asked| asked.attempts as f64),
@@ -210,7 +219,8 @@ mod tests {
         };
         let asked = [asked(0, true), asked(0, false), asked(2, true)];
         let unasked = [vec![tags[0], tags[1]], vec![tags[0]]];
-        let prompts = summed(&tags, &asked, &unasked, &[]);
+        let places: Vec<_> = tags.iter().map(|_| Places::default()).collect();
+        let prompts = summed(&tags, &places, &asked, &unasked, &[]);
         assert_eq!(prompts.satisfaction, Some(0.75));
         assert_eq!(prompts.unconditional, Some(0.5));
         assert_eq!(prompts.rows[0]["satisfaction"], 0.5);
@@ -219,6 +229,6 @@ mod tests {
             (&prompts.rows[1]["maps"], &prompts.rows[1]["satisfaction"]),
             (&json!(0), &Value::Null)
         );
-        assert_eq!(summed(&tags, &[], &[], &[]).satisfaction, None);
+        assert_eq!(summed(&tags, &places, &[], &[], &[]).satisfaction, None);
     }
 }
