@@ -170,6 +170,9 @@ impl Cli {
             Verb::Ablate(ablate::Verb::Scaling(args)) => {
                 Run::of("ablate scaling", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Ablate(ablate::Verb::Switches(args)) => {
+                Run::of("ablate switches", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Bench(bench::Verb::Engine(args)) => {
                 Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))
             }

@@ -1,7 +1,9 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
 mod decoding;
+mod lesson;
 mod scaling;
+mod switches;
 
 use std::num::NonZeroUsize;
 
@@ -37,6 +39,8 @@ pub(crate) enum Verb {
     Chunking(decoding::Args),
     /// Three sizes trained on the same samples: loss against tokens with a fitted law, and realism
     Scaling(scaling::Args),
+    /// Each option of the network and of its training left out or put in: loss and realism
+    Switches(switches::Args),
 }
 
 /// Arguments of `ablate nar`.

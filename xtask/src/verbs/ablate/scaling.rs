@@ -4,32 +4,16 @@
 //! The law is loss = A · tokens^-t · parameters^-p. Every width is measured after the same tokens, so
 //! the two exponents are fitted apart from each other.
 
-use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
-use std::time::Instant;
-
 use anyhow::Context as _;
-use gump_metrics::interval;
-use gump_metrics::wosac::Scores;
-use gump_model::checkpoint::{self, Precision};
-use gump_model::{Mode, ModelConfig, RunConfig, Trainer};
-use gump_scene::{Scenario, Seed};
 use gump_viz::{Chart, Series};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 
-use super::decoding;
-use crate::dataset::{self, Part, Split, Training};
-use crate::run::{Common, Run, stop_if_interrupted};
-use crate::shipped;
-use crate::worlds::{Draw, WorldName};
+use super::lesson::{Learned, Lesson, of_width};
+use crate::run::{Common, Run};
 
-/// How the laptop model is trained.
-const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
 /// Widths of the network; the last is that of `tiny`.
 const WIDTHS: [usize; 3] = [32, 64, 128];
-/// Width of an attention head.
-const HEAD: usize = 32;
 /// Losses measured, while tokens grow to so many times as many: the beginning of a run, in which the
 /// learning rate warms up, follows no law.
 const MEASURED: usize = 7;
@@ -38,107 +22,35 @@ const GROWTH: f64 = 5.0;
 /// Arguments of `ablate scaling`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// A folder with a manifest.toml, or any file or folder of scenarios, to train on
-    #[arg(long, value_name = "PATH")]
-    data: PathBuf,
-    /// Scenarios for loss and realism, none of them trained on [default: the shipped procedural
-    /// ones]
-    #[arg(long, value_name = "PATH")]
-    scenarios: Option<PathBuf>,
-    /// Optimiser steps of each size
-    #[arg(long, value_name = "N", default_value = "1000")]
-    steps: NonZeroUsize,
-    /// Rollouts of each scenario
-    #[arg(long, value_name = "N", default_value = "4")]
-    rollouts_per_scenario: NonZeroUsize,
     #[command(flatten)]
     #[serde(flatten)]
-    draw: Draw,
+    lesson: Lesson,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
 }
 
-/// What a size learned: its parameters, and the held-out loss after so many tokens.
-struct Curve {
-    parameters: f64,
-    losses: Vec<(f64, f64)>,
-}
-
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let held_out = match &self.scenarios {
-            Some(path) => path.clone(),
-            None => shipped::data().join("procedural.tfrecord.gz"),
-        };
-        run.setting("scenarios", held_out.display().to_string())?;
-        let progress = run.progress("reading", 0, "scenarios");
-        let validation = dataset::read(&[Part::whole(&held_out)], &progress)?;
-        drop(progress);
-        let sampling = self.draw.resolve(Mode::PartialAr)?;
-        let (mut rows, mut curves) = (Vec::new(), Vec::new());
+        let class = self.lesson.begin(run)?;
+        let (mut rows, mut sizes) = (Vec::new(), Vec::new());
         for width in WIDTHS {
-            let weights = run.path(&format!("width-{width}.safetensors"));
-            let began = Instant::now();
-            let curve = run.phase(&format!("train {width}"), |run| {
-                self.train(run, width, &validation, &weights)
-            })?;
-            let seconds = began.elapsed().as_secs_f64();
-            let (scores, _) = run.phase(&format!("score {width}"), |run| {
-                let world = WorldName::Model(weights.clone());
-                let n = self.rollouts_per_scenario.get();
-                decoding::score(run, &held_out, &world, sampling.clone(), n)
-            })?;
-            rows.push(row(width, &curve, &scores, seconds)?);
+            let name = format!("width-{width}");
+            let measured = measured(self.lesson.steps());
+            let learned = class.teach(run, &name, of_width(width)?, &measured)?;
+            let mut row = learned.row()?;
+            row["width"] = json!(width);
+            let slope = slope(&logarithms(&learned.losses));
+            row["own_exponent"] = json!(slope.map(|slope| -slope));
+            rows.push(row);
             run.result("rows", &rows)?;
-            curves.push(curve);
+            sizes.push(learned);
         }
-        let law = Law::fit(&curves).context("--steps: too few to fit a law to")?;
+        let law = Law::fit(&sizes).context("--steps: too few to fit a law to")?;
         run.result("tokens_exponent", law.tokens)?;
         run.result("parameters_exponent", law.parameters)?;
         run.result("residual", law.residual)?;
-        Ok(chart(&curves, &law).save(&run.path("scaling"))?)
-    }
-
-    /// Trains one size, writes its weights and tells its losses.
-    fn train(
-        &self,
-        run: &Run,
-        width: usize,
-        validation: &[Scenario],
-        weights: &Path,
-    ) -> anyhow::Result<Curve> {
-        let progress = run.progress("reading", 0, "scenarios");
-        let data = Training::open(&dataset::parts(&self.data, Split::Train)?, &progress)?;
-        drop(progress);
-        let steps = self.steps.get();
-        let mut config = RunConfig::from_toml(CONFIG)?.train;
-        config.steps = steps;
-        config.seed = run.seed().0;
-        config.optimizer.warmup = config.optimizer.warmup.min(steps / 10);
-        let model = ModelConfig {
-            width,
-            heads: width / HEAD,
-            ..ModelConfig::tiny()
-        };
-        let mut trainer = Trainer::new(model, config, data, run.device())?;
-        let progress = run.progress("training", steps as u64, "steps");
-        let (mut tokens, mut losses) = (0, Vec::new());
-        for step in 1..=steps {
-            stop_if_interrupted()?;
-            tokens += trainer.step()?.tokens;
-            progress.advance(1);
-            if measured(steps).contains(&step) {
-                let loss = trainer.validate(validation, usize::MAX)?.state;
-                progress.message(&format!("width {width}, held-out loss {loss:.3}"));
-                losses.push((tokens as f64, loss));
-            }
-        }
-        checkpoint::save(trainer.network(), weights, Precision::Half)?;
-        Ok(Curve {
-            parameters: trainer.network().parameters().count() as f64,
-            losses,
-        })
+        Ok(chart(&sizes, &law).save(&run.path("scaling"))?)
     }
 }
 
@@ -153,27 +65,6 @@ fn measured(steps: usize) -> Vec<usize> {
     at
 }
 
-fn row(width: usize, curve: &Curve, scores: &[Scores], seconds: f64) -> anyhow::Result<Value> {
-    let mean = Scores::mean(scores).context("--scenarios: expected some, found none")?;
-    let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
-    let interval = interval(&metametrics, Seed(0));
-    let (tokens, loss) = curve.losses.last().context("no loss was measured")?;
-    Ok(json!({
-        "width": width,
-        "parameters": curve.parameters,
-        "tokens": tokens,
-        "loss": loss,
-        "own_exponent": slope(&logarithms(&curve.losses)).map(|slope| -slope),
-        "metametric": mean.metametric,
-        "low": interval.map(|interval| interval.low),
-        "high": interval.map(|interval| interval.high),
-        "min_ade": mean.min_ade,
-        "collision_rate": mean.collision_rate,
-        "offroad_rate": mean.offroad_rate,
-        "training_seconds": seconds,
-    }))
-}
-
 /// loss = factor · tokens^-tokens · parameters^-parameters.
 #[derive(Debug)]
 struct Law {
@@ -186,7 +77,7 @@ struct Law {
 
 impl Law {
     /// The least squares in logarithms; `None` without two sizes or two losses each.
-    fn fit(curves: &[Curve]) -> Option<Self> {
+    fn fit(curves: &[Learned]) -> Option<Self> {
         // The same tokens for every size make the two logarithms orthogonal: each slope is that of
         // the means over the other.
         let slopes: Option<Vec<f64>> = curves
@@ -194,7 +85,7 @@ impl Law {
             .map(|curve| slope(&logarithms(&curve.losses)))
             .collect();
         let tokens = -mean(slopes?);
-        let by_size = |curve: &Curve| {
+        let by_size = |curve: &Learned| {
             let losses = logarithms(&curve.losses).into_iter().map(|point| point.1);
             (curve.parameters.ln(), mean(losses))
         };
@@ -246,8 +137,8 @@ fn slope(points: &[(f64, f64)]) -> Option<f64> {
     (spread > 0.0).then(|| together / spread)
 }
 
-fn chart(curves: &[Curve], law: &Law) -> Chart {
-    let millions = |curve: &Curve| format!("{:.2} M", curve.parameters / 1e6);
+fn chart(curves: &[Learned], law: &Law) -> Chart {
+    let millions = |curve: &Learned| format!("{:.2} M", curve.parameters / 1e6);
     let measured = curves.iter().map(|curve| Series {
         name: format!("{} parameters", millions(curve)),
         points: curve.losses.clone(),
@@ -280,9 +171,9 @@ mod tests {
     #[test]
     fn a_law_is_found_again() {
         let law = |tokens: f64, parameters: f64| 30.0 * tokens.powf(-0.2) * parameters.powf(-0.05);
-        let curve = |parameters: f64| Curve {
-            parameters,
-            losses: [1e5, 3e5, 1e6].map(|t| (t, law(t, parameters))).into(),
+        let curve = |parameters: f64| {
+            let losses = [1e5, 3e5, 1e6].map(|t| (t, law(t, parameters)));
+            Learned::of_losses(parameters, losses.into())
         };
         let curves = [3e5, 1e6, 3.5e6].map(curve);
         let found = Law::fit(&curves).unwrap();
@@ -295,10 +186,7 @@ mod tests {
 
     #[test]
     fn one_size_or_one_loss_make_no_law() {
-        let curve = |n: usize| Curve {
-            parameters: 1e6,
-            losses: vec![(1e5, 2.0); n],
-        };
+        let curve = |n: usize| Learned::of_losses(1e6, vec![(1e5, 2.0); n]);
         assert!(Law::fit(&[curve(3), curve(3)]).is_none());
         assert!(Law::fit(&[]).is_none());
     }
@@ -309,11 +197,5 @@ mod tests {
         assert_eq!((at[0], at[3], at[6]), (200, 447, 1000));
         assert_eq!(at.len(), MEASURED);
         assert_eq!(measured(3), [1, 2, 3]);
-    }
-
-    #[test]
-    fn the_recorded_configuration_is_read() {
-        let config = RunConfig::from_toml(CONFIG).unwrap();
-        assert_eq!(config.model().unwrap(), ModelConfig::tiny());
     }
 }

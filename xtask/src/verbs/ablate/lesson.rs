@@ -1,0 +1,204 @@
+//! Networks that learn the same lesson: trained on the same samples, judged by the same held-out
+//! scenes.
+
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::Context as _;
+use gump_metrics::interval;
+use gump_metrics::wosac::Scores;
+use gump_model::checkpoint::{self, Precision};
+use gump_model::{Mode, ModelConfig, RunConfig, SamplingConfig, TrainConfig, Trainer};
+use gump_scene::{Scenario, Seed};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::decoding;
+use crate::dataset::{self, Part, Split, Training};
+use crate::run::{Run, stop_if_interrupted};
+use crate::shipped;
+use crate::worlds::{Draw, WorldName};
+
+/// How the laptop model is trained.
+pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
+/// Width of an attention head.
+const HEAD: usize = 32;
+
+/// What is learned, and who judges it.
+#[derive(Debug, Serialize, clap::Args)]
+pub(super) struct Lesson {
+    /// A folder with a manifest.toml, or any file or folder of scenarios, to train on
+    #[arg(long, value_name = "PATH")]
+    data: PathBuf,
+    /// Scenarios for loss and realism, none of them trained on [default: the shipped procedural
+    /// ones]
+    #[arg(long, value_name = "PATH")]
+    scenarios: Option<PathBuf>,
+    /// Optimiser steps of each network
+    #[arg(long, value_name = "N", default_value = "1000")]
+    steps: NonZeroUsize,
+    /// Rollouts of each scenario
+    #[arg(long, value_name = "N", default_value = "4")]
+    rollouts_per_scenario: NonZeroUsize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    draw: Draw,
+}
+
+/// What a network learned.
+pub(super) struct Learned {
+    pub(super) parameters: f64,
+    /// The held-out loss after so many tokens.
+    pub(super) losses: Vec<(f64, f64)>,
+    scores: Vec<Scores>,
+    seconds: f64,
+}
+
+/// A lesson whose held-out scenes are read.
+pub(super) struct Class<'a> {
+    lesson: &'a Lesson,
+    held_out: PathBuf,
+    scenes: Vec<Scenario>,
+    sampling: SamplingConfig,
+}
+
+impl Lesson {
+    /// Optimiser steps of each network.
+    pub(super) fn steps(&self) -> usize {
+        self.steps.get()
+    }
+
+    /// Reads the held-out scenes.
+    pub(super) fn begin(&self, run: &mut Run) -> anyhow::Result<Class<'_>> {
+        let held_out = match &self.scenarios {
+            Some(path) => path.clone(),
+            None => shipped::data().join("procedural.tfrecord.gz"),
+        };
+        run.setting("scenarios", held_out.display().to_string())?;
+        let progress = run.progress("reading", 0, "scenarios");
+        Ok(Class {
+            lesson: self,
+            scenes: dataset::read(&[Part::whole(&held_out)], &progress)?,
+            sampling: self.draw.resolve(Mode::PartialAr)?,
+            held_out,
+        })
+    }
+}
+
+/// The laptop model and how it is trained, in another width.
+pub(super) fn of_width(width: usize) -> anyhow::Result<(ModelConfig, TrainConfig)> {
+    let model = ModelConfig {
+        width,
+        heads: (width / HEAD).max(1),
+        ..ModelConfig::tiny()
+    };
+    Ok((model, RunConfig::from_toml(CONFIG)?.train))
+}
+
+impl Class<'_> {
+    /// Trains a network, writes its weights as `name`, measures the loss after the steps in
+    /// `measured`, and judges its traffic.
+    pub(super) fn teach(
+        &self,
+        run: &mut Run,
+        name: &str,
+        (model, config): (ModelConfig, TrainConfig),
+        measured: &[usize],
+    ) -> anyhow::Result<Learned> {
+        let weights = run.path(&format!("{name}.safetensors"));
+        let began = Instant::now();
+        let mut learned = run.phase(&format!("train {name}"), |run| {
+            self.train(run, model, config, measured, &weights)
+        })?;
+        learned.seconds = began.elapsed().as_secs_f64();
+        let n = self.lesson.rollouts_per_scenario.get();
+        (learned.scores, _) = run.phase(&format!("score {name}"), |run| {
+            let world = WorldName::Model(weights.clone());
+            decoding::score(run, &self.held_out, &world, self.sampling.clone(), n)
+        })?;
+        Ok(learned)
+    }
+
+    fn train(
+        &self,
+        run: &Run,
+        model: ModelConfig,
+        mut config: TrainConfig,
+        measured: &[usize],
+        weights: &Path,
+    ) -> anyhow::Result<Learned> {
+        let progress = run.progress("reading", 0, "scenarios");
+        let data = Training::open(&dataset::parts(&self.lesson.data, Split::Train)?, &progress)?;
+        drop(progress);
+        let steps = self.lesson.steps();
+        config.steps = steps;
+        config.seed = run.seed().0;
+        config.optimizer.warmup = config.optimizer.warmup.min(steps / 10);
+        let mut trainer = Trainer::new(model, config, data, run.device())?;
+        let progress = run.progress("training", steps as u64, "steps");
+        let (mut tokens, mut losses) = (0, Vec::new());
+        for step in 1..=steps {
+            stop_if_interrupted()?;
+            tokens += trainer.step()?.tokens;
+            progress.advance(1);
+            if measured.contains(&step) {
+                let loss = trainer.validate(&self.scenes, usize::MAX)?.state;
+                progress.message(&format!("held-out loss {loss:.3}"));
+                losses.push((tokens as f64, loss));
+            }
+        }
+        checkpoint::save(trainer.network(), weights, Precision::Half)?;
+        Ok(Learned {
+            parameters: trainer.network().parameters().count() as f64,
+            losses,
+            scores: Vec::new(),
+            seconds: 0.0,
+        })
+    }
+}
+
+impl Learned {
+    /// What a network of one loss law would be: for tests of laws.
+    #[cfg(test)]
+    pub(super) fn of_losses(parameters: f64, losses: Vec<(f64, f64)>) -> Self {
+        Self {
+            parameters,
+            losses,
+            scores: Vec::new(),
+            seconds: 0.0,
+        }
+    }
+
+    /// The row of a table: what was learned in the end, and the realism of 2025.
+    pub(super) fn row(&self) -> anyhow::Result<Value> {
+        let mean = Scores::mean(&self.scores).context("--scenarios: expected some, found none")?;
+        let metametrics: Vec<f64> = self.scores.iter().map(|s| s.metametric).collect();
+        let interval = interval(&metametrics, Seed(0));
+        let (tokens, loss) = self.losses.last().context("no loss was measured")?;
+        Ok(json!({
+            "parameters": self.parameters,
+            "tokens": tokens,
+            "loss": loss,
+            "metametric": mean.metametric,
+            "low": interval.map(|interval| interval.low),
+            "high": interval.map(|interval| interval.high),
+            "min_ade": mean.min_ade,
+            "collision_rate": mean.collision_rate,
+            "offroad_rate": mean.offroad_rate,
+            "training_seconds": self.seconds,
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_recorded_configuration_is_read() {
+        let config = RunConfig::from_toml(CONFIG).unwrap();
+        assert_eq!(config.model().unwrap(), ModelConfig::tiny());
+        assert_eq!(of_width(128).unwrap(), (ModelConfig::tiny(), config.train));
+    }
+}
