@@ -385,7 +385,7 @@ mod tests {
             ring: crate::aggregation::Ring::default(),
             limits: None,
             frame: 0,
-            restrict: None,
+            guide: None,
         };
         let arc = |i: usize| {
             let turn = 0.1 * (i + 1) as f64;

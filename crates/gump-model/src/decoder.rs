@@ -19,6 +19,9 @@ use crate::parameters::{Init, Scope};
 /// Poses in a chunk: the frame itself and three more, half a second apart.
 pub(crate) const CHUNK: usize = 4;
 
+/// Steps that make the first state; poses of later moments follow.
+pub(crate) const STATE_STEPS: usize = 7;
+
 /// What each step of the decoder yields.
 pub(crate) const STEPS: [Field; 4 + 3 * CHUNK] = [
     Field::Width,

@@ -12,7 +12,9 @@ use gump_scene::Seed;
 use gump_tokenizer::Field;
 
 use crate::decoder::STEPS;
-use crate::sampling::{Request, SamplingConfig};
+use crate::ops::OrdinalSmoothing;
+use crate::sampling::{Guide, Request, SamplingConfig};
+use crate::unsmooth::unsmoothed;
 
 /// Bins that a draw is among, with their logits and then their weights.
 pub(crate) type Candidates = Vec<(usize, f32)>;
@@ -29,16 +31,71 @@ pub(crate) fn draw_field(
 ) -> u16 {
     let field = STEPS[step];
     debug_assert_eq!(logits.len(), field.n_bins());
+    let sharpness = Sharpness {
+        temperature: config.temperature,
+        top_k: config.top_k,
+    };
+    if let Some(guide) = &request.guide {
+        return guided(
+            logits,
+            step,
+            drawn,
+            (&**guide, request.stream),
+            sharpness,
+            room,
+        );
+    }
     let allowed = allowed(request, step, field);
     let uniform = uniform(request.stream.fork(step as u64));
-    let mask = request.restrict.as_ref();
-    if let Some(mask) = mask.and_then(|mask| mask.allowed(step, &drawn[..step]))
-        && mask.contains(&true)
-    {
-        return draw_masked(logits, &mask, uniform, config, room) as u16;
-    }
-    let found = draw(&logits[allowed.clone()], uniform, config, room);
+    let found = draw(&logits[allowed.clone()], uniform, sharpness, room);
     (allowed.start + found) as u16
+}
+
+/// How far a draw keeps to what is likely.
+#[derive(Clone, Copy, Debug)]
+struct Sharpness {
+    /// Divides the logits.
+    temperature: f64,
+    /// Bins that may be drawn.
+    top_k: usize,
+}
+
+/// As [`draw_field`], as a guide says.
+fn guided(
+    logits: &[f32],
+    step: usize,
+    drawn: &[u16],
+    (guide, stream): (&dyn Guide, Seed),
+    sharpness: Sharpness,
+    room: &mut Candidates,
+) -> u16 {
+    let number = guide.number(step);
+    let number = number.unwrap_or_else(|| uniform(stream.fork(step as u64)));
+    let sharpness = Sharpness {
+        temperature: guide.boldness(step) * sharpness.temperature,
+        ..sharpness
+    };
+    let sharp = guide.smoothing(step).map(|sigma_bins| {
+        let circular = STEPS[step].is_circular();
+        unsmoothed(
+            logits,
+            OrdinalSmoothing {
+                sigma_bins,
+                circular,
+            },
+        )
+    });
+    let logits = sharp.as_deref().unwrap_or(logits);
+    let weights = guide.weights(step, &drawn[..step]);
+    let weights = weights.filter(|weights| weights.iter().any(|weight| *weight > 0.0));
+    let Some(weights) = weights else {
+        return draw(logits, number, sharpness, room) as u16;
+    };
+    let open: Vec<usize> = (0..logits.len()).filter(|i| weights[*i] > 0.0).collect();
+    // Dividing by the temperature must leave the factors as they are.
+    let tilted = |&i: &usize| logits[i] + sharpness.temperature as f32 * weights[i].ln();
+    let tilted: Vec<f32> = open.iter().map(tilted).collect();
+    open[draw(&tilted, number, sharpness, room)] as u16
 }
 
 /// The bins of pose 0 near enough to where the object can be.
@@ -59,30 +116,18 @@ fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
     usize::from(*bins.start())..usize::from(*bins.end()) + 1
 }
 
-/// As [`draw`], among the bins that `mask` has.
-fn draw_masked(
-    logits: &[f32],
-    mask: &[bool],
-    uniform: f64,
-    config: &SamplingConfig,
-    room: &mut Candidates,
-) -> usize {
-    let places: Vec<usize> = (0..logits.len()).filter(|i| mask[*i]).collect();
-    let left: Vec<f32> = places.iter().map(|i| logits[*i]).collect();
-    places[draw(&left, uniform, config, room)]
-}
-
 /// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
-fn draw(logits: &[f32], uniform: f64, config: &SamplingConfig, room: &mut Candidates) -> usize {
+fn draw(logits: &[f32], uniform: f64, sharpness: Sharpness, room: &mut Candidates) -> usize {
+    let Sharpness { temperature, top_k } = sharpness;
     let peak = crate::ops::wide(
         #[inline(always)]
         || crate::ops::max(logits),
     );
     let best = || logits.iter().position(|l| *l == peak).unwrap_or(0);
-    if config.temperature <= 0.0 || config.top_k <= 1 {
+    if temperature <= 0.0 || top_k <= 1 {
         return best();
     }
-    let (threshold, mut spare) = threshold(logits, peak, config.top_k);
+    let (threshold, mut spare) = threshold(logits, peak, top_k);
     room.clear();
     for (i, &logit) in logits.iter().enumerate() {
         if logit == threshold {
@@ -93,7 +138,7 @@ fn draw(logits: &[f32], uniform: f64, config: &SamplingConfig, room: &mut Candid
             room.push((i, logit));
         }
     }
-    let inverse = 1.0 / config.temperature;
+    let inverse = 1.0 / temperature;
     for (_, logit) in room.iter_mut() {
         *logit = (f64::from(*logit - peak) * inverse).exp() as f32;
     }
@@ -169,7 +214,7 @@ mod tests {
             ring: Ring::default(),
             limits: None,
             frame: 0,
-            restrict: None,
+            guide: None,
         }
     }
 
@@ -228,6 +273,62 @@ mod tests {
         assert_eq!(allowed(&request, 7, Field::X), 0..1000);
     }
 
+    /// Prefers the first bin three to one, and allows but two.
+    #[derive(Debug)]
+    struct Prefers;
+
+    impl Guide for Prefers {
+        fn weights(&self, step: usize, _drawn: &[u16]) -> Option<Vec<f32>> {
+            let mut weights = vec![0.0; STEPS[step].n_bins()];
+            (weights[0], weights[5]) = (3.0, 1.0);
+            Some(weights)
+        }
+
+        fn boldness(&self, _step: usize) -> f64 {
+            4.0
+        }
+
+        fn smoothing(&self, _step: usize) -> Option<f32> {
+            None
+        }
+
+        fn number(&self, step: usize) -> Option<f64> {
+            (step == 1).then_some(0.76)
+        }
+    }
+
+    #[test]
+    fn guides_weigh_bins_whatever_the_temperature() {
+        let guide: std::sync::Arc<dyn Guide> = std::sync::Arc::new(Prefers);
+        let config = SamplingConfig {
+            temperature: 0.5,
+            top_k: 1000,
+            ..SamplingConfig::default()
+        };
+        let drawn = |logits: &[f32], step: usize, i: u64| {
+            let request = Request {
+                stream: Seed(i),
+                guide: Some(guide.clone()),
+                ..request()
+            };
+            draw_field(logits, step, &[4], &request, &config, &mut Vec::new())
+        };
+        let n = |logits: &[f32]| {
+            let draws = (0..4000).map(|i| drawn(logits, 0, i));
+            draws
+                .inspect(|bin| assert!([0, 5].contains(bin)))
+                .filter(|bin| *bin == 0)
+                .count() as i64
+        };
+        // Standard deviations are below 32.
+        assert!((n(&[0.0; 14]) - 3000).abs() < 110);
+        // At four times 0.5, odds of nine count as three.
+        let mut logits = [0.0f32; 14];
+        logits[5] = 9f32.ln();
+        assert!((n(&logits) - 2000).abs() < 130);
+        assert_eq!(drawn(&[0.0; 30], 1, 3), 5);
+    }
+
     /// The `k` largest, the first of equal ones, by sorting.
     fn largest(logits: &[f32], k: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..logits.len()).collect();
@@ -244,15 +345,14 @@ mod tests {
         let flat = vec![-2.5; 1000];
         for logits in [spread, ties, flat] {
             for k in [2, 40, 999, 1000] {
-                let config = SamplingConfig {
+                let sharpness = Sharpness {
                     top_k: k,
                     temperature: 1e6,
-                    ..SamplingConfig::default()
                 };
                 let mut room = Vec::new();
                 let n = 4 * k;
                 let mut drawn: Vec<usize> = (0..n)
-                    .map(|i| draw(&logits, (i as f64 + 0.5) / n as f64, &config, &mut room))
+                    .map(|i| draw(&logits, (i as f64 + 0.5) / n as f64, sharpness, &mut room))
                     .collect();
                 drawn.dedup();
                 assert_eq!(drawn, largest(&logits, k));

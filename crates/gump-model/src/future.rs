@@ -95,7 +95,7 @@ impl Future {
                 },
                 limits: self.limits(agent, scene, sampling).filter(|_| !driven),
                 frame: index,
-                restrict: None,
+                guide: None,
             });
         }
         Window {

@@ -71,6 +71,7 @@ mod surroundings;
 mod tests;
 pub mod train;
 mod trajectory;
+mod unsmooth;
 mod visual;
 pub mod world;
 

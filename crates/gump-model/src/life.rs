@@ -31,7 +31,7 @@ use crate::future::{Future, stream};
 use crate::generation::agent_of;
 use crate::generation::births::{BEGIN_AT, next_key, pick, stays};
 use crate::generation::constraint::ObjectSpec;
-use crate::generation::rules::{Rules, box_of, state_of};
+use crate::generation::rules::{Manner, Rules, box_of, state_of};
 use crate::sampling::Request;
 use crate::scene::Scene;
 use crate::session::TransformerSession;
@@ -299,7 +299,7 @@ impl TransformerSession<'_> {
                     ring: Ring::default(),
                     limits: None,
                     frame: future.index,
-                    restrict: Some(Arc::clone(&rules) as _),
+                    guide: Some(Arc::clone(&rules) as _),
                 })
                 .collect();
             let requests: Vec<&Request> = requests.iter().collect();
@@ -316,7 +316,7 @@ impl TransformerSession<'_> {
                 is_far
                     && rules.enters(&state)
                     && rules
-                        .broken(&state, &scene.map, scene.world_from_scene)
+                        .broken(&state, &box_of(&state), &scene.map, scene.world_from_scene)
                         .is_none()
             });
             let Some(bins) = kept else {
@@ -460,6 +460,7 @@ impl Future {
             taken,
             comes_to: ego,
             is_guided: true,
+            manner: Manner::default(),
         }
     }
 }

@@ -148,15 +148,26 @@ pub(crate) struct Request {
     pub(crate) limits: Option<(Pose, Limits)>,
     /// Number of the frame being decoded.
     pub(crate) frame: usize,
-    /// Which bins may be drawn, beyond that.
-    pub(crate) restrict: Option<Arc<dyn Restrict>>,
+    /// What the draws go by beyond that.
+    pub(crate) guide: Option<Arc<dyn Guide>>,
 }
 
-/// A mask that knows what was drawn before.
-pub(crate) trait Restrict: fmt::Debug + Send + Sync {
-    /// Which bins of `step` may be drawn after the steps in `drawn`; `None` leaves all. Where none
-    /// may, the draw is free, and whoever asked will find out.
-    fn allowed(&self, step: usize, drawn: &[u16]) -> Option<Vec<bool>>;
+/// What draws go by beside the logits, knowing what was drawn before.
+pub(crate) trait Guide: fmt::Debug + Send + Sync {
+    /// Factors on the probabilities of the bins of `step` after the steps in `drawn`, 0 for those
+    /// that may not be drawn; `None` leaves them as they are. Where none may, the draw is free, and
+    /// whoever asked will find out.
+    fn weights(&self, step: usize, drawn: &[u16]) -> Option<Vec<f32>>;
+
+    /// Factor on the temperature of `step`.
+    fn boldness(&self, step: usize) -> f64;
+
+    /// How widely the targets of `step` were spread in training, where that is to be taken off:
+    /// standard deviation in bins.
+    fn smoothing(&self, step: usize) -> Option<f32>;
+
+    /// The number in [0, 1) that decides `step`, instead of one of the object's stream.
+    fn number(&self, step: usize) -> Option<f64>;
 }
 
 impl Request {

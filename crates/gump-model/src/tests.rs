@@ -524,7 +524,7 @@ fn window(scenario: &Scenario) -> Window {
         ring: Ring::default(),
         limits: None,
         frame: 3,
-        restrict: None,
+        guide: None,
     };
     let requests = next.tracked.iter().enumerate().map(request).collect();
     Window {

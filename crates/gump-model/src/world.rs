@@ -267,7 +267,7 @@ impl TransformerWorld {
                     ring: Ring::default(),
                     limits: None,
                     frame: last,
-                    restrict: None,
+                    guide: None,
                 }
             })
             .collect();

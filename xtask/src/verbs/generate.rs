@@ -65,12 +65,16 @@ pub(crate) struct Args {
     /// Weights of the model [default: the shipped ones]
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// Divides the logits; above 1 is bolder
-    #[arg(long, value_name = "X", default_value_t = 1.25)]
-    temperature: f64,
-    /// Bins that may be drawn per field
-    #[arg(long, value_name = "N", default_value = "400")]
-    top_k: NonZeroUsize,
+    /// Divides the logits; above 1 is bolder [default: 1, with --paper 1.25]
+    #[arg(long, value_name = "X")]
+    temperature: Option<f64>,
+    /// Bins that may be drawn per field [default: all, with --paper 400]
+    #[arg(long, value_name = "N")]
+    top_k: Option<NonZeroUsize>,
+    /// Draw as the paper does: every field from the network's distribution as it is, every object
+    /// on its own
+    #[arg(long)]
+    paper: bool,
     /// Scenes made before one is written that is not what the prompt says
     #[arg(long, value_name = "N", default_value = "20")]
     attempts: NonZeroUsize,
@@ -133,11 +137,9 @@ impl Args {
     }
 
     fn check_numbers(&self) -> anyhow::Result<()> {
-        let wrong = if !(self.temperature > 0.0 && self.temperature.is_finite()) {
-            format!(
-                "--temperature: expected a number above 0, found {}",
-                self.temperature
-            )
+        let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
+        let wrong = if let Some(t) = self.temperature.filter(absurd) {
+            format!("--temperature: expected a number above 0, found {t}")
         } else if !(0.0..=3600.0).contains(&self.simulate) {
             format!(
                 "--simulate: expected a number from 0 to 3600, found {}",
@@ -168,11 +170,15 @@ impl Args {
     }
 
     fn config(&self) -> GenerateConfig {
+        let manner = match self.paper {
+            true => GenerateConfig::paper(),
+            false => GenerateConfig::default(),
+        };
         GenerateConfig {
-            temperature: self.temperature,
-            top_k: self.top_k.get(),
+            temperature: self.temperature.unwrap_or(manner.temperature),
+            top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
             placement: self.placement.resolve(),
-            ..GenerateConfig::default()
+            ..manner
         }
     }
 

@@ -78,12 +78,14 @@ impl Decoder {
         self.hidden.iter().chain(&self.input).chain(&self.heads)
     }
 
-    /// One state per request; `hidden` `[K, C]` are the hidden vectors at the keys.
+    /// One state per request, the first `n_steps` of its bins; `hidden` `[K, C]` are the hidden
+    /// vectors at the keys.
     pub(super) fn sample(
         &self,
         hidden: &[f32],
         requests: &[&Request],
         config: &SamplingConfig,
+        n_steps: usize,
         rooms: &Pool,
     ) -> Vec<Bins> {
         let mut bins = vec![[0; STEPS.len()]; requests.len()];
@@ -92,18 +94,19 @@ impl Decoder {
             .zip(requests.par_chunks(step))
             .zip(hidden.par_chunks(step * self.width))
             .for_each(|((bins, requests), hidden)| {
-                rooms.with(|room| self.sample_few(hidden, requests, config, bins, room));
+                rooms.with(|room| self.sample_few(hidden, requests, (config, n_steps), bins, room));
             });
         bins
     }
 
-    /// Multiplications of decoding `n` objects whose first `given` fields are forced.
-    pub(super) fn products(&self, n: usize, given: usize) -> u64 {
+    /// Multiplications of the first `n_steps` of decoding `n` objects whose first `given` fields are
+    /// forced.
+    pub(super) fn products(&self, n: usize, given: usize, n_steps: usize) -> u64 {
         let recurrent = self.hidden.iter().chain(&self.input);
         let recurrent: u64 = recurrent.map(|panels| panels.products(n)).sum();
-        let heads = STEPS.iter().skip(given);
+        let heads = STEPS.iter().take(n_steps).skip(given);
         let heads: u64 = heads.map(|field| self.head(*field).products(n)).sum();
-        recurrent * STEPS.len() as u64 + heads
+        recurrent * n_steps as u64 + heads
     }
 
     fn head(&self, field: Field) -> &Panels {
@@ -115,7 +118,7 @@ impl Decoder {
         &self,
         hidden: &[f32],
         requests: &[&Request],
-        config: &SamplingConfig,
+        (config, n_steps): (&SamplingConfig, usize),
         bins: &mut [Bins],
         room: &mut Workroom,
     ) {
@@ -129,7 +132,7 @@ impl Decoder {
         states.clear();
         (0..self.hidden.len()).for_each(|_| states.extend_from_slice(hidden));
         gates.resize(3 * n * c, 0.0);
-        for (step, field) in STEPS.into_iter().enumerate() {
+        for (step, field) in STEPS.into_iter().enumerate().take(n_steps) {
             self.first_inputs(step, bins, input);
             for (layer, panels) in self.hidden.iter().enumerate() {
                 let (below, state) = states.split_at_mut(layer * n * c);

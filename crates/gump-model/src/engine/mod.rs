@@ -33,6 +33,7 @@ use self::successor::Successors;
 use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
 use crate::ModelError;
 use crate::batch::PlacedSlot;
+use crate::decoder::{STATE_STEPS, STEPS};
 use crate::draw::Candidates;
 use crate::mct::VisualMemory;
 use crate::network::Network;
@@ -184,8 +185,23 @@ impl Engine {
         config: &SamplingConfig,
     ) -> Vec<Bins> {
         // Widths and lengths are always given.
-        self.count(self.decoder.products(requests.len(), 2));
-        self.decoder.sample(hidden, requests, config, &self.rooms)
+        let n_steps = STEPS.len();
+        self.count(self.decoder.products(requests.len(), 2, n_steps));
+        self.decoder
+            .sample(hidden, requests, config, n_steps, &self.rooms)
+    }
+
+    /// As [`Engine::sample`], but no more than the first state, size included; the bins of what
+    /// would come next are 0.
+    pub(crate) fn sample_state(
+        &self,
+        hidden: &[f32],
+        requests: &[&Request],
+        config: &SamplingConfig,
+    ) -> Vec<Bins> {
+        self.count(self.decoder.products(requests.len(), 0, STATE_STEPS));
+        self.decoder
+            .sample(hidden, requests, config, STATE_STEPS, &self.rooms)
     }
 
     /// What may follow the tokens whose hidden vectors `[N, C]` are given.

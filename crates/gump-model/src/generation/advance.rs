@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use gump_geometry::OrientedBox;
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
@@ -130,10 +131,10 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
             .collect();
         let references: Vec<&Request> = requests.iter().collect();
         let sampling = &queries[0].draft.prepared.sampling;
-        let bins = engine.sample(&hidden, &references, sampling);
+        let bins = engine.sample_state(&hidden, &references, sampling);
         drawn += n;
         let is_last = drawn >= tries;
-        let judged: Vec<Vec<Result<QuantizedState, String>>> = queries
+        let judged: Vec<Vec<Result<Found, String>>> = queries
             .par_iter()
             .zip(bins.par_chunks(n))
             .map(|(query, bins)| bins.iter().map(|bins| judge(query, bins)).collect())
@@ -143,8 +144,8 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
             let mut kept = None;
             for result in judged {
                 match result {
-                    Ok(state) => {
-                        kept = Some(state);
+                    Ok(found) => {
+                        kept = Some(found);
                         break;
                     }
                     Err(clause) => {
@@ -154,9 +155,13 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
                 }
             }
             match kept {
-                Some(state) => query.draft.accept(query.key, state),
+                Some((state, outline)) => query.draft.accept(query.key, state, outline),
                 None if is_last => query.draft.fail(query.key, &query.broken),
-                None => left.push(query),
+                None => {
+                    // The numbers of the first draw would give the same again.
+                    Arc::make_mut(&mut query.rules).manner.numbers = None;
+                    left.push(query);
+                }
             }
         }
         queries = left;
@@ -174,20 +179,22 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
         ring: Ring::default(),
         limits: None,
         frame: 0,
-        restrict: Some(rules),
+        guide: Some(rules),
     }
 }
 
+/// A state and its outline.
+type Found = (QuantizedState, OrientedBox);
+
 /// The state that was drawn, or the rule it breaks. The ego's box is given and therefore good.
-fn judge(query: &Query<'_, '_>, bins: &Bins) -> Result<QuantizedState, String> {
+fn judge(query: &Query<'_, '_>, bins: &Bins) -> Result<Found, String> {
     let state = state_of(bins);
     let prepared = query.draft.prepared;
-    let map = &prepared.request.map;
-    let broken = query
-        .rules
-        .broken(&state, map, prepared.scene.world_from_scene);
+    let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
+    let outline = query.rules.outline(&state, map, world_from_scene);
+    let broken = query.rules.broken(&state, &outline, map, world_from_scene);
     match broken {
         Some(clause) if !query.key.is_ego() || clause.starts_with("speed") => Err(clause),
-        _ => Ok(state),
+        _ => Ok((state, outline)),
     }
 }

@@ -4,15 +4,16 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use gump_geometry::OrientedBox;
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Seed};
-use gump_tokenizer::{AGENT_KEYS, Key, QuantizedState, TokenAgent};
+use gump_tokenizer::{AGENT_KEYS, Key, QuantizedState, TokenAgent, class_index};
 use rand::seq::SliceRandom;
 
 use super::births::{self, NEWBORN_AT};
 use super::constraint::{Bounds, EGO, ObjectSpec};
+use super::even;
 use super::prepared::Prepared;
-use super::rules::{Rules, box_of};
+use super::rules::Rules;
 use super::{GenerateError, GeneratedScene, agent_of};
-use crate::decoder::STEPS;
+use crate::decoder::{STATE_STEPS, STEPS};
 use crate::engine::{Context, Successor};
 
 /// One scene in progress.
@@ -137,7 +138,22 @@ impl<'a> Draft<'a> {
         if !key.is_ego() {
             taken.extend_from_slice(&self.prepared.fixtures);
         }
-        self.prepared.rules(key.kind, &spec, &taken, &self.named)
+        let mut rules = self.prepared.rules(key.kind, &spec, &taken, &self.named);
+        rules.manner.numbers = self.numbers(key);
+        rules
+    }
+
+    /// What decides the first draw of the object with this key, which is next.
+    fn numbers(&self, key: Key) -> Option<[f64; STATE_STEPS]> {
+        let request = self.prepared.request;
+        let n = request.counts.as_ref()?.of(key.kind);
+        let others = self.agents.iter().map(|agent| agent.key);
+        let before = others.filter(|other| !other.is_ego() && other.kind == key.kind);
+        let i = before.count();
+        // The scene's own stream 0 has drawn the ids.
+        let seed = self.stream(0).fork(1 + class_index(key.kind) as u64);
+        let evenly = request.config.even && !key.is_ego() && i < n;
+        evenly.then(|| even::numbers(seed, i, n))
     }
 
     /// What is given of the ego, per step of the decoder.
@@ -154,7 +170,8 @@ impl<'a> Draft<'a> {
         forced
     }
 
-    pub(super) fn accept(&mut self, key: Key, state: QuantizedState) {
+    /// Puts an object there, its outline as [`Rules::outline`] has it.
+    pub(super) fn accept(&mut self, key: Key, state: QuantizedState, outline: OrientedBox) {
         if !key.is_ego()
             && self
                 .wished
@@ -167,7 +184,7 @@ impl<'a> Draft<'a> {
             self.named.insert(EGO.to_owned(), 0);
         }
         self.agents.push(TokenAgent { key, state });
-        self.boxes.push(box_of(&state));
+        self.boxes.push(outline);
     }
 
     /// Begins anew, or gives up with what was broken most often.
@@ -202,9 +219,9 @@ impl<'a> Draft<'a> {
         let world_from_scene = scene.world_from_scene;
         let to_world = |(i, token): (usize, &TokenAgent)| {
             let mut state = token.state.to_agent_state();
-            state.pose = world_from_scene * state.pose;
-            state.velocity = world_from_scene.rotate(state.velocity);
             let own = self.boxes[i];
+            state.pose = world_from_scene * own.pose;
+            state.velocity = world_from_scene.rotate(state.velocity);
             let mut size = [own.length, own.width];
             if i == 0 {
                 // What is given is kept exactly, not to the grid.

@@ -7,8 +7,8 @@
 //! [`TransformerWorld::generate`]; wishes for single objects are in [`constraint`], what a draw may
 //! not do in `rules`, where on a map things belong in `ground`.
 //!
-//! Source: GUMP's scene generation, in full autoregression with temperature 1.25; masks, rejection
-//! and counts left to the model are ours.
+//! Source: GUMP's scene generation, in full autoregression ([`GenerateConfig::paper`]); masks,
+//! rejection, sharper and even draws, and counts left to the model are ours.
 
 mod advance;
 pub mod baseline;
@@ -16,6 +16,7 @@ pub(crate) mod births;
 pub mod constraint;
 mod draft;
 mod drive;
+mod even;
 pub mod factory;
 pub(crate) mod ground;
 mod prepared;
@@ -111,6 +112,16 @@ impl Counts {
 pub struct GenerateConfig {
     /// Divides the logits (paper: 1.25).
     pub temperature: f64,
+    /// Multiplies the temperature of widths and lengths (paper: 1).
+    pub size_boldness: f64,
+    /// Multiplies the temperature of x and y (paper: 1).
+    pub place_boldness: f64,
+    /// What training spread the targets of sizes and velocities by (`smoothing_bins`), to be taken
+    /// off again: a standard deviation in bins; 0 leaves it (paper).
+    pub smoothing_bins: f64,
+    /// Whether the draws of a scene's objects are spread evenly where their number is given (paper:
+    /// no).
+    pub even: bool,
     /// Bins that may be drawn per field (paper: 200 in the text, 400 in the table).
     pub top_k: usize,
     /// Where objects may be drawn.
@@ -123,11 +134,32 @@ pub struct GenerateConfig {
     pub max_agents: usize,
 }
 
-impl Default for GenerateConfig {
-    fn default() -> Self {
+impl GenerateConfig {
+    /// Draws as the paper has them: bolder, and each on its own.
+    pub fn paper() -> Self {
         Self {
             temperature: 1.25,
+            size_boldness: 1.0,
+            place_boldness: 1.0,
             top_k: 400,
+            smoothing_bins: 0.0,
+            even: false,
+            ..Self::default()
+        }
+    }
+}
+
+impl Default for GenerateConfig {
+    /// What makes scenes most like recorded ones with the shipped weights
+    /// (docs/results/0012-generation.md).
+    fn default() -> Self {
+        Self {
+            temperature: 1.0,
+            size_boldness: 1.3,
+            place_boldness: 1.5,
+            smoothing_bins: 0.7,
+            even: true,
+            top_k: 1000,
             placement: Placement::Guided,
             tries: 24,
             restarts: 4,

@@ -12,7 +12,7 @@ use gump_tokenizer::{
 
 use super::constraint::{self, EGO, ObjectSpec};
 use super::ground::Ground;
-use super::rules::Rules;
+use super::rules::{Manner, Rules};
 use super::{GenerateError, GenerateRequest, Placement, agent_of};
 use crate::ModelError;
 use crate::batch::{PlacedSlot, place};
@@ -33,6 +33,7 @@ pub(crate) struct Prepared<'a> {
     /// Boxes of what stands around, scene frame.
     pub(super) fixtures: Vec<OrientedBox>,
     pub(super) sampling: SamplingConfig,
+    manner: Manner,
 }
 
 impl<'a> Prepared<'a> {
@@ -62,7 +63,14 @@ impl<'a> Prepared<'a> {
             own
         });
         let fixtures = fixtures.collect();
+        let config = &request.config;
         let prepared = Self {
+            manner: Manner {
+                size_boldness: config.size_boldness,
+                place_boldness: config.place_boldness,
+                smoothing_bins: Some(config.smoothing_bins as f32).filter(|bins| *bins > 0.0),
+                numbers: None,
+            },
             request,
             scene,
             fixtures,
@@ -71,8 +79,8 @@ impl<'a> Prepared<'a> {
             grounds,
             lanes,
             sampling: SamplingConfig {
-                temperature: request.config.temperature,
-                top_k: request.config.top_k,
+                temperature: config.temperature,
+                top_k: config.top_k,
                 ..world.sampling().clone()
             },
         };
@@ -169,6 +177,7 @@ impl<'a> Prepared<'a> {
             rows,
             comes_to: None,
             is_guided,
+            manner: self.manner.clone(),
         }
     }
 

@@ -7,20 +7,24 @@
 
 use std::sync::Arc;
 
-use gump_geometry::{DVec2, OrientedBox, Pose, dvec2};
+use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, dvec2};
 use gump_metrics::metres_off_road;
 use gump_scene::{AgentKind, MapGraph};
 use gump_tokenizer::{Field, QuantizedState};
 
 use super::constraint::{Bounds, ObjectSpec};
 use super::ground::{CELLS, Cell, Entry, Ground, SLOW, goes};
-use crate::decoder::STEPS;
-use crate::sampling::{Bins, Restrict};
+use crate::decoder::{STATE_STEPS, STEPS};
+use crate::sampling::{Bins, Guide};
 
 /// Gap that boxes keep, metres.
 const CLEARANCE: f64 = 0.2;
 /// Whoever comes over the border nears the ego at least so fast, metres per second.
 const CLOSING: f64 = 0.5;
+/// How far a vehicle on a lane is typically turned from the lane's way, radians.
+const LANE_KEEPING: f64 = 0.03;
+/// Whoever is this near to a lane's centre line is on it, metres.
+const ON_LANE_M: f64 = 1.2;
 /// A gap in a row is met to this, metres: half a step of the grid along each axis and some turn.
 const ROW_SLACK: f64 = 0.5;
 
@@ -40,16 +44,43 @@ pub(crate) struct Rules {
     pub(crate) comes_to: Option<(DVec2, DVec2)>,
     /// Whether sizes and speeds keep to what is common in the class.
     pub(crate) is_guided: bool,
+    pub(crate) manner: Manner,
 }
 
-impl Restrict for Rules {
-    fn allowed(&self, step: usize, drawn: &[u16]) -> Option<Vec<bool>> {
-        let field = *STEPS.get(step).filter(|_| step < 7)?;
+/// How the fields of an object are drawn.
+#[derive(Clone, Debug)]
+pub(crate) struct Manner {
+    /// Multiplies the temperature of widths and lengths.
+    pub(crate) size_boldness: f64,
+    /// Multiplies the temperature of x and y.
+    pub(crate) place_boldness: f64,
+    /// What training spread the targets of sizes and velocities by, bins, if that is taken off.
+    pub(crate) smoothing_bins: Option<f32>,
+    /// What decides its fields, instead of its stream.
+    pub(crate) numbers: Option<[f64; STATE_STEPS]>,
+}
+
+impl Default for Manner {
+    /// As the network says.
+    fn default() -> Self {
+        Self {
+            size_boldness: 1.0,
+            place_boldness: 1.0,
+            smoothing_bins: None,
+            numbers: None,
+        }
+    }
+}
+
+impl Guide for Rules {
+    fn weights(&self, step: usize, drawn: &[u16]) -> Option<Vec<f32>> {
+        let field = *STEPS.get(step).filter(|_| step < STATE_STEPS)?;
         let value = |i: usize| STEPS[i].dequantize(drawn[i]);
-        let bins = |open: &dyn Fn(f64) -> bool| -> Vec<bool> {
+        let weigh = |weight: &dyn Fn(f64) -> f32| -> Vec<f32> {
             let bins = 0..field.n_bins() as u16;
-            bins.map(|bin| open(field.dequantize(bin))).collect()
+            bins.map(|bin| weight(field.dequantize(bin))).collect()
         };
+        let bins = |open: &dyn Fn(f64) -> bool| weigh(&|value| f32::from(u8::from(open(value))));
         let half = field.step() / 2.0 + 1e-6;
         match field {
             Field::Width | Field::Length => {
@@ -70,25 +101,79 @@ impl Restrict for Rules {
             Field::Heading => {
                 let velocity = dvec2(value(2), value(3));
                 let at = dvec2(value(4), value(5));
-                Some(bins(&|heading| self.admits_heading(heading, at, velocity)))
+                Some(weigh(&|heading| {
+                    if self.admits_heading(heading, at, velocity) {
+                        self.keeps_lane(heading, at)
+                    } else {
+                        0.0
+                    }
+                }))
             }
         }
+    }
+
+    fn boldness(&self, step: usize) -> f64 {
+        match STEPS[step] {
+            _ if step >= STATE_STEPS => 1.0,
+            Field::Width | Field::Length => self.manner.size_boldness,
+            Field::X | Field::Y => self.manner.place_boldness,
+            _ => 1.0,
+        }
+    }
+
+    fn smoothing(&self, step: usize) -> Option<f32> {
+        // Bins of places and headings are so narrow that it does not show.
+        let is_coarse =
+            step < STATE_STEPS && !matches!(STEPS[step], Field::X | Field::Y | Field::Heading);
+        self.manner.smoothing_bins.filter(|_| is_coarse)
+    }
+
+    fn number(&self, step: usize) -> Option<f64> {
+        self.manner.numbers?.get(step).copied()
     }
 }
 
 impl Rules {
-    /// The first rule that a drawn state breaks, in words.
-    pub(crate) fn broken(
+    /// The box of a state, scene frame. On lanes the grid of headings is too coarse: who faces the
+    /// lane's way as far as its bin says, faces that.
+    pub(crate) fn outline(
         &self,
         state: &QuantizedState,
         map: &MapGraph,
         world_from_scene: Pose,
+    ) -> OrientedBox {
+        let mut own = box_of(state);
+        let is_driving = self.kind != AgentKind::Pedestrian;
+        if self.ground.is_none() || !is_driving || self.heading().is_some() {
+            return own;
+        }
+        let pose = world_from_scene * own.pose;
+        let off = |heading: f64| angle_difference(heading, pose.heading).abs();
+        let nearest = map
+            .lanes_near(pose.position, ON_LANE_M)
+            .map(|(lane, _)| {
+                let at = lane.centerline.project(pose.position).arc_length;
+                lane.centerline.pose_at(at).heading
+            })
+            .min_by(|a, b| off(*a).total_cmp(&off(*b)));
+        if let Some(way) = nearest.filter(|way| off(*way) <= 1.5 * Field::Heading.step()) {
+            own.pose.heading = (world_from_scene.inverse() * Pose::new(0.0, 0.0, way)).heading;
+        }
+        own
+    }
+
+    /// The first rule that a drawn state and its outline break, in words.
+    pub(crate) fn broken(
+        &self,
+        state: &QuantizedState,
+        own: &OrientedBox,
+        map: &MapGraph,
+        world_from_scene: Pose,
     ) -> Option<String> {
-        let own = box_of(state);
         if own.length <= 0.0 || own.width <= 0.0 {
             return Some("a box needs an extent".into());
         }
-        if let Some(clause) = self.broken_spec(state, &own) {
+        if let Some(clause) = self.broken_spec(state, own) {
             return Some(clause);
         }
         if self.taken.iter().any(|other| own.overlaps(other)) {
@@ -216,7 +301,7 @@ impl Rules {
     }
 
     /// Where on the axis of `field` its centre may be, given what is drawn before.
-    fn place(&self, field: Field, value: &dyn Fn(usize) -> f64) -> Option<Vec<bool>> {
+    fn place(&self, field: Field, value: &dyn Fn(usize) -> f64) -> Option<Vec<f32>> {
         let velocity = dvec2(value(2), value(3));
         let size = dvec2(value(1), value(0));
         let (given, axis) = match field {
@@ -234,17 +319,20 @@ impl Rules {
         if bounds.is_none() && ground.is_none() {
             return None;
         }
-        let open: Option<[bool; CELLS]> = ground.map(|ground| {
-            let mut open = [false; CELLS];
+        let open: Option<[f32; CELLS]> = ground.map(|ground| {
+            let mut open = [0.0; CELLS];
             let fits = |(at, cell): &(DVec2, &Cell)| self.fits(*at, cell, size, velocity);
             if field == Field::X {
                 for (x, open) in open.iter_mut().enumerate() {
-                    *open = ground.column(x).any(|cell| fits(&cell));
+                    let n = ground.column(x).filter(fits).count();
+                    // Where y goes is drawn later; between one per column and one per cell, which
+                    // would follow the network and the length of lanes.
+                    *open = (n as f32).sqrt();
                 }
             } else {
                 let x = ((value(4) + 100.0).floor().max(0.0) as usize).min(CELLS - 1);
                 for (at, _) in ground.column(x).filter(fits) {
-                    open[(at.y + 100.0).floor() as usize] = true;
+                    open[(at.y + 100.0).floor() as usize] = 1.0;
                 }
             }
             open
@@ -253,7 +341,12 @@ impl Rules {
         let admits = |bin: u16| {
             let at = field.dequantize(bin);
             let cell = ((at + 100.0).floor().max(0.0) as usize).min(CELLS - 1);
-            bounds.is_none_or(|bounds| bounds.admit(at, half)) && open.is_none_or(|open| open[cell])
+            let within = bounds.is_none_or(|bounds| bounds.admit(at, half));
+            if within {
+                open.map_or(1.0, |open| open[cell])
+            } else {
+                0.0
+            }
         };
         Some((0..field.n_bins() as u16).map(admits).collect())
     }
@@ -302,6 +395,16 @@ impl Rules {
         })
     }
 
+    /// How well a heading keeps to the lane, from 0 to 1; 1 where there is none.
+    fn keeps_lane(&self, heading: f64, at: DVec2) -> f32 {
+        let cell = self.ground.as_ref().and_then(|ground| ground.cell(at));
+        let ways = cell.map_or(&[][..], |cell| &cell.ways).iter();
+        let off = ways.map(|way| angle_difference(heading, f64::from(*way)).abs());
+        off.reduce(f64::min).map_or(1.0, |off| {
+            (-0.5 * (off / LANE_KEEPING).powi(2)).exp() as f32
+        })
+    }
+
     fn admits_heading(&self, heading: f64, at: DVec2, velocity: DVec2) -> bool {
         let half = Field::Heading.step() / 2.0 + 1e-6;
         if let Some(bounds) = self.heading() {
@@ -313,7 +416,7 @@ impl Rules {
             0.12
         };
         let follows = || {
-            let turn = gump_geometry::angle_difference(heading, velocity.to_angle());
+            let turn = angle_difference(heading, velocity.to_angle());
             velocity.length() < SLOW || turn.abs() <= slack
         };
         match &self.ground {
@@ -359,12 +462,13 @@ mod tests {
             taken: Vec::new(),
             comes_to: None,
             is_guided: false,
+            manner: Manner::default(),
         }
     }
 
     fn open(rules: &Rules, step: usize, drawn: &[u16]) -> Vec<f64> {
-        let mask = rules.allowed(step, drawn).unwrap();
-        let bins = (0..mask.len()).filter(|i| mask[*i]);
+        let weights = rules.weights(step, drawn).unwrap();
+        let bins = (0..weights.len()).filter(|i| weights[*i] > 0.0);
         bins.map(|bin| STEPS[step].dequantize(bin as u16)).collect()
     }
 
@@ -378,7 +482,7 @@ mod tests {
         assert_eq!(open(&rules, 2, &[4, 9]), [0.0]);
         assert_eq!(open(&rules, 3, &[4, 9, 100]), [0.0]);
         assert!((open(&rules, 4, &[4, 9, 100, 100])[0] - 10.0).abs() < 1e-9);
-        assert!(rules.allowed(0, &[]).is_none() && rules.allowed(9, &[0; 9]).is_none());
+        assert!(rules.weights(0, &[]).is_none() && rules.weights(9, &[0; 9]).is_none());
     }
 
     #[test]
@@ -402,6 +506,34 @@ mod tests {
         assert!(y.iter().all(|y| (9.9..11.1).contains(y)), "{y:?}");
         let heading = open(&rules, 6, &[4, 9, drawn[2], 100, 600, 550]);
         assert!(heading.iter().all(|h| h.abs() < 0.15));
+    }
+
+    #[test]
+    fn who_keeps_to_a_lane_faces_its_way_exactly() {
+        let scenario = fixture::scenario("lane 1: -50,0 50,1.3\nego vehicle 0: 0,0").unwrap();
+        let way = 0.013_f64.atan();
+        let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
+        let rules = Rules {
+            ground: Some(Arc::new(ground)),
+            is_guided: true,
+            ..rules(ObjectSpec::default())
+        };
+        let facing = |heading: f64| {
+            let state = QuantizedState {
+                x: Field::X.quantize(10.0).bin,
+                y: Field::Y.quantize(0.1).bin,
+                heading: Field::Heading.quantize(heading).bin,
+                ..QuantizedState::default()
+            };
+            let outline = rules.outline(&state, &scenario.map, Pose::IDENTITY);
+            outline.pose.heading
+        };
+        assert!((facing(0.0) - way).abs() < 1e-9 && (facing(0.04) - way).abs() < 1e-9);
+        assert!((facing(0.1) - 0.1).abs() < 0.02);
+        // Standing, it is most likely drawn that way.
+        let weights = rules.weights(6, &[4, 9, 100, 100, 550, 500]).unwrap();
+        let best = (0..weights.len()).max_by(|a, b| weights[*a].total_cmp(&weights[*b]));
+        assert_eq!(best, Some(usize::from(Field::Heading.quantize(way).bin)));
     }
 
     #[test]
@@ -429,14 +561,18 @@ mod tests {
             length: 9,
         };
         let map = fixture::scenario("ego vehicle 0: 0,0").unwrap().map;
-        let broken = |x: f64| rules.broken(&state(x), &map, Pose::IDENTITY);
+        let broken = |x: f64| {
+            let state = state(x);
+            rules.broken(&state, &box_of(&state), &map, Pose::IDENTITY)
+        };
         assert_eq!(broken(-10.2), None);
         assert_eq!(broken(-3.0).as_deref(), Some("behind another by 6 m"));
         let none = Rules {
             rows: Vec::new(),
             ..rules.clone()
         };
-        let found = none.broken(&state(-3.0), &map, Pose::IDENTITY);
+        let near = state(-3.0);
+        let found = none.broken(&near, &box_of(&near), &map, Pose::IDENTITY);
         assert_eq!(found.as_deref(), Some("no overlap with the others"));
     }
 }

@@ -37,7 +37,7 @@ impl OrdinalSmoothing {
     }
 
     /// Bins and probabilities of target `t` among `v` bins.
-    fn spread(&self, t: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
+    pub(crate) fn spread(&self, t: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
         let radius = self.radius();
         bins.clear();
         if self.circular {

@@ -5,26 +5,26 @@
 //! vehicles within 50 m of the recorded ego, which every source is given with as many vehicles as
 //! were recorded. Prompts are judged on scenes of their own.
 
-use std::path::PathBuf;
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
-use gump_metrics::mmd::{MmdMean, MmdProtocol, scene_mmd};
-use gump_model::generation::baseline::{
-    overlapping_vehicles, random_along_lanes, retrieved, wrong_way,
-};
-use gump_model::generation::constraint::{Bounds, ObjectSpec};
+use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
+use gump_metrics::{Interval, intervals};
+use gump_model::generation::Placement;
+use gump_model::generation::baseline::{overlapping_vehicles, wrong_way};
 use gump_model::generation::verdict::off_road;
-use gump_model::generation::{Counts, GenerateConfig, GenerateRequest, Placement};
-use gump_model::world::TransformerWorld;
-use gump_scene::{AgentKind, Frame, Scenario, Seed};
+use gump_scene::{Frame, Scenario, Seed};
 use gump_viz::Bars;
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::sources::{Case, Makers, Source};
 use super::{long, prompts};
 use crate::charts;
+use crate::dataset::{self, Split};
 use crate::run::{Common, Run, stop_if_interrupted};
+use crate::shipped;
 use crate::verbs::generate;
 
 /// Arguments of `evaluate generation`.
@@ -33,6 +33,13 @@ pub(crate) struct Args {
     /// A file or folder of scenarios
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
+    /// Further scenes per scenario, each around another vehicle at another time
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    centres: usize,
+    /// A file or folder of recordings that are put onto the maps for comparison [default: those of
+    /// the shipped data that are for training]
+    #[arg(long, value_name = "PATH")]
+    bank: Option<PathBuf>,
     /// At most so many scenarios that take part [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
@@ -56,39 +63,11 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// Where scenes come from.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Source {
-    Model(Placement),
-    Random,
-    Retrieval,
-    Log,
-}
-
-impl Source {
-    const ALL: [Self; 5] = [
-        Self::Model(Placement::Guided),
-        Self::Model(Placement::Free),
-        Self::Random,
-        Self::Retrieval,
-        Self::Log,
-    ];
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Model(Placement::Guided) => "model guided",
-            Self::Model(Placement::Free) => "model free",
-            Self::Random => "random along lanes",
-            Self::Retrieval => "retrieval",
-            Self::Log => "log",
-        }
-    }
-}
-
 /// What one source made.
 #[derive(Default)]
 struct Tally {
-    mmd: MmdMean,
+    /// By recording.
+    mmd: Vec<(usize, SceneMmd)>,
     failed: usize,
     vehicles: usize,
     overlapping: usize,
@@ -106,21 +85,33 @@ impl Args {
             min_vehicles: self.min_vehicles,
             ..MmdProtocol::gump()
         };
-        let scenarios = run.phase("read", |_| self.read(&protocol))?;
+        let seed = run.seed();
+        let scenarios = run.phase("read", |_| read(&self.scenarios, self.limit, &protocol))?;
+        let bank = run.phase("bank", |_| self.bank(&protocol))?;
         anyhow::ensure!(
             scenarios.len() > 1,
             "{} scenarios have {} vehicles within 50 m, expected at least 2",
             scenarios.len(),
             self.min_vehicles
         );
+        let numbered = scenarios.iter().cloned().enumerate();
+        let cases = numbered.flat_map(|(i, scenario)| {
+            let seed = seed.fork(9).fork(i as u64);
+            Case::of(i, scenario, self.centres, &protocol, seed)
+        });
+        let cases: Vec<Case> = cases.collect();
         run.result("scenarios", scenarios.len())?;
-        let seed = run.seed();
+        run.result("scenes", cases.len())?;
+        let makers = Makers {
+            world: &world,
+            cases: &cases,
+            bank: &bank,
+            protocol,
+        };
         let mut tallies = Vec::new();
         for source in Source::ALL {
             stop_if_interrupted()?;
-            let tally = run.phase(source.name(), |_| {
-                Ok(tally(&world, source, &scenarios, &protocol, seed))
-            })?;
+            let tally = run.phase(source.name(), |_| Ok(tally(&makers, source, seed)))?;
             tallies.push((source, tally));
         }
         let prompts = run.phase("prompts", |run| {
@@ -131,13 +122,20 @@ impl Args {
                 Source::Model(Placement::Guided) => prompts.satisfaction,
                 Source::Model(Placement::Free) => prompts.unconditional,
                 Source::Log => prompts.logged,
-                Source::Random | Source::Retrieval => None,
+                _ => None,
             };
             row(*source, tally, satisfaction)
         });
         let rows: Vec<Value> = rows.collect();
-        charts::save(run, "likeness", &chart(&rows))?;
+        let intervals = tallies.iter().map(|(source, tally)| {
+            let spans = tally.intervals(scenarios.len(), seed);
+            spans_row(*source, &spans)
+        });
+        let intervals: Vec<Value> = intervals.collect();
+        charts::save(run, "likeness", &chart(&rows, &intervals))?;
+        run.result("gain_over_random", gain(&rows))?;
         run.result("rows", rows)?;
+        run.result("intervals", intervals)?;
         run.result("prompts", prompts.rows)?;
         if self.long_scenes > 0 {
             let (weights, n) = (self.weights.as_ref(), self.long_scenes);
@@ -148,52 +146,84 @@ impl Args {
         Ok(())
     }
 
-    fn read(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
-        let mut scenarios = Vec::new();
-        for record in gump_data::open(&self.scenarios)? {
-            stop_if_interrupted()?;
-            let scenario = record?.scenario;
-            let present = scenario.present();
-            if scene_mmd(&present, present.now(), protocol).is_some() {
-                scenarios.push(scenario);
-            }
-            if self.limit.is_some_and(|limit| scenarios.len() >= limit) {
-                break;
-            }
+    /// The recordings that are retrieved.
+    fn bank(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
+        if let Some(path) = &self.bank {
+            return read(path, None, protocol);
         }
-        Ok(scenarios)
+        let parts = dataset::parts(&shipped::data(), Split::Train)?;
+        let parts = parts.iter().map(|part| read(&part.path, None, protocol));
+        Ok(parts.collect::<anyhow::Result<Vec<_>>>()?.concat())
     }
 }
 
-fn tally(
-    world: &TransformerWorld,
-    source: Source,
-    scenarios: &[Scenario],
+/// The scenarios of a file or folder that take part.
+fn read(
+    path: &Path,
+    limit: Option<usize>,
     protocol: &MmdProtocol,
-    seed: Seed,
-) -> Tally {
-    let made: Vec<Option<Frame>> = (0..scenarios.len())
+) -> anyhow::Result<Vec<Scenario>> {
+    let mut scenarios = Vec::new();
+    for record in gump_data::open(path)? {
+        stop_if_interrupted()?;
+        let scenario = record?.scenario;
+        let present = scenario.present();
+        if scene_mmd(&present, present.now(), protocol).is_some() {
+            scenarios.push(scenario);
+        }
+        if limit.is_some_and(|limit| scenarios.len() >= limit) {
+            break;
+        }
+    }
+    Ok(scenarios)
+}
+
+fn tally(makers: &Makers<'_>, source: Source, seed: Seed) -> Tally {
+    let made: Vec<Option<Frame>> = (0..makers.cases.len())
         .into_par_iter()
-        .map(|i| scene_of(world, source, scenarios, i, protocol, seed.fork(i as u64)))
+        .map(|i| makers.make(source, i, seed.fork(i as u64)))
         .collect();
     let mut tally = Tally::default();
-    for (scenario, frame) in scenarios.iter().zip(made) {
+    for (case, frame) in makers.cases.iter().zip(made) {
         let Some(frame) = frame else {
             tally.failed += 1;
             continue;
         };
-        if let Some(mmd) = scene_mmd(&scenario.present(), &frame, protocol) {
-            tally.mmd.add(&mmd);
+        let recorded = &case.recorded;
+        if let Some(mmd) = scene_mmd(&recorded.present(), &frame, &makers.protocol) {
+            tally.mmd.push((case.recording, mmd));
         }
         let (overlapping, vehicles) = overlapping_vehicles(&frame);
-        let (wrong, moving) = wrong_way(&scenario.map, &frame);
+        let (wrong, moving) = wrong_way(&recorded.map, &frame);
         tally.overlapping += overlapping;
         tally.vehicles += vehicles;
         tally.wrong_way += wrong;
         tally.moving += moving;
-        tally.off_road += off_road(&alone(scenario, frame));
+        tally.off_road += off_road(&alone(recorded, frame));
     }
     tally
+}
+
+impl Tally {
+    /// Means over scenes.
+    fn mean(&self) -> SceneMmd {
+        let mut mean = MmdMean::default();
+        self.mmd.iter().for_each(|(_, mmd)| mean.add(mmd));
+        mean.mean()
+    }
+
+    /// Where the means of position, heading, speed and size lie with 95 % confidence, recordings
+    /// drawn with all their scenes.
+    fn intervals(&self, n_recordings: usize, seed: Seed) -> Vec<Option<Interval>> {
+        intervals(n_recordings, 1000, seed, |drawn| {
+            let mut mean = MmdMean::default();
+            for recording in drawn {
+                let own = self.mmd.iter().filter(|(of, _)| of == recording);
+                own.for_each(|(_, mmd)| mean.add(mmd));
+            }
+            attributes(&mean.mean()).to_vec()
+        })
+    }
 }
 
 /// The frame as the only one of a scenario.
@@ -205,100 +235,52 @@ fn alone(scenario: &Scenario, frame: Frame) -> Scenario {
     }
 }
 
-/// The scene that a source makes in place of a recorded one, vehicles only; `None` if it fails.
-fn scene_of(
-    world: &TransformerWorld,
-    source: Source,
-    scenarios: &[Scenario],
-    i: usize,
-    protocol: &MmdProtocol,
-    seed: Seed,
-) -> Option<Frame> {
-    let scenario = &scenarios[i];
-    let present = scenario.present();
-    let ego = present.ego_now();
-    let ego_from_world = ego.state.pose.inverse();
-    let near = |agent: &&gump_scene::Agent| {
-        let place = ego_from_world * agent.state.pose.position;
-        agent.kind == AgentKind::Vehicle
-            && (agent.id == ego.id || place.abs().max_element() <= protocol.half_side)
-    };
-    let recorded: Vec<_> = present
-        .now()
-        .agents()
-        .iter()
-        .filter(near)
-        .copied()
-        .collect();
-    let n = (recorded.len() - 1).min(protocol.max_vehicles);
-    match source {
-        Source::Log => Some(Frame::new(recorded, Vec::new())),
-        Source::Random => Some(random_along_lanes(&present, n, protocol.half_side, seed)),
-        Source::Retrieval => {
-            // Any other scene, but the same for the same seed.
-            let others = scenarios.len() - 1;
-            let pick = (seed.fork(1).0 % others as u64) as usize;
-            let other = &scenarios[if pick < i { pick } else { pick + 1 }];
-            Some(retrieved(&present, &other.present(), n))
-        }
-        Source::Model(placement) => {
-            let side = Some(Bounds::new(-protocol.half_side, protocol.half_side));
-            let object = |i: usize| ObjectSpec {
-                id: format!("vehicle {i}"),
-                x: side,
-                y: side,
-                ..ObjectSpec::default()
-            };
-            let mut request = GenerateRequest {
-                counts: Some(Counts {
-                    vehicles: n,
-                    ..Counts::default()
-                }),
-                objects: (0..n).map(object).collect(),
-                config: GenerateConfig {
-                    placement,
-                    ..GenerateConfig::default()
-                },
-                map: Arc::clone(&scenario.map),
-                ..generate::request(scenario)
-            };
-            request.ego.velocity = Some(ego.state.velocity);
-            let made = world.generate(&request, &[seed]).ok()?;
-            let scene = made.into_iter().next()?.ok()?;
-            // The recorded ego has its own id, by which both scenes are seen.
-            let agents = scene.frame.agents().iter().map(|agent| {
-                let mut agent = *agent;
-                agent.id = match agent.id {
-                    id if id == scene.ego => ego.id,
-                    id => gump_scene::AgentId(ego.id.0.saturating_add(id.0)),
-                };
-                agent
-            });
-            let moving = agents.filter(|agent| agent.kind.is_moving());
-            Some(Frame::new(moving.collect(), Vec::new()))
-        }
-    }
+/// What scenes are compared in.
+const ATTRIBUTES: [&str; 4] = ["position", "heading", "speed", "size"];
+
+/// The numbers of [`ATTRIBUTES`].
+fn attributes(mmd: &SceneMmd) -> [Option<f64>; 4] {
+    [mmd.position, mmd.heading, mmd.velocity, mmd.size]
 }
 
 /// The discrepancy of every source on every attribute; the log's is none.
-fn chart(rows: &[Value]) -> Bars {
-    let attributes = ["position", "heading", "speed", "size"];
-    let rows: Vec<&Value> = rows.iter().filter(|row| row["source"] != "log").collect();
+fn chart(rows: &[Value], intervals: &[Value]) -> Bars {
+    let is_shown = |row: &&Value| row["source"] != Source::Log.name();
+    let rows: Vec<&Value> = rows.iter().filter(is_shown).collect();
+    let spans: Vec<&Value> = intervals.iter().filter(is_shown).collect();
     let sources = rows.iter().filter_map(|row| row["source"].as_str());
     let legend = sources.map(String::from).collect();
     let label = "maximum mean discrepancy from recorded scenes, lower is nearer";
-    let names = attributes.map(String::from).into();
+    let names = ATTRIBUTES.map(String::from).into();
     charts::bars(label, names, legend, |attribute, source| {
-        charts::bar(
-            &rows[source][attributes[attribute]],
-            &Value::Null,
-            &Value::Null,
-        )
+        let (name, span) = (ATTRIBUTES[attribute], spans[source]);
+        let end = |end: &str| &span[format!("{name}_{end}")];
+        charts::bar(&rows[source][name], end("low"), end("high"))
     })
 }
 
+fn spans_row(source: Source, spans: &[Option<Interval>]) -> Value {
+    let mut row = json!({ "source": source.name() });
+    for (name, span) in ATTRIBUTES.iter().zip(spans) {
+        row[format!("{name}_low")] = json!(span.map(|span| span.low));
+        row[format!("{name}_high")] = json!(span.map(|span| span.high));
+    }
+    row
+}
+
+/// By which share of random placement's discrepancy guided generation is below it.
+fn gain(rows: &[Value]) -> Value {
+    let of = |source: Source| rows.iter().find(|row| row["source"] == source.name());
+    let guided = of(Source::Model(Placement::Guided));
+    let gain = |name: &str| {
+        let value = |row: Option<&Value>| row.and_then(|row| row[name].as_f64());
+        Some(1.0 - value(guided)? / value(of(Source::Random))?)
+    };
+    json!(BTreeMap::from(ATTRIBUTES.map(|name| (name, gain(name)))))
+}
+
 fn row(source: Source, tally: &Tally, prompt_satisfaction: Option<f64>) -> Value {
-    let mean = tally.mmd.mean();
+    let mean = tally.mean();
     let rate = |n: usize, of: usize| n as f64 / of.max(1) as f64;
     json!({
         "source": source.name(),
@@ -310,7 +292,7 @@ fn row(source: Source, tally: &Tally, prompt_satisfaction: Option<f64>) -> Value
         "offroad_rate": rate(tally.off_road, tally.vehicles),
         "wrong_way_rate": rate(tally.wrong_way, tally.moving),
         "prompt_satisfaction": prompt_satisfaction,
-        "scenes": tally.mmd.scenes(),
+        "scenes": tally.mmd.len(),
         "failed": tally.failed,
     })
 }

@@ -15,6 +15,7 @@ mod open_loop;
 mod prompts;
 mod ranking;
 mod shard;
+mod sources;
 pub(crate) mod wosac;
 
 pub(crate) use closed_loop::Driving;
