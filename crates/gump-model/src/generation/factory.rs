@@ -235,7 +235,14 @@ fn judged(
         is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
     };
     if !prompts.is_empty() {
-        let mut found = takes::moment(takes::free(world, &made.scenario, stream.fork(2))?, holds);
+        let mut found = None;
+        // One future shows who is there; what happens may take several.
+        for (n, i) in [(1, 0), (takes::FUTURES, 1)] {
+            if found.is_none() {
+                let futures = takes::free(world, &made.scenario, n, stream.fork(2).fork(i))?;
+                found = takes::moment(futures, holds);
+            }
+        }
         if let (None, Some(stage)) = (&found, stage) {
             let drive = stage.drive_from(made.scenario.present().ego_now());
             let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;

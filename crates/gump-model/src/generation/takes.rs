@@ -8,8 +8,8 @@ use super::drive::{Drive, Steered};
 use crate::ModelError;
 use crate::world::TransformerWorld;
 
-/// Futures imagined of a scene.
-const FUTURES: usize = 4;
+/// Futures imagined of a scene, after one that often will do.
+pub(super) const FUTURES: usize = 4;
 /// What tags say of the future is known from so many seconds of it.
 pub(super) const JUDGED_S: f64 = 4.0;
 /// The moment is found in so many seconds from the scene that was made.
@@ -21,11 +21,12 @@ const HISTORY_S: f64 = 1.0;
 pub(super) fn free(
     world: &TransformerWorld,
     scene: &Scenario,
+    n_futures: usize,
     seed: Seed,
 ) -> Result<Vec<Scenario>, ModelError> {
     let start = Start {
         scene: scene.present(),
-        n_futures: FUTURES,
+        n_futures,
         seed,
     };
     let rollouts = imagine(world, &[start], None, JUDGED_S + MOMENTS_S)?;
