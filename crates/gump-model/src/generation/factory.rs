@@ -134,13 +134,19 @@ pub fn make(
         let scene = match made.map(|mut scenes| scenes.remove(0)) {
             Ok(Ok(scene)) => scene,
             // Another place or another draw may do, but never for what contradicts itself.
-            Ok(Err(error)) | Err(error) => match error {
-                GenerateError::NoLane | GenerateError::NoPlace { .. } => {
-                    failure = Some(error);
-                    continue;
+            Ok(Err(error)) | Err(error) => {
+                let is_of_place = match error {
+                    GenerateError::NoLane | GenerateError::NoPlace { .. } => true,
+                    // At this place nobody may be where the prompt wants somebody.
+                    GenerateError::Constraints(_) => stage.is_some(),
+                    _ => false,
+                };
+                if !is_of_place {
+                    return Err(error);
                 }
-                _ => return Err(error),
-            },
+                failure = Some(error);
+                continue;
+            }
         };
         let made = Made {
             scenario: scene.scenario(name(number), &request.map, &request.prompts),

@@ -222,6 +222,30 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
 }
 
 #[test]
+fn a_place_where_nobody_walks_is_left_for_another() {
+    let mut request = request(Vec::new());
+    let text = "lane 1: -60,0 40,0 width 3.6\ncrosswalk: -24,-6 -16,-6 -16,6 -24,6\n\
+                ego vehicle 0: -55,0";
+    request.map = fixture::scenario(text).unwrap().map;
+    request.ego.pose = Pose::new(-55.0, 0.0, 0.0);
+    request.prompts = vec!["near_multiple_pedestrians".parse().unwrap()];
+    request.counts = Some(Counts {
+        pedestrians: 4,
+        ..Counts::default()
+    });
+    let order = factory::Order {
+        request,
+        roams: false,
+        seconds: 0.0,
+        attempts: 60,
+    };
+    let made = factory::make(&world(), &order, 0, Seed(1)).unwrap();
+    assert!(made.attempts > 1 && made.holds(), "{:?}", made.clauses);
+    let ego = made.scene.frame.agent(made.scene.ego).unwrap();
+    assert!((-40.0..0.0).contains(&ego.state.pose.position.x));
+}
+
+#[test]
 fn a_steered_ego_is_where_its_drive_says() {
     let scene = &make(&request(Vec::new()), 1)[0];
     let map = &request(Vec::new()).map;
