@@ -13,6 +13,7 @@ use crate::anchor::Anchor;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::engine::Context;
+use crate::life::Phases;
 use crate::limits::Limits;
 use crate::sample::TOKEN_DT;
 use crate::sampling::{Bins, CacheMode, Request, SamplingConfig, Surrogate, set_pose};
@@ -38,6 +39,8 @@ pub(crate) struct Future {
     pub(crate) recent: Vec<Frame>,
     /// Who has which key; of those who came in this future, too.
     pub(crate) identities: Identities,
+    /// How long lights have shown what they show, where traffic lives.
+    pub(crate) phases: Phases,
     /// What the engine keeps of its window.
     pub(crate) context: Context,
 }

@@ -1,7 +1,7 @@
 //! Traffic that lives: who leaves, who comes, what the lights show, in futures of any length.
 //!
 //! All three are read off the network. Before the agents of a frame are decoded, its lights are
-//! drawn one after another, and whoever is where the map ends is asked whether it is still there;
+//! drawn one after another (`lights`), and whoever is where the map ends is asked whether it is still there;
 //! once they are decoded, new ones come as long as the network wants more. Agents that leave the
 //! window are gone.
 //!
@@ -12,24 +12,27 @@
 //! what recordings have by [`Pace`](crate::Pace). Switched on by `SamplingConfig::life`; what is
 //! benchmarked on given agents leaves it off.
 
+mod lights;
+
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::OrientedBox;
-use gump_scene::{AgentKind, AgentState, Frame, Light, LightState, Seed};
-use gump_tokenizer::{Key, Slot, TokenAgent, TokenFrame, TokenSequence};
+use gump_scene::{AgentKind, AgentState, Frame, Light, Seed};
+use gump_tokenizer::{Key, TokenAgent, TokenFrame, TokenSequence};
 
+pub(crate) use self::lights::Phases;
 use crate::ModelError;
 use crate::aggregation::Ring;
 use crate::anchor::Anchor;
 use crate::batch::{PlacedSlot, place};
 use crate::decode::{Window, present_all};
-use crate::decoder::{N_LIGHT_STATES, STEPS};
+use crate::decoder::STEPS;
 use crate::draw::uniform;
 use crate::engine::{Context, Engine, Job};
 use crate::future::{Future, stream};
 use crate::generation::agent_of;
-use crate::generation::births::{BEGIN_AT, next_key, pick, stays};
+use crate::generation::births::{BEGIN_AT, next_key, stays};
 use crate::generation::constraint::ObjectSpec;
 use crate::generation::rules::{Manner, Rules, box_of, state_of};
 use crate::sampling::Request;
@@ -42,14 +45,6 @@ const MOST_BIRTHS: usize = 4;
 const TRIES: u64 = 6;
 /// Nobody comes or leaves nearer to the ego than this, metres.
 const SEEN_M: f64 = 50.0;
-
-/// States of a light in the order of their tokens.
-const LIGHT_STATES: [LightState; 4] = [
-    LightState::Green,
-    LightState::Yellow,
-    LightState::Red,
-    LightState::Unknown,
-];
 
 /// What a decision is about, as the part of a seed.
 #[derive(Clone, Copy)]
@@ -72,34 +67,6 @@ impl TransformerSession<'_> {
         self.draw_lights(engine, windows, &mut placed, &mut contexts);
         self.take_out(engine, windows, &placed, &mut contexts);
         Ok(())
-    }
-
-    fn draw_lights(
-        &self,
-        engine: &Engine,
-        windows: &mut [Window],
-        placed: &mut [Vec<PlacedSlot>],
-        contexts: &mut [Context],
-    ) {
-        let most = windows.iter().map(|w| w.next.lights.len()).max();
-        for light in 0..most.unwrap_or(0) {
-            let has_light = |w: &&usize| light < windows[**w].next.lights.len();
-            let all: Vec<usize> = (0..windows.len()).collect();
-            let members: Vec<usize> = all.iter().filter(has_light).copied().collect();
-            let at = |w: usize| first_slot(&windows[w], &placed[w]) + light;
-            let wanted: Vec<Vec<usize>> = members.iter().map(|w| vec![at(*w)]).collect();
-            let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
-            for (&w, said) in members.iter().zip(engine.say(&hidden)) {
-                let future = &self.futures[w];
-                let seed = future.decision(About::Lights).fork(light as u64);
-                let shown = windows[w].next.lights[light].state;
-                let changes = self.world.sampling().pace.light_changes;
-                let state = next_light(&said.lights, shown, changes, uniform(seed));
-                windows[w].next.lights[light].state = state;
-                let slot = first_slot(&windows[w], &placed[w]) + light + 1;
-                placed[w][slot].slot = Slot::Light(windows[w].next.lights[light]);
-            }
-        }
     }
 
     /// Asks before every tracked agent but the ego whether it is the next; who is in sight is.
@@ -351,26 +318,6 @@ impl TransformerSession<'_> {
     }
 }
 
-/// The next state of a light that shows `shown`, from the logits of all; the odds of any other are
-/// multiplied by `changes`.
-fn next_light(
-    logits: &[f32; N_LIGHT_STATES],
-    shown: LightState,
-    changes: f64,
-    uniform: f64,
-) -> LightState {
-    let peak = logits.iter().copied().fold(f32::MIN, f32::max);
-    let weights: Vec<f64> = LIGHT_STATES
-        .iter()
-        .zip(logits)
-        .map(|(state, logit)| {
-            let factor = if *state == shown { 1.0 } else { changes };
-            factor * f64::from((logit - peak).exp())
-        })
-        .collect();
-    pick(&weights, uniform).map_or(shown, |state| LIGHT_STATES[state])
-}
-
 /// Index of BEGIN of a window's next frame; its lights follow.
 fn first_slot(window: &Window, slots: &[PlacedSlot]) -> usize {
     // BEGIN, lights, LIGHTS_END, then two slots per tracked agent.
@@ -462,28 +409,5 @@ impl Future {
             is_guided: true,
             manner: Manner::default(),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn lights_change_with_the_odds_of_the_network_times_their_pace() {
-        // The network gives red, which shows, as much as green.
-        let logits = [0.0, -30.0, 0.0, -30.0];
-        let share = |pace: f64| {
-            let draws = (0..4000).map(|i| uniform(Seed(i)));
-            let states = draws.map(|u| next_light(&logits, LightState::Red, pace, u));
-            states.filter(|state| *state == LightState::Green).count() as f64 / 4000.0
-        };
-        // Standard deviations are below 0.008.
-        assert!((share(1.0) - 0.5).abs() < 0.03);
-        assert!((share(0.25) - 0.2).abs() < 0.03);
-        assert_eq!(share(0.0), 0.0);
-        let sure = [-90.0, -90.0, -90.0, 0.0];
-        let told = next_light(&sure, LightState::Red, 0.25, 0.5);
-        assert_eq!(told, LightState::Unknown);
     }
 }

@@ -26,6 +26,7 @@ use crate::batch::{PlacedSlot, place};
 use crate::decoder::STEPS;
 use crate::engine::{Engine, Job};
 use crate::future::{Future, stream};
+use crate::life::Phases;
 use crate::network::Network;
 use crate::outlook::{Outlook, Watch};
 use crate::plain::sample_states;
@@ -219,6 +220,7 @@ impl TransformerWorld {
                 rings: BTreeMap::new(),
                 recent: shared.recent.clone(),
                 identities: shared.identities.clone(),
+                phases: Phases::default(),
                 context: shared.prefix.clone(),
             };
             for (id, chunk) in rings {

@@ -1,12 +1,12 @@
 //! The long part of `evaluate generation`: thirty seconds of traffic with and without agents that
 //! come and leave and lights that change, against what was simulated by rules.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use gump_model::world::TransformerWorld;
 use gump_rollout::{BoxError, Start, WorldModel as _};
-use gump_scene::{AgentId, Frame, LightState, Scenario, SceneState, Seed};
+use gump_scene::{AgentId, Frame, LaneId, LightState, Scenario, SceneState, Seed};
 use gump_synthesis::{SynthesisConfig, try_synthesize};
 use gump_viz::Bars;
 use rayon::prelude::*;
@@ -24,15 +24,22 @@ const DT: f64 = 0.5;
 const COUNTED_M: f64 = 80.0;
 
 /// What frames of half a minute show.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Default)]
 struct Seen {
     at_end: f64,
-    entries: f64,
-    exits: f64,
-    exit_m: f64,
+    /// How far from the ego agents come, and leave, metres.
+    entries_m: Vec<f64>,
+    exits_m: Vec<f64>,
     light_changes: f64,
     lights: f64,
+    /// Changes from green to yellow, from there to red, from there to green.
+    in_order: f64,
+    /// How long lights that were seen to change showed [`COLOURS`] until they changed again, seconds.
+    phases_s: [Vec<f64>; 3],
 }
+
+/// What lights show, in the order in which they do.
+const COLOURS: [LightState; 3] = [LightState::Green, LightState::Yellow, LightState::Red];
 
 /// One row per world: log, frozen casts, traffic that lives.
 ///
@@ -104,23 +111,33 @@ fn strided(scenario: &Scenario, dt: f64) -> Vec<Frame> {
 fn seen(present: SceneState<'_>, frames: &[Frame]) -> Seen {
     let mut seen = Seen::default();
     let mut before = present.now();
-    for frame in frames {
+    let mut began: BTreeMap<LaneId, usize> = BTreeMap::new();
+    for (i, frame) in frames.iter().enumerate() {
         let near = |frame: &Frame| near(frame, present.ego);
         let (then, now) = (near(before), near(frame));
-        seen.entries += now.difference(&then).count() as f64;
-        for id in then.difference(&now) {
-            seen.exits += 1.0;
-            let ego = before.agent(present.ego).map(|ego| ego.state.pose.position);
-            let left = before.agent(*id).map(|agent| agent.state.pose.position);
-            if let (Some(ego), Some(left)) = (ego, left) {
-                seen.exit_m += ego.distance(left);
-            }
-        }
-        let known = |state: LightState| state != LightState::Unknown;
-        for light in frame.lights().iter().filter(|light| known(light.state)) {
+        let distance = |frame: &Frame, id: &AgentId| {
+            let place = |id| frame.agent(id).map(|agent| agent.state.pose.position);
+            Some(place(present.ego)?.distance(place(*id)?))
+        };
+        let entries = now.difference(&then);
+        let entries = entries.filter_map(|id| distance(frame, id));
+        seen.entries_m.extend(entries);
+        let exits = then.difference(&now);
+        let exits = exits.filter_map(|id| distance(before, id));
+        seen.exits_m.extend(exits);
+        for light in frame.lights() {
+            let colour = |state| COLOURS.iter().position(|colour| *colour == state);
             let was = before.light(light.lane).map(|light| light.state);
-            let changed = was.is_some_and(|was| known(was) && was != light.state);
-            seen.light_changes += f64::from(u8::from(changed));
+            let (Some(was), Some(is)) = (was.and_then(colour), colour(light.state)) else {
+                continue;
+            };
+            if was != is {
+                seen.light_changes += 1.0;
+                seen.in_order += f64::from(u8::from(is == (was + 1) % 3));
+                if let Some(began) = began.insert(light.lane, i) {
+                    seen.phases_s[was].push((i - began) as f64 * DT);
+                }
+            }
         }
         before = frame;
     }
@@ -147,16 +164,60 @@ fn row(world: &str, seen: &[Seen], logged: &[Seen]) -> Value {
     let sum = |of: fn(&Seen) -> f64| seen.iter().map(of).sum::<f64>();
     let pairs = seen.iter().zip(logged);
     let error: f64 = pairs.map(|(a, b)| (a.at_end - b.at_end).abs()).sum();
+    let mean = |values: &[f64]| {
+        let n = values.len();
+        (n > 0).then(|| values.iter().sum::<f64>() / n as f64)
+    };
+    let all = |of: fn(&Seen) -> &[f64]| {
+        let pool = |seen: &[Seen]| seen.iter().flat_map(of).copied().collect::<Vec<f64>>();
+        (pool(seen), pool(logged))
+    };
+    let (entries, logged_entries) = all(|s| &s.entries_m);
+    let (exits, logged_exits) = all(|s| &s.exits_m);
+    let [green, yellow, red] = [
+        all(|s| &s.phases_s[0]),
+        all(|s| &s.phases_s[1]),
+        all(|s| &s.phases_s[2]),
+    ];
+    let off = [&green, &yellow, &red];
+    let off = off.map(|(own, logged)| apart(own, logged));
+    let off: Vec<f64> = off.into_iter().flatten().collect();
     json!({
         "world": world,
         "scenes": seen.len(),
         "agents_at_30_s": sum(|s| s.at_end) / n,
         "agent_count_error": error / n,
-        "entries": sum(|s| s.entries) / n,
-        "exits": sum(|s| s.exits) / n,
-        "exit_distance_m": sum(|s| s.exit_m) / sum(|s| s.exits).max(1.0),
+        "entries": entries.len() as f64 / n,
+        "exits": exits.len() as f64 / n,
+        "entry_m": mean(&entries),
+        "exit_m": mean(&exits),
+        "entry_off_m": apart(&entries, &logged_entries),
+        "exit_off_m": apart(&exits, &logged_exits),
         "changes_per_light": sum(|s| s.light_changes) / sum(|s| s.lights).max(1.0),
+        "changes_in_order": sum(|s| s.in_order) / sum(|s| s.light_changes).max(1.0),
+        "green_s": mean(&green.0),
+        "yellow_s": mean(&yellow.0),
+        "red_s": mean(&red.0),
+        "phase_off_s": mean(&off),
     })
+}
+
+/// How far apart two distributions are, in the unit of their values: the area between their
+/// quantiles (Wasserstein's first distance), at a hundred of them. `None` if one is empty.
+fn apart(a: &[f64], b: &[f64]) -> Option<f64> {
+    const N: usize = 100;
+    if a.is_empty() || b.is_empty() {
+        return None;
+    }
+    let sorted = |values: &[f64]| {
+        let mut values = values.to_vec();
+        values.sort_by(f64::total_cmp);
+        values
+    };
+    let (a, b) = (sorted(a), sorted(b));
+    let quantile = |values: &[f64], i: usize| values[(2 * i + 1) * values.len() / (2 * N)];
+    let off = (0..N).map(|i| (quantile(&a, i) - quantile(&b, i)).abs());
+    Some(off.sum::<f64>() / N as f64)
 }
 
 /// What changes in half a minute, in every world.
@@ -180,7 +241,7 @@ pub(super) fn chart(rows: &[Value]) -> Bars {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use gump_scene::fixture;
+    use gump_scene::{Light, fixture};
     use gump_viz::log_as_rollout;
 
     #[test]
@@ -193,7 +254,38 @@ mod tests {
         .unwrap();
         let rollout = log_as_rollout(&scenario);
         let found = seen(scenario.present(), rollout.imagined());
-        assert_eq!((found.entries, found.exits, found.at_end), (1.0, 1.0, 2.0));
-        assert!((found.exit_m - 80.0).abs() < 1.0);
+        let counts = (found.entries_m.len(), found.exits_m.len());
+        assert_eq!((counts, found.at_end), ((1, 1), 2.0));
+        assert!((found.exits_m[0] - 80.0).abs() < 1.0 && (found.entries_m[0] - 80.0).abs() < 1.0);
+    }
+
+    #[test]
+    fn phases_count_from_change_to_change() {
+        let scenario = fixture::scenario("lane 1: 0,0 9,0\nego vehicle 0: 0,0").unwrap();
+        let frame = |state: LightState| {
+            let light = Light {
+                lane: LaneId(1),
+                state,
+                stop_point: None,
+            };
+            Frame::new(scenario.present().now().agents().to_vec(), vec![light])
+        };
+        let [green, yellow, red] = COLOURS;
+        let mut shown = vec![green; 4];
+        shown.extend([yellow; 6]);
+        shown.extend([red; 10]);
+        shown.extend([yellow; 3]);
+        let frames: Vec<Frame> = shown.into_iter().map(frame).collect();
+        let found = seen(scenario.present(), &frames);
+        // Green was there before the first change, the last yellow goes on.
+        assert_eq!(found.phases_s, [vec![], vec![3.0], vec![5.0]]);
+        assert_eq!((found.light_changes, found.in_order), (3.0, 2.0));
+    }
+
+    #[test]
+    fn distributions_are_as_far_apart_as_their_values_are() {
+        assert_eq!(apart(&[1.0, 3.0], &[3.0, 1.0]), Some(0.0));
+        assert_eq!(apart(&[1.0], &[2.0, 2.0, 4.0, 4.0]), Some(2.0));
+        assert_eq!(apart(&[], &[1.0]), None);
     }
 }
