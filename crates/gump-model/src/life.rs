@@ -1,15 +1,15 @@
 //! Traffic that lives: who leaves, who comes, what the lights show, in futures of any length.
 //!
 //! All three are read off the network. Before the agents of a frame are decoded, its lights are
-//! drawn one after another (`lights`), and whoever is where the map ends is asked whether it is still there;
-//! once they are decoded, new ones come as long as the network wants more. Agents that leave the
-//! window are gone.
+//! drawn one after another (`lights`), and whoever is where the map ends is asked whether it is
+//! still there; once they are decoded, new ones come as long as the network wants more. Agents that
+//! leave the window are gone.
 //!
 //! Nobody vanishes in sight and nobody appears there: agents come over the border of the window,
 //! nearing the ego, or from where a lane of the map begins, and leave likewise, away from the ego.
 //! A network that is unsure says births and departures of everybody, and training shows false ones
-//! wherever a sample leaves agents out. How often they come and how often lights change is set to
-//! what recordings have by [`Pace`](crate::Pace). Switched on by `SamplingConfig::life`; what is
+//! wherever a sample leaves agents out. How often they come and lights change may be set by
+//! [`Pace`](crate::Pace). Switched on by `SamplingConfig::life`; what is
 //! benchmarked on given agents leaves it off.
 
 mod lights;

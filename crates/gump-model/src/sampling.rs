@@ -81,12 +81,12 @@ pub struct Pace {
 }
 
 impl Default for Pace {
-    /// What makes half a minute of made-up scenes with the shipped weights as lively as the same
-    /// scenes simulated by rules (docs/results/0012-generation.md).
+    /// As the network says: that makes half a minute of made-up scenes with the shipped weights about
+    /// as lively as the same scenes simulated by rules (docs/results/0012-generation.md).
     fn default() -> Self {
         Self {
             arrivals: 1.0,
-            light_changes: 0.3,
+            light_changes: 1.0,
         }
     }
 }
