@@ -4,7 +4,6 @@
 //! tokenized, so that map and agents cannot fall out of register. Which frames are shown is said in
 //! `window`, what is asked in `targets`.
 
-mod mirror;
 mod targets;
 #[cfg(test)]
 mod tests;
@@ -76,8 +75,6 @@ pub struct SampleConfig {
     pub prompt_dropout: f64,
     /// Probability that the window begins with the frame of reference, as a scene to generate does.
     pub from_reference: f64,
-    /// Probability that left and right are exchanged.
-    pub mirror: f64,
 }
 
 impl Default for SampleConfig {
@@ -98,7 +95,6 @@ impl Default for SampleConfig {
             shuffle_ids: true,
             prompt_dropout: 0.5,
             from_reference: 0.25,
-            mirror: 0.0,
         }
     }
 }
@@ -241,7 +237,6 @@ pub(crate) fn draw(
     }
     sample.slots = slots;
     blank_frames(&mut sample, config, &mut rng);
-    mirror::mirror(&mut sample, config.mirror, &mut rng);
     Some(sample)
 }
 

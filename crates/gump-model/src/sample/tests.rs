@@ -4,7 +4,6 @@ use super::targets::{CONTROL_BEGIN, CONTROL_LIGHTS_END, CONTROL_NEWBORN};
 use super::*;
 use crate::closed_loop::Drive;
 use crate::decoder::STEPS;
-use crate::surroundings::look_around;
 use gump_scene::fixture;
 
 fn reader() -> Reader {
@@ -194,77 +193,6 @@ fn a_drive_is_shown_and_the_way_back_is_asked_for() {
     // The pedestrian itself walks half a metre to the right in a frame.
     let then = asked[0] - asked[1];
     assert!((then - 1.0).abs() < 0.25, "{then}");
-}
-
-/// A crossing road to the left alone, and somebody on it.
-const LOPSIDED: &str = "lane 1: -100,0.3 100,0.3
-     lane 2: 0,0 0,90
-     edge: -100,-2 100,-2
-     light 2 red: 60,4
-     ego vehicle 0: 0,0 velocity 8,0
-     agent vehicle 1: 20,12 velocity 5,2";
-
-#[test]
-fn a_mirrored_sample_is_that_of_the_mirrored_world() {
-    let mut config = SampleConfig::plain(4);
-    let drawn = |text: &str, config: &SampleConfig| {
-        let scenario = fixture::scenario(text).unwrap();
-        let reader = Reader {
-            spec: RasterSpec::full(256, 0.75),
-            ..reader()
-        };
-        draw(&scenario, None, &reader, config, Seed(1)).unwrap()
-    };
-    // The same world with every y turned round, by hand.
-    let by_hand = "lane 1: -100,-0.3 100,-0.3
-         lane 2: 0,0 0,-90
-         edge: -100,2 100,2
-         light 2 red: 60,-4
-         ego vehicle 0: 0,0 velocity 8,0
-         agent vehicle 1: 20,-12 velocity 5,-2";
-    let expected = drawn(by_hand, &config);
-    let straight = drawn(LOPSIDED, &config);
-    config.mirror = 1.0;
-    let mirrored = drawn(LOPSIDED, &config);
-    // Where a line runs along the border of two pixels, one world may paint the other one.
-    let apart = |a: &Sample, b: &Sample| {
-        let pixels = a.raster.data.iter().zip(&b.raster.data);
-        pixels.filter(|(a, b)| (*a - *b).abs() > 0.05).count()
-    };
-    let (same, other) = (apart(&mirrored, &expected), apart(&mirrored, &straight));
-    assert!(20 * same < other, "{same} and {other} pixels");
-    assert_eq!(mirrored.slots, expected.slots);
-    let bins = |sample: &Sample| -> Vec<_> { sample.states.iter().map(|s| s.bins).collect() };
-    assert!(bins(&straight) != bins(&mirrored));
-    assert_eq!(bins(&mirrored), bins(&expected));
-    let futures = |sample: &Sample| -> Vec<_> {
-        let all = sample.trajectories.iter();
-        all.map(|target| {
-            target
-                .future
-                .map(|pose| pose.map(|[_, y, sin, _]| (y, sin)))
-        })
-        .collect()
-    };
-    for (a, b) in futures(&mirrored)
-        .iter()
-        .zip(futures(&expected))
-        .flat_map(|(a, b)| a.iter().zip(b))
-    {
-        let far = a
-            .zip(b)
-            .map(|((y, sin), (y1, sin1))| (y - y1).abs() + (sin - sin1).abs());
-        assert!(far.is_none_or(|far| far < 1e-5), "{a:?} and {b:?}");
-    }
-    // What an object sees around itself.
-    let numbers = |sample: &Sample| look_around(&sample.survey, &sample.slots, 0);
-    for ((i, a), (j, b)) in numbers(&mirrored).iter().zip(&numbers(&expected)) {
-        assert_eq!(i, j);
-        assert!(
-            a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4),
-            "slot {i}"
-        );
-    }
 }
 
 #[test]

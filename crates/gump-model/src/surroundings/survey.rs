@@ -40,7 +40,7 @@ pub(super) struct LanePoint {
 }
 
 /// A lane as a run of points.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct LaneRun {
     first: u32,
     n: u32,
@@ -113,28 +113,6 @@ impl Survey {
         survey.lane_cells = Cells::new(survey.points.iter().map(|point| point.pose.position));
         survey.edge_cells = Cells::new(survey.edges.iter().copied());
         survey
-    }
-
-    /// The map with left and right exchanged.
-    pub(crate) fn mirrored(&self) -> Self {
-        let place = |at: DVec2| DVec2::new(at.x, -at.y);
-        let pose = |pose: Pose| Pose {
-            position: place(pose.position),
-            heading: -pose.heading,
-        };
-        let points = self.points.iter().map(|point| LanePoint {
-            pose: pose(point.pose),
-            ..*point
-        });
-        let points: Vec<LanePoint> = points.collect();
-        let edges: Vec<DVec2> = self.edges.iter().copied().map(place).collect();
-        Self {
-            lane_cells: Cells::new(points.iter().map(|point| point.pose.position)),
-            edge_cells: Cells::new(edges.iter().copied()),
-            lanes: self.lanes.clone(),
-            points,
-            edges,
-        }
     }
 
     pub(super) fn point(&self, index: u32) -> LanePoint {

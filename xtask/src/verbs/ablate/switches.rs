@@ -37,7 +37,7 @@ fn width(text: &str) -> Result<usize, String> {
 type Turn = fn(&mut ModelConfig, &mut TrainConfig);
 
 /// The recorded configuration, and what is changed of it.
-const SWITCHES: [(&str, Turn); 10] = [
+const SWITCHES: [(&str, Turn); 9] = [
     ("recorded", |_, _| {}),
     ("no-surroundings", |model, _| model.surroundings = false),
     ("no-anchors", |model, _| model.anchored = false),
@@ -50,7 +50,6 @@ const SWITCHES: [(&str, Turn); 10] = [
     ("sharp-targets", |_, train| train.loss.smoothing_bins = 0.0),
     ("no-sway", |_, train| train.sample.sway = 0.0),
     ("no-turns", |_, train| train.sample.augment = 0.0),
-    ("mirror", |_, train| train.sample.mirror = 0.5),
 ];
 
 fn known() -> clap::builder::PossibleValuesParser {
