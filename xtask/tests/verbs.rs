@@ -513,6 +513,7 @@ fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
         "loss_first",
         "loss_last",
         "validation_loss",
+        "validation_realism",
     ] {
         assert!(whole[key].is_number(), "{key}: {}", whole[key]);
     }
@@ -523,6 +524,8 @@ fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
         "losses.csv",
         "losses.png",
         "losses.svg",
+        "realism.png",
+        "realism.svg",
         "report.json",
         "weights.safetensors",
     ];
@@ -534,7 +537,13 @@ fn a_run_that_is_resumed_goes_on_as_if_nothing_had_happened() {
     assert_eq!(first_half["steps"], 3);
     let resumed = train(" --resume");
     assert_eq!(resumed["resumed"], true);
-    for key in ["steps", "loss_first", "loss_last", "validation_loss"] {
+    for key in [
+        "steps",
+        "loss_first",
+        "loss_last",
+        "validation_loss",
+        "validation_realism",
+    ] {
         assert_eq!(resumed[key], whole[key], "{key}");
     }
     let again = fs::read_to_string(place.path("out/losses.csv")).unwrap();
