@@ -161,7 +161,9 @@ impl Args {
                 .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         }
         let seed = Seed(trainer.config().seed).fork(9);
-        let judge = Judge::new(&validation, self.realism_rollouts, seed).filter(|_| writes);
+        // One process tells for all: what is imagined changes nothing that is learned.
+        let rollouts = if writes { self.realism_rollouts } else { 0 };
+        let judge = Judge::new(&validation, rollouts, seed);
         let held_out = HeldOut {
             scenarios: &validation,
             judge,

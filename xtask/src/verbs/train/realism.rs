@@ -26,13 +26,16 @@ impl<'a> Judge<'a> {
     /// The first of the scenes on which the challenge is defined, with so many rollouts of each;
     /// none if there is no such scene or no rollout is asked for.
     pub(super) fn new(scenes: &'a [Scenario], rollouts: usize, seed: Seed) -> Option<Self> {
+        if rollouts == 0 {
+            return None;
+        }
         let config = Config::of(Year::Y2025);
         let scored = scenes.iter().filter_map(|scenario| {
             let log = Log::of(scenario).ok()?;
             let is_defined = Reference::new(&log, &config).is_ok();
             is_defined.then_some((scenario, log))
         });
-        let scenes: Vec<_> = scored.take(if rollouts > 0 { SCENES } else { 0 }).collect();
+        let scenes: Vec<_> = scored.take(SCENES).collect();
         (!scenes.is_empty()).then_some(Self {
             scenes,
             config,
