@@ -103,6 +103,8 @@ pub struct ReadOptions {
     pub infer_edges: bool,
     /// The lane of a light that states only where it is.
     pub infer_light_lanes: bool,
+    /// The lanes of stop signs, where a format states only where they stand.
+    pub infer_stop_sign_lanes: bool,
     /// Colours of lights for up to four seconds between two sightings of the same colour, **the
     /// later one included**, in recordings that lose sight of lights (Waymo's). Official metrics
     /// read what was recorded.
@@ -138,6 +140,7 @@ impl ReadOptions {
         infer_drivable: false,
         infer_edges: false,
         infer_light_lanes: false,
+        infer_stop_sign_lanes: false,
         infer_light_gaps: false,
         infer_route: false,
         infer_ego: false,
@@ -156,6 +159,7 @@ impl ReadOptions {
         infer_drivable: true,
         infer_edges: true,
         infer_light_lanes: true,
+        infer_stop_sign_lanes: true,
         infer_light_gaps: true,
         infer_route: true,
         infer_ego: true,

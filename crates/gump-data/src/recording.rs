@@ -68,19 +68,6 @@ pub(crate) struct State {
 /// A number that is not stated.
 pub(crate) const UNSTATED: f64 = f64::NAN;
 
-/// Length, width and height of an agent of this kind about which nothing is known, metres.
-///
-/// Source: the medians of the 11,672 tracks in 201 scenes of the Waymo Open Motion Dataset;
-/// for things that do not move, a barrel.
-pub(crate) fn usual_size(kind: AgentKind) -> [f64; 3] {
-    match kind {
-        AgentKind::Vehicle => [4.7, 2.1, 1.7],
-        AgentKind::Pedestrian => [0.9, 0.9, 1.7],
-        AgentKind::Bicycle => [1.8, 0.8, 1.7],
-        _ => [0.6, 0.6, 1.0],
-    }
-}
-
 /// No agent on a road is longer, metres: a road train measures 54 m.
 const MAX_SIZE: f64 = 100.0;
 

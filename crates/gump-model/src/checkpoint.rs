@@ -17,9 +17,13 @@ use crate::ModelError;
 use crate::config::ModelConfig;
 use crate::network::Network;
 use crate::parameters::Parameters;
+use crate::surroundings::n_numbers;
 
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";
+
+/// The matrix that reads what objects see around themselves, marks last.
+const SURROUNDINGS_IN: &str = "mct.surroundings.in.weight";
 
 /// How numbers are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,6 +88,48 @@ pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
             path: path.to_owned(),
         },
     })
+}
+
+/// Reads a network to train on as one of the configuration `wanted`; `None` if the file holds another
+/// model.
+///
+/// A file without `unknown_marks` grows them: what a mark adds starts at zero, so that the network
+/// computes what it did.
+///
+/// # Errors
+/// Those of [`load`].
+pub fn load_to_grow(
+    path: &Path,
+    wanted: &ModelConfig,
+    device: &Device,
+) -> Result<Option<Network>, ModelError> {
+    let network = load(path, device)?;
+    if network.config() == wanted {
+        return Ok(Some(network));
+    }
+    let grown = ModelConfig {
+        unknown_marks: true,
+        ..network.config().clone()
+    };
+    if grown != *wanted {
+        return Ok(None);
+    }
+    let tensors = network.parameters().all().map(|(name, var)| {
+        let tensor = match name {
+            SURROUNDINGS_IN => widened(var.as_tensor(), n_numbers(wanted))?,
+            _ => var.as_tensor().clone(),
+        };
+        Ok((name.to_owned(), tensor))
+    });
+    let tensors: BTreeMap<String, Tensor> = tensors.collect::<Result<_, ModelError>>()?;
+    Network::build(grown, Parameters::loaded(tensors, device)).map(Some)
+}
+
+/// The matrix `[rows, n]` with columns of zeros up to `columns`.
+fn widened(matrix: &Tensor, columns: usize) -> Result<Tensor, ModelError> {
+    let (rows, n) = matrix.dims2()?;
+    let zeros = Tensor::zeros((rows, columns - n), matrix.dtype(), matrix.device())?;
+    Ok(Tensor::cat(&[matrix, &zeros], 1)?)
 }
 
 impl Archive {
@@ -334,6 +380,47 @@ mod tests {
             }
             let beside = fs::read_dir(path.parent().unwrap()).unwrap().count();
             assert_eq!(beside, 1, "nothing partial is left");
+        });
+    }
+
+    #[test]
+    fn weights_without_marks_grow_them_and_say_the_same() {
+        with_file(|path| {
+            let config = |unknown_marks: bool| ModelConfig {
+                unknown_marks,
+                block_size: 256,
+                ..small()
+            };
+            let network = Network::random(config(false), Seed(1), &Device::Cpu).unwrap();
+            save(&network, path, Precision::Full).unwrap();
+            let grown = load_to_grow(path, &config(true), &Device::Cpu).unwrap();
+            let grown = grown.expect("the same model but for the marks");
+            assert_eq!(*grown.config(), config(true));
+            // A scene whose limit is unknown, so that a mark is set.
+            let scenario = gump_scene::fixture::scenario(
+                "lane 1: -100,0 100,0
+                 ego vehicle 0: 0,0 velocity 8,0
+                 agent vehicle 1: 20,0 velocity 5,0",
+            )
+            .unwrap();
+            let slots = crate::tests::slots(&scenario);
+            let said = |network: &Network| {
+                let memory = crate::tests::memory(network, &scenario);
+                crate::tests::hidden(network, &[&slots], &memory).concat().concat()
+            };
+            let pairs = said(&network).into_iter().zip(said(&grown));
+            let off = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(off < 1e-5, "{off}");
+            // The other way round, and into another model, nothing grows.
+            save(&grown, path, Precision::Full).unwrap();
+            let load = |config| load_to_grow(path, &config, &Device::Cpu).unwrap();
+            assert!(load(config(false)).is_none());
+            let wider = ModelConfig {
+                layers: 2,
+                ..config(true)
+            };
+            assert!(load(wider).is_none());
+            assert!(load(config(true)).is_some());
         });
     }
 

@@ -12,6 +12,7 @@ use gump_tokenizer::{Field, QuantizedState};
 use serde::{Deserialize, Serialize};
 
 use crate::aggregation::Ring;
+use crate::agreement;
 use crate::anchor::Anchor;
 use crate::decoder::STEPS;
 use crate::limits::Limits;
@@ -176,16 +177,43 @@ impl Request {
         self.forced[..7].iter().all(Option::is_some)
     }
 
-    /// The final state of a decoded object: its sample, aggregated, within its limits; scene frame,
-    /// not quantised.
+    /// Where the object was, scene frame; `None` if that is not known.
+    pub(crate) fn from(&self) -> Option<Pose> {
+        let limited = self.limits.map(|(from, _)| from);
+        limited.or(self.anchor.origin())
+    }
+
+    /// The final state of a decoded object: its sample, aggregated, within its limits, its velocity in
+    /// agreement; scene frame, not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
-        let said = self.anchor.poses(bins)[0];
-        let pose = self.ring.aggregate(self.frame, said, config.decay);
-        let velocity = self.anchor.velocity(bins);
-        match self.limits {
-            Some((from, limits)) => limits.keep(from, AgentState { pose, velocity }),
-            None => AgentState { pose, velocity },
+        let said = AgentState {
+            pose: self.anchor.poses(bins)[0],
+            velocity: self.anchor.velocity(bins),
+        };
+        let average = self.ring.aggregate(self.frame, said.pose, config.decay);
+        let Some(from) = self.from().filter(|_| !self.is_driven()) else {
+            return AgentState {
+                pose: average,
+                ..said
+            };
+        };
+        let steers = self.limits.is_some();
+        let velocity = agreement::follow(from, said, average, steers);
+        let mut settled = AgentState {
+            pose: average,
+            velocity,
+        };
+        if let Some((from, limits)) = self.limits {
+            let kept = limits.keep(from, settled);
+            settled = AgentState {
+                velocity: agreement::follow(from, settled, kept.pose, steers),
+                ..kept
+            };
         }
+        if config.limits {
+            settled.velocity = agreement::allowed(from, settled.pose, settled.velocity);
+        }
+        settled
     }
 
     /// The token state of a decoded object whose final state is `settled`: the one value that

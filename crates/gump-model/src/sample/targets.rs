@@ -21,6 +21,11 @@ pub(crate) struct StateTarget {
 }
 
 impl StateTarget {
+    /// Asks for no size.
+    pub(crate) fn forget_size(&mut self) {
+        self.bins[..2].fill(None);
+    }
+
     /// The token of a step, PAD where the log has nothing.
     pub(crate) fn token(&self, step: usize) -> u32 {
         self.bins[step].map_or(PAD, |bin| STEPS[step].token(bin))
@@ -70,7 +75,7 @@ pub(super) fn targets(
         };
         let frame = placed.frame;
         let anchor = match anchored {
-            true => window.anchor(placed.last, frame, id),
+            true => placed.last_pose().map_or(Anchor::SCENE, Anchor::at),
             false => Anchor::SCENE,
         };
         let mut chunk = std::array::from_fn(|pose| window.expected(frame, -1, pose + 1, id));

@@ -234,19 +234,19 @@ impl Args {
     }
 }
 
-/// The weights to go on from.
+/// The weights to go on from; those without marks of what is not known grow them where the
+/// configuration has them.
 ///
 /// Error: [`WrongArguments`] if they are of another model than the configuration.
 fn load(weights: &Path, stage: &Stage, device: &Device) -> anyhow::Result<Network> {
-    let network = checkpoint::load(weights, device)?;
-    if *network.config() != stage.config.model()? {
+    let network = checkpoint::load_to_grow(weights, &stage.config.model()?, device)?;
+    network.ok_or_else(|| {
         let wrong = format!(
             "{} holds another model than the configuration",
             weights.display()
         );
-        return Err(WrongArguments(wrong).into());
-    }
-    Ok(network)
+        WrongArguments(wrong).into()
+    })
 }
 
 /// What a stage is validated on.
