@@ -92,6 +92,7 @@ pub fn masked_cross_entropy(
         bins: targets.to_device(&Device::Cpu)?.to_vec1::<u32>()?,
         weights: weights.to_vec1::<f32>()?,
         smoothing,
+        exact: Vec::new(),
     };
     asked.check(n, v)?;
     let op = CrossEntropy {
@@ -111,6 +112,8 @@ pub struct Targets {
     pub weights: Vec<f32>,
     /// How each class is spread over its neighbours, if it is.
     pub smoothing: Option<OrdinalSmoothing>,
+    /// Rows whose class is not spread all the same; none if it is empty.
+    pub exact: Vec<bool>,
 }
 
 impl Targets {
@@ -119,6 +122,9 @@ impl Targets {
         if self.bins.len() != n || self.weights.len() != n {
             let (bins, weights) = (self.bins.len(), self.weights.len());
             bail!("cross entropy of {n} rows: {bins} targets, {weights} weights");
+        }
+        if !self.exact.is_empty() && self.exact.len() != n {
+            bail!("cross entropy of {n} rows: {} marks of exact ones", self.exact.len());
         }
         let is_wrong = |s: OrdinalSmoothing| !(s.sigma_bins > 0.0 && s.sigma_bins.is_finite());
         if self.smoothing.is_some_and(is_wrong) {
@@ -138,9 +144,13 @@ impl Targets {
         1.0 / total.max(1e-9)
     }
 
+    fn is_exact(&self, row: usize) -> bool {
+        self.exact.get(row).copied().unwrap_or(false)
+    }
+
     fn spread(&self, row: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
         let target = self.bins[row] as usize;
-        match self.smoothing {
+        match self.smoothing.filter(|_| !self.is_exact(row)) {
             Some(s) => s.spread(target, v, bins),
             None => {
                 bins.clear();
@@ -327,14 +337,18 @@ fn composed_steps(
 ) -> Result<Tensor> {
     let step = |(step, (rows, asked)): (usize, &(Range<usize>, Targets))| {
         let rows = weight.narrow(0, rows.start, rows.len())?;
+        let logits = linear(&x.get(step)?, &rows, None)?;
         let bins = Tensor::from_slice(&asked.bins, asked.bins.len(), x.device())?;
-        let weights = Tensor::from_slice(&asked.weights, asked.weights.len(), x.device())?;
-        masked_cross_entropy(
-            &linear(&x.get(step)?, &rows, None)?,
-            &bins,
-            &weights,
-            asked.smoothing,
-        )
+        // The mean over all rows from those of the exact ones and of the others.
+        let part = |exact: bool, smoothing| {
+            let of_part = |row: usize| asked.is_exact(row) == exact;
+            let kept = asked.weights.iter().enumerate();
+            let weights: Vec<f32> = kept.map(|(i, w)| if of_part(i) { *w } else { 0.0 }).collect();
+            let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+            let weights = Tensor::new(weights, x.device())?;
+            masked_cross_entropy(&logits, &bins, &weights, smoothing)? * (sum * asked.scale())
+        };
+        part(false, asked.smoothing)? + part(true, None)?
     };
     let losses = asked.iter().enumerate().map(step);
     Tensor::stack(&losses.collect::<Result<Vec<_>>>()?, 0)
@@ -498,6 +512,8 @@ mod tests {
                 bins: bins.to_vec1().unwrap(),
                 weights: weights.to_vec1().unwrap(),
                 smoothing,
+                // Every third is exact.
+                exact: (0..33).map(|row| row % 3 == 0).collect(),
             };
             (of, asked)
         };

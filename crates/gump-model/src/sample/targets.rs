@@ -9,6 +9,9 @@ use crate::batch::PlacedSlot;
 use crate::decoder::{CONTROL_KEYS, STEPS};
 use crate::trajectory::{FUTURE, PAST, POSE};
 
+/// Slower objects stand, metres per second: above the jitter of recorded boxes.
+const STANDING_M_PER_S: f64 = 0.3;
+
 /// What the decoder should say at a key.
 #[derive(Clone, Debug)]
 pub(crate) struct StateTarget {
@@ -18,6 +21,8 @@ pub(crate) struct StateTarget {
     pub(crate) bins: [Option<u16>; STEPS.len()],
     /// False if the window has not shown the object before, so that it could be anywhere.
     pub(crate) is_known: bool,
+    /// True of an object that the log shows slower than 0.3 m/s.
+    pub(crate) stands: bool,
 }
 
 impl StateTarget {
@@ -84,6 +89,7 @@ pub(super) fn targets(
             key: i,
             bins: anchor.bins(value, chunk),
             is_known: placed.last.is_some(),
+            stands: chunk[0].is_some_and(|state| state.speed() < STANDING_M_PER_S),
         });
         let seen = |offset: isize| {
             let agent = window.seen(frame, offset)?.agent(id)?;
