@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gump_model::checkpoint::{self, Precision};
+use gump_model::ops::Kernel;
 use gump_model::train::ModelChoice;
 use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
 use gump_scene::Seed;
@@ -126,10 +127,17 @@ fn wrong_arguments_exit_with_2() {
         "simulate --scenario s --world idm --temperature 0",
         "simulate --scenario s --world idm --heat",
         "simulate --scenario s --world idm --device cuda",
+        "simulate --scenario s --world idm --kernel neon",
         "data synthesize --scenes 1 --family cul-de-sac",
         "tidy --seed many",
     ] {
         place.fails(words, 2, &[]);
+    }
+    if Kernel::Amx.is_present() {
+        eprintln!("skipped: this processor has amx, so that it can be asked for");
+    } else {
+        let words = "simulate --scenario s --world idm --kernel amx";
+        place.fails(words, 2, &["--kernel", "no kernel amx"]);
     }
 }
 

@@ -11,7 +11,9 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp3, D, DType, Layout, Result, Shape, Tensor, bail,
 };
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{
     dot, exp, exp_shifted_sum, for_pieces, for_pieces2, for_pieces3, max, rows_per_task,
 };
@@ -255,6 +257,7 @@ const TASK_PRODUCTS: usize = 64 * 1024;
 
 struct Attention {
     view: View,
+    operands: Operands,
     /// Logarithm of the softmax sum of each row, `[B, H, Tq]`, kept for the gradient.
     log_sums: OnceLock<Vec<f32>>,
 }
@@ -263,6 +266,7 @@ impl Attention {
     fn new(view: View) -> Self {
         Self {
             view,
+            operands: Operands::current(),
             log_sums: OnceLock::new(),
         }
     }
@@ -476,6 +480,7 @@ impl Attention {
                 Mat::strided(&q[queries..], rows, d, of_queries),
                 Mat::strided(&k[keys..], n, d, of_keys).t(),
                 Threads::One,
+                self.operands,
             );
             let mut reciprocals = [0.0; 64];
             wide(
@@ -501,6 +506,7 @@ impl Attention {
                 Mat::new(scores, rows, n),
                 Mat::strided(&v[keys..], n, d, of_keys),
                 Threads::One,
+                self.operands,
             );
             for (row, reciprocal) in out.chunks_exact_mut(d).zip(reciprocals) {
                 for o in row {
@@ -543,7 +549,7 @@ impl Attention {
             let k = Mat::strided(&inputs.k[keys..], n, d, of_keys);
             let v = Mat::strided(&inputs.v[keys..], n, d, of_keys);
             let scale = view.scale();
-            let one = Threads::One;
+            let (one, by) = (Threads::One, self.operands);
             // Scores, and the gradient that reaches the probabilities.
             gemm(
                 MatMut::new(p, rows, n),
@@ -552,6 +558,7 @@ impl Attention {
                 q,
                 k.t(),
                 one,
+                by,
             );
             gemm(
                 MatMut::new(ds, rows, n),
@@ -560,6 +567,7 @@ impl Attention {
                 d_out,
                 v.t(),
                 one,
+                by,
             );
             wide(
                 #[inline(always)]
@@ -581,9 +589,9 @@ impl Attention {
             );
             let (p, ds) = (Mat::new(p, rows, n), Mat::new(ds, rows, n));
             let dq = MatMut::new(&mut dq[start * d..], rows, d);
-            gemm(dq, Store::Replace, scale, ds, k, one);
-            gemm(MatMut::new(dk, n, d), Store::Add, scale, ds.t(), q, one);
-            gemm(MatMut::new(dv, n, d), Store::Add, 1.0, p.t(), d_out, one);
+            gemm(dq, Store::Replace, scale, ds, k, one, by);
+            gemm(MatMut::new(dk, n, d), Store::Add, scale, ds.t(), q, one, by);
+            gemm(MatMut::new(dv, n, d), Store::Add, 1.0, p.t(), d_out, one, by);
         }
     }
 }

@@ -7,7 +7,9 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{add_partials, add_to, for_pieces, for_pieces2, sum};
 use super::{Host, elements, fusible, gradient, output};
 
@@ -68,6 +70,7 @@ struct Conv {
     padding: usize,
     out_h: usize,
     out_w: usize,
+    operands: Operands,
 }
 
 impl Conv {
@@ -107,6 +110,7 @@ impl Conv {
             padding,
             out_h: (h + 2 * padding - kh) / stride + 1,
             out_w: (w + 2 * padding - kw) / stride + 1,
+            operands: Operands::current(),
         })
     }
 
@@ -278,6 +282,7 @@ impl Conv {
                     Mat::new(weight, self.c_out, self.patch()),
                     self.columns(x, band, &mut cols),
                     self.threads(),
+                    self.operands,
                 );
             }
         });
@@ -321,6 +326,7 @@ impl Conv {
                             dy,
                             self.columns(x, band, &mut cols).t(),
                             self.threads(),
+                            self.operands,
                         );
                         if wants_dx {
                             self.backward_image(w, dy, band, &mut cols, dx);
@@ -353,11 +359,11 @@ impl Conv {
         if self.is_pointwise() {
             let dx = &mut dx[band.0 * self.out_w..];
             let dst = MatMut::strided(dx, self.c_in, n, self.positions());
-            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads());
+            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads(), self.operands);
         } else {
             cols.resize(self.patch() * n, 0.0);
             let dst = MatMut::new(cols, self.patch(), n);
-            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads());
+            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads(), self.operands);
             self.scatter(cols, band, dx);
         }
     }

@@ -6,7 +6,9 @@
 
 use candle_core::{CpuStorage, CustomOp3, D, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{column_sums, exp, for_pieces, for_pieces3, rows_per_task};
 use super::{Host, elements, fusible, gradient, output};
 
@@ -42,7 +44,7 @@ pub fn gru(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Resu
     let affine = Tensor::cat(&[weight, &bias.unsqueeze(1)?], 1)?; // [3C, C + 1]
     x_gates
         .contiguous()?
-        .apply_op3(&h.contiguous()?, &affine, Gru)
+        .apply_op3(&h.contiguous()?, &affine, Gru { operands: Operands::current() })
 }
 
 fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
@@ -62,7 +64,9 @@ fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Res
     Tensor::stack(&states, 0)
 }
 
-struct Gru;
+struct Gru {
+    operands: Operands,
+}
 
 /// Sizes of a sequence: steps, rows, channels.
 type Sizes = (usize, usize, usize);
@@ -74,13 +78,13 @@ fn halves(affine: &[f32], c: usize) -> (Mat<'_>, Vec<f32>) {
 }
 
 /// `out = h weight^T + bias`, `[N, 3C]`.
-fn hidden_gates(out: &mut [f32], h: &[f32], (weight, bias): (Mat<'_>, &[f32]), c: usize) {
+fn hidden_gates(out: &mut [f32], h: &[f32], (turned, bias): (&Right<'_>, &[f32]), c: usize) {
     for row in out.chunks_exact_mut(3 * c) {
         row.copy_from_slice(bias);
     }
     let n = h.len() / c;
     let (dst, h) = (MatMut::new(out, n, 3 * c), Mat::new(h, n, c));
-    gemm(dst, Store::Add, 1.0, h, weight.t(), Threads::Pool);
+    turned.product(dst, Store::Add, 1.0, h, Threads::Pool);
 }
 
 impl CustomOp3 for Gru {
@@ -101,6 +105,7 @@ impl CustomOp3 for Gru {
         let (n, c) = h_layout.shape().dims2()?;
         let steps = x_layout.dims()[0];
         let (weight, bias) = halves(elements(affine, affine_layout)?, c);
+        let turned = Right::new(weight.t(), self.operands);
         let mut states = vec![0.0; steps * n * c];
         let mut g = vec![0.0; n * 3 * c];
         let piece = rows_per_task(4 * c);
@@ -111,7 +116,7 @@ impl CustomOp3 for Gru {
             } else {
                 &before[(step - 1) * n * c..]
             };
-            hidden_gates(&mut g, h, (weight, &bias), c);
+            hidden_gates(&mut g, h, (&turned, &bias), c);
             let (x, g) = (&x[step * n * 3 * c..], &g);
             for_pieces(&mut states[..n * c], piece * c, |i, out| {
                 let at = i * piece * c..i * piece * c + out.len();
@@ -149,7 +154,7 @@ impl CustomOp3 for Gru {
         ];
         let [x_all, first, weights, states, d_states] = &hosts;
         let (dx, dh, d_affine) = backward(
-            sizes,
+            (sizes, self.operands),
             x_all.slice()?,
             first.slice()?,
             weights.slice()?,
@@ -166,7 +171,7 @@ impl CustomOp3 for Gru {
 
 /// Gradients of the gates, of the first state and of the matrix with its bias.
 fn backward(
-    (steps, n, c): Sizes,
+    ((steps, n, c), operands): (Sizes, Operands),
     x: &[f32],
     first: &[f32],
     affine: &[f32],
@@ -174,6 +179,7 @@ fn backward(
     d_states: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (weight, bias) = halves(affine, c);
+    let (turned, straight) = (Right::new(weight.t(), operands), Right::new(weight, operands));
     let mut dx = vec![0.0; steps * n * 3 * c];
     let mut dg = vec![0.0; steps * n * 3 * c];
     let mut dh = vec![0.0; n * c];
@@ -185,7 +191,7 @@ fn backward(
         } else {
             &states[(step - 1) * n * c..step * n * c]
         };
-        hidden_gates(&mut g, before, (weight, &bias), c);
+        hidden_gates(&mut g, before, (&turned, &bias), c);
         let (x, d_states) = (&x[step * n * 3 * c..], &d_states[step * n * c..]);
         let of_step = step * n * 3 * c..(step + 1) * n * 3 * c;
         for_pieces3(
@@ -215,7 +221,7 @@ fn backward(
         // What reaches the state before through the gates.
         let dg = Mat::new(&dg[of_step], n, 3 * c);
         let dst = MatMut::new(&mut dh, n, c);
-        gemm(dst, Store::Add, 1.0, dg, weight, Threads::Pool);
+        straight.product(dst, Store::Add, 1.0, dg, Threads::Pool);
     }
     let mut d_affine = vec![0.0; 3 * c * (c + 1)];
     let sums = column_sums(&dg, 3 * c);
@@ -227,7 +233,7 @@ fn backward(
         let rows = dg.len() / (3 * c);
         let dst = MatMut::strided(&mut d_affine, 3 * c, c, c + 1);
         let (dg, before) = (Mat::new(dg, rows, 3 * c), Mat::new(before, rows, c));
-        gemm(dst, Store::Add, 1.0, dg.t(), before, Threads::Pool);
+        gemm(dst, Store::Add, 1.0, dg.t(), before, Threads::Pool, operands);
     }
     (dx, dh, d_affine)
 }

@@ -11,7 +11,9 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, D, DType, Device, Layout, Result, Shape, Tensor, bail,
 };
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{exp, for_pieces, for_pieces2, max, rows_per_task, sum_exp_shifted};
 use super::{Host, elements, fusible, gradient, linear, output};
 
@@ -325,6 +327,7 @@ pub fn linear_cross_entropy(
     let op = LinearCrossEntropy {
         asked,
         learns: x.track_op() || weight.track_op(),
+        operands: Operands::current(),
         slopes: OnceLock::new(),
     };
     x.contiguous()?.apply_op2(&weight.contiguous()?, op)
@@ -358,6 +361,7 @@ struct LinearCrossEntropy {
     asked: Vec<(Range<usize>, Targets)>,
     /// Whether anything asks for gradients.
     learns: bool,
+    operands: Operands,
     /// Gradients of the logits per step, `[N, V]`, as they are where the loss itself is asked for.
     slopes: OnceLock<Vec<Vec<f32>>>,
 }
@@ -389,6 +393,7 @@ impl CustomOp2 for LinearCrossEntropy {
                 Mat::new(&x[step * n * c..(step + 1) * n * c], n, c),
                 weight.t(),
                 Threads::Pool,
+                self.operands,
             );
             let scale = asked.scale();
             let mut losses = vec![0.0; n];
@@ -449,6 +454,7 @@ impl CustomOp2 for LinearCrossEntropy {
                 slope,
                 Mat::new(&w[of_rows.clone()], v, c),
                 Threads::Pool,
+                self.operands,
             );
             gemm(
                 MatMut::new(&mut dw[of_rows], v, c),
@@ -457,6 +463,7 @@ impl CustomOp2 for LinearCrossEntropy {
                 slope.t(),
                 Mat::new(&x_all[at..at + n * c], n, c),
                 Threads::Pool,
+                self.operands,
             );
         }
         Ok((Some(gradient(dx, x)?), Some(gradient(dw, weight)?)))

@@ -5,8 +5,9 @@
 //! over rayon. On other devices and for other types every function falls back to candle's own
 //! operations with the same result. What does not: layers with parameters, the network itself.
 //!
-//! One file per family; start with `norm` (the simplest), then `attention`. `rows` and `gemm`
-//! hold the arithmetic, and `gemm` holds all the `unsafe`.
+//! One file per family; start with `norm` (the simplest), then `attention`. `rows`, `gemm` and
+//! `kernels` hold the arithmetic, and the last two all the `unsafe`. `operands` says in which form
+//! numbers are multiplied.
 //!
 //! Results on a CPU are bit-identical for any number of threads: work is cut by shape, and sums
 //! are added in a fixed order. Gradients cannot be differentiated again.
@@ -17,9 +18,11 @@ mod conv;
 mod gelu;
 mod gemm;
 mod gru;
+mod kernels;
 mod linear;
 mod loss;
 mod norm;
+mod operands;
 pub(crate) mod panels;
 mod rows;
 
@@ -31,14 +34,16 @@ pub use conv::conv2d;
 pub use gelu::gelu;
 pub use gemm::square_product;
 pub use gru::gru;
+pub use kernels::{Choice, Kernel};
 pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
 
 pub(crate) use gelu::gelu_row;
-pub(crate) use gemm::{tile, wide};
+pub(crate) use kernels::{tile, wide};
 pub(crate) use gru::gru_row;
 pub(crate) use norm::normalize_row;
+pub(crate) use operands::Operands;
 pub(crate) use rows::{count_from, exp_shifted_sum, max};
 
 use candle_core::{

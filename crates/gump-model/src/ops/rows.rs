@@ -9,7 +9,7 @@
 
 use rayon::prelude::*;
 
-use super::gemm::wide;
+use super::kernels::wide;
 
 /// Independent accumulators of a sum; two 512-bit vectors.
 const LANES: usize = 32;

@@ -192,6 +192,7 @@ impl Trainer {
     /// Loss and gradients of a batch, of which these are this process's samples.
     fn differentiate(&self, samples: &[Sample]) -> Result<Found, ModelError> {
         let (network, config) = (&self.learner.network, &self.config.loss);
+        let operands = self.learner.operands;
         let whole = self.total(Counts::of(samples, &self.config.loss))?;
         let seed = Seed(self.config.seed).fork(2);
         let seed = seed.fork(self.learner.step as u64);
@@ -202,8 +203,9 @@ impl Trainer {
             let alone = network.samples_together(samples.len());
             let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
                 let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
-                let (total, parts) =
-                    loss(network, samples, config, &whole, true, dropout.as_ref())?;
+                let found = operands
+                    .during(|| loss(network, samples, config, &whole, true, dropout.as_ref()));
+                let (total, parts) = found?;
                 let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
                 Ok((total.backward()?, parts, tokens))
             });
