@@ -1,10 +1,10 @@
 //! Stops that nothing asks for.
 //!
 //! Reasons to stop, each enough: the vehicle is not on a lane (over 1 m beside the centre line or
-//! 30 degrees off it, as who parks); anybody or anything ahead within 20 m of the front bumper and
+//! 30 degrees off it, as who parks); anybody or anything ahead within 15 m of the front bumper and
 //! half a metre of its way, people and bicycles within 3 m; ahead within 25 m a light that is not
 //! green, a stop line, a stop sign or the end of the road; an intersection within 15 m and someone
-//! within 50 m who moves another way. A stop is free if there is no reason as it begins, at its end
+//! within 50 m who moves another way and comes nearer. A stop is free if there is no reason as it begins, at its end
 //! and in between.
 
 use std::f64::consts::FRAC_PI_6;
@@ -20,7 +20,7 @@ use crate::red_light::stop_line;
 /// Farther beside the centre line one is not on the lane, metres.
 const ON_LANE_M: f64 = 1.0;
 /// How far ahead of the front bumper others matter, and lights, signs and the end of the road.
-const OTHERS_M: f64 = 20.0;
+const OTHERS_M: f64 = 15.0;
 const ROAD_M: f64 = 25.0;
 /// How far beside the way others matter, from the side of the vehicle, metres.
 const BESIDE_M: f64 = 0.5;
@@ -110,7 +110,7 @@ fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
     })
 }
 
-/// At an intersection, someone who moves another way.
+/// At an intersection, someone who moves another way and comes nearer.
 fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
     let junction = |part: &Ahead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
     let crosses = |other: &&&Agent| {
@@ -120,8 +120,10 @@ fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
         } else {
             STANDS
         };
+        let towards = pose.position - state.pose.position;
         state.speed() > speed
-            && state.pose.position.distance(pose.position) <= CROSSING_M
+            && towards.length() <= CROSSING_M
+            && towards.dot(state.velocity) > 0.0
             && angle_difference(state.velocity.to_angle(), pose.heading).abs() > FRAC_PI_6
     };
     way.iter().any(junction) && others.iter().find(crosses).is_some()

@@ -72,10 +72,9 @@ impl Measure {
             Self::ParkedMove => "parked vehicle",
             Self::FreeRoadStop | Self::LaneChange => "minute of moving",
             Self::NewOverlap | Self::Standing => "agent",
-            Self::HardAcceleration => "minute",
+            Self::HardAcceleration | Self::SetOff => "minute",
             Self::Slip => "time of moving",
             Self::RedLight => "passage of a light",
-            Self::SetOff => "minute of standing",
             Self::ConflictingGreen => "time of crossing lights",
         }
     }

@@ -12,7 +12,7 @@
 //! | `slip` | a vehicle faster than 1 m/s slides sideways at more than 0.5 m/s wherever its rear axle may be | time that vehicles move |
 //! | `red_light` | a vehicle passes the stop line of the lane that it then follows at red | passage of a line whose light is known |
 //! | `lane_change` | a vehicle goes over to a lane beside its own, each held for a second, outside of intersections | minute that vehicles move |
-//! | `set_off` | who stood for a second goes faster than 1 m/s | minute of standing |
+//! | `set_off` | who stood for a second goes faster than 1 m/s | minute that agents are there |
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
 //!

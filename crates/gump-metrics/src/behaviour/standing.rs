@@ -44,9 +44,9 @@ pub(super) fn parked(scenario: &Scenario) -> BTreeSet<AgentId> {
 /// What a walk over the paces of a track finds.
 #[derive(Default)]
 struct Walk {
-    /// Frames ahead in which it moves, and stands.
+    /// Frames ahead in which it is known how fast it goes, and in which it moves.
+    known: usize,
     moving: usize,
-    standing: usize,
     /// Frames at which it sets off.
     starts: Vec<usize>,
     /// Frames at which it comes to stand, and those at which that is a stop.
@@ -87,8 +87,8 @@ impl Counter<'_> {
         for track in self.tracks {
             let class = Class::of(track.kind);
             let walk = self.walk(track);
-            let (moving, standing) = (self.minutes(walk.moving), self.minutes(walk.standing));
-            self.add(Measure::SetOff, class, walk.starts.len() as f64, standing);
+            let (known, moving) = (self.minutes(walk.known), self.minutes(walk.moving));
+            self.add(Measure::SetOff, class, walk.starts.len() as f64, known);
             for &k in &walk.starts {
                 self.note(Measure::SetOff, track.id, None, k);
             }
@@ -142,7 +142,7 @@ impl Counter<'_> {
             };
             let stands = pace < STANDS;
             if k > now {
-                walk.standing += usize::from(stands);
+                walk.known += 1;
                 walk.moving += usize::from(pace > MOVES);
             }
             if !stands {
