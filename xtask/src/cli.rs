@@ -112,6 +112,9 @@ impl Cli {
             Verb::Evaluate(evaluate::Verb::Wosac(args)) => {
                 Run::of("evaluate wosac", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Evaluate(evaluate::Verb::Behaviour(args)) => {
+                Run::of("evaluate behaviour", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Plan(args) => {
                 Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))
             }

@@ -188,6 +188,12 @@ impl Run {
         Ok(())
     }
 
+    /// Adds a result that the terminal does not show: the same stands there in another form.
+    pub(crate) fn result_untold(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
+        self.report.untold.insert(key.into());
+        self.result(key, value)
+    }
+
     /// From here on this process only helps another one, which tells and writes for both.
     pub(crate) fn follow(&mut self) {
         self.leads = false;

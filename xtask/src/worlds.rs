@@ -258,6 +258,11 @@ impl Sampling {
 }
 
 impl Draw {
+    /// True if agents come and leave.
+    pub(crate) fn has_life(&self) -> bool {
+        self.life
+    }
+
     /// The model's form of the flags.
     ///
     /// Error: [`WrongArguments`] for a number out of its range.

@@ -7,6 +7,7 @@
 mod recording;
 mod rollouts;
 mod tell;
+mod worst;
 
 use std::io::Write as _;
 use std::num::NonZeroUsize;
@@ -30,6 +31,7 @@ use crate::worlds::{Sampling, WorldName};
 pub(crate) use recording::{Recorded, recordings};
 pub(crate) use rollouts::Source;
 pub(crate) use tell::tell_merged;
+use worst::Worst;
 
 /// Name of the benchmark in ledgers.
 pub(crate) const BENCHMARK: &str = "wosac";
@@ -56,7 +58,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "K/N")]
     shard: Option<Shard>,
     /// Also say what lowered the scores and when, in explain.jsonl, agents.parquet and the dearest in
-    /// the report
+    /// the report, and which agents do what no driver would, in conduct.parquet
     #[arg(long)]
     explain: bool,
     #[command(flatten)]
@@ -171,6 +173,7 @@ impl Args {
         };
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
+        let mut worst = self.explain.then(Worst::default);
         run.phase("evaluate", |run| {
             let mut log = match self.explain {
                 true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
@@ -181,7 +184,8 @@ impl Args {
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
             for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
                 let scored = recorded.and_then(|recorded| {
-                    let scored = self.evaluate(run, &config, &recorded, &mut source)?;
+                    let scored =
+                        self.evaluate(run, &config, &recorded, &mut source, worst.as_mut())?;
                     Ok((recorded, scored))
                 });
                 let scored = left_out.sift(scored, is_of_another_length)?;
@@ -219,6 +223,9 @@ impl Args {
             run.result("explain", &explained)?;
             tabulate(run)?;
         }
+        if let Some(worst) = worst {
+            worst.tell(run)?;
+        }
         Ok(())
     }
 
@@ -245,6 +252,7 @@ impl Args {
         config: &Config,
         recorded: &Recorded,
         source: &mut Source,
+        worst: Option<&mut Worst>,
     ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
@@ -269,7 +277,11 @@ impl Args {
             id: id.clone(),
             scores,
         };
-        Ok((entry, evaluation.explain()))
+        let blames = evaluation.explain();
+        if let Some(worst) = worst.filter(|_| config.mode == Mode::SimAgents) {
+            worst.add(&recorded.scenario, &rollouts, &evaluation, &blames);
+        }
+        Ok((entry, blames))
     }
 }
 
