@@ -97,6 +97,9 @@ impl Cli {
             Verb::Data(data::Verb::Synthesize(args)) => {
                 Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Data(data::Verb::Benchmark(args)) => {
+                Run::of("data benchmark", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Train(args) => {
                 Run::of("train", &args.common, &args)?.execute(|run| args.execute(run))
             }

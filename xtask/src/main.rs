@@ -9,6 +9,7 @@
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
 )]
 
+mod benchmark;
 mod charts;
 mod checks;
 mod cli;

@@ -55,6 +55,27 @@ pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named>
     })))
 }
 
+/// Every scenario of some files or folders, read one by one.
+///
+/// Error: nothing to read at the first; what is wrong with the others is told where it is.
+pub(crate) fn open_all(
+    paths: &[PathBuf],
+) -> anyhow::Result<Box<dyn Iterator<Item = Named> + Send + '_>> {
+    let (first, others) = paths
+        .split_first()
+        .context("expected scenarios, found none")?;
+    let others = others.iter().flat_map(|path| match open(path) {
+        Ok(cases) => cases,
+        Err(error) => Box::new(std::iter::once(Named {
+            id: path.display().to_string(),
+            log_name: log_name(path),
+            scenario_type: "unknown".into(),
+            case: Err(error),
+        })) as Box<dyn Iterator<Item = Named> + Send>,
+    });
+    Ok(Box::new(open(first)?.chain(others)))
+}
+
 /// A file's name without its endings.
 pub(crate) fn log_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default().to_string_lossy();

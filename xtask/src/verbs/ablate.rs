@@ -70,7 +70,7 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let name = match &self.scenario {
             Some(name) => name.clone(),
-            None => shipped::scenario()?,
+            None => shipped::scenario(),
         };
         let scenario = run.phase("read", |_| Ok(find(&name)?))?;
         run.setting("scenario", &name)?;

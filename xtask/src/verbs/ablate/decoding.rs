@@ -207,7 +207,8 @@ pub(super) fn score(
     let mut source = Source::world(world.clone(), sampling, n, run.seed());
     let progress = run.progress("evaluating", 0, "scenarios");
     let (mut all, mut cost, mut frames) = (Vec::new(), Cost::default(), 0.0);
-    for recorded in recordings(scenarios, source.read_options(), |_| true)? {
+    let scenarios = [scenarios.to_owned()];
+    for recorded in recordings(&scenarios, source.read_options(), |_| true)? {
         stop_if_interrupted()?;
         let recorded = recorded?;
         let (cpu, began) = (cpu_seconds(), Instant::now());

@@ -74,7 +74,7 @@ impl Args {
         shipped::check_weights()?;
         let name = match &self.scenario {
             Some(name) => name.clone(),
-            None => shipped::scenario()?,
+            None => shipped::scenario(),
         };
         run.setting("scenario", &name)?;
         let mut demo = Demo {

@@ -17,6 +17,7 @@ use serde_json::{Map, Value, json};
 use self::realism::Judge;
 use self::stages::Stage;
 use crate::cli::WrongArguments;
+use crate::benchmark;
 use crate::dataset::{self, Part, Split, Training};
 use crate::losses::Losses;
 use crate::peers::{Processes, together};
@@ -225,13 +226,31 @@ impl Args {
     fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
         let training = Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?;
+        warn_of_frozen(run, &training)?;
         let validation = match &self.validation {
             Some(path) => vec![Part::whole(path)],
-            None => dataset::parts(&stage.data, Split::Validation)?,
+            None => dataset::parts(&stage.data, Split::Tune)?,
         };
         let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
         Ok((training, validation))
     }
+}
+
+/// Says so if the network is to learn from scenes of a frozen set.
+///
+/// Error: a list of this repository that cannot be read.
+fn warn_of_frozen(run: &Run, training: &Training) -> anyhow::Result<()> {
+    let frozen = benchmark::frozen_ids()?;
+    let sets = training.ids().filter_map(|id| Some((id, frozen.get(id)?)));
+    let found: Vec<_> = sets.collect();
+    if let Some((id, set)) = found.first() {
+        run.say(&format!(
+            "warning: {} training scenes are of frozen sets, {id} of {set} for one: \
+             what these weights score there says nothing",
+            found.len()
+        ));
+    }
+    Ok(())
 }
 
 /// The weights to go on from; those without marks of what is not known grow them where the

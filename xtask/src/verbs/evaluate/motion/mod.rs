@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use gump_data::{ReadOptions, open_with};
+use gump_data::ReadOptions;
 use gump_metrics::motion::{
     MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
     forecast,
@@ -23,6 +23,7 @@ use self::source::Predictions;
 use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
 use super::shard::Shard;
+use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::worlds::{Sampling, WorldName, Worlds};
@@ -35,9 +36,9 @@ pub(crate) const NAME: &str = "motion";
 /// Arguments of `evaluate motion`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Scenarios with their futures: a file or a folder
+    /// Scenarios with their futures: a file, a folder, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     #[command(flatten)]
     #[serde(flatten)]
     source: Source,
@@ -98,11 +99,12 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
-        let header = self.header(run)?;
+        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let header = self.header(run, &scenarios)?;
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
-        let mut records = self.open()?.enumerate();
+        let mut records = self.open(&scenarios)?.enumerate();
         while let Some((index, record)) = run.phase("read", |_| Ok(records.next()))? {
             run::stop_if_interrupted()?;
             let mut scenario = record?.scenario;
@@ -133,16 +135,16 @@ impl Args {
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(run, &entries, &config)
+        tell::tell(run, &scenarios.set, &entries, &config)
     }
 
-    fn open(&self) -> anyhow::Result<gump_data::Reader> {
+    fn open(&self, scenarios: &Found) -> anyhow::Result<gump_data::Reader> {
         // Only worlds look at the map.
         let options = match self.source.world {
             Some(_) => ReadOptions::ALL,
             None => ReadOptions::STATED,
         };
-        Ok(open_with(&self.scenarios, options)?)
+        Ok(scenarios.open(options)?)
     }
 
     fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
@@ -157,10 +159,10 @@ impl Args {
     }
 
     /// Everything that the scores of a scenario depend on.
-    fn header(&self, run: &Run) -> anyhow::Result<Header> {
+    fn header(&self, run: &Run, scenarios: &Found) -> anyhow::Result<Header> {
         let mut settings = toml::Table::new();
         let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
-        set("scenarios", self.scenarios.display().to_string().into());
+        set("scenarios", scenarios.set.clone().into());
         set("shapes", toml::Value::try_from(self.shapes)?);
         set("seed", i64::try_from(run.seed().0)?.into());
         if let Some(path) = &self.source.rollouts {

@@ -32,6 +32,7 @@ const CHARTS: [(&str, &str, &[&str]); 2] = [
 /// Fills the report of a run.
 pub(super) fn tell(
     run: &mut Run,
+    set: &str,
     entries: &[Entry<Scores>],
     config: &MotionConfig,
 ) -> anyhow::Result<()> {
@@ -49,6 +50,7 @@ pub(super) fn tell(
     })?;
     let absent: usize = entries.iter().map(|entry| entry.scores.absent).sum();
     run.result("benchmark", NAME)?;
+    run.result("set", set)?;
     run.result("scenarios", entries.len())?;
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
@@ -71,7 +73,12 @@ pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<
         .get("seed")
         .and_then(toml::Value::as_integer);
     run.reseed(seed.and_then(|seed| u64::try_from(seed).ok()).unwrap_or(0));
-    tell(run, &entries, &Shapes::deserialize(shapes)?.config())
+    let set = header
+        .settings
+        .get("scenarios")
+        .and_then(toml::Value::as_str);
+    let config = Shapes::deserialize(shapes)?.config();
+    tell(run, set.unwrap_or_default(), &entries, &config)
 }
 
 fn merged<'a>(tallies: impl Iterator<Item = &'a MotionTally>) -> MotionTally {

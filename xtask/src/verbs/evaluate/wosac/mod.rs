@@ -24,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
 use super::shard::Shard;
+use crate::benchmark::{Found, Scenes};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
 use crate::tables;
@@ -39,9 +40,9 @@ pub(crate) const BENCHMARK: &str = "wosac";
 /// Arguments of `evaluate wosac`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// File or directory of recorded scenarios
+    /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", required_unless_present = "rollouts")]
     world: Option<WorldName>,
@@ -113,8 +114,8 @@ pub(crate) struct Settings {
     pub(crate) year: String,
     /// How many rollouts a world imagines.
     pub(crate) rollouts_per_scenario: usize,
-    /// File names, without the folders that differ between machines.
-    scenarios: String,
+    /// The set, without the folders that differ between machines.
+    pub(crate) scenarios: String,
     rollouts: String,
     /// How a learned world decodes, as JSON.
     sampling: String,
@@ -153,7 +154,8 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let sampling = self.sampling.resolve()?;
         let shard = self.shard.unwrap_or(Shard::WHOLE);
-        let settings = self.settings(run)?;
+        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let settings = self.settings(run, &scenarios)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard,
@@ -182,7 +184,7 @@ impl Args {
             let progress = run.progress("evaluating", 0, "scenarios");
             let kept = ledger.indices();
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
-            for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
+            for recorded in recordings(&scenarios.paths, source.read_options(), wanted)? {
                 let scored = recorded.and_then(|recorded| {
                     let scored =
                         self.evaluate(run, &config, &recorded, &mut source, worst.as_mut())?;
@@ -216,7 +218,7 @@ impl Args {
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {shard}, found none: {}",
-            self.scenarios.display()
+            self.scenarios
         );
         tell::tell(run, &settings, &entries)?;
         if self.explain {
@@ -229,7 +231,7 @@ impl Args {
         Ok(())
     }
 
-    fn settings(&self, run: &Run) -> anyhow::Result<Settings> {
+    fn settings(&self, run: &Run, scenarios: &Found) -> anyhow::Result<Settings> {
         let name = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default();
             name.to_string_lossy().into_owned()
@@ -239,7 +241,7 @@ impl Args {
             world: world.unwrap_or_else(|| "rollouts".into()),
             year: self.year.year().name().into(),
             rollouts_per_scenario: self.rollouts_per_scenario.get(),
-            scenarios: name(&self.scenarios),
+            scenarios: scenarios.set.clone(),
             rollouts: self.rollouts.as_ref().map(name).unwrap_or_default(),
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),

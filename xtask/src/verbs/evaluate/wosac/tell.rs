@@ -44,6 +44,7 @@ pub(crate) fn tell(
         worlds.push((CONSTANT_VELOCITY, of(|scored| &scored.constant_velocity)));
     }
     per_scenario(settings, entries, &worlds).write(&run.path("scores.parquet"))?;
+    run.result("set", &settings.scenarios)?;
     run.result("scenarios", entries.len())?;
     let rows = worlds.iter().filter_map(|(world, scores)| {
         let mean = Scores::mean(scores)?;
