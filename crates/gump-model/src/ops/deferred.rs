@@ -1,13 +1,14 @@
 //! Gradients of matrices, put off until all samples of a step are differentiated.
 //!
-//! The gradient of a weight matrix is a product of two tensors that the backward pass has at hand.
-//! Multiplied there and then, it is a matrix per sample: zeroed, added to, kept, and added to those
-//! of the other samples, which for millions of parameters and a few hundred tokens costs as much as
-//! the products. So an operation that is built within [`Deferred::during`] only notes the two
-//! tensors, and [`Deferred::take_in`] adds all products of a matrix up in one place.
+//! The gradient of a weight matrix is a product of two tensors that the backward pass has at hand;
+//! that of a table of embeddings, a few of its rows. Computed there and then, it is a matrix per
+//! sample: zeroed, added to, kept, and added to those of the other samples, which for millions of
+//! parameters and a few hundred tokens costs as much as the products. So an operation that is built
+//! within [`Deferred::during`] only notes the tensors, and [`Deferred::take_in`] adds all parts of a
+//! matrix's gradient up in one place.
 //!
-//! What lives here: the notes and their sum. What does not: who notes (`linear`), and when the sums
-//! are due, which training knows.
+//! What lives here: the notes and their sum. What does not: who notes (`linear`, `table`), and when
+//! the sums are due, which training knows.
 
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -16,22 +17,28 @@ use candle_core::{Result, Tensor, TensorId};
 
 use super::Host;
 use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::kernels::wide;
 use super::operands::Operands;
+use super::rows::add_to;
 
-/// A product to be added to the gradient of a matrix: `dy^T x`.
+/// A part of the gradient of a matrix `[R, C]`.
 #[derive(Debug)]
-struct Product {
-    matrix: TensorId,
-    /// `[.., in]`
-    x: Tensor,
-    /// `[.., out]`
-    dy: Tensor,
-    operands: Operands,
+pub(super) enum Part {
+    /// `dy^T x`, of `x` `[.., C]` and `dy` `[.., R]`.
+    Product {
+        x: Tensor,
+        dy: Tensor,
+        operands: Operands,
+    },
+    /// The rows from `first` on, `[.., C]`.
+    Rows { first: usize, slopes: Tensor },
+    /// To each of the rows `[N, K]`, `u32::MAX` for none, a row of `[N, C]` is added.
+    Scattered { rows: Tensor, slopes: Tensor },
 }
 
 /// What one backward pass has put off, in its order.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Deferred(Arc<Mutex<Vec<Product>>>);
+pub(crate) struct Deferred(Arc<Mutex<Vec<(TensorId, Part)>>>);
 
 thread_local! {
     static CURRENT: RefCell<Option<Deferred>> = const { RefCell::new(None) };
@@ -56,16 +63,10 @@ impl Deferred {
         f()
     }
 
-    /// Notes that `dy^T x` is part of the gradient of `matrix`.
-    pub(super) fn note(&self, matrix: &Tensor, x: &Tensor, dy: &Tensor, operands: Operands) {
-        let product = Product {
-            matrix: matrix.id(),
-            x: x.detach(),
-            dy: dy.detach(),
-            operands,
-        };
-        let mut products = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        products.push(product);
+    /// Notes a part of the gradient of `matrix`.
+    pub(super) fn note(&self, matrix: &Tensor, part: Part) {
+        let mut parts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        parts.push((matrix.id(), part));
     }
 
     /// Adds what was noted for `matrix`, in the order of `all`, to its gradient so far; `None` where
@@ -79,20 +80,20 @@ impl Deferred {
     ) -> Result<Option<Tensor>> {
         let mut gradient: Option<Vec<f32>> = None;
         for deferred in all {
-            let products = deferred.0.lock().unwrap_or_else(PoisonError::into_inner);
-            for product in products.iter().filter(|p| p.matrix == matrix.id()) {
-                let mut store = Store::Add;
+            let parts = deferred.0.lock().unwrap_or_else(PoisonError::into_inner);
+            for (_, part) in parts.iter().filter(|(of, _)| *of == matrix.id()) {
+                let mut is_zero = false;
                 let numbers = match &mut gradient {
                     Some(numbers) => numbers,
                     None => gradient.insert(match sum.take() {
                         Some(sum) => sum.flatten_all()?.to_vec1::<f32>()?,
                         None => {
-                            store = Store::Replace;
+                            is_zero = true;
                             vec![0.0; matrix.elem_count()]
                         }
                     }),
                 };
-                product.take_into(numbers, store, matrix.dims2()?)?;
+                part.add_to(numbers, is_zero, matrix.dims2()?)?;
             }
         }
         match gradient {
@@ -102,26 +103,46 @@ impl Deferred {
     }
 }
 
-impl Product {
-    /// Adds the product to `numbers` `[out, in]`, or replaces them by it.
-    fn take_into(
+impl Part {
+    /// Adds the part to `numbers` `[R, C]`, which may be known to be zeros.
+    fn add_to(
         &self,
         numbers: &mut [f32],
-        store: Store,
-        (n_out, n_in): (usize, usize),
+        is_zero: bool,
+        (n_rows, width): (usize, usize),
     ) -> Result<()> {
-        let (x, dy) = (Host::new(&self.x)?, Host::new(&self.dy)?);
-        let (x, dy) = (x.slice::<f32>()?, dy.slice::<f32>()?);
-        let rows = x.len() / n_in.max(1);
-        gemm(
-            MatMut::new(numbers, n_out, n_in),
-            store,
-            1.0,
-            Mat::new(dy, rows, n_out).t(),
-            Mat::new(x, rows, n_in),
-            Threads::One,
-            self.operands,
-        );
+        match self {
+            Self::Product { x, dy, operands } => {
+                let (x, dy) = (Host::new(x)?, Host::new(dy)?);
+                let (x, dy) = (x.slice::<f32>()?, dy.slice::<f32>()?);
+                let n = x.len() / width.max(1);
+                let store = if is_zero { Store::Replace } else { Store::Add };
+                gemm(
+                    MatMut::new(numbers, n_rows, width),
+                    store,
+                    1.0,
+                    Mat::new(dy, n, n_rows).t(),
+                    Mat::new(x, n, width),
+                    Threads::One,
+                    *operands,
+                );
+            }
+            Self::Rows { first, slopes } => {
+                let slopes = Host::new(slopes)?;
+                let slopes = slopes.slice::<f32>()?;
+                let numbers = &mut numbers[first * width..][..slopes.len()];
+                wide(
+                    #[inline(always)]
+                    || add_to(numbers, slopes),
+                );
+            }
+            Self::Scattered { rows, slopes } => {
+                let n_each = rows.dim(1)?;
+                let (rows, slopes) = (Host::new(rows)?, Host::new(slopes)?);
+                let (rows, slopes) = (rows.slice::<u32>()?, slopes.slice::<f32>()?);
+                super::table::scatter(numbers, rows.chunks_exact(n_each), slopes, width);
+            }
+        }
         Ok(())
     }
 }

@@ -5,7 +5,7 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, DType, Layout, Result, Shape, Tensor};
 
-use super::deferred::Deferred;
+use super::deferred::{Deferred, Part};
 use super::gemm::{Mat, MatMut, Store, Threads, gemm};
 use super::operands::Operands;
 use super::rows::column_sums;
@@ -205,7 +205,12 @@ impl Linear {
             None
         };
         let dw = if let Some(deferred) = self.deferred.as_ref().filter(|_| weight.is_variable()) {
-            deferred.note(weight, x, dy_tensor, self.operands);
+            let part = Part::Product {
+                x: x.detach(),
+                dy: dy_tensor.detach(),
+                operands: self.operands,
+            };
+            deferred.note(weight, part);
             None
         } else if weight.track_op() {
             let mut dw = vec![0.0; w.len()];

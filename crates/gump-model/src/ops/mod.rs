@@ -27,6 +27,7 @@ mod norm;
 mod operands;
 pub(crate) mod panels;
 mod rows;
+mod table;
 
 pub use absolute::mean_absolute_difference;
 pub use attention::{
@@ -41,6 +42,7 @@ pub use kernels::{Choice, Kernel};
 pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
+pub use table::{embedding_sum, table_rows};
 
 pub(crate) use deferred::Deferred;
 pub(crate) use gelu::gelu_row;
