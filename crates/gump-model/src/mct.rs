@@ -470,7 +470,7 @@ impl Mct {
     /// Logits over the class of an agent not seen before, from the slot before its key; the rows by
     /// which classes enter are also those by which they are told; [N, 3].
     pub(crate) fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
-        let rows = self.table.narrow(0, Tables::CLASS, N_CLASSES)?;
+        let rows = ops::table_rows(&self.table, Tables::CLASS, N_CLASSES)?;
         ops::linear(hidden, &rows, None)
     }
 

@@ -4,12 +4,14 @@
 //! the product over the inputs of all steps, which is one `linear`, and the stacking of layers,
 //! which is the network's.
 
+use std::sync::OnceLock;
+
 use candle_core::{CpuStorage, CustomOp3, D, Layout, Result, Shape, Tensor, bail};
 
 use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
 use super::kernels::wide;
 use super::operands::Operands;
-use super::rows::{column_sums, exp, for_pieces, for_pieces3, rows_per_task};
+use super::rows::{column_sums, exp, for_pieces2, for_pieces3, rows_per_task};
 use super::{Host, elements, fusible, gradient, output};
 
 /// All hidden states of a gated recurrent unit, as in PyTorch; at each step, with
@@ -44,7 +46,7 @@ pub fn gru(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Resu
     let affine = Tensor::cat(&[weight, &bias.unsqueeze(1)?], 1)?; // [3C, C + 1]
     x_gates
         .contiguous()?
-        .apply_op3(&h.contiguous()?, &affine, Gru { operands: Operands::current() })
+        .apply_op3(&h.contiguous()?, &affine, Gru::now())
 }
 
 fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
@@ -66,6 +68,17 @@ fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Res
 
 struct Gru {
     operands: Operands,
+    /// Per step and row what [`kept_row`] keeps, for the gradient.
+    kept: OnceLock<Vec<f32>>,
+}
+
+impl Gru {
+    fn now() -> Self {
+        Self {
+            operands: Operands::current(),
+            kept: OnceLock::new(),
+        }
+    }
 }
 
 /// Sizes of a sequence: steps, rows, channels.
@@ -108,6 +121,7 @@ impl CustomOp3 for Gru {
         let turned = Right::new(weight.t(), self.operands);
         let mut states = vec![0.0; steps * n * c];
         let mut g = vec![0.0; n * 3 * c];
+        let mut kept = vec![0.0; steps * n * 4 * c];
         let piece = rows_per_task(4 * c);
         for step in 0..steps {
             let (before, states) = states.split_at_mut(step * n * c);
@@ -118,20 +132,27 @@ impl CustomOp3 for Gru {
             };
             hidden_gates(&mut g, h, (&turned, &bias), c);
             let (x, g) = (&x[step * n * 3 * c..], &g);
-            for_pieces(&mut states[..n * c], piece * c, |i, out| {
-                let at = i * piece * c..i * piece * c + out.len();
-                out.copy_from_slice(&h[at]);
-                wide(
-                    #[inline(always)]
-                    || {
-                        for (row, h) in out.chunks_exact_mut(c).enumerate() {
-                            let row = i * piece + row;
-                            gru_row(&x[row * 3 * c..], &g[row * 3 * c..], h);
-                        }
-                    },
-                );
-            });
+            let of_step = step * n * 4 * c..(step + 1) * n * 4 * c;
+            for_pieces2(
+                (&mut states[..n * c], piece * c),
+                (&mut kept[of_step], piece * 4 * c),
+                |i, out, kept| {
+                    let at = i * piece * c..i * piece * c + out.len();
+                    out.copy_from_slice(&h[at]);
+                    wide(
+                        #[inline(always)]
+                        || {
+                            let rows = out.chunks_exact_mut(c).zip(kept.chunks_exact_mut(4 * c));
+                            for (row, (h, kept)) in rows.enumerate() {
+                                let row = i * piece + row;
+                                kept_row(gates(x, row, c), gates(g, row, c), h, kept);
+                            }
+                        },
+                    );
+                },
+            );
         }
+        let _ = self.kept.set(kept);
         Ok(output(states, (steps, n, c)))
     }
 
@@ -146,16 +167,15 @@ impl CustomOp3 for Gru {
         let d_states = d_states.contiguous()?;
         let sizes = states.dims3()?;
         let hosts = [
-            Host::new(x)?,
             Host::new(h)?,
             Host::new(affine)?,
             Host::new(states)?,
             Host::new(&d_states)?,
         ];
-        let [x_all, first, weights, states, d_states] = &hosts;
+        let [first, weights, states, d_states] = &hosts;
         let (dx, dh, d_affine) = backward(
             (sizes, self.operands),
-            x_all.slice()?,
+            self.kept.get().expect("forward ran before backward"),
             first.slice()?,
             weights.slice()?,
             states.slice()?,
@@ -172,18 +192,17 @@ impl CustomOp3 for Gru {
 /// Gradients of the gates, of the first state and of the matrix with its bias.
 fn backward(
     ((steps, n, c), operands): (Sizes, Operands),
-    x: &[f32],
+    kept: &[f32],
     first: &[f32],
     affine: &[f32],
     states: &[f32],
     d_states: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-    let (weight, bias) = halves(affine, c);
-    let (turned, straight) = (Right::new(weight.t(), operands), Right::new(weight, operands));
+    let (weight, _) = halves(affine, c);
+    let straight = Right::new(weight, operands);
     let mut dx = vec![0.0; steps * n * 3 * c];
     let mut dg = vec![0.0; steps * n * 3 * c];
     let mut dh = vec![0.0; n * c];
-    let mut g = vec![0.0; n * 3 * c];
     let piece = rows_per_task(8 * c);
     for step in (0..steps).rev() {
         let before = if step == 0 {
@@ -191,8 +210,8 @@ fn backward(
         } else {
             &states[(step - 1) * n * c..step * n * c]
         };
-        hidden_gates(&mut g, before, (&turned, &bias), c);
-        let (x, d_states) = (&x[step * n * 3 * c..], &d_states[step * n * c..]);
+        let d_states = &d_states[step * n * c..];
+        let kept = &kept[step * n * 4 * c..(step + 1) * n * 4 * c];
         let of_step = step * n * 3 * c..(step + 1) * n * 3 * c;
         for_pieces3(
             (&mut dx[of_step.clone()], piece * 3 * c),
@@ -208,11 +227,11 @@ fn backward(
                             .zip(dh.chunks_exact_mut(c));
                         for (row, ((dx, dg), dh)) in rows.enumerate() {
                             let row = i * piece + row;
-                            for (dh, d) in dh.iter_mut().zip(&d_states[row * c..]) {
+                            for (dh, d) in dh.iter_mut().zip(&d_states[row * c..(row + 1) * c]) {
                                 *dh += d;
                             }
-                            let (x, g) = (gates(x, row, c), gates(&g, row, c));
-                            backward_row(x, g, &before[row * c..(row + 1) * c], dx, dg, dh);
+                            let kept = &kept[row * 4 * c..(row + 1) * 4 * c];
+                            backward_row(kept, &before[row * c..(row + 1) * c], dx, dg, dh);
                         }
                     },
                 );
@@ -243,9 +262,52 @@ fn backward(
 pub(crate) fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
     let c = h.len();
     let (x, g) = (gates(x_gates, 0, c), gates(h_gates, 0, c));
-    for (j, h) in h.iter_mut().enumerate() {
-        let [_, z, n] = cell(x, g, j);
-        *h = (1.0 - z) * n + z * *h;
+    for at in (0..c).step_by(LANES) {
+        let [_, z, n] = cell(x.map(|x| lanes(x, at)), g.map(|g| lanes(g, at)));
+        let before = lanes(h, at);
+        put(h, at, &next(z, n, before));
+    }
+}
+
+/// As [`gru_row`], which also keeps what the gradient asks for: `[4C]`, both sigmoids, the candidate
+/// and the candidate's hidden gate.
+#[inline(always)]
+fn kept_row(x: [&[f32]; 3], g: [&[f32]; 3], h: &mut [f32], kept: &mut [f32]) {
+    let c = h.len();
+    for at in (0..c).step_by(LANES) {
+        let g = g.map(|g| lanes(g, at));
+        let [r, z, n] = cell(x.map(|x| lanes(x, at)), g);
+        let before = lanes(h, at);
+        put(h, at, &next(z, n, before));
+        for (kept, numbers) in kept.chunks_exact_mut(c).zip([r, z, n, g[2]]) {
+            put(kept, at, &numbers);
+        }
+    }
+}
+
+/// Channels worked on together: a vector of 512 bits.
+const LANES: usize = 16;
+
+/// Channels `at..at + LANES`, zeros beyond the last.
+#[inline(always)]
+fn lanes(row: &[f32], at: usize) -> [f32; LANES] {
+    if let Some(lanes) = row[at..].first_chunk() {
+        return *lanes;
+    }
+    let mut lanes = [0.0; LANES];
+    lanes[..row.len() - at].copy_from_slice(&row[at..]);
+    lanes
+}
+
+/// The inverse of [`lanes`].
+#[inline(always)]
+fn put(row: &mut [f32], at: usize, lanes: &[f32; LANES]) {
+    match row[at..].first_chunk_mut() {
+        Some(row) => *row = *lanes,
+        None => {
+            let rest = &mut row[at..];
+            rest.copy_from_slice(&lanes[..rest.len()]);
+        }
     }
 }
 
@@ -256,13 +318,25 @@ fn gates(all: &[f32], row: usize, c: usize) -> [&[f32]; 3] {
     [&row[..c], &row[c..2 * c], &row[2 * c..]]
 }
 
-/// Reset, update and candidate at channel `j`.
+/// Reset, update and candidate of some channels.
 #[inline(always)]
-fn cell(x: [&[f32]; 3], g: [&[f32]; 3], j: usize) -> [f32; 3] {
-    let r = sigmoid(x[0][j] + g[0][j]);
-    let z = sigmoid(x[1][j] + g[1][j]);
-    let n = 2.0 * sigmoid(2.0 * (x[2][j] + r * g[2][j])) - 1.0;
+fn cell(x: [[f32; LANES]; 3], g: [[f32; LANES]; 3]) -> [[f32; LANES]; 3] {
+    let (mut r, mut z, mut n) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+    for j in 0..LANES {
+        r[j] = sigmoid(x[0][j] + g[0][j]);
+        z[j] = sigmoid(x[1][j] + g[1][j]);
+        n[j] = 2.0 * sigmoid(2.0 * (x[2][j] + r[j] * g[2][j])) - 1.0;
+    }
     [r, z, n]
+}
+
+#[inline(always)]
+fn next(z: [f32; LANES], n: [f32; LANES], h: [f32; LANES]) -> [f32; LANES] {
+    let mut next = [0.0; LANES];
+    for j in 0..LANES {
+        next[j] = (1.0 - z[j]) * n[j] + z[j] * h[j];
+    }
+    next
 }
 
 #[inline(always)]
@@ -271,35 +345,34 @@ fn sigmoid(x: f32) -> f32 {
 }
 
 /// `dh` comes as the gradient of the state after the step and leaves as what reaches the state
-/// before directly.
+/// before directly; `kept` is as [`kept_row`] left it.
 #[inline(always)]
-fn backward_row(
-    x: [&[f32]; 3],
-    g: [&[f32]; 3],
-    h: &[f32],
-    dx: &mut [f32],
-    dg: &mut [f32],
-    dh: &mut [f32],
-) {
+fn backward_row(kept: &[f32], h: &[f32], dx: &mut [f32], dg: &mut [f32], dh: &mut [f32]) {
     let c = h.len();
-    let (dx_r, dx) = dx.split_at_mut(c);
-    let (dx_z, dx_n) = dx.split_at_mut(c);
-    let (dg_r, dg) = dg.split_at_mut(c);
-    let (dg_z, dg_n) = dg.split_at_mut(c);
-    let (dx_n, dg_n, dh) = (&mut dx_n[..c], &mut dg_n[..c], &mut dh[..c]);
-    for j in 0..c {
-        let [r, z, n] = cell(x, g, j);
-        let d = dh[j];
-        let d_candidate = d * (1.0 - z) * (1.0 - n * n);
-        let d_update = d * (h[j] - n) * z * (1.0 - z);
-        let d_reset = d_candidate * g[2][j] * r * (1.0 - r);
-        dx_r[j] = d_reset;
-        dx_z[j] = d_update;
-        dx_n[j] = d_candidate;
-        dg_r[j] = d_reset;
-        dg_z[j] = d_update;
-        dg_n[j] = d_candidate * r;
-        dh[j] = d * z;
+    for at in (0..c).step_by(LANES) {
+        let part = |i: usize| lanes(&kept[i * c..(i + 1) * c], at);
+        let (r, z, n, g) = (part(0), part(1), part(2), part(3));
+        let (h, mut d) = (lanes(h, at), lanes(dh, at));
+        let (mut to_x, mut to_g) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3]);
+        for j in 0..LANES {
+            let d_candidate = d[j] * (1.0 - z[j]) * (1.0 - n[j] * n[j]);
+            let d_update = d[j] * (h[j] - n[j]) * z[j] * (1.0 - z[j]);
+            let d_reset = d_candidate * g[j] * r[j] * (1.0 - r[j]);
+            to_x[0][j] = d_reset;
+            to_x[1][j] = d_update;
+            to_x[2][j] = d_candidate;
+            to_g[0][j] = d_reset;
+            to_g[1][j] = d_update;
+            to_g[2][j] = d_candidate * r[j];
+            d[j] *= z[j];
+        }
+        for (row, numbers) in dx.chunks_exact_mut(c).zip(&to_x) {
+            put(row, at, numbers);
+        }
+        for (row, numbers) in dg.chunks_exact_mut(c).zip(&to_g) {
+            put(row, at, numbers);
+        }
+        put(dh, at, &d);
     }
 }
 

@@ -5,9 +5,10 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, DType, Layout, Result, Shape, Tensor};
 
+use super::deferred::{Deferred, Part};
 use super::gemm::{Mat, MatMut, Store, Threads, gemm};
 use super::operands::Operands;
-use super::rows::{column_sums, for_pieces, rows_per_task};
+use super::rows::column_sums;
 use super::{Host, elements, fusible, gradient, output};
 
 /// `x weight^T + bias`.
@@ -69,12 +70,14 @@ fn composed(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor
 
 struct Linear {
     operands: Operands,
+    deferred: Option<Deferred>,
 }
 
 impl Linear {
     fn now() -> Self {
         Self {
             operands: Operands::current(),
+            deferred: Deferred::current(),
         }
     }
 }
@@ -165,18 +168,13 @@ impl Linear {
         let mut shape = x_layout.dims().to_vec();
         *shape.last_mut().expect("x has a last axis") = n_out;
         let rows = shape[..shape.len() - 1].iter().product();
-        let mut y = vec![0.0; rows * n_out];
-        if let Some(bias) = bias {
-            for_pieces(&mut y, rows_per_task(n_out) * n_out, |_, y| {
-                for row in y.chunks_exact_mut(n_out) {
-                    row.copy_from_slice(bias);
-                }
-            });
-        }
-        let store = if bias.is_some() {
-            Store::Add
-        } else {
-            Store::Replace
+        let (mut y, store) = match bias {
+            Some(bias) => {
+                let mut y = Vec::with_capacity(rows * n_out);
+                (0..rows).for_each(|_| y.extend_from_slice(bias));
+                (y, Store::Add)
+            }
+            None => (vec![0.0; rows * n_out], Store::Replace),
         };
         gemm(
             MatMut::new(&mut y, rows, n_out),
@@ -191,6 +189,7 @@ impl Linear {
 
     fn backward(&self, x: &Tensor, weight: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (n_out, n_in) = weight.dims2()?;
+        let dy_tensor = dy;
         let (x_host, weight_host, dy) = (Host::new(x)?, Host::new(weight)?, Host::new(dy)?);
         let (x_all, w) = (x_host.slice::<f32>()?, weight_host.slice::<f32>()?);
         let dy = dy.slice::<f32>()?;
@@ -205,7 +204,15 @@ impl Linear {
         } else {
             None
         };
-        let dw = if weight.track_op() {
+        let dw = if let Some(deferred) = self.deferred.as_ref().filter(|_| weight.is_variable()) {
+            let part = Part::Product {
+                x: x.detach(),
+                dy: dy_tensor.detach(),
+                operands: self.operands,
+            };
+            deferred.note(weight, part);
+            None
+        } else if weight.track_op() {
             let mut dw = vec![0.0; w.len()];
             let x_all = Mat::new(x_all, rows, n_in);
             let dst = MatMut::new(&mut dw, n_out, n_in);

@@ -11,7 +11,7 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, D, DType, Device, Layout, Result, Shape, Tensor, bail,
 };
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
 use super::kernels::wide;
 use super::operands::Operands;
 use super::rows::{exp, for_pieces, for_pieces2, max, rows_per_task, sum_exp_shifted};
@@ -357,6 +357,21 @@ fn composed_steps(
     Tensor::stack(&losses.collect::<Result<Vec<_>>>()?, 0)
 }
 
+/// The right matrix of some rows, which several steps share; `mat` if none had them yet.
+fn packed_once<'a, 'b>(
+    packed: &'b mut Vec<(Range<usize>, Right<'a>)>,
+    rows: &Range<usize>,
+    mat: Mat<'a>,
+    operands: Operands,
+) -> &'b Right<'a> {
+    let known = packed.iter().position(|(known, _)| known == rows);
+    let at = known.unwrap_or(packed.len());
+    if known.is_none() {
+        packed.push((rows.clone(), Right::new(mat, operands)));
+    }
+    &packed[at].1
+}
+
 struct LinearCrossEntropy {
     asked: Vec<(Range<usize>, Targets)>,
     /// Whether anything asks for gradients.
@@ -382,18 +397,17 @@ impl CustomOp2 for LinearCrossEntropy {
         let (_, n, c) = x_layout.shape().dims3()?;
         let mut means = Vec::new();
         let mut slopes = Vec::new();
+        let mut packed = Vec::new();
         for (step, (rows, asked)) in self.asked.iter().enumerate() {
             let v = rows.len();
             let mut logits = vec![0.0; n * v];
-            let weight = Mat::new(&weight[rows.start * c..rows.end * c], v, c);
-            gemm(
+            let turned = Mat::new(&weight[rows.start * c..rows.end * c], v, c).t();
+            packed_once(&mut packed, rows, turned, self.operands).product(
                 MatMut::new(&mut logits, n, v),
                 Store::Replace,
                 1.0,
                 Mat::new(&x[step * n * c..(step + 1) * n * c], n, c),
-                weight.t(),
                 Threads::Pool,
-                self.operands,
             );
             let scale = asked.scale();
             let mut losses = vec![0.0; n];
@@ -443,18 +457,18 @@ impl CustomOp2 for LinearCrossEntropy {
         let slopes = self.slopes.get().expect("forward ran before backward");
         let mut dx = vec![0.0; x_all.len()];
         let mut dw = vec![0.0; w.len()];
+        let mut packed = Vec::new();
         for (step, ((rows, _), slope)) in self.asked.iter().zip(slopes).enumerate() {
             let v = rows.len();
             let (at, of_rows) = (step * n * c, rows.start * c..rows.end * c);
             let slope = Mat::new(slope, n, v);
-            gemm(
+            let straight = Mat::new(&w[of_rows.clone()], v, c);
+            packed_once(&mut packed, rows, straight, self.operands).product(
                 MatMut::new(&mut dx[at..at + n * c], n, c),
                 Store::Replace,
                 grad[step],
                 slope,
-                Mat::new(&w[of_rows.clone()], v, c),
                 Threads::Pool,
-                self.operands,
             );
             gemm(
                 MatMut::new(&mut dw[of_rows], v, c),

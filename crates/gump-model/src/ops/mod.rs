@@ -12,9 +12,11 @@
 //! Results on a CPU are bit-identical for any number of threads: work is cut by shape, and sums
 //! are added in a fixed order. Gradients cannot be differentiated again.
 
+mod absolute;
 mod attention;
 mod batch_norm;
 mod conv;
+mod deferred;
 mod gelu;
 mod gemm;
 mod gru;
@@ -25,7 +27,9 @@ mod norm;
 mod operands;
 pub(crate) mod panels;
 mod rows;
+mod table;
 
+pub use absolute::mean_absolute_difference;
 pub use attention::{
     causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
 };
@@ -38,7 +42,9 @@ pub use kernels::{Choice, Kernel};
 pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
+pub use table::{embedding_sum, table_rows};
 
+pub(crate) use deferred::Deferred;
 pub(crate) use gelu::gelu_row;
 pub(crate) use kernels::{tile, wide};
 pub(crate) use gru::gru_row;
@@ -49,6 +55,12 @@ pub(crate) use rows::{count_from, exp_shifted_sum, max};
 use candle_core::{
     CpuStorage, DType, Layout, Result, Shape, Storage, StorageRef, Tensor, WithDType, bail,
 };
+
+/// Runs `f`; what it builds of these operations multiplies numbers rounded to bfloat16, forward and
+/// backward, on a CPU. Sums stay f32.
+pub fn in_bfloat16<R>(f: impl FnOnce() -> R) -> R {
+    Operands::Bf16.during(f)
+}
 
 /// Whether the fused path takes these tensors: f32 on a CPU, all of them.
 fn fusible(tensors: &[&Tensor]) -> bool {
@@ -89,6 +101,16 @@ impl<'a> Host<'a> {
             _ => bail!("fused operations take CPU tensors"),
         }
     }
+}
+
+/// The sum of the squares of a tensor's elements.
+pub(crate) fn sum_of_squares(tensor: &Tensor) -> Result<f64> {
+    let tensor = tensor.contiguous()?;
+    if fusible(&[&tensor]) {
+        return Ok(rows::squares(Host::new(&tensor)?.slice()?));
+    }
+    let sum = tensor.sqr()?.sum_all()?.to_dtype(DType::F32)?;
+    Ok(f64::from(sum.to_scalar::<f32>()?))
 }
 
 /// Wraps computed elements as the output of a custom operation.

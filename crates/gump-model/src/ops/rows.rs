@@ -181,6 +181,18 @@ pub(super) fn sum_squares_from(x: &[f32], centre: f32) -> f32 {
     fold_lanes(&lanes)
 }
 
+/// Sum of the squares of many numbers, in f64 over pieces.
+pub(super) fn squares(x: &[f32]) -> f64 {
+    let piece = |x: &[f32]| {
+        let square = wide(
+            #[inline(always)]
+            || dot(x, x),
+        );
+        f64::from(square)
+    };
+    x.chunks(TASK_ELEMENTS).map(piece).sum()
+}
+
 /// Inner product of two rows of one length.
 #[inline(always)]
 pub(super) fn dot(x: &[f32], y: &[f32]) -> f32 {

@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 pub use self::config::{ModelChoice, RunConfig, TrainConfig};
-use self::gradients::Found;
+use self::gradients::{Found, Part};
 pub(crate) use self::gradients::Gradients;
 use self::learner::Learner;
 pub use self::peers::{Alone, Peers};
@@ -36,6 +36,7 @@ use crate::config::ModelConfig;
 use crate::loss::{Counts, LossConfig, LossParts, loss};
 use crate::mct::Dropout;
 use crate::network::Network;
+use crate::ops::Deferred;
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::Scenes;
 
@@ -203,11 +204,16 @@ impl Trainer {
             let alone = network.samples_together(samples.len());
             let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
                 let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
-                let found = operands
-                    .during(|| loss(network, samples, config, &whole, true, dropout.as_ref()));
-                let (total, parts) = found?;
+                let deferred = Deferred::default();
+                let build = || loss(network, samples, config, &whole, true, dropout.as_ref());
+                let (total, loss) = operands.during(|| deferred.during(build))?;
                 let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
-                Ok((total.backward()?, parts, tokens))
+                Ok(Part {
+                    gradients: total.backward()?,
+                    deferred,
+                    loss,
+                    tokens,
+                })
             });
             let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
             found.add(network.parameters(), &parts)?;

@@ -121,6 +121,7 @@ fn tile<const N: usize>(block: &[[u32; BLOCK]], panel: &[[u32; PANEL]], to: &mut
 
 /// Takes row `r` of a product into its target.
 #[target_feature(enable = "avx512f")]
+#[inline]
 pub(super) fn store_row(to: &mut Target<'_>, r: usize, sums: [__m512; 2]) {
     if to.columns < PANEL {
         // SAFETY: two vectors are 32 numbers.
@@ -178,9 +179,28 @@ fn put<const W: usize>(out: &mut [[u32; W]], pairs: usize, lane: usize, p: usize
 fn pack_across<const W: usize>(from: Lanes<'_>, pairs: usize, out: &mut [[u32; W]]) {
     /// Pairs written one after another, before the next lanes: whole cache lines.
     const RUN: usize = 8;
+    let groups = from.lanes / GROUP;
     for run in (0..pairs).step_by(RUN) {
-        for lane in (0..from.lanes).step_by(GROUP) {
-            for p in run..pairs.min(run + RUN) {
+        let here = RUN.min(pairs - run);
+        if 2 * (run + RUN) > from.depth {
+            for (lane, p) in (0..from.lanes).step_by(GROUP).flat_map(|l| (0..here).map(move |p| (l, p))) {
+                put(out, pairs, lane, run + p, &pairs_across(from, lane, run + p));
+            }
+            continue;
+        }
+        let rows: [&[[f32; GROUP]]; 2 * RUN] = std::array::from_fn(|i| {
+            let row = &from.data[(2 * run + i) * from.depth_stride..];
+            &row.as_chunks().0[..groups]
+        });
+        for group in 0..groups {
+            for (p, row) in rows.as_chunks::<2>().0.iter().enumerate() {
+                let both = interleave(&row[0][group], &row[1][group]);
+                put(out, pairs, group * GROUP, run + p, &both);
+            }
+        }
+        if groups * GROUP < from.lanes {
+            for p in run..run + RUN {
+                let lane = groups * GROUP;
                 put(out, pairs, lane, p, &pairs_across(from, lane, p));
             }
         }
@@ -212,6 +232,7 @@ fn padded<const N: usize>(numbers: &[f32]) -> [f32; N] {
 
 /// Rounds two rows and lays them together, number by number.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+#[inline]
 fn interleave(even: &[f32; GROUP], odd: &[f32; GROUP]) -> [u32; GROUP] {
     const ORDER: [u16; 32] = {
         let mut order = [0; 32];
@@ -263,11 +284,20 @@ fn rows_of_pairs(from: Lanes<'_>, lane: usize, p: usize) -> [__m512i; GROUP] {
 
 /// [`rows_of_pairs`] of lanes whose inner index lies side by side, or in any strides.
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+#[inline]
 fn rows_along(from: Lanes<'_>, lane: usize, p: usize) -> [__m512i; GROUP] {
     let lanes = GROUP.min(from.lanes.saturating_sub(lane));
     let depth = (2 * GROUP).min(from.depth.saturating_sub(2 * p));
     let mut rows = [_mm512_setzero_si512(); GROUP];
     if depth == 0 {
+        return rows;
+    }
+    if lanes == GROUP && depth == 2 * GROUP && from.depth_stride == 1 {
+        let block = &from.data[lane * from.lane_stride + 2 * p..];
+        for (row, numbers) in rows.iter_mut().zip(block.chunks(from.lane_stride)) {
+            let numbers = numbers.first_chunk().expect("the depth is there");
+            *row = rounded(numbers);
+        }
         return rows;
     }
     for (r, row) in rows.iter_mut().enumerate().take(lanes) {
@@ -285,17 +315,25 @@ fn rows_along(from: Lanes<'_>, lane: usize, p: usize) -> [__m512i; GROUP] {
         } else {
             padded(&from.data[start..][..depth])
         };
-        // SAFETY: 32 numbers are two vectors, 32 bfloat16 are one.
-        *row = unsafe {
-            let [low, high] = transmute::<[f32; 2 * GROUP], [__m512; 2]>(numbers);
-            transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low))
-        };
+        *row = rounded(&numbers);
     }
     rows
 }
 
+/// Numbers side by side as pairs.
+#[target_feature(enable = "avx512f,avx512bf16")]
+#[inline]
+fn rounded(numbers: &[f32; 2 * GROUP]) -> __m512i {
+    // SAFETY: 32 numbers are two vectors, 32 bfloat16 are one.
+    unsafe {
+        let [low, high] = transmute::<[f32; 2 * GROUP], [__m512; 2]>(*numbers);
+        transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low))
+    }
+}
+
 /// The transpose of 16 by 16 pairs.
 #[target_feature(enable = "avx512f")]
+#[inline]
 fn turn(rows: [__m512i; 16]) -> [__m512i; 16] {
     // Two rows, then four, within each quarter of a vector.
     let mut twos = rows;
