@@ -214,7 +214,9 @@ pub(crate) fn frozen_ids() -> anyhow::Result<BTreeMap<String, String>> {
         let list = List::read(&path)?;
         let made = list.made.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
-        let frozen = made.chain(recorded).filter(|(split, _)| *split != Split::Train);
+        let frozen = made
+            .chain(recorded)
+            .filter(|(split, _)| *split != Split::Train);
         for (split, scenes) in frozen {
             let set = format!("{}/{}", list.name, split.name());
             // The id is the last word, of lines that have one.
