@@ -73,7 +73,7 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     );
     assert_eq!(
         (&scored["set"], &scored["scenarios"]),
-        (&"small/tune".into(), &2.into())
+        (&"small".into(), &2.into())
     );
     for shard in ["1/2", "2/2"] {
         let words = format!("{words} --scenarios small.toml --shard {shard}");
@@ -83,11 +83,11 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     assert_eq!(merged["set"], scored["set"]);
     assert_eq!(merged["rows"], scored["rows"]);
     let words = "evaluate motion --scenarios small.toml --world constant-velocity --futures 2";
-    assert_eq!(results(&folder, words, "motion")["set"], "small/tune");
+    assert_eq!(results(&folder, words, "motion")["set"], "small");
     let words = "evaluate closed-loop --scenarios small.toml --planner log --world log --films 0 \
                  --seconds 1";
     let driven = results(&folder, words, "driven");
-    assert_eq!(driven["set"], "small/tune");
+    assert_eq!(driven["set"], "small");
     assert_eq!(driven["rows"][0]["scenarios"], 2);
 
     fails(
@@ -184,7 +184,7 @@ fn recorded_scenes_of_two_formats_are_one_set() {
     let scored = results(&folder, words, "b");
     assert_eq!(
         (&scored["set"], &scored["scenarios"]),
-        (&"two/test".into(), &2.into())
+        (&"two".into(), &2.into())
     );
     let entries = fs::read_to_string(folder.path().join("b/scenarios.toml")).unwrap();
     let (first, second) = (
