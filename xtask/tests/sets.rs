@@ -66,8 +66,15 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     assert_eq!(fs::read_to_string(&list).unwrap(), text);
 
     let words = "evaluate wosac --world constant-velocity --rollouts-per-scenario 2";
-    let scored = results(&folder, &format!("{words} --scenarios small.toml#tune"), "c");
-    assert_eq!((&scored["set"], &scored["scenarios"]), (&"small/tune".into(), &2.into()));
+    let scored = results(
+        &folder,
+        &format!("{words} --scenarios small.toml#tune"),
+        "c",
+    );
+    assert_eq!(
+        (&scored["set"], &scored["scenarios"]),
+        (&"small".into(), &2.into())
+    );
     for shard in ["1/2", "2/2"] {
         let words = format!("{words} --scenarios small.toml --shard {shard}");
         results(&folder, &words, &format!("s{}", &shard[..1]));
@@ -76,14 +83,19 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     assert_eq!(merged["set"], scored["set"]);
     assert_eq!(merged["rows"], scored["rows"]);
     let words = "evaluate motion --scenarios small.toml --world constant-velocity --futures 2";
-    assert_eq!(results(&folder, words, "motion")["set"], "small/tune");
+    assert_eq!(results(&folder, words, "motion")["set"], "small");
     let words = "evaluate closed-loop --scenarios small.toml --planner log --world log --films 0 \
                  --seconds 1";
     let driven = results(&folder, words, "driven");
-    assert_eq!(driven["set"], "small/tune");
+    assert_eq!(driven["set"], "small");
     assert_eq!(driven["rows"][0]["scenarios"], 2);
 
-    fails(&folder, &format!("{words} --scenarios small.toml#test"), 1, "with tune, found");
+    fails(
+        &folder,
+        &format!("{words} --scenarios small.toml#test"),
+        1,
+        "with tune, found",
+    );
     // One digit of a sum.
     let i = text.find("scenes = [").unwrap();
     let at = i + text[i..].find("    \"").unwrap() + 5;
@@ -91,20 +103,50 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     fs::write(&list, format!("{}{digit}{}", &text[..at], &text[at + 1..])).unwrap();
     let differs = "expected scene 0 of procedural to be";
     fails(&folder, "data benchmark --list small.toml", 1, differs);
-    fails(&folder, "data benchmark --list small.toml --check a", 1, differs);
-    fails(&folder, &format!("{words} --scenarios small.toml"), 1, differs);
+    fails(
+        &folder,
+        "data benchmark --list small.toml --check a",
+        1,
+        differs,
+    );
+    fails(
+        &folder,
+        &format!("{words} --scenarios small.toml"),
+        1,
+        differs,
+    );
     fs::write(&list, text.replace("procedural/1", "procedural/99")).unwrap();
     fs::remove_dir_all(folder.path().join("failed")).unwrap();
-    fails(&folder, "data benchmark --list small.toml", 1, "found procedural/99");
-    fails(&folder, "data benchmark --list nowhere.toml", 1, "cannot read the list");
-    fails(&folder, "evaluate wosac --scenarios small.toml#x --world log", 1, "found small.toml#x");
+    fails(
+        &folder,
+        "data benchmark --list small.toml",
+        1,
+        "found procedural/99",
+    );
+    fails(
+        &folder,
+        "data benchmark --list nowhere.toml",
+        1,
+        "cannot read the list",
+    );
+    fails(
+        &folder,
+        "evaluate wosac --scenarios small.toml#x --world log",
+        1,
+        "found small.toml#x",
+    );
 }
 
 #[test]
 fn seeds_of_frozen_sets_are_not_for_training() {
     let folder = tempfile::tempdir().unwrap();
     let words = "data synthesize --scenes 1 --seed";
-    fails(&folder, &format!("{words} 900000001"), 2, "those are of the frozen sets");
+    fails(
+        &folder,
+        &format!("{words} 900000001"),
+        2,
+        "those are of the frozen sets",
+    );
     results(&folder, &format!("{words} 899999999"), "a");
 }
 
@@ -127,7 +169,12 @@ fn recorded_scenes_of_two_formats_are_one_set() {
     let head = "name = \"two\"\nabout = \"\"\n";
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, waymo: &str| {
-        let text = [head, &part("gpudrive/validation", other), &part("waymo", waymo)].concat();
+        let text = [
+            head,
+            &part("gpudrive/validation", other),
+            &part("waymo", waymo),
+        ]
+        .concat();
         fs::write(folder.path().join(name), text).unwrap();
     };
     write("two.toml", waymo);
@@ -135,13 +182,29 @@ fn recorded_scenes_of_two_formats_are_one_set() {
     assert_eq!(found["rows"].as_array().unwrap().len(), 2);
     let words = "evaluate wosac --scenarios two.toml --world log --rollouts-per-scenario 1";
     let scored = results(&folder, words, "b");
-    assert_eq!((&scored["set"], &scored["scenarios"]), (&"two/test".into(), &2.into()));
+    assert_eq!(
+        (&scored["set"], &scored["scenarios"]),
+        (&"two".into(), &2.into())
+    );
     let entries = fs::read_to_string(folder.path().join("b/scenarios.toml")).unwrap();
-    let (first, second) = (entries.find("140fca52e29b6ec1"), entries.find("ee519cf571686d19"));
+    let (first, second) = (
+        entries.find("140fca52e29b6ec1"),
+        entries.find("ee519cf571686d19"),
+    );
     assert!(first.is_some() && first < second, "{entries}");
     // A sum that differs, a file that is not there.
     write("other.toml", &waymo.replacen(char::is_alphanumeric, "x", 1));
-    fails(&folder, &words.replace("two", "other"), 1, "expected SHA-256 x");
+    fails(
+        &folder,
+        &words.replace("two", "other"),
+        1,
+        "expected SHA-256 x",
+    );
     write("absent.toml", &waymo.replace("scenario_b", "scenario_c"));
-    fails(&folder, &words.replace("two", "absent"), 1, "expected the recorded scene ee519cf571686d19");
+    fails(
+        &folder,
+        &words.replace("two", "absent"),
+        1,
+        "expected the recorded scene ee519cf571686d19",
+    );
 }

@@ -65,7 +65,7 @@ fn version_1_makes_the_scenes_it_always_made() {
         };
         sum.scene(&synthesize(&config, Seed(41).fork(k)));
     }
-    assert_eq!(format!("{:016x}", sum.0), "0");
+    assert_eq!(format!("{:016x}", sum.0), "5387d87bc366abaa");
 }
 
 #[test]
@@ -85,7 +85,7 @@ fn version_1_draws_the_trips_it_always_drew() {
         sum.number(trip.depart_s);
         sum.bytes(format!("{} {} {} {:?}", trip.from, trip.to, trip.kind, trip.on).as_bytes());
     }
-    assert_eq!(format!("{:016x}", sum.0), "0");
+    assert_eq!(format!("{:016x}", sum.0), "f235041b5ecf3636");
 }
 
 #[test]

@@ -63,7 +63,13 @@ pub(crate) fn make(
         return Ok(false);
     }
     write(list, part, folder, progress)?;
-    check(list, part, folder).context("was a generator changed without a version of its own?")?;
+    check(list, part, folder).with_context(|| {
+        let n = gump_synthesis::GENERATOR_VERSION;
+        format!(
+            "scenes of {} come out otherwise than they were frozen (newest version: {n})",
+            part.generator
+        )
+    })?;
     Ok(true)
 }
 
@@ -85,6 +91,13 @@ pub(crate) fn freeze(
 /// Error: a file that is missing, or the first scene that differs.
 pub(crate) fn check(list: &List, part: &Made, folder: &Path) -> anyhow::Result<()> {
     let path = list.file(folder, part);
+    anyhow::ensure!(
+        !part.scenes.is_empty(),
+        "expected sums of the part {} in {}, found none: `data benchmark --freeze` writes those \
+         of a new list",
+        part.file,
+        list.path.display()
+    );
     let found = sums(&path)?;
     let differs = part.scenes.iter().zip(&found).position(|(a, b)| a != b);
     if let Some(k) = differs {
@@ -244,7 +257,7 @@ impl<'a> Simulation<'a> {
                 &fresh
             }
         };
-        let id = format!("{}-{}-{r:05}", self.part.file, place.name);
+        let id = format!("{}-{}-{r:05}", place.name, self.part.seed);
         let mut all = self
             .sumo
             .scenes(place, &self.demand, seed.fork(2), &id, &folder)?;

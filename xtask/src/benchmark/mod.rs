@@ -173,6 +173,14 @@ impl List {
         Split::ALL.into_iter().filter(is_there).collect()
     }
 
+    /// What results call a split: `NAME/SPLIT`, or the name alone if there is no other split.
+    pub(crate) fn set(&self, split: Split) -> String {
+        match self.splits()[..] {
+            [_] => self.name.clone(),
+            _ => format!("{}/{}", self.name, split.name()),
+        }
+    }
+
     /// A path that the list gives from itself.
     fn beside(&self, path: &Path) -> PathBuf {
         self.path.parent().unwrap_or(Path::new("")).join(path)
@@ -214,9 +222,11 @@ pub(crate) fn frozen_ids() -> anyhow::Result<BTreeMap<String, String>> {
         let list = List::read(&path)?;
         let made = list.made.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
-        let frozen = made.chain(recorded).filter(|(split, _)| *split != Split::Train);
+        let frozen = made
+            .chain(recorded)
+            .filter(|(split, _)| *split != Split::Train);
         for (split, scenes) in frozen {
-            let set = format!("{}/{}", list.name, split.name());
+            let set = list.set(split);
             // The id is the last word, of lines that have one.
             let id = |line: &String| line.rsplit_once(' ').map(|(_, id)| id.to_owned());
             ids.extend(scenes.iter().filter_map(id).map(|id| (id, set.clone())));

@@ -21,7 +21,7 @@ pub(crate) struct Scenes(String);
 /// Scenarios as they were found.
 #[derive(Debug)]
 pub(crate) struct Found {
-    /// What results call them: `NAME/SPLIT` of a list, else the name of the file or folder.
+    /// What results call them: [`List::set`], else the name of the file or folder.
     pub(crate) set: String,
     /// One file or folder; of a list the files of its scenes.
     pub(crate) paths: Vec<PathBuf>,
@@ -74,7 +74,7 @@ fn find_listed(
     for part in list.recorded.iter().filter(|part| part.split == split) {
         paths.extend(check_recorded(&list, part, data)?);
     }
-    let set = format!("{}/{}", list.name, split.name());
+    let set = list.set(split);
     Ok(Found { set, paths })
 }
 

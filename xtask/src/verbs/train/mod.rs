@@ -16,8 +16,8 @@ use serde_json::{Map, Value, json};
 
 use self::realism::Judge;
 use self::stages::Stage;
-use crate::cli::WrongArguments;
 use crate::benchmark;
+use crate::cli::WrongArguments;
 use crate::dataset::{self, Part, Split, Training};
 use crate::losses::Losses;
 use crate::peers::{Processes, together};
