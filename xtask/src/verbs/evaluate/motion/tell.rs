@@ -13,6 +13,7 @@ use serde_json::{Map, Value, json};
 use super::scores::Scores;
 use super::{NAME, Shapes};
 use crate::charts;
+use crate::futures;
 use crate::run::Run;
 use crate::verbs::evaluate::ledger::{self, Entry};
 
@@ -52,6 +53,8 @@ pub(super) fn tell(
     run.result("scenarios", entries.len())?;
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
+    let digests = entries.iter().filter_map(|e| e.scores.digest.as_deref());
+    run.result("digest", futures::digest_of(digests))?;
     let table: Vec<Value> = rows.iter().map(|row| Value::Object(line(row))).collect();
     let intervals = interval_lines(&rows, &spans);
     for (stem, label, columns) in CHARTS {
