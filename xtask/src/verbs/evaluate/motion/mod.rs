@@ -100,7 +100,7 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
-        let header = self.header(run)?;
+        let header = self.header(run, forecaster.decoding())?;
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
@@ -136,8 +136,7 @@ impl Args {
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        run.result("decoding", forecaster.decoding())?;
-        tell::tell(run, &entries, &config)
+        tell::tell(run, &entries, &config, forecaster.decoding())
     }
 
     fn open(&self) -> anyhow::Result<gump_data::Reader> {
@@ -165,11 +164,12 @@ impl Args {
     }
 
     /// Everything that the scores of a scenario depend on.
-    fn header(&self, run: &Run) -> anyhow::Result<Header> {
+    fn header(&self, run: &Run, decoding: &str) -> anyhow::Result<Header> {
         let mut settings = toml::Table::new();
         let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
         set("scenarios", self.scenarios.display().to_string().into());
         set("shapes", toml::Value::try_from(self.shapes)?);
+        set("decoding", decoding.into());
         set("seed", i64::try_from(run.seed().0)?.into());
         if let Some(path) = &self.source.rollouts {
             set("rollouts", path.display().to_string().into());

@@ -13,6 +13,7 @@ use serde_json::{Map, Value, json};
 use super::scores::Scores;
 use super::{NAME, Shapes};
 use crate::charts;
+use crate::decoding::Decoding;
 use crate::futures;
 use crate::run::Run;
 use crate::verbs::evaluate::ledger::{self, Entry};
@@ -35,6 +36,7 @@ pub(super) fn tell(
     run: &mut Run,
     entries: &[Entry<Scores>],
     config: &MotionConfig,
+    decoding: &str,
 ) -> anyhow::Result<()> {
     let tallies = entries.iter().map(|entry| {
         let scores = entry.scores.scores();
@@ -50,6 +52,7 @@ pub(super) fn tell(
     })?;
     let absent: usize = entries.iter().map(|entry| entry.scores.absent).sum();
     run.result("benchmark", NAME)?;
+    run.result("decoding", decoding)?;
     run.result("scenarios", entries.len())?;
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
@@ -74,7 +77,12 @@ pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<
         .get("seed")
         .and_then(toml::Value::as_integer);
     run.reseed(seed.and_then(|seed| u64::try_from(seed).ok()).unwrap_or(0));
-    tell(run, &entries, &Shapes::deserialize(shapes)?.config())
+    let decoding = header
+        .settings
+        .get("decoding")
+        .and_then(toml::Value::as_str);
+    let config = Shapes::deserialize(shapes)?.config();
+    tell(run, &entries, &config, decoding.unwrap_or(Decoding::NONE))
 }
 
 fn merged<'a>(tallies: impl Iterator<Item = &'a MotionTally>) -> MotionTally {
