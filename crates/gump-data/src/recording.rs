@@ -348,3 +348,43 @@ fn agent(track: &Track, state: &State) -> Agent {
         },
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_geometry::dvec3;
+
+    /// Sizes of a car in steps 0 to 3, the present being step 1; `None` is not stated.
+    fn check(stated: [Option<f64>; 4], options: ReadOptions, expected: &[(usize, f64)]) {
+        let state = |(step, length): (usize, &Option<f64>)| State {
+            step,
+            position: dvec3(0.0, 0.0, 0.0),
+            heading: 0.0,
+            velocity: DVec2::ZERO,
+            size: length.map_or([UNSTATED; 3], |length| [length, 2.0, 1.5]),
+        };
+        let mut track = Track {
+            id: 1,
+            kind: AgentKind::Vehicle,
+            usual_size: usual_size(AgentKind::Vehicle),
+            states: stated.iter().enumerate().map(state).collect(),
+        };
+        complete_sizes(&mut track, 1, options, &mut ReadReport::default());
+        let found = track.states.iter().map(|state| (state.step, state.size[0]));
+        assert_eq!(found.collect::<Vec<_>>(), expected, "{stated:?}");
+    }
+
+    #[test]
+    fn sizes_up_to_the_present_come_from_frames_up_to_the_present() {
+        let (all, stated) = (ReadOptions::ALL, ReadOptions::STATED);
+        let (none, five) = (None, Some(5.0));
+        let whole = [(0, 5.0), (1, 5.0), (2, 5.0), (3, 5.0)];
+        check([five, none, none, none], all, &whole);
+        check([none, five, none, none], stated, &whole);
+        let later = [none, none, none, five];
+        check(later, all, &[(0, 4.7), (1, 4.7), (2, 5.0), (3, 5.0)]);
+        check(later, stated, &[(2, 5.0), (3, 5.0)]);
+        check([none; 4], all, &[(0, 4.7), (1, 4.7), (2, 4.7), (3, 4.7)]);
+        check([none; 4], stated, &[]);
+    }
+}

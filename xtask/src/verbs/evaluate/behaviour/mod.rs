@@ -8,15 +8,15 @@ mod tell;
 mod ways;
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
 
 use anyhow::Context as _;
-use gump_data::{ReadOptions, open_with};
+use gump_data::ReadOptions;
 use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
 use serde::{Deserialize, Serialize};
 
 use super::ledger::{Entry, Header, Ledger};
 use super::shard::Shard;
+use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine;
 use crate::run::{Common, Run, interrupted};
 use crate::worlds::{Sampling, WorldName, Worlds};
@@ -32,9 +32,9 @@ const HORIZONS: [u32; 3] = [8, 30, 60];
 /// Arguments of `evaluate behaviour`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// File or directory of recorded scenarios
+    /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, side by side
     #[arg(long, value_name = "W", required = true, num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
@@ -66,7 +66,7 @@ fn horizon(text: &str) -> Result<u32, String> {
 /// What the counts of a scenario depend on, beside the scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Settings {
-    /// File or folder, without the folders that differ between machines.
+    /// The set, or the name of the file or folder.
     scenarios: String,
     seconds: u32,
     futures: usize,
@@ -151,7 +151,8 @@ impl Cells {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let ways = ways(&self.world, &self.sampling)?;
-        let settings = self.settings(run, &ways)?;
+        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let settings = self.settings(run, &scenarios, &ways)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard: self.shard,
@@ -159,19 +160,13 @@ impl Args {
         };
         let mut worlds: Vec<Worlds<'_>> = ways
             .iter()
-            .map(|way| Worlds::new(run.device(), &way.world, way.sampling.clone()))
+            .map(|way| Worlds::new(run.device(), &way.world, way.decoding.sampling.clone()))
             .collect();
         let mut ledger = Ledger::open(run.out(), &header)?;
         let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
-        // Nothing of the future may reach a world: neither the ego's route nor lights seen later.
-        let options = ReadOptions {
-            infer_route: false,
-            infer_light_gaps: false,
-            ..ReadOptions::ALL
-        };
         run.phase("count", |run| {
             let progress = run.progress("counting", 0, "scenarios");
-            let records = open_with(&self.scenarios, options)?;
+            let records = scenarios.open(ReadOptions::ALL)?;
             for (index, record) in records.enumerate().take(limit) {
                 if !self.shard.holds(index) || ledger.has(index) {
                     continue;
@@ -181,8 +176,9 @@ impl Args {
                 let counted = ways.iter().zip(&mut worlds).map(|(way, worlds)| {
                     let world = worlds.of(&scenario)?;
                     let n = way.futures(self.futures.get());
-                    let (scene, seed) = (scenario.present(), run.seed().fork(index as u64));
-                    let imagined = imagine(run, world, scene, n, self.seconds.into(), seed)?;
+                    let frames = way.decoding.frames(self.seconds.into());
+                    let seed = run.seed().fork(index as u64);
+                    let imagined = imagine(run, world, &scenario, n, &frames, seed)?;
                     Ok(Cells::of(&behaviour.tally(&imagined.rollouts)))
                 });
                 let counted = counted.collect::<anyhow::Result<Vec<Cells>>>();
@@ -209,7 +205,7 @@ impl Args {
             !entries.is_empty(),
             "expected scenarios in shard {}, found none: {}",
             self.shard,
-            self.scenarios.display()
+            scenarios.set
         );
         tell::tell(run, &settings, &entries)
     }
@@ -222,10 +218,9 @@ impl Args {
         }
     }
 
-    fn settings(&self, run: &Run, ways: &[Way]) -> anyhow::Result<Settings> {
-        let name = self.scenarios.file_name().unwrap_or_default();
+    fn settings(&self, run: &Run, scenarios: &Found, ways: &[Way]) -> anyhow::Result<Settings> {
         Ok(Settings {
-            scenarios: name.to_string_lossy().into_owned(),
+            scenarios: scenarios.set.clone(),
             seconds: self.seconds,
             futures: self.futures.get(),
             limit: self.limit.map(NonZeroUsize::get),

@@ -137,6 +137,7 @@ pub(super) fn tell(
         .map(|(name, tallies)| Column::of(Some(name.clone()), &keys, tallies))
         .collect();
     run.result("scenarios", entries.len())?;
+    run.result("set", &settings.scenarios)?;
     run.result("futures", settings.futures)?;
     let rows = worlds.iter().flat_map(|world| rows(world, &log, &keys));
     run.result_untold("rows", rows.collect::<Vec<_>>())?;
