@@ -6,9 +6,9 @@ use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor, Va
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::{ModelError, ops};
 use crate::parameters::Parameters;
 use crate::train::Gradients;
+use crate::{ModelError, ops};
 
 /// Step size and its schedule.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -88,7 +88,10 @@ fn weights_without_end_are_refused_by_name() {
     set(&numbers);
     for (precision, form) in [(Precision::Bf16, "bfloat16"), (Precision::Int8, "8 bits")] {
         let why = refused(precision);
-        assert!(why.contains(name) && why.contains("inf") && why.contains(form), "{why}");
+        assert!(
+            why.contains(name) && why.contains("inf") && why.contains(form),
+            "{why}"
+        );
     }
 }
 

@@ -49,7 +49,9 @@ impl CustomOp2 for Difference {
         let mut sums = vec![0.0; x.len().div_ceil(PIECE)];
         for_pieces(&mut sums, 1, |i, sums| {
             let end = ((i + 1) * PIECE).min(x.len());
-            let pairs = x[i * PIECE..end].chunks(LANES).zip(target[i * PIECE..end].chunks(LANES));
+            let pairs = x[i * PIECE..end]
+                .chunks(LANES)
+                .zip(target[i * PIECE..end].chunks(LANES));
             wide(
                 #[inline(always)]
                 || {
@@ -121,7 +123,10 @@ mod tests {
         let mean = mean_absolute_difference(&x, &x.copy().unwrap()).unwrap();
         let grads = mean.backward().unwrap();
         let slopes = grads.get(&x).unwrap().to_vec1::<f32>().unwrap();
-        assert_eq!((mean.to_scalar::<f32>().unwrap(), slopes), (0.0, vec![0.0; 4]));
+        assert_eq!(
+            (mean.to_scalar::<f32>().unwrap(), slopes),
+            (0.0, vec![0.0; 4])
+        );
         assert!(mean_absolute_difference(&x, &var(&[5], 1)).is_err());
     }
 }

@@ -580,7 +580,15 @@ impl Attention {
             let dq = MatMut::new(&mut dq[start * d..], rows, d);
             k.product(dq, Store::Replace, scale, ds, one);
             gemm(MatMut::new(dk, n, d), Store::Add, scale, ds.t(), q, one, by);
-            gemm(MatMut::new(dv, n, d), Store::Add, 1.0, p.t(), d_out, one, by);
+            gemm(
+                MatMut::new(dv, n, d),
+                Store::Add,
+                1.0,
+                p.t(),
+                d_out,
+                one,
+                by,
+            );
         }
     }
 }

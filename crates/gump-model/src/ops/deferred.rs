@@ -176,13 +176,22 @@ mod tests {
             let grads_put_off = deferred.during(|| loss(x)).backward().unwrap();
             assert!(grads_put_off.get(&w).is_none());
             for v in [x, &b] {
-                assert_close("others", grads_put_off.get(v).unwrap(), grads.get(v).unwrap(), 1e-6);
+                assert_close(
+                    "others",
+                    grads_put_off.get(v).unwrap(),
+                    grads.get(v).unwrap(),
+                    1e-6,
+                );
             }
             found = Deferred::take_in([&deferred].into_iter(), &w, found).unwrap();
         }
         assert_close("sum", &found.unwrap(), &expected.unwrap(), 1e-5);
         let none = Deferred::default();
-        assert!(Deferred::take_in([&none].into_iter(), &w, None).unwrap().is_none());
+        assert!(
+            Deferred::take_in([&none].into_iter(), &w, None)
+                .unwrap()
+                .is_none()
+        );
     }
 
     #[test]
@@ -192,6 +201,10 @@ mod tests {
         let y = deferred.during(|| linear(&x, &(&*w * 2.0).unwrap(), None).unwrap());
         let grads = y.sum_all().unwrap().backward().unwrap();
         assert!(grads.get(&w).is_some());
-        assert!(Deferred::take_in([&deferred].into_iter(), &w, None).unwrap().is_none());
+        assert!(
+            Deferred::take_in([&deferred].into_iter(), &w, None)
+                .unwrap()
+                .is_none()
+        );
     }
 }

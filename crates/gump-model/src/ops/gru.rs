@@ -252,7 +252,15 @@ fn backward(
         let rows = dg.len() / (3 * c);
         let dst = MatMut::strided(&mut d_affine, 3 * c, c, c + 1);
         let (dg, before) = (Mat::new(dg, rows, 3 * c), Mat::new(before, rows, c));
-        gemm(dst, Store::Add, 1.0, dg.t(), before, Threads::Pool, operands);
+        gemm(
+            dst,
+            Store::Add,
+            1.0,
+            dg.t(),
+            before,
+            Threads::Pool,
+            operands,
+        );
     }
     (dx, dh, d_affine)
 }
@@ -262,53 +270,47 @@ fn backward(
 pub(crate) fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
     let c = h.len();
     let (x, g) = (gates(x_gates, 0, c), gates(h_gates, 0, c));
-    for at in (0..c).step_by(LANES) {
-        let [_, z, n] = cell(x.map(|x| lanes(x, at)), g.map(|g| lanes(g, at)));
-        let before = lanes(h, at);
-        put(h, at, &next(z, n, before));
+    for (j, h) in h.iter_mut().enumerate() {
+        let r = sigmoid(x[0][j] + g[0][j]);
+        let z = sigmoid(x[1][j] + g[1][j]);
+        *h = next(z, candidate(x[2][j], r, g[2][j]), *h);
     }
 }
 
 /// As [`gru_row`], which also keeps what the gradient asks for: `[4C]`, both sigmoids, the candidate
-/// and the candidate's hidden gate.
+/// and the candidate's hidden gate. One loop per gate, each over slices of one length, so that all
+/// are compiled to vectors.
 #[inline(always)]
 fn kept_row(x: [&[f32]; 3], g: [&[f32]; 3], h: &mut [f32], kept: &mut [f32]) {
-    let c = h.len();
-    for at in (0..c).step_by(LANES) {
-        let g = g.map(|g| lanes(g, at));
-        let [r, z, n] = cell(x.map(|x| lanes(x, at)), g);
-        let before = lanes(h, at);
-        put(h, at, &next(z, n, before));
-        for (kept, numbers) in kept.chunks_exact_mut(c).zip([r, z, n, g[2]]) {
-            put(kept, at, &numbers);
-        }
+    let [r, z, n, gate] = quarters_mut(kept);
+    for ((r, x), g) in r.iter_mut().zip(x[0]).zip(g[0]) {
+        *r = sigmoid(x + g);
+    }
+    for ((z, x), g) in z.iter_mut().zip(x[1]).zip(g[1]) {
+        *z = sigmoid(x + g);
+    }
+    gate.copy_from_slice(g[2]);
+    for (((n, x), g), r) in n.iter_mut().zip(x[2]).zip(&*gate).zip(&*r) {
+        *n = candidate(*x, *r, *g);
+    }
+    for ((h, z), n) in h.iter_mut().zip(&*z).zip(&*n) {
+        *h = next(*z, *n, *h);
     }
 }
 
-/// Channels worked on together: a vector of 512 bits.
-const LANES: usize = 16;
-
-/// Channels `at..at + LANES`, zeros beyond the last.
 #[inline(always)]
-fn lanes(row: &[f32], at: usize) -> [f32; LANES] {
-    if let Some(lanes) = row[at..].first_chunk() {
-        return *lanes;
-    }
-    let mut lanes = [0.0; LANES];
-    lanes[..row.len() - at].copy_from_slice(&row[at..]);
-    lanes
+fn quarters_mut(row: &mut [f32]) -> [&mut [f32]; 4] {
+    let (low, high) = row.split_at_mut(row.len() / 2);
+    let (a, b) = low.split_at_mut(low.len() / 2);
+    let (c, d) = high.split_at_mut(high.len() / 2);
+    [a, b, c, d]
 }
 
-/// The inverse of [`lanes`].
 #[inline(always)]
-fn put(row: &mut [f32], at: usize, lanes: &[f32; LANES]) {
-    match row[at..].first_chunk_mut() {
-        Some(row) => *row = *lanes,
-        None => {
-            let rest = &mut row[at..];
-            rest.copy_from_slice(&lanes[..rest.len()]);
-        }
-    }
+fn thirds_mut(row: &mut [f32]) -> [&mut [f32]; 3] {
+    let (a, rest) = row.split_at_mut(row.len() / 3);
+    let (b, c) = rest.split_at_mut(rest.len() / 2);
+    [a, b, c]
 }
 
 /// The three gate rows of row `row`.
@@ -318,25 +320,14 @@ fn gates(all: &[f32], row: usize, c: usize) -> [&[f32]; 3] {
     [&row[..c], &row[c..2 * c], &row[2 * c..]]
 }
 
-/// Reset, update and candidate of some channels.
 #[inline(always)]
-fn cell(x: [[f32; LANES]; 3], g: [[f32; LANES]; 3]) -> [[f32; LANES]; 3] {
-    let (mut r, mut z, mut n) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-    for j in 0..LANES {
-        r[j] = sigmoid(x[0][j] + g[0][j]);
-        z[j] = sigmoid(x[1][j] + g[1][j]);
-        n[j] = 2.0 * sigmoid(2.0 * (x[2][j] + r[j] * g[2][j])) - 1.0;
-    }
-    [r, z, n]
+fn candidate(x: f32, r: f32, g: f32) -> f32 {
+    2.0 * sigmoid(2.0 * (x + r * g)) - 1.0
 }
 
 #[inline(always)]
-fn next(z: [f32; LANES], n: [f32; LANES], h: [f32; LANES]) -> [f32; LANES] {
-    let mut next = [0.0; LANES];
-    for j in 0..LANES {
-        next[j] = (1.0 - z[j]) * n[j] + z[j] * h[j];
-    }
-    next
+fn next(z: f32, n: f32, h: f32) -> f32 {
+    (1.0 - z) * n + z * h
 }
 
 #[inline(always)]
@@ -349,30 +340,25 @@ fn sigmoid(x: f32) -> f32 {
 #[inline(always)]
 fn backward_row(kept: &[f32], h: &[f32], dx: &mut [f32], dg: &mut [f32], dh: &mut [f32]) {
     let c = h.len();
-    for at in (0..c).step_by(LANES) {
-        let part = |i: usize| lanes(&kept[i * c..(i + 1) * c], at);
-        let (r, z, n, g) = (part(0), part(1), part(2), part(3));
-        let (h, mut d) = (lanes(h, at), lanes(dh, at));
-        let (mut to_x, mut to_g) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3]);
-        for j in 0..LANES {
-            let d_candidate = d[j] * (1.0 - z[j]) * (1.0 - n[j] * n[j]);
-            let d_update = d[j] * (h[j] - n[j]) * z[j] * (1.0 - z[j]);
-            let d_reset = d_candidate * g[j] * r[j] * (1.0 - r[j]);
-            to_x[0][j] = d_reset;
-            to_x[1][j] = d_update;
-            to_x[2][j] = d_candidate;
-            to_g[0][j] = d_reset;
-            to_g[1][j] = d_update;
-            to_g[2][j] = d_candidate * r[j];
-            d[j] *= z[j];
-        }
-        for (row, numbers) in dx.chunks_exact_mut(c).zip(&to_x) {
-            put(row, at, numbers);
-        }
-        for (row, numbers) in dg.chunks_exact_mut(c).zip(&to_g) {
-            put(row, at, numbers);
-        }
-        put(dh, at, &d);
+    let [r, z, n, g] = [0, 1, 2, 3].map(|i| &kept[i * c..(i + 1) * c]);
+    let [dx_r, dx_z, dx_n] = thirds_mut(dx);
+    let [dg_r, dg_z, dg_n] = thirds_mut(dg);
+    for (((dx, d), z), n) in dx_n.iter_mut().zip(&*dh).zip(z).zip(n) {
+        *dx = d * (1.0 - z) * (1.0 - n * n);
+    }
+    for ((((dx, d), z), n), h) in dx_z.iter_mut().zip(&*dh).zip(z).zip(n).zip(h) {
+        *dx = d * (h - n) * z * (1.0 - z);
+    }
+    for (((dx, d), g), r) in dx_r.iter_mut().zip(&*dx_n).zip(g).zip(r) {
+        *dx = d * g * r * (1.0 - r);
+    }
+    for ((dg, d), r) in dg_n.iter_mut().zip(&*dx_n).zip(r) {
+        *dg = d * r;
+    }
+    dg_r.copy_from_slice(dx_r);
+    dg_z.copy_from_slice(dx_z);
+    for (dh, z) in dh.iter_mut().zip(z) {
+        *dh *= z;
     }
 }
 

@@ -182,12 +182,18 @@ impl Linear {
             1.0,
             Mat::new(x, rows, n_in),
             Mat::new(weight, n_out, n_in).t(),
-            Threads::Pool, self.operands,
+            Threads::Pool,
+            self.operands,
         );
         Ok(output(y, shape))
     }
 
-    fn backward(&self, x: &Tensor, weight: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
+    fn backward(
+        &self,
+        x: &Tensor,
+        weight: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (n_out, n_in) = weight.dims2()?;
         let dy_tensor = dy;
         let (x_host, weight_host, dy) = (Host::new(x)?, Host::new(weight)?, Host::new(dy)?);
@@ -199,7 +205,15 @@ impl Linear {
             let mut dx = vec![0.0; x_all.len()];
             let w = Mat::new(w, n_out, n_in);
             let dst = MatMut::new(&mut dx, rows, n_in);
-            gemm(dst, Store::Replace, 1.0, dy, w, Threads::Pool, self.operands);
+            gemm(
+                dst,
+                Store::Replace,
+                1.0,
+                dy,
+                w,
+                Threads::Pool,
+                self.operands,
+            );
             Some(gradient(dx, x)?)
         } else {
             None
@@ -216,7 +230,15 @@ impl Linear {
             let mut dw = vec![0.0; w.len()];
             let x_all = Mat::new(x_all, rows, n_in);
             let dst = MatMut::new(&mut dw, n_out, n_in);
-            gemm(dst, Store::Replace, 1.0, dy.t(), x_all, Threads::Pool, self.operands);
+            gemm(
+                dst,
+                Store::Replace,
+                1.0,
+                dy.t(),
+                x_all,
+                Threads::Pool,
+                self.operands,
+            );
             Some(gradient(dw, weight)?)
         } else {
             None

@@ -46,8 +46,8 @@ pub use table::{embedding_sum, table_rows};
 
 pub(crate) use deferred::Deferred;
 pub(crate) use gelu::gelu_row;
-pub(crate) use kernels::{tile, wide};
 pub(crate) use gru::gru_row;
+pub(crate) use kernels::{tile, wide};
 pub(crate) use norm::normalize_row;
 pub(crate) use operands::Operands;
 pub(crate) use rows::{count_from, exp_shifted_sum, max};

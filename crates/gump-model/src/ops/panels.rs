@@ -167,7 +167,10 @@ impl Panels {
                 for row in y.chunks_exact_mut(self.n_out) {
                     row.copy_from_slice(bias);
                 }
-                let (x, y) = (Mat::new(x, rows, self.n_in), MatMut::new(y, rows, self.n_out));
+                let (x, y) = (
+                    Mat::new(x, rows, self.n_in),
+                    MatMut::new(y, rows, self.n_out),
+                );
                 packed.product(y, Store::Add, 1.0, x, Threads::One);
             }
             Weights::Int8 {

@@ -106,7 +106,11 @@ impl CustomOp2 for EmbeddingSum {
         let table = elements(table, table_layout)?;
         let rows = &rows.as_slice::<u32>()?[rows_layout.start_offset()..][..n * k];
         let is_there = |row: &&u32| **row != u32::MAX;
-        if let Some(row) = rows.iter().filter(is_there).find(|r| **r as usize >= n_rows) {
+        if let Some(row) = rows
+            .iter()
+            .filter(is_there)
+            .find(|r| **r as usize >= n_rows)
+        {
             bail!("embedding_sum: row {row} of a table of {n_rows}");
         }
         let mut out = vec![0f32; n * width];
@@ -189,7 +193,12 @@ mod tests {
         let rows = [[0, 3, u32::MAX], [5, 5, 1], [u32::MAX; 3]].concat();
         let indices = Tensor::from_vec(rows.clone(), (3, 3), &Device::Cpu).unwrap();
         let picks: Vec<f32> = (0..3 * 6)
-            .map(|i| rows[i / 6 * 3..][..3].iter().filter(|r| **r == i as u32 % 6).count() as f32)
+            .map(|i| {
+                rows[i / 6 * 3..][..3]
+                    .iter()
+                    .filter(|r| **r == i as u32 % 6)
+                    .count() as f32
+            })
             .collect();
         let picks = Tensor::from_vec(picks, (3, 6), &Device::Cpu).unwrap();
         check(
@@ -217,6 +226,11 @@ mod tests {
         let of = |table: &Var| grads.get(table).cloned();
         assert!(of(&table).is_none());
         let found = Deferred::take_in([&deferred].into_iter(), &table, None).unwrap();
-        assert_close("table", &found.unwrap(), expected.get(&table).unwrap(), 1e-5);
+        assert_close(
+            "table",
+            &found.unwrap(),
+            expected.get(&table).unwrap(),
+            1e-5,
+        );
     }
 }

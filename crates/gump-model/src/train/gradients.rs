@@ -34,11 +34,7 @@ pub(super) struct Part {
 
 impl Found {
     /// Adds what parts of the batch found, in their order.
-    pub(super) fn add(
-        &mut self,
-        parameters: &Parameters,
-        parts: &[Part],
-    ) -> Result<()> {
+    pub(super) fn add(&mut self, parameters: &Parameters, parts: &[Part]) -> Result<()> {
         let trainable: Vec<_> = parameters.trainable().collect();
         let sums = trainable.into_par_iter().map(|(name, var)| {
             let mut sum = self.gradients.get(name).cloned();

@@ -23,8 +23,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 pub use self::config::{ModelChoice, RunConfig, TrainConfig};
-use self::gradients::{Found, Part};
 pub(crate) use self::gradients::Gradients;
+use self::gradients::{Found, Part};
 use self::learner::Learner;
 pub use self::peers::{Alone, Peers};
 #[cfg(feature = "mpi")]

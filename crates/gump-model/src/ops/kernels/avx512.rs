@@ -27,7 +27,11 @@ impl Avx512 {
             && is_x86_feature_detected!("avx512bw")
             && is_x86_feature_detected!("avx512dq")
             && is_x86_feature_detected!("avx512vl");
-        if is_there { Avx2::detect().map(Self) } else { None }
+        if is_there {
+            Avx2::detect().map(Self)
+        } else {
+            None
+        }
     }
 
     /// Runs `f` compiled for these vectors.

@@ -13,9 +13,9 @@
 
 use std::arch::x86_64::{
     __m512, __m512bh, __m512i, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_fmadd_ps,
-    _mm512_mul_ps, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_set1_ps,
-    _mm512_setzero_ps, _mm512_setzero_si512, _mm512_shuffle_i32x4, _mm512_unpackhi_epi32,
-    _mm512_unpackhi_epi64, _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
+    _mm512_mul_ps, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps,
+    _mm512_setzero_si512, _mm512_shuffle_i32x4, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64,
+    _mm512_unpacklo_epi32, _mm512_unpacklo_epi64,
 };
 use std::mem::transmute;
 
@@ -162,7 +162,13 @@ fn pack<const W: usize>(from: Lanes<'_>, pairs: usize, out: &mut [[u32; W]]) {
 
 /// Pairs of a group of lanes, as far as there are such lanes, at one inner index of `out`.
 #[inline(always)]
-fn put<const W: usize>(out: &mut [[u32; W]], pairs: usize, lane: usize, p: usize, group: &[u32; GROUP]) {
+fn put<const W: usize>(
+    out: &mut [[u32; W]],
+    pairs: usize,
+    lane: usize,
+    p: usize,
+    group: &[u32; GROUP],
+) {
     if W >= GROUP {
         out[lane / W * pairs + p][lane % W..][..GROUP].copy_from_slice(group);
     } else {
@@ -183,8 +189,17 @@ fn pack_across<const W: usize>(from: Lanes<'_>, pairs: usize, out: &mut [[u32; W
     for run in (0..pairs).step_by(RUN) {
         let here = RUN.min(pairs - run);
         if 2 * (run + RUN) > from.depth {
-            for (lane, p) in (0..from.lanes).step_by(GROUP).flat_map(|l| (0..here).map(move |p| (l, p))) {
-                put(out, pairs, lane, run + p, &pairs_across(from, lane, run + p));
+            for (lane, p) in (0..from.lanes)
+                .step_by(GROUP)
+                .flat_map(|l| (0..here).map(move |p| (l, p)))
+            {
+                put(
+                    out,
+                    pairs,
+                    lane,
+                    run + p,
+                    &pairs_across(from, lane, run + p),
+                );
             }
             continue;
         }
@@ -214,7 +229,11 @@ fn pairs_across(from: Lanes<'_>, lane: usize, p: usize) -> [u32; GROUP] {
     let row = |i: usize| {
         let is_there = i < from.depth && lanes > 0;
         let start = i * from.depth_stride + lane;
-        if is_there { &from.data[start..][..lanes] } else { &[] }
+        if is_there {
+            &from.data[start..][..lanes]
+        } else {
+            &[]
+        }
     };
     let (even, odd) = (row(2 * p), row(2 * p + 1));
     match (even.first_chunk(), odd.first_chunk()) {
@@ -246,7 +265,10 @@ fn interleave(even: &[f32; GROUP], odd: &[f32; GROUP]) -> [u32; GROUP] {
     };
     // SAFETY: all of these are 512 bits.
     unsafe {
-        let both = _mm512_cvtne2ps_pbh(transmute::<[f32; 16], __m512>(*odd), transmute::<[f32; 16], __m512>(*even));
+        let both = _mm512_cvtne2ps_pbh(
+            transmute::<[f32; 16], __m512>(*odd),
+            transmute::<[f32; 16], __m512>(*even),
+        );
         let order = transmute::<[u16; 32], __m512i>(ORDER);
         let pairs = _mm512_permutexvar_epi16(order, transmute::<__m512bh, __m512i>(both));
         transmute::<__m512i, [u32; GROUP]>(pairs)
@@ -354,10 +376,16 @@ fn turn(rows: [__m512i; 16]) -> [__m512i; 16] {
     let mut columns = fours;
     for j in 0..4 {
         let [a, b, c, d] = [fours[j], fours[4 + j], fours[8 + j], fours[12 + j]];
-        let [ab, cd] = [_mm512_shuffle_i32x4::<EVEN>(a, b), _mm512_shuffle_i32x4::<EVEN>(c, d)];
+        let [ab, cd] = [
+            _mm512_shuffle_i32x4::<EVEN>(a, b),
+            _mm512_shuffle_i32x4::<EVEN>(c, d),
+        ];
         columns[j] = _mm512_shuffle_i32x4::<EVEN>(ab, cd);
         columns[8 + j] = _mm512_shuffle_i32x4::<ODD>(ab, cd);
-        let [ab, cd] = [_mm512_shuffle_i32x4::<ODD>(a, b), _mm512_shuffle_i32x4::<ODD>(c, d)];
+        let [ab, cd] = [
+            _mm512_shuffle_i32x4::<ODD>(a, b),
+            _mm512_shuffle_i32x4::<ODD>(c, d),
+        ];
         columns[4 + j] = _mm512_shuffle_i32x4::<EVEN>(ab, cd);
         columns[12 + j] = _mm512_shuffle_i32x4::<ODD>(ab, cd);
     }

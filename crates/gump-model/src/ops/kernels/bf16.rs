@@ -195,7 +195,9 @@ impl Right {
         let mut work = Work::new(dst, store, scale, Lanes::of_rows(lhs), threads);
         assert!(work.lhs.depth <= self.depth, "inner size of the product");
         assert!(work.columns <= self.columns, "columns of the product");
-        for (whole, (piece, panels)) in depths(self.depth).zip(depths(work.lhs.depth).zip(&self.pieces)) {
+        for (whole, (piece, panels)) in
+            depths(self.depth).zip(depths(work.lhs.depth).zip(&self.pieces))
+        {
             work.add(unit, piece, panels.all(), U::pairs(whole.1));
         }
     }
@@ -241,13 +243,7 @@ struct Work<'a> {
 }
 
 impl<'a> Work<'a> {
-    fn new(
-        dst: MatMut<'a>,
-        store: Store,
-        scale: f32,
-        lhs: Lanes<'a>,
-        threads: Threads,
-    ) -> Self {
+    fn new(dst: MatMut<'a>, store: Store, scale: f32, lhs: Lanes<'a>, threads: Threads) -> Self {
         let (data, [rows, columns], stride) = dst.into_parts();
         let products = rows * columns * lhs.depth;
         // Rows after the last may be part of the slice, but not of the matrix.
@@ -304,12 +300,7 @@ impl<'a> Work<'a> {
 }
 
 /// The product of a few rows with all panels, each `deep` pairs; `to` is as wide as its columns.
-fn rows_product<U: Unit>(
-    unit: U,
-    lhs: Lanes<'_>,
-    (panels, deep): (&[u32], usize),
-    to: Target<'_>,
-) {
+fn rows_product<U: Unit>(unit: U, lhs: Lanes<'_>, (panels, deep): (&[u32], usize), to: Target<'_>) {
     let pairs = U::pairs(lhs.depth);
     let mut left = LEFT.take();
     let blocks = left.room(pairs * lhs.lanes.next_multiple_of(U::ROWS));

@@ -65,7 +65,9 @@ impl Kernel {
         let found = Self::ALL.into_iter().find(|kernel| kernel.name() == name);
         found.ok_or_else(|| {
             let known = Self::ALL.map(Self::name).join(", ");
-            ModelError::Kernel(format!("no kernel is called {name}, expected one of {known}"))
+            ModelError::Kernel(format!(
+                "no kernel is called {name}, expected one of {known}"
+            ))
         })
     }
 
@@ -95,13 +97,22 @@ impl Kernel {
     fn is_right(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         {
-            let wide = || Avx512::detect().is_some_and(|v| are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p)));
+            let wide = || {
+                Avx512::detect()
+                    .is_some_and(|v| are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p)))
+            };
             match self {
                 Self::Portable => true,
-                Self::Avx2 => Avx2::detect().is_some_and(|v| are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p))),
+                Self::Avx2 => Avx2::detect().is_some_and(|v| {
+                    are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p))
+                }),
                 Self::Avx512 => wide(),
                 Self::Avx512Bf16 => wide() && Avx512Bf16::detect().is_some_and(is_unit_right),
-                Self::Amx => wide() && Amx::detect().is_some_and(|unit| is_unit_right(unit) && are_bytes_right(unit)),
+                Self::Amx => {
+                    wide()
+                        && Amx::detect()
+                            .is_some_and(|unit| is_unit_right(unit) && are_bytes_right(unit))
+                }
             }
         }
         #[cfg(not(target_arch = "x86_64"))]
@@ -150,7 +161,9 @@ impl Choice {
             ));
         }
         if !kernel.is_right() {
-            return refuse(format!("kernel {kernel} multiplies wrongly on this processor"));
+            return refuse(format!(
+                "kernel {kernel} multiplies wrongly on this processor"
+            ));
         }
         let forced = Self {
             kernel,
@@ -160,7 +173,9 @@ impl Choice {
         let made = MADE.get_or_init(|| forced);
         if made.kernel != kernel {
             let other = made.kernel;
-            return refuse(format!("kernel {kernel} comes too late, {other} is at work"));
+            return refuse(format!(
+                "kernel {kernel} comes too late, {other} is at work"
+            ));
         }
         Ok(made)
     }

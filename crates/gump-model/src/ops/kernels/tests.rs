@@ -64,9 +64,7 @@ mod tiles {
 
     /// A tile of 16 rows of 16 pairs, its rows `stride` bytes apart from a byte on.
     fn load(memory: &[u32], byte: usize, stride: usize) -> [[u32; 16]; 16] {
-        std::array::from_fn(|r| {
-            std::array::from_fn(|c| memory[byte / 4 + r * stride / 4 + c])
-        })
+        std::array::from_fn(|r| std::array::from_fn(|c| memory[byte / 4 + r * stride / 4 + c]))
     }
 
     fn halves(pair: u32) -> [f32; 2] {
@@ -143,7 +141,14 @@ fn products_are_those_of_rounded_numbers() {
                 for (store, scale) in [(Store::Replace, 1.0), (Store::Add, -0.7)] {
                     let before = values(m * n, 3);
                     let mut found = before.clone();
-                    way(MatMut::new(&mut found, m, n), store, scale, lhs, rhs, Threads::One);
+                    way(
+                        MatMut::new(&mut found, m, n),
+                        store,
+                        scale,
+                        lhs,
+                        rhs,
+                        Threads::One,
+                    );
                     let before = match store {
                         Store::Replace => vec![0.0; m * n],
                         Store::Add => before,
@@ -155,7 +160,14 @@ fn products_are_those_of_rounded_numbers() {
                         assert!(off < most, "{name} {m} {k} {n} [{at}]: {found} {expected}");
                     }
                     let mut shared = before_of(store, m * n);
-                    way(MatMut::new(&mut shared, m, n), store, scale, lhs, rhs, Threads::Pool);
+                    way(
+                        MatMut::new(&mut shared, m, n),
+                        store,
+                        scale,
+                        lhs,
+                        rhs,
+                        Threads::Pool,
+                    );
                     assert_eq!(found, shared, "{name} {m} {k} {n} on all threads");
                 }
             }
@@ -247,7 +259,16 @@ fn a_product_over_nothing_is_zero() {
 #[test]
 fn infinities_stay_and_the_smallest_vanish() {
     for (name, way) in ways() {
-        let a = [f32::INFINITY, 1.0, 1e-40, 1.0, -f32::INFINITY, 0.0, 2.0, 0.5];
+        let a = [
+            f32::INFINITY,
+            1.0,
+            1e-40,
+            1.0,
+            -f32::INFINITY,
+            0.0,
+            2.0,
+            0.5,
+        ];
         let b = [1.0, 1.0];
         let mut found = [0.0; 4];
         let dst = MatMut::new(&mut found, 4, 1);
