@@ -14,6 +14,7 @@ mod checks;
 mod cli;
 mod config;
 mod dataset;
+mod decoding;
 mod futures;
 mod imagine;
 mod losses;

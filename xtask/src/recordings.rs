@@ -77,7 +77,14 @@ pub(crate) fn find(source: &str) -> anyhow::Result<Case> {
 }
 
 /// A case of a scenario that knows boxes alone.
+///
+/// Error: no lanes, or a scenario that cannot be driven through.
 fn of_boxes(mut scenario: Scenario) -> anyhow::Result<Case> {
+    anyhow::ensure!(
+        !scenario.map.lanes().is_empty(),
+        "scenario {}: expected a map with lanes to plan on, found none",
+        scenario.id
+    );
     let map = Arc::clone(&scenario.map);
     derive_roadblocks(&mut scenario);
     Ok(Case {

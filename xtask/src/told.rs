@@ -5,6 +5,7 @@ use anyhow::Context as _;
 use gump_metrics::behaviour::{Behaviour, Judged, judge};
 use gump_metrics::wosac::{Component, Config, Features, Log, Reference, Rollouts, Year};
 use gump_model::{Outlook, Watch};
+use gump_rollout::SimulateConfig;
 use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
 
@@ -117,16 +118,16 @@ pub(crate) fn heat(
     run: &Run,
     viewer: &mut Viewer<'_>,
     world: World,
-    scene: SceneState<'_>,
+    scenario: &Scenario,
     n_futures: usize,
-    seconds: f64,
+    config: &SimulateConfig,
 ) -> anyhow::Result<()> {
     let watch = Watch {
         futures: n_futures,
         draws: DRAWS,
     };
     let world = world.watching(watch);
-    imagine(run, &world, scene, n_futures, seconds, run.seed())?;
+    imagine(run, &world, scenario, n_futures, config, run.seed())?;
     let outlooks = world
         .take_outlooks()
         .context("a world that follows rules draws nothing")?;

@@ -1,8 +1,11 @@
 //! Motion prediction and submissions from the outside: official numbers, shards, broken input.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../tests/shared.rs"]
+mod shared_data;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use gump_data::submission::{
@@ -18,6 +21,7 @@ use gump_metrics::logged;
 use gump_scene::{PredictedMode, Prediction, Scenario};
 use prost::Message;
 use serde_json::Value;
+use shared_data::shared;
 use tempfile::TempDir;
 
 /// The reference prints f32 results with nine digits.
@@ -60,15 +64,6 @@ fn mini() -> String {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let path = repository.join("datasets/mini/procedural.tfrecord.gz");
     path.display().to_string()
-}
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared")).join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("SKIPPED: the file {name} is not beside the repository");
-    None
 }
 
 /// The scenarios of the official numbers as one file: those without a map get one, since every

@@ -1,6 +1,9 @@
 //! Every verb from the outside: exit status, sentences, files, and the report that scripts rely on.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../tests/shared.rs"]
+mod shared_data;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -10,6 +13,7 @@ use gump_model::train::ModelChoice;
 use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
 use gump_scene::Seed;
 use serde_json::Value;
+use shared_data::shared;
 
 /// A folder for one test, and the driver in it.
 struct Workplace {
@@ -589,7 +593,10 @@ fn ablate_nar_compares_the_two_ways_of_decoding() {
         .iter()
         .map(|row| row["mode"].as_str().unwrap())
         .collect();
-    assert_eq!(modes, ["full-AR", "partial-AR"]);
+    assert_eq!(modes, ["full-AR", "partial-AR", "full-AR", "partial-AR"]);
+    let decodings = rows.iter().map(|row| &row["decoding"]);
+    let expected = ["ruled", "ruled", "raw", "raw"];
+    assert!(decodings.eq(expected));
     assert_eq!(rows[1]["passes_per_frame"], 1.0);
     assert!(rows[0]["passes_per_frame"].as_f64().unwrap() > 1.0);
     let rate = |row: &Value| row["frames_per_second"].as_f64().unwrap();
@@ -599,7 +606,7 @@ fn ablate_nar_compares_the_two_ways_of_decoding() {
     assert!(place.files().contains(&"picture.png".to_owned()));
     place.fails(
         &format!("{words} {scene} --world idm"),
-        1,
+        2,
         &["model:WEIGHTS"],
     );
 }
@@ -825,13 +832,11 @@ fn evaluate_wosac_takes_rollouts_from_files() {
 #[test]
 fn official_rollouts_of_a_recorded_scenario_get_the_official_score() {
     let place = Workplace::new();
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
-    let scenario = shared.join("data/waymo/scenario_a.tfrecord");
-    let rollouts = shared.join("golden/wosac/inputs_real/test_submission.binproto.gz");
-    if !(scenario.is_file() && rollouts.is_file()) {
-        eprintln!("skipped: no {}", scenario.display());
+    let scenario = shared("data/waymo/scenario_a.tfrecord");
+    let rollouts = shared("golden/wosac/inputs_real/test_submission.binproto.gz");
+    let (Some(scenario), Some(rollouts)) = (scenario, rollouts) else {
         return;
-    }
+    };
     // Wheels 1.6.0, 1.6.1, 1.6.4 and 1.6.7 of the official evaluator.
     for (year, expected) in [
         ("2023-v0", 0.231_545),

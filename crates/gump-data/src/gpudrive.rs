@@ -155,7 +155,7 @@ impl Document for File {
         infer::lane_graph(&mut parts, options, report);
         let recording = self.recording(id, options, report)?;
         let mut scenario = assemble(recording, parts, options, report)?;
-        infer::light_gaps(&mut scenario.log, DT, options, report);
+        infer::light_gaps(&mut scenario.log, scenario.now, DT, options, report);
         Ok(scenario)
     }
 }

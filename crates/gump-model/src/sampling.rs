@@ -69,6 +69,46 @@ impl Default for SamplingConfig {
     }
 }
 
+impl SamplingConfig {
+    /// The network alone: what it says is what happens. Nothing is drawn again and nothing held
+    /// back; temperature and averaging are the default's.
+    pub fn raw() -> Self {
+        Self::default().without_rules()
+    }
+
+    /// The decoding of the paper's Waymo evaluation: warmer draws, more weight for earlier
+    /// predictions, no rules. Its frames are interpolated by `SimulateConfig::compat` of
+    /// `gump-rollout`.
+    ///
+    /// Source: GUMP (ECCV 2024), section on simulation: temperature 1.1, the 40 likeliest bins,
+    /// decay 1.2, three frames of history.
+    pub fn paper() -> Self {
+        Self {
+            temperature: 1.1,
+            top_k: 40,
+            decay: 1.2,
+            history: 3,
+            surrogate: Surrogate::Chunk,
+            ..Self::raw()
+        }
+    }
+
+    /// The same decoding with neither redraws nor limits.
+    #[must_use]
+    pub fn without_rules(self) -> Self {
+        Self {
+            redraws: 0,
+            limits: false,
+            ..self
+        }
+    }
+
+    /// Whether rules correct what the network says.
+    pub fn has_rules(&self) -> bool {
+        self.redraws > 0 || self.limits
+    }
+}
+
 /// Factors on the odds that the network gives to what happens in a frame of living traffic; 1 is what
 /// it says.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -209,3 +249,40 @@ pub(crate) fn set_pose(mut state: QuantizedState, pose: Pose) -> QuantizedState 
 
 /// What the decoder says of one object: a bin per step, to be read through the object's anchor.
 pub(crate) type Bins = [u16; STEPS.len()];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every field is spelled out, so that a new one asks what it is in these decodings.
+    #[test]
+    fn what_raw_and_paper_set_is_pinned() {
+        let raw = SamplingConfig {
+            mode: Mode::PartialAr,
+            cache: CacheMode::Window,
+            temperature: 0.5,
+            top_k: 40,
+            decay: 0.3,
+            history: 3,
+            surrogate: Surrogate::Chunk,
+            life: false,
+            pace: Pace {
+                arrivals: 1.0,
+                light_changes: 1.0,
+            },
+            redraws: 0,
+            limits: false,
+            precision: Precision::F32,
+        };
+        assert_eq!(SamplingConfig::raw(), raw);
+        let paper = SamplingConfig {
+            temperature: 1.1,
+            decay: 1.2,
+            ..raw.clone()
+        };
+        assert_eq!(SamplingConfig::paper(), paper);
+        assert!(!raw.has_rules() && !paper.has_rules());
+        assert!(SamplingConfig::default().has_rules());
+        assert_eq!(SamplingConfig::default().without_rules(), raw);
+    }
+}

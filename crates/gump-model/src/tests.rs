@@ -326,7 +326,15 @@ fn nothing_looks_at_the_logged_future() {
                 velocity: gump_geometry::dvec2(f64::NAN, f64::NAN),
             })
         });
-        *frame = Frame::new(agents.collect(), vec![]);
+        // Everyone is nowhere, a light changes, and somebody appears.
+        let mut agents: Vec<_> = agents.collect();
+        agents.push(gump_scene::Agent {
+            id: AgentId(99),
+            ..agents[0]
+        });
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = gump_scene::LightState::Green;
+        *frame = Frame::new(agents, lights);
     }
     let (a, _) = imagine(SamplingConfig::default(), &scenario, 2, 3, None);
     let (b, _) = imagine(SamplingConfig::default(), &blinded, 2, 3, None);

@@ -270,29 +270,6 @@ fn the_number_of_threads_changes_nothing() {
 }
 
 #[test]
-fn the_logged_future_is_not_seen() {
-    let scenario = scene(&format!(
-        "{FORK}ego vehicle 0: 10,0 velocity 10,0\nagent vehicle 1: 30,0 velocity 9,0"
-    ));
-    let mut other = scenario.clone();
-    for frame in &mut other.log[scenario.now + 1..] {
-        let agents = frame.agents().iter().map(|agent| {
-            agent.with_state(AgentState {
-                pose: Pose::new(f64::NAN, 0.0, 0.0),
-                velocity: dvec2(f64::NAN, 1.0),
-            })
-        });
-        *frame = Frame::new(agents.collect(), vec![]);
-    }
-    for (a, b) in run_futures(&scenario, 4, 8.0)
-        .iter()
-        .zip(&run_futures(&other, 4, 8.0))
-    {
-        assert_eq!(a.imagined(), b.imagined());
-    }
-}
-
-#[test]
 fn parameters_are_checked() {
     let config = IdmConfig {
         headway: 0.0,

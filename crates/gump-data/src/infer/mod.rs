@@ -79,15 +79,17 @@ pub(crate) fn light_lanes(
     }
 }
 
-/// Holds the colours of lights across moments in which they were not seen.
+/// Holds the colours of lights across moments in which they were not seen; `now` is the index of
+/// the present.
 pub(crate) fn light_gaps(
     log: &mut [Frame],
+    now: usize,
     dt: f64,
     options: ReadOptions,
     report: &mut ReadReport,
 ) {
     if options.infer_light_gaps {
-        light_gaps::infer(log, dt, report);
+        light_gaps::infer(log, now, dt, report);
     }
 }
 

@@ -82,8 +82,8 @@ struct Settings {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Named {
     world: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    decoding: Option<String>,
+    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
+    decoding: String,
 }
 
 /// What one scenario shows.
@@ -159,19 +159,13 @@ impl Args {
         };
         let mut worlds: Vec<Worlds<'_>> = ways
             .iter()
-            .map(|way| Worlds::new(run.device(), &way.world, way.sampling.clone()))
+            .map(|way| Worlds::new(run.device(), &way.world, way.decoding.sampling.clone()))
             .collect();
         let mut ledger = Ledger::open(run.out(), &header)?;
         let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
-        // Nothing of the future may reach a world: neither the ego's route nor lights seen later.
-        let options = ReadOptions {
-            infer_route: false,
-            infer_light_gaps: false,
-            ..ReadOptions::ALL
-        };
         run.phase("count", |run| {
             let progress = run.progress("counting", 0, "scenarios");
-            let records = open_with(&self.scenarios, options)?;
+            let records = open_with(&self.scenarios, ReadOptions::ALL)?;
             for (index, record) in records.enumerate().take(limit) {
                 if !self.shard.holds(index) || ledger.has(index) {
                     continue;
@@ -181,8 +175,9 @@ impl Args {
                 let counted = ways.iter().zip(&mut worlds).map(|(way, worlds)| {
                     let world = worlds.of(&scenario)?;
                     let n = way.futures(self.futures.get());
-                    let (scene, seed) = (scenario.present(), run.seed().fork(index as u64));
-                    let imagined = imagine(run, world, scene, n, self.seconds.into(), seed)?;
+                    let frames = way.decoding.frames(self.seconds.into());
+                    let seed = run.seed().fork(index as u64);
+                    let imagined = imagine(run, world, &scenario, n, &frames, seed)?;
                     Ok(Cells::of(&behaviour.tally(&imagined.rollouts)))
                 });
                 let counted = counted.collect::<anyhow::Result<Vec<Cells>>>();

@@ -1,46 +1,26 @@
 //! Worlds and how they decode: a learned one as it is used and without its rules.
 
-use gump_model::SamplingConfig;
-
 use super::Named;
+use crate::decoding::Decoding;
 use crate::worlds::{Sampling, WorldName};
 
 /// One column of the table.
 pub(super) struct Way {
     pub(super) world: WorldName,
-    /// `ruled` or `raw`; of worlds that decode nothing none.
-    decoding: Option<&'static str>,
-    pub(super) sampling: SamplingConfig,
+    pub(super) decoding: Decoding,
 }
 
-/// Every way that the table shows of some worlds: of a network with rules also the network alone.
+/// Every way that the table shows of some worlds.
 ///
-/// Error: a sampling flag out of its range.
+/// Error: sampling flags that do not fit.
 pub(super) fn ways(worlds: &[WorldName], sampling: &Sampling) -> anyhow::Result<Vec<Way>> {
-    let asked = sampling.resolve()?;
-    let raw = SamplingConfig {
-        redraws: 0,
-        limits: false,
-        ..asked.clone()
-    };
-    let has_rules = asked != raw;
     let mut ways = Vec::new();
     for world in worlds {
-        let mut add = |decoding, sampling: &SamplingConfig| {
-            ways.push(Way {
-                world: world.clone(),
-                decoding,
-                sampling: sampling.clone(),
-            });
-        };
-        match world {
-            WorldName::Model(_) if has_rules => {
-                add(Some("ruled"), &asked);
-                add(Some("raw"), &raw);
-            }
-            WorldName::Model(_) => add(Some("raw"), &raw),
-            _ => add(None, &asked),
-        }
+        let decodings = sampling.decodings(world)?.into_iter();
+        ways.extend(decodings.map(|decoding| Way {
+            world: world.clone(),
+            decoding,
+        }));
     }
     Ok(ways)
 }
@@ -57,7 +37,7 @@ impl Way {
     pub(super) fn named(&self) -> Named {
         Named {
             world: self.world.to_string(),
-            decoding: self.decoding.map(Into::into),
+            decoding: self.decoding.name.into(),
         }
     }
 }

@@ -23,6 +23,8 @@ use self::source::Predictions;
 use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
 use super::shard::Shard;
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::worlds::{Sampling, WorldName, Worlds};
@@ -98,7 +100,7 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
-        let header = self.header(run)?;
+        let header = self.header(run, forecaster.decoding())?;
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
@@ -114,17 +116,18 @@ impl Args {
             let predictions = run.phase("predict", |run| {
                 forecaster.predict(run, &scenario, &config, index)
             });
-            let scores = predictions.and_then(|predictions| {
+            let scores = predictions.and_then(|(predictions, digest)| {
                 run.phase("score", |_| {
-                    Ok(evaluate_predictions(&scenario, &predictions, &config)?)
+                    let scores = evaluate_predictions(&scenario, &predictions, &config)?;
+                    Ok((scores, digest))
                 })
             });
-            let scores: Option<Vec<PredictionScore>> =
+            let scores: Option<(Vec<PredictionScore>, Option<String>)> =
                 left_out.sift(scores, is_of_another_length)?;
-            let Some(scores) = scores else {
+            let Some((scores, digest)) = scores else {
                 continue;
             };
-            let scores = Scores::new(&scores, absent);
+            let scores = Scores::new(&scores, absent, digest);
             let id = scenario.id;
             ledger.enter(Entry { index, id, scores })?;
             progress.advance(1);
@@ -133,7 +136,7 @@ impl Args {
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(run, &entries, &config)
+        tell::tell(run, &entries, &config, forecaster.decoding())
     }
 
     fn open(&self) -> anyhow::Result<gump_data::Reader> {
@@ -148,20 +151,25 @@ impl Args {
     fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
         Ok(match (&self.source.rollouts, &self.source.world) {
             (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
-            (None, Some(name)) => Forecaster::World {
-                worlds: Worlds::new(device, name, self.sampling.resolve()?),
-                n_futures: self.futures.get(),
-            },
+            (None, Some(name)) => {
+                let decoding = self.sampling.decoding(name)?;
+                Forecaster::World {
+                    worlds: Worlds::new(device, name, decoding.sampling.clone()),
+                    n_futures: self.futures.get(),
+                    decoding,
+                }
+            }
             (None, None) => anyhow::bail!("expected --rollouts or --world"),
         })
     }
 
     /// Everything that the scores of a scenario depend on.
-    fn header(&self, run: &Run) -> anyhow::Result<Header> {
+    fn header(&self, run: &Run, decoding: &str) -> anyhow::Result<Header> {
         let mut settings = toml::Table::new();
         let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
         set("scenarios", self.scenarios.display().to_string().into());
         set("shapes", toml::Value::try_from(self.shapes)?);
+        set("decoding", decoding.into());
         set("seed", i64::try_from(run.seed().0)?.into());
         if let Some(path) = &self.source.rollouts {
             set("rollouts", path.display().to_string().into());
@@ -196,6 +204,7 @@ enum Forecaster<'a> {
     World {
         worlds: Worlds<'a>,
         n_futures: usize,
+        decoding: Decoding,
     },
 }
 
@@ -212,22 +221,37 @@ impl Forecaster<'_> {
         before - scenario.targets.len()
     }
 
+    /// How its futures are made; a file does not tell.
+    fn decoding(&self) -> &'static str {
+        match self {
+            Self::File(..) => Decoding::NONE,
+            Self::World { decoding, .. } => decoding.name,
+        }
+    }
+
+    /// Predictions, and the digest of the futures they were condensed from.
     fn predict(
         &mut self,
         run: &Run,
         scenario: &Scenario,
         config: &MotionConfig,
         index: usize,
-    ) -> anyhow::Result<Vec<Prediction>> {
+    ) -> anyhow::Result<(Vec<Prediction>, Option<String>)> {
         match self {
-            Self::File(predictions, path) => predictions.of(scenario, config, path),
-            Self::World { .. } if scenario.targets.is_empty() => Ok(Vec::new()),
-            Self::World { worlds, n_futures } => {
-                let seconds = config.n_steps as f64 * config.step_seconds;
+            Self::File(predictions, path) => Ok((predictions.of(scenario, config, path)?, None)),
+            Self::World { .. } if scenario.targets.is_empty() => Ok((Vec::new(), None)),
+            Self::World {
+                worlds,
+                n_futures,
+                decoding,
+            } => {
+                let frames = decoding.frames(config.n_steps as f64 * config.step_seconds);
                 let seed = run.seed().fork(index as u64);
-                let (world, scene) = (worlds.of(scenario)?, scenario.present());
-                let imagined = imagine(run, world, scene, *n_futures, seconds, seed)?;
-                Ok(forecast(scenario, &imagined.rollouts, config)?)
+                let world = worlds.of(scenario)?;
+                let imagined = imagine(run, world, scenario, *n_futures, &frames, seed)?;
+                let digest = futures::digest(&imagined.rollouts);
+                let predictions = forecast(scenario, &imagined.rollouts, config)?;
+                Ok((predictions, Some(digest)))
             }
         }
     }

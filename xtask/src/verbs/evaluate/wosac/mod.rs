@@ -57,8 +57,8 @@ pub(crate) struct Args {
     /// Evaluate part K of N; put the parts together with `evaluate merge`
     #[arg(long, value_name = "K/N")]
     shard: Option<Shard>,
-    /// Also say what lowered the scores and when, in explain.jsonl, agents.parquet and the dearest in
-    /// the report, and which agents do what no driver would, in conduct.parquet
+    /// Also say what lowered the scores of the first row and when, in explain.jsonl, agents.parquet
+    /// and the dearest in the report, and which agents do what no driver would, in conduct.parquet
     #[arg(long)]
     explain: bool,
     #[command(flatten)]
@@ -126,9 +126,21 @@ pub(crate) struct Settings {
 pub(crate) struct Scored {
     /// Wall seconds that scoring took, without imagining.
     pub(crate) seconds: f64,
-    pub(crate) evaluated: Scores,
+    /// One for each decoding, in order.
+    pub(crate) evaluated: Vec<Evaluated>,
     pub(crate) oracle: Scores,
     pub(crate) constant_velocity: Scores,
+}
+
+/// What is evaluated, decoded in one way.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Evaluated {
+    /// `ruled`, `raw` or `paper`; `-` where nothing is decoded.
+    pub(crate) decoding: String,
+    /// Of the rollouts, if a world imagined them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) digest: Option<String>,
+    pub(crate) scores: Scores,
 }
 
 /// What one agent cost in one scenario, as it is written.
@@ -151,7 +163,6 @@ const N_EXPLAINED: usize = 20;
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let sampling = self.sampling.resolve()?;
         let shard = self.shard.unwrap_or(Shard::WHOLE);
         let settings = self.settings(run)?;
         let header = Header {
@@ -160,17 +171,8 @@ impl Args {
             settings: toml::Table::try_from(&settings)?,
         };
         let config = Config::of(self.year.year());
-        let mut source = match (&self.world, &self.rollouts) {
-            (_, Some(path)) => run.phase("index rollouts", |_| Source::files(path))?,
-            (Some(world), None) => {
-                let n = self.rollouts_per_scenario.get();
-                Source::world(world.clone(), sampling, n, run.seed())
-            }
-            (None, None) => {
-                let wrong = "expected --world or --rollouts, found neither";
-                return Err(WrongArguments(wrong.into()).into());
-            }
-        };
+        let mut sources = self.sources(run)?;
+        let options = sources[0].read_options();
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
         let mut worst = self.explain.then(Worst::default);
@@ -182,10 +184,10 @@ impl Args {
             let progress = run.progress("evaluating", 0, "scenarios");
             let kept = ledger.indices();
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
-            for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
+            for recorded in recordings(&self.scenarios, options, wanted)? {
                 let scored = recorded.and_then(|recorded| {
                     let scored =
-                        self.evaluate(run, &config, &recorded, &mut source, worst.as_mut())?;
+                        self.evaluate(run, &config, &recorded, &mut sources, worst.as_mut())?;
                     Ok((recorded, scored))
                 });
                 let scored = left_out.sift(scored, is_of_another_length)?;
@@ -229,6 +231,23 @@ impl Args {
         Ok(())
     }
 
+    /// Where rollouts come from, once for each decoding; at least one.
+    fn sources(&self, run: &mut Run) -> anyhow::Result<Vec<Source>> {
+        match (&self.world, &self.rollouts) {
+            (_, Some(path)) => Ok(vec![run.phase("index rollouts", |_| Source::files(path))?]),
+            (Some(world), None) => {
+                let (n, seed) = (self.rollouts_per_scenario.get(), run.seed());
+                let decodings = self.sampling.decodings(world)?.into_iter();
+                let sources = decodings.map(|way| Source::world(world.clone(), way, n, seed));
+                Ok(sources.collect())
+            }
+            (None, None) => {
+                let wrong = "expected --world or --rollouts, found neither";
+                Err(WrongArguments(wrong.into()).into())
+            }
+        }
+    }
+
     fn settings(&self, run: &Run) -> anyhow::Result<Settings> {
         let name = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default();
@@ -251,37 +270,52 @@ impl Args {
         run: &Run,
         config: &Config,
         recorded: &Recorded,
-        source: &mut Source,
-        worst: Option<&mut Worst>,
+        sources: &mut [Source],
+        mut worst: Option<&mut Worst>,
     ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
-        let rollouts = source
-            .rollouts(run, recorded, config.mode)
-            .with_context(|| format!("cannot evaluate scenario {id}"))?;
+        let found = sources.iter_mut().map(|source| {
+            let found = source.rollouts(run, recorded, config.mode);
+            let found = found.with_context(|| format!("cannot evaluate scenario {id}"))?;
+            Ok((source.decoding(), found))
+        });
+        let found = found.collect::<anyhow::Result<Vec<_>>>()?;
         let baseline = constant_velocity(recorded, config.mode)
             .with_context(|| format!("cannot evaluate scenario {id}"))?;
         let oracle = recorded.log.oracle(n, config.mode == Mode::Generation);
         let began = Instant::now();
         let reference = Reference::new(&recorded.log, config)?;
-        let evaluation = reference.evaluate(&rollouts)?;
-        let seconds = began.elapsed().as_secs_f64();
+        let (mut evaluated, mut blames) = (Vec::new(), None);
+        for (decoding, found) in found {
+            let evaluation = reference.evaluate(&found.rollouts)?;
+            if blames.is_none() {
+                let own = evaluation.explain();
+                let worst = worst.take().filter(|_| config.mode == Mode::SimAgents);
+                if let Some(worst) = worst {
+                    worst.add(&recorded.scenario, &found.rollouts, &evaluation, &own);
+                }
+                blames = Some(own);
+            }
+            evaluated.push(Evaluated {
+                decoding: decoding.into(),
+                digest: found.digest,
+                scores: evaluation.scores,
+            });
+        }
+        let seconds = began.elapsed().as_secs_f64() / evaluated.len() as f64;
         let scores = Scored {
             seconds,
             oracle: reference.evaluate(&oracle)?.scores,
             constant_velocity: reference.evaluate(&baseline.repeated(n))?.scores,
-            evaluated: evaluation.scores.clone(),
+            evaluated,
         };
         let entry = Entry {
             index: recorded.index,
             id: id.clone(),
             scores,
         };
-        let blames = evaluation.explain();
-        if let Some(worst) = worst.filter(|_| config.mode == Mode::SimAgents) {
-            worst.add(&recorded.scenario, &rollouts, &evaluation, &blames);
-        }
-        Ok((entry, blames))
+        Ok((entry, blames.unwrap_or_default()))
     }
 }
 
@@ -291,7 +325,7 @@ fn constant_velocity(
     mode: Mode,
 ) -> anyhow::Result<gump_metrics::wosac::Rollouts> {
     let start = Start {
-        scene: recorded.scenario.present(),
+        scene: recorded.scenario.present().unguided(),
         n_futures: 1,
         seed: gump_scene::Seed(0),
     };
