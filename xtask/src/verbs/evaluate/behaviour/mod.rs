@@ -82,8 +82,8 @@ struct Settings {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Named {
     world: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    decoding: Option<String>,
+    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
+    decoding: String,
 }
 
 /// What one scenario shows.

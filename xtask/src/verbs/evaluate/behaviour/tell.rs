@@ -11,6 +11,7 @@ use serde_json::{Map, Value, json};
 
 use super::{Counted, Named, Settings};
 use crate::charts;
+use crate::decoding::Decoding;
 use crate::run::Run;
 use crate::table;
 use crate::verbs::evaluate::ledger::{self, Entry};
@@ -97,10 +98,10 @@ impl Column {
             return "log".into();
         };
         let world = charts::legend(&name.world);
-        match name.decoding.as_deref() {
-            Some(decoding) => format!("{world} ({decoding})"),
-            None if world == "log" => "log replayed".into(),
-            None => world,
+        match name.decoding.as_str() {
+            Decoding::NONE if world == "log" => "log replayed".into(),
+            Decoding::NONE => world,
+            decoding => format!("{world} ({decoding})"),
         }
     }
 }
@@ -165,7 +166,7 @@ fn rows<'a>(
             let name = world.name.as_ref();
             json!({
                 "world": name.map(|name| &name.world),
-                "decoding": name.and_then(|name| name.decoding.as_ref()),
+                "decoding": name.map(|name| &name.decoding),
                 "class": key.class.name(),
                 "measure": key.measure.name(),
                 "seconds": key.seconds,

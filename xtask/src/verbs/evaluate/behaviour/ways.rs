@@ -10,9 +10,9 @@ pub(super) struct Way {
     pub(super) decoding: Decoding,
 }
 
-/// Every way that the table shows of some worlds: of a network with rules also the network alone.
+/// Every way that the table shows of some worlds.
 ///
-/// Error: sampling flags out of their range, or that contradict one another.
+/// Error: sampling flags that do not fit.
 pub(super) fn ways(worlds: &[WorldName], sampling: &Sampling) -> anyhow::Result<Vec<Way>> {
     let mut ways = Vec::new();
     for world in worlds {
@@ -37,10 +37,7 @@ impl Way {
     pub(super) fn named(&self) -> Named {
         Named {
             world: self.world.to_string(),
-            decoding: match self.decoding.name {
-                Decoding::NONE => None,
-                name => Some(name.into()),
-            },
+            decoding: self.decoding.name.into(),
         }
     }
 }
