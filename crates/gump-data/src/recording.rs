@@ -366,7 +366,7 @@ mod tests {
         let mut track = Track {
             id: 1,
             kind: AgentKind::Vehicle,
-            usual_size: usual_size(AgentKind::Vehicle),
+            usual_size: AgentKind::Vehicle.usual_size(),
             states: stated.iter().enumerate().map(state).collect(),
         };
         complete_sizes(&mut track, 1, options, &mut ReadReport::default());
