@@ -30,7 +30,10 @@ const SHORT_M: f64 = 0.1;
 /// The velocity of what was at `from`, said it would be in the state `said`, and is at `pose`;
 /// `steers` tells whether it goes where it faces.
 pub(crate) fn follow(from: Pose, said: AgentState, pose: Pose, steers: bool) -> DVec2 {
-    let (meant, made) = (said.pose.position - from.position, pose.position - from.position);
+    let (meant, made) = (
+        said.pose.position - from.position,
+        pose.position - from.position,
+    );
     let long = meant.length() > SHORT_M && made.length() > SHORT_M;
     let turn = match (steers, long) {
         (true, _) => angle_difference(pose.heading, said.pose.heading),

@@ -4,6 +4,9 @@
 //! its exact pose (`anchor`), so what it sees around itself must be seen from there, too: the slots
 //! of a window carry both.
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::BTreeMap;
 
 use gump_geometry::{DVec2, Pose, dvec2};

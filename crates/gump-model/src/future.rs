@@ -220,8 +220,7 @@ impl Future {
                 .drain(..self.frames.len().saturating_sub(history));
         }
         let kept = history.max(self.frames.len());
-        self.recent
-            .drain(..self.recent.len().saturating_sub(kept));
+        self.recent.drain(..self.recent.len().saturating_sub(kept));
         self.rings.retain(|id, _| moved.contains_key(id));
         // In the first frame of a window nobody is newborn: who was, counts as tracked.
         let first = std::mem::take(&mut self.frames[0]);

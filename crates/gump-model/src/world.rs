@@ -246,12 +246,9 @@ impl TransformerWorld {
             .windows(2)
             .enumerate()
             .filter_map(|(i, pair)| match (pair[0].slot, pair[1].slot) {
-                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => Some((
-                    i,
-                    key.id,
-                    state,
-                    scene.anchor(&pair[0], network.config()),
-                )),
+                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => {
+                    Some((i, key.id, state, scene.anchor(&pair[0], network.config())))
+                }
                 _ => None,
             })
             .collect();

@@ -112,7 +112,10 @@ mod tests {
         };
         let (mut stated, mut found, mut both) = (0, 0, 0);
         for scenario in reader {
-            let map = scenario.expect("the recorded scenes can be read").scenario.map;
+            let map = scenario
+                .expect("the recorded scenes can be read")
+                .scenario
+                .map;
             let mut parts = map.parts().clone();
             let truth: Vec<Vec<LaneId>> = parts
                 .stop_signs

@@ -37,8 +37,8 @@ impl Hidden {
     pub(super) fn map(self, map: &Arc<MapGraph>) -> Arc<MapGraph> {
         let hides_limits = self.limits && map.lanes().iter().any(|l| l.speed_limit.is_some());
         let unstated = map.unstated();
-        let hides_rest = (self.stop_signs && !unstated.stop_signs)
-            || (self.lights && !unstated.lights);
+        let hides_rest =
+            (self.stop_signs && !unstated.stop_signs) || (self.lights && !unstated.lights);
         if !hides_limits && !hides_rest {
             return Arc::clone(map);
         }

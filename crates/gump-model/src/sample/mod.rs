@@ -28,8 +28,8 @@ use crate::exact::ExactFrames;
 use crate::network::Network;
 use crate::surroundings::Survey;
 
-pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
 use self::hidden::Hidden;
+pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
 use self::targets::{class_targets, control_targets, light_targets, targets};
 pub(crate) use self::window::Driven;
 use self::window::{Window, choose_window};

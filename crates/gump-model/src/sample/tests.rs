@@ -251,14 +251,21 @@ fn what_is_hidden_is_unknown_and_what_is_asked_stays() {
         let plane = sample.raster.data.chunks(16 * 16).nth(plane).unwrap();
         plane.iter().copied().fold(0.0, f32::max)
     };
-    for layer in [Layer::StopLine, Layer::TrafficLightRed] {
-        assert_eq!((most(&told, layer), most(&hidden, layer)), (1.0, 0.0), "{layer}");
+    for layer in [Layer::StopLine, Layer::TrafficLightOccupancy] {
+        assert_eq!(
+            (most(&told, layer), most(&hidden, layer)),
+            (1.0, 0.0),
+            "{layer}"
+        );
     }
     // Lane 2 states no limit, and hidden ones look the same.
     let typical = (gump_scene::TYPICAL_SPEED_LIMIT / 24.0) as f32;
     assert_eq!(most(&hidden, Layer::SpeedLimit), typical);
     let unstated = scenario.map.unstated();
-    assert!(!unstated.stop_signs && !unstated.lights, "the scene itself stays");
+    assert!(
+        !unstated.stop_signs && !unstated.lights,
+        "the scene itself stays"
+    );
     let sizes = |sample: &Sample| {
         let exact = sample.slots.iter().filter_map(|placed| placed.exact);
         exact.filter(|exact| exact.has_size).count()

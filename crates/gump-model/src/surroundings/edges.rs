@@ -119,10 +119,7 @@ mod tests {
 
     fn edges(points: &[(f64, f64)]) -> Vec<Edge> {
         let points = points.iter().map(|&(x, y)| dvec2(x, y)).collect();
-        Edge::of(
-            &Polyline::new(points).expect("two points"),
-            Pose::default(),
-        )
+        Edge::of(&Polyline::new(points).expect("two points"), Pose::default())
     }
 
     #[test]
