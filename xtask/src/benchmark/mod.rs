@@ -115,10 +115,8 @@ impl List {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read the list {}", path.display()))?;
         let list: Self = toml::from_str(&text).map_err(|error| {
-            let line = text[..error.span().map_or(0, |span| span.start)]
-                .lines()
-                .count()
-                .max(1);
+            let before = &text[..error.span().map_or(0, |span| span.start)];
+            let line = 1 + before.matches('\n').count();
             anyhow::anyhow!(
                 "expected a list of scenes, found in line {line} of {}: {}",
                 path.display(),
