@@ -22,7 +22,7 @@ use super::operands::Operands;
 use super::rows::add_to;
 
 /// A part of the gradient of a matrix `[R, C]`.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) enum Part {
     /// `dy^T x`, of `x` `[.., C]` and `dy` `[.., R]`.
     Product {
@@ -69,6 +69,13 @@ impl Deferred {
         parts.push((matrix.id(), part));
     }
 
+    /// What was noted for `matrix`; the notes are free again for other threads meanwhile.
+    fn parts_of(&self, matrix: &Tensor) -> Vec<Part> {
+        let parts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = parts.iter().filter(|(of, _)| *of == matrix.id());
+        own.map(|(_, part)| part.clone()).collect()
+    }
+
     /// Adds what was noted for `matrix`, in the order of `all`, to its gradient so far; `None` where
     /// there is neither.
     ///
@@ -80,8 +87,7 @@ impl Deferred {
     ) -> Result<Option<Tensor>> {
         let mut gradient: Option<Vec<f32>> = None;
         for deferred in all {
-            let parts = deferred.0.lock().unwrap_or_else(PoisonError::into_inner);
-            for (_, part) in parts.iter().filter(|(of, _)| *of == matrix.id()) {
+            for part in deferred.parts_of(matrix) {
                 let mut is_zero = false;
                 let numbers = match &mut gradient {
                     Some(numbers) => numbers,

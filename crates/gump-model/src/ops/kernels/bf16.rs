@@ -155,7 +155,7 @@ thread_local! {
 
 /// A right matrix, packed once for many products.
 #[derive(Debug)]
-pub(super) struct Right {
+pub(in crate::ops) struct Right {
     /// Per piece of the depth, its panels.
     pieces: Vec<Pairs>,
     depth: usize,

@@ -32,7 +32,7 @@ fn rounded(mat: Mat<'_>) -> Vec<f32> {
 
 /// A right matrix `[depth, columns]`, rounded.
 #[derive(Debug)]
-pub(super) struct Right {
+pub(in crate::ops) struct Right {
     numbers: Vec<f32>,
     columns: usize,
 }
