@@ -224,7 +224,7 @@ impl Training {
         let sources = self.sources.iter().zip(starts);
         sources.flat_map(|((end, source), begin)| {
             (0..end - begin).filter_map(move |i| match source {
-                Source::Held(held) => held.iter().nth(i).map(|scene| scene.id.as_str()),
+                Source::Held(held) => held.get(i).map(|scene| scene.id.as_str()),
                 Source::Cached { cache, start } => cache.id(start + i),
             })
         })
