@@ -2,8 +2,9 @@
 //!
 //! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
 //! about many futures at once, [`Reward`] says what is wanted. The benchmarks of the field are
-//! modules: [`wosac`] for realism, [`motion`] for prediction, [`mmd`] for scene generation. Nothing
-//! here steps a simulation or reads a file.
+//! modules: [`wosac`] for realism, [`motion`] for prediction, [`mmd`] for scene generation.
+//! [`statistics`] says what any set of scenes is like. Nothing here steps a simulation or reads a
+//! file.
 //!
 //! # Terms
 //! * **metric** measures, **reward** combines, **score** is the number with its parts.
@@ -57,6 +58,7 @@ mod progress;
 mod red_light;
 mod reward;
 mod road_edge;
+pub mod statistics;
 mod summary;
 pub mod tags;
 pub mod wosac;
