@@ -101,9 +101,12 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     let road = &plan.roads[at.0];
     let driveway = road.half_width(!at.2) + DRIVEWAY;
     let length = rng.random_range(45.0..85.0_f64).min(1.4 * extent - start.position.length());
+    if length < 35.0 {
+        return false;
+    }
     let whole = bend(start, driveway + length, &[]);
     let whole = Track::through(&whole);
-    if length < 35.0 || !is_clear(plan, at.0, &whole, aisle.half_width(true)) {
+    if !is_clear(plan, at.0, &whole, aisle.half_width(true)) {
         return false;
     }
     let node = split(plan, at, Control::MinorYield, false, rng);
