@@ -14,6 +14,7 @@
 mod attention;
 mod batch_norm;
 mod conv;
+mod edge_attention;
 mod gelu;
 mod gemm;
 mod gru;
@@ -28,6 +29,7 @@ pub use attention::{
 };
 pub use batch_norm::batch_norm;
 pub use conv::conv2d;
+pub use edge_attention::{Edges, edge_attention};
 pub use gelu::gelu;
 pub use gemm::square_product;
 pub use gru::gru;
@@ -35,6 +37,7 @@ pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
 
+pub(crate) use edge_attention::{Heads, attend};
 pub(crate) use gelu::gelu_row;
 pub(crate) use gemm::{tile, wide};
 pub(crate) use gru::gru_row;
