@@ -126,7 +126,7 @@ pub fn edge_attention(
 
 /// One row of the result from one row of queries; `source` gives the keys and values of an edge
 /// (`[2 H d]`), `feature` its features (`[F]`). `scores` is scratch and holds the attention weights
-/// afterwards, `[edges, H]`.
+/// afterwards, `[H, edges]`.
 #[inline(always)]
 pub(crate) fn attend<'a>(
     heads: Heads,
@@ -169,8 +169,11 @@ fn weigh<'a>(
     for e in 0..n_edges {
         let (key, feature) = (&source(e)[..n * d], &feature(e)[..f]);
         for h in 0..n {
-            scores[h * n_edges + e] = scale * product(&q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d])
-                + product(&u[h * f..(h + 1) * f], feature);
+            let mut lanes = Lanes::default();
+            lanes.add(&q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d]);
+            lanes.scale(scale);
+            lanes.add(&u[h * f..(h + 1) * f], feature);
+            scores[h * n_edges + e] = lanes.sum();
         }
     }
     for scores in scores.chunks_exact_mut(n_edges.max(1)) {
@@ -180,31 +183,50 @@ fn weigh<'a>(
     }
 }
 
-/// Inner product in sixteen fixed lanes: rows here are short.
-#[inline(always)]
-fn product(x: &[f32], y: &[f32]) -> f32 {
-    let mut lanes = [0.0f32; 16];
-    let (xs, ys) = (x.as_chunks::<16>(), y.as_chunks::<16>());
-    for (x, y) in xs.0.iter().zip(ys.0) {
-        for i in 0..16 {
-            lanes[i] += x[i] * y[i];
+/// A sum of products in sixteen fixed lanes: rows here are short.
+#[derive(Default)]
+struct Lanes([f32; 16]);
+
+impl Lanes {
+    #[inline(always)]
+    fn add(&mut self, x: &[f32], y: &[f32]) {
+        let ((xs, x_tail), (ys, y_tail)) = (x.as_chunks::<16>(), y.as_chunks::<16>());
+        for (x, y) in xs.iter().zip(ys) {
+            for i in 0..16 {
+                self.0[i] += x[i] * y[i];
+            }
+        }
+        for (i, (x, y)) in x_tail.iter().zip(y_tail).enumerate() {
+            self.0[i] += x * y;
         }
     }
-    for (i, (x, y)) in xs.1.iter().zip(ys.1).enumerate() {
-        lanes[i] += x * y;
+
+    #[inline(always)]
+    fn scale(&mut self, by: f32) {
+        self.0.iter_mut().for_each(|lane| *lane *= by);
     }
-    for width in [8, 4, 2, 1] {
-        for i in 0..width {
-            lanes[i] += lanes[i + width];
+
+    #[inline(always)]
+    fn sum(mut self) -> f32 {
+        for width in [8, 4, 2, 1] {
+            for i in 0..width {
+                self.0[i] += self.0[i + width];
+            }
         }
+        self.0[0]
     }
-    lanes[0]
 }
 
 /// `out += by * x`
 #[inline(always)]
 fn add_scaled(out: &mut [f32], by: f32, x: &[f32]) {
-    for (out, x) in out.iter_mut().zip(x) {
+    let ((outs, out_tail), (xs, x_tail)) = (out.as_chunks_mut::<16>(), x.as_chunks::<16>());
+    for (out, x) in outs.iter_mut().zip(xs) {
+        for i in 0..16 {
+            out[i] += by * x[i];
+        }
+    }
+    for (out, x) in out_tail.iter_mut().zip(x_tail) {
         *out += by * x;
     }
 }
@@ -302,9 +324,10 @@ impl EdgeAttention {
         for e in 0..n_edges {
             let (value, feature) = (&source(e)[n * d..], feature(e));
             for h in 0..n {
-                slopes[h * n_edges + e] =
-                    product(&d_values[h * d..(h + 1) * d], &value[h * d..(h + 1) * d])
-                        + product(&d_averages[h * f..(h + 1) * f], feature);
+                let mut lanes = Lanes::default();
+                lanes.add(&d_values[h * d..(h + 1) * d], &value[h * d..(h + 1) * d]);
+                lanes.add(&d_averages[h * f..(h + 1) * f], feature);
+                slopes[h * n_edges + e] = lanes.sum();
             }
         }
         let rows = slopes.chunks_exact_mut(n_edges.max(1));

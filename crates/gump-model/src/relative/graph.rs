@@ -122,9 +122,9 @@ impl Shown {
         let change = if self.earlier.is_some() { faster } else { 0.0 };
         writer.put([
             change,
-            (change * 5.0).tanh(),
+            bend(change * 5.0),
             (self.stood / 5.0).min(2.0),
-            (self.stood / 0.8).tanh(),
+            bend(self.stood),
             self.velocity().length() / 10.0,
         ]);
         out
@@ -143,12 +143,12 @@ fn put_step(writer: &mut Writer<'_>, step: Pose) {
     let p = step.position;
     writer.put([
         p.x / 5.0,
-        (p.x / 0.5).tanh(),
+        bend(p.x / 0.5),
         p.y,
-        (p.y * 10.0).tanh(),
+        bend(p.y * 10.0),
         step.heading * 2.0,
-        (step.heading * 20.0).tanh(),
-        (step.heading * 100.0).tanh(),
+        bend(step.heading * 20.0),
+        bend(step.heading * 100.0),
     ]);
 }
 
@@ -179,31 +179,70 @@ const OF_NEIGHBOUR: usize = OF_PAST + 1;
 const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
 
-/// An edge of this kind to something at `pose`, seen from `from`.
-fn relative(kind: usize, from: Pose, pose: Pose) -> EdgeRow {
+/// A place and a direction, whose sine and cosine are taken once for many edges.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Axes {
+    pub(super) origin: DVec2,
+    pub(super) direction: DVec2,
+}
+
+impl Axes {
+    pub(super) fn of(pose: Pose) -> Self {
+        Self {
+            origin: pose.position,
+            direction: pose.direction(),
+        }
+    }
+
+    /// A vector along these axes.
+    pub(super) fn turn(self, vector: DVec2) -> DVec2 {
+        let (ahead, left) = (self.direction.dot(vector), self.direction.perp_dot(vector));
+        DVec2::new(ahead, left)
+    }
+
+    /// A point seen from here.
+    pub(super) fn see(self, point: DVec2) -> DVec2 {
+        self.turn(point - self.origin)
+    }
+}
+
+/// An edge of this kind to something at `to`, seen from `from`.
+fn relative(kind: usize, from: Axes, to: Axes) -> EdgeRow {
     let mut out = [0.0; EDGE_NUMBERS];
     out[kind] = 1.0;
-    let local = from.inverse() * pose;
-    let p = local.position;
+    let (p, direction) = (from.see(to.origin), from.turn(to.direction));
     let away = p.length();
+    // Fine where directions are nearly equal; the same at both ends of a turn of half a circle.
+    let bent = 10.0 * direction.y;
+    let near = fast_exp(-away / 12.0);
     Writer(&mut out[KINDS..]).put([
         p.x / 30.0,
         p.y / 30.0,
-        (p.x / 6.0).tanh(),
-        (p.y / 2.0).tanh(),
-        local.heading.cos(),
-        local.heading.sin(),
-        (local.heading * 10.0).tanh(),
+        bend(p.x / 6.0),
+        bend(p.y / 2.0),
+        direction.x,
+        direction.y,
+        bend(bent),
         away / 30.0,
-        (-away / 3.0).exp(),
-        (-away / 12.0).exp(),
+        near * near * near * near,
+        near,
     ]);
     out
 }
 
+/// From -1 to 1, steep around 0.
+fn bend(x: f64) -> f64 {
+    x / (1.0 + x.abs())
+}
+
+/// e to a number that is not above 0.
+fn fast_exp(x: f64) -> f64 {
+    f64::from((x as f32).exp())
+}
+
 /// The edge to the node's own state `ago` frames before; 0 is itself.
 pub(super) fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
-    let mut out = relative(0, now.pose, then.pose);
+    let mut out = relative(0, Axes::of(now.pose), Axes::of(then.pose));
     out[OF_PAST] = ago as f32 / PAST as f32;
     out
 }
@@ -242,12 +281,12 @@ fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: 
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBOURS);
+    let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
     for (_, j) in near {
         let other = &agents[j];
-        let mut row = relative(1, own.pose, other.pose);
-        let local = own.pose.inverse();
-        let place = local * other.pose.position;
-        let velocity = local.rotate(other.velocity() - own.velocity());
+        let mut row = relative(1, from, Axes::of(other.pose));
+        let place = from.see(other.pose.position);
+        let velocity = from.turn(other.velocity() - own_velocity);
         let (body, class) = (other.body, class_index(other.body.kind));
         // When they are nearest if both keep their velocities, and how near.
         let speed = velocity.length_squared();
@@ -266,10 +305,10 @@ fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: 
             mark(class == 1),
             mark(class == 2),
             mark(other.stands()),
-            (ahead / 5.0).tanh(),
-            (aside / 1.5).tanh(),
-            (-soon / 2.0).exp(),
-            (nearest / 3.0).tanh(),
+            bend(ahead / 3.0),
+            bend(aside),
+            fast_exp(-soon / 2.0),
+            bend(nearest / 2.0),
             mark(other.tracked),
         ]);
         on_paths(map, other, paths, &mut row);
@@ -282,8 +321,8 @@ fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
     for (k, path) in paths.iter().enumerate().take(PATHS) {
         let at = path.iter().find_map(|&(i, away)| {
             let piece = &map.pieces[i as usize];
-            let local = piece.pose.inverse() * other.pose.position;
-            if local.x.abs() > 6.0 {
+            let local = piece.axes.see(other.pose.position);
+            if local.x.abs() > 6.0 || local.y.abs() > 8.0 {
                 return None;
             }
             let (distance, _) = piece.offset(other.pose.position);
@@ -292,12 +331,13 @@ fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
         if let Some(away) = at.filter(|away| *away > 0.0) {
             row[OF_PATH + k] = 1.0;
             row[OF_PATH + 3] = (away / 30.0) as f32;
-            row[OF_PATH + 4] = (away / 6.0).tanh() as f32;
+            row[OF_PATH + 4] = bend(away / 6.0) as f32;
         }
     }
 }
 
 fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &mut View) {
+    let axes = Axes::of(own.pose);
     // Of a piece on several paths the first distance, which all share.
     let mut ahead: Vec<(u32, f64, [bool; PATHS])> = Vec::new();
     for (k, path) in paths.iter().enumerate().take(PATHS) {
@@ -309,12 +349,12 @@ fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &m
         }
     }
     for &(i, away, on) in &ahead {
-        let mut row = map_edge(map, lights, own, i);
+        let mut row = map_edge(map, lights, axes, i);
         for (k, on) in on.into_iter().enumerate() {
             row[OF_PATH + k] = f32::from(u8::from(on));
         }
         row[OF_PATH + 3] = (away / 30.0) as f32;
-        row[OF_PATH + 4] = (away / 6.0).tanh() as f32;
+        row[OF_PATH + 4] = bend(away / 6.0) as f32;
         row[OF_PATH + 5] = 1.0;
         view.pieces.push((i, row));
     }
@@ -325,7 +365,7 @@ fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &m
             continue;
         }
         let piece = &map.pieces[i as usize];
-        let end = |k: usize| (piece.pose * piece.shape[k]).distance_squared(from);
+        let end = |k: usize| piece.line[k].distance_squared(from);
         let away = end(0).min(end(2)).min(end(4));
         if away < MAP_REACH_M * MAP_REACH_M {
             let kind = match piece.kind {
@@ -343,33 +383,33 @@ fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &m
         }
         near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         for &(_, i) in near.iter() {
-            view.pieces.push((i, map_edge(map, lights, own, i)));
+            view.pieces.push((i, map_edge(map, lights, axes, i)));
         }
     }
 }
 
-fn map_edge(map: &VectorMap, lights: &Lights, own: &Shown, i: u32) -> EdgeRow {
+fn map_edge(map: &VectorMap, lights: &Lights, from: Axes, i: u32) -> EdgeRow {
     let piece = &map.pieces[i as usize];
     let kind = match piece.kind {
         PieceKind::Lane => 2,
         PieceKind::Edge => 3,
         PieceKind::Area => 4,
     };
-    let mut row = relative(kind, own.pose, piece.pose);
-    let (distance, left) = piece.offset(own.pose.position);
+    let mut row = relative(kind, from, piece.axes);
+    let (distance, left) = piece.offset(from.origin);
     let (light, elapsed) = match lights.of(piece.lane) {
         Some((state, elapsed)) => (Some(state), elapsed),
         None => (None, None),
     };
     Writer(&mut row[OF_LANE..]).put([
-        (distance / 5.0).tanh(),
-        (left / 2.0).tanh(),
-        (left * 2.0).tanh(),
+        bend(distance / 3.0),
+        bend(left),
+        bend(left * 4.0),
         mark(light == Some(LightState::Green)),
         mark(light == Some(LightState::Yellow)),
         mark(light == Some(LightState::Red)),
         mark(light == Some(LightState::Unknown)),
-        elapsed.map_or(0.0, |s| (s / 10.0).tanh()),
+        elapsed.map_or(0.0, |s| bend(s / 8.0)),
         mark(light.is_some() && elapsed.is_none()),
         mark(piece.starts_lane),
     ]);
@@ -407,7 +447,7 @@ mod tests {
     #[test]
     fn what_is_seen_does_not_depend_on_the_place() {
         let scenario = gump_scene::fixture::scenario(
-            "lane 1: 0,0 100,0 speed 15 then 2
+            "lane 1: 0,0 100,0 speed 15 next 2
              lane 2: 100,0 180,30
              ego vehicle 0: 10,0 velocity 8,0",
         )

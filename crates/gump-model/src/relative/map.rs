@@ -8,6 +8,8 @@ use std::collections::BTreeMap;
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_scene::{AreaKind, LaneId, LaneKind, MapGraph, RoadEdgeKind};
 
+use super::graph::Axes;
+
 /// Longest piece of a lane, metres.
 const LANE_PIECE_M: f64 = 8.0;
 /// Longest piece of a road edge, metres.
@@ -48,8 +50,12 @@ pub(super) struct Piece {
     /// The middle, along the direction of travel; of an area its centre, along its longer side.
     pub(super) pose: Pose,
     pub(super) kind: PieceKind,
+    /// The same as axes.
+    pub(super) axes: Axes,
     /// Its line in its own frame, from the first point to the last.
     pub(super) shape: [DVec2; SHAPE],
+    /// The same in the world.
+    pub(super) line: [DVec2; SHAPE],
     /// The lane it belongs to.
     pub(super) lane: Option<LaneId>,
     pub(super) starts_lane: bool,
@@ -62,7 +68,7 @@ pub(super) struct Piece {
 impl Piece {
     /// Distance of a point to the line of the piece, metres, and how far the point lies to its left.
     pub(super) fn offset(&self, point: DVec2) -> (f64, f64) {
-        let local = self.pose.inverse() * point;
+        let local = self.axes.see(point);
         let mut best = (f64::INFINITY, 0.0);
         for pair in self.shape.windows(2) {
             let (a, along) = (pair[0], pair[1] - pair[0]);
@@ -234,7 +240,7 @@ impl VectorMap {
         let mut paths = Vec::new();
         for &(_, start) in starts.iter().take_while(|s| s.0 <= best + ALTERNATIVE_M) {
             let piece = &self.pieces[start as usize];
-            let along = (piece.pose.inverse() * from.position).x;
+            let along = piece.axes.see(from.position).x;
             self.follow(&mut Vec::new(), start, -along, &mut paths);
         }
         self.most_different(paths, from)
@@ -319,11 +325,13 @@ fn piece(
         position: points[SHAPE / 2],
         heading,
     };
-    let local = pose.inverse();
+    let axes = Axes::of(pose);
     Piece {
         pose,
+        axes,
         kind,
-        shape: points.map(|p| local * p),
+        shape: points.map(|p| axes.see(p)),
+        line: points,
         lane,
         starts_lane: false,
         length: step,
@@ -349,10 +357,19 @@ fn area_piece(ring: &[DVec2]) -> Option<Piece> {
         high = high.max(point);
     }
     // The corners of the box around it, and its centre.
+    let shape = [
+        low,
+        DVec2::new(low.x, high.y),
+        DVec2::ZERO,
+        high,
+        DVec2::new(high.x, low.y),
+    ];
     Some(Piece {
         pose,
+        axes: Axes::of(pose),
         kind: PieceKind::Area,
-        shape: [low, DVec2::new(low.x, high.y), DVec2::ZERO, high, DVec2::new(high.x, low.y)],
+        line: shape.map(|point| pose * point),
+        shape,
         lane: None,
         starts_lane: false,
         length: high.x - low.x,

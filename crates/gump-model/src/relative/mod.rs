@@ -14,6 +14,8 @@ mod grid;
 mod map;
 mod net;
 mod sample;
+#[cfg(test)]
+mod tests;
 mod train;
 mod world;
 

@@ -14,7 +14,7 @@ use super::graph::{
 use super::grid::{FIELDS, quantize};
 use super::map::{Hidden, PIECE_NUMBERS, VectorMap};
 use crate::ops::Edges;
-use crate::sample::{TOKEN_DT, stride_of};
+use crate::sample::stride_of;
 
 /// How samples are drawn from scenarios.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -91,9 +91,6 @@ impl Sample {
         self.nodes.len() / NODE_NUMBERS
     }
 
-    pub(super) fn n_pieces(&self) -> usize {
-        self.pieces.len() / PIECE_NUMBERS
-    }
 }
 
 /// What a node should say.
@@ -366,11 +363,6 @@ fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     })
 }
 
-/// Seconds that a sample of so many frames covers.
-pub(super) fn seconds(frames: usize) -> f64 {
-    frames.saturating_sub(1) as f64 * TOKEN_DT
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -401,7 +393,6 @@ mod tests {
         assert_eq!(sample.targets.len(), nodes - 3);
         let parked = sample.targets.iter().find(|t| t.node % 3 == 1).unwrap();
         assert_eq!(parked.bins[0], super::super::grid::STANDS);
-        assert!(seconds(3) == 1.0);
     }
 
     #[test]

@@ -78,6 +78,20 @@ impl RelativeWorld {
     }
 }
 
+#[cfg(test)]
+impl RelativeWorld {
+    /// The numbers of the present's nodes and what they end with, agents in the order of their ids.
+    pub(super) fn read_present(
+        &self,
+        scene: SceneState<'_>,
+    ) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
+        let shared = Arc::new(Scene::new(&self.engine, scene));
+        let future = Future::begin(&self.engine, &shared, scene)?;
+        let numbers = future.members.iter().flat_map(|member| member.now().numbers());
+        Ok((numbers.collect(), future.hidden))
+    }
+}
+
 impl WorldModel for RelativeWorld {
     fn name(&self) -> &str {
         "model"
