@@ -6,6 +6,7 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use gump_model::relative::{self, RelativeSampling, RelativeWorld};
 use gump_model::world::TransformerWorld;
 use gump_model::{Device, Outlook, SamplingConfig, Watch, checkpoint};
 use gump_rollout::WorldModel;
@@ -98,6 +99,15 @@ impl World {
             WorldName::Log => anyhow::bail!("the world log needs a scenario to replay"),
             WorldName::Idm => Self::Rule(Box::new(Idm::default())),
             WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
+            WorldName::Model(path) if relative::is_relative(path)? => {
+                let network = relative::load(path, device)?;
+                let sampling = RelativeSampling {
+                    temperature: sampling.temperature,
+                    precision: sampling.precision,
+                    ..RelativeSampling::default()
+                };
+                Self::Rule(Box::new(RelativeWorld::new(&network, sampling)?))
+            }
             WorldName::Model(path) => {
                 let network = checkpoint::load(path, device)?;
                 Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))

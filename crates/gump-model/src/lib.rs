@@ -63,6 +63,7 @@ mod optimizer;
 mod outlook;
 mod parameters;
 mod plain;
+pub mod relative;
 mod sample;
 mod sampling;
 mod scene;

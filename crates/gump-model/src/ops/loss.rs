@@ -126,7 +126,10 @@ impl Targets {
             bail!("cross entropy of {n} rows: {bins} targets, {weights} weights");
         }
         if !self.exact.is_empty() && self.exact.len() != n {
-            bail!("cross entropy of {n} rows: {} marks of exact ones", self.exact.len());
+            bail!(
+                "cross entropy of {n} rows: {} marks of exact ones",
+                self.exact.len()
+            );
         }
         let is_wrong = |s: OrdinalSmoothing| !(s.sigma_bins > 0.0 && s.sigma_bins.is_finite());
         if self.smoothing.is_some_and(is_wrong) {
@@ -346,7 +349,9 @@ fn composed_steps(
         let part = |exact: bool, smoothing| {
             let of_part = |row: usize| asked.is_exact(row) == exact;
             let kept = asked.weights.iter().enumerate();
-            let weights: Vec<f32> = kept.map(|(i, w)| if of_part(i) { *w } else { 0.0 }).collect();
+            let weights: Vec<f32> = kept
+                .map(|(i, w)| if of_part(i) { *w } else { 0.0 })
+                .collect();
             let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
             let weights = Tensor::new(weights, x.device())?;
             masked_cross_entropy(&logits, &bins, &weights, smoothing)? * (sum * asked.scale())

@@ -17,6 +17,7 @@ mod attention;
 mod batch_norm;
 mod conv;
 mod deferred;
+mod edge_attention;
 mod gelu;
 mod gemm;
 mod gru;
@@ -35,6 +36,7 @@ pub use attention::{
 };
 pub use batch_norm::batch_norm;
 pub use conv::conv2d;
+pub use edge_attention::{Edges, edge_attention};
 pub use gelu::gelu;
 pub use gemm::square_product;
 pub use gru::gru;
@@ -45,6 +47,7 @@ pub use norm::layer_norm;
 pub use table::{embedding_sum, table_rows};
 
 pub(crate) use deferred::Deferred;
+pub(crate) use edge_attention::{Heads, attend};
 pub(crate) use gelu::gelu_row;
 pub(crate) use gru::gru_row;
 pub(crate) use kernels::{tile, wide};

@@ -116,6 +116,11 @@ impl Panels {
         }
     }
 
+    /// Columns of what is multiplied.
+    pub(crate) fn n_in(&self) -> usize {
+        self.n_in
+    }
+
     /// Columns of the result.
     pub(crate) fn n_out(&self) -> usize {
         self.n_out

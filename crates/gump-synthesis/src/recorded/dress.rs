@@ -100,7 +100,9 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     let start = start(plan, at, rng.random_range(-0.06..0.06));
     let road = &plan.roads[at.0];
     let driveway = road.half_width(!at.2) + DRIVEWAY;
-    let length = rng.random_range(45.0..85.0_f64).min(1.4 * extent - start.position.length());
+    let length = rng
+        .random_range(45.0..85.0_f64)
+        .min(1.4 * extent - start.position.length());
     if length < 35.0 {
         return false;
     }

@@ -162,12 +162,7 @@ fn draw_demand(
 }
 
 /// A number of the range, small ones more often than large ones, the more so the higher `skew`.
-fn draw_skewed(
-    range: &RangeInclusive<usize>,
-    skew: f64,
-    density: f64,
-    rng: &mut Rng,
-) -> usize {
+fn draw_skewed(range: &RangeInclusive<usize>, skew: f64, density: f64, rng: &mut Rng) -> usize {
     let part: f64 = rng.random_range(0.0..1.0);
     let (low, high) = (*range.start() as f64, *range.end() as f64);
     ((low + (high - low) * part.powf(skew)) * density).round() as usize
@@ -176,7 +171,10 @@ fn draw_skewed(
 /// Leaves the lanes of most car parks off the map, unless the ego drives there.
 fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
     let slow = |lane: &crate::network::NetworkLane| lane.speed_limit < CAR_PARK_SPEED;
-    let ego_parks = ego.places().iter().any(|(lane, _)| slow(&network.lanes[*lane]));
+    let ego_parks = ego
+        .places()
+        .iter()
+        .any(|(lane, _)| slow(&network.lanes[*lane]));
     if !ego_parks && rng.random_bool(UNMAPPED_CAR_PARKS) {
         let lanes = network.lanes.iter().enumerate();
         network.unmapped = lanes.filter(|(_, l)| slow(l)).map(|(i, _)| i).collect();

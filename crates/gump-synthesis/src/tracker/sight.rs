@@ -35,7 +35,10 @@ impl Sight {
             return Self { tracked: None };
         };
         let n = scenario.log.len();
-        let open = Open::of(scenario, seed.fork(0).rng().random_range(tracker.open_m.clone()));
+        let open = Open::of(
+            scenario,
+            seed.fork(0).rng().random_range(tracker.open_m.clone()),
+        );
         let mut visible: BTreeMap<AgentId, Vec<f64>> = BTreeMap::new();
         let every = (LOOK_S / scenario.dt).round().max(1.0) as usize;
         for (step, frame) in scenario.log.iter().enumerate() {
@@ -59,10 +62,15 @@ impl Sight {
                 let frame = &scenario.log[step];
                 let [agent, ego] = [id, scenario.ego].map(|id| frame.agent(id));
                 let both = agent.zip(ego);
-                both.map_or(range, |(a, e)| a.state.pose.position.distance(e.state.pose.position))
+                both.map_or(range, |(a, e)| {
+                    a.state.pose.position.distance(e.state.pose.position)
+                })
             };
             let near = |step| (distance(step) / range).clamp(0.0, 1.0);
-            (id, keep_track(&shares, near, tracker, scenario.dt, ids_seed))
+            (
+                id,
+                keep_track(&shares, near, tracker, scenario.dt, ids_seed),
+            )
         });
         Self {
             tracked: Some(tracked.collect()),
@@ -185,7 +193,12 @@ impl Open {
                 open.add(*point, beside);
             }
         }
-        for area in scenario.map.areas().iter().filter(|a| a.kind == AreaKind::Driveway) {
+        for area in scenario
+            .map
+            .areas()
+            .iter()
+            .filter(|a| a.kind == AreaKind::Driveway)
+        {
             for point in area.polygon.ring() {
                 open.add(*point, AROUND);
             }
@@ -210,7 +223,10 @@ impl Open {
     /// True if the ground on the way is open.
     fn is_between(&self, from: DVec2, to: DVec2) -> bool {
         let n = (from.distance(to) / CELL).ceil() as usize;
-        (1..n).all(|k| self.cells.contains(&cell(from.lerp(to, k as f64 / n as f64))))
+        (1..n).all(|k| {
+            self.cells
+                .contains(&cell(from.lerp(to, k as f64 / n as f64)))
+        })
     }
 }
 

@@ -40,7 +40,10 @@ impl Args {
     fn provenance(&self) -> String {
         let name = |path: &PathBuf| {
             let parts = path.components().rev().take(2).collect::<Vec<_>>();
-            let parts = parts.iter().rev().map(|part| part.as_os_str().to_string_lossy());
+            let parts = parts
+                .iter()
+                .rev()
+                .map(|part| part.as_os_str().to_string_lossy());
             parts.collect::<Vec<_>>().join("/")
         };
         let names: Vec<String> = self.paths.iter().map(name).collect();

@@ -287,7 +287,12 @@ impl<'a> Work<'a> {
                 store,
                 scale,
             };
-            rows_product(unit, lhs.part((first, to.rows), piece), (panels, pairs), &mut to);
+            rows_product(
+                unit,
+                lhs.part((first, to.rows), piece),
+                (panels, pairs),
+                &mut to,
+            );
         };
         let at_once = (ROWS_AT_ONCE * stride).max(1);
         if self.is_shared {

@@ -138,7 +138,13 @@ impl Args {
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(run, &scenarios.set, &entries, &config, forecaster.decoding())
+        tell::tell(
+            run,
+            &scenarios.set,
+            &entries,
+            &config,
+            forecaster.decoding(),
+        )
     }
 
     fn open(&self, scenarios: &Found) -> anyhow::Result<gump_data::Reader> {
