@@ -91,7 +91,7 @@ fn replay_starts_anywhere_in_the_log_and_lets_the_ego_be_driven() {
     // A scene whose ego has left the log is still recognised by the others.
     let history = [first];
     let again = Start {
-        scene: gump_scene::SceneState {
+        scene: SceneState {
             history: &history,
             ..scenario.present()
         },

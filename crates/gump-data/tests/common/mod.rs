@@ -12,6 +12,7 @@ use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 #[path = "../../../../tests/shared.rs"]
 mod shared_data;
 
+#[allow(unused_imports, reason = "each test file uses a part of this")]
 pub(crate) use shared_data::shared;
 
 /// A Parquet file whose rows fit into one batch.
