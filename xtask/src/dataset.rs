@@ -10,6 +10,7 @@ use gump_model::{ModelError, Scenes};
 use gump_scene::Scenario;
 use serde::{Deserialize, Serialize};
 
+use crate::fresh::{Fresh, Stream};
 use crate::progress::Progress;
 use crate::run::stop_if_interrupted;
 
@@ -185,10 +186,13 @@ pub(crate) fn read_first(
     Ok(scenarios)
 }
 
-/// Scenarios to train on: those in a cache stay there until they are asked for, others are held.
+/// Scenarios to train on: those in a cache stay there until they are asked for, others are held;
+/// or a stream of scenes that are made up.
 pub(crate) struct Training {
     /// Each with the number of the first scenario after it.
     sources: Vec<(usize, Source)>,
+    /// Takes the place of all sources.
+    fresh: Option<Fresh>,
 }
 
 enum Source {
@@ -215,7 +219,18 @@ impl Training {
             };
             sources.push((end, source));
         }
-        Ok(Self { sources })
+        Ok(Self {
+            sources,
+            fresh: None,
+        })
+    }
+
+    /// A stream, for steps of `batch` samples.
+    pub(crate) fn fresh(stream: Stream, batch: usize) -> Self {
+        Self {
+            sources: Vec::new(),
+            fresh: Some(Fresh::start(stream, batch)),
+        }
     }
 
     /// The ids of all.
@@ -224,7 +239,7 @@ impl Training {
         let sources = self.sources.iter().zip(starts);
         sources.flat_map(|((end, source), begin)| {
             (0..end - begin).filter_map(move |i| match source {
-                Source::Held(held) => held.iter().nth(i).map(|scene| scene.id.as_str()),
+                Source::Held(held) => held.as_slice().get(i).map(|scene| scene.id.as_str()),
                 Source::Cached { cache, start } => cache.id(start + i),
             })
         })
@@ -233,10 +248,21 @@ impl Training {
 
 impl Scenes for Training {
     fn len(&self) -> usize {
-        self.sources.last().map_or(0, |(end, _)| *end)
+        let held = self.sources.last().map_or(0, |(end, _)| *end);
+        self.fresh.as_ref().map_or(held, Fresh::len)
+    }
+
+    fn pick(&self, step: usize, draw: u64) -> usize {
+        match &self.fresh {
+            Some(fresh) => fresh.pick(step, draw),
+            None => (draw % self.len() as u64) as usize,
+        }
     }
 
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+        if let Some(fresh) = &self.fresh {
+            return fresh.get(index);
+        }
         let missing = || ModelError::Scene(format!("there is no scenario {index}"));
         let i = self.sources.partition_point(|(end, _)| *end <= index);
         let begin = i.checked_sub(1).map_or(0, |before| self.sources[before].0);

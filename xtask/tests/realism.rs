@@ -3,7 +3,6 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use gump_metrics::wosac::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
@@ -91,7 +90,6 @@ fn scores(scenarios: &[Scenario], world: &dyn WorldModel) -> Scores {
 
 #[test]
 fn shipped_weights_are_as_realistic_as_they_were() {
-    let began = Instant::now();
     let scenarios = SCENES.map(|name| {
         let path = datasets().join("mini").join(name);
         gump_data::find(&path.display().to_string()).unwrap()
@@ -122,6 +120,5 @@ fn shipped_weights_are_as_realistic_as_they_were() {
         at_least("map-based", found.map_based, floor.map_based);
         at_least("minADE, negative", -found.min_ade, -floor.min_ade);
     }
-    eprintln!("{:.1} s", began.elapsed().as_secs_f64());
     assert!(short.is_empty(), "{}", short.join("; "));
 }

@@ -3,7 +3,8 @@
 //! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
 //! about many futures at once, [`Reward`] says what is wanted. The benchmarks of the field are
 //! modules: [`wosac`] for realism, [`motion`] for prediction, [`mmd`] for scene generation;
-//! [`behaviour`] counts what a driver would notice. Nothing here steps a simulation or reads a
+//! [`behaviour`] counts what a driver would notice, [`statistics`] says what any set of scenes is
+//! like. Nothing here steps a simulation or reads a
 //! file.
 //!
 //! # Terms
@@ -59,6 +60,7 @@ mod progress;
 mod red_light;
 mod reward;
 mod road_edge;
+pub mod statistics;
 mod summary;
 pub mod tags;
 pub mod wosac;

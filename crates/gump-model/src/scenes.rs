@@ -18,7 +18,16 @@ pub trait Scenes: Send + Sync {
         self.len() == 0
     }
 
-    /// Scenario `index`, which is below [`Scenes::len`].
+    /// The scenario that a sample of a training step shows, told from a number drawn at random.
+    ///
+    /// Collections that change over time answer for the time of the step; [`Scenes::get`] must know
+    /// every answer, however long ago the step was.
+    fn pick(&self, step: usize, draw: u64) -> usize {
+        let _ = step;
+        (draw % self.len() as u64) as usize
+    }
+
+    /// Scenario `index`, which is below [`Scenes::len`] or was picked.
     ///
     /// # Errors
     /// [`ModelError::Scene`] for one that cannot be fetched.

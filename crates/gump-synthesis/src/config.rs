@@ -50,7 +50,7 @@ impl SynthesisConfig {
     /// What a version of the generator asked for, field by field: it stays as it is when
     /// [`Self::standard`] moves on. `None` for a version that does not exist.
     pub fn of_version(version: u32) -> Option<Self> {
-        (version == 1).then(|| Self {
+        (version == 1).then_some(Self {
             history_s: 1.0,
             future_s: 8.0,
             dt: 0.1,

@@ -325,7 +325,7 @@ fn crosswalk_node(control: Control) -> NodePlan {
 }
 
 /// A road style without a course yet: `n` lanes each way and what usually goes with them.
-fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
+pub(crate) fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
     let median = match n {
         1 => 0.0,
         _ if rng.random_bool(0.4) => rng.random_range(1.8..4.5),
@@ -345,6 +345,7 @@ fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
         median,
         bike_lanes: rng.random_bool(0.25),
         parking: n <= 2 && rng.random_bool(0.55),
+        bays: false,
         sidewalks: rng.random_bool(0.9),
         speed_limit: rng.random_range(speed),
         major,

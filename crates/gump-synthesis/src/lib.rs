@@ -1,7 +1,8 @@
 //! Scenarios made up from nothing: procedural roads and rule-driven traffic.
 //!
 //! Free of any recording and of its licence, endless, and the same for the same seed. Start with
-//! [`synthesize`]. Scenes that SUMO simulates begin with [`draw_sumo_demand`]; running SUMO is the
+//! [`synthesize`], or with [`Profile`] for scenes like recorded ones, which [`track`] shows as a
+//! vehicle's sensors would. Scenes that SUMO simulates begin with [`draw_sumo_demand`]; running SUMO is the
 //! driver's affair, reading what it puts out that of `gump_data::sumo`.
 //!
 //! ```
@@ -20,10 +21,13 @@ mod layout;
 mod map;
 mod network;
 mod plan;
+mod profile;
 mod record;
+mod recorded;
 mod scenario;
 mod smooth;
 mod sumo_demand;
+mod tracker;
 mod traffic;
 
 /// Version of the generators: it grows whenever a seed gives another scene than before.
@@ -35,6 +39,8 @@ pub const GENERATOR_VERSION: u32 = 1;
 
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;
+pub use profile::Profile;
 pub use scenario::{synthesize, synthesize_many, try_synthesize};
 pub use smooth::smooth_motion;
+pub use tracker::{Tracker, track};
 pub use sumo_demand::{SumoDemand, draw_sumo_demand};

@@ -58,7 +58,8 @@ pub(crate) fn build_map(network: &Network, placement: &Placement) -> Result<MapG
         next_id
     };
     let mut parts = MapParts::default();
-    for (i, lane) in network.lanes.iter().enumerate() {
+    let lanes = network.lanes.iter().enumerate();
+    for (i, lane) in lanes.filter(|(i, _)| !network.unmapped.contains(i)) {
         parts.lanes.push(map_lane(network, i, lane, placement));
     }
     for (kind, points) in &network.furniture.lines {
@@ -119,7 +120,7 @@ fn map_lane(network: &Network, i: LaneIdx, lane: &NetworkLane, placement: &Place
     Lane {
         kind: lane.kind,
         width: lane.width,
-        speed_limit: Some(lane.speed_limit),
+        speed_limit: (!network.hides_limits).then_some(lane.speed_limit),
         in_intersection: lane.connector.as_ref().is_some_and(|connector| {
             network.junctions[connector.junction].control != crate::plan::Control::Free
         }),

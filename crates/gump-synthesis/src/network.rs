@@ -13,6 +13,8 @@ mod signal;
 
 pub(crate) use signal::Cycle;
 
+use std::collections::BTreeSet;
+
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{AreaKind, LaneKind, RoadEdgeKind, RoadLineKind};
 
@@ -37,10 +39,16 @@ pub(crate) struct Network {
     pub(crate) n_walk_nodes: usize,
     /// Middles of parking strips, in the direction of the lane beside them.
     pub(crate) parking: Vec<Track>,
+    /// Middles of strips where cars park at right angles, in the direction of the lane beside them.
+    pub(crate) bays: Vec<Track>,
     /// Places of parking lots, as a car would stand in them.
     pub(crate) lot_places: Vec<Pose>,
     /// What is only drawn.
     pub(crate) furniture: Furniture,
+    /// The map states no speed limits, though vehicles keep to them.
+    pub(crate) hides_limits: bool,
+    /// Lanes that are not on the map, as those of car parks often are.
+    pub(crate) unmapped: BTreeSet<LaneIdx>,
 }
 
 /// Curbs, paint and surfaces.

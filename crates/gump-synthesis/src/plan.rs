@@ -11,6 +11,8 @@ const GUTTER: f64 = 0.4;
 pub(crate) const BIKE_LANE_WIDTH: f64 = 1.8;
 /// Width of a strip of parked cars, metres.
 pub(crate) const PARKING_WIDTH: f64 = 2.4;
+/// Depth of a strip of cars parked at right angles to the road, metres.
+pub(crate) const BAY_DEPTH: f64 = 5.8;
 
 /// Junctions and the roads that join them.
 #[derive(Clone, Debug, Default)]
@@ -68,6 +70,8 @@ pub(crate) struct RoadPlan {
     pub(crate) bike_lanes: bool,
     /// Parking strips along the curbs.
     pub(crate) parking: bool,
+    /// Cars park at right angles to the road, as in car parks, instead of along it.
+    pub(crate) bays: bool,
     /// Sidewalks beyond the curbs.
     pub(crate) sidewalks: bool,
     /// Metres per second.
@@ -103,7 +107,12 @@ impl RoadPlan {
 
     /// Distance of the middle of the parking strip from the reference, metres.
     pub(crate) fn parking_offset(&self, forward: bool) -> f64 {
-        self.half_width(forward) - GUTTER - PARKING_WIDTH / 2.0
+        self.half_width(forward) - GUTTER - self.parking_depth() / 2.0
+    }
+
+    /// How far parked cars reach from the curb, metres.
+    fn parking_depth(&self) -> f64 {
+        if self.bays { BAY_DEPTH } else { PARKING_WIDTH }
     }
 
     /// Distance of the curb from the reference on the side of one direction, metres.
@@ -115,7 +124,11 @@ impl RoadPlan {
             } else {
                 0.0
             };
-            half += if self.parking { PARKING_WIDTH } else { 0.0 };
+            half += if self.parking {
+                self.parking_depth()
+            } else {
+                0.0
+            };
         }
         half
     }

@@ -1,9 +1,9 @@
 //! What was seen of running traffic, frame by frame and track by track.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use gump_geometry::{DVec2, OrientedBox, Pose, wrap_angle};
-use gump_scene::{Agent, AgentId, AgentState, LightState};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
 
 use crate::map::Placement;
 use crate::network::LaneIdx;
@@ -70,6 +70,53 @@ impl Recording {
     /// Lights in a frame.
     pub(crate) fn lights(&self, frame: usize) -> &[(LaneIdx, LightState, DVec2)] {
         &self.lights[frame]
+    }
+
+    /// Nobody saw the lights.
+    pub(crate) fn forget_lights(&mut self) {
+        self.lights.iter_mut().for_each(Vec::clear);
+    }
+
+    /// Takes out people and parked vehicles whose boxes overlap others; false if two boxes of
+    /// traffic overlap.
+    pub(crate) fn part_bodies(&mut self) -> bool {
+        let mut out = BTreeSet::new();
+        for frame in 0..self.n_frames {
+            let boxes: Vec<(&Body, OrientedBox, f64)> = self
+                .tracks
+                .values()
+                .filter_map(|track| {
+                    let (_, shape) = track.oriented_box(frame)?;
+                    Some((&track.body, shape, shape.length.hypot(shape.width) / 2.0))
+                })
+                .collect();
+            for (i, (a, shape, reach)) in boxes.iter().enumerate() {
+                for (b, other, their_reach) in &boxes[i + 1..] {
+                    let stand = !a.is_mobile && !b.is_mobile && frame > 0;
+                    let apart = shape.pose.position.distance(other.pose.position);
+                    if stand || apart > reach + their_reach || !shape.overlaps(other) {
+                        continue;
+                    }
+                    if out.contains(&a.id) || out.contains(&b.id) {
+                        continue;
+                    }
+                    // Standing people go first, then parked vehicles, then people who walk.
+                    let order = |body: &Body| match (body.kind, body.is_mobile) {
+                        (AgentKind::Pedestrian, false) => 0,
+                        (_, false) => 1,
+                        (AgentKind::Pedestrian, true) => 2,
+                        (_, true) => 3,
+                    };
+                    let first = if order(a) <= order(b) { a } else { b };
+                    if order(first) == 3 {
+                        return false;
+                    }
+                    out.insert(first.id);
+                }
+            }
+        }
+        self.tracks.retain(|id, _| !out.contains(id));
+        true
     }
 
     /// True if two boxes overlap in any frame.

@@ -11,7 +11,7 @@ use crate::layout::draw_plan;
 use crate::map::{Placement, build_map, lane_id};
 use crate::network::{LaneIdx, Network};
 use crate::record::{Recording, Track};
-use crate::traffic::{Demand, Traffic};
+use crate::traffic::{Demand, Scenery, Traffic};
 use crate::{RoadFamily, SynthesisConfig};
 
 /// Draws of roads and traffic before giving up; a few suffice, see the test of this module.
@@ -123,10 +123,11 @@ fn draw_demand(config: &SynthesisConfig, network: &Network, rng: &mut gump_scene
         people,
         bicycles,
         arrivals: rng.random_range(0.06..0.3) * config.density,
+        scenery: Scenery::default(),
     }
 }
 
-fn draw_placement(rng: &mut gump_scene::Rng) -> Placement {
+pub(crate) fn draw_placement(rng: &mut gump_scene::Rng) -> Placement {
     let mut coordinate = || rng.random_range(-6000.0..6000.0);
     let position = dvec2(coordinate(), coordinate());
     let steepest = if rng.random_bool(0.4) { 0.03 } else { 0.0 };
@@ -167,7 +168,7 @@ fn choose_ego<'a>(
 }
 
 /// The moving agents nearest to the ego, itself included, sorted by id.
-fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<AgentId> {
+pub(crate) fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<AgentId> {
     let here = ego.pose(now).map_or(DVec2::ZERO, |pose| pose.position);
     let mut near: Vec<(f64, i64)> = recording
         .tracks()
@@ -186,7 +187,7 @@ fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<AgentId> {
 }
 
 /// The lanes the ego drove, then those it had in mind, and the path along them.
-fn route(network: &Network, ego: &Track, traffic: &Traffic<'_>, placement: &Placement) -> Route {
+pub(crate) fn route(network: &Network, ego: &Track, traffic: &Traffic<'_>, placement: &Placement) -> Route {
     let mut runs: Vec<(LaneIdx, f64, f64)> = Vec::new();
     for &(lane, s) in ego.places() {
         match runs.last_mut() {
@@ -232,7 +233,7 @@ fn route(network: &Network, ego: &Track, traffic: &Traffic<'_>, placement: &Plac
     }
 }
 
-fn frames(recording: &Recording, placement: &Placement, dt: f64) -> Vec<Frame> {
+pub(crate) fn frames(recording: &Recording, placement: &Placement, dt: f64) -> Vec<Frame> {
     (0..recording.n_frames())
         .map(|frame| {
             let agents = recording

@@ -5,20 +5,25 @@
 //! connector shares no part of it with another claim, which is why boxes do not overlap.
 
 mod demand;
+mod crosser;
 mod driver;
 mod lane_change;
 mod occupancy;
 mod people;
 mod right_of_way;
+mod size;
 mod vehicle;
 
-pub(crate) use demand::Demand;
+pub(crate) use crosser::{Jaywalk, Span};
+pub(crate) use demand::{Demand, Scenery, Standing};
+pub(crate) use size::{draw_person_size, draw_real_size};
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentKind, LightState, Rng};
 
 use crate::network::{LaneIdx, Network};
 use occupancy::Occupancy;
+use crosser::Crosser;
 use people::Person;
 use vehicle::Vehicle;
 
@@ -52,6 +57,8 @@ pub(crate) struct Traffic<'a> {
     people: Vec<Person>,
     occupancy: Occupancy,
     next_id: i64,
+    /// People who cross the road away from crosswalks.
+    crossers: Vec<Crosser>,
 }
 
 impl<'a> Traffic<'a> {
@@ -68,6 +75,7 @@ impl<'a> Traffic<'a> {
             people: Vec::new(),
             occupancy: Occupancy::new(network.lanes.len()),
             next_id: 0,
+            crossers: Vec::new(),
         };
         traffic.populate();
         traffic
@@ -77,6 +85,7 @@ impl<'a> Traffic<'a> {
     pub(crate) fn step(&mut self) {
         self.step_people();
         self.occupancy.fill(self.network, &self.vehicles);
+        self.step_crossers();
         self.settle_claims();
         self.choose_lanes();
         let accelerations: Vec<f64> = (0..self.vehicles.len())
@@ -98,8 +107,12 @@ impl<'a> Traffic<'a> {
             .iter()
             .map(|vehicle| vehicle.body(self.network));
         let people = self.people.iter().map(Person::body);
+        let companions = self.people.iter().flat_map(Person::companions);
+        let crossers = self.crossers.iter().map(Crosser::body);
         vehicles
             .chain(people)
+            .chain(companions)
+            .chain(crossers)
             .chain(self.parked.iter().copied())
             .collect()
     }
@@ -128,6 +141,9 @@ impl<'a> Traffic<'a> {
 
     fn acceleration(&mut self, i: usize) -> f64 {
         let vehicle = &self.vehicles[i];
+        if vehicle.is_held {
+            return -1.0;
+        }
         let ahead = self.occupancy.leader(self.network, vehicle);
         let stop = self.distance_to_stop(i);
         let speed = vehicle.allowed_speed(self.network);

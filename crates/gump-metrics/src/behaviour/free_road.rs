@@ -113,7 +113,7 @@ fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
 /// At an intersection, someone who moves another way and comes nearer.
 fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
     let junction = |part: &Ahead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
-    let crosses = |other: &&&Agent| {
+    let crosses = |other: &&Agent| {
         let state = other.state;
         let speed = if other.kind == AgentKind::Vehicle {
             MOVES
@@ -126,5 +126,5 @@ fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
             && towards.dot(state.velocity) > 0.0
             && angle_difference(state.velocity.to_angle(), pose.heading).abs() > FRAC_PI_6
     };
-    way.iter().any(junction) && others.iter().find(crosses).is_some()
+    way.iter().any(junction) && others.iter().any(crosses)
 }

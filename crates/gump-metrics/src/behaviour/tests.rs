@@ -371,7 +371,7 @@ fn a_log_that_ends_early_is_counted_as_far_as_it_goes() {
         Some(0.0)
     );
     // Nor is anybody held to a log that is over.
-    let rollout = only(&scenario, 1, |pose, t| ahead(pose, t));
+    let rollout = only(&scenario, 1, ahead);
     let seen = Behaviour::new(&scenario, 8).of(&rollout).tally;
     assert_eq!(
         seen.count(Measure::ParkedMove, Class::Vehicle, 8).rate(),

@@ -46,7 +46,8 @@ impl Source<'_> {
             Precision::Bf16 => ("bfloat16", f32::from(half::bf16::MAX)),
             Precision::Int8 => ("8 bits", f32::MAX),
         };
-        match numbers.iter().find(|number| !(number.abs() <= largest)) {
+        let fits = |number: &f32| number.is_finite() && number.abs() <= largest;
+        match numbers.iter().find(|number| !fits(number)) {
             None => Ok(numbers),
             Some(&number) => Err(ModelError::WeightNotFinite {
                 name: name.to_owned(),

@@ -36,7 +36,7 @@ impl Source {
         for &i in numbers {
             let seed = seed.fork(i as u64);
             for attempt in 0..ATTEMPTS {
-                if let Some(sample) = self.sample(seed.fork(attempt))? {
+                if let Some(sample) = self.sample(step, seed.fork(attempt))? {
                     samples.push(sample);
                     break;
                 }
@@ -46,7 +46,7 @@ impl Source {
     }
 
     /// One draw; `None` if the scenario drawn is too short.
-    fn sample(&self, seed: Seed) -> Result<Option<Sample>, ModelError> {
+    fn sample(&self, step: usize, seed: Seed) -> Result<Option<Sample>, ModelError> {
         let pick = |n: usize| (seed.fork(0).0 % n as u64) as usize;
         let is_driven =
             !self.drives.is_empty() && seed.fork(2).rng().random_bool(self.closed_loop.share);
@@ -54,7 +54,10 @@ impl Source {
             drive: &self.drives[pick(self.drives.len())],
             slack: self.closed_loop.slack,
         });
-        let scenario = driven.map_or_else(|| pick(self.scenarios.len()), |d| d.drive.scenario);
+        let scenario = match driven {
+            Some(driven) => driven.drive.scenario,
+            None => self.scenarios.pick(step, seed.fork(0).0),
+        };
         let scenario = self.scenarios.get(scenario)?;
         check_rate(&scenario)?;
         Ok(draw(

@@ -19,6 +19,15 @@ const STRAIGHT: f64 = 0.62;
 impl Network {
     /// Builds everything in the plan; `rng` decides on light phases, turning lanes and parking lots.
     pub(crate) fn new(plan: &Plan, rng: &mut Rng) -> Self {
+        let (mut network, trimmed) = Self::roads(plan, rng);
+        let n_lots = rng.random_range(0..=4);
+        network.lay_lots(plan, &trimmed, n_lots, 1..=1, rng);
+        network
+    }
+
+    /// Builds everything in the plan but parking lots; also gives the references of the roads
+    /// between the mouths of their junctions.
+    pub(crate) fn roads(plan: &Plan, rng: &mut Rng) -> (Self, Vec<Track>) {
         let mut network = Self::default();
         let mut legs: Vec<Vec<Leg>> = (0..plan.nodes.len()).map(|n| legs_of(plan, n)).collect();
         let trimmed: Vec<Track> = (0..plan.roads.len())
@@ -39,9 +48,7 @@ impl Network {
         network.furnish(plan, &legs, &trimmed);
         network.lay_walks(plan, &legs, &trimmed);
         network.find_crossings();
-        let n_lots = rng.random_range(0..=4);
-        network.lay_lots(plan, &trimmed, n_lots, rng);
-        network
+        (network, trimmed)
     }
 
     fn add_road(&mut self, plan: &Plan, road: usize, track: &Track, legs: &mut [Vec<Leg>]) {
@@ -67,7 +74,12 @@ impl Network {
                 self.lanes.len() - 1
             });
             if n > 0 && r.parking {
-                self.parking.push(along(r.parking_offset(forward)));
+                let strips = if r.bays {
+                    &mut self.bays
+                } else {
+                    &mut self.parking
+                };
+                strips.push(along(r.parking_offset(forward)));
             }
             let lanes: Vec<LaneIdx> = (first..first + n).collect();
             for leg in legs.iter_mut().flatten().filter(|leg| leg.road == road) {

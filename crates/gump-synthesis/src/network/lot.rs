@@ -1,5 +1,7 @@
 //! Parking lots beside the road: rows of places at right angles to it.
 
+use std::ops::RangeInclusive;
+
 use gump_geometry::{DVec2, Polygon, Pose, wrap_angle};
 use gump_scene::{AreaKind, Rng};
 use rand::Rng as _;
@@ -12,12 +14,21 @@ use crate::plan::Plan;
 const SET_BACK: f64 = 7.0;
 /// Depth of a place, metres.
 const DEPTH: f64 = 5.6;
+/// Width of the aisle between two pairs of rows, metres.
+const AISLE: f64 = 6.4;
 /// Metres that a lot keeps from everything else.
 const CLEARANCE: f64 = 1.5;
 
 impl Network {
-    /// Lays out up to `n` lots where there is room between the roads.
-    pub(crate) fn lay_lots(&mut self, plan: &Plan, trimmed: &[Track], n: usize, rng: &mut Rng) {
+    /// Lays out up to `n` lots of so many rows where there is room between the roads.
+    pub(crate) fn lay_lots(
+        &mut self,
+        plan: &Plan,
+        trimmed: &[Track],
+        n: usize,
+        rows: RangeInclusive<usize>,
+        rng: &mut Rng,
+    ) {
         let roads: Vec<Polygon> = self
             .furniture
             .drivable
@@ -48,7 +59,15 @@ impl Network {
                 },
             };
             let corner = |x: f64, y: f64| curb * DVec2::new(x, y);
-            let far = SET_BACK + DEPTH + 0.5;
+            // A range of one value draws nothing, which keeps the scenes of lots of one row.
+            let n_rows = if rows.start() == rows.end() {
+                *rows.start()
+            } else {
+                rng.random_range(rows.clone())
+            };
+            // The second row of a pair is reached from behind.
+            let behind = if n_rows.is_multiple_of(2) { AISLE } else { 0.0 };
+            let far = row_start(n_rows - 1) + DEPTH + 0.5 + behind;
             let ring = vec![
                 corner(-half, 0.4),
                 corner(half, 0.4),
@@ -72,12 +91,12 @@ impl Network {
             {
                 continue;
             }
-            for k in 0..n_places {
+            for (row, k) in (0..n_rows).flat_map(|row| (0..n_places).map(move |k| (row, k))) {
                 let x = (f64::from(k) + 0.5) * spacing - half;
                 let nose_in = if rng.random_bool(0.8) { 0.5 } else { -0.5 };
                 let heading = wrap_angle(curb.heading + nose_in * std::f64::consts::PI);
                 self.lot_places.push(Pose {
-                    position: corner(x, SET_BACK + DEPTH / 2.0),
+                    position: corner(x, row_start(row) + DEPTH / 2.0),
                     heading,
                 });
             }
@@ -97,8 +116,19 @@ impl Network {
     }
 }
 
+/// Metres from the curb to the near end of a row: rows stand back to back in pairs, with an aisle
+/// between pairs.
+fn row_start(row: usize) -> f64 {
+    SET_BACK + row as f64 * DEPTH + (row / 2) as f64 * AISLE
+}
+
 /// True if the borders of two polygons come closer than the clearance, or one contains the other.
 fn is_near(a: &Polygon, b: &Polygon) -> bool {
+    let reach = DVec2::splat(CLEARANCE);
+    let ((low, high), (their_low, their_high)) = (a.bounds(), b.bounds());
+    if (low - reach).cmpgt(their_high).any() || (their_low - reach).cmpgt(high).any() {
+        return false;
+    }
     let close = |a: &Polygon, b: &Polygon| {
         a.edges().any(|(from, to)| {
             let n = (from.distance(to) / 2.0).ceil().max(1.0) as usize;

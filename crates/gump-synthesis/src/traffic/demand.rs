@@ -1,10 +1,12 @@
 //! How many of what there are, where they appear and where they want to go.
 
 use gump_geometry::{Pose, wrap_angle};
-use gump_scene::{AgentKind, Rng};
+use gump_scene::AgentKind;
 use rand::Rng as _;
 
+use super::crosser::{Crosser, Jaywalk};
 use super::driver::Driver;
+use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size};
 use super::people::Person;
 use super::vehicle::Vehicle;
 use super::{Body, Traffic};
@@ -28,12 +30,43 @@ pub(crate) struct Demand {
     pub(crate) bicycles: usize,
     /// Vehicles that want to enter, per second and entry lane.
     pub(crate) arrivals: f64,
+    /// What stands about; set for scenes like recorded ones.
+    pub(crate) scenery: Scenery,
+}
+
+/// What a scene like a recorded one has besides traffic in its lanes.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Scenery {
+    /// Drivers of every temper and vehicles of the sizes that are met on the road.
+    pub(crate) is_real: bool,
+    /// Parked vehicles and people who stand.
+    pub(crate) standing: Vec<Standing>,
+    /// Vehicles that have stopped in their lane: the lane and the arc length of their centre.
+    pub(crate) held: Vec<(LaneIdx, f64)>,
+    /// Ways across the road away from crosswalks.
+    pub(crate) jaywalks: Vec<Jaywalk>,
+    /// Who takes which of them, and from which second of the simulation on.
+    pub(crate) crossers: Vec<(usize, f64)>,
+}
+
+/// Something that stays where it is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Standing {
+    pub(crate) kind: AgentKind,
+    /// Length, width and height, metres.
+    pub(crate) size: [f64; 3],
+    /// Box centre and heading, in the scene's frame.
+    pub(crate) pose: Pose,
 }
 
 impl Traffic<'_> {
     /// Fills the network once, before the first step.
     pub(super) fn populate(&mut self) {
-        self.park();
+        if self.demand.scenery.is_real {
+            self.set_scenery();
+        } else {
+            self.park();
+        }
         for _ in 0..self.demand.people {
             self.add_person(None);
         }
@@ -62,6 +95,47 @@ impl Traffic<'_> {
             let s = self.rng.random_range(4.0..length - 4.0);
             self.try_add(AgentKind::Bicycle, lane, s);
         }
+    }
+
+    /// Puts what stands about where it stands, and people at the curbs they will leave.
+    fn set_scenery(&mut self) {
+        for body in std::mem::take(&mut self.demand.scenery.standing) {
+            let id = self.new_id();
+            self.parked.push(Body {
+                id,
+                kind: body.kind,
+                size: body.size,
+                pose: body.pose,
+                is_mobile: false,
+                place: None,
+            });
+        }
+        for (lane, s) in std::mem::take(&mut self.demand.scenery.held) {
+            let size = draw_real_size(&mut self.rng);
+            let size = [size[0].min(9.0), size[1], size[2]];
+            let driver = Driver::of_any_temper(&mut self.rng);
+            let path = self.plan_path(lane, size[0]);
+            let id = self.new_id();
+            let held = (AgentKind::Vehicle, size, driver);
+            let mut vehicle = Vehicle::new(id, held, path, s, 0.0, &mut self.rng);
+            // Towards the curb, as far as the lane allows.
+            let aside = self.network.lanes[lane].width / 2.0 - size[1] / 2.0 - 0.1;
+            vehicle.settle(-aside.max(0.0));
+            vehicle.is_held = true;
+            self.vehicles.push(vehicle);
+        }
+        for (jaywalk, starts) in std::mem::take(&mut self.demand.scenery.crossers) {
+            let id = self.new_id();
+            let size = draw_person_size(&mut self.rng);
+            let pace = self.rng.random_range(1.1..2.2);
+            let way = (jaywalk, &self.demand.scenery.jaywalks[jaywalk]);
+            self.crossers.push(Crosser::new(id, size, way, pace, starts));
+        }
+    }
+
+    fn new_id(&mut self) -> i64 {
+        self.next_id += 1;
+        self.next_id - 1
     }
 
     /// Lets newcomers in at the border.
@@ -153,6 +227,12 @@ impl Traffic<'_> {
         if kind == AgentKind::Bicycle && !l.is_bike_lane() {
             vehicle.settle(-(l.width / 2.0 - 0.55));
         }
+        if self.demand.scenery.is_real && kind == AgentKind::Vehicle {
+            // Hardly anybody drives in the very middle of the lane.
+            let room = (l.width / 2.0 - vehicle.width() / 2.0 - 0.15).clamp(0.0, 0.65);
+            let part: f64 = self.rng.random_range(-1.0..1.0);
+            vehicle.settle(part * room);
+        }
         self.next_id += 1;
         self.vehicles.push(vehicle);
     }
@@ -177,11 +257,24 @@ impl Traffic<'_> {
                 rng.random_range(0.55..0.8),
                 rng.random_range(1.6..1.9),
             ];
+            if self.demand.scenery.is_real {
+                let size = draw_bicycle_size(rng);
+                let top_speed = rng.random_range(3.2..8.0);
+                let driver = Driver::of_bicycle(rng);
+                return (size, Driver { top_speed, ..driver });
+            }
             return (size, Driver::of_bicycle(rng));
         }
-        let size = draw_size(rng);
+        let is_real = self.demand.scenery.is_real;
+        let size = if is_real {
+            draw_real_size(rng)
+        } else {
+            draw_size(rng)
+        };
         let driver = if size[0] > 7.0 {
             Driver::of_heavy_vehicle(rng)
+        } else if is_real {
+            Driver::of_any_temper(rng)
         } else {
             Driver::of_car(rng)
         };
@@ -239,17 +332,36 @@ impl Traffic<'_> {
             let (walk, forward) = outer[self.rng.random_range(0..outer.len())];
             (walk, forward, 0.0)
         } else {
-            let walk = walks[self.rng.random_range(0..walks.len())];
+            let mut walk = walks[self.rng.random_range(0..walks.len())];
+            for _ in 0..3 {
+                // Those far from the centre are seen by nobody.
+                let track = &self.network.walks[walk].track;
+                let near = track.pose_at(track.length() / 2.0).position.length() < 75.0;
+                if near || !self.demand.scenery.is_real {
+                    break;
+                }
+                walk = walks[self.rng.random_range(0..walks.len())];
+            }
             let length = self.network.walks[walk].track.length();
-            (
-                walk,
-                self.rng.random_bool(0.5),
-                self.rng.random_range(0.0..length),
-            )
+            let forward = self.rng.random_bool(0.5);
+            let progress = self.rng.random_range(0.0..length);
+            if self.demand.scenery.is_real {
+                // More people are near the corners, where they cross.
+                let left = self.rng.random_range(0.0..60.0_f64).min(length);
+                (walk, forward, progress.max(length - left))
+            } else {
+                (walk, forward, progress)
+            }
         };
         let id = self.next_id;
         self.next_id += 1;
-        let person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
+        let mut person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
+        if self.demand.scenery.is_real {
+            // Half of those who walk are with somebody.
+            let n = [0, 0, 0, 0, 1, 1, 1, 2, 3, 4][self.rng.random_range(0..10)];
+            person.accompany(self.next_id, n, &mut self.rng);
+            self.next_id += n as i64;
+        }
         self.people.push(person);
     }
 
@@ -315,36 +427,6 @@ impl Traffic<'_> {
                 is_mobile: false,
                 place: None,
             });
-        }
-    }
-}
-
-/// Length, width and height of a vehicle, metres: mostly cars, some vans, few trucks and buses.
-fn draw_size(rng: &mut Rng) -> [f64; 3] {
-    match rng.random_range(0..100) {
-        0..=86 => {
-            let length = 4.0 + rng.random_range(0.0..0.55) + rng.random_range(0.0..0.7);
-            [
-                length,
-                rng.random_range(1.75..2.05),
-                rng.random_range(1.4..1.8),
-            ]
-        }
-        87..=96 => {
-            let length = rng.random_range(5.2..6.3);
-            [
-                length,
-                rng.random_range(1.95..2.2),
-                rng.random_range(1.8..2.6),
-            ]
-        }
-        _ => {
-            let length = rng.random_range(7.2..11.9);
-            [
-                length,
-                rng.random_range(2.3..2.55),
-                rng.random_range(2.7..3.4),
-            ]
         }
     }
 }

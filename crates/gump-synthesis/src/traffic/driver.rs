@@ -38,6 +38,16 @@ pub(crate) struct Driver {
     pub(crate) bend_factor: f64,
     /// Metres before a stop line at which the front comes to rest.
     pub(crate) line_gap: f64,
+    /// Deceleration up to which the driver stops for yellow, m/s².
+    pub(crate) yellow_braking: f64,
+    /// Seconds into red for which the driver still crosses the line rather than brake hard.
+    pub(crate) late: f64,
+    /// Speed below which a stop sign counts as obeyed, m/s.
+    pub(crate) rolling_stop: f64,
+    /// Half the width within which the driver wanders in the lane, metres.
+    pub(crate) wander: f64,
+    /// Deviation of the random part of the acceleration, as a multiple of the usual one.
+    pub(crate) unrest: f64,
 }
 
 impl Driver {
@@ -54,6 +64,52 @@ impl Driver {
             is_polite: rng.random_bool(0.75),
             bend_factor: rng.random_range(0.85..1.05),
             line_gap: rng.random_range(0.3..1.6),
+            yellow_braking: 3.0,
+            late: 0.0,
+            rolling_stop: 0.3,
+            wander: 0.17,
+            unrest: 1.0,
+        }
+    }
+
+    /// A car driver of any temper, as they are met on the road: from the timid to those who roll
+    /// through stop signs and over the line when the light has just turned red.
+    pub(crate) fn of_any_temper(rng: &mut Rng) -> Self {
+        // One number for how much of a hurry somebody is in, and the rest around it.
+        let hurry: f64 = f64::midpoint(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0));
+        let mut around = |middle: f64, by_hurry: f64, spread: f64| {
+            middle + by_hurry * hurry + rng.random_range(-spread..spread)
+        };
+        let driver = Self {
+            speed_factor: around(0.96, 0.3, 0.18),
+            top_speed: 40.0,
+            headway: around(1.35, -0.7, 0.4).max(0.6),
+            standstill: around(2.6, -0.8, 1.2).max(1.2),
+            acceleration: around(1.7, 0.7, 0.5).max(0.8),
+            braking: around(2.1, 0.7, 0.5).max(1.3),
+            gap_time: around(4.8, -1.3, 0.8),
+            bend_factor: around(0.95, 0.18, 0.12),
+            line_gap: around(1.5, -0.7, 1.2).max(0.2),
+            yellow_braking: around(3.2, -0.8, 0.6),
+            late: 0.0,
+            rolling_stop: 0.3,
+            wander: around(0.22, 0.0, 0.1),
+            unrest: around(1.3, 0.4, 0.5).max(0.5),
+            is_polite: true,
+        };
+        Self {
+            is_polite: rng.random_bool((0.75 - 0.3 * hurry).clamp(0.0, 1.0)),
+            late: if rng.random_bool(0.06) {
+                rng.random_range(0.0..0.9)
+            } else {
+                0.0
+            },
+            rolling_stop: if rng.random_bool(0.35) {
+                rng.random_range(0.5..2.2)
+            } else {
+                0.3
+            },
+            ..driver
         }
     }
 

@@ -32,12 +32,15 @@ pub(crate) struct Entry {
 #[derive(Debug)]
 pub(crate) struct Occupancy {
     entries: Vec<Vec<Entry>>,
+    /// Lane and arc length of what stands in the way without being a vehicle.
+    blocks: Vec<(LaneIdx, f64)>,
 }
 
 impl Occupancy {
     pub(crate) fn new(n_lanes: usize) -> Self {
         Self {
             entries: vec![Vec::new(); n_lanes],
+            blocks: Vec::new(),
         }
     }
 
@@ -51,9 +54,15 @@ impl Occupancy {
         for entries in &mut self.entries {
             entries.clear();
         }
+        self.blocks.clear();
         for (i, vehicle) in vehicles.iter().enumerate() {
             self.add(network, i, vehicle);
         }
+    }
+
+    /// Lets nobody pass a place on a lane until the lanes are filled again.
+    pub(crate) fn block(&mut self, lane: LaneIdx, at: f64) {
+        self.blocks.push((lane, at));
     }
 
     /// Notes where one vehicle is.
@@ -153,6 +162,11 @@ impl Occupancy {
                     continue;
                 }
                 consider(start + entry.rear, entry.speed);
+            }
+            for &(_, at) in self.blocks.iter().filter(|(there, _)| *there == lane) {
+                if n > 0 || at > vehicle.s {
+                    consider(start + at, 0.0);
+                }
             }
             start += network.lanes[lane].length();
             if start > SIGHT {

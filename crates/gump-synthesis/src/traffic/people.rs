@@ -4,6 +4,7 @@ use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
 
+use super::size::draw_person_size;
 use super::{Body, Traffic};
 use crate::network::Network;
 
@@ -45,6 +46,16 @@ pub(crate) struct Person {
     pose: Pose,
     activity: Option<Activity>,
     gone: bool,
+    companions: Vec<Companion>,
+}
+
+/// Somebody who walks with a person, always at the same place beside or behind.
+#[derive(Clone, Copy, Debug)]
+struct Companion {
+    id: i64,
+    size: [f64; 3],
+    /// Metres ahead and to the left of the person.
+    place: DVec2,
 }
 
 impl Person {
@@ -87,7 +98,44 @@ impl Person {
             pose: Pose { position, heading },
             activity: None,
             gone: false,
+            companions: Vec::new(),
         }
+    }
+
+    /// Lets others walk with the person: ids follow each other from `first_id` on.
+    pub(crate) fn accompany(&mut self, first_id: i64, n: usize, rng: &mut Rng) {
+        self.size = draw_person_size(rng);
+        if n > 0 {
+            // Leaves room on the right, so that nobody walks off the sidewalk.
+            let shift = self.aside - rng.random_range(0.25..0.45);
+            self.aside -= shift;
+            self.pose.position += self.pose.direction().perp() * shift;
+        }
+        for k in 0..n {
+            let row = k.div_ceil(2) as f64;
+            let side = if k % 2 == 0 { -1.0 } else { 0.0 };
+            self.companions.push(Companion {
+                id: first_id + k as i64,
+                size: draw_person_size(rng),
+                place: DVec2::new(
+                    -1.35 * row + rng.random_range(-0.15..0.15),
+                    side * rng.random_range(0.95..1.15),
+                ),
+            });
+        }
+    }
+
+    /// The boxes of those who walk with the person.
+    pub(crate) fn companions(&self) -> impl Iterator<Item = Body> + '_ {
+        self.companions.iter().map(|companion| Body {
+            id: companion.id,
+            size: companion.size,
+            pose: Pose {
+                position: self.pose * companion.place,
+                ..self.pose
+            },
+            ..self.body()
+        })
     }
 
     /// The crosswalk the person is at, where along its walk, and what the person does there.
@@ -264,7 +312,15 @@ impl Traffic<'_> {
             person.gone = true;
             return;
         }
-        let (walk, forward) = choices[self.rng.random_range(0..choices.len())];
+        // Where there is a crosswalk most people who have come to it cross.
+        let crossing = choices
+            .iter()
+            .position(|(walk, _)| self.network.walks[*walk].crosswalk.is_some());
+        let crosses = self.demand.scenery.is_real && self.rng.random_bool(0.65);
+        let (walk, forward) = match crossing.filter(|_| crosses) {
+            Some(crossing) => choices[crossing],
+            None => choices[self.rng.random_range(0..choices.len())],
+        };
         (person.walk, person.forward) = (walk, forward);
         person.progress -= length;
         person.activity = None;

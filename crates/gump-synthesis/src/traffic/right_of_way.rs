@@ -12,8 +12,6 @@ use super::vehicle::Vehicle;
 use crate::network::{Connector, LaneIdx};
 use crate::plan::Control;
 
-/// Deceleration up to which a vehicle stops for yellow, m/s².
-const YELLOW_BRAKING: f64 = 3.0;
 /// Metres behind the last conflict at which a claim ends.
 const CLEAR: f64 = 1.0;
 /// Metres of pavement beside a vehicle's way that must be free of people.
@@ -99,7 +97,7 @@ impl Traffic<'_> {
     fn can_stop(&self, vehicle: &Vehicle, distance: f64) -> bool {
         // Brakes do not bite at once.
         let left = distance - 0.3 - 0.3 * vehicle.speed;
-        vehicle.speed * vehicle.speed < 2.0 * YELLOW_BRAKING * left.max(0.01)
+        vehicle.speed * vehicle.speed < 2.0 * vehicle.driver.yellow_braking * left.max(0.01)
     }
 
     /// Remembers since when a vehicle stands at its line.
@@ -108,7 +106,7 @@ impl Traffic<'_> {
         let at_line = vehicle
             .next_connector(self.network)
             .is_some_and(|leg| vehicle.distance_to(self.network, leg) < 3.5);
-        let stands = at_line && vehicle.speed < 0.3;
+        let stands = at_line && vehicle.speed < vehicle.driver.rolling_stop;
         if !at_line {
             self.vehicles[i].waiting_since = None;
         } else if stands && vehicle.waiting_since.is_none() {
@@ -129,6 +127,12 @@ impl Traffic<'_> {
         let lane = vehicle.path[leg];
         let connector = self.connector(lane);
         let light = self.light(connector, self.time);
+        // Those who are late see yellow for a little longer than it is.
+        let was = self.light(connector, self.time - vehicle.driver.late);
+        let light = match (light, was) {
+            (LightState::Red, LightState::Yellow) => LightState::Yellow,
+            (light, _) => light,
+        };
         let goes = match light {
             LightState::Green => true,
             LightState::Yellow => !self.can_stop(vehicle, distance),

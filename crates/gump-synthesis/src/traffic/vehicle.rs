@@ -65,6 +65,8 @@ pub(crate) struct Vehicle {
     pub(crate) change: Option<LaneChange>,
     /// Seconds until it thinks of changing lanes again.
     pub(crate) patience: f64,
+    /// Stays where it is, as a vehicle that stopped in the lane to load does.
+    pub(crate) is_held: bool,
 }
 
 impl Vehicle {
@@ -98,6 +100,7 @@ impl Vehicle {
             waiting_since: None,
             change: None,
             patience: rng.random_range(1.0..12.0),
+            is_held: false,
         }
     }
 
@@ -184,7 +187,7 @@ impl Vehicle {
     pub(crate) fn advance(&mut self, network: &Network, wanted: f64, dt: f64, rng: &mut Rng) {
         // An Ornstein-Uhlenbeck process with a time constant of two seconds.
         let kick: f64 = rng.random_range(-1.0..1.0);
-        self.noise += -self.noise * dt / 2.0 + 0.28 * kick * dt.sqrt();
+        self.noise += -self.noise * dt / 2.0 + 0.28 * self.driver.unrest * kick * dt.sqrt();
         let down = if wanted < -3.0 {
             BRAKING_JERK
         } else {
@@ -215,7 +218,7 @@ impl Vehicle {
         if self.wander_left <= 0.0 {
             // Steering is corrected every one to three seconds, on any road.
             self.wander_left = rng.random_range(0.8..2.5) * self.speed.max(5.0);
-            self.wander = rng.random_range(-0.17..0.17);
+            self.wander = rng.random_range(-self.driver.wander..self.driver.wander);
         }
         let target = self.keep + self.evade + self.wander;
         let k = 1.0 / (STEERING_TIME * self.speed).max(STEERING_LENGTH);
@@ -264,7 +267,7 @@ impl Vehicle {
             kind: self.kind,
             size: self.size,
             pose: self.pose(network),
-            is_mobile: true,
+            is_mobile: !self.is_held,
             place: Some((self.lane(), self.s)),
         }
     }

@@ -1,9 +1,11 @@
-//! `data stats`: what scenes consist of, counted over files and directories.
+//! `data stats`: what scenes consist of, counted over files and directories, and how far their
+//! distributions are from those of other scenes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use gump_data::{ReadOptions, groups, list_files, open_files};
+use gump_metrics::statistics::{Comparison, Statistics, class_name};
 use gump_scene::{AgentId, AgentKind, Scenario};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -11,6 +13,7 @@ use serde_json::{Value, json};
 
 use crate::progress::Progress;
 use crate::run::{self, Common, Run};
+use crate::targets;
 
 /// Slower agents stand, metres per second.
 const STANDING: f64 = 0.5;
@@ -21,16 +24,39 @@ pub(crate) struct Args {
     /// Files or directories
     #[arg(value_name = "PATH", required = true)]
     paths: Vec<PathBuf>,
+    /// Scenes, or a table of targets (.toml), to measure the distance of every distribution from
+    #[arg(long, value_name = "PATH")]
+    against: Option<PathBuf>,
+    /// Write the distributions as a table of targets
+    #[arg(long, value_name = "FILE.toml")]
+    save_targets: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
 }
 
 impl Args {
+    /// What a table of targets was measured on: names of files and folders, no more.
+    fn provenance(&self) -> String {
+        let name = |path: &PathBuf| {
+            let parts = path.components().rev().take(2).collect::<Vec<_>>();
+            let parts = parts.iter().rev().map(|part| part.as_os_str().to_string_lossy());
+            parts.collect::<Vec<_>>().join("/")
+        };
+        let names: Vec<String> = self.paths.iter().map(name).collect();
+        format!("cargo xtask data stats of {}", names.join(", "))
+    }
+
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let distributions = self.against.is_some() || self.save_targets.is_some();
+        let reference = match &self.against {
+            Some(path) => Some(run.phase("reference", |run| reference(run, path))?),
+            None => None,
+        };
         let counted = run.phase("count", |run| {
             let progress = run.progress("counting", 0, "scenes");
-            let all = self.paths.iter().map(|path| Stats::of(path, &progress));
+            let of = |path: &PathBuf| Stats::of(path, distributions, &progress);
+            let all = self.paths.iter().map(of);
             all.collect::<anyhow::Result<Vec<_>>>()
         })?;
         let mut sources = Vec::new();
@@ -58,6 +84,12 @@ impl Args {
         run.result("classes", all.class_rows())?;
         run.result("tags", all.tag_rows())?;
         run.result("problems", &all.refused)?;
+        if let Some(path) = &self.save_targets {
+            targets::write(path, &self.provenance(), &all.statistics)?;
+        }
+        if let Some(reference) = &reference {
+            tell_distance(run, &all.statistics.compare(reference))?;
+        }
         anyhow::ensure!(
             all.scenes() > 0,
             "expected scenarios, found none; {} could not be read{}",
@@ -68,6 +100,48 @@ impl Args {
         );
         Ok(())
     }
+}
+
+/// The distributions of a table of targets, or of scenes.
+///
+/// Error: nothing there that can be read, or Ctrl-C.
+fn reference(run: &Run, path: &Path) -> anyhow::Result<Statistics> {
+    if targets::is_table(path) {
+        return targets::read(path);
+    }
+    let progress = run.progress("counting the reference", 0, "scenes");
+    let stats = Stats::of(path, true, &progress)?;
+    let why = stats.refused.first();
+    anyhow::ensure!(
+        stats.scenes() > 0,
+        "{}: expected scenarios to compare with, found none{}",
+        path.display(),
+        why.map_or(String::new(), |why| format!("; {why}"))
+    );
+    Ok(stats.statistics)
+}
+
+/// One row per distribution, and the means of the distances.
+fn tell_distance(run: &mut Run, compared: &[Comparison]) -> anyhow::Result<()> {
+    let row = |row: &Comparison| {
+        json!({
+            "measure": row.measure.name(),
+            "class": class_name(row.class),
+            "mean": row.mean,
+            "reference": row.reference_mean,
+            "distance": row.wasserstein,
+            "jensen_shannon": row.jensen_shannon,
+            "n": row.n,
+            "reference_n": row.reference_n,
+        })
+    };
+    let mean = |of: fn(&Comparison) -> Option<f64>| {
+        let known: Vec<f64> = compared.iter().filter_map(of).collect();
+        known.iter().sum::<f64>() / (known.len() as f64).max(1.0)
+    };
+    run.result("distance_mean", mean(|row| row.wasserstein))?;
+    run.result("jensen_shannon_mean", mean(|row| row.jensen_shannon))?;
+    run.result("distances", compared.iter().map(row).collect::<Vec<_>>())
 }
 
 /// What some scenes consist of.
@@ -83,6 +157,8 @@ struct Stats {
     tags: BTreeMap<&'static str, usize>,
     refused: Vec<String>,
     skipped: BTreeMap<&'static str, usize>,
+    /// Distributions, where they are asked for.
+    statistics: Statistics,
 }
 
 /// The agents of one class.
@@ -101,7 +177,7 @@ impl Stats {
     /// Counts the scenes of a path.
     ///
     /// Error: nothing there, or Ctrl-C; what cannot be read is counted.
-    fn of(path: &Path, progress: &Progress) -> anyhow::Result<Self> {
+    fn of(path: &Path, distributions: bool, progress: &Progress) -> anyhow::Result<Self> {
         let files = list_files(path)?;
         let parts = groups(&files);
         let parts = parts.into_par_iter().map(|range| {
@@ -110,7 +186,12 @@ impl Stats {
             for record in &mut reader {
                 run::stop_if_interrupted()?;
                 match record {
-                    Ok(record) => stats.add(&record.scenario),
+                    Ok(record) => {
+                        stats.add(&record.scenario);
+                        if distributions {
+                            stats.statistics.add(&record.scenario);
+                        }
+                    }
                     Err(error) => stats.refused.push(error.to_string()),
                 }
                 progress.advance(1);
@@ -183,6 +264,7 @@ impl Stats {
         for (what, n) in other.skipped {
             *self.skipped.entry(what).or_default() += n;
         }
+        self.statistics.merge(&other.statistics);
     }
 
     fn scenes(&self) -> usize {

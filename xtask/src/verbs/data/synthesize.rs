@@ -6,17 +6,20 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use gump_scene::{Scenario, Seed};
-use gump_synthesis::{RoadFamily, SumoDemand, SynthesisConfig, synthesize};
+use gump_synthesis::{Profile, RoadFamily, SumoDemand, SynthesisConfig};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::benchmark;
 use crate::cli::WrongArguments;
+use crate::fresh::profile_of_name;
 use crate::run::{self, Common, Run};
 use crate::sumo::{self, Sumo};
 
 /// Files to spread scenes over; fewer if there are fewer scenes.
 const SHARDS: usize = 8;
+/// Procedural scenes made together, by all threads, before they are written.
+const AT_A_TIME: usize = 64;
 /// Scenes of SUMO per file at most, where the number of files is not given: they are held in
 /// memory until their file is written.
 const SHARD_SCENES: usize = 200;
@@ -41,6 +44,16 @@ pub(crate) struct Args {
     #[arg(long, value_name = "NAME", value_parser = road_family)]
     #[serde(serialize_with = "as_name")]
     family: Option<RoadFamily>,
+    /// What scenes are like: plain, or recorded-like
+    #[arg(long, value_name = "NAME", value_parser = profile_of_name, default_value = "plain")]
+    #[serde(serialize_with = "profile_name")]
+    profile: Profile,
+    /// Show scenes of a profile as they are, without what a tracker misses and gets wrong
+    #[arg(long)]
+    clean: bool,
+    /// Write the cache that training reads from instead of Waymo's format
+    #[arg(long)]
+    cache: bool,
     /// Files to spread the scenes over [default: 8, or one per scene if those are fewer]
     #[arg(long, value_name = "N")]
     shards: Option<NonZeroUsize>,
@@ -68,13 +81,7 @@ impl Args {
         check_seed(run.seed())?;
         let mut made = Made::default();
         match self.kind {
-            Kind::Procedural => {
-                let scenes = self.procedural(run)?;
-                made.add(&scenes);
-                let names = shard_names(self.n_shards(SHARDS));
-                run.phase("write", |run| write(run, &names, &scenes))?;
-                made.files = names;
-            }
+            Kind::Procedural => self.procedural(run, &mut made)?,
             Kind::Sumo => self.sumo(run, &mut made)?,
         }
         run.result("scenes", made.scenes)?;
@@ -90,6 +97,9 @@ impl Args {
         let why = match self.kind {
             Kind::Procedural if self.network.is_some() => "--network is for --kind sumo",
             Kind::Sumo if self.family.is_some() => "--family is for --kind procedural",
+            Kind::Sumo if self.profile != Profile::Plain || self.cache || self.clean => {
+                "--profile, --cache and --clean are for --kind procedural"
+            }
             _ => return Ok(()),
         };
         Err(WrongArguments(why.into()).into())
@@ -100,27 +110,58 @@ impl Args {
         asked.min(self.scenes.get())
     }
 
-    fn procedural(&self, run: &mut Run) -> anyhow::Result<Vec<Scenario>> {
+    /// Makes and writes file by file, some scenes at a time, so that any number of scenes needs
+    /// little memory. Scene `k` comes from `seed.fork(k)` and goes to file `k` modulo their number.
+    fn procedural(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
         let config = SynthesisConfig {
             density: self.density,
             family: self.family,
-            ..SynthesisConfig::standard()
+            ..self.profile.config()
         };
-        run.phase("synthesize", |run| {
-            let n = self.scenes.get() as u64;
-            let progress = run.progress("synthesizing", n, "scenes");
-            let seed = run.seed();
-            let scene = |k: u64| {
-                run::stop_if_interrupted()?;
-                let scene = synthesize(&config, seed.fork(k));
-                progress.advance(1);
-                Ok(scene)
+        let n = self.scenes.get();
+        let progress = run.progress("synthesizing", n as u64, "scenes");
+        let seed = run.seed();
+        let one = |k: usize| {
+            let seed = seed.fork(k as u64);
+            let scene = if self.clean {
+                self.profile.synthesize_clean(&config, seed)
+            } else {
+                self.profile.synthesize(&config, seed)
             };
-            (0..n)
-                .into_par_iter()
-                .map(scene)
-                .collect::<anyhow::Result<Vec<_>>>()
-        })
+            progress.advance(1);
+            scene
+        };
+        let names = shard_names(self.n_shards(SHARDS));
+        for (shard, name) in names.iter().enumerate() {
+            let name = match self.cache {
+                true => name.replace(".tfrecord.gz", ".cache"),
+                false => name.clone(),
+            };
+            let numbers: Vec<usize> = (shard..n).step_by(names.len()).collect();
+            let mut stopped = Ok(());
+            let chunks = numbers.chunks(AT_A_TIME).map_while(|chunk| {
+                stopped = run::stop_if_interrupted();
+                let scenes: Vec<Scenario> = chunk.par_iter().map(|&k| one(k)).collect();
+                made.add(&scenes);
+                stopped.is_ok().then_some(scenes)
+            });
+            run.phase("synthesize", |run| {
+                let path = run.path(&name);
+                if self.cache {
+                    gump_data::cache::write_shard(&path, chunks.flatten())?;
+                } else {
+                    gump_data::womd::write_scenarios(&path, chunks.flatten())?;
+                }
+                Ok(())
+            })?;
+            // A file that was cut short would look like a whole one.
+            if stopped.is_err() {
+                std::fs::remove_file(run.path(&name)).ok();
+            }
+            stopped?;
+            made.files.push(name);
+        }
+        Ok(())
     }
 
     /// Simulates and writes shard by shard, so that thousands of scenes need little memory.
@@ -252,7 +293,8 @@ impl Made {
 /// first part that begins with a digit or is a seed.
 fn road(id: &str) -> String {
     let families = RoadFamily::ALL.iter().map(|family| family.name());
-    if let Some(family) = families.into_iter().find(|name| id.starts_with(name)) {
+    let plain = id.strip_prefix("like-").unwrap_or(id);
+    if let Some(family) = families.into_iter().find(|name| plain.starts_with(name)) {
         return family.to_owned();
     }
     // NETWORK-RUN-WINDOW-EGO
@@ -294,6 +336,10 @@ fn road_family(name: &str) -> Result<RoadFamily, String> {
         let known: Vec<_> = RoadFamily::ALL.iter().map(|family| family.name()).collect();
         format!("expected one of {}", known.join(", "))
     })
+}
+
+fn profile_name<S: serde::Serializer>(profile: &Profile, to: S) -> Result<S::Ok, S::Error> {
+    profile.name().serialize(to)
 }
 
 #[expect(clippy::ref_option, reason = "serde hands the field over by reference")]

@@ -19,6 +19,7 @@ use self::stages::Stage;
 use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::dataset::{self, Part, Split, Training};
+use crate::fresh::Stream;
 use crate::losses::Losses;
 use crate::peers::{Processes, together};
 use crate::run::{self, Common, Run};
@@ -41,7 +42,7 @@ const LOSSES: &str = "losses.csv";
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     /// A folder with a manifest.toml, or any file or folder of scenarios; a cache is not held in
-    /// memory
+    /// memory; or fresh:PROFILE[:SEED], scenes made up on the way, none of which comes back
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
     /// Scenarios to validate on [default: the manifest's]
@@ -225,11 +226,16 @@ impl Args {
 
     fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
-        let training = Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?;
+        let stream = Stream::of_name(&stage.data)?;
+        let training = match &stream {
+            Some(stream) => Training::fresh(stream.clone(), stage.config.train.batch),
+            None => Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?,
+        };
         warn_of_frozen(run, &training)?;
-        let validation = match &self.validation {
-            Some(path) => vec![Part::whole(path)],
-            None => dataset::parts(&stage.data, Split::Tune)?,
+        let validation = match (&self.validation, stream) {
+            (Some(path), _) => vec![Part::whole(path)],
+            (None, Some(stream)) => return Ok((training, stream.validation(VALIDATION_SAMPLES))),
+            (None, None) => dataset::parts(&stage.data, Split::Tune)?,
         };
         let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
         Ok((training, validation))

@@ -1,7 +1,7 @@
 //! What is to be trained: a run of one stage, or of several that go on from each other.
 //!
 //! In the file, `[train]` holds for all stages, and each `[[stage]]` says what it does otherwise:
-//! `data` (a folder in `--data`), `stop_at` and its own `[stage.train]`.
+//! `data` (a folder in `--data`, or a stream `fresh:PROFILE`), `stop_at` and its own `[stage.train]`.
 
 use std::path::{Path, PathBuf};
 
@@ -11,6 +11,7 @@ use toml::{Table, Value};
 use super::Args;
 use crate::cli::WrongArguments;
 use crate::config;
+use crate::fresh::PREFIX;
 
 /// A part of a run with a schedule of its own.
 #[derive(Debug)]
@@ -74,6 +75,7 @@ impl Args {
             Ok(Stage {
                 config: self.config(&table)?,
                 data: match stage.get("data") {
+                    Some(Value::String(stream)) if stream.starts_with(PREFIX) => stream.into(),
                     Some(Value::String(folder)) => self.data.join(folder),
                     None => self.data.clone(),
                     Some(other) => return Err(wrong(path, "data", "a folder", other)),

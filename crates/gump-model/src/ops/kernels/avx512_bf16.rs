@@ -50,7 +50,7 @@ impl Avx512Bf16 {
     /// Packs lanes as `[lanes / 32, pairs / 16, 2, 16, 16]`: 16 lanes, each of 16 pairs, are a tile.
     pub(super) fn pack_tiles(self, from: Lanes<'_>, pairs: usize, tiles: &mut [u32]) {
         let (tiles, _) = tiles.as_chunks_mut::<{ GROUP * GROUP }>();
-        for tile in 0..tiles.len() {
+        for (tile, out) in tiles.iter_mut().enumerate() {
             let (block, step, half) = (
                 tile / (pairs / GROUP * 2),
                 tile / 2 % (pairs / GROUP),
@@ -60,7 +60,7 @@ impl Avx512Bf16 {
             // SAFETY: the value proves the features.
             let lanes = unsafe { rows_of_pairs(from, lane, p) };
             // SAFETY: 16 vectors are 256 pairs.
-            tiles[tile] = unsafe { transmute::<[__m512i; GROUP], [u32; GROUP * GROUP]>(lanes) };
+            *out = unsafe { transmute::<[__m512i; GROUP], [u32; GROUP * GROUP]>(lanes) };
         }
     }
 }
@@ -149,7 +149,7 @@ pub(super) fn store_row(to: &mut Target<'_>, r: usize, sums: [__m512; 2]) {
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 fn pack<const W: usize>(from: Lanes<'_>, pairs: usize, out: &mut [[u32; W]]) {
     // A last group of 16 may leave panels of 32 half written.
-    if W > GROUP && from.lanes % W != 0 && from.lanes % W <= GROUP {
+    if W > GROUP && !from.lanes.is_multiple_of(W) && from.lanes % W <= GROUP {
         let last = out.len() - pairs;
         out[last..].fill([0; W]);
     }

@@ -279,7 +279,7 @@ impl<'a> Work<'a> {
         let store = if piece.0 == 0 { self.store } else { Store::Add };
         let rows = |(chunk, data): (usize, &mut [f32])| {
             let first = chunk * ROWS_AT_ONCE;
-            let to = Target {
+            let mut to = Target {
                 data,
                 stride,
                 rows: ROWS_AT_ONCE.min(lhs.lanes - first),
@@ -287,7 +287,7 @@ impl<'a> Work<'a> {
                 store,
                 scale,
             };
-            rows_product(unit, lhs.part((first, to.rows), piece), (panels, pairs), to);
+            rows_product(unit, lhs.part((first, to.rows), piece), (panels, pairs), &mut to);
         };
         let at_once = (ROWS_AT_ONCE * stride).max(1);
         if self.is_shared {
@@ -300,7 +300,12 @@ impl<'a> Work<'a> {
 }
 
 /// The product of a few rows with all panels, each `deep` pairs; `to` is as wide as its columns.
-fn rows_product<U: Unit>(unit: U, lhs: Lanes<'_>, (panels, deep): (&[u32], usize), to: Target<'_>) {
+fn rows_product<U: Unit>(
+    unit: U,
+    lhs: Lanes<'_>,
+    (panels, deep): (&[u32], usize),
+    to: &mut Target<'_>,
+) {
     let pairs = U::pairs(lhs.depth);
     let mut left = LEFT.take();
     let blocks = left.room(pairs * lhs.lanes.next_multiple_of(U::ROWS));
@@ -315,7 +320,7 @@ fn rows_product<U: Unit>(unit: U, lhs: Lanes<'_>, (panels, deep): (&[u32], usize
                     data: &mut to.data[row * to.stride + column..],
                     rows: U::ROWS.min(to.rows - row),
                     columns: PANEL.min(to.columns - column),
-                    ..to
+                    ..*to
                 };
                 unit.multiply(block, panel, &mut to);
             }

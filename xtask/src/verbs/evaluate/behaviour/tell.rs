@@ -19,8 +19,10 @@ use crate::verbs::evaluate::ledger::{self, Entry};
 /// Draws of scenarios for an interval; its ends move by a few percent of its width with the seed.
 const DRAWS: usize = 1000;
 
-/// What is on which chart, and what its axis says.
-const CHARTS: [(&str, &str, fn(Measure) -> bool); 3] = [
+/// A chart: its name, what its axis says, and which measures are on it.
+type Chart = (&'static str, &'static str, fn(Measure) -> bool);
+
+const CHARTS: [Chart; 3] = [
     (
         "shares",
         "share, or number per agent, with 95 % intervals over scenarios",

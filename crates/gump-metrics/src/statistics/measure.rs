@@ -1,0 +1,223 @@
+//! The measures: their names, what they mean and their bins.
+
+/// Something that is counted. Rates and shares are fractions, other units are SI.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Measure {
+    /// Share of steps slower than 0.3 m/s.
+    Standing,
+    /// Share of tracks of at least two seconds that stay within 1 m of where they were first.
+    Parked,
+    /// Of the parked tracks, the share more than 2 m from any lane centre.
+    ParkedOffLane,
+    /// Distance of parked tracks to the nearest lane centre, m.
+    ParkedLaneDistance,
+    /// Share of tracks that both stand and drive faster than 1 m/s.
+    StopsAndGoes,
+    /// Speed of what moves, m/s.
+    Speed,
+    /// Acceleration along the heading of what moves, m/s².
+    Acceleration,
+    /// Turning of what moves, either way, rad/s.
+    YawRate,
+    /// Free metres to whoever is ahead in the same direction within 50 m, of those on a lane.
+    Gap,
+    /// Length of a track's box, m.
+    Length,
+    /// Width of a track's box, m.
+    Width,
+    /// Agents at the present.
+    Agents,
+    /// Agents within 60 m of the ego at the present.
+    AgentsNear,
+    /// Tracks over the whole scene.
+    Tracks,
+    /// Share of the scene's steps in which a track is there.
+    Presence,
+    /// Share of tracks that begin after the first step.
+    BeginsLate,
+    /// Share of tracks that end before the last step.
+    EndsEarly,
+    /// Share of tracks that are missing between two steps in which they are there.
+    Interrupted,
+    /// Metres that the box of a parked track moves per 0.1 s.
+    Jitter,
+    /// Radians that the box of a parked track turns per 0.1 s.
+    HeadingJitter,
+    /// Speed that the recording states of parked tracks, m/s.
+    ParkedSpeed,
+    /// Of what moves, the share within 3 m of the centre of a lane in its direction.
+    OnLane,
+    /// Distance from that centre, m.
+    LateralOffset,
+    /// Share of steps within a crosswalk, of people and bicycles.
+    OnCrosswalk,
+    /// Share of steps on a lane outside of crosswalks, of people and bicycles.
+    OnRoad,
+    /// Share of steps beside the road, of people and bicycles.
+    Beside,
+    /// Signed distance of the centre to the nearest road edge, m: negative on the road.
+    EdgeDistance,
+    /// Other agents within 10 m.
+    Neighbours,
+    /// Free metres to the nearest other agent.
+    Nearest,
+    /// Distance from the ego, m.
+    EgoDistance,
+    /// Speed of the ego at the present, m/s.
+    EgoSpeed,
+    /// Share of egos that stand at the present.
+    EgoStands,
+    /// Lanes.
+    Lanes,
+    /// Kilometres of lanes.
+    LaneKilometres,
+    /// Intersections: groups of lanes in an intersection less than 25 m apart.
+    Junctions,
+    /// Share of lanes with a speed limit.
+    LanesWithLimit,
+    /// Lights at the present.
+    Lights,
+    /// Stop signs.
+    StopSigns,
+    /// Crosswalks.
+    Crosswalks,
+    /// Driveways.
+    Driveways,
+}
+
+impl Measure {
+    /// Every measure.
+    pub const ALL: [Self; 40] = [
+        Self::Standing,
+        Self::Parked,
+        Self::ParkedOffLane,
+        Self::ParkedLaneDistance,
+        Self::StopsAndGoes,
+        Self::Speed,
+        Self::Acceleration,
+        Self::YawRate,
+        Self::Gap,
+        Self::Length,
+        Self::Width,
+        Self::Agents,
+        Self::AgentsNear,
+        Self::Tracks,
+        Self::Presence,
+        Self::BeginsLate,
+        Self::EndsEarly,
+        Self::Interrupted,
+        Self::Jitter,
+        Self::HeadingJitter,
+        Self::ParkedSpeed,
+        Self::OnLane,
+        Self::LateralOffset,
+        Self::OnCrosswalk,
+        Self::OnRoad,
+        Self::Beside,
+        Self::EdgeDistance,
+        Self::Neighbours,
+        Self::Nearest,
+        Self::EgoDistance,
+        Self::EgoSpeed,
+        Self::EgoStands,
+        Self::Lanes,
+        Self::LaneKilometres,
+        Self::Junctions,
+        Self::LanesWithLimit,
+        Self::Lights,
+        Self::StopSigns,
+        Self::Crosswalks,
+        Self::Driveways,
+    ];
+
+    /// The name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Standing => "standing",
+            Self::Parked => "parked",
+            Self::ParkedOffLane => "parked_off_lane",
+            Self::ParkedLaneDistance => "parked_lane_distance",
+            Self::StopsAndGoes => "stops_and_goes",
+            Self::Speed => "speed",
+            Self::Acceleration => "acceleration",
+            Self::YawRate => "yaw_rate",
+            Self::Gap => "gap",
+            Self::Length => "length",
+            Self::Width => "width",
+            Self::Agents => "agents",
+            Self::AgentsNear => "agents_near",
+            Self::Tracks => "tracks",
+            Self::Presence => "presence",
+            Self::BeginsLate => "begins_late",
+            Self::EndsEarly => "ends_early",
+            Self::Interrupted => "interrupted",
+            Self::Jitter => "jitter",
+            Self::HeadingJitter => "heading_jitter",
+            Self::ParkedSpeed => "parked_speed",
+            Self::OnLane => "on_lane",
+            Self::LateralOffset => "lateral_offset",
+            Self::OnCrosswalk => "on_crosswalk",
+            Self::OnRoad => "on_road",
+            Self::Beside => "beside",
+            Self::EdgeDistance => "edge_distance",
+            Self::Neighbours => "neighbours",
+            Self::Nearest => "nearest",
+            Self::EgoDistance => "ego_distance",
+            Self::EgoSpeed => "ego_speed",
+            Self::EgoStands => "ego_stands",
+            Self::Lanes => "lanes",
+            Self::LaneKilometres => "lane_km",
+            Self::Junctions => "junctions",
+            Self::LanesWithLimit => "lanes_with_limit",
+            Self::Lights => "lights",
+            Self::StopSigns => "stop_signs",
+            Self::Crosswalks => "crosswalks",
+            Self::Driveways => "driveways",
+        }
+    }
+
+    /// The measure with this name.
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|measure| measure.name() == name)
+    }
+
+    /// Where its bins begin and end, and how many there are. Shares have two: does not hold, holds.
+    pub fn bins(self) -> (f64, f64, usize) {
+        match self {
+            Self::Standing
+            | Self::Parked
+            | Self::ParkedOffLane
+            | Self::StopsAndGoes
+            | Self::BeginsLate
+            | Self::EndsEarly
+            | Self::Interrupted
+            | Self::OnLane
+            | Self::OnCrosswalk
+            | Self::OnRoad
+            | Self::Beside
+            | Self::EgoStands
+            | Self::LanesWithLimit => (-0.5, 1.5, 2),
+            Self::Speed | Self::EgoSpeed => (0.0, 30.0, 60),
+            Self::Acceleration => (-6.0, 6.0, 60),
+            Self::YawRate => (0.0, 1.0, 100),
+            Self::Gap => (0.0, 50.0, 50),
+            Self::Length => (0.0, 16.0, 64),
+            Self::Width => (0.0, 4.0, 40),
+            Self::Agents | Self::AgentsNear | Self::Tracks => (0.0, 200.0, 50),
+            Self::Presence => (0.0, 1.0, 20),
+            Self::Jitter => (0.0, 0.1, 100),
+            Self::HeadingJitter => (0.0, 0.5, 100),
+            Self::ParkedSpeed => (0.0, 0.5, 50),
+            Self::LateralOffset => (0.0, 3.0, 30),
+            Self::ParkedLaneDistance => (0.0, 20.0, 40),
+            Self::EdgeDistance => (-15.0, 25.0, 40),
+            Self::Neighbours => (0.0, 25.0, 25),
+            Self::Nearest => (0.0, 20.0, 40),
+            Self::EgoDistance => (0.0, 150.0, 50),
+            Self::Lanes => (0.0, 500.0, 50),
+            Self::LaneKilometres => (0.0, 20.0, 40),
+            Self::Junctions => (0.0, 20.0, 20),
+            Self::Lights | Self::StopSigns | Self::Crosswalks | Self::Driveways => (0.0, 40.0, 40),
+        }
+    }
+}

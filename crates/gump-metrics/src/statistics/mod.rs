@@ -1,0 +1,266 @@
+//! What traffic is like, as distributions: counted over any number of scenes in constant memory,
+//! and compared with those of other scenes.
+//!
+//! Start with [`Statistics::add`] and [`Statistics::compare`]; [`Measure::ALL`] lists what is
+//! counted. A measure is counted for vehicles, pedestrians and bicycles separately, or once per
+//! scene. Every distribution has fixed bins, so that counts of parts add up and two sets can be
+//! compared without their scenes.
+//!
+//! ```
+//! use gump_metrics::statistics::{Measure, Statistics};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 200,0
+//!      ego vehicle 0: 10,0 velocity 8,0
+//!      agent vehicle 1: 40,5",
+//! ).unwrap();
+//! let mut statistics = Statistics::default();
+//! statistics.add(&scenario);
+//! let rows = statistics.rows();
+//! let standing = rows.iter().find(|row| row.measure == Measure::Standing).unwrap();
+//! assert_eq!(standing.distribution.mean(), 0.5);
+//! assert!(statistics.compare(&statistics).iter().all(|row| row.wasserstein == Some(0.0)));
+//! ```
+
+mod distribution;
+mod measure;
+mod observe;
+mod surroundings;
+
+use std::collections::BTreeMap;
+
+use gump_scene::{AgentKind, Scenario};
+
+pub use self::distribution::Distribution;
+pub use self::measure::Measure;
+
+/// Of whom a measure speaks: a kind of agent, or `None` for the scene as a whole.
+pub type Class = Option<AgentKind>;
+
+/// The name of a class in tables.
+pub fn class_name(class: Class) -> &'static str {
+    class.map_or("scene", AgentKind::name)
+}
+
+/// The class with this name in tables.
+pub fn class_of_name(name: &str) -> Option<Class> {
+    let kinds = AgentKind::MOVING.into_iter().map(Some);
+    let mut all = std::iter::once(None).chain(kinds);
+    all.find(|class| class_name(*class) == name)
+}
+
+/// Distributions of every measure over some scenes.
+#[derive(Clone, Debug, Default)]
+pub struct Statistics {
+    scenes: u64,
+    counted: BTreeMap<(Measure, Class), Distribution>,
+}
+
+/// One distribution.
+#[derive(Clone, Debug)]
+pub struct Row<'a> {
+    /// What is counted.
+    pub measure: Measure,
+    /// Of whom.
+    pub class: Class,
+    /// How it is distributed.
+    pub distribution: &'a Distribution,
+}
+
+/// One distribution beside that of other scenes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Comparison {
+    /// What is compared.
+    pub measure: Measure,
+    /// Of whom.
+    pub class: Class,
+    /// Observations in the set.
+    pub n: u64,
+    /// Mean of the set; `None` without observations.
+    pub mean: Option<f64>,
+    /// Observations in the reference.
+    pub reference_n: u64,
+    /// Mean of the reference.
+    pub reference_mean: Option<f64>,
+    /// 1-Wasserstein distance in standard deviations of the reference; `None` where either side
+    /// has no observation.
+    pub wasserstein: Option<f64>,
+    /// Jensen-Shannon divergence in bits: 0 for equal, 1 for disjoint distributions.
+    pub jensen_shannon: Option<f64>,
+}
+
+impl Statistics {
+    /// Counts a scene.
+    pub fn add(&mut self, scenario: &Scenario) {
+        self.scenes += 1;
+        observe::observe(scenario, self);
+    }
+
+    /// Adds what was counted elsewhere.
+    pub fn merge(&mut self, other: &Self) {
+        self.scenes += other.scenes;
+        for (key, distribution) in &other.counted {
+            self.of(*key).merge(distribution);
+        }
+    }
+
+    /// Scenes counted.
+    pub fn scenes(&self) -> u64 {
+        self.scenes
+    }
+
+    /// Statistics of `scenes` scenes that were counted before, from their distributions.
+    pub fn from_rows(
+        scenes: u64,
+        rows: impl IntoIterator<Item = (Measure, Class, Distribution)>,
+    ) -> Self {
+        let counted = rows.into_iter().map(|(m, c, d)| ((m, c), d)).collect();
+        Self { scenes, counted }
+    }
+
+    /// All distributions, by measure and class.
+    pub fn rows(&self) -> Vec<Row<'_>> {
+        let row = |(&(measure, class), distribution)| Row {
+            measure,
+            class,
+            distribution,
+        };
+        self.counted.iter().map(row).collect()
+    }
+
+    /// The distribution of a measure; `None` if nothing was observed.
+    pub fn get(&self, measure: Measure, class: Class) -> Option<&Distribution> {
+        self.counted.get(&(measure, class))
+    }
+
+    /// Every distribution that either side has, beside that of the reference.
+    pub fn compare(&self, reference: &Self) -> Vec<Comparison> {
+        let keys = self.counted.keys().chain(reference.counted.keys());
+        let keys: std::collections::BTreeSet<_> = keys.copied().collect();
+        let compared = keys.into_iter().map(|(measure, class)| {
+            let (mine, theirs) = (self.get(measure, class), reference.get(measure, class));
+            let both = mine.zip(theirs);
+            Comparison {
+                measure,
+                class,
+                n: mine.map_or(0, Distribution::n),
+                mean: mine.map(Distribution::mean),
+                reference_n: theirs.map_or(0, Distribution::n),
+                reference_mean: theirs.map(Distribution::mean),
+                wasserstein: both.map(|(mine, theirs)| mine.wasserstein(theirs)),
+                jensen_shannon: both.map(|(mine, theirs)| mine.jensen_shannon(theirs)),
+            }
+        });
+        compared.collect()
+    }
+
+    /// Notes an observation.
+    fn note(&mut self, measure: Measure, class: Class, value: f64) {
+        self.of((measure, class)).add(value);
+    }
+
+    /// Notes whether something holds.
+    fn note_if(&mut self, measure: Measure, class: Class, holds: bool) {
+        self.note(measure, class, f64::from(u8::from(holds)));
+    }
+
+    fn of(&mut self, key: (Measure, Class)) -> &mut Distribution {
+        let empty = || {
+            let (low, high, bins) = key.0.bins();
+            Distribution::new(low, high, bins)
+        };
+        self.counted.entry(key).or_insert_with(empty)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use Measure as M;
+
+    const VEHICLE: Class = Some(AgentKind::Vehicle);
+
+    fn counted(text: &str) -> Statistics {
+        let mut statistics = Statistics::default();
+        statistics.add(&gump_scene::fixture::scenario(text).unwrap());
+        statistics
+    }
+
+    fn mean(statistics: &Statistics, measure: Measure, class: Class) -> f64 {
+        statistics.get(measure, class).unwrap().mean()
+    }
+
+    #[test]
+    fn a_street_with_a_parked_car_is_told_as_it_is() {
+        let statistics = counted(
+            "lane 1: 0,0 300,0
+             ego vehicle 0: 10,0.5 velocity 8,0
+             agent vehicle 1: 30,0.5 velocity 8,0
+             agent vehicle 2: 40,4
+             agent pedestrian 3: 60,1 velocity 0,-0.4
+             history 1 future 2 dt 0.1",
+        );
+        assert_eq!(statistics.scenes(), 1);
+        assert!((mean(&statistics, M::Standing, VEHICLE) - 1.0 / 3.0).abs() < 1e-9);
+        assert!((mean(&statistics, M::Parked, VEHICLE) - 1.0 / 3.0).abs() < 1e-9);
+        assert_eq!(mean(&statistics, M::ParkedOffLane, VEHICLE), 1.0);
+        assert!((mean(&statistics, M::Speed, VEHICLE) - 8.0).abs() < 1e-9);
+        // Boxes of 4.5 m, 20 m apart.
+        let gap = statistics.get(M::Gap, VEHICLE).unwrap();
+        assert!((gap.mean() - 15.5).abs() < 1.0, "{}", gap.mean());
+        assert_eq!(mean(&statistics, M::LateralOffset, VEHICLE), 0.5);
+        assert_eq!(mean(&statistics, M::Agents, VEHICLE), 3.0);
+        assert_eq!(mean(&statistics, M::OnCrosswalk, Some(AgentKind::Pedestrian)), 0.0);
+        assert_eq!(mean(&statistics, M::EgoSpeed, None), 8.0);
+        assert_eq!(mean(&statistics, M::Lanes, None), 1.0);
+        assert_eq!(mean(&statistics, M::Jitter, VEHICLE), 0.0);
+    }
+
+    #[test]
+    fn parts_add_up_and_rows_are_all_there_is() {
+        let texts = [
+            "ego vehicle 0: 0,0 velocity 5,0",
+            "ego vehicle 0: 0,0\nagent vehicle 1: 9,0 velocity 3,0",
+        ];
+        let mut whole = Statistics::default();
+        let mut merged = Statistics::default();
+        for text in texts {
+            let scenario = gump_scene::fixture::scenario(text).unwrap();
+            whole.add(&scenario);
+            merged.merge(&counted(text));
+        }
+        let rows = |s: &Statistics| {
+            let rows = s.rows().into_iter().map(|r| (r.measure, r.class, r.distribution.clone()));
+            rows.collect::<Vec<_>>()
+        };
+        assert_eq!(rows(&whole), rows(&merged));
+        let again = Statistics::from_rows(2, rows(&whole));
+        assert!(again.compare(&whole).iter().all(|row| row.wasserstein == Some(0.0)));
+    }
+
+    #[test]
+    fn what_only_one_side_has_has_no_distance() {
+        let [one, two] = [
+            counted("ego vehicle 0: 0,0 velocity 5,0"),
+            counted("ego vehicle 0: 0,0 velocity 5,0\nagent pedestrian 1: 9,0"),
+        ];
+        let rows = one.compare(&two);
+        let row = rows
+            .iter()
+            .find(|row| row.class == Some(AgentKind::Pedestrian) && row.measure == M::Standing)
+            .unwrap();
+        assert_eq!((row.n, row.mean, row.wasserstein), (0, None, None));
+        assert_eq!(row.reference_mean, Some(1.0));
+    }
+
+    #[test]
+    fn names_are_unique_and_known() {
+        for measure in Measure::ALL {
+            assert_eq!(Measure::of_name(measure.name()), Some(measure));
+        }
+        for name in ["scene", "vehicle", "pedestrian", "bicycle"] {
+            assert_eq!(class_of_name(name).map(class_name), Some(name));
+        }
+        assert_eq!(class_of_name("cone"), None);
+    }
+}

@@ -1,0 +1,213 @@
+//! What a plan gets besides its main roads: side roads, car parks, and where one may park.
+
+use std::collections::BTreeMap;
+use std::f64::consts::FRAC_PI_2;
+
+use gump_geometry::{Pose, wrap_angle};
+use gump_scene::Rng;
+use rand::Rng as _;
+
+use crate::curve::{Track, bend};
+use crate::layout::street;
+use crate::plan::{Control, NodePlan, Plan, RoadPlan};
+
+/// Shortest road that is left on either side of a new junction, metres.
+const SHORTEST: f64 = 34.0;
+/// Metres between the sidewalks of a new road and those of the others.
+const CLEARANCE: f64 = 9.0;
+/// Metres of a new road beside its own junction, where it is near the road it leaves.
+const OWN_JUNCTION: f64 = 26.0;
+/// Length of a driveway between the road and the first bay, metres.
+const DRIVEWAY: f64 = 16.0;
+
+/// Adds side roads and car parks, then decides along which roads vehicles park.
+pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
+    let n_side = rng.random_range(2..=7);
+    add_some(plan, extent, n_side, add_side_road, rng);
+    let n_parks = rng.random_range(0..=5);
+    add_some(plan, extent, n_parks, add_car_park, rng);
+    allow_parking(plan, rng);
+    // Traffic is faster on wide roads than their plain plans have it.
+    let haste = rng.random_range(1.0..1.3);
+    for road in plan.roads.iter_mut().filter(|road| road.forward > 1) {
+        road.speed_limit *= haste;
+    }
+}
+
+type Adds = fn(&mut Plan, (usize, f64, bool), f64, &mut Rng) -> bool;
+
+/// Tries a few places for each of `n` roads.
+fn add_some(plan: &mut Plan, extent: f64, n: usize, add: Adds, rng: &mut Rng) {
+    let mut left = n;
+    for _ in 0..8 * n {
+        if left == 0 {
+            return;
+        }
+        let road = rng.random_range(0..plan.roads.len());
+        let is_left = rng.random_bool(0.5);
+        let part = rng.random_range(0.0..1.0);
+        let r = &plan.roads[road];
+        let room = r.reference.length() - 2.0 * SHORTEST;
+        if r.freeway || r.ring || r.bays || !r.sidewalks && r.speed_limit < 7.0 || room <= 0.0 {
+            continue;
+        }
+        let s = SHORTEST + part * room;
+        left -= usize::from(add(plan, (road, s, is_left), extent, rng));
+    }
+}
+
+/// A minor road that leaves another one, without any sign in many places.
+fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
+    let style = RoadPlan {
+        speed_limit: rng.random_range(8.0..12.0),
+        ..street(1, false, rng)
+    };
+    let start = start(plan, at, rng.random_range(-0.2..0.2));
+    let whole = (1.2 * extent - start.position.length()).max(95.0);
+    let sharpest = rng.random_range(-0.4..0.4);
+    let bends = [(45.0, 25.0, sharpest)];
+    let of_length = |length| Track::through(&bend(start, length, &bends));
+    let clear = |road: &Track| is_clear(plan, at.0, road, style.half_width(true));
+    let Some(reference) = [whole, 80.0].map(of_length).into_iter().find(clear) else {
+        return false;
+    };
+    let control = if rng.random_bool(0.75) {
+        Control::MinorStop
+    } else {
+        Control::MinorYield
+    };
+    let node = split(plan, at, control, rng.random_bool(0.3), rng);
+    plan.roads.push(RoadPlan {
+        reference,
+        ends: [Some(node), None],
+        ..style
+    });
+    true
+}
+
+/// A driveway and, behind it, an aisle between two rows of bays.
+fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
+    let aisle = RoadPlan {
+        lane_width: rng.random_range(2.9..3.2),
+        median: 0.0,
+        bike_lanes: false,
+        parking: true,
+        bays: true,
+        sidewalks: false,
+        speed_limit: rng.random_range(3.5..5.5),
+        ..street(1, false, rng)
+    };
+    let start = start(plan, at, rng.random_range(-0.06..0.06));
+    let road = &plan.roads[at.0];
+    let driveway = road.half_width(!at.2) + DRIVEWAY;
+    let length = rng.random_range(45.0..85.0_f64).min(1.4 * extent - start.position.length());
+    if length < 35.0 {
+        return false;
+    }
+    let whole = bend(start, driveway + length, &[]);
+    let whole = Track::through(&whole);
+    if !is_clear(plan, at.0, &whole, aisle.half_width(true)) {
+        return false;
+    }
+    let node = split(plan, at, Control::MinorYield, false, rng);
+    let inner = plan.nodes.len();
+    plan.nodes.push(NodePlan {
+        control: Control::Free,
+        crosswalks: false,
+        corner_radius: 1.0,
+        min_setback: 3.0,
+    });
+    plan.roads.push(RoadPlan {
+        reference: whole.slice(0.0, driveway),
+        ends: [Some(node), Some(inner)],
+        parking: false,
+        bays: false,
+        ..aisle.clone()
+    });
+    plan.roads.push(RoadPlan {
+        reference: whole.slice(driveway, whole.length()),
+        ends: [Some(inner), None],
+        ..aisle
+    });
+    true
+}
+
+/// The pose on the reference of a road from which a new one sets out, to its left or right.
+fn start(plan: &Plan, (road, s, left): (usize, f64, bool), skew: f64) -> Pose {
+    let along = plan.roads[road].reference.pose_at(s);
+    let turn = if left { FRAC_PI_2 } else { -FRAC_PI_2 };
+    Pose {
+        heading: wrap_angle(along.heading + turn + skew),
+        ..along
+    }
+}
+
+/// Cuts a road in two at a new junction, of which it gives the index.
+fn split(
+    plan: &mut Plan,
+    (road, s, _): (usize, f64, bool),
+    control: Control,
+    crosswalks: bool,
+    rng: &mut Rng,
+) -> usize {
+    let node = plan.nodes.len();
+    plan.nodes.push(NodePlan {
+        control,
+        crosswalks,
+        corner_radius: rng.random_range(3.5..7.0),
+        min_setback: 5.0,
+    });
+    let whole = plan.roads[road].clone();
+    let length = whole.reference.length();
+    plan.roads[road].reference = whole.reference.slice(0.0, s);
+    plan.roads[road].ends[1] = Some(node);
+    plan.roads[road].major = true;
+    plan.roads.push(RoadPlan {
+        reference: whole.reference.slice(s, length),
+        ends: [Some(node), whole.ends[1]],
+        major: true,
+        ..whole
+    });
+    node
+}
+
+/// True if a new road stays away from all others, the one it leaves apart near its start.
+fn is_clear(plan: &Plan, from: usize, reference: &Track, half_width: f64) -> bool {
+    plan.roads.iter().enumerate().all(|(i, other)| {
+        let theirs = other.half_width(true).max(other.half_width(false));
+        let apart = half_width + theirs + CLEARANCE;
+        let skipped = if i == from {
+            OWN_JUNCTION + theirs
+        } else {
+            0.0
+        };
+        let far = |point: &gump_geometry::DVec2| {
+            let foot = other.reference.project(*point);
+            other.reference.pose_at(foot).position.distance(*point) > apart
+        };
+        let points = reference.points().iter();
+        points.skip(skipped as usize).step_by(4).all(far)
+    })
+}
+
+/// Decides for every kind of road in the plan whether vehicles park along it, and how.
+fn allow_parking(plan: &mut Plan, rng: &mut Rng) {
+    // Roads of one kind share the width of their lanes, which was drawn for the kind.
+    let mut decided: BTreeMap<u64, (bool, bool)> = BTreeMap::new();
+    for road in &mut plan.roads {
+        if road.freeway || road.ring || road.bays || road.speed_limit < 7.0 {
+            continue;
+        }
+        let n = road.forward.max(road.backward);
+        let (parking, bays) = *decided.entry(road.lane_width.to_bits()).or_insert_with(|| {
+            let share = match n {
+                1 => 0.85,
+                2 => 0.6,
+                _ => 0.3,
+            };
+            let bays = n == 1 && !road.bike_lanes && rng.random_bool(0.08);
+            (rng.random_bool(share), bays)
+        });
+        (road.parking, road.bays) = (parking, parking && bays);
+    }
+}

@@ -1,0 +1,117 @@
+//! Driveways: where vehicles cross the sidewalk to a yard, with or without one that stands there.
+
+use gump_geometry::{DVec2, Pose, wrap_angle};
+use gump_scene::{AgentKind, AreaKind, Rng};
+use rand::Rng as _;
+
+use crate::curve::Track;
+use crate::network::Network;
+use crate::plan::Plan;
+use crate::traffic::{Standing, draw_real_size};
+
+/// From the curb to the end of a driveway, behind the sidewalk, metres.
+const DEPTH: f64 = 4.6;
+/// Metres of road without driveways at its ends.
+const ENDS: f64 = 9.0;
+/// Vehicles in yards stay away from every lane by this much, metres.
+const FROM_LANES: f64 = 5.5;
+
+/// A driveway.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Driveway {
+    /// The middle of its mouth on the curb; +y points away from the road.
+    pub(crate) curb: Pose,
+    /// Metres along the curb.
+    pub(crate) width: f64,
+}
+
+impl Driveway {
+    /// True if a body parked along the curb would block it.
+    pub(crate) fn is_blocked_by(&self, body: &Standing) -> bool {
+        let local = self.curb.inverse() * body.pose.position;
+        local.x.abs() < (self.width + body.size[0]) / 2.0 + 0.3 && (-3.5..0.5).contains(&local.y)
+    }
+}
+
+/// Lays driveways along the streets, as areas of the map.
+pub(crate) fn lay(
+    network: &mut Network,
+    plan: &Plan,
+    trimmed: &[Track],
+    rng: &mut Rng,
+) -> Vec<Driveway> {
+    let mut driveways = Vec::new();
+    // Between town centres with hardly any and streets of houses with one each.
+    let spacing = rng.random_range(9.0..32.0);
+    for (road, track) in plan.roads.iter().zip(trimmed) {
+        if road.freeway || road.ring || road.bays || !road.sidewalks {
+            continue;
+        }
+        for left in [false, true] {
+            let mut s = ENDS + rng.random_range(0.0..spacing);
+            while s < track.length() - ENDS {
+                let along = track.pose_at(s);
+                let side = if left { 1.0 } else { -1.0 };
+                let turned = if left { 0.0 } else { std::f64::consts::PI };
+                let curb = Pose {
+                    position: along * DVec2::new(0.0, side * road.half_width(!left)),
+                    heading: wrap_angle(along.heading + turned),
+                };
+                let width = rng.random_range(3.2..7.0);
+                let corner = |x: f64, y: f64| curb * DVec2::new(x, y);
+                let half = width / 2.0;
+                let ring = vec![
+                    corner(-half, 0.0),
+                    corner(half, 0.0),
+                    corner(half - 0.4, DEPTH),
+                    corner(0.4 - half, DEPTH),
+                ];
+                network.furniture.areas.push((AreaKind::Driveway, ring));
+                driveways.push(Driveway { curb, width });
+                s += spacing * rng.random_range(0.6..1.6) + width;
+            }
+        }
+    }
+    driveways
+}
+
+/// Vehicles that stand in yards behind the driveways, a `share` of them taken.
+pub(crate) fn parked(
+    network: &Network,
+    driveways: &[Driveway],
+    share: f64,
+    rng: &mut Rng,
+) -> Vec<Standing> {
+    let mut all = Vec::new();
+    for driveway in driveways {
+        if !rng.random_bool(share) {
+            continue;
+        }
+        let n = if driveway.width > 5.2 { 2 } else { 1 };
+        for k in 0..n {
+            let mut size = draw_real_size(rng);
+            size[0] = size[0].min(6.0);
+            size[1] = size[1].min(2.2);
+            let x = (f64::from(k) - f64::from(n - 1) / 2.0) * 2.7;
+            let y = DEPTH + 0.6 + size[0] / 2.0 + rng.random_range(0.0..2.5);
+            let nose_in = if rng.random_bool(0.7) { 0.5 } else { -0.5 };
+            let turn = nose_in * std::f64::consts::PI + rng.random_range(-0.05..0.05);
+            let pose = driveway.curb * Pose::new(x + rng.random_range(-0.15..0.15), y, turn);
+            let far = network.lanes.iter().all(|lane| {
+                let foot = lane.track.pose_at(lane.track.project(pose.position));
+                foot.position.distance(pose.position) > FROM_LANES
+            });
+            if far && rng.random_bool(0.8) {
+                all.push(Standing {
+                    kind: AgentKind::Vehicle,
+                    size,
+                    pose: Pose {
+                        heading: wrap_angle(pose.heading),
+                        ..pose
+                    },
+                });
+            }
+        }
+    }
+    all
+}

@@ -1,0 +1,199 @@
+//! Scenes like recorded ones: the plain families of roads, dressed with what recordings show.
+//!
+//! `dress` adds side roads, car parks and parking to a plan; `scenery` puts parked vehicles,
+//! people who stand and people who cross anywhere on the network; here all is put together. How
+//! many of what there are is fitted to `configs/targets/waymo-like.toml`.
+
+mod dress;
+mod driveways;
+mod scenery;
+
+use std::ops::RangeInclusive;
+use std::sync::Arc;
+
+use gump_scene::{AgentId, AgentKind, LaneId, Rng, Scenario, Seed};
+use rand::Rng as _;
+
+use self::driveways::Driveway;
+use crate::layout::draw_plan;
+use crate::map::{build_map, lane_id};
+use crate::network::Network;
+use crate::record::{Recording, Track};
+use crate::scenario::{draw_placement, frames, route, targets};
+use crate::traffic::{Demand, Traffic};
+use crate::{RoadFamily, SynthesisConfig};
+
+/// How often a family is drawn: recordings are made in towns, rarely on motorways.
+const FAMILIES: [(RoadFamily, u32); 9] = [
+    (RoadFamily::SignalizedCrossing, 25),
+    (RoadFamily::StopCrossing, 13),
+    (RoadFamily::TeeJunction, 11),
+    (RoadFamily::Roundabout, 2),
+    (RoadFamily::Arterial, 18),
+    (RoadFamily::CurvedRoad, 5),
+    (RoadFamily::OnRamp, 12),
+    (RoadFamily::MidBlockCrosswalk, 5),
+    (RoadFamily::Grid, 17),
+];
+/// Share of scenes whose map states no speed limits.
+const NO_LIMITS: f64 = 0.5;
+/// Share of scenes whose map states no stop signs, though drivers keep to the rule.
+const NO_SIGNS: f64 = 0.2;
+/// Share of scenes with lights whose lights are not recorded.
+const NO_LIGHTS: f64 = 0.3;
+/// Share of scenes whose map has no lanes in car parks.
+const UNMAPPED_CAR_PARKS: f64 = 0.7;
+/// Limits below this are those of car parks, m/s.
+const CAR_PARK_SPEED: f64 = 6.0;
+/// Metres from the centre of the scene within which the ego is chosen.
+const EGO_REACH: f64 = 60.0;
+
+/// What a scene like a recorded one aims at.
+pub(crate) fn config() -> SynthesisConfig {
+    SynthesisConfig {
+        extent_m: 150.0,
+        vehicles: 10..=60,
+        pedestrians: 0..=34,
+        bicycles: 0..=3,
+        ..SynthesisConfig::standard()
+    }
+}
+
+/// A family, as often as recordings show it.
+pub(crate) fn draw_family(rng: &mut Rng) -> RoadFamily {
+    let total = FAMILIES.iter().map(|(_, weight)| weight).sum();
+    let mut draw = rng.random_range(0..total);
+    for (family, weight) in FAMILIES {
+        if draw < weight {
+            return family;
+        }
+        draw -= weight;
+    }
+    RoadFamily::Grid
+}
+
+/// One draw of a scene; `None` if vehicles touched or nobody can be the ego.
+pub(crate) fn draw_scenario(
+    config: &SynthesisConfig,
+    family: RoadFamily,
+    seed: Seed,
+    attempt: u64,
+) -> Option<Scenario> {
+    let mut rng = seed.fork(attempt).rng();
+    let mut plan = draw_plan(family, config.extent_m, &mut rng);
+    dress::dress(&mut plan, config.extent_m, &mut rng);
+    let (mut network, trimmed) = Network::roads(&plan, &mut rng);
+    let n_lots = rng.random_range(0..=8);
+    network.lay_lots(&plan, &trimmed, n_lots, 1..=5, &mut rng);
+    let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
+    let demand = draw_demand(config, &network, &driveways, &mut rng);
+    let traffic_rng = seed.fork(attempt).fork(1).rng();
+    let mut traffic = Traffic::new(&network, demand, config.dt, traffic_rng);
+    for _ in 0..(config.warmup_s / config.dt).round() as usize {
+        traffic.step();
+    }
+    let mut recording = Recording::make(&mut traffic, config.n_frames());
+    if !recording.part_bodies() {
+        return None;
+    }
+    let ego = choose_ego(&recording, config.now(), &mut rng)?;
+    let placement = draw_placement(&mut rng);
+    let mut route = route(&network, ego, &traffic, &placement);
+    let (ego_id, targets) = (ego.body.id, targets(&recording, ego, config.now()));
+    hide_car_parks(&mut network, ego, &mut rng);
+    let is_mapped = |lane: &LaneId| !network.unmapped.iter().any(|&i| lane_id(i) == *lane);
+    route.lanes.retain(is_mapped);
+    network.hides_limits = rng.random_bool(NO_LIMITS);
+    if rng.random_bool(NO_SIGNS) {
+        network.furniture.stop_signs.clear();
+    }
+    if rng.random_bool(NO_LIGHTS) {
+        recording.forget_lights();
+    }
+    let map = build_map(&network, &placement).expect("networks have finite coordinates");
+    let log = frames(&recording, &placement, config.dt);
+    let mut scenario = Scenario {
+        id: format!("like-{family}-{:016x}", seed.0),
+        map: Arc::new(map),
+        route: Some(Arc::new(route)),
+        targets,
+        ego: AgentId(ego_id),
+        log,
+        dt: config.dt,
+        now: config.now(),
+        objects_of_interest: Vec::new(),
+        tags: Vec::new(),
+    };
+    scenario.tags = gump_metrics::tags::mine(&scenario);
+    Some(scenario)
+}
+
+fn draw_demand(
+    config: &SynthesisConfig,
+    network: &Network,
+    driveways: &[Driveway],
+    rng: &mut Rng,
+) -> Demand {
+    let metres: f64 = network
+        .lanes
+        .iter()
+        .filter(|lane| lane.connector.is_none() && !lane.is_bike_lane())
+        .map(|lane| lane.length())
+        .sum();
+    // One vehicle per 24 m of lane is as much as flows.
+    let most = ((metres / 24.0) as usize).max(1);
+    let moving = draw_skewed(&config.vehicles, 1.3, config.density, rng).clamp(1, most);
+    // How busy people and parking are goes together.
+    let bustle = rng.random_range(0.0_f64..1.0);
+    let people = draw_skewed(
+        &config.pedestrians,
+        3.0,
+        config.density * (0.4 + bustle),
+        rng,
+    );
+    Demand {
+        moving,
+        parked: 0,
+        people,
+        bicycles: draw_skewed(&config.bicycles, 4.0, config.density, rng),
+        arrivals: rng.random_range(0.05..0.25) * config.density,
+        scenery: scenery::draw(network, config, (driveways, bustle), rng),
+    }
+}
+
+/// A number of the range, small ones more often than large ones, the more so the higher `skew`.
+fn draw_skewed(
+    range: &RangeInclusive<usize>,
+    skew: f64,
+    density: f64,
+    rng: &mut Rng,
+) -> usize {
+    let part: f64 = rng.random_range(0.0..1.0);
+    let (low, high) = (*range.start() as f64, *range.end() as f64);
+    ((low + (high - low) * part.powf(skew)) * density).round() as usize
+}
+
+/// Leaves the lanes of most car parks off the map, unless the ego drives there.
+fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
+    let slow = |lane: &crate::network::NetworkLane| lane.speed_limit < CAR_PARK_SPEED;
+    let ego_parks = ego.places().iter().any(|(lane, _)| slow(&network.lanes[*lane]));
+    if !ego_parks && rng.random_bool(UNMAPPED_CAR_PARKS) {
+        let lanes = network.lanes.iter().enumerate();
+        network.unmapped = lanes.filter(|(_, l)| slow(l)).map(|(i, _)| i).collect();
+    }
+}
+
+/// Any car in traffic that is there all the time and near the centre, standing or not.
+fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option<&'a Track> {
+    let suits = |track: &&Track| {
+        let body = track.body;
+        let near = |pose: gump_geometry::Pose| pose.position.length() < EGO_REACH;
+        body.is_mobile
+            && body.kind == AgentKind::Vehicle
+            && body.size[0] < 6.0
+            && track.is_complete()
+            && track.pose(now).is_some_and(near)
+    };
+    let able: Vec<&Track> = recording.tracks().filter(suits).collect();
+    (!able.is_empty()).then(|| able[rng.random_range(0..able.len())])
+}

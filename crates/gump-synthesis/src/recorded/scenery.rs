@@ -1,0 +1,315 @@
+//! What stands about: parked vehicles, people who wait, vehicles that load, ways people cross.
+
+use gump_geometry::{DVec2, Pose, wrap_angle};
+use gump_scene::{AgentKind, LaneKind, Rng};
+use rand::Rng as _;
+
+use super::driveways::{self, Driveway};
+use crate::SynthesisConfig;
+use crate::curve::{Track, line};
+use crate::network::{LaneIdx, Network};
+use crate::traffic::{Jaywalk, Scenery, Span, Standing, draw_person_size, draw_real_size};
+
+/// From the middle of a parking strip to the curb, metres.
+const STRIP_TO_CURB: f64 = 1.6;
+/// Widest vehicle that parks along a curb, and in a bay, metres.
+const WIDEST: [f64; 2] = [2.3, 2.15];
+/// Longest vehicle that parks along a curb, and in a bay, metres.
+const LONGEST: [f64; 2] = [7.5, 5.5];
+/// Metres of curb without parked vehicles beside a way across the road.
+const JAYWALK_ROOM: f64 = 4.0;
+/// From the middle of a sidewalk to the curb, metres.
+const WALK_TO_CURB: f64 = 2.2;
+/// From the middle of a sidewalk to people who stand beside it, metres.
+const BESIDE_WALK: std::ops::Range<f64> = 2.2..3.3;
+/// Share of scenes in which a vehicle has stopped in its lane.
+const HELD: f64 = 0.12;
+/// Parked vehicles of a scene, at most, before density.
+const MOST_PARKED: f64 = 170.0;
+
+/// Draws what stands about; `bustle` of 0 to 1 says how lively the place is.
+pub(crate) fn draw(
+    network: &Network,
+    config: &SynthesisConfig,
+    (driveways, bustle): (&[Driveway], f64),
+    rng: &mut Rng,
+) -> Scenery {
+    let jaywalks = draw_jaywalks(network, rng);
+    let begins = config.warmup_s - 8.0;
+    let ends = config.warmup_s + config.history_s + config.future_s;
+    let crossers = (0..jaywalks.len())
+        .filter(|_| rng.random_bool(0.35 + 0.6 * bustle))
+        .collect::<Vec<_>>();
+    let crossers = crossers.into_iter().map(|way| (way, rng.random_range(begins..ends)));
+    let crossers = crossers.collect();
+    let mut standing = parked(network, rng);
+    standing.retain(|body| {
+        let at = body.pose.position;
+        let off = |way: &Jaywalk| {
+            let foot = way.track.pose_at(way.track.project(at)).position;
+            foot.distance(at) > JAYWALK_ROOM
+        };
+        jaywalks.iter().all(off) && !driveways.iter().any(|d| d.is_blocked_by(body))
+    });
+    let share = rng.random_range(0.0..0.9);
+    standing.extend(driveways::parked(network, driveways, share, rng));
+    // The farthest are left out: nobody at the centre would see them.
+    standing.sort_by(|a, b| {
+        let far = |body: &Standing| body.pose.position.length();
+        far(a).total_cmp(&far(b))
+    });
+    standing.truncate((MOST_PARKED * config.density) as usize);
+    standing.extend(waiting_people(network, bustle * config.density, rng));
+    Scenery {
+        is_real: true,
+        standing,
+        held: draw_held(network, rng),
+        jaywalks,
+        crossers,
+    }
+}
+
+/// Vehicles along the curbs, in bays and in lots, row by row.
+fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
+    let mut all = Vec::new();
+    for strip in &network.parking {
+        park_along(strip, rng, &mut all);
+    }
+    for strip in &network.bays {
+        let fill = draw_fill(rng);
+        let spacing = rng.random_range(2.75..3.0);
+        let n = ((strip.length() - 4.0) / spacing).max(0.0) as usize;
+        for k in 0..n {
+            if rng.random_bool(fill) {
+                let middle = strip.pose_at(2.0 + (k as f64 + 0.5) * spacing);
+                all.push(in_bay(middle, rng));
+            }
+        }
+    }
+    let fill = draw_fill(rng);
+    for place in &network.lot_places {
+        if rng.random_bool(fill) {
+            let turned = Pose {
+                heading: wrap_angle(place.heading + std::f64::consts::FRAC_PI_2),
+                ..*place
+            };
+            all.push(in_bay(turned, rng));
+        }
+    }
+    all
+}
+
+/// The share of places that are taken; rows are mostly nearly full or nearly empty.
+fn draw_fill(rng: &mut Rng) -> f64 {
+    let part: f64 = rng.random_range(0.0..1.0);
+    0.1 + 0.88 * (0.55 - (std::f64::consts::PI * part).cos() / 2.0).clamp(0.0, 1.0)
+}
+
+fn park_along(strip: &Track, rng: &mut Rng, all: &mut Vec<Standing>) {
+    let fill = draw_fill(rng);
+    let mut s = rng.random_range(5.0..9.0);
+    let end = strip.length() - rng.random_range(5.0..9.0);
+    loop {
+        let mut size = draw_real_size(rng);
+        size[0] = size[0].min(LONGEST[0]);
+        size[1] = size[1].min(WIDEST[0]);
+        if s + size[0] > end {
+            return;
+        }
+        if !rng.random_bool(fill) {
+            s += rng.random_range(5.0..7.0);
+            continue;
+        }
+        let from_curb = rng.random_range(0.1..0.45);
+        let local = Pose::new(
+            0.0,
+            size[1] / 2.0 + from_curb - STRIP_TO_CURB,
+            rng.random_range(-0.03..0.03),
+        );
+        let on_strip = strip.pose_at(s + size[0] / 2.0);
+        let against = if rng.random_bool(0.06) { std::f64::consts::PI } else { 0.0 };
+        let pose = on_strip * local;
+        all.push(Standing {
+            kind: AgentKind::Vehicle,
+            size,
+            pose: Pose {
+                heading: wrap_angle(pose.heading + against),
+                ..pose
+            },
+        });
+        s += size[0] + rng.random_range(0.6..1.0) + rng.random_range(0.0_f64..1.0).powi(3) * 2.5;
+    }
+}
+
+/// A vehicle in the bay around the middle of a strip, at right angles to it.
+fn in_bay(middle: Pose, rng: &mut Rng) -> Standing {
+    let mut size = draw_real_size(rng);
+    size[0] = size[0].min(LONGEST[1]);
+    size[1] = size[1].min(WIDEST[1]);
+    let nose_in = if rng.random_bool(0.75) { -0.5 } else { 0.5 };
+    let turn = nose_in * std::f64::consts::PI + rng.random_range(-0.04..0.04);
+    let local = Pose::new(
+        rng.random_range(-0.12..0.12),
+        rng.random_range(-0.25..0.15),
+        turn,
+    );
+    let pose = middle * local;
+    Standing {
+        kind: AgentKind::Vehicle,
+        size,
+        pose: Pose {
+            heading: wrap_angle(pose.heading),
+            ..pose
+        },
+    }
+}
+
+/// People who stand beside a sidewalk, alone or in groups.
+fn waiting_people(network: &Network, bustle: f64, rng: &mut Rng) -> Vec<Standing> {
+    let walks: Vec<&Track> = network
+        .walks
+        .iter()
+        .filter(|walk| walk.crosswalk.is_none() && walk.track.length() > 20.0)
+        .map(|walk| &walk.track)
+        .collect();
+    let mut people: Vec<Standing> = Vec::new();
+    if walks.is_empty() {
+        return people;
+    }
+    let n_groups = rng.random_range(0..=(1.0 + 6.0 * bustle) as usize);
+    for _ in 0..n_groups {
+        let walk = walks[rng.random_range(0..walks.len())];
+        let s = rng.random_range(4.0..walk.length() - 4.0);
+        let n = if rng.random_bool(0.5) {
+            1
+        } else {
+            rng.random_range(2..=5)
+        };
+        let side = away_from_road(network, walk, s);
+        for _ in 0..n {
+            let along = walk.pose_at(s + rng.random_range(-1.8..1.8));
+            let aside = rng.random_range(BESIDE_WALK) * side;
+            let position = along * DVec2::new(0.0, aside);
+            let crowded = |other: &Standing| other.pose.position.distance(position) < 1.15;
+            if people.iter().any(crowded) {
+                continue;
+            }
+            people.push(Standing {
+                kind: AgentKind::Pedestrian,
+                size: draw_person_size(rng),
+                pose: Pose {
+                    position,
+                    heading: rng.random_range(-std::f64::consts::PI..std::f64::consts::PI),
+                },
+            });
+        }
+    }
+    people
+}
+
+/// 1 if the road is on the right of the walk, -1 if it is on its left.
+fn away_from_road(network: &Network, walk: &Track, s: f64) -> f64 {
+    let pose = walk.pose_at(s);
+    let nearest = |side: f64| {
+        let point = pose * DVec2::new(0.0, 6.0 * side);
+        let lanes = network.lanes.iter();
+        lanes
+            .map(|lane| {
+                let foot = lane.track.project(point);
+                lane.track.pose_at(foot).position.distance(point)
+            })
+            .fold(f64::INFINITY, f64::min)
+    };
+    if nearest(1.0) > nearest(-1.0) { 1.0 } else { -1.0 }
+}
+
+/// Vehicles that have stopped in the outer lane of a road with another one beside it.
+fn draw_held(network: &Network, rng: &mut Rng) -> Vec<(LaneIdx, f64)> {
+    let suits = |&lane: &LaneIdx| {
+        let l = &network.lanes[lane];
+        l.connector.is_none()
+            && l.kind == LaneKind::SurfaceStreet
+            && l.right.is_none()
+            && l.left.is_some()
+            && l.length() > 70.0
+    };
+    let lanes: Vec<LaneIdx> = (0..network.lanes.len()).filter(suits).collect();
+    if lanes.is_empty() || !rng.random_bool(HELD) {
+        return Vec::new();
+    }
+    let lane = lanes[rng.random_range(0..lanes.len())];
+    vec![(lane, rng.random_range(30.0..network.lanes[lane].length() - 30.0))]
+}
+
+/// Ways straight across roads, between the sidewalks on both sides.
+fn draw_jaywalks(network: &Network, rng: &mut Rng) -> Vec<Jaywalk> {
+    let mut ways: Vec<Jaywalk> = Vec::new();
+    let lanes: Vec<LaneIdx> = (0..network.lanes.len())
+        .filter(|&lane| {
+            let l = &network.lanes[lane];
+            l.connector.is_none() && l.kind == LaneKind::SurfaceStreet && l.length() > 40.0
+        })
+        .collect();
+    if lanes.is_empty() {
+        return ways;
+    }
+    for _ in 0..rng.random_range(0..=6) {
+        let lane = lanes[rng.random_range(0..lanes.len())];
+        let s = rng.random_range(15.0..network.lanes[lane].length() - 15.0);
+        let mirrored = rng.random_bool(0.5);
+        let apart = |way: &Jaywalk| {
+            let here = network.lanes[lane].track.pose_at(s).position;
+            way.track.points().iter().all(|p| p.distance(here) > 8.0)
+        };
+        if ways.iter().all(apart)
+            && let Some(way) = way_across(network, lane, s, mirrored)
+        {
+            ways.push(way);
+        }
+    }
+    ways
+}
+
+/// The way across at a place on a lane; `None` without sidewalks on both sides.
+fn way_across(network: &Network, lane: LaneIdx, s: f64, mirrored: bool) -> Option<Jaywalk> {
+    let pose = network.lanes[lane].track.pose_at(s);
+    // Distances to the left at which something runs along the road here.
+    let abeam = |track: &Track| {
+        let foot = track.project(pose.position);
+        let local = pose.inverse() * track.pose_at(foot).position;
+        let inside = foot > 1.0 && foot < track.length() - 1.0;
+        (inside && local.x.abs() < 1.0).then_some((local.y, foot))
+    };
+    let walks = network.walks.iter().filter(|walk| walk.crosswalk.is_none());
+    let walks: Vec<f64> = walks
+        .filter_map(|walk| abeam(&walk.track))
+        .map(|(y, _)| y)
+        .filter(|y| y.abs() < 40.0)
+        .collect();
+    let nearest = |sign: f64| {
+        let side = walks.iter().filter(|y| **y * sign > 0.0).map(|y| y * sign);
+        side.reduce(f64::min).map(|y| (y - WALK_TO_CURB + 0.5) * sign)
+    };
+    let (left, right) = (nearest(1.0)?, nearest(-1.0)?);
+    let (from, to) = if mirrored { (left, right) } else { (right, left) };
+    let sign = (to - from).signum();
+    let spans = network.lanes.iter().enumerate().filter_map(|(other, l)| {
+        let (y, at) = abeam(&l.track)?;
+        let across = (y - from) * sign;
+        let half = l.width / 2.0;
+        let between = across > 0.0 && across < (to - from).abs();
+        between.then_some(Span {
+            lane: other,
+            at,
+            across: (across - half, across + half),
+        })
+    });
+    let track = Track::through(&line(
+        pose * DVec2::new(0.0, from),
+        pose * DVec2::new(0.0, to),
+    ));
+    Some(Jaywalk {
+        track,
+        spans: spans.collect(),
+    })
+}

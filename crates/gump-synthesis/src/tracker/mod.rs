@@ -1,0 +1,184 @@
+//! What a tracker on the ego would have recorded of a scene: what is out of sight is missing,
+//! tracks begin late and end early, and what is there is a little off.
+//!
+//! Start with [`track`]. Who can be seen is in `sight`, errors of what is seen in `noise`. Both are
+//! drawn per agent from the seed and the agent's id, so nobody's errors depend on who else is there.
+
+mod noise;
+mod sight;
+
+use std::collections::BTreeMap;
+
+use gump_scene::{Agent, AgentId, Frame, Light, Rng, Scenario, Seed};
+use rand::Rng as _;
+
+use self::noise::Noise;
+use self::sight::Sight;
+
+/// How good a tracker is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tracker {
+    /// Metres from the ego beyond which nobody is seen; `None` has no limit and nothing in the way.
+    pub range_m: Option<f64>,
+    /// Share of an agent's outline that must be in sight.
+    pub visible_share: f64,
+    /// Metres beside the road that are open; behind are buildings, which nobody sees through.
+    pub open_m: std::ops::Range<f64>,
+    /// Seconds in sight before a track begins.
+    pub begins_after_s: std::ops::Range<f64>,
+    /// Seconds out of sight before a track is given up.
+    pub coasts_s: std::ops::Range<f64>,
+    /// How often somebody in sight is lost all the same, per second, at the end of the range.
+    pub misses_per_s: f64,
+    /// Multiplies all errors of pose, velocity and size; 0 shows everybody where they are.
+    pub noise: f64,
+}
+
+impl Tracker {
+    /// As good as what `configs/targets/waymo-like.toml` was measured with.
+    pub fn recorded_like() -> Self {
+        Self {
+            range_m: Some(79.0),
+            visible_share: 0.25,
+            open_m: 9.0..20.0,
+            begins_after_s: 0.0..0.4,
+            coasts_s: 0.1..0.8,
+            misses_per_s: 0.12,
+            noise: 1.0,
+        }
+    }
+
+    /// Sees everybody as they are.
+    pub fn perfect() -> Self {
+        Self {
+            range_m: None,
+            noise: 0.0,
+            ..Self::recorded_like()
+        }
+    }
+}
+
+/// Replaces the log of a scenario by what the tracker saw of it.
+///
+/// The ego is always there, without errors but for those of its own motion; agents that only stand
+/// in the way (cones, signs) stay as they are. Targets and objects of interest that are not seen at
+/// the present are dropped.
+pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
+    let seen = Sight::of(scenario, tracker, seed.fork(0));
+    let mut noises: BTreeMap<AgentId, Noise> = BTreeMap::new();
+    let dt = scenario.dt;
+    let mut log = Vec::with_capacity(scenario.log.len());
+    for (step, frame) in scenario.log.iter().enumerate() {
+        let ego = frame.agent(scenario.ego).map(|ego| ego.state.pose.position);
+        let mut agents = Vec::with_capacity(frame.agents().len());
+        for agent in frame.agents() {
+            if !agent.kind.is_moving() {
+                agents.push(*agent);
+                continue;
+            }
+            let is_ego = agent.id == scenario.ego;
+            let noise = noises.entry(agent.id).or_insert_with(|| {
+                let seed = seed.fork(1).fork(agent.id.0 as u64);
+                Noise::new(agent, is_ego, tracker.noise, seed)
+            });
+            let position = agent.state.pose.position;
+            let distance = ego.map_or(0.0, |ego| ego.distance(position));
+            // Errors go on out of sight, so that who is seen when changes no error.
+            let shown = noise.step(agent, distance, dt);
+            if is_ego || seen.is_tracked(agent.id, step) {
+                agents.push(shown);
+            }
+        }
+        let lights = frame.lights().iter();
+        let lights = lights.filter(|light| is_light_seen(light, ego, tracker));
+        log.push(Frame::new(agents, lights.copied().collect()));
+    }
+    scenario.log = log;
+    let now = scenario.log[scenario.now].clone();
+    let is_there = |id: &AgentId| now.agent(*id).is_some();
+    scenario.targets.retain(is_there);
+    scenario.objects_of_interest.retain(is_there);
+}
+
+/// Lights are read from farther than boxes are tracked, for they face the traffic.
+fn is_light_seen(light: &Light, ego: Option<gump_geometry::DVec2>, tracker: &Tracker) -> bool {
+    match (light.stop_point, ego, tracker.range_m) {
+        (Some(at), Some(ego), Some(range)) => at.distance(ego) < 1.1 * range,
+        _ => true,
+    }
+}
+
+/// A number from the standard normal distribution.
+fn normal(rng: &mut Rng) -> f64 {
+    // Box and Muller 1958; 1 - u is never 0.
+    let (u, v): (f64, f64) = (rng.random(), rng.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+}
+
+/// True if the agent has hardly moved so far.
+fn stands(agent: &Agent) -> bool {
+    agent.state.speed() < 0.05
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{SynthesisConfig, synthesize};
+
+    fn tracked(tracker: &Tracker) -> (Scenario, Scenario) {
+        let clean = synthesize(&SynthesisConfig::standard(), Seed(4));
+        let mut seen = clean.clone();
+        track(&mut seen, tracker, Seed(9));
+        seen.validate().unwrap();
+        (clean, seen)
+    }
+
+    #[test]
+    fn a_perfect_tracker_changes_nothing() {
+        let (clean, seen) = tracked(&Tracker::perfect());
+        assert_eq!(clean.log, seen.log);
+        assert_eq!(clean.targets, seen.targets);
+    }
+
+    #[test]
+    fn one_seed_one_recording() {
+        let tracker = Tracker::recorded_like();
+        assert_eq!(tracked(&tracker).1.log, tracked(&tracker).1.log);
+        let mut other = tracked(&tracker).0;
+        track(&mut other, &tracker, Seed(10));
+        assert_ne!(other.log, tracked(&tracker).1.log);
+    }
+
+    #[test]
+    fn nobody_is_seen_beyond_the_range_and_everybody_near_their_place() {
+        let (clean, seen) = tracked(&Tracker::recorded_like());
+        let (mut states, mut all) = (0, 0);
+        for (before, after) in clean.log.iter().zip(&seen.log) {
+            let ego = after.agent(seen.ego).unwrap().state.pose.position;
+            all += before.agents().len();
+            states += after.agents().len();
+            for agent in after.agents() {
+                let truth = before.agent(agent.id).unwrap();
+                let pose = agent.state.pose;
+                assert!(pose.position.distance(ego) < 82.0);
+                assert!(pose.position.distance(truth.state.pose.position) < 1.0);
+                assert_eq!(agent.kind, truth.kind);
+            }
+        }
+        assert!(states < all && states * 10 > all, "{states} of {all}");
+    }
+
+    #[test]
+    fn without_noise_what_is_seen_is_true() {
+        let tracker = Tracker {
+            noise: 0.0,
+            ..Tracker::recorded_like()
+        };
+        let (clean, seen) = tracked(&tracker);
+        for (before, after) in clean.log.iter().zip(&seen.log) {
+            for agent in after.agents() {
+                assert_eq!(before.agent(agent.id), Some(agent));
+            }
+        }
+    }
+}

@@ -1,0 +1,154 @@
+//! People who cross the road where there is no crosswalk: they wait for a gap and go straight over.
+//!
+//! Nobody has to let them, so they start only when everybody who comes is far enough away; once
+//! they are on the road, vehicles stop for them like for anything that stands in the way.
+
+use gump_geometry::{Pose, wrap_angle};
+use gump_scene::AgentKind;
+
+use super::vehicle::Vehicle;
+use super::{Body, Traffic};
+use crate::curve::Track;
+use crate::network::{LaneIdx, Network};
+
+/// Seconds left between a person who has crossed a lane and the next vehicle.
+const SPARE_S: f64 = 2.0;
+/// Vehicles slower than this could set off at any time: they are taken to drive so fast, m/s.
+const AT_LEAST: f64 = 3.0;
+/// Metres before and behind a lane in which a person is in the way.
+const IN_THE_WAY: f64 = 0.9;
+/// Change of walking speed, m/s².
+const CHANGE: f64 = 1.2;
+/// Lanes of its path on which a vehicle is looked for ahead of where it is.
+const LOOK_AHEAD: usize = 5;
+
+/// A way across a road from curb to curb.
+#[derive(Clone, Debug)]
+pub(crate) struct Jaywalk {
+    /// From where people wait to where they arrive.
+    pub(crate) track: Track,
+    /// The lanes on the way.
+    pub(crate) spans: Vec<Span>,
+}
+
+/// A lane on the way.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Span {
+    /// The lane.
+    pub(crate) lane: LaneIdx,
+    /// Arc length on the lane, metres.
+    pub(crate) at: f64,
+    /// From where to where on the way across, metres.
+    pub(crate) across: (f64, f64),
+}
+
+/// Somebody on the way across, or waiting for a gap.
+#[derive(Clone, Debug)]
+pub(crate) struct Crosser {
+    pub(crate) id: i64,
+    pub(crate) size: [f64; 3],
+    /// Index of the way.
+    pub(crate) jaywalk: usize,
+    /// Metres per second.
+    pub(crate) pace: f64,
+    /// Seconds of the simulation before which the person does not want to cross.
+    pub(crate) starts: f64,
+    progress: f64,
+    speed: f64,
+    goes: bool,
+    pose: Pose,
+}
+
+impl Crosser {
+    /// Somebody who waits at the beginning of a way.
+    pub(crate) fn new(
+        id: i64,
+        size: [f64; 3],
+        (jaywalk, way): (usize, &Jaywalk),
+        pace: f64,
+        starts: f64,
+    ) -> Self {
+        Self {
+            id,
+            size,
+            jaywalk,
+            pace,
+            starts,
+            progress: 0.0,
+            speed: 0.0,
+            goes: false,
+            pose: way.track.pose_at(0.0),
+        }
+    }
+
+    pub(crate) fn body(&self) -> Body {
+        Body {
+            id: self.id,
+            kind: AgentKind::Pedestrian,
+            size: self.size,
+            pose: Pose {
+                heading: wrap_angle(self.pose.heading),
+                ..self.pose
+            },
+            is_mobile: true,
+            place: None,
+        }
+    }
+}
+
+impl Traffic<'_> {
+    /// Moves those who cross, and puts them in the way of vehicles; after the lanes were filled.
+    pub(super) fn step_crossers(&mut self) {
+        let ways = std::mem::take(&mut self.demand.scenery.jaywalks);
+        for i in 0..self.crossers.len() {
+            let mut crosser = self.crossers[i].clone();
+            let way = &ways[crosser.jaywalk];
+            if !crosser.goes && self.time >= crosser.starts {
+                crosser.goes = self.has_gap(way, crosser.pace);
+            }
+            let length = way.track.length();
+            let left = length - crosser.progress;
+            if crosser.goes && left > 0.05 {
+                let wanted = crosser.pace.min((2.0 * CHANGE * left).sqrt());
+                crosser.speed = (crosser.speed + CHANGE * self.dt).min(wanted);
+                crosser.progress = (crosser.progress + crosser.speed * self.dt).min(length);
+                crosser.pose = way.track.pose_at(crosser.progress);
+            }
+            for span in way.spans.iter().filter(|_| crosser.goes) {
+                let soon = crosser.progress + 1.5 * crosser.pace + IN_THE_WAY;
+                let (from, to) = span.across;
+                if from < soon && crosser.progress < to + IN_THE_WAY {
+                    self.occupancy.block(span.lane, span.at - 0.6);
+                }
+            }
+            self.crossers[i] = crosser;
+        }
+        self.demand.scenery.jaywalks = ways;
+    }
+
+    /// True if nobody on any lane of the way arrives before a person of this pace has passed.
+    fn has_gap(&self, way: &Jaywalk, pace: f64) -> bool {
+        way.spans.iter().all(|span| {
+            let (enters, leaves) = (span.across.0 / pace, span.across.1 / pace + 1.0);
+            self.vehicles.iter().all(|vehicle| {
+                let Some(distance) = metres_to(self.network, vehicle, span) else {
+                    return true;
+                };
+                let passed = -distance > vehicle.length() + 0.8;
+                let speed = vehicle.speed.max(AT_LEAST);
+                // Gone by before the person gets there, or there well after.
+                let gone = vehicle.speed > AT_LEAST
+                    && (distance + vehicle.length() + 2.0) / speed + 0.5 < enters;
+                passed || gone || distance / speed > leaves + SPARE_S
+            })
+        })
+    }
+}
+
+/// Metres from a vehicle's front to a place on a lane; `None` if it is not on its way there.
+fn metres_to(network: &Network, vehicle: &Vehicle, span: &Span) -> Option<f64> {
+    let first = vehicle.leg.saturating_sub(1);
+    let last = (vehicle.leg + LOOK_AHEAD).min(vehicle.path.len());
+    let leg = (first..last).find(|&leg| vehicle.path[leg] == span.lane)?;
+    Some(vehicle.distance_to(network, leg) + span.at)
+}

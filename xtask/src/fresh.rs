@@ -1,0 +1,270 @@
+//! Scenes that are made up while they are learned from, none of which comes back: `fresh:PROFILE`.
+//!
+//! Scenes form an endless stream: number `k` comes from the stream's seed and `k` alone. Step `s`
+//! of a training run draws its samples from a window of the stream that moves on with `s`, so a run
+//! that is resumed goes on exactly where it was, and nothing about the stream is saved. A thread
+//! makes scenes ahead of the window; what is not ready is made by whoever asks.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+
+use gump_model::ModelError;
+use gump_scene::{Scenario, Seed};
+use gump_synthesis::{Profile, SynthesisConfig};
+use rayon::prelude::*;
+
+use crate::cli::WrongArguments;
+
+/// What the name of a stream begins with.
+pub(crate) const PREFIX: &str = "fresh:";
+/// Scenes that samples of one step are drawn from: enough that a batch shows as many scenes, few
+/// enough to be held (about 1.5 MB each).
+const WINDOW: usize = 128;
+/// Samples that a scene gives on average before it is left behind: they have other egos, other
+/// presents and other augmentations.
+const USES: usize = 8;
+/// Forks of the seed: scenes to learn from, and scenes to validate on.
+const TRAIN: u64 = 0;
+/// See [`TRAIN`].
+const VALIDATE: u64 = 1;
+
+/// A stream of scenes.
+pub(crate) struct Fresh {
+    stream: Stream,
+    shared: Arc<Shared>,
+    /// Scenes by which the window moves on in a step, times [`USES`].
+    batch: usize,
+}
+
+/// Which scenes the stream consists of.
+#[derive(Clone, Debug)]
+pub(crate) struct Stream {
+    profile: Profile,
+    config: SynthesisConfig,
+    seed: Seed,
+}
+
+/// What the thread that makes scenes shares with those who ask.
+struct Shared {
+    held: Mutex<Held>,
+    /// Told when the window moves on.
+    moved: Condvar,
+    ends: AtomicBool,
+    made: AtomicUsize,
+}
+
+/// The window.
+#[derive(Default)]
+struct Held {
+    first: usize,
+    scenes: BTreeMap<usize, Arc<Scenario>>,
+}
+
+impl Stream {
+    /// The stream of this name, `fresh:PROFILE` or `fresh:PROFILE:SEED`; `None` for other names.
+    ///
+    /// Error: [`WrongArguments`] for a profile that does not exist or a seed that is no number.
+    pub(crate) fn of_name(name: &Path) -> anyhow::Result<Option<Self>> {
+        let Some(asked) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
+            return Ok(None);
+        };
+        let (profile, seed) = asked.split_once(':').unwrap_or((asked, "0"));
+        let profile = profile_of_name(profile).map_err(WrongArguments)?;
+        let seed = seed.parse().map_err(|_| {
+            WrongArguments(format!("expected a whole number as seed in {PREFIX}{asked}"))
+        })?;
+        Ok(Some(Self {
+            profile,
+            config: profile.config(),
+            seed: Seed(seed),
+        }))
+    }
+
+    /// Scene `k` to learn from.
+    fn scene(&self, k: usize) -> Scenario {
+        let seed = self.seed.fork(TRAIN).fork(k as u64);
+        self.profile.synthesize(&self.config, seed)
+    }
+
+    /// Scenes to validate on, which are none of those to learn from.
+    pub(crate) fn validation(&self, n: usize) -> Vec<Scenario> {
+        let seed = self.seed.fork(VALIDATE);
+        let scene = |k: usize| self.profile.synthesize(&self.config, seed.fork(k as u64));
+        (0..n).into_par_iter().map(scene).collect()
+    }
+}
+
+/// The profile of this name.
+///
+/// Error: a sentence that names those there are.
+pub(crate) fn profile_of_name(name: &str) -> Result<Profile, String> {
+    Profile::of_name(name).ok_or_else(|| {
+        let known = Profile::ALL.map(Profile::name).join(", ");
+        format!("expected one of the profiles {known}, found {name:?}")
+    })
+}
+
+impl Fresh {
+    /// Starts to make the scenes that steps of `batch` samples are drawn from.
+    pub(crate) fn start(stream: Stream, batch: usize) -> Self {
+        let shared = Arc::new(Shared {
+            held: Mutex::default(),
+            moved: Condvar::new(),
+            ends: AtomicBool::new(false),
+            made: AtomicUsize::new(0),
+        });
+        let fresh = Self {
+            stream,
+            shared,
+            batch: batch.max(1),
+        };
+        let (stream, shared) = (fresh.stream.clone(), Arc::clone(&fresh.shared));
+        std::thread::spawn(move || make_ahead(&stream, &shared));
+        fresh
+    }
+
+    /// Scenes to draw from at any step.
+    pub(crate) fn len(&self) -> usize {
+        WINDOW
+    }
+
+    /// The scene that a draw of a step means; moves the window on.
+    pub(crate) fn pick(&self, step: usize, draw: u64) -> usize {
+        let first = step * self.batch / USES;
+        self.shared.move_to(first);
+        first + (draw % WINDOW as u64) as usize
+    }
+
+    /// A scene of the stream.
+    pub(crate) fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+        if let Some(scene) = self.shared.lock().scenes.get(&index) {
+            return Ok(Cow::Owned(Scenario::clone(scene)));
+        }
+        let scene = Arc::new(self.stream.scene(index));
+        self.shared.keep(index, &scene);
+        Ok(Cow::Owned(Arc::unwrap_or_clone(scene)))
+    }
+
+    /// Scenes made so far, by anybody.
+    #[cfg(test)]
+    fn made(&self) -> usize {
+        self.shared.made.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Fresh {
+    fn drop(&mut self) {
+        // Under the lock, so that the thread cannot begin to wait in between.
+        let _held = self.shared.lock();
+        self.shared.ends.store(true, Ordering::Relaxed);
+        self.shared.moved.notify_all();
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Held> {
+        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Moves the window on, never back: samples of the step before may still be drawn.
+    fn move_to(&self, first: usize) {
+        let mut held = self.lock();
+        if first > held.first {
+            held.first = first;
+            held.scenes = held.scenes.split_off(&first);
+            drop(held);
+            self.moved.notify_all();
+        }
+    }
+
+    /// Keeps a scene while it is in the window.
+    fn keep(&self, index: usize, scene: &Arc<Scenario>) {
+        self.made.fetch_add(1, Ordering::Relaxed);
+        let mut held = self.lock();
+        if (held.first..held.first + 2 * WINDOW).contains(&index) {
+            held.scenes.insert(index, Arc::clone(scene));
+        }
+    }
+}
+
+/// Makes the scenes of the window, and as many again after it, until the stream is dropped.
+fn make_ahead(stream: &Stream, shared: &Shared) {
+    // Of a stream that nobody has asked yet nobody knows where it begins.
+    let mut held = shared.lock();
+    while !shared.ends.load(Ordering::Relaxed) {
+        let first = held.first;
+        let missing = (first..first + WINDOW + WINDOW / 4).find(|k| !held.scenes.contains_key(k));
+        let Some(k) = missing else {
+            held = shared.moved.wait(held).unwrap_or_else(PoisonError::into_inner);
+            continue;
+        };
+        drop(held);
+        let scene = Arc::new(stream.scene(k));
+        shared.keep(k, &scene);
+        held = shared.lock();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stream(name: &str) -> Stream {
+        Stream::of_name(Path::new(name)).unwrap().unwrap()
+    }
+
+    #[test]
+    fn names_are_understood_or_refused() {
+        assert!(Stream::of_name(Path::new("some/folder")).unwrap().is_none());
+        assert_eq!(stream("fresh:recorded-like").profile, Profile::RecordedLike);
+        assert_eq!(stream("fresh:plain:7").seed, Seed(7));
+        let told = |name: &str| Stream::of_name(Path::new(name)).unwrap_err().to_string();
+        assert!(told("fresh:real").contains("plain, recorded-like, found \"real\""));
+        assert!(told("fresh:plain:x").contains("a whole number as seed in fresh:plain:x"));
+    }
+
+    #[test]
+    fn a_position_in_the_stream_is_all_that_counts() {
+        let batch = 16;
+        let [one, two] = [(); 2].map(|()| Fresh::start(stream("fresh:plain:3"), batch));
+        // The second begins in the middle, as a resumed run does.
+        let draws = [5_u64, 130, 999];
+        for step in [0, 1, 40] {
+            for draw in draws {
+                let index = one.pick(step, draw);
+                assert!((step * batch / USES..).contains(&index));
+                if step == 40 {
+                    assert_eq!(two.pick(step, draw), index);
+                    let [a, b] = [&one, &two].map(|fresh| fresh.get(index).unwrap().into_owned());
+                    assert_eq!((a.id, a.log), (b.id, b.log));
+                }
+            }
+        }
+        assert!(one.made() > 0);
+    }
+
+    #[test]
+    fn what_the_window_has_left_is_not_held_and_never_picked_again() {
+        let fresh = Fresh::start(stream("fresh:plain:1"), 8 * USES);
+        let old = fresh.pick(0, 0);
+        assert!(!fresh.get(old).unwrap().log.is_empty());
+        let later = WINDOW / 8 + 1;
+        assert!((0..500).all(|draw| fresh.pick(later, draw) > old));
+        assert!(!fresh.shared.lock().scenes.contains_key(&old));
+        // Drives of the network ask for scenes of the past: they are made again.
+        assert!(fresh.get(old).unwrap().id.ends_with(&format!("{:016x}", {
+            fresh.stream.seed.fork(TRAIN).fork(old as u64).0
+        })));
+    }
+
+    #[test]
+    fn scenes_to_validate_on_are_others() {
+        let stream = stream("fresh:plain");
+        let validation = stream.validation(2);
+        let ids: Vec<String> = (0..2).map(|k| stream.scene(k).id).collect();
+        assert!(validation.iter().all(|scene| !ids.contains(&scene.id)));
+    }
+}
