@@ -400,7 +400,11 @@ mod tests {
         assert_eq!(sample.targets.len(), nodes - 3);
         let stands = |target: &&Target| target.bins[0] == super::super::grid::STANDS;
         let standing = sample.targets.iter().filter(stands).count();
-        assert_eq!(standing, nodes / 3 - 1, "the parked car, at every frame but the last");
+        assert_eq!(
+            standing,
+            nodes / 3 - 1,
+            "the parked car, at every frame but the last"
+        );
     }
 
     #[test]
