@@ -258,7 +258,7 @@ fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> 
                 *entry = (light.state, Some(i).filter(|_| seen));
             }
         }
-        if i >= start && (i - start) % stride == 0 {
+        if i >= start && (i - start).is_multiple_of(stride) {
             let now = frame.lights().iter().map(|light| {
                 let since = known.get(&light.lane).and_then(|entry| entry.1);
                 let elapsed = since.map(|since| (i - since) as f64 * scenario.dt);
