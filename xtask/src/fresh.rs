@@ -74,7 +74,9 @@ impl Stream {
         let (profile, seed) = asked.split_once(':').unwrap_or((asked, "0"));
         let profile = profile_of_name(profile).map_err(WrongArguments)?;
         let seed = seed.parse().map_err(|_| {
-            WrongArguments(format!("expected a whole number as seed in {PREFIX}{asked}"))
+            WrongArguments(format!(
+                "expected a whole number as seed in {PREFIX}{asked}"
+            ))
         })?;
         Ok(Some(Self {
             profile,
@@ -198,7 +200,10 @@ fn make_ahead(stream: &Stream, shared: &Shared) {
         let first = held.first;
         let missing = (first..first + WINDOW + WINDOW / 4).find(|k| !held.scenes.contains_key(k));
         let Some(k) = missing else {
-            held = shared.moved.wait(held).unwrap_or_else(PoisonError::into_inner);
+            held = shared
+                .moved
+                .wait(held)
+                .unwrap_or_else(PoisonError::into_inner);
             continue;
         };
         drop(held);

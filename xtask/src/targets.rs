@@ -35,15 +35,16 @@ struct Target {
 
 /// True for a path that names a table rather than scenes.
 pub(crate) fn is_table(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "toml")
+    path.extension()
+        .is_some_and(|extension| extension == "toml")
 }
 
 /// Reads a table.
 ///
 /// Error: a file that cannot be read, or an entry that is unknown or does not fit its measure.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Statistics> {
-    let text = std::fs::read_to_string(path)
-        .with_context(|| format!("cannot read {}", path.display()))?;
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let table: Targets = toml::from_str(&text)
         .map_err(|error| anyhow::anyhow!("{}: {}", path.display(), error.message()))?;
     let rows = table.distributions.iter().map(|target| {
@@ -57,15 +58,23 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Statistics> {
 fn parse(
     target: &Target,
 ) -> Result<(Measure, gump_metrics::statistics::Class, Distribution), String> {
-    let Target { measure: name, class, .. } = target;
+    let Target {
+        measure: name,
+        class,
+        ..
+    } = target;
     let measure = Measure::of_name(name)
         .ok_or_else(|| format!("expected the name of a measure, found {name:?}"))?;
-    let class = class_of_name(class)
-        .ok_or_else(|| format!("expected scene, vehicle, pedestrian or bicycle, found {class:?}"))?;
+    let class = class_of_name(class).ok_or_else(|| {
+        format!("expected scene, vehicle, pedestrian or bicycle, found {class:?}")
+    })?;
     let (low, high, bins) = measure.bins();
     let mut counts = target.counts.clone();
     if counts.len() > bins {
-        return Err(format!("{name} has {} counts, expected at most {bins}", counts.len()));
+        return Err(format!(
+            "{name} has {} counts, expected at most {bins}",
+            counts.len()
+        ));
     }
     counts.resize(bins, 0);
     let distribution = Distribution::from_parts(low, high, counts, target.mean, target.deviation);
@@ -94,7 +103,10 @@ pub(crate) fn write(path: &Path, provenance: &str, statistics: &Statistics) -> a
 
 fn target(row: &Row<'_>) -> Target {
     let counts = row.distribution.counts();
-    let used = counts.iter().rposition(|&n| n > 0).map_or(0, |last| last + 1);
+    let used = counts
+        .iter()
+        .rposition(|&n| n > 0)
+        .map_or(0, |last| last + 1);
     let round = |x: f64| (x * 1e6).round() / 1e6;
     Target {
         measure: row.measure.name().into(),
@@ -126,8 +138,15 @@ mod tests {
         assert_eq!(after.scenes(), 1);
         let rows = before.compare(&after);
         assert_eq!(rows.len(), before.rows().len());
-        assert!(rows.iter().all(|row| row.wasserstein.is_some_and(|d| d < 1e-4)));
-        assert!(rows.iter().all(|row| row.mean.zip(row.reference_mean).is_some_and(|(a, b)| (a - b).abs() < 1e-5)));
+        assert!(
+            rows.iter()
+                .all(|row| row.wasserstein.is_some_and(|d| d < 1e-4))
+        );
+        assert!(rows.iter().all(|row| {
+            row.mean
+                .zip(row.reference_mean)
+                .is_some_and(|(a, b)| (a - b).abs() < 1e-5)
+        }));
     }
 
     #[test]
@@ -139,10 +158,20 @@ mod tests {
             format!("{:#}", read(&path).unwrap_err())
         };
         let head = "provenance = \"\"\nscenes = 1\n[[distribution]]\nmean = 0.0\ndeviation = 0.0\n";
-        let wrong = told(&format!("{head}measure = \"sped\"\nclass = \"vehicle\"\ncounts = []"));
-        assert!(wrong.ends_with("expected the name of a measure, found \"sped\""), "{wrong}");
-        let wrong = told(&format!("{head}measure = \"standing\"\nclass = \"vehicle\"\ncounts = [1, 2, 3]"));
-        assert!(wrong.ends_with("standing has 3 counts, expected at most 2"), "{wrong}");
+        let wrong = told(&format!(
+            "{head}measure = \"sped\"\nclass = \"vehicle\"\ncounts = []"
+        ));
+        assert!(
+            wrong.ends_with("expected the name of a measure, found \"sped\""),
+            "{wrong}"
+        );
+        let wrong = told(&format!(
+            "{head}measure = \"standing\"\nclass = \"vehicle\"\ncounts = [1, 2, 3]"
+        ));
+        assert!(
+            wrong.ends_with("standing has 3 counts, expected at most 2"),
+            "{wrong}"
+        );
         assert!(told("scenes = 1").contains("provenance"));
     }
 

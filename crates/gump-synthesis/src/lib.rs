@@ -35,5 +35,5 @@ pub use family::RoadFamily;
 pub use profile::Profile;
 pub use scenario::{synthesize, synthesize_many, try_synthesize};
 pub use smooth::smooth_motion;
-pub use tracker::{Tracker, track};
 pub use sumo_demand::{SumoDemand, draw_sumo_demand};
+pub use tracker::{Tracker, track};

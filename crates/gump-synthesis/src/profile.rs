@@ -55,7 +55,11 @@ impl Profile {
     pub fn synthesize(self, config: &SynthesisConfig, seed: Seed) -> Scenario {
         let mut scenario = self.synthesize_clean(config, seed);
         if self == Self::RecordedLike {
-            track(&mut scenario, &Tracker::recorded_like(), seed.fork(u64::MAX));
+            track(
+                &mut scenario,
+                &Tracker::recorded_like(),
+                seed.fork(u64::MAX),
+            );
         }
         scenario
     }

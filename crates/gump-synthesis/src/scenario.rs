@@ -187,7 +187,12 @@ pub(crate) fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<Age
 }
 
 /// The lanes the ego drove, then those it had in mind, and the path along them.
-pub(crate) fn route(network: &Network, ego: &Track, traffic: &Traffic<'_>, placement: &Placement) -> Route {
+pub(crate) fn route(
+    network: &Network,
+    ego: &Track,
+    traffic: &Traffic<'_>,
+    placement: &Placement,
+) -> Route {
     let mut runs: Vec<(LaneIdx, f64, f64)> = Vec::new();
     for &(lane, s) in ego.places() {
         match runs.last_mut() {

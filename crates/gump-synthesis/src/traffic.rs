@@ -4,8 +4,8 @@
 //! Who may enter a junction is settled by claims ([`right_of_way`]): a vehicle that has claimed a
 //! connector shares no part of it with another claim, which is why boxes do not overlap.
 
-mod demand;
 mod crosser;
+mod demand;
 mod driver;
 mod lane_change;
 mod occupancy;
@@ -22,8 +22,8 @@ use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentKind, LightState, Rng};
 
 use crate::network::{LaneIdx, Network};
-use occupancy::Occupancy;
 use crosser::Crosser;
+use occupancy::Occupancy;
 use people::Person;
 use vehicle::Vehicle;
 

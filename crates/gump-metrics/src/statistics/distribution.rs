@@ -105,7 +105,13 @@ impl Distribution {
 
     /// Jensen-Shannon divergence over the bins, in bits.
     pub fn jensen_shannon(&self, reference: &Self) -> f64 {
-        let term = |p: f64, middle: f64| if p > 0.0 { p * (p / middle).log2() } else { 0.0 };
+        let term = |p: f64, middle: f64| {
+            if p > 0.0 {
+                p * (p / middle).log2()
+            } else {
+                0.0
+            }
+        };
         let (mine, theirs) = (self.shares(), reference.shares());
         let pairs = mine.iter().zip(&theirs);
         let sum: f64 = pairs
@@ -169,7 +175,8 @@ mod tests {
     #[test]
     fn parts_give_the_same_distances() {
         let (a, b) = (of(&[1.0, 2.0, 7.5]), of(&[2.0, 4.0]));
-        let again = Distribution::from_parts(0.0, 10.0, b.counts().to_vec(), b.mean(), b.deviation());
+        let again =
+            Distribution::from_parts(0.0, 10.0, b.counts().to_vec(), b.mean(), b.deviation());
         assert!((a.wasserstein(&b) - a.wasserstein(&again)).abs() < 1e-9);
     }
 }

@@ -210,7 +210,10 @@ mod tests {
         assert!((gap.mean() - 15.5).abs() < 1.0, "{}", gap.mean());
         assert_eq!(mean(&statistics, M::LateralOffset, VEHICLE), 0.5);
         assert_eq!(mean(&statistics, M::Agents, VEHICLE), 3.0);
-        assert_eq!(mean(&statistics, M::OnCrosswalk, Some(AgentKind::Pedestrian)), 0.0);
+        assert_eq!(
+            mean(&statistics, M::OnCrosswalk, Some(AgentKind::Pedestrian)),
+            0.0
+        );
         assert_eq!(mean(&statistics, M::EgoSpeed, None), 8.0);
         assert_eq!(mean(&statistics, M::Lanes, None), 1.0);
         assert_eq!(mean(&statistics, M::Jitter, VEHICLE), 0.0);
@@ -230,12 +233,20 @@ mod tests {
             merged.merge(&counted(text));
         }
         let rows = |s: &Statistics| {
-            let rows = s.rows().into_iter().map(|r| (r.measure, r.class, r.distribution.clone()));
+            let rows = s
+                .rows()
+                .into_iter()
+                .map(|r| (r.measure, r.class, r.distribution.clone()));
             rows.collect::<Vec<_>>()
         };
         assert_eq!(rows(&whole), rows(&merged));
         let again = Statistics::from_rows(2, rows(&whole));
-        assert!(again.compare(&whole).iter().all(|row| row.wasserstein == Some(0.0)));
+        assert!(
+            again
+                .compare(&whole)
+                .iter()
+                .all(|row| row.wasserstein == Some(0.0))
+        );
     }
 
     #[test]

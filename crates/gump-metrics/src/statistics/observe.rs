@@ -71,7 +71,9 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
     if seconds >= LONG_ENOUGH_S {
         parked = reach < PARKED_REACH;
         let drives = track.iter().any(|(_, agent)| agent.state.speed() > DRIVES);
-        let stands = track.iter().any(|(_, agent)| agent.state.speed() < STANDING);
+        let stands = track
+            .iter()
+            .any(|(_, agent)| agent.state.speed() < STANDING);
         statistics.note_if(M::Parked, class, parked);
         statistics.note_if(M::StopsAndGoes, class, drives && stands);
     }
@@ -80,14 +82,16 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
         statistics.note_if(M::Standing, class, speed < STANDING);
         if speed >= STANDING {
             statistics.note(M::Speed, class, speed);
-        } 
+        }
         if parked {
             statistics.note(M::ParkedSpeed, class, speed);
         }
     }
     note_steps(scenario.dt, track, parked, statistics);
     let stride = (LOOK_EVERY_S / scenario.dt).round().max(1.0) as usize;
-    let looked_at = track.iter().filter(|(step, _)| step % stride == scenario.now % stride);
+    let looked_at = track
+        .iter()
+        .filter(|(step, _)| step % stride == scenario.now % stride);
     for (step, agent) in looked_at {
         let ego = scenario.log[*step].agent(scenario.ego);
         if let Some(ego) = ego.filter(|ego| ego.id != agent.id) {

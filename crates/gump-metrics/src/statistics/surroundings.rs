@@ -72,7 +72,10 @@ fn lane_offset(map: &MapGraph, agent: &Agent) -> Option<f64> {
 /// Notes how much room agents have in a frame: neighbours and leaders.
 pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
     let agents = scenario.log[step].agents();
-    let agents: Vec<&Agent> = agents.iter().filter(|agent| agent.kind.is_moving()).collect();
+    let agents: Vec<&Agent> = agents
+        .iter()
+        .filter(|agent| agent.kind.is_moving())
+        .collect();
     let has_lanes = !scenario.map.lanes().is_empty();
     for (i, agent) in agents.iter().enumerate() {
         let class: Class = Some(agent.kind);
@@ -90,7 +93,10 @@ pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
             to.note(M::Nearest, class, nearest);
         }
         let drives = agent.kind != AgentKind::Pedestrian && has_lanes;
-        if drives && let Some(gap) = gap(agent, others()) && lane_offset(&scenario.map, agent).is_some_and(|off| off < OFF_LANE) {
+        if drives
+            && let Some(gap) = gap(agent, others())
+            && lane_offset(&scenario.map, agent).is_some_and(|off| off < OFF_LANE)
+        {
             to.note(M::Gap, class, gap);
         }
     }
@@ -136,7 +142,11 @@ pub(super) fn note_road(scenario: &Scenario, to: &mut Statistics) {
 fn junctions(map: &MapGraph) -> usize {
     let inside = map.lanes().iter().filter(|lane| lane.in_intersection);
     let middles: Vec<DVec2> = inside
-        .map(|lane| lane.centerline.pose_at(lane.centerline.length() / 2.0).position)
+        .map(|lane| {
+            lane.centerline
+                .pose_at(lane.centerline.length() / 2.0)
+                .position
+        })
         .collect();
     let mut seen = vec![false; middles.len()];
     let mut groups = 0;

@@ -40,7 +40,9 @@ pub(crate) fn draw(
     let crossers = (0..jaywalks.len())
         .filter(|_| rng.random_bool(0.35 + 0.6 * bustle))
         .collect::<Vec<_>>();
-    let crossers = crossers.into_iter().map(|way| (way, rng.random_range(begins..ends)));
+    let crossers = crossers
+        .into_iter()
+        .map(|way| (way, rng.random_range(begins..ends)));
     let crossers = crossers.collect();
     let mut standing = parked(network, rng);
     standing.retain(|body| {
@@ -127,7 +129,11 @@ fn park_along(strip: &Track, rng: &mut Rng, all: &mut Vec<Standing>) {
             rng.random_range(-0.03..0.03),
         );
         let on_strip = strip.pose_at(s + size[0] / 2.0);
-        let against = if rng.random_bool(0.06) { std::f64::consts::PI } else { 0.0 };
+        let against = if rng.random_bool(0.06) {
+            std::f64::consts::PI
+        } else {
+            0.0
+        };
         let pose = on_strip * local;
         all.push(Standing {
             kind: AgentKind::Vehicle,
@@ -220,7 +226,11 @@ fn away_from_road(network: &Network, walk: &Track, s: f64) -> f64 {
             })
             .fold(f64::INFINITY, f64::min)
     };
-    if nearest(1.0) > nearest(-1.0) { 1.0 } else { -1.0 }
+    if nearest(1.0) > nearest(-1.0) {
+        1.0
+    } else {
+        -1.0
+    }
 }
 
 /// Vehicles that have stopped in the outer lane of a road with another one beside it.
@@ -238,7 +248,10 @@ fn draw_held(network: &Network, rng: &mut Rng) -> Vec<(LaneIdx, f64)> {
         return Vec::new();
     }
     let lane = lanes[rng.random_range(0..lanes.len())];
-    vec![(lane, rng.random_range(30.0..network.lanes[lane].length() - 30.0))]
+    vec![(
+        lane,
+        rng.random_range(30.0..network.lanes[lane].length() - 30.0),
+    )]
 }
 
 /// Ways straight across roads, between the sidewalks on both sides.
@@ -253,7 +266,7 @@ fn draw_jaywalks(network: &Network, rng: &mut Rng) -> Vec<Jaywalk> {
     if lanes.is_empty() {
         return ways;
     }
-    for _ in 0..rng.random_range(0..=6) {
+    for _ in 0..rng.random_range(0..=12) {
         let lane = lanes[rng.random_range(0..lanes.len())];
         let s = rng.random_range(15.0..network.lanes[lane].length() - 15.0);
         let mirrored = rng.random_bool(0.5);
@@ -288,10 +301,15 @@ fn way_across(network: &Network, lane: LaneIdx, s: f64, mirrored: bool) -> Optio
         .collect();
     let nearest = |sign: f64| {
         let side = walks.iter().filter(|y| **y * sign > 0.0).map(|y| y * sign);
-        side.reduce(f64::min).map(|y| (y - WALK_TO_CURB + 0.5) * sign)
+        side.reduce(f64::min)
+            .map(|y| (y - WALK_TO_CURB + 0.5) * sign)
     };
     let (left, right) = (nearest(1.0)?, nearest(-1.0)?);
-    let (from, to) = if mirrored { (left, right) } else { (right, left) };
+    let (from, to) = if mirrored {
+        (left, right)
+    } else {
+        (right, left)
+    };
     let sign = (to - from).signum();
     let spans = network.lanes.iter().enumerate().filter_map(|(other, l)| {
         let (y, at) = abeam(&l.track)?;

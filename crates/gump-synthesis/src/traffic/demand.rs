@@ -6,8 +6,8 @@ use rand::Rng as _;
 
 use super::crosser::{Crosser, Jaywalk};
 use super::driver::Driver;
-use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size};
 use super::people::Person;
+use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size};
 use super::vehicle::Vehicle;
 use super::{Body, Traffic};
 use crate::network::{LaneIdx, Turn};
@@ -129,7 +129,8 @@ impl Traffic<'_> {
             let size = draw_person_size(&mut self.rng);
             let pace = self.rng.random_range(1.1..2.2);
             let way = (jaywalk, &self.demand.scenery.jaywalks[jaywalk]);
-            self.crossers.push(Crosser::new(id, size, way, pace, starts));
+            self.crossers
+                .push(Crosser::new(id, size, way, pace, starts));
         }
     }
 
@@ -261,7 +262,13 @@ impl Traffic<'_> {
                 let size = draw_bicycle_size(rng);
                 let top_speed = rng.random_range(3.2..8.0);
                 let driver = Driver::of_bicycle(rng);
-                return (size, Driver { top_speed, ..driver });
+                return (
+                    size,
+                    Driver {
+                        top_speed,
+                        ..driver
+                    },
+                );
             }
             return (size, Driver::of_bicycle(rng));
         }

@@ -72,7 +72,10 @@ const BICYCLE_SIZES: [Quantiles<6>; 2] = [
 /// The value at a share of a distribution, between its quantiles.
 fn quantile<const N: usize>(quantiles: &Quantiles<N>, share: f64) -> f64 {
     let last = N - 1;
-    let upper = quantiles.iter().position(|(q, _)| share < *q).unwrap_or(last);
+    let upper = quantiles
+        .iter()
+        .position(|(q, _)| share < *q)
+        .unwrap_or(last);
     let ((q, a), (r, b)) = (quantiles[upper.max(1) - 1], quantiles[upper.max(1)]);
     a + (b - a) * ((share - q) / (r - q)).clamp(0.0, 1.0)
 }
@@ -85,7 +88,11 @@ pub(crate) fn draw_real_size(rng: &mut Rng) -> [f64; 3] {
     let width = quantile(&VEHICLE_WIDTHS, share(rng));
     let height = 1.45 + 0.45 * share(rng) + rng.random_range(0.0..0.15);
     let length = quantile(&VEHICLE_LENGTHS, big);
-    [length, width, height + 0.35 * (length - 5.6).clamp(0.0, 4.0)]
+    [
+        length,
+        width,
+        height + 0.35 * (length - 5.6).clamp(0.0, 4.0),
+    ]
 }
 
 /// Length, width and height of a person, metres.
