@@ -24,7 +24,7 @@ fn main() -> anyhow::Result<()> {
         for record in gump_data::open(&path)?.take(3) {
             let scenario = record?.scenario;
             let start = Start {
-                scene: scenario.present(),
+                scene: scenario.present().unguided(),
                 n_futures: 32,
                 seed: Seed(0),
             };

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Words that the output of an example has; only such as are the same on every machine.
-const SAYS: [(&str, &str); 12] = [
+const SAYS: [(&str, &str); 13] = [
     ("brake_for_nobody", "among idm: 0.0 % of agents collide"),
     ("build_a_scenario", "after 8 s: +1.4 m to the car ahead"),
     ("closest_calls", "8 scenes, the closest calls first"),
@@ -25,6 +25,7 @@ const SAYS: [(&str, &str); 12] = [
     ("raster_as_text", "drivable_area"),
     ("score_a_planner", "among idm: "),
     ("tokens_of_a_dataset", "a vocabulary of 2972 tokens"),
+    ("train_relative", "step 6 loss "),
 ];
 
 /// Examples that are longer than a page, and why.

@@ -97,6 +97,9 @@ impl Cli {
             Verb::Data(data::Verb::Synthesize(args)) => {
                 Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Data(data::Verb::Benchmark(args)) => {
+                Run::of("data benchmark", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Train(args) => {
                 Run::of("train", &args.common, &args)?.execute(|run| args.execute(run))
             }
@@ -111,6 +114,9 @@ impl Cli {
             }
             Verb::Evaluate(evaluate::Verb::Wosac(args)) => {
                 Run::of("evaluate wosac", &args.common, &args)?.execute(|run| args.execute(run))
+            }
+            Verb::Evaluate(evaluate::Verb::Behaviour(args)) => {
+                Run::of("evaluate behaviour", &args.common, &args)?.execute(|run| args.execute(run))
             }
             Verb::Plan(args) => {
                 Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))

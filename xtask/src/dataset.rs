@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use gump_data::cache::Cache;
 use gump_model::{ModelError, Scenes};
 use gump_scene::Scenario;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::fresh::{Fresh, Stream};
 use crate::progress::Progress;
@@ -65,16 +65,35 @@ pub(crate) struct ManifestFile {
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Splits {
     pub(crate) train: [usize; 2],
-    pub(crate) validation: [usize; 2],
+    #[serde(alias = "validation")]
+    pub(crate) tune: [usize; 2],
     pub(crate) test: [usize; 2],
 }
 
 /// What scenes are for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub(crate) enum Split {
+    /// Weights learn from them.
     Train,
-    Validation,
+    /// Choices are made on them: weights, temperatures, rules.
+    Tune,
+    /// Nothing is chosen on them.
     Test,
+}
+
+impl Split {
+    /// All of them.
+    pub(crate) const ALL: [Self; 3] = [Self::Train, Self::Tune, Self::Test];
+
+    /// Its name in lists and results.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Tune => "tune",
+            Self::Test => "test",
+        }
+    }
 }
 
 /// Scenes of one file or folder.
@@ -119,13 +138,13 @@ pub(crate) fn parts(data: &Path, split: Split) -> anyhow::Result<Vec<Part>> {
     let Some(manifest) = Manifest::of(data)? else {
         return Ok(match split {
             Split::Train => vec![Part::whole(data)],
-            Split::Validation | Split::Test => Vec::new(),
+            Split::Tune | Split::Test => Vec::new(),
         });
     };
     let parts = manifest.files.iter().map(|file| {
         let [start, end] = match split {
             Split::Train => file.split.train,
-            Split::Validation => file.split.validation,
+            Split::Tune => file.split.tune,
             Split::Test => file.split.test,
         };
         Part {
@@ -213,6 +232,18 @@ impl Training {
             fresh: Some(Fresh::start(stream, batch)),
         }
     }
+
+    /// The ids of all.
+    pub(crate) fn ids(&self) -> impl Iterator<Item = &str> {
+        let starts = std::iter::once(0).chain(self.sources.iter().map(|(end, _)| *end));
+        let sources = self.sources.iter().zip(starts);
+        sources.flat_map(|((end, source), begin)| {
+            (0..end - begin).filter_map(move |i| match source {
+                Source::Held(held) => held.as_slice().get(i).map(|scene| scene.id.as_str()),
+                Source::Cached { cache, start } => cache.id(start + i),
+            })
+        })
+    }
 }
 
 impl Scenes for Training {
@@ -279,8 +310,8 @@ mod tests {
             let scenes = read(&parts(&folder, split).unwrap(), &silent).unwrap();
             scenes.into_iter().map(|scene| scene.id).collect::<Vec<_>>()
         };
-        let [train, validation, test] = [Split::Train, Split::Validation, Split::Test].map(of);
-        assert_eq!((train.len(), validation.len(), test.len()), (71, 16, 26));
+        let [train, tune, test] = Split::ALL.map(of);
+        assert_eq!((train.len(), tune.len(), test.len()), (55, 36, 22));
         // The ids of SUMO's scenes are NETWORK-RUN-WINDOW-EGO, those of NGSIM USA_NETWORK-PLACE_...
         let network = |id: &String| {
             if let Some((name, _)) = id.strip_prefix("USA_").and_then(|id| id.split_once('-')) {
@@ -292,13 +323,13 @@ mod tests {
             name.map(str::to_owned)
         };
         let networks = |ids: &[String]| ids.iter().filter_map(network).collect::<BTreeSet<_>>();
-        let [a, b, c] = [&train, &validation, &test].map(|ids| networks(ids));
+        let [a, b, c] = [&train, &tune, &test].map(|ids| networks(ids));
         assert!(a.contains("berlin-doerpfeldstr") && c.contains("tavf-hamburg"));
         assert!(a.contains("us101") && b.contains("lanker") && c.contains("peach"));
         for (one, other) in [(&a, &b), (&a, &c), (&b, &c)] {
             assert!(one.is_disjoint(other), "{one:?} and {other:?}");
         }
-        let all: BTreeSet<_> = train.iter().chain(&validation).chain(&test).collect();
+        let all: BTreeSet<_> = train.iter().chain(&tune).chain(&test).collect();
         assert_eq!(all.len(), 113, "every scene has an id of its own");
     }
 
@@ -307,7 +338,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let whole = Part::whole(folder.path());
         assert_eq!(parts(folder.path(), Split::Train).unwrap(), [whole]);
-        assert!(parts(folder.path(), Split::Validation).unwrap().is_empty());
+        assert!(parts(folder.path(), Split::Tune).unwrap().is_empty());
     }
 
     #[test]
@@ -328,6 +359,9 @@ mod tests {
         let silent = Progress::begin(true, "", 0, "");
         let numbers = |parts: &[Part]| {
             let scenes = Training::open(parts, &silent).unwrap();
+            let ids: Vec<&str> = scenes.ids().collect();
+            let read = (0..scenes.len()).map(|i| scenes.get(i).unwrap().id.clone());
+            assert_eq!(ids, read.collect::<Vec<_>>());
             let id = |i| scenes.get(i).unwrap().id.clone();
             assert!(scenes.get(scenes.len()).is_err());
             (0..scenes.len()).map(id).collect::<Vec<_>>().join("")

@@ -20,10 +20,21 @@ pub(crate) fn digest(rollouts: &[Rollout]) -> String {
             hash.update((number as f32).to_le_bytes());
         }
     }
-    hash.finalize()
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
+    hexadecimal(hash)
+}
+
+/// One digest of many in their order; `None` of none.
+pub(crate) fn digest_of<'a>(digests: impl IntoIterator<Item = &'a str>) -> Option<String> {
+    let mut digests = digests.into_iter().peekable();
+    digests.peek()?;
+    let mut hash = Sha256::new();
+    digests.for_each(|digest| hash.update(digest));
+    Some(hexadecimal(hash))
+}
+
+fn hexadecimal(hash: Sha256) -> String {
+    let bytes = hash.finalize();
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn numbers(agent: &Agent) -> [f64; 5] {

@@ -6,7 +6,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use gump_rollout::{BoxError, Session, SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed};
+use gump_scene::{AgentState, Frame, Rollout, Scenario, Seed};
 
 use crate::progress::Progress;
 use crate::run::{Run, stop_if_interrupted};
@@ -32,17 +32,24 @@ impl Imagined {
     }
 }
 
-/// Imagines `n_futures` of a scene for `seconds`; the world drives the ego too.
+/// Imagines `n_futures` of what comes after the present; the world drives the ego too, and is not
+/// told its route, which comes from what is to be imagined.
 ///
-/// Error: what the world reports, or Ctrl-C.
+/// Error: a map without lanes for a world that follows them, what the world reports, or Ctrl-C.
 pub(crate) fn imagine(
     run: &Run,
     world: &World,
-    scene: SceneState<'_>,
+    scenario: &Scenario,
     n_futures: usize,
-    seconds: f64,
+    config: &SimulateConfig,
     seed: Seed,
 ) -> anyhow::Result<Imagined> {
+    anyhow::ensure!(
+        !(world.follows_lanes() && scenario.map.lanes().is_empty()),
+        "scenario {}: expected a map with lanes to drive on, found none",
+        scenario.id
+    );
+    let (scene, seconds) = (scenario.present().unguided(), config.seconds);
     let start = Start {
         scene,
         n_futures,
@@ -56,12 +63,8 @@ pub(crate) fn imagine(
         scene_dt: scene.dt,
         cost: Mutex::new(Cost::default()),
     };
-    let config = SimulateConfig {
-        seconds,
-        ..SimulateConfig::default()
-    };
     let rollouts =
-        simulate(&watched, &[start], None, &config).map_err(|error| anyhow::anyhow!(error))?;
+        simulate(&watched, &[start], None, config).map_err(|error| anyhow::anyhow!(error))?;
     let cost = watched.into_cost();
     let passes = world.passes().saturating_sub(cost.passes_before);
     Ok(Imagined {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gump_model::ops::Choice;
 use serde::Serialize;
 
 /// The machine as a report names it.
@@ -16,6 +17,8 @@ pub(crate) struct Machine {
     pub(crate) memory_gb: Option<f64>,
     /// Where tensors live.
     pub(crate) device: String,
+    /// What multiplies matrices on the processor.
+    pub(crate) kernel: Choice,
     /// Operating system and architecture.
     pub(crate) system: String,
 }
@@ -29,6 +32,7 @@ impl Machine {
             cores: cores(),
             memory_gb: kib.map(|kib| (kib * 1024.0 / 1e8).round() / 10.0),
             device: device.into(),
+            kernel: Choice::made().clone(),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
         }
     }

@@ -9,11 +9,13 @@
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
 )]
 
+mod benchmark;
 mod charts;
 mod checks;
 mod cli;
 mod config;
 mod dataset;
+mod decoding;
 mod fresh;
 mod futures;
 mod imagine;

@@ -55,6 +55,27 @@ pub(crate) fn open(path: &Path) -> anyhow::Result<Box<dyn Iterator<Item = Named>
     })))
 }
 
+/// Every scenario of some files or folders, read one by one.
+///
+/// Error: nothing to read at the first; what is wrong with the others is told where it is.
+pub(crate) fn open_all(
+    paths: &[PathBuf],
+) -> anyhow::Result<Box<dyn Iterator<Item = Named> + Send + '_>> {
+    let (first, others) = paths
+        .split_first()
+        .context("expected scenarios, found none")?;
+    let others = others.iter().flat_map(|path| match open(path) {
+        Ok(cases) => cases,
+        Err(error) => Box::new(std::iter::once(Named {
+            id: path.display().to_string(),
+            log_name: log_name(path),
+            scenario_type: "unknown".into(),
+            case: Err(error),
+        })) as Box<dyn Iterator<Item = Named> + Send>,
+    });
+    Ok(Box::new(open(first)?.chain(others)))
+}
+
 /// A file's name without its endings.
 pub(crate) fn log_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -77,7 +98,14 @@ pub(crate) fn find(source: &str) -> anyhow::Result<Case> {
 }
 
 /// A case of a scenario that knows boxes alone.
+///
+/// Error: no lanes, or a scenario that cannot be driven through.
 fn of_boxes(mut scenario: Scenario) -> anyhow::Result<Case> {
+    anyhow::ensure!(
+        !scenario.map.lanes().is_empty(),
+        "scenario {}: expected a map with lanes to plan on, found none",
+        scenario.id
+    );
     let map = Arc::clone(&scenario.map);
     derive_roadblocks(&mut scenario);
     Ok(Case {

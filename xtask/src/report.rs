@@ -1,5 +1,6 @@
 //! `report.json`: what was asked, on what machine, how long it took, what came out.
 
+use std::collections::BTreeSet;
 use std::io::Write as _;
 use std::path::Path;
 use std::time::Duration;
@@ -32,6 +33,9 @@ pub(crate) struct Report {
     pub(crate) peak_rss_mb: Option<f64>,
     /// What came out; the same for the same seed and machine, clocks aside.
     pub(crate) results: Map<String, Value>,
+    /// Keys of results that the terminal does not show.
+    #[serde(skip)]
+    pub(crate) untold: BTreeSet<String>,
     /// The sentence it failed with.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) error: Option<String>,
@@ -53,6 +57,7 @@ impl Report {
             seconds: Map::new(),
             peak_rss_mb: None,
             results: Map::new(),
+            untold: BTreeSet::new(),
             error: None,
         }
     }
@@ -89,7 +94,9 @@ impl Report {
 
     /// The results and times as the terminal shows them.
     pub(crate) fn text(&self) -> String {
-        let results = table::text(&Value::Object(self.results.clone()));
+        let mut told = self.results.clone();
+        told.retain(|key, _| !self.untold.contains(key));
+        let results = table::text(&Value::Object(told));
         let seconds = self.seconds.iter().map(|(phase, seconds)| {
             let seconds = seconds.as_f64().unwrap_or_default();
             format!("{phase} {seconds:.2}")

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_model::ops::{Choice, Kernel};
 use gump_scene::Seed;
 use serde::Serialize;
 
@@ -33,6 +34,10 @@ pub(crate) struct Common {
     /// Where tensors live
     #[arg(long, value_enum, default_value_t = Device::Cpu)]
     device: Device,
+    /// What multiplies matrices: amx, avx512-bf16, avx512, avx2 or portable [default: the best that
+    /// the processor has and that passes its test]
+    #[arg(long, value_name = "NAME")]
+    kernel: Option<String>,
     /// No progress and no table, errors only
     #[arg(long)]
     quiet: bool,
@@ -96,6 +101,10 @@ impl Run {
         common: &Common,
         settings: &impl Serialize,
     ) -> anyhow::Result<Self> {
+        if let Some(name) = &common.kernel {
+            let forced = Kernel::named(name).and_then(Choice::force);
+            forced.map_err(|why| WrongArguments(format!("--kernel: {why}")))?;
+        }
         let device = common.device.open()?;
         let out = match &common.out {
             Some(out) => out.clone(),
@@ -177,6 +186,12 @@ impl Run {
             .with_context(|| format!("the result {key} cannot be written as JSON"))?;
         self.report.results.insert(key.into(), value);
         Ok(())
+    }
+
+    /// Adds a result that the terminal does not show: the same stands there in another form.
+    pub(crate) fn result_untold(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
+        self.report.untold.insert(key.into());
+        self.result(key, value)
     }
 
     /// From here on this process only helps another one, which tells and writes for both.

@@ -2,8 +2,10 @@
 //! over time, what a learned world drew from.
 
 use anyhow::Context as _;
+use gump_metrics::behaviour::{Behaviour, Judged, judge};
 use gump_metrics::wosac::{Component, Config, Features, Log, Reference, Rollouts, Year};
 use gump_model::{Outlook, Watch};
+use gump_rollout::SimulateConfig;
 use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
 
@@ -15,6 +17,8 @@ use crate::worlds::World;
 const AGENTS: usize = 32;
 /// Draws per agent and step of a heat map.
 const DRAWS: usize = 128;
+/// How far the futures that the challenge is defined on go, seconds.
+const HORIZON_S: u32 = 8;
 /// Beyond that a distance means that there is nothing, metres.
 const NOTHING: f32 = 1e9;
 
@@ -28,9 +32,11 @@ const METRICS: [(Component, &str); 3] = [
     (Component::DistanceToRoadEdge, "beyond the road edge, m"),
 ];
 
-/// Tells how likely the log of the agents near the ego is under the futures, as the Waymo Sim
-/// Agents Challenge of 2025 measures it, and what it measures on the way. Nothing of a scene or of
-/// futures that the challenge is not defined on: other rates, no log to compare with, no road edge.
+/// Tells how plausible the futures of the agents near the ego are: how likely the log is under
+/// them, as the Waymo Sim Agents Challenge of 2025 measures it, times the share of futures in which
+/// the agent does nothing that a driver would not do; and what the challenge measures on the way.
+/// Nothing of a scene or of futures that the challenge is not defined on: other rates, no log to
+/// compare with, no road edge.
 pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[Rollout]) {
     let config = Config::of(Year::Y2025);
     let Ok(mut log) = Log::of(scenario) else {
@@ -44,8 +50,15 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
     let Ok(evaluation) = reference.evaluate(&imagined) else {
         return;
     };
-    for agent in evaluation.realism() {
-        viewer.realism(agent.agent, agent.realism);
+    let realism = evaluation.realism();
+    let conduct = Behaviour::new(scenario, HORIZON_S).conduct(futures);
+    for judged in judge(&realism, conduct) {
+        if judged.realism.is_some() {
+            viewer.realism(judged.conduct.agent, judged.plausibility);
+            viewer.deeds(judged.conduct.agent, deeds(&judged));
+        }
+    }
+    for agent in realism {
         viewer.metric(MetricTrack {
             name: "realism of the futures, 0 to 1".into(),
             agent: agent.agent,
@@ -59,6 +72,16 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
     for (k, features) in evaluation.imagined.iter().enumerate() {
         metrics(viewer, features, Some(k), 1);
     }
+}
+
+/// What an agent does that a driver would not, in words; empty if it does nothing such.
+fn deeds(judged: &Judged) -> String {
+    let deeds = judged.conduct.deeds.iter();
+    let words = deeds.map(|(deed, share)| {
+        let name = deed.name().replace('_', " ");
+        format!("{name} {:.0} %", 100.0 * share)
+    });
+    words.collect::<Vec<_>>().join(", ")
 }
 
 /// Agents that move and are near to the ego, without it.
@@ -95,16 +118,16 @@ pub(crate) fn heat(
     run: &Run,
     viewer: &mut Viewer<'_>,
     world: World,
-    scene: SceneState<'_>,
+    scenario: &Scenario,
     n_futures: usize,
-    seconds: f64,
+    config: &SimulateConfig,
 ) -> anyhow::Result<()> {
     let watch = Watch {
         futures: n_futures,
         draws: DRAWS,
     };
     let world = world.watching(watch);
-    imagine(run, &world, scene, n_futures, seconds, run.seed())?;
+    imagine(run, &world, scenario, n_futures, config, run.seed())?;
     let outlooks = world
         .take_outlooks()
         .context("a world that follows rules draws nothing")?;
@@ -154,6 +177,40 @@ mod tests {
         // The ego and two others have a number, the obstacle has none.
         assert_eq!(html.matches("\"realism\":null").count(), 1);
         assert_eq!(plain.matches("\"realism\":null").count(), 4);
+    }
+
+    #[test]
+    fn a_parked_car_that_pulls_out_in_every_future_has_the_worst_colour() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 250,0
+             edge: -50,-8 250,-8
+             ego vehicle 3: 10,0 velocity 10,0
+             agent vehicle 4: 30,-5
+             agent vehicle 5: 30,0 velocity 10,0
+             history 1 future 8 dt 0.1",
+        )
+        .unwrap();
+        let pulls_out = || {
+            let mut rollout = Rollout::begin(scenario.present());
+            for (k, frame) in scenario.future().iter().enumerate() {
+                let agents = frame.agents().iter().map(|agent| {
+                    let mut agent = *agent;
+                    if agent.id == AgentId(4) {
+                        agent.state.pose.position.x += 0.002 * (k as f64).powi(2);
+                    }
+                    agent
+                });
+                rollout.push(gump_scene::Frame::new(agents.collect(), Vec::new()));
+            }
+            rollout
+        };
+        let futures = vec![pulls_out(); 4];
+        let mut viewer = Viewer::new(&scenario);
+        viewer.futures(&futures);
+        realism(&mut viewer, &scenario, &futures);
+        let html = viewer.to_html();
+        assert!(html.contains("\"deeds\":\"parked move 100 %\""));
+        assert_eq!(html.matches("\"realism\":0.0").count(), 1);
     }
 
     #[test]

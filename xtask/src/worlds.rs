@@ -1,17 +1,20 @@
 //! Worlds by name: `log`, `idm`, `constant-velocity` and `model:WEIGHTS`.
 
+mod flags;
+
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use gump_model::relative::{self, RelativeSampling, RelativeWorld};
 use gump_model::world::TransformerWorld;
-use gump_model::{CacheMode, Device, Mode, Outlook, Precision, SamplingConfig, Watch, checkpoint};
+use gump_model::{Device, Outlook, SamplingConfig, Watch, checkpoint};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
 use serde::{Serialize, Serializer};
 
-use crate::cli::WrongArguments;
+pub(crate) use flags::{Draw, PrecisionName, Sampling};
 
 /// Which world imagines.
 #[derive(Clone, Debug, PartialEq)]
@@ -96,6 +99,15 @@ impl World {
             WorldName::Log => anyhow::bail!("the world log needs a scenario to replay"),
             WorldName::Idm => Self::Rule(Box::new(Idm::default())),
             WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
+            WorldName::Model(path) if relative::is_relative(path)? => {
+                let network = relative::load(path, device)?;
+                let sampling = RelativeSampling {
+                    temperature: sampling.temperature,
+                    precision: sampling.precision,
+                    ..RelativeSampling::default()
+                };
+                Self::Rule(Box::new(RelativeWorld::new(&network, sampling)?))
+            }
             WorldName::Model(path) => {
                 let network = checkpoint::load(path, device)?;
                 Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))
@@ -108,6 +120,14 @@ impl World {
         match self {
             Self::Rule(world) => &**world,
             Self::Learned(world) => &**world,
+        }
+    }
+
+    /// Whether a map without lanes leaves it nothing to go by.
+    pub(crate) fn follows_lanes(&self) -> bool {
+        match self {
+            Self::Rule(world) => world.name() == "idm",
+            Self::Learned(_) => true,
         }
     }
 
@@ -165,133 +185,6 @@ impl<'a> Worlds<'a> {
             _ => World::build(&self.device, self.name, scenario, &self.sampling)?,
         };
         Ok(self.loaded.insert(world))
-    }
-}
-
-/// How a learned world decodes.
-#[derive(Clone, Debug, Serialize, clap::Args)]
-pub(crate) struct Sampling {
-    /// Decode all agents of a frame at once, or one after another
-    #[arg(long, value_enum, default_value_t = ModeName::PartialAr)]
-    mode: ModeName,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub(crate) draw: Draw,
-}
-
-/// How a learned world decodes, whatever the order.
-#[derive(Clone, Debug, Serialize, clap::Args)]
-pub(crate) struct Draw {
-    /// What is kept between the passes of a frame
-    #[arg(long, value_enum, default_value_t = CacheName::Window)]
-    cache: CacheName,
-    /// In which form the weights are multiplied
-    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
-    precision: PrecisionName,
-    /// Divides the logits; above 1 is bolder [default: 0.5]
-    #[arg(long, value_name = "X")]
-    temperature: Option<f64>,
-    /// Bins that may be drawn per field [default: 40]
-    #[arg(long, value_name = "N")]
-    top_k: Option<usize>,
-    /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
-    #[arg(long, value_name = "X")]
-    decay: Option<f64>,
-    /// Draws again at most that often what would run into something or off the road, 0 for never [default: 12]
-    #[arg(long, value_name = "N")]
-    redraws: Option<usize>,
-    /// Vehicles and bicycles may turn on the spot and slip sideways as the model says
-    #[arg(long)]
-    no_limits: bool,
-    /// Agents come and leave and lights change as the model says
-    #[arg(long)]
-    life: bool,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum ModeName {
-    PartialAr,
-    FullAr,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum CacheName {
-    /// Every pass reads the whole window
-    None,
-    /// The window slides; within a frame nothing is read twice
-    Window,
-    /// The window grows as far as it fits; between frames nothing is read twice either
-    Growing,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum PrecisionName {
-    F32,
-    Bf16,
-    Int8,
-}
-
-impl PrecisionName {
-    /// The model's form of the name.
-    pub(crate) fn resolve(self) -> Precision {
-        match self {
-            Self::F32 => Precision::F32,
-            Self::Bf16 => Precision::Bf16,
-            Self::Int8 => Precision::Int8,
-        }
-    }
-}
-
-impl Sampling {
-    /// The model's form of the flags.
-    ///
-    /// Error: [`WrongArguments`] for a number out of its range.
-    pub(crate) fn resolve(&self) -> anyhow::Result<SamplingConfig> {
-        self.draw.resolve(match self.mode {
-            ModeName::PartialAr => Mode::PartialAr,
-            ModeName::FullAr => Mode::FullAr,
-        })
-    }
-}
-
-impl Draw {
-    /// The model's form of the flags.
-    ///
-    /// Error: [`WrongArguments`] for a number out of its range.
-    pub(crate) fn resolve(&self, mode: Mode) -> anyhow::Result<SamplingConfig> {
-        let default = SamplingConfig::default();
-        let config = SamplingConfig {
-            mode,
-            cache: match self.cache {
-                CacheName::None => CacheMode::None,
-                CacheName::Window => CacheMode::Window,
-                CacheName::Growing => CacheMode::Growing,
-            },
-            precision: self.precision.resolve(),
-            life: self.life,
-            temperature: self.temperature.unwrap_or(default.temperature),
-            top_k: self.top_k.unwrap_or(default.top_k),
-            decay: self.decay.unwrap_or(default.decay),
-            redraws: self.redraws.unwrap_or(default.redraws),
-            limits: !self.no_limits,
-            ..default
-        };
-        let wrong = if !(config.temperature > 0.0 && config.temperature.is_finite()) {
-            format!(
-                "--temperature: expected a number above 0, found {}",
-                config.temperature
-            )
-        } else if config.top_k == 0 {
-            "--top-k: expected at least 1, found 0".into()
-        } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
-            format!("--decay: expected 0 or more, found {}", config.decay)
-        } else {
-            return Ok(config);
-        };
-        Err(WrongArguments(wrong).into())
     }
 }
 

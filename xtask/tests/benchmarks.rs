@@ -1,8 +1,11 @@
 //! Motion prediction and submissions from the outside: official numbers, shards, broken input.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../tests/shared.rs"]
+mod shared_data;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use gump_data::submission::{
@@ -18,6 +21,7 @@ use gump_metrics::logged;
 use gump_scene::{PredictedMode, Prediction, Scenario};
 use prost::Message;
 use serde_json::Value;
+use shared_data::shared;
 use tempfile::TempDir;
 
 /// The reference prints f32 results with nine digits.
@@ -60,15 +64,6 @@ fn mini() -> String {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let path = repository.join("datasets/mini/procedural.tfrecord.gz");
     path.display().to_string()
-}
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared")).join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("SKIPPED: the file {name} is not beside the repository");
-    None
 }
 
 /// The scenarios of the official numbers as one file: those without a map get one, since every
@@ -464,4 +459,126 @@ fn a_submission_that_breaks_the_rules_is_not_packed() {
         2,
         "--rollouts",
     );
+}
+
+/// The value of one row of `evaluate behaviour`.
+fn row<'a>(rows: &'a Value, world: &str, measure: &str, class: &str, seconds: u64) -> &'a Value {
+    let rows = rows.as_array().unwrap().iter();
+    let mut found = rows.filter(|row| {
+        row["world"] == world
+            && row["measure"] == measure
+            && row["class"] == class
+            && row["seconds"] == seconds
+    });
+    let row = found
+        .next()
+        .unwrap_or_else(|| panic!("no {measure} of {class} in {world}"));
+    assert!(
+        found.next().is_none(),
+        "two rows {measure} of {class} in {world}"
+    );
+    row
+}
+
+#[test]
+fn behaviour_is_counted_in_worlds_beside_the_log() {
+    let folder = tempfile::tempdir().unwrap();
+    let words = format!(
+        "evaluate behaviour --scenarios {} --world log,constant-velocity,idm --futures 2 --limit 6",
+        mini()
+    );
+    let results = results(&folder, &words, "out");
+    assert_eq!(results["scenarios"], 6);
+    let rows = &results["rows"];
+    let keys = [
+        "world", "class", "measure", "seconds", "value", "log", "low", "high",
+    ];
+    for one in rows.as_array().unwrap() {
+        for key in keys {
+            assert!(one.get(key).is_some(), "{key} is missing: {one}");
+        }
+        // The log replayed is the log.
+        if one["world"] == "log" {
+            assert_eq!(one["value"], one["log"], "{one}");
+        }
+        let number = |key: &str| one[key].as_f64();
+        let inside = number("low")
+            .zip(number("high"))
+            .zip(number("value"))
+            .is_none_or(|((low, high), value)| low <= value + 1e-9 && value <= high + 1e-9);
+        assert!(inside, "{one}");
+    }
+    // Who goes on with the velocity of the present and has none stays, and runs into others.
+    let parked = row(rows, "constant-velocity", "parked_move", "vehicle", 8);
+    assert_eq!(parked["value"], 0.0);
+    let overlaps = |world| {
+        row(rows, world, "new_overlap", "all", 8)["value"]
+            .as_f64()
+            .unwrap()
+    };
+    assert!(overlaps("constant-velocity") > overlaps("log"), "{rows}");
+    let standing = |seconds| &row(rows, "constant-velocity", "standing", "vehicle", seconds)["of"];
+    assert!(standing(8).as_f64().unwrap() > 20.0);
+    for file in [
+        "shares.svg",
+        "rates.png",
+        "standing.svg",
+        "rows.parquet",
+        "scenarios.toml",
+    ] {
+        assert!(folder.path().join("out").join(file).is_file(), "{file}");
+    }
+}
+
+#[test]
+fn behaviour_after_the_log_has_no_log_and_shards_add_up() {
+    let folder = tempfile::tempdir().unwrap();
+    let verb = format!(
+        "evaluate behaviour --scenarios {} --world idm --futures 1 --seconds 30 --limit 4",
+        mini()
+    );
+    let whole = results(&folder, &verb, "whole");
+    let rows = &whole["rows"];
+    let late = row(rows, "idm", "standing", "vehicle", 30);
+    assert!(late["value"].is_number() && late["log"].is_null(), "{late}");
+    assert!(row(rows, "idm", "standing", "vehicle", 4)["log"].is_number());
+    assert!(row(rows, "idm", "new_overlap", "all", 30)["log"].is_null());
+    assert!(row(rows, "idm", "set_off", "vehicle", 30)["log"].is_number());
+    for k in [1, 2] {
+        results(&folder, &format!("{verb} --shard {k}/2"), &k.to_string());
+    }
+    let merged = results(&folder, "evaluate merge 2 1", "merged");
+    assert_eq!(merged, whole);
+}
+
+#[test]
+fn behaviour_refuses_what_it_cannot_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let verb = format!("evaluate behaviour --scenarios {}", mini());
+    fails(&folder, &verb, 2, "--world");
+    fails(
+        &folder,
+        &format!("{verb} --world sumo"),
+        2,
+        "expected log, idm",
+    );
+    fails(
+        &folder,
+        &format!("{verb} --world idm --seconds 9"),
+        2,
+        "expected 8, 30 or 60",
+    );
+    fails(
+        &folder,
+        &format!("{verb} --world idm --shard 3/2"),
+        2,
+        "K/N",
+    );
+    fails(
+        &folder,
+        "evaluate behaviour --scenarios nowhere --world idm",
+        1,
+        "nowhere",
+    );
+    fails(&folder, &format!("{verb} --world model:none"), 1, "none");
 }

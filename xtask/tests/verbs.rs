@@ -1,15 +1,20 @@
 //! Every verb from the outside: exit status, sentences, files, and the report that scripts rely on.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../tests/shared.rs"]
+mod shared_data;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gump_model::checkpoint::{self, Precision};
+use gump_model::ops::Kernel;
 use gump_model::train::ModelChoice;
 use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
 use gump_scene::Seed;
 use serde_json::Value;
+use shared_data::shared;
 
 /// A folder for one test, and the driver in it.
 struct Workplace {
@@ -126,10 +131,17 @@ fn wrong_arguments_exit_with_2() {
         "simulate --scenario s --world idm --temperature 0",
         "simulate --scenario s --world idm --heat",
         "simulate --scenario s --world idm --device cuda",
+        "simulate --scenario s --world idm --kernel neon",
         "data synthesize --scenes 1 --family cul-de-sac",
         "tidy --seed many",
     ] {
         place.fails(words, 2, &[]);
+    }
+    if Kernel::Amx.is_present() {
+        eprintln!("skipped: this processor has amx, so that it can be asked for");
+    } else {
+        let words = "simulate --scenario s --world idm --kernel amx";
+        place.fails(words, 2, &["--kernel", "no kernel amx"]);
     }
 }
 
@@ -626,7 +638,10 @@ fn ablate_nar_compares_the_two_ways_of_decoding() {
         .iter()
         .map(|row| row["mode"].as_str().unwrap())
         .collect();
-    assert_eq!(modes, ["full-AR", "partial-AR"]);
+    assert_eq!(modes, ["full-AR", "partial-AR", "full-AR", "partial-AR"]);
+    let decodings = rows.iter().map(|row| &row["decoding"]);
+    let expected = ["ruled", "ruled", "raw", "raw"];
+    assert!(decodings.eq(expected));
     assert_eq!(rows[1]["passes_per_frame"], 1.0);
     assert!(rows[0]["passes_per_frame"].as_f64().unwrap() > 1.0);
     let rate = |row: &Value| row["frames_per_second"].as_f64().unwrap();
@@ -636,7 +651,7 @@ fn ablate_nar_compares_the_two_ways_of_decoding() {
     assert!(place.files().contains(&"picture.png".to_owned()));
     place.fails(
         &format!("{words} {scene} --world idm"),
-        1,
+        2,
         &["model:WEIGHTS"],
     );
 }
@@ -862,13 +877,11 @@ fn evaluate_wosac_takes_rollouts_from_files() {
 #[test]
 fn official_rollouts_of_a_recorded_scenario_get_the_official_score() {
     let place = Workplace::new();
-    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
-    let scenario = shared.join("data/waymo/scenario_a.tfrecord");
-    let rollouts = shared.join("golden/wosac/inputs_real/test_submission.binproto.gz");
-    if !(scenario.is_file() && rollouts.is_file()) {
-        eprintln!("skipped: no {}", scenario.display());
+    let scenario = shared("data/waymo/scenario_a.tfrecord");
+    let rollouts = shared("golden/wosac/inputs_real/test_submission.binproto.gz");
+    let (Some(scenario), Some(rollouts)) = (scenario, rollouts) else {
         return;
-    }
+    };
     // Wheels 1.6.0, 1.6.1, 1.6.4 and 1.6.7 of the official evaluator.
     for (year, expected) in [
         ("2023-v0", 0.231_545),

@@ -20,7 +20,7 @@ use serde::Deserialize;
 use crate::document::{self, Document};
 use crate::files::Format;
 use crate::json::{self, Flag, Real};
-use crate::recording::{self, Recording, State, Track, assemble};
+use crate::recording::{Recording, State, Track, assemble};
 use crate::{DataError, Problem, ReadOptions, ReadReport, features, infer};
 
 pub(crate) const FORMAT: Format = Format {
@@ -57,7 +57,7 @@ pub(crate) struct File {
     objects: Vec<Object>,
     roads: Vec<Road>,
     #[serde(default)]
-    tl_states: BTreeMap<String, Signal>,
+    tl_states: Option<BTreeMap<String, Signal>>,
     #[serde(default)]
     metadata: Option<Metadata>,
 }
@@ -149,13 +149,14 @@ impl Document for File {
         report: &mut ReadReport,
     ) -> Result<gump_scene::Scenario, Problem> {
         let mut parts = parts(&self.roads, report);
+        parts.unstated.lights = self.tl_states.is_none();
         if parts.lanes.is_empty() && parts.road_edges.is_empty() {
             return Err(Problem::NoMap);
         }
         infer::lane_graph(&mut parts, options, report);
         let recording = self.recording(id, options, report)?;
         let mut scenario = assemble(recording, parts, options, report)?;
-        infer::light_gaps(&mut scenario.log, DT, options, report);
+        infer::light_gaps(&mut scenario.log, scenario.now, DT, options, report);
         Ok(scenario)
     }
 }
@@ -210,7 +211,7 @@ impl File {
             steps,
             now: PRESENT.min(steps.saturating_sub(1)),
             ego,
-            lights: lights(&self.tl_states, report),
+            lights: lights(self.tl_states.as_ref(), report),
             targets: Some(targets),
             objects_of_interest: self
                 .metadata
@@ -268,7 +269,7 @@ impl Object {
         Ok(Track {
             id,
             kind,
-            usual_size: recording::usual_size(kind),
+            usual_size: kind.usual_size(),
             states: (0..steps)
                 .filter(|&step| self.valid[step].0)
                 .map(state)
@@ -406,9 +407,12 @@ fn edge_kind(element: Option<i64>) -> RoadEdgeKind {
     }
 }
 
-fn lights(signals: &BTreeMap<String, Signal>, report: &mut ReadReport) -> Vec<(usize, Light)> {
+fn lights(
+    signals: Option<&BTreeMap<String, Signal>>,
+    report: &mut ReadReport,
+) -> Vec<(usize, Light)> {
     let mut lights = Vec::new();
-    for (lane, signal) in signals {
+    for (lane, signal) in signals.into_iter().flatten() {
         let Ok(id) = lane.parse() else {
             report.drop_damaged("light of a lane that is no number", || lane.clone());
             continue;

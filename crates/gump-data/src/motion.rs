@@ -1,4 +1,7 @@
 //! Velocities and headings that a format leaves out, and smoother ones where it is noisy.
+//!
+//! What is filled in up to the present comes from states up to the present; smoothing, which is off
+//! unless asked for, looks ahead.
 
 use std::f64::consts::PI;
 
@@ -18,8 +21,14 @@ const MAX_GAP: usize = 10;
 const SMOOTHING: f64 = 0.1;
 
 /// Fills in velocities from positions, then headings from velocities; states for which that cannot
-/// be done are left out.
-pub(crate) fn complete(track: &mut Track, dt: f64, options: ReadOptions, report: &mut ReadReport) {
+/// be done are left out. `now` is the present step, `dt` the seconds between steps.
+pub(crate) fn complete(
+    track: &mut Track,
+    now: usize,
+    dt: f64,
+    options: ReadOptions,
+    report: &mut ReadReport,
+) {
     let unsound = |v: DVec2| v.is_nan() || v.length() > MAX_SPEED;
     let moving = |state: &State| !unsound(state.velocity);
     let n = track.states.len();
@@ -35,7 +44,8 @@ pub(crate) fn complete(track: &mut Track, dt: f64, options: ReadOptions, report:
         return;
     }
     report.infer("velocity from positions", without_velocity);
-    let velocities = velocities(&track.states, dt);
+    let past = track.states.partition_point(|state| state.step <= now);
+    let velocities = velocities(&track.states, past, dt);
     for (state, velocity) in track.states.iter_mut().zip(velocities) {
         if unsound(state.velocity) {
             state.velocity = velocity;
@@ -43,12 +53,15 @@ pub(crate) fn complete(track: &mut Track, dt: f64, options: ReadOptions, report:
     }
     report.infer("heading from motion", without_heading);
     if without_heading > 0 {
-        complete_headings(&mut track.states);
+        let (past, future) = track.states.split_at_mut(past);
+        let last = complete_headings(past, None);
+        complete_headings(future, last);
     }
 }
 
-/// Differences over the steps before and after; 0 for a state alone.
-fn velocities(states: &[State], dt: f64) -> Vec<DVec2> {
+/// Differences over the steps before and after, over the step before alone for the last of the
+/// first `past` states; 0 for a state alone.
+fn velocities(states: &[State], past: usize, dt: f64) -> Vec<DVec2> {
     let near = |a: &State, b: &State| b.step - a.step <= MAX_GAP;
     let velocity = |i: usize| {
         let before = if i > 0 && near(&states[i - 1], &states[i]) {
@@ -57,7 +70,7 @@ fn velocities(states: &[State], dt: f64) -> Vec<DVec2> {
             i
         };
         let after = match states.get(i + 1) {
-            Some(next) if near(&states[i], next) => i + 1,
+            Some(next) if near(&states[i], next) && i + 1 != past => i + 1,
             _ => i,
         };
         let (a, b) = (&states[before], &states[after]);
@@ -72,8 +85,9 @@ fn velocities(states: &[State], dt: f64) -> Vec<DVec2> {
     (0..states.len()).map(velocity).collect()
 }
 
-/// Headings from the direction of motion, from the nearest known one where there is little.
-fn complete_headings(states: &mut [State]) {
+/// Headings from the direction of motion; where there is little, the one known before, at first
+/// `last` or else the first that is known. Returns the last one, if any is known.
+fn complete_headings(states: &mut [State], last: Option<f64>) -> Option<f64> {
     let known: Vec<Option<f64>> = states
         .iter()
         .map(|state| {
@@ -82,11 +96,12 @@ fn complete_headings(states: &mut [State]) {
             stated.or_else(|| fast.then(|| state.velocity.to_angle()))
         })
         .collect();
-    let mut last = known.iter().flatten().next().copied().unwrap_or(0.0);
+    let mut last = last.or_else(|| known.iter().flatten().next().copied());
     for (state, known) in states.iter_mut().zip(known) {
-        last = known.unwrap_or(last);
-        state.heading = last;
+        last = known.or(last);
+        state.heading = last.unwrap_or(0.0);
     }
+    last
 }
 
 /// Smooths positions with a Gaussian window within stretches without gaps, and derives velocity
@@ -112,7 +127,7 @@ pub(crate) fn smooth(track: &mut Track, dt: f64, report: &mut ReadReport) {
             window.fold((original[i].position, 1.0), |(p, w), (q, v)| (p + q, w + v));
         state.position = sum / total;
     }
-    let velocities = velocities(&track.states, dt);
+    let velocities = velocities(&track.states, track.states.len(), dt);
     for (state, velocity) in track.states.iter_mut().zip(velocities) {
         state.velocity = velocity;
         let direction = velocity.to_angle();
@@ -152,7 +167,7 @@ mod tests {
     fn velocities_and_headings_come_from_positions() {
         let mut track = track(&[(0, 0.0, 0.0), (1, 0.0, 1.0), (2, 0.0, 2.0), (50, 9.0, 9.0)]);
         let mut report = ReadReport::default();
-        complete(&mut track, 0.1, ReadOptions::ALL, &mut report);
+        complete(&mut track, 50, 0.1, ReadOptions::ALL, &mut report);
         let found: Vec<_> = track.states.iter().map(|s| s.velocity).collect();
         let up = dvec2(0.0, 10.0);
         assert_eq!(found, [up, up, up, DVec2::ZERO]);
@@ -167,10 +182,32 @@ mod tests {
     }
 
     #[test]
+    fn what_is_filled_in_up_to_the_present_does_not_depend_on_what_follows() {
+        let past = [(0, 0.0, 0.0), (1, 0.0, 0.0), (2, 0.0, 0.01)];
+        let filled = |after: &[(usize, f64, f64)]| {
+            let mut track = track(&[&past, after].concat());
+            let mut report = ReadReport::default();
+            complete(&mut track, 2, 0.1, ReadOptions::ALL, &mut report);
+            track.states
+        };
+        let [none, left, right] = [
+            filled(&[]),
+            filled(&[(3, 0.0, 2.0), (4, 0.0, 4.0)]),
+            filled(&[(3, 2.0, 0.0), (4, 4.0, 0.0)]),
+        ];
+        assert_eq!((&left[..3], &right[..3]), (&none[..], &none[..]));
+        assert!((left[2].velocity - dvec2(0.0, 0.1)).length() < 1e-9);
+        // Who stood up to the present has the heading of what it does then.
+        assert_eq!((left[2].heading, right[2].heading), (0.0, 0.0));
+        assert!((left[3].heading - PI / 2.0).abs() < 1e-9);
+        assert!((left[3].velocity - dvec2(0.0, 19.95)).length() < 1e-9);
+    }
+
+    #[test]
     fn without_inference_such_states_are_left_out() {
         let mut track = track(&[(0, 0.0, 0.0), (1, 0.0, 1.0)]);
         let mut report = ReadReport::default();
-        complete(&mut track, 0.1, ReadOptions::STATED, &mut report);
+        complete(&mut track, 50, 0.1, ReadOptions::STATED, &mut report);
         assert!(track.states.is_empty());
         assert_eq!(report.dropped["state without velocity or heading"], 2);
     }

@@ -85,6 +85,16 @@ fn add(counts: &mut BTreeMap<&'static str, usize>, key: &'static str, n: usize) 
 ///
 /// The default fills all of them: planners need routes and drivable surfaces. Smoothing changes
 /// what a format states and is off unless asked for.
+///
+/// # What the present tells of the future
+///
+/// States, sizes and lights up to the present are filled in from frames up to the present alone:
+/// two recordings that are equal until then have equal pasts. Four things do look ahead, each by
+/// its own option: the route ([`gump_scene::SceneState::unguided`] hides it from an actor), whom to
+/// predict (which no actor sees), which vehicle is the ego where a format does not say (a choice of
+/// scene, not of what is seen in it), and smoothing. What a file states is taken as it is stated,
+/// whatever its makers knew: a map that is cut out along the ego's way, a size that is the same in
+/// all frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
     /// Which lane leads to which, which lie side by side, from the centre lines, where a format
@@ -103,9 +113,11 @@ pub struct ReadOptions {
     pub infer_edges: bool,
     /// The lane of a light that states only where it is.
     pub infer_light_lanes: bool,
-    /// Colours of lights for up to four seconds between two sightings of the same colour, **the
-    /// later one included**, in recordings that lose sight of lights (Waymo's). Official metrics
-    /// read what was recorded.
+    /// The lanes of stop signs, where a format states only where they stand.
+    pub infer_stop_sign_lanes: bool,
+    /// Colours of lights for up to four seconds between two sightings of the same colour, in
+    /// recordings that lose sight of lights (Waymo's); up to the present, between two sightings up
+    /// to the present. Official metrics read what was recorded.
     pub infer_light_gaps: bool,
     /// The ego's route from its logged path, **future included**: it tells where the ego went,
     /// as a navigation system would; it does not tell when or how.
@@ -124,7 +136,8 @@ pub struct ReadOptions {
     /// Elevations of agents from the map; otherwise 0.
     pub infer_elevation: bool,
     /// Replaces tracks by a smoothed version, with velocities and headings that fit: for noisy
-    /// recordings such as NGSIM. Never on by default.
+    /// recordings such as NGSIM. Looks 0.3 s to both sides, **at the present too**. Never on by
+    /// default.
     pub smooth: bool,
 }
 
@@ -138,6 +151,7 @@ impl ReadOptions {
         infer_drivable: false,
         infer_edges: false,
         infer_light_lanes: false,
+        infer_stop_sign_lanes: false,
         infer_light_gaps: false,
         infer_route: false,
         infer_ego: false,
@@ -156,6 +170,7 @@ impl ReadOptions {
         infer_drivable: true,
         infer_edges: true,
         infer_light_lanes: true,
+        infer_stop_sign_lanes: true,
         infer_light_gaps: true,
         infer_route: true,
         infer_ego: true,

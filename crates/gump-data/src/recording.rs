@@ -68,19 +68,6 @@ pub(crate) struct State {
 /// A number that is not stated.
 pub(crate) const UNSTATED: f64 = f64::NAN;
 
-/// Length, width and height of an agent of this kind about which nothing is known, metres.
-///
-/// Source: the medians of the 11,672 tracks in 201 scenes of the Waymo Open Motion Dataset;
-/// for things that do not move, a barrel.
-pub(crate) fn usual_size(kind: AgentKind) -> [f64; 3] {
-    match kind {
-        AgentKind::Vehicle => [4.7, 2.1, 1.7],
-        AgentKind::Pedestrian => [0.9, 0.9, 1.7],
-        AgentKind::Bicycle => [1.8, 0.8, 1.7],
-        _ => [0.6, 0.6, 1.0],
-    }
-}
-
 /// No agent on a road is longer, metres: a road train measures 54 m.
 const MAX_SIZE: f64 = 100.0;
 
@@ -139,8 +126,8 @@ pub(crate) fn assemble(
         if options.smooth {
             motion::smooth(track, recording.dt, report);
         }
-        motion::complete(track, recording.dt, options, report);
-        complete_sizes(track, options, report);
+        motion::complete(track, recording.now, recording.dt, options, report);
+        complete_sizes(track, recording.now, options, report);
         complete_elevations(track, &map, options, report);
     }
     recording.tracks.retain(|track| !track.states.is_empty());
@@ -229,41 +216,51 @@ fn sound_tracks(recording: &mut Recording, report: &mut ReadReport) {
     });
 }
 
-/// Gives every state a size that is one.
-fn complete_sizes(track: &mut Track, options: ReadOptions, report: &mut ReadReport) {
-    let is_size = |extent: f64| extent > 0.0 && extent < MAX_SIZE;
+/// Gives every state a size that is one: the first that is stated, up to the present the first that
+/// is stated up to then, or else that of the class.
+fn complete_sizes(track: &mut Track, now: usize, options: ReadOptions, report: &mut ReadReport) {
     let unstated = |size: &[f64; 3]| size[..2].iter().all(|extent| extent.is_nan());
-    let sized = |state: &State| state.size[..2].iter().all(|&extent| is_size(extent));
-    if let Some(damaged) = track
-        .states
-        .iter()
-        .find(|s| !sized(s) && !unstated(&s.size))
-    {
+    let mut states = track.states.iter();
+    if let Some(damaged) = states.find(|s| !is_sized(s) && !unstated(&s.size)) {
         let (id, [length, width, _]) = (track.id, damaged.size);
         report.drop_damaged("size that is none", || {
             format!("track {id} at step {}: {length} x {width} m", damaged.step)
         });
     }
-    let known = track
-        .states
-        .iter()
-        .find(|state| sized(state))
-        .map(|state| state.size);
-    if known.is_none() {
-        if !options.infer_sizes {
-            report.drop("track without a size", 1);
-            track.states.clear();
-            return;
+    let past = track.states.partition_point(|state| state.step <= now);
+    let known = |states: &[State]| states.iter().find(|s| is_sized(s)).map(|s| s.size);
+    let of_class = options.infer_sizes.then_some(track.usual_size);
+    let by_then = known(&track.states[..past]);
+    let ever = by_then.or_else(|| known(&track.states[past..]));
+    let lacks = |states: &[State]| states.iter().any(|state| !is_sized(state));
+    let by_class = lacks(&track.states[..past]) && by_then.is_none()
+        || lacks(&track.states[past..]) && ever.is_none();
+    if by_class {
+        match of_class {
+            Some(_) => report.infer("size of an agent by its class", 1),
+            None if ever.is_none() => report.drop("track without a size", 1),
+            None => report.drop("states before the first size of a track", 1),
         }
-        report.infer("size of an agent by its class", 1);
     }
-    let fallback = known.unwrap_or(track.usual_size);
-    for state in &mut track.states {
-        if !sized(state) {
+    let (earlier, later) = track.states.split_at_mut(past);
+    fill_sizes(earlier, by_then.or(of_class), options);
+    fill_sizes(later, ever.or(of_class), options);
+    track.states.retain(is_sized);
+}
+
+/// True if length and width are such; formats without heights have 0 there.
+fn is_sized(state: &State) -> bool {
+    let is_size = |extent: f64| extent > 0.0 && extent < MAX_SIZE;
+    state.size[..2].iter().all(|&extent| is_size(extent))
+}
+
+fn fill_sizes(states: &mut [State], fallback: Option<[f64; 3]>, options: ReadOptions) {
+    let Some(fallback) = fallback else { return };
+    for state in states {
+        if !is_sized(state) {
             state.size = fallback;
         }
         if !(0.0..MAX_SIZE).contains(&state.size[2]) {
-            // Formats without heights have 0 there.
             state.size[2] = if options.infer_sizes {
                 fallback[2].max(0.0)
             } else {
@@ -349,5 +346,45 @@ fn agent(track: &Track, state: &State) -> Agent {
             pose: Pose::new(x, y, wrap_angle(state.heading)),
             velocity: dvec2(state.velocity.x, state.velocity.y),
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_geometry::dvec3;
+
+    /// Sizes of a car in steps 0 to 3, the present being step 1; `None` is not stated.
+    fn check(stated: [Option<f64>; 4], options: ReadOptions, expected: &[(usize, f64)]) {
+        let state = |(step, length): (usize, &Option<f64>)| State {
+            step,
+            position: dvec3(0.0, 0.0, 0.0),
+            heading: 0.0,
+            velocity: DVec2::ZERO,
+            size: length.map_or([UNSTATED; 3], |length| [length, 2.0, 1.5]),
+        };
+        let mut track = Track {
+            id: 1,
+            kind: AgentKind::Vehicle,
+            usual_size: AgentKind::Vehicle.usual_size(),
+            states: stated.iter().enumerate().map(state).collect(),
+        };
+        complete_sizes(&mut track, 1, options, &mut ReadReport::default());
+        let found = track.states.iter().map(|state| (state.step, state.size[0]));
+        assert_eq!(found.collect::<Vec<_>>(), expected, "{stated:?}");
+    }
+
+    #[test]
+    fn sizes_up_to_the_present_come_from_frames_up_to_the_present() {
+        let (all, stated) = (ReadOptions::ALL, ReadOptions::STATED);
+        let (none, five) = (None, Some(5.0));
+        let whole = [(0, 5.0), (1, 5.0), (2, 5.0), (3, 5.0)];
+        check([five, none, none, none], all, &whole);
+        check([none, five, none, none], stated, &whole);
+        let later = [none, none, none, five];
+        check(later, all, &[(0, 4.7), (1, 4.7), (2, 5.0), (3, 5.0)]);
+        check(later, stated, &[(2, 5.0), (3, 5.0)]);
+        check([none; 4], all, &[(0, 4.7), (1, 4.7), (2, 4.7), (3, 4.7)]);
+        check([none; 4], stated, &[]);
     }
 }

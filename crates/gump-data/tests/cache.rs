@@ -13,7 +13,7 @@ use gump_geometry::{Polygon, Polyline, Pose, dvec2, dvec3};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Area, AreaKind, Frame, Lane, LaneId, LaneKind, Light,
     LightState, MapGraph, MapParts, Rng, RoadEdge, RoadEdgeKind, RoadLine, RoadLineKind, Roadblock,
-    RoadblockId, Route, Scenario, ScenarioTag, Seed, StopSign,
+    RoadblockId, Route, Scenario, ScenarioTag, Seed, StopSign, Unstated,
 };
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
@@ -144,6 +144,10 @@ fn map(rng: &mut Rng) -> MapGraph {
             lanes: links(rng),
         }],
         drivable: (0..rng.random_range(0..3)).map(|_| polygon(rng)).collect(),
+        unstated: Unstated {
+            stop_signs: rng.random(),
+            lights: rng.random(),
+        },
     })
     .unwrap()
 }

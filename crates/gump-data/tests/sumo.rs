@@ -1,5 +1,8 @@
 //! SUMO recordings: one made for these tests, and real city networks where they are at hand.
 
+#[path = "../../../tests/shared.rs"]
+mod shared_data;
+
 use std::path::{Path, PathBuf};
 
 use gump_data::sumo::{CutOptions, EdgeFunction, Network, Roads, open_recording};
@@ -14,14 +17,7 @@ fn fixture(name: &str) -> PathBuf {
 
 /// Real networks and recordings; `None`, and a note, where they are not at hand.
 fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../../../shared/data/sumo_epl")
-        .join(name);
-    if !path.exists() {
-        println!("skipped: {} is not here", path.display());
-        return None;
-    }
-    Some(path)
+    shared_data::shared(&format!("data/sumo_epl/{name}"))
 }
 
 fn scenarios(path: &Path) -> Vec<Scenario> {

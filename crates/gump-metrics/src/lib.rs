@@ -2,8 +2,9 @@
 //!
 //! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
 //! about many futures at once, [`Reward`] says what is wanted. The benchmarks of the field are
-//! modules: [`wosac`] for realism, [`motion`] for prediction, [`mmd`] for scene generation.
-//! [`statistics`] says what any set of scenes is like. Nothing here steps a simulation or reads a
+//! modules: [`wosac`] for realism, [`motion`] for prediction, [`mmd`] for scene generation;
+//! [`behaviour`] counts what a driver would notice, [`statistics`] says what any set of scenes is
+//! like. Nothing here steps a simulation or reads a
 //! file.
 //!
 //! # Terms
@@ -43,6 +44,7 @@
 //! # Ok::<(), gump_metrics::wosac::WosacError>(())
 //! ```
 
+pub mod behaviour;
 mod bootstrap;
 mod border;
 mod collision;

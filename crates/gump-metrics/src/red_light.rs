@@ -1,6 +1,6 @@
 //! Driving past a red light.
 
-use gump_geometry::Pose;
+use gump_geometry::{DVec2, Pose};
 use gump_scene::{Agent, AgentKind, Lane, Light, LightState, SceneState};
 
 use crate::{Metric, Reduce};
@@ -32,10 +32,7 @@ impl Metric for RedLight {
                 let Some(lane) = scene.map.lane(light.lane) else {
                     return false;
                 };
-                let line = stop_line(lane, light);
-                let (from, to) = (line.inverse() * before, line.inverse() * now.position);
-                let along = now.direction().dot(line.direction()) > 0.0;
-                along && from.x <= 0.0 && to.x > 0.0 && to.y.abs() <= lane.width / 2.0
+                passes(stop_line(lane, light), lane.width, before, now)
             });
         Some(f64::from(passed))
     }
@@ -45,8 +42,15 @@ impl Metric for RedLight {
     }
 }
 
+/// True if an agent comes over a line in its direction, from where it was before.
+pub(crate) fn passes(line: Pose, width: f64, before: DVec2, now: Pose) -> bool {
+    let (from, to) = (line.inverse() * before, line.inverse() * now.position);
+    let along = now.direction().dot(line.direction()) > 0.0;
+    along && from.x <= 0.0 && to.x > 0.0 && to.y.abs() <= width / 2.0
+}
+
 /// The middle of the stop line, heading along the lane.
-fn stop_line(lane: &Lane, light: &Light) -> Pose {
+pub(crate) fn stop_line(lane: &Lane, light: &Light) -> Pose {
     let center = &lane.centerline;
     center.pose_at(match light.stop_point {
         Some(point) => center.project(point).arc_length,

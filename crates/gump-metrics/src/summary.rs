@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gump_geometry::DVec2;
-use gump_scene::{Agent, AgentId, AgentKind, Rollout, Scenario};
+use gump_scene::{Agent, AgentId, AgentKind, Rollout, Scenario, SceneState};
 use rayon::prelude::*;
 
 use crate::{Metric, OffRoad, average_displacement, overlapping};
@@ -152,8 +152,7 @@ fn one_future(rollout: &Rollout) -> Summary {
         ..Summary::default()
     };
     for agent in evaluated(rollout.start().agents()) {
-        let start = rollout.at(0);
-        let on_road = OffRoad.at(&start, agent) == Some(0.0);
+        let on_road = is_on_road(&rollout.at(0), agent);
         summary.by_kind.entry(agent.kind).or_default().merge(&Part {
             agents: 1,
             collided: usize::from(collided.contains(&agent.id)),
@@ -187,7 +186,13 @@ fn collided(rollout: &Rollout) -> BTreeSet<AgentId> {
     collided
 }
 
-fn leaves_road(rollout: &Rollout, id: AgentId) -> bool {
+/// True of a vehicle that is on the road now, where that is known.
+pub(crate) fn is_on_road(scene: &SceneState<'_>, agent: &Agent) -> bool {
+    OffRoad.at(scene, agent) == Some(0.0)
+}
+
+/// True if a vehicle is off the road at any imagined frame.
+pub(crate) fn leaves_road(rollout: &Rollout, id: AgentId) -> bool {
     // Many vehicles stand, and where one stands nothing changes.
     let mut last: Option<([DVec2; 4], f64)> = None;
     (1..=rollout.steps()).any(|step| {

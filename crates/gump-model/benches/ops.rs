@@ -203,6 +203,13 @@ fn products(c: &mut Criterion) {
             || learn(&ops::linear(&x, &w, Some(&b))?),
             || learn(&linear(&x, &w, &b)?),
         );
+        c.bench_function(
+            &format!("linear_2048x{n_in}x{n_out}_backward/bfloat16"),
+            |bench| {
+                let y = || ops::in_bfloat16(|| ops::linear(&x, &w, Some(&b)));
+                bench.iter(|| learn(&y().expect("shapes fit")).expect("it learns"));
+            },
+        );
     }
     let shape = [4, 512, 384];
     let (q, k, v) = (var(&shape, 2.0), var(&shape, 2.0), var(&shape, 2.0));
@@ -273,6 +280,10 @@ fn blocks(c: &mut Criterion) {
             || learn(&block.fused(&x)?),
             || learn(&block.composed(&x)?),
         );
+        c.bench_function(&format!("block_{width}_4x512_backward/bfloat16"), |bench| {
+            let y = || ops::in_bfloat16(|| block.fused(&x));
+            bench.iter(|| learn(&y().expect("shapes fit")).expect("it learns"));
+        });
     }
 }
 

@@ -48,6 +48,11 @@ impl Anchor {
         }
     }
 
+    /// Where the object was last; `None` if chunks are said in the scene's frame.
+    pub(crate) fn origin(&self) -> Option<Pose> {
+        (*self != Self::SCENE).then_some(self.scene_from_anchor)
+    }
+
     /// The bins of a chunk: the size of `like`, the velocity of the first state, and the poses of
     /// all, scene frame; `None` where there is no state. A later pose beyond the grid has no bins,
     /// because the clamped ones would be a lie; the first is clamped.

@@ -4,17 +4,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use gump_geometry::DVec2;
+use gump_geometry::{DVec2, Pose};
 use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
 use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::embedding::{ROWS_PER_TOKEN, SineKey, SineTables, Tables};
+use crate::exact::Exact;
 use crate::mct::{PLACES, TokenBatch};
-use crate::surroundings::{N_NUMBERS, Surroundings, Survey, look_around};
+use crate::surroundings::{Surroundings, Survey, look_around, n_numbers};
 
 /// A slot and where it stands in the presented window.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PlacedSlot {
     pub(crate) slot: Slot,
     /// Index of the token, from 0 at the start of the window.
@@ -25,13 +26,34 @@ pub(crate) struct PlacedSlot {
     pub(crate) key: Option<Key>,
     /// What its object was last seen as in the window, if it is a key.
     pub(crate) last: Option<QuantizedState>,
+    /// The same, or what its object is, if it is a value, before it was rounded; `None` where only
+    /// the token is known.
+    pub(crate) exact: Option<Exact>,
 }
 
-/// The slots of a sequence with their places; prompts belong to frame 0.
+impl PlacedSlot {
+    /// Where the object of a key was last seen in the window: where it sees from, and in whose frame
+    /// its chunk is said.
+    pub(crate) fn last_pose(&self) -> Option<Pose> {
+        let last = self.last?;
+        Some(self.exact.map_or(last.pose(), |exact| exact.pose()))
+    }
+}
+
+/// The slots of a sequence of which only the tokens are known.
 pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
+    place_exactly(sequence, |_, _| None)
+}
+
+/// The slots of a sequence with their places; prompts belong to frame 0. `exact` tells what an object
+/// was in a frame, by the index of the frame and the id.
+pub(crate) fn place_exactly(
+    sequence: &TokenSequence,
+    exact: impl Fn(usize, u16) -> Option<Exact>,
+) -> Vec<PlacedSlot> {
     let mut frame = None;
     let mut key: Option<Key> = None;
-    let mut seen: BTreeMap<u16, QuantizedState> = BTreeMap::new();
+    let mut seen: BTreeMap<u16, (QuantizedState, Option<Exact>)> = BTreeMap::new();
     let slots = sequence.slots().into_iter().enumerate();
     slots
         .map(|(position, slot)| {
@@ -39,14 +61,18 @@ pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
                 frame = Some(frame.map_or(0, |frame: usize| frame + 1));
             }
             let before = key.take();
-            let mut last = None;
+            let (mut last, mut is) = (None, None);
             match (slot, before) {
                 (Slot::Key(found), _) => {
                     key = Some(found);
-                    last = seen.get(&found.id).copied();
+                    (last, is) = match seen.get(&found.id) {
+                        Some((state, exact)) => (Some(*state), *exact),
+                        None => (None, None),
+                    };
                 }
                 (Slot::Value(state), Some(key)) => {
-                    seen.insert(key.id, state);
+                    is = exact(frame.unwrap_or(0), key.id);
+                    seen.insert(key.id, (state, is));
                 }
                 _ => {}
             }
@@ -56,6 +82,7 @@ pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
                 frame: frame.unwrap_or(0),
                 key: before,
                 last,
+                exact: is,
             }
         })
         .collect()
@@ -69,6 +96,7 @@ pub(crate) struct Packer {
     width: usize,
     local_map: bool,
     surroundings: bool,
+    n_numbers: usize,
     visual_side: usize,
     cell_m: f64,
 }
@@ -81,6 +109,7 @@ impl Packer {
             width: config.width,
             local_map: config.local_map,
             surroundings: config.surroundings,
+            n_numbers: n_numbers(config),
             visual_side: config.visual_side(),
             cell_m: config.visual.metres_per_px * config.visual.encoder.stride() as f64,
         }
@@ -150,10 +179,10 @@ impl Packer {
             seers: Tensor::from_iter(seen.iter().map(|(at, _)| *at as u32), device)?,
             surroundings: Tensor::from_vec(
                 seen.iter()
-                    .flat_map(|(_, numbers)| numbers)
+                    .flat_map(|(_, numbers)| &numbers[..self.n_numbers])
                     .copied()
                     .collect(),
-                (seen.len(), N_NUMBERS),
+                (seen.len(), self.n_numbers),
                 device,
             )?,
             shape: (b, t),
@@ -178,7 +207,11 @@ impl Packer {
     /// The visual tokens at the places that a token's object looks at, if it looks.
     pub(crate) fn cells(&self, placed: &PlacedSlot) -> Option<[u32; PLACES.len()]> {
         let last = placed.last.filter(|_| self.local_map)?;
-        let at = |seconds| self.cell(last.pose().position + last.velocity() * seconds);
+        let (from, velocity) = match placed.exact {
+            Some(exact) => (exact.pose(), exact.velocity()),
+            None => (last.pose(), last.velocity()),
+        };
+        let at = |seconds| self.cell(from.position + velocity * seconds);
         matches!(placed.slot, Slot::Key(_)).then(|| PLACES.map(at))
     }
 
@@ -201,6 +234,7 @@ fn padding(position: usize) -> PlacedSlot {
         frame: 0,
         key: None,
         last: None,
+        exact: None,
     }
 }
 

@@ -3,6 +3,9 @@
 //! A file holds everything needed to load it and is written beside its final name, then renamed, so
 //! that a crash leaves the previous one intact.
 
+#[cfg(test)]
+mod tests;
+
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::io::Write as _;
@@ -17,9 +20,13 @@ use crate::ModelError;
 use crate::config::ModelConfig;
 use crate::network::Network;
 use crate::parameters::Parameters;
+use crate::surroundings::n_numbers;
 
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";
+
+/// The matrix that reads what objects see around themselves, marks last.
+const SURROUNDINGS_IN: &str = "mct.surroundings.in.weight";
 
 /// How numbers are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,6 +91,48 @@ pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
             path: path.to_owned(),
         },
     })
+}
+
+/// Reads a network to train on as one of the configuration `wanted`; `None` if the file holds another
+/// model.
+///
+/// A file without `unknown_marks` grows them: what a mark adds starts at zero, so that the network
+/// computes what it did.
+///
+/// # Errors
+/// Those of [`load`].
+pub fn load_to_grow(
+    path: &Path,
+    wanted: &ModelConfig,
+    device: &Device,
+) -> Result<Option<Network>, ModelError> {
+    let network = load(path, device)?;
+    if network.config() == wanted {
+        return Ok(Some(network));
+    }
+    let grown = ModelConfig {
+        unknown_marks: true,
+        ..network.config().clone()
+    };
+    if grown != *wanted {
+        return Ok(None);
+    }
+    let tensors = network.parameters().all().map(|(name, var)| {
+        let tensor = match name {
+            SURROUNDINGS_IN => widened(var.as_tensor(), n_numbers(wanted))?,
+            _ => var.as_tensor().clone(),
+        };
+        Ok((name.to_owned(), tensor))
+    });
+    let tensors: BTreeMap<String, Tensor> = tensors.collect::<Result<_, ModelError>>()?;
+    Network::build(grown, Parameters::loaded(tensors, device)).map(Some)
+}
+
+/// The matrix `[rows, n]` with columns of zeros up to `columns`.
+fn widened(matrix: &Tensor, columns: usize) -> Result<Tensor, ModelError> {
+    let (rows, n) = matrix.dims2()?;
+    let zeros = Tensor::zeros((rows, columns - n), matrix.dtype(), matrix.device())?;
+    Ok(Tensor::cat(&[matrix, &zeros], 1)?)
 }
 
 impl Archive {
@@ -265,145 +314,4 @@ fn write_beside(path: &Path, bytes: &[u8]) -> Result<(), ModelError> {
             path: path.to_owned(),
         }
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::VisualConfig;
-    use gump_scene::Seed;
-
-    fn small() -> ModelConfig {
-        let visual = VisualConfig {
-            side_px: 40,
-            metres_per_px: 5.0,
-            ..ModelConfig::tiny().visual
-        };
-        ModelConfig {
-            width: 16,
-            heads: 2,
-            layers: 1,
-            block_size: 64,
-            trajectory_heads: vec![],
-            visual,
-            ..ModelConfig::tiny()
-        }
-    }
-
-    /// A file in a folder of its own, removed at the end.
-    fn with_file(test: impl FnOnce(&Path)) {
-        let folder = tempfile::tempdir().unwrap();
-        test(&folder.path().join("weights.safetensors"));
-    }
-
-    fn write_tensors(
-        path: &Path,
-        change: impl FnOnce(&mut BTreeMap<String, Tensor>, &mut BTreeMap<String, String>),
-    ) {
-        let network = Network::random(small(), Seed(1), &Device::Cpu).unwrap();
-        let named = network.parameters().all();
-        let mut tensors: BTreeMap<String, Tensor> = named
-            .map(|(name, var)| (name.to_owned(), var.as_tensor().clone()))
-            .collect();
-        let mut metadata = header(network.config()).unwrap();
-        change(&mut tensors, &mut metadata);
-        write(path, tensors, metadata, Precision::Full).unwrap();
-    }
-
-    /// Loading must fail with one line that names the file and contains `expected`.
-    fn check_refused(path: &Path, expected: &str) {
-        let message = load(path, &Device::Cpu).unwrap_err().to_string();
-        assert!(
-            message.contains(expected) && message.contains("weights.safetensors"),
-            "{message}"
-        );
-        assert!(!message.contains('\n'), "{message}");
-    }
-
-    #[test]
-    fn weights_come_back() {
-        with_file(|path| {
-            let network = Network::random(small(), Seed(1), &Device::Cpu).unwrap();
-            save(&network, path, Precision::Full).unwrap();
-            let loaded = load(path, &Device::Cpu).unwrap();
-            assert_eq!(loaded.config(), network.config());
-            for ((name, a), (_, b)) in network.parameters().all().zip(loaded.parameters().all()) {
-                let values =
-                    |v: &candle_core::Var| v.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-                assert_eq!(values(a), values(b), "{name}");
-            }
-            let beside = fs::read_dir(path.parent().unwrap()).unwrap().count();
-            assert_eq!(beside, 1, "nothing partial is left");
-        });
-    }
-
-    #[test]
-    fn another_vocabulary_is_refused() {
-        with_file(|path| {
-            write_tensors(path, |_, metadata| {
-                metadata.insert("vocabulary".into(), "3174".into());
-            });
-            check_refused(path, "vocabulary has 3174 tokens, expected 2972");
-        });
-    }
-
-    #[test]
-    fn another_shape_is_refused() {
-        with_file(|path| {
-            write_tensors(path, |tensors, _| {
-                let slots = Tensor::zeros((14, 16), DType::F32, &Device::Cpu).unwrap();
-                tensors.insert("decoder.slots".into(), slots);
-            });
-            check_refused(
-                path,
-                "\"decoder.slots\" has shape [14, 16], expected [16, 16]",
-            );
-        });
-    }
-
-    #[test]
-    fn missing_and_surplus_tensors_are_named() {
-        with_file(|path| {
-            write_tensors(path, |tensors, _| drop(tensors.remove("mct.norm.weight")));
-            check_refused(path, "\"mct.norm.weight\" is missing");
-            write_tensors(path, |tensors, _| {
-                let extra = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();
-                tensors.insert("mct.extra".into(), extra);
-            });
-            check_refused(path, "\"mct.extra\" has no place");
-        });
-    }
-
-    #[test]
-    fn what_is_no_checkpoint_is_refused() {
-        with_file(|path| {
-            check_refused(path, "No such file");
-            for bytes in [&b""[..], b"GIF89a", &[0xff; 64]] {
-                fs::write(path, bytes).unwrap();
-                check_refused(path, "expected a safetensors file");
-            }
-            write_tensors(path, |_, _| ());
-            let whole = fs::read(path).unwrap();
-            for cut in [1, whole.len() / 2, whole.len() - 1] {
-                fs::write(path, &whole[..cut]).unwrap();
-                check_refused(path, "weights");
-            }
-            write_tensors(path, |_, metadata| drop(metadata.remove("format")));
-            check_refused(path, "not a gump checkpoint");
-        });
-    }
-
-    #[test]
-    fn a_folder_that_is_not_there_is_an_error_and_leaves_nothing() {
-        let network = Network::random(small(), Seed(1), &Device::Cpu).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("nowhere").join("weights.safetensors");
-        assert!(
-            save(&network, &path, Precision::Half)
-                .unwrap_err()
-                .to_string()
-                .contains("nowhere")
-        );
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
-    }
 }

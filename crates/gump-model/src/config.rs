@@ -45,6 +45,10 @@ pub struct ModelConfig {
     /// numbers at its key (the paper: the raster and the tokens alone).
     #[serde(default)]
     pub surroundings: bool,
+    /// True adds to the surroundings marks of what is not known: speed limits, stop signs, lights and
+    /// sizes that the source of a scene does not state. False shows stand-ins alone.
+    #[serde(default)]
+    pub unknown_marks: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
     /// True builds the decoder that reconstructs the raster from the visual features.
@@ -136,6 +140,7 @@ impl ModelConfig {
             local_map: true,
             anchored: true,
             surroundings: true,
+            unknown_marks: true,
             dropout: 0.0,
             reconstruction: true,
             visual: VisualConfig {
@@ -168,6 +173,7 @@ impl ModelConfig {
             local_map: false,
             anchored: false,
             surroundings: false,
+            unknown_marks: false,
             dropout: 0.1,
             reconstruction: true,
             visual: VisualConfig {

@@ -11,9 +11,10 @@ use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
 use crate::ModelError;
-use crate::batch::{PlacedSlot, place};
+use crate::batch::{PlacedSlot, place_exactly};
 use crate::clearance::Clearance;
 use crate::engine::{Context, Engine, Job, SceneMemory};
+use crate::exact::ExactFrames;
 use crate::outlook::{Seen, Watch};
 use crate::sampling::{Bins, CacheMode, Mode, Request, SamplingConfig};
 use crate::surroundings::Survey;
@@ -25,6 +26,8 @@ pub(crate) struct Window {
     pub(crate) scene: usize,
     /// Final states, oldest first.
     pub(crate) history: Vec<TokenFrame>,
+    /// The same, not rounded.
+    pub(crate) exact: ExactFrames,
     /// The frame to decode, with provisional states; the order of its tracked agents is the order
     /// of decoding.
     pub(crate) next: TokenFrame,
@@ -46,12 +49,13 @@ pub(crate) fn presented(window: &Window, block_size: usize) -> Result<Vec<Placed
             fits
         })
         .count();
-    let mut frames = window.history[window.history.len() - n.max(1)..].to_vec();
+    let first = window.history.len() - n.max(1);
+    let mut frames = window.history[first..].to_vec();
     frames[0] = std::mem::take(&mut frames[0]).into_first();
     frames.push(window.next.clone());
     let sequence = TokenSequence::new(Vec::new(), frames)
         .map_err(|error| ModelError::Scene(error.to_string()))?;
-    let mut slots = place(&sequence);
+    let mut slots = place_exactly(&sequence, |frame, id| window.exact.of(first + frame, id));
     // The last frame's NEWBORN decides nothing yet.
     slots.truncate(
         slots
@@ -221,6 +225,8 @@ impl Step<'_> {
                 let slots = &mut self.placed[w];
                 let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
                 slots[value].slot = Slot::Value(request.settled_state(bins, settled));
+                let like = slots[value - 1].exact;
+                slots[value].exact = like.map(|like| like.with_state(settled));
             }
         }
         Decoded {

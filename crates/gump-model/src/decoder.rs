@@ -288,7 +288,7 @@ impl StateDecoder {
     /// [`StateDecoder::rows_of`].
     pub(crate) fn all_output_rows(&self) -> Result<Tensor> {
         let fields = field_rows();
-        let rows = self.head.weight().narrow(0, fields.start, fields.len())?;
+        let rows = ops::table_rows(self.head.weight(), fields.start, fields.len())?;
         match &self.smooth {
             Some(smooth) => rows + smooth.outputs()?,
             None => Ok(rows),
@@ -317,8 +317,8 @@ impl StateDecoder {
     /// LIGHTS_END; [N, 324].
     pub(crate) fn control_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let weight = self.head.weight();
-        let keys = weight.narrow(0, 0, CONTROL_KEYS)?;
-        let specials = weight.narrow(0, gump_tokenizer::BEGIN as usize, 3)?;
+        let keys = ops::table_rows(weight, 0, CONTROL_KEYS)?;
+        let specials = ops::table_rows(weight, gump_tokenizer::BEGIN as usize, 3)?;
         ops::linear(hidden, &Tensor::cat(&[&keys, &specials], 0)?, None)
     }
 
@@ -328,7 +328,7 @@ impl StateDecoder {
         let first = gump_tokenizer::FIRST_LIGHT as usize;
         ops::linear(
             hidden,
-            &self.head.weight().narrow(0, first, N_LIGHT_STATES)?,
+            &ops::table_rows(self.head.weight(), first, N_LIGHT_STATES)?,
             None,
         )
     }

@@ -2,11 +2,11 @@
 //!
 //! All tables of the specification (tokens, classes, light indices, prompts, positions, frames)
 //! are stacked into one, so that every token of every kind is the sum of a few of its rows; the
-//! gather and its backward pass are one operation.
+//! gather and its backward pass are one operation, in `ops`.
 
 use crate::batch::PlacedSlot;
 use crate::config::ModelConfig;
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
+pub(crate) use crate::ops::embedding_sum;
 use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TABLE_ROWS};
 
 /// Rows of the frame table; frames beyond share the last row.
@@ -189,101 +189,4 @@ fn frequency(field: Field, m: usize, k: usize) -> f64 {
         0.0
     };
     std::f64::consts::TAU / (shortest * (longest / shortest).powf(t))
-}
-
-/// Sums table rows: `table` [R, C], `rows` [N, K] of u32 with `u32::MAX` for "none" gives [N, C].
-pub(crate) fn embedding_sum(table: &Tensor, rows: &Tensor) -> Result<Tensor> {
-    if table.device().is_cpu() {
-        return table
-            .contiguous()?
-            .apply_op2(&rows.contiguous()?, EmbeddingSum);
-    }
-    // "None" points at a row of zeros behind the table.
-    let (n_rows, width) = table.dims2()?;
-    let (n, k) = rows.dims2()?;
-    let zeros = Tensor::zeros((1, width), table.dtype(), table.device())?;
-    let padded = Tensor::cat(&[table, &zeros], 0)?;
-    let last = Tensor::full(n_rows as u32, (n, k), rows.device())?;
-    let rows = rows.minimum(&last)?.flatten_all()?;
-    padded
-        .index_select(&rows, 0)?
-        .reshape((n, k, width))?
-        .sum(1)
-}
-
-struct EmbeddingSum;
-
-impl CustomOp2 for EmbeddingSum {
-    fn name(&self) -> &'static str {
-        "embedding-sum"
-    }
-
-    fn cpu_fwd(
-        &self,
-        table: &CpuStorage,
-        tl: &Layout,
-        rows: &CpuStorage,
-        rl: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (n_rows, width) = tl.shape().dims2()?;
-        let (n, k) = rl.shape().dims2()?;
-        let table = &table.as_slice::<f32>()?[tl.start_offset()..][..n_rows * width];
-        let rows = &rows.as_slice::<u32>()?[rl.start_offset()..][..n * k];
-        let mut out = vec![0f32; n * width];
-        for (sum, rows) in out.chunks_exact_mut(width).zip(rows.chunks_exact(k)) {
-            for &row in rows.iter().filter(|row| **row != u32::MAX) {
-                let row = &table[row as usize * width..][..width];
-                sum.iter_mut().zip(row).for_each(|(s, r)| *s += r);
-            }
-        }
-        Ok((CpuStorage::F32(out), Shape::from((n, width))))
-    }
-
-    fn bwd(
-        &self,
-        table: &Tensor,
-        rows: &Tensor,
-        _res: &Tensor,
-        grad: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let scatter = ScatterRows {
-            n_rows: table.dim(0)?,
-        };
-        Ok((
-            Some(grad.contiguous()?.apply_op2_no_bwd(rows, &scatter)?),
-            None,
-        ))
-    }
-}
-
-/// The transpose of [`EmbeddingSum`]: adds every row of the gradient to the table rows it came from.
-struct ScatterRows {
-    n_rows: usize,
-}
-
-impl CustomOp2 for ScatterRows {
-    fn name(&self) -> &'static str {
-        "scatter-rows"
-    }
-
-    fn cpu_fwd(
-        &self,
-        grad: &CpuStorage,
-        gl: &Layout,
-        rows: &CpuStorage,
-        rl: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (n, width) = gl.shape().dims2()?;
-        let k = rl.shape().dims2()?.1;
-        let grad = &grad.as_slice::<f32>()?[gl.start_offset()..][..n * width];
-        let rows = &rows.as_slice::<u32>()?[rl.start_offset()..][..n * k];
-        let mut out = vec![0f32; self.n_rows * width];
-        for (grad, rows) in grad.chunks_exact(width).zip(rows.chunks_exact(k)) {
-            for &row in rows.iter().filter(|row| **row != u32::MAX) {
-                let row = &mut out[row as usize * width..][..width];
-                row.iter_mut().zip(grad).for_each(|(r, g)| *r += g);
-            }
-        }
-        Ok((CpuStorage::F32(out), Shape::from((self.n_rows, width))))
-    }
 }

@@ -27,6 +27,19 @@ pub enum ModelError {
         /// What the file holds.
         found: Vec<usize>,
     },
+    /// A kernel that this processor does not have, or that multiplies wrongly.
+    #[error("{0}")]
+    Kernel(String),
+    /// A weight cannot be written in the form that is asked for.
+    #[error("tensor \"{name}\" holds {number}, which {form} cannot express")]
+    WeightNotFinite {
+        /// Its name.
+        name: String,
+        /// The first number at fault.
+        number: f32,
+        /// "bfloat16" or "8 bits".
+        form: &'static str,
+    },
     /// A file is not a checkpoint of this crate, or of another vocabulary.
     #[error("{what}: {path}")]
     Checkpoint {

@@ -13,6 +13,7 @@ use crate::anchor::Anchor;
 use crate::decode::Window;
 use crate::decoder::STEPS;
 use crate::engine::Context;
+use crate::exact::ExactFrames;
 use crate::life::Phases;
 use crate::limits::Limits;
 use crate::sample::TOKEN_DT;
@@ -35,7 +36,8 @@ pub(crate) struct Future {
     /// What that was at the start.
     pub(crate) begun: usize,
     pub(crate) rings: BTreeMap<u16, Ring>,
-    /// The last `history` frames in world coordinates; the last is the present.
+    /// The same frames in world coordinates, `history` of them at least where there are as many; the
+    /// last is the present.
     pub(crate) recent: Vec<Frame>,
     /// Who has which key; of those who came in this future, too.
     pub(crate) identities: Identities,
@@ -104,10 +106,17 @@ impl Future {
         Window {
             scene: self.scene,
             history: self.frames.clone(),
+            exact: self.exact(scene),
             next,
             requests,
             survey: Arc::clone(&scene.survey),
         }
+    }
+
+    /// The objects of the window's frames, not rounded.
+    pub(crate) fn exact(&self, scene: &Scene) -> ExactFrames {
+        let n = self.frames.len();
+        ExactFrames::last(n, &self.recent, &self.identities, scene.world_from_scene)
     }
 
     /// In whose frame the next chunk of `agent`, a token of the last frame, is said: where it is,
@@ -206,12 +215,12 @@ impl Future {
         self.recent.push(frame.clone());
         self.frames.push(next);
         let history = sampling.history.max(1);
-        self.recent
-            .drain(..self.recent.len().saturating_sub(history));
         if sampling.cache != CacheMode::Growing || self.overflows(world) {
             self.frames
                 .drain(..self.frames.len().saturating_sub(history));
         }
+        let kept = history.max(self.frames.len());
+        self.recent.drain(..self.recent.len().saturating_sub(kept));
         self.rings.retain(|id, _| moved.contains_key(id));
         // In the first frame of a window nobody is newborn: who was, counts as tracked.
         let first = std::mem::take(&mut self.frames[0]);

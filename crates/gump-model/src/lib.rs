@@ -36,6 +36,7 @@
 //! ```
 
 mod aggregation;
+mod agreement;
 mod anchor;
 mod batch;
 pub mod checkpoint;
@@ -49,6 +50,7 @@ mod drift;
 mod embedding;
 mod engine;
 mod error;
+mod exact;
 mod future;
 pub mod generation;
 mod life;
@@ -61,6 +63,7 @@ mod optimizer;
 mod outlook;
 mod parameters;
 mod plain;
+pub mod relative;
 mod sample;
 mod sampling;
 mod scene;

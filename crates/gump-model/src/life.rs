@@ -25,7 +25,7 @@ pub(crate) use self::lights::Phases;
 use crate::ModelError;
 use crate::aggregation::Ring;
 use crate::anchor::Anchor;
-use crate::batch::{PlacedSlot, place};
+use crate::batch::{PlacedSlot, place_exactly};
 use crate::decode::{Window, present_all};
 use crate::decoder::STEPS;
 use crate::draw::uniform;
@@ -166,7 +166,7 @@ impl TransformerSession<'_> {
             let before = open.clone();
             let slots: Vec<Vec<PlacedSlot>> = before
                 .iter()
-                .map(|&f| self.futures[f].slots_to_end())
+                .map(|&f| self.futures[f].slots_to_end(&self.scenes[self.futures[f].scene]))
                 .collect::<Result<_, _>>()?;
             let hidden = self.read(engine, &mut contexts, &before, &slots);
             let mut coming = Vec::new();
@@ -249,7 +249,10 @@ impl TransformerSession<'_> {
         let members: Vec<usize> = arriving.iter().map(|(f, ..)| *f).collect();
         let slots: Vec<Vec<PlacedSlot>> = arriving
             .iter()
-            .map(|(f, key, ..)| self.futures[*f].slots_to_key(*key))
+            .map(|(f, key, ..)| {
+                let future = &self.futures[*f];
+                future.slots_to_key(*key, &self.scenes[future.scene])
+            })
             .collect::<Result<_, _>>()?;
         let hidden = self.read(engine, contexts, &members, &slots);
         let width = self.world.network().config().width;
@@ -371,14 +374,15 @@ impl Future {
     }
 
     /// All slots of the window, the present frame included, up to where a new agent may come.
-    fn slots_to_end(&self) -> Result<Vec<PlacedSlot>, ModelError> {
+    fn slots_to_end(&self, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
         let sequence = TokenSequence::new(Vec::new(), self.frames.clone());
         let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
-        Ok(place(&sequence))
+        let exact = self.exact(scene);
+        Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
     }
 
     /// The same with the key of a new agent after them.
-    fn slots_to_key(&self, key: Key) -> Result<Vec<PlacedSlot>, ModelError> {
+    fn slots_to_key(&self, key: Key, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
         let mut frames = self.frames.clone();
         let now = frames.last_mut().expect("a future has a present");
         now.newborn.push(TokenAgent {
@@ -387,7 +391,8 @@ impl Future {
         });
         let sequence = TokenSequence::new(Vec::new(), frames);
         let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
-        let mut slots = place(&sequence);
+        let exact = self.exact(scene);
+        let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
         slots.pop();
         Ok(slots)
     }

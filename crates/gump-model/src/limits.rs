@@ -12,7 +12,8 @@ const STILL_M: f64 = 0.05;
 /// And what is slower than this, metres per second: a bin and a half.
 const STILL_M_PER_S: f64 = 0.3;
 
-/// How a kind of object may move.
+/// How a kind of object may move. What a pose that was held back means for the velocity is said in
+/// `agreement`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Limits {
     /// Change of heading per metre.

@@ -20,7 +20,7 @@ use crate::config::{Gate, ModelConfig};
 use crate::embedding::{Tables, embedding_sum};
 use crate::ops;
 use crate::parameters::{Init, Scope};
-use crate::surroundings::{N_NUMBERS, Survey};
+use crate::surroundings::{Survey, n_numbers};
 
 /// Every table starts from this deviation, as GPT-2's do.
 pub(crate) const TABLE_DEVIATION: f64 = 0.02;
@@ -398,7 +398,7 @@ pub(crate) struct TokenBatch {
     pub(crate) looker_rows: Vec<u32>,
     /// Flat indices of the keys that see their surroundings, [K'].
     pub(crate) seers: Tensor,
-    /// What they see, [K', N_NUMBERS].
+    /// What they see, [K', n] with n the numbers that this network is shown.
     pub(crate) surroundings: Tensor,
     /// (B, T)
     pub(crate) shape: (usize, usize),
@@ -434,7 +434,7 @@ impl Mct {
                 let zero = Some(Init::Constant(0.0));
                 let small = Init::Normal(TABLE_DEVIATION);
                 Ok::<_, ModelError>((
-                    Linear::new(&mut scope, "in", N_NUMBERS, 2 * c)?,
+                    Linear::new(&mut scope, "in", n_numbers(config), 2 * c)?,
                     Linear::with(&mut scope, "out", 2 * c, c, small, zero)?,
                 ))
             })
@@ -470,7 +470,7 @@ impl Mct {
     /// Logits over the class of an agent not seen before, from the slot before its key; the rows by
     /// which classes enter are also those by which they are told; [N, 3].
     pub(crate) fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
-        let rows = self.table.narrow(0, Tables::CLASS, N_CLASSES)?;
+        let rows = ops::table_rows(&self.table, Tables::CLASS, N_CLASSES)?;
         ops::linear(hidden, &rows, None)
     }
 

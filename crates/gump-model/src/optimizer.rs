@@ -6,9 +6,9 @@ use candle_core::{CpuStorage, InplaceOp2, InplaceOp3, Layout, Result, Tensor, Va
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::ModelError;
 use crate::parameters::Parameters;
 use crate::train::Gradients;
+use crate::{ModelError, ops};
 
 /// Step size and its schedule.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -152,10 +152,7 @@ impl AdamW {
     ) -> Result<f64> {
         // Each tensor on a thread of its own; the sum over tensors keeps their order.
         let all: Vec<&Tensor> = gradients.values().collect();
-        let squares = all.into_par_iter().map(|gradient| {
-            let sum = gradient.sqr()?.sum_all()?.to_scalar::<f32>()?;
-            Ok(f64::from(sum))
-        });
+        let squares = all.into_par_iter().map(ops::sum_of_squares);
         let squares: Vec<f64> = squares.collect::<Result<_>>()?;
         let norm = squares.iter().sum::<f64>().sqrt();
         let scale = if norm > config.clip {

@@ -199,6 +199,7 @@ impl Group<'_> {
             for ((row, decoded), request) in rows.iter_mut().zip(&decoded).zip(&requests) {
                 let settled = request.settle(&decoded[i], passes.sampling);
                 row[key + 1].slot = Slot::Value(request.settled_state(&decoded[i], settled));
+                row[key + 1].exact = row[key].exact.map(|like| like.with_state(settled));
             }
         }
         Ok(decoded)

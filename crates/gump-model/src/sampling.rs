@@ -12,6 +12,7 @@ use gump_tokenizer::{Field, QuantizedState};
 use serde::{Deserialize, Serialize};
 
 use crate::aggregation::Ring;
+use crate::agreement;
 use crate::anchor::Anchor;
 use crate::decoder::STEPS;
 use crate::limits::Limits;
@@ -66,6 +67,46 @@ impl Default for SamplingConfig {
             limits: true,
             precision: Precision::F32,
         }
+    }
+}
+
+impl SamplingConfig {
+    /// The network alone: what it says is what happens. Nothing is drawn again and nothing held
+    /// back; temperature and averaging are the default's.
+    pub fn raw() -> Self {
+        Self::default().without_rules()
+    }
+
+    /// The decoding of the paper's Waymo evaluation: warmer draws, more weight for earlier
+    /// predictions, no rules. Its frames are interpolated by `SimulateConfig::compat` of
+    /// `gump-rollout`.
+    ///
+    /// Source: GUMP (ECCV 2024), section on simulation: temperature 1.1, the 40 likeliest bins,
+    /// decay 1.2, three frames of history.
+    pub fn paper() -> Self {
+        Self {
+            temperature: 1.1,
+            top_k: 40,
+            decay: 1.2,
+            history: 3,
+            surrogate: Surrogate::Chunk,
+            ..Self::raw()
+        }
+    }
+
+    /// The same decoding with neither redraws nor limits.
+    #[must_use]
+    pub fn without_rules(self) -> Self {
+        Self {
+            redraws: 0,
+            limits: false,
+            ..self
+        }
+    }
+
+    /// Whether rules correct what the network says.
+    pub fn has_rules(&self) -> bool {
+        self.redraws > 0 || self.limits
     }
 }
 
@@ -176,16 +217,43 @@ impl Request {
         self.forced[..7].iter().all(Option::is_some)
     }
 
-    /// The final state of a decoded object: its sample, aggregated, within its limits; scene frame,
-    /// not quantised.
+    /// Where the object was, scene frame; `None` if that is not known.
+    pub(crate) fn from(&self) -> Option<Pose> {
+        let limited = self.limits.map(|(from, _)| from);
+        limited.or(self.anchor.origin())
+    }
+
+    /// The final state of a decoded object: its sample, aggregated, within its limits, its velocity in
+    /// agreement; scene frame, not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
-        let said = self.anchor.poses(bins)[0];
-        let pose = self.ring.aggregate(self.frame, said, config.decay);
-        let velocity = self.anchor.velocity(bins);
-        match self.limits {
-            Some((from, limits)) => limits.keep(from, AgentState { pose, velocity }),
-            None => AgentState { pose, velocity },
+        let said = AgentState {
+            pose: self.anchor.poses(bins)[0],
+            velocity: self.anchor.velocity(bins),
+        };
+        let average = self.ring.aggregate(self.frame, said.pose, config.decay);
+        let Some(from) = self.from().filter(|_| !self.is_driven()) else {
+            return AgentState {
+                pose: average,
+                ..said
+            };
+        };
+        let steers = self.limits.is_some();
+        let velocity = agreement::follow(from, said, average, steers);
+        let mut settled = AgentState {
+            pose: average,
+            velocity,
+        };
+        if let Some((from, limits)) = self.limits {
+            let kept = limits.keep(from, settled);
+            settled = AgentState {
+                velocity: agreement::follow(from, settled, kept.pose, steers),
+                ..kept
+            };
         }
+        if config.limits {
+            settled.velocity = agreement::allowed(from, settled.pose, settled.velocity);
+        }
+        settled
     }
 
     /// The token state of a decoded object whose final state is `settled`: the one value that
@@ -209,3 +277,40 @@ pub(crate) fn set_pose(mut state: QuantizedState, pose: Pose) -> QuantizedState 
 
 /// What the decoder says of one object: a bin per step, to be read through the object's anchor.
 pub(crate) type Bins = [u16; STEPS.len()];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every field is spelled out, so that a new one asks what it is in these decodings.
+    #[test]
+    fn what_raw_and_paper_set_is_pinned() {
+        let raw = SamplingConfig {
+            mode: Mode::PartialAr,
+            cache: CacheMode::Window,
+            temperature: 0.5,
+            top_k: 40,
+            decay: 0.3,
+            history: 3,
+            surrogate: Surrogate::Chunk,
+            life: false,
+            pace: Pace {
+                arrivals: 1.0,
+                light_changes: 1.0,
+            },
+            redraws: 0,
+            limits: false,
+            precision: Precision::F32,
+        };
+        assert_eq!(SamplingConfig::raw(), raw);
+        let paper = SamplingConfig {
+            temperature: 1.1,
+            decay: 1.2,
+            ..raw.clone()
+        };
+        assert_eq!(SamplingConfig::paper(), paper);
+        assert!(!raw.has_rules() && !paper.has_rules());
+        assert!(SamplingConfig::default().has_rules());
+        assert_eq!(SamplingConfig::default().without_rules(), raw);
+    }
+}

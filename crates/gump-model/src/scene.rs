@@ -8,12 +8,13 @@ use gump_geometry::Pose;
 use gump_raster::rasterize;
 use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, MapGraph, Route, SceneState};
 use gump_tokenizer::{
-    Identities, Key, N_CLASSES, QuantizedState, TokenAgent, TokenFrame, class_index,
+    Identities, Key, N_CLASSES, QuantizedState, TokenAgent, TokenFrame, TokenSequence, class_index,
 };
 
 use crate::anchor::Anchor;
-use crate::batch::PlacedSlot;
+use crate::batch::{PlacedSlot, place_exactly};
 use crate::engine::{Context, SceneMemory};
+use crate::exact::ExactFrames;
 use crate::generation::ground::Ground;
 use crate::mct::VisualMemory;
 use crate::sample::TOKEN_DT;
@@ -144,21 +145,23 @@ impl Scene {
 
     /// The state of an object in the present, scene frame, not rounded.
     pub(crate) fn present(&self, id: u16) -> Option<AgentState> {
-        self.was(id, 0)
+        let now = self.recent.last()?;
+        Some(self.local(now.agent(self.identities.agent(id)?)?.state))
     }
 
     /// In whose frame the chunk at a key of the present is said.
-    pub(crate) fn anchor(&self, key: &PlacedSlot, id: u16, config: &ModelConfig) -> Anchor {
-        let last = key.last.filter(|_| config.anchored);
-        last.map_or(Anchor::SCENE, |last| {
-            Anchor::at(self.was(id, 1).map_or(last.pose(), |state| state.pose))
-        })
+    pub(crate) fn anchor(&self, key: &PlacedSlot, config: &ModelConfig) -> Anchor {
+        let last = key.last_pose().filter(|_| config.anchored);
+        last.map_or(Anchor::SCENE, Anchor::at)
     }
 
-    /// The state of an object some frames ago.
-    fn was(&self, id: u16, ago: usize) -> Option<AgentState> {
-        let frame = self.recent.iter().rev().nth(ago)?;
-        Some(self.local(frame.agent(self.identities.agent(id)?)?.state))
+    /// The slots of its own history.
+    pub(crate) fn slots(&self) -> Result<Vec<PlacedSlot>, ModelError> {
+        let sequence = TokenSequence::new(Vec::new(), self.history.clone())
+            .map_err(|error| ModelError::Scene(error.to_string()))?;
+        let n = self.history.len();
+        let exact = ExactFrames::last(n, &self.recent, &self.identities, self.world_from_scene);
+        Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
     }
 
     /// A world state in tokens, with the size of `like`.

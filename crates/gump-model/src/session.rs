@@ -112,6 +112,7 @@ impl TransformerSession<'_> {
         let far: Vec<usize> = (0..self.futures.len())
             .filter(|i| self.futures[*i].ego_reach() >= reach)
             .collect();
+        let history = self.world.sampling().history.max(1);
         let around = |i: &usize| {
             let future = &self.futures[*i];
             let from = &self.scenes[future.scene];
@@ -119,7 +120,7 @@ impl TransformerSession<'_> {
                 self.world,
                 Arc::clone(&from.map),
                 from.route.clone(),
-                future.recent.clone(),
+                future.recent[future.recent.len().saturating_sub(history)..].to_vec(),
                 from.ego,
                 future.identities.clone(),
             )

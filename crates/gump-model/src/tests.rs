@@ -9,10 +9,11 @@ use gump_tokenizer::{Identities, Slot, Tokenizer, TokenizerConfig};
 
 use crate::aggregation::Ring;
 use crate::anchor::Anchor;
-use crate::batch::{PlacedSlot, place};
+use crate::batch::{PlacedSlot, place_exactly};
 use crate::config::{Gate, ModelConfig, VisualConfig};
 use crate::decode::{Window, present_all};
 use crate::decoder::STEPS;
+use crate::exact::ExactFrames;
 use crate::mct::{Cache, VisualMemory};
 use crate::plain::{Passes, decode};
 use crate::sampling::{CacheMode, Mode, Request, SamplingConfig};
@@ -65,7 +66,9 @@ pub(crate) fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
         pose,
         &identities,
     );
-    place(&encoded.sequence)
+    let frames: Vec<Frame> = frames.into_iter().cloned().collect();
+    let exact = ExactFrames::last(frames.len(), &frames, &identities, pose);
+    place_exactly(&encoded.sequence, |frame, id| exact.of(frame, id))
 }
 
 pub(crate) fn memory(network: &Network, scenario: &Scenario) -> VisualMemory {
@@ -220,7 +223,7 @@ fn the_decoder_says_the_same_forced_and_free() {
 }
 
 /// The frames of `n` futures over `steps` steps.
-fn imagine(
+pub(crate) fn imagine(
     sampling: SamplingConfig,
     scenario: &Scenario,
     n: usize,
@@ -326,7 +329,15 @@ fn nothing_looks_at_the_logged_future() {
                 velocity: gump_geometry::dvec2(f64::NAN, f64::NAN),
             })
         });
-        *frame = Frame::new(agents.collect(), vec![]);
+        // Everyone is nowhere, a light changes, and somebody appears.
+        let mut agents: Vec<_> = agents.collect();
+        agents.push(gump_scene::Agent {
+            id: AgentId(99),
+            ..agents[0]
+        });
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = gump_scene::LightState::Green;
+        *frame = Frame::new(agents, lights);
     }
     let (a, _) = imagine(SamplingConfig::default(), &scenario, 2, 3, None);
     let (b, _) = imagine(SamplingConfig::default(), &blinded, 2, 3, None);
@@ -530,6 +541,7 @@ fn window(scenario: &Scenario) -> Window {
     Window {
         scene: 0,
         history,
+        exact: Default::default(),
         next,
         requests,
         survey: Arc::default(),

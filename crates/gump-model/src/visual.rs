@@ -418,7 +418,7 @@ impl Reconstruction {
             .reshape(vec![scenes, planes, n, self.stride, n, self.stride])?
             .permute(vec![0, 2, 4, 1, 3, 5])?
             .reshape((scenes, n * n, self.planes * self.stride * self.stride))?;
-        (drawn - patches)?.abs()?.mean_all()
+        ops::mean_absolute_difference(&drawn, &patches)
     }
 }
 

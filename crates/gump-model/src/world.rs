@@ -16,13 +16,13 @@ use std::sync::{Arc, Mutex};
 use candle_core::Tensor;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 use gump_scene::{SceneState, Seed};
-use gump_tokenizer::{QuantizedState, Slot, TokenSequence, Tokenizer, TokenizerConfig};
+use gump_tokenizer::{QuantizedState, Slot, Tokenizer, TokenizerConfig};
 use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::aggregation::{Chunk, Ring};
 use crate::anchor::Anchor;
-use crate::batch::{PlacedSlot, place};
+use crate::batch::PlacedSlot;
 use crate::decoder::STEPS;
 use crate::engine::{Engine, Job};
 use crate::future::{Future, stream};
@@ -240,20 +240,15 @@ impl TransformerWorld {
         seed: Seed,
     ) -> Result<Vec<Vec<(u16, Chunk)>>, ModelError> {
         let network = &self.network;
-        let sequence = TokenSequence::new(Vec::new(), scene.history.clone())
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
-        let slots = place(&sequence);
+        let slots = scene.slots()?;
         let last = scene.history.len() - 1;
         let keys: Vec<(usize, u16, QuantizedState, Anchor)> = slots
             .windows(2)
             .enumerate()
             .filter_map(|(i, pair)| match (pair[0].slot, pair[1].slot) {
-                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => Some((
-                    i,
-                    key.id,
-                    state,
-                    scene.anchor(&pair[0], key.id, network.config()),
-                )),
+                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => {
+                    Some((i, key.id, state, scene.anchor(&pair[0], network.config())))
+                }
                 _ => None,
             })
             .collect();
@@ -330,9 +325,7 @@ impl TransformerWorld {
     /// A scene that cannot be tokenised, or what the tensor library reports.
     pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, ModelError> {
         let mut scene = Scene::new(self, scene)?;
-        let sequence = TokenSequence::new(Vec::new(), scene.history.clone())
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
-        let slots = place(&sequence);
+        let slots = scene.slots()?;
         let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
         let key = key.expect("the ego is in every frame of the window");
         let mut said = self.read_history(&mut scene, &slots, vec![key])?;

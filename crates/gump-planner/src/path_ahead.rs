@@ -58,7 +58,7 @@ impl PathAhead {
             .filter_map(|&id| scene.map.lane(id))
             .filter_map(|lane| Some((lane, foot_on_lane(lane, ego)?)))
             .min_by(|a, b| a.1.distance.total_cmp(&b.1.distance))
-            .and_then(|(lane, _)| lane.speed_limit);
+            .and_then(|(lane, _)| lane.speed_limit.or(lane.kind.usual_speed_limit()));
         extend(scene, &mut points, &mut lanes, foot.arc_length + distance);
         let line = Polyline::new(points).expect("a line the ego was projected on has points");
         Ok(Self {

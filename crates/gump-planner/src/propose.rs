@@ -19,7 +19,7 @@ pub struct ProposalConfig {
     pub speed_fractions: Vec<f64>,
     /// Lines to follow, metres to the left of the centre.
     pub lateral_offsets: Vec<f64>,
-    /// The limit of a lane that states none, metres per second, > 0.
+    /// The limit of a lane that states neither one nor of what kind it is, metres per second, > 0.
     pub fallback_speed: f64,
     /// Seconds to propose, > 0; rounded to whole steps.
     pub horizon: f64,

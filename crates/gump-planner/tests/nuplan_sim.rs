@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../../tests/shared.rs"]
+mod shared_data;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -22,13 +25,7 @@ const TOLERANCE: f64 = 1e-4;
 const STEERING_TOLERANCE: f64 = 2e-4;
 
 fn golden_folder() -> Option<PathBuf> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/golden/nuplan");
-    let folder = Path::new(folder);
-    if !folder.is_dir() {
-        eprintln!("SKIPPED: {} is not here", folder.display());
-        return None;
-    }
-    Some(folder.into())
+    shared_data::shared("golden/nuplan")
 }
 
 struct Synthetic {

@@ -2,8 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../../tests/shared.rs"]
+mod shared_data;
+
 use std::ops::Range;
-use std::path::PathBuf;
 
 use gump_planner::{
     IdmPlanner, Interactive, InteractiveConfig, Planner, PlannerPolicy, ProposalConfig,
@@ -13,13 +15,8 @@ use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Scenario, Seed};
 
 fn shared(name: &str) -> Option<Scenario> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/waymo");
-    let path = PathBuf::from(folder).join(name);
-    if path.exists() {
-        return Some(gump_data::find(&path.display().to_string()).unwrap());
-    }
-    eprintln!("SKIPPED: the real file {name} is not beside the repository");
-    None
+    let path = shared_data::shared(&format!("data/waymo/{name}"))?;
+    Some(gump_data::find(&path.display().to_string()).unwrap())
 }
 
 /// Plans interactively among reactive and among replayed traffic; metres the choice drives.

@@ -29,7 +29,8 @@ pub enum Layer {
     Route,
     /// Drivable polygons: 1.
     DrivableArea,
-    /// Speed limit over 24 m/s, at most 1, on lane surfaces; 0 where no limit is stated.
+    /// Speed limit over 24 m/s, at most 1, on lane surfaces; a lane that states none has
+    /// [`TYPICAL_SPEED_LIMIT`](gump_scene::TYPICAL_SPEED_LIMIT).
     SpeedLimit,
     /// Boxes of cones, barriers and other things that do not move by themselves, now: 1.
     StaticAgents,

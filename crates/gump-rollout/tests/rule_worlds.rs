@@ -1,12 +1,14 @@
-//! Log replay and constant velocity.
+//! Log replay and constant velocity; what no world but the log may see.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use approx::assert_abs_diff_eq;
 use gump_geometry::{Pose, dvec2};
-use gump_rollout::worlds::{ConstantVelocity, LogReplay};
+use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
+use gump_scene::{
+    Agent, AgentId, AgentState, Frame, LightState, Scenario, SceneState, Seed, fixture,
+};
 
 fn scene() -> Scenario {
     let text = "ego vehicle 0: 0,0 velocity 5,0
@@ -89,7 +91,7 @@ fn replay_starts_anywhere_in_the_log_and_lets_the_ego_be_driven() {
     // A scene whose ego has left the log is still recognised by the others.
     let history = [first];
     let again = Start {
-        scene: gump_scene::SceneState {
+        scene: SceneState {
             history: &history,
             ..scenario.present()
         },
@@ -140,4 +142,60 @@ fn a_slot_can_be_replaced() {
     assert_abs_diff_eq!(x(0), 1.0, epsilon = 1e-9);
     assert_abs_diff_eq!(x(1), 0.5, epsilon = 1e-9);
     assert!(session.replace(2, start(&scenario)).is_err());
+}
+
+/// A fork, and a log that goes on as `way` says: the ego takes that lane, which its route shows as
+/// readers infer it; on the third lane a light turns red and somebody appears. Equal up to now.
+fn recording(way: i64) -> Scenario {
+    let text = format!(
+        "lane 1: 0,0 50,0 next 2,3
+         lane 2: 50,0 100,40
+         lane 3: 50,0 100,-40
+         route 1,{way}
+         light 1 green: 48,0
+         ego vehicle 0: 10,0 velocity 10,0
+         agent vehicle 1: 30,0 velocity 9,0"
+    );
+    let mut scenario = fixture::scenario(&text).unwrap();
+    let now = scenario.now;
+    for frame in scenario.log[now + 1..].iter_mut().filter(|_| way == 3) {
+        // A single look at these states would show everywhere.
+        let nowhere = AgentState {
+            pose: Pose::new(f64::NAN, 0.0, 0.0),
+            velocity: dvec2(f64::NAN, 1.0),
+        };
+        let agents = frame.agents().iter();
+        let mut agents: Vec<Agent> = agents.map(|agent| agent.with_state(nowhere)).collect();
+        agents.push(Agent {
+            id: AgentId(9),
+            ..agents[0]
+        });
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = LightState::Red;
+        *frame = Frame::new(agents, lights);
+    }
+    scenario
+}
+
+#[test]
+fn what_comes_after_the_present_is_not_seen_but_for_the_route_that_can_be_hidden() {
+    let [left, right] = [2, 3].map(recording);
+    let idm = Idm::default();
+    for world in [&idm as &dyn WorldModel, &ConstantVelocity] {
+        let futures = |scene: SceneState<'_>| {
+            let start = Start {
+                scene,
+                n_futures: 8,
+                seed: Seed(5),
+            };
+            let rollouts = simulate(world, &[start], None, &seconds(8.0)).unwrap();
+            let frames = rollouts.iter().map(|rollout| rollout.imagined().to_vec());
+            frames.collect::<Vec<_>>()
+        };
+        let [a, b] = [&left, &right].map(|scenario| futures(scenario.present().unguided()));
+        assert_eq!(a, b, "{}", world.name());
+        // The test can fail: a guided ego takes the way of its log.
+        let [a, b] = [&left, &right].map(|scenario| futures(scenario.present()));
+        assert_eq!(a != b, world.name() == idm.name(), "{}", world.name());
+    }
 }

@@ -60,6 +60,20 @@ impl AgentKind {
     pub fn is_moving(self) -> bool {
         Self::MOVING.contains(&self)
     }
+
+    /// Length, width and height of an agent of this kind about which nothing is known, metres;
+    /// readers give exactly this to an agent whose size its format does not state.
+    ///
+    /// Source: the medians of the 11,672 tracks in 201 scenes of the Waymo Open Motion Dataset;
+    /// for things that do not move, a barrel.
+    pub fn usual_size(self) -> [f64; 3] {
+        match self {
+            Self::Vehicle => [4.7, 2.1, 1.7],
+            Self::Pedestrian => [0.9, 0.9, 1.7],
+            Self::Bicycle => [1.8, 0.8, 1.7],
+            _ => [0.6, 0.6, 1.0],
+        }
+    }
 }
 
 /// Where an agent is and how it moves.
@@ -110,6 +124,13 @@ impl Agent {
             length: self.length,
             width: self.width,
         }
+    }
+
+    /// True if the footprint is that of [`AgentKind::usual_size`], to what a format with 32-bit
+    /// numbers keeps of it: whoever must not take a guess for a measurement takes it for a guess.
+    pub fn has_usual_size(&self) -> bool {
+        let [length, width, _] = self.kind.usual_size();
+        (self.length - length).abs() < 1e-6 && (self.width - width).abs() < 1e-6
     }
 
     /// The same agent in another state.

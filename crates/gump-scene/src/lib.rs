@@ -47,7 +47,7 @@ pub use frame::{Frame, Light, LightState};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
-    RoadLineKind, Roadblock, RoadblockId, StopSign,
+    RoadLineKind, Roadblock, RoadblockId, StopSign, TYPICAL_SPEED_LIMIT, Unstated,
 };
 pub use map_graph::MapGraph;
 pub use prediction::{PredictedMode, Prediction};

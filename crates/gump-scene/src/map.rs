@@ -40,6 +40,37 @@ pub enum LaneKind {
     Undefined,
 }
 
+impl LaneKind {
+    /// What rule-driven vehicles take for the limit of a lane that states none, metres per second;
+    /// `None` for a kind that is not stated either. Never what a network is told.
+    ///
+    /// Source: 65 mph on American freeways and 30 mph in their cities; 20 km/h is the pace of an
+    /// unhurried cyclist.
+    pub fn usual_speed_limit(self) -> Option<f64> {
+        match self {
+            Self::Freeway => Some(29.1),
+            Self::SurfaceStreet => Some(TYPICAL_SPEED_LIMIT),
+            Self::BikeLane => Some(5.6),
+            Self::Undefined => None,
+        }
+    }
+}
+
+/// A speed limit that says nothing in particular, metres per second: 30 mph. It stands where a
+/// number has to stand for a limit that is not known.
+pub const TYPICAL_SPEED_LIMIT: f64 = 13.4;
+
+/// What the source of a scene has no word for, so that its absence from the scene says nothing.
+///
+/// The limit of a lane is its own `Option`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Unstated {
+    /// There may be stop signs on this map.
+    pub stop_signs: bool,
+    /// There may be traffic lights.
+    pub lights: bool,
+}
+
 /// A lane: a centre line with a direction of travel, and its neighbours in the graph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lane {
@@ -235,7 +266,7 @@ pub struct StopSign {
 
 /// What a map is built from; see [`MapGraph::new`](crate::MapGraph::new).
 #[derive(Clone, Debug, Default)]
-#[allow(missing_docs, reason = "each field is a list of the type it names")]
+#[allow(missing_docs, reason = "each list is one of the type it names")]
 pub struct MapParts {
     pub lanes: Vec<Lane>,
     pub roadblocks: Vec<Roadblock>,
@@ -245,6 +276,8 @@ pub struct MapParts {
     pub stop_signs: Vec<StopSign>,
     /// Surfaces a vehicle may be on; derived by the reader where the format has none.
     pub drivable: Vec<Polygon>,
+    /// What the source has no word for.
+    pub unstated: Unstated,
 }
 
 /// Why parts do not make a map.

@@ -10,7 +10,7 @@ use gump_geometry::{BoxIndex, DVec2, PointIndex, Polygon, SegmentIndex, dvec2};
 
 use crate::{
     Area, AreaKind, Lane, LaneId, MapError, MapParts, RoadEdge, RoadLine, Roadblock, RoadblockId,
-    StopSign,
+    StopSign, Unstated,
 };
 
 /// An immutable, indexed map; share it by `Arc`, and its indices are built once for all.
@@ -79,6 +79,11 @@ impl MapGraph {
     /// anew.
     pub fn parts(&self) -> &MapParts {
         &self.parts
+    }
+
+    /// What the source of the map has no word for.
+    pub fn unstated(&self) -> Unstated {
+        self.parts.unstated
     }
 
     /// All lanes, in the order given.

@@ -11,7 +11,7 @@ pub struct Scenario {
     pub id: String,
     /// The road.
     pub map: Arc<MapGraph>,
-    /// The ego's route, if known or derived.
+    /// The ego's route, if known or derived, usually from the log with its future.
     pub route: Option<Arc<Route>>,
     /// One frame every `dt` seconds, past and future.
     pub log: Vec<Frame>,
@@ -108,7 +108,8 @@ impl Scenario {
         Ok(())
     }
 
-    /// What an actor may see now: the future is cut off.
+    /// What an actor may see now: the future is cut off, but for the route, which tells where the
+    /// ego goes ([`SceneState::unguided`] leaves it out).
     pub fn present(&self) -> SceneState<'_> {
         self.at(self.now)
     }

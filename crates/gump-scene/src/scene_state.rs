@@ -9,7 +9,7 @@ use crate::{Agent, AgentId, Frame, MapGraph, Route};
 pub struct SceneState<'a> {
     /// The road.
     pub map: &'a Arc<MapGraph>,
-    /// The ego's route, if one is known.
+    /// The ego's route, if one is known; see [`SceneState::unguided`].
     pub route: Option<&'a Arc<Route>>,
     /// Frames up to now, oldest first, `dt` seconds apart, never empty.
     pub history: &'a [Frame],
@@ -25,6 +25,19 @@ impl<'a> SceneState<'a> {
         self.history
             .last()
             .expect("the history of a scene is never empty")
+    }
+
+    /// The same without the ego's route: what an actor may see where its realism is judged.
+    ///
+    /// Few recordings state a route. Readers take it from where the ego drives *after* the present,
+    /// and files keep it without saying whose word it is; so a route tells which way the ego turns
+    /// at the next fork. That is the task of whoever plans, and a hint to whoever predicts.
+    #[must_use]
+    pub fn unguided(self) -> Self {
+        Self {
+            route: None,
+            ..self
+        }
     }
 
     /// The ego now.

@@ -47,6 +47,23 @@ impl SynthesisConfig {
         }
     }
 
+    /// What a version of the generator asked for, field by field: it stays as it is when
+    /// [`Self::standard`] moves on. `None` for a version that does not exist.
+    pub fn of_version(version: u32) -> Option<Self> {
+        (version == 1).then_some(Self {
+            history_s: 1.0,
+            future_s: 8.0,
+            dt: 0.1,
+            warmup_s: 25.0,
+            density: 1.0,
+            extent_m: 120.0,
+            vehicles: 12..=60,
+            pedestrians: 0..=14,
+            bicycles: 0..=5,
+            family: None,
+        })
+    }
+
     /// Index of the present in the log.
     pub fn now(&self) -> usize {
         (self.history_s / self.dt).round() as usize

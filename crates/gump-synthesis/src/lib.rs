@@ -30,6 +30,13 @@ mod sumo_demand;
 mod tracker;
 mod traffic;
 
+/// Version of the generators: it grows whenever a seed gives another scene than before.
+///
+/// Frozen sets of scenes name the version that made them; [`SynthesisConfig::of_version`] and
+/// [`SumoDemand::of_version`] say what a version asked for. `tests/frozen.rs` holds every version
+/// to the scenes it made first.
+pub const GENERATOR_VERSION: u32 = 1;
+
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;
 pub use profile::Profile;

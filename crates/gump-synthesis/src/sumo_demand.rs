@@ -39,6 +39,19 @@ impl SumoDemand {
             density: 1.0,
         }
     }
+
+    /// What a version of the generator asked for, field by field: it stays as it is when
+    /// [`Self::standard`] moves on. `None` for a version that does not exist.
+    pub fn of_version(version: u32) -> Option<Self> {
+        (version == 1).then_some(Self {
+            until_s: 150.0,
+            radius_m: 450.0,
+            vehicles: 50..=220,
+            bicycles: 0.08,
+            people: 0.45,
+            density: 1.0,
+        })
+    }
 }
 
 /// Metres of lane per vehicle at least: more vehicles than that stand.

@@ -27,8 +27,9 @@ pub struct TokenizerConfig {
     /// Most agents of a frame besides the ego, 0..=320, nearest to the scene's origin first.
     /// Source: the released code has 320 ids.
     pub max_agents: usize,
-    /// Lights have tokens if their lane starts within this distance of the scene's origin, metres.
-    /// Source: 50 in the released code.
+    /// Lights have tokens if their lane starts within this distance of the scene's origin, metres:
+    /// by default all that the grid can place. The released code has 50, which an ego that drives on
+    /// in the frame of its start leaves behind.
     pub light_radius_m: f64,
     /// Most lights, 0..=63, nearest first. Source: 64 in the released code, 0 being "no light".
     pub max_lights: usize,
@@ -40,7 +41,7 @@ impl Default for TokenizerConfig {
             position_range_m: 100.0,
             pedestrian_range_m: 100.0,
             max_agents: *AGENT_KEYS.end() as usize,
-            light_radius_m: 50.0,
+            light_radius_m: 100.0,
             max_lights: MAX_LIGHTS,
         }
     }

@@ -47,6 +47,7 @@ pub struct Viewer<'a> {
     metrics: Vec<MetricTrack>,
     heat: Vec<HeatMap>,
     realism: BTreeMap<AgentId, f64>,
+    deeds: BTreeMap<AgentId, String>,
     candidates: Vec<CandidatePath>,
     note: String,
 }
@@ -69,6 +70,7 @@ impl<'a> Viewer<'a> {
             metrics: Vec::new(),
             heat: Vec::new(),
             realism: BTreeMap::new(),
+            deeds: BTreeMap::new(),
             candidates: Vec::new(),
             note: String::new(),
         }
@@ -110,6 +112,13 @@ impl<'a> Viewer<'a> {
     /// Says how realistic an agent's futures are, 0 to 1, for a colour.
     pub fn realism(&mut self, agent: AgentId, realism: f64) -> &mut Self {
         self.realism.insert(agent, realism);
+        self
+    }
+
+    /// Says what an agent does in its futures that it should not, shown when it is chosen; empty
+    /// words say nothing.
+    pub fn deeds(&mut self, agent: AgentId, words: impl Into<String>) -> &mut Self {
+        self.deeds.insert(agent, words.into());
         self
     }
 
@@ -189,6 +198,7 @@ impl<'a> Viewer<'a> {
                 "length": rounded(a.length),
                 "width": rounded(a.width),
                 "realism": self.realism.get(&a.id).map(|&realism| rounded(realism)),
+                "deeds": self.deeds.get(&a.id).filter(|words| !words.is_empty()),
             })).collect::<Vec<_>>(),
             "lights": lights.iter().map(|&(_, at)| local(at)).collect::<Vec<_>>(),
             "takes": takes.iter().map(|take| json!({

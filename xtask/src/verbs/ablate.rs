@@ -16,6 +16,8 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 pub(crate) use self::decoding::Knob;
+use crate::cli::WrongArguments;
+use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
@@ -70,24 +72,43 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let name = match &self.scenario {
             Some(name) => name.clone(),
-            None => shipped::scenario()?,
+            None => shipped::scenario(),
         };
         let scenario = run.phase("read", |_| Ok(find(&name)?))?;
         run.setting("scenario", &name)?;
-        let full = self.imagine(run, &scenario, Mode::FullAr, "full-AR")?;
-        let partial = self.imagine(run, &scenario, Mode::PartialAr, "partial-AR")?;
-        let [full_part, partial_part] = [&full, &partial]
-            .map(|imagined| summarize(&imagined.rollouts, Some(&scenario)).total());
+        let world = self.world.clone().unwrap_or_else(shipped::world);
+        if !matches!(world, WorldName::Model(_)) {
+            let wrong = format!(
+                "--world: expected model:WEIGHTS, since rules decode nothing, found {world}"
+            );
+            return Err(WrongArguments(wrong).into());
+        }
+        let mut rows = Vec::new();
+        let (mut pairs, mut digests) = (Vec::new(), Vec::new());
+        let fulls = self.draw.decodings(Mode::FullAr)?;
+        let partials = self.draw.decodings(Mode::PartialAr)?;
+        for (full, partial) in fulls.iter().zip(&partials) {
+            let pair = [
+                self.imagine(run, &scenario, &world, full, "full-AR")?,
+                self.imagine(run, &scenario, &world, partial, "partial-AR")?,
+            ];
+            let parts = pair
+                .each_ref()
+                .map(|imagined| summarize(&imagined.rollouts, Some(&scenario)).total());
+            for (mode, i) in [("full-AR", 0), ("partial-AR", 1)] {
+                let (imagined, decoding) = (&pair[i], partial.name);
+                rows.push(row(mode, decoding, imagined, &parts[i]));
+                let digest = futures::digest(&imagined.rollouts);
+                digests.push(json!({"mode": mode, "decoding": decoding, "digest": digest}));
+            }
+            pairs.push((pair, parts));
+        }
+        run.result("rows", rows)?;
+        run.result("digests", digests)?;
+        let ([full, partial], [full_part, partial_part]) = &pairs[0];
         let ratio = partial.frames_per_second() / full.frames_per_second();
-        run.result(
-            "rows",
-            [
-                row("full-AR", &full, &full_part),
-                row("partial-AR", &partial, &partial_part),
-            ],
-        )?;
         run.result("ratio", ratio)?;
-        run.result("difference", difference(&partial_part, &full_part))?;
+        run.result("difference", difference(partial_part, full_part))?;
         let pictures = [
             ("full-AR", &full.rollouts),
             ("partial-AR", &partial.rollouts),
@@ -110,18 +131,15 @@ impl Args {
         &self,
         run: &mut Run,
         scenario: &Scenario,
-        mode: Mode,
-        phase: &str,
+        world: &WorldName,
+        decoding: &Decoding,
+        mode: &str,
     ) -> anyhow::Result<Imagined> {
-        let world = self.world.clone().unwrap_or_else(shipped::world);
-        anyhow::ensure!(
-            matches!(world, WorldName::Model(_)),
-            "--world: expected model:WEIGHTS, since rules decode nothing, found {world}"
-        );
-        let world = World::build(run.device(), &world, scenario, &self.draw.resolve(mode)?)?;
-        run.phase(phase, |run| {
+        let world = World::build(run.device(), world, scenario, &decoding.sampling)?;
+        run.phase(&format!("{mode}, {}", decoding.name), |run| {
             let (n, seed) = (self.futures.get(), run.seed());
-            imagine(run, &world, scenario.present(), n, self.seconds, seed)
+            let config = decoding.frames(self.seconds);
+            imagine(run, &world, scenario, n, &config, seed)
         })
     }
 }
@@ -138,9 +156,10 @@ const RATES: [(&str, Rate); 6] = [
     ("min_fde", Part::min_fde),
 ];
 
-fn row(mode: &str, imagined: &Imagined, part: &Part) -> Value {
+fn row(mode: &str, decoding: &str, imagined: &Imagined, part: &Part) -> Value {
     let mut row = Map::new();
     row.insert("mode".into(), json!(mode));
+    row.insert("decoding".into(), json!(decoding));
     row.insert(
         "frames_per_second".into(),
         json!(imagined.frames_per_second()),

@@ -80,14 +80,15 @@ impl Args {
                          use cargo run -p xtask --features rerun -- simulate";
             return Err(WrongArguments(wrong.into()).into());
         }
-        let sampling = self.sampling.resolve()?;
+        let decoding = self.sampling.decoding(&self.world)?;
+        let config = decoding.frames(self.seconds);
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
         let world = run.phase("load", |run| {
-            World::build(run.device(), &self.world, &scenario, &sampling)
+            World::build(run.device(), &self.world, &scenario, &decoding.sampling)
         })?;
         let imagined = run.phase("imagine", |run| {
             let (n, seed) = (self.futures.get(), run.seed());
-            imagine(run, &world, scenario.present(), n, self.seconds, seed)
+            imagine(run, &world, &scenario, n, &config, seed)
                 .with_context(|| format!("cannot simulate {}", self.scenario))
         })?;
         let summary = run.phase("score", |_| {
@@ -100,15 +101,15 @@ impl Args {
                 .heat
                 .map_or(0, NonZeroUsize::get)
                 .min(self.futures.get());
-            let (scene, seconds) = (scenario.present(), self.seconds);
             match n {
                 0 => Ok(()),
-                n => told::heat(run, &mut viewer, world, scene, n, seconds),
+                n => told::heat(run, &mut viewer, world, &scenario, n, &config),
             }
         })?;
         run.phase("write", |run| {
             self.write(run, &scenario, &imagined.rollouts, viewer)
         })?;
+        run.result("decoding", decoding.name)?;
         self.tell(run, &scenario, &imagined, &summary)
     }
 

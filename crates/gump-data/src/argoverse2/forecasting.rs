@@ -10,7 +10,7 @@ use super::map::{self, Map};
 use super::{DT, beside, table};
 use crate::document::{self, Document};
 use crate::files::Format;
-use crate::recording::{self, Recording, State, Track, UNSTATED, assemble};
+use crate::recording::{Recording, State, Track, UNSTATED, assemble};
 use crate::{DataError, Problem, ReadOptions, ReadReport};
 
 pub(crate) const FORMAT: Format = Format {
@@ -184,7 +184,7 @@ fn track(id: i64, name: &str) -> Track {
 /// Source of sizes: the means that the Argoverse 2 sensor logs show for these classes, to a
 /// decimetre.
 pub(super) fn kind(name: &str) -> (AgentKind, [f64; 3]) {
-    let usual = |kind| (kind, recording::usual_size(kind));
+    let usual = |kind: AgentKind| (kind, kind.usual_size());
     match name {
         "vehicle" => usual(AgentKind::Vehicle),
         "bus" => (AgentKind::Vehicle, [11.0, 2.9, 3.3]),

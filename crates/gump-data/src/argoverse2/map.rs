@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use gump_geometry::{DVec3, dvec3};
-use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapParts, RoadLineKind};
+use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapParts, RoadLineKind, Unstated};
 use serde::Deserialize;
 
 use crate::json::{self, Real};
@@ -79,7 +79,13 @@ pub(super) fn read(path: &Path) -> Result<Map, DataError> {
 /// What the map states. Centre lines run between the bounds; those that forecasting maps state
 /// are left out because they are the same, without heights.
 pub(super) fn parts(map: &Map, report: &mut ReadReport) -> MapParts {
-    let mut parts = MapParts::default();
+    let mut parts = MapParts {
+        unstated: Unstated {
+            stop_signs: true,
+            lights: true,
+        },
+        ..MapParts::default()
+    };
     for segment in map.lane_segments.values() {
         add_lane(segment, &mut parts, report);
     }

@@ -263,5 +263,5 @@ fn kind(category: &str) -> (AgentKind, [f64; 3]) {
         "SIGN" | "STOP_SIGN" | "MOBILE_PEDESTRIAN_CROSSING_SIGN" => AgentKind::Sign,
         _ => AgentKind::Other,
     };
-    (kind, recording::usual_size(kind))
+    (kind, kind.usual_size())
 }

@@ -159,6 +159,11 @@ impl<'a> Decoder<'a> {
         }
     }
 
+    /// True if nothing is left.
+    pub(super) fn is_at_end(&self) -> bool {
+        self.at == self.bytes.len()
+    }
+
     /// Checks that nothing is left over.
     pub(super) fn end(&self) -> Decoded<()> {
         match self.bytes.len() - self.at {

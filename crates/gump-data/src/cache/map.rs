@@ -5,7 +5,7 @@
 use gump_geometry::dvec3;
 use gump_scene::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
-    RoadLineKind, Roadblock, RoadblockId, StopSign,
+    RoadLineKind, Roadblock, RoadblockId, StopSign, Unstated,
 };
 
 use super::bytes::{Decoded, Decoder, Encoder};
@@ -56,6 +56,7 @@ pub(super) fn write(to: &mut Encoder, parts: &MapParts) {
         areas,
         stop_signs,
         drivable,
+        unstated,
     } = parts;
     each(to, lanes, write_lane);
     each(to, roadblocks, write_roadblock);
@@ -64,6 +65,11 @@ pub(super) fn write(to: &mut Encoder, parts: &MapParts) {
     each(to, areas, write_area);
     each(to, stop_signs, write_stop_sign);
     each(to, drivable, Encoder::polygon);
+    // The end of a record: where everything is stated there is nothing, as in older files.
+    let Unstated { stop_signs, lights } = *unstated;
+    if stop_signs || lights {
+        to.byte(u8::from(stop_signs) | u8::from(lights) << 1);
+    }
 }
 
 /// Reads what [`write`] wrote.
@@ -78,6 +84,21 @@ pub(super) fn read(from: &mut Decoder<'_>) -> Decoded<MapParts> {
         areas: from.list(LEAST, read_area)?,
         stop_signs: from.list(LEAST, read_stop_sign)?,
         drivable: from.list(LEAST, Decoder::polygon)?,
+        unstated: read_unstated(from)?,
+    })
+}
+
+fn read_unstated(from: &mut Decoder<'_>) -> Decoded<Unstated> {
+    let bits = match from.is_at_end() {
+        true => 0,
+        false => from.byte()?,
+    };
+    if bits > 3 {
+        return Err(from.damage("marks of what is not stated, 0 to 3", &bits));
+    }
+    Ok(Unstated {
+        stop_signs: bits & 1 > 0,
+        lights: bits & 2 > 0,
     })
 }
 

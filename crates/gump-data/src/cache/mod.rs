@@ -3,7 +3,9 @@
 //! A cache is a folder of shards (or one of them), each with its own index, so that shards can be
 //! copied, joined and deleted like any file. Opening reads the indices alone; a scenario is fetched
 //! by its number without touching the others, from many threads at once. What is stored is what a
-//! reader made, inference included, to the bit: [`ReadOptions`] change nothing here.
+//! reader made, inference included, to the bit: [`ReadOptions`] change nothing here. That holds for
+//! the ego's route too, which is usually taken from its future: see
+//! [`gump_scene::SceneState::unguided`].
 //!
 //! Start with [`write_shard`] and [`Cache::open`]; [`crate::open`] reads a cache like any format.
 //!

@@ -89,7 +89,7 @@ fn track(element: &Element, report: &mut ReadReport) -> Option<Track> {
     Some(Track {
         id,
         kind,
-        usual_size: recording::usual_size(kind),
+        usual_size: kind.usual_size(),
         states: kept,
     })
 }

@@ -4,6 +4,9 @@
 //! Who takes such a moment for "nobody says stop" drives into a red light. A colour is held only
 //! between two sightings of the same colour; between different ones the light changed at a moment
 //! that nobody saw, and nothing is filled in.
+//!
+//! What an actor sees up to the present comes from sightings up to the present: a later one fills
+//! gaps after it alone.
 
 use std::collections::BTreeMap;
 
@@ -18,10 +21,11 @@ use crate::ReadReport;
 /// intervals of 3 to 6 s in the Manual on Uniform Traffic Control Devices.
 const MAX_GAP_S: f64 = 4.0;
 
-/// Fills gaps of unknown or absent lights; `dt` is the seconds between frames.
+/// Fills gaps of unknown or absent lights; `now` is the index of the present, `dt` the seconds
+/// between frames.
 ///
 /// Filling twice fills nothing more: whatever is filled lies between what was seen.
-pub(super) fn infer(log: &mut [Frame], dt: f64, report: &mut ReadReport) {
+pub(super) fn infer(log: &mut [Frame], now: usize, dt: f64, report: &mut ReadReport) {
     let longest = (MAX_GAP_S / dt).round() as usize;
     let mut seen: BTreeMap<LaneId, (usize, Light)> = BTreeMap::new();
     let mut held: BTreeMap<usize, Vec<Light>> = BTreeMap::new();
@@ -32,7 +36,8 @@ pub(super) fn infer(log: &mut [Frame], dt: f64, report: &mut ReadReport) {
                 continue;
             };
             if before.state == light.state && step - last <= longest + 1 {
-                for gap in last + 1..step {
+                let known_from = if step > now { now + 1 } else { 0 };
+                for gap in known_from.max(last + 1)..step {
                     held.entry(gap).or_default().push(before);
                 }
             }
@@ -74,17 +79,29 @@ mod tests {
         states.chars().map(frame).collect()
     }
 
-    /// Steps are a second apart.
+    /// Steps are a second apart; the present is the last one.
     fn check(states: &str, expected: &str) {
+        check_at(states.len(), states, expected);
+    }
+
+    fn check_at(now: usize, states: &str, expected: &str) {
         let (mut filled, mut report) = (log(states), ReadReport::default());
-        infer(&mut filled, 1.0, &mut report);
+        infer(&mut filled, now, 1.0, &mut report);
         assert_eq!(filled, log(expected), "{states}");
         let changed = states.chars().zip(expected.chars());
         let changed = changed.filter(|(a, b)| a != b).count();
         let counted = report.inferred.values().sum::<usize>();
         assert_eq!(counted, changed, "{states}");
-        infer(&mut filled, 1.0, &mut report);
+        infer(&mut filled, now, 1.0, &mut report);
         assert_eq!(filled, log(expected), "{states} filled twice");
+    }
+
+    #[test]
+    fn a_sighting_after_the_present_fills_nothing_up_to_it() {
+        for (now, expected) in [(0, "rrrr"), (1, "r.rr"), (2, "r..r"), (3, "rrrr")] {
+            check_at(now, "r..r", expected);
+        }
+        check_at(4, "r.r.?.r", "rrr.?rr");
     }
 
     #[test]

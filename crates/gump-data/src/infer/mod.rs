@@ -10,6 +10,7 @@ mod lane_graph;
 mod light_gaps;
 mod light_lanes;
 mod route;
+mod stop_sign_lanes;
 mod targets;
 mod widths;
 
@@ -37,6 +38,9 @@ pub(crate) fn default_width(kind: LaneKind) -> f64 {
 pub(crate) fn map(parts: &mut MapParts, options: ReadOptions, report: &mut ReadReport) {
     if options.infer_intersections {
         intersections::infer(&mut parts.lanes, report);
+    }
+    if options.infer_stop_sign_lanes {
+        stop_sign_lanes::infer(parts, report);
     }
     if options.infer_widths {
         widths::infer(parts, report);
@@ -79,15 +83,17 @@ pub(crate) fn light_lanes(
     }
 }
 
-/// Holds the colours of lights across moments in which they were not seen.
+/// Holds the colours of lights across moments in which they were not seen; `now` is the index of
+/// the present.
 pub(crate) fn light_gaps(
     log: &mut [Frame],
+    now: usize,
     dt: f64,
     options: ReadOptions,
     report: &mut ReadReport,
 ) {
     if options.infer_light_gaps {
-        light_gaps::infer(log, dt, report);
+        light_gaps::infer(log, now, dt, report);
     }
 }
 

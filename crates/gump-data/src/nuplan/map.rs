@@ -11,7 +11,7 @@ use std::sync::Arc;
 use gump_geometry::{DVec2, Polygon, Polyline, segments_intersect};
 use gump_scene::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapGraph, MapParts, RoadLine, RoadLineKind, Roadblock,
-    RoadblockId,
+    RoadblockId, Unstated,
 };
 use rusqlite::Row;
 
@@ -63,6 +63,10 @@ pub fn read_map(path: &Path) -> Result<CityMap, DataError> {
         drivable: drivable(&package, report_mut)?,
         road_lines: boundaries(&package, report_mut)?,
         lanes,
+        unstated: Unstated {
+            stop_signs: true,
+            lights: false,
+        },
         ..MapParts::default()
     };
     attach_stop_lines(&mut parts, &stop_line_ids);

@@ -341,7 +341,7 @@ impl TrackEntry {
         Track {
             id,
             kind,
-            usual_size: recording::usual_size(kind),
+            usual_size: kind.usual_size(),
             states: (0..n.min(states.position.len()))
                 .filter(valid)
                 .map(state)

@@ -110,6 +110,7 @@ impl Roads {
                 near.touches(&[sign.position.truncate()])
             }),
             drivable: pick(&all.drivable, |polygon| near.touches(polygon.ring())),
+            unstated: all.unstated,
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gump_geometry::{DVec3, dvec3};
-use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapParts, RoadLineKind};
+use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapParts, RoadLineKind, Unstated};
 
 use super::Meta;
 use crate::xml::Element;
@@ -21,7 +21,13 @@ type Way = Vec<i64>;
 
 /// The map around the origin.
 pub(super) fn parts(root: &Element, meta: &Meta, report: &mut ReadReport) -> MapParts {
-    let mut parts = MapParts::default();
+    let mut parts = MapParts {
+        unstated: Unstated {
+            stop_signs: true,
+            lights: true,
+        },
+        ..MapParts::default()
+    };
     let nodes: BTreeMap<i64, DVec3> = root
         .all("node")
         .filter_map(|node| Some((node.id("id")?, place(node, meta)?)))

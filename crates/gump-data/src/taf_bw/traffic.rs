@@ -90,7 +90,7 @@ pub(super) fn recording(
         let track = tracks.entry(id).or_insert_with(|| Track {
             id,
             kind,
-            usual_size: recording::usual_size(kind),
+            usual_size: kind.usual_size(),
             states: Vec::new(),
         });
         track.states.push(State { step, ..state });

@@ -37,7 +37,13 @@ pub fn scenario_from_proto(
     let ego = ego(proto)?;
     let mut parts = map::parts_from_proto(&proto.map_features, &mut report)?;
     let mut log = frames(proto, &mut report)?;
-    infer::light_gaps(&mut log, dt, options, &mut report);
+    let stamps = proto.timestamps_seconds.len();
+    let now = usize::try_from(proto.current_time_index()).map_err(|_| Problem::Index {
+        what: "the index of the present",
+        len: stamps,
+        index: proto.current_time_index().into(),
+    })?;
+    infer::light_gaps(&mut log, now, dt, options, &mut report);
     infer::map(&mut parts, options, &mut report);
     let map = Arc::new(gump_scene::MapGraph::new(parts)?);
     let mut targets = Vec::with_capacity(proto.tracks_to_predict.len());
@@ -56,11 +62,7 @@ pub fn scenario_from_proto(
         route: None,
         log,
         dt,
-        now: usize::try_from(proto.current_time_index()).map_err(|_| Problem::Index {
-            what: "the index of the present",
-            len: proto.timestamps_seconds.len(),
-            index: proto.current_time_index().into(),
-        })?,
+        now,
         ego,
         targets,
         objects_of_interest: proto

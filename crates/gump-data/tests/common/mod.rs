@@ -3,11 +3,17 @@
 #![allow(dead_code, reason = "each test file uses a part of this")]
 
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use arrow_array::RecordBatch;
 use gump_scene::Scenario;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+#[path = "../../../../tests/shared.rs"]
+mod shared_data;
+
+#[allow(unused_imports, reason = "each test file uses a part of this")]
+pub(crate) use shared_data::shared;
 
 /// A Parquet file whose rows fit into one batch.
 pub(crate) fn table(path: &Path) -> RecordBatch {
@@ -17,17 +23,6 @@ pub(crate) fn table(path: &Path) -> RecordBatch {
     let all = batches.next().expect("one batch").expect("a whole batch");
     assert!(batches.next().is_none());
     all
-}
-
-/// A file of the shared data beside the repository; says so and yields `None` if it is absent.
-pub(crate) fn shared(name: &str) -> Option<PathBuf> {
-    let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared");
-    let path = PathBuf::from(root).join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("SKIPPED: the real file {name} is not beside the repository");
-    None
 }
 
 /// A small crossing with everything Waymo's messages can hold.

@@ -7,6 +7,8 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod messages;
+#[path = "../../../../tests/shared.rs"]
+mod shared_data;
 
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -20,7 +22,6 @@ use prost::Message;
 use serde_json::Value;
 
 const SHIPPED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wosac");
-const SHARED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared");
 
 /// Likelihoods and scores.
 const SCORE_TOLERANCE: f64 = 1e-5;
@@ -44,11 +45,7 @@ impl Case {
 
     /// `None`, said aloud, where recorded data is not at hand.
     fn recorded() -> Option<Self> {
-        let path = Path::new(SHARED).join("data/waymo/scenario_a.tfrecord");
-        if !path.is_file() {
-            eprintln!("skipped: no {}", path.display());
-            return None;
-        }
+        let path = shared_data::shared("data/waymo/scenario_a.tfrecord")?;
         Some(Self::read("637f20cafde22ff8", &path))
     }
 
@@ -80,10 +77,7 @@ impl Case {
         if self.is_synthetic() {
             Path::new(SHIPPED).join(format!("{name}.gz"))
         } else {
-            Path::new(SHARED)
-                .join("golden/wosac")
-                .join(folder)
-                .join(name)
+            beside(&format!("golden/wosac/{folder}/{name}"))
         }
     }
 
@@ -105,14 +99,19 @@ impl Case {
                 both.rollouts()
             }
             "submission" => {
-                let path = Path::new(SHARED).join("golden/wosac/inputs_real");
-                let bytes = bytes(&path.join("test_submission.binproto.gz"));
+                let name = "golden/wosac/inputs_real/test_submission.binproto.gz";
+                let bytes = bytes(&beside(name));
                 let submission = Submission::decode(bytes.as_slice()).unwrap();
                 submission.scenario_rollouts[0].rollouts()
             }
             set => self.file(set).rollouts(),
         }
     }
+}
+
+/// What lies beside a recorded scenario that is there.
+fn beside(name: &str) -> PathBuf {
+    shared_data::shared(name).expect("golden values lie beside the recorded scenario")
 }
 
 /// A file's content, unpacked.

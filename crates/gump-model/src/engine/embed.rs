@@ -14,7 +14,7 @@ use crate::embedding::SineKey;
 use crate::mct::PLACES;
 use crate::ops::panels::{Panels, Room};
 use crate::ops::{gelu_row, wide};
-use crate::surroundings::{N_NUMBERS, Surroundings, Survey, look_around};
+use crate::surroundings::{Surroundings, Survey, look_around, n_numbers};
 
 use super::weights::{Norm, Source, numbers};
 use super::{Pool, chunk_rows};
@@ -32,6 +32,8 @@ pub(super) struct Embedder {
     local: Vec<Panels>,
     /// Two layers over what an object sees around itself, if it does.
     surroundings: Option<[Panels; 2]>,
+    /// Numbers that it is shown of them.
+    n_numbers: usize,
 }
 
 /// What an object sees of a scene at each place it looks at, `[M, C]` per place.
@@ -55,11 +57,12 @@ impl Embedder {
                 .collect::<Result<_, _>>()?,
             surroundings: match config.surroundings {
                 true => Some([
-                    source.linear("mct.surroundings.in", N_NUMBERS)?,
+                    source.linear("mct.surroundings.in", n_numbers(config))?,
                     source.linear("mct.surroundings.out", 2 * c)?,
                 ]),
                 false => None,
             },
+            n_numbers: n_numbers(config),
         })
     }
 
@@ -148,7 +151,7 @@ impl Embedder {
                 let [numbers, hidden, ..] = &mut room.buffers;
                 numbers.clear();
                 seen.iter()
-                    .for_each(|(_, seen)| numbers.extend_from_slice(seen));
+                    .for_each(|(_, seen)| numbers.extend_from_slice(&seen[..self.n_numbers]));
                 hidden.resize(2 * c * seen.len(), 0.0);
                 first.apply(numbers, hidden, &mut room.products);
                 gelu_row(hidden);

@@ -69,6 +69,33 @@ fn lower_precision_says_nearly_the_same() {
 }
 
 #[test]
+fn weights_without_end_are_refused_by_name() {
+    let network = network();
+    let name = "mct.blocks.0.qkv.weight";
+    let weight = network.parameters().find(name).unwrap();
+    let mut numbers = weight.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    // The largest f32 is beyond the largest bfloat16.
+    numbers[7] = f32::MAX;
+    let set = |numbers: &[f32]| {
+        let tensor = candle_core::Tensor::from_slice(numbers, weight.shape(), weight.device());
+        weight.set(&tensor.unwrap()).unwrap();
+    };
+    set(&numbers);
+    let refused = |precision| Engine::new(&network, precision).unwrap_err().to_string();
+    assert!(Engine::new(&network, Precision::Int8).is_ok());
+    assert!(refused(Precision::Bf16).contains(name));
+    numbers[7] = f32::INFINITY;
+    set(&numbers);
+    for (precision, form) in [(Precision::Bf16, "bfloat16"), (Precision::Int8, "8 bits")] {
+        let why = refused(precision);
+        assert!(
+            why.contains(name) && why.contains("inf") && why.contains(form),
+            "{why}"
+        );
+    }
+}
+
+#[test]
 fn a_context_changes_no_bit() {
     let (network, scenario) = (network(), scenario());
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));

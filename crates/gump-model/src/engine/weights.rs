@@ -33,9 +33,28 @@ impl Source<'_> {
 
     /// The linear layer called `name`.
     pub(super) fn linear(&self, name: &str, n_in: usize) -> Result<Panels, ModelError> {
-        let weight = self.get(&format!("{name}.weight"))?;
+        let weight = self.expressible(&format!("{name}.weight"))?;
         let bias = self.find(&format!("{name}.bias"))?;
         Ok(Panels::new(&weight, n_in, bias.as_deref(), self.precision))
+    }
+
+    /// The numbers called `name`, which the precision can express.
+    fn expressible(&self, name: &str) -> Result<Vec<f32>, ModelError> {
+        let numbers = self.get(name)?;
+        let (form, largest) = match self.precision {
+            Precision::F32 => return Ok(numbers),
+            Precision::Bf16 => ("bfloat16", f32::from(half::bf16::MAX)),
+            Precision::Int8 => ("8 bits", f32::MAX),
+        };
+        let fits = |number: &f32| number.is_finite() && number.abs() <= largest;
+        match numbers.iter().find(|number| !fits(number)) {
+            None => Ok(numbers),
+            Some(&number) => Err(ModelError::WeightNotFinite {
+                name: name.to_owned(),
+                number,
+                form,
+            }),
+        }
     }
 
     /// Rows `first..first + n` of the linear layer called `name`.
@@ -46,7 +65,7 @@ impl Source<'_> {
         first: usize,
         n: usize,
     ) -> Result<Panels, ModelError> {
-        let weight = self.get(&format!("{name}.weight"))?;
+        let weight = self.expressible(&format!("{name}.weight"))?;
         let bias = self.find(&format!("{name}.bias"))?;
         Ok(Panels::new(
             &weight[first * n_in..(first + n) * n_in],

@@ -119,6 +119,8 @@ pub struct GenerateConfig {
     /// What training spread the targets of sizes and velocities by (`smoothing_bins`), to be taken
     /// off again: a standard deviation in bins; 0 leaves it (paper).
     pub smoothing_bins: f64,
+    /// Whether training spread the targets of sizes, too: not with `exact_standing`.
+    pub smoothed_sizes: bool,
     /// Whether the draws of a scene's objects are spread evenly where their number is given (paper:
     /// no).
     pub even: bool,
@@ -143,6 +145,7 @@ impl GenerateConfig {
             place_boldness: 1.0,
             top_k: 400,
             smoothing_bins: 0.0,
+            smoothed_sizes: true,
             even: false,
             ..Self::default()
         }
@@ -158,6 +161,7 @@ impl Default for GenerateConfig {
             size_boldness: 1.3,
             place_boldness: 1.5,
             smoothing_bins: 0.7,
+            smoothed_sizes: true,
             even: true,
             top_k: 1000,
             placement: Placement::Guided,

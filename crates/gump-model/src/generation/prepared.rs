@@ -69,6 +69,7 @@ impl<'a> Prepared<'a> {
                 size_boldness: config.size_boldness,
                 place_boldness: config.place_boldness,
                 smoothing_bins: Some(config.smoothing_bins as f32).filter(|bins| *bins > 0.0),
+                smoothed_sizes: config.smoothed_sizes,
                 numbers: None,
             },
             request,

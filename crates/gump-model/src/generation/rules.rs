@@ -54,8 +54,10 @@ pub(crate) struct Manner {
     pub(crate) size_boldness: f64,
     /// Multiplies the temperature of x and y.
     pub(crate) place_boldness: f64,
-    /// What training spread the targets of sizes and velocities by, bins, if that is taken off.
+    /// What training spread the targets of velocities by, bins, if that is taken off.
     pub(crate) smoothing_bins: Option<f32>,
+    /// Whether those of sizes were spread as widely.
+    pub(crate) smoothed_sizes: bool,
     /// What decides its fields, instead of its stream.
     pub(crate) numbers: Option<[f64; STATE_STEPS]>,
 }
@@ -67,6 +69,7 @@ impl Default for Manner {
             size_boldness: 1.0,
             place_boldness: 1.0,
             smoothing_bins: None,
+            smoothed_sizes: true,
             numbers: None,
         }
     }
@@ -123,8 +126,12 @@ impl Guide for Rules {
 
     fn smoothing(&self, step: usize) -> Option<f32> {
         // Bins of places and headings are so narrow that it does not show.
-        let is_coarse =
-            step < STATE_STEPS && !matches!(STEPS[step], Field::X | Field::Y | Field::Heading);
+        let is_coarse = match STEPS[step] {
+            _ if step >= STATE_STEPS => false,
+            Field::Width | Field::Length => self.manner.smoothed_sizes,
+            Field::VelocityX | Field::VelocityY => true,
+            Field::X | Field::Y | Field::Heading => false,
+        };
         self.manner.smoothing_bins.filter(|_| is_coarse)
     }
 

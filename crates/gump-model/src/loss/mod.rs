@@ -24,6 +24,9 @@ use crate::network::Network;
 use crate::ops::{self, OrdinalSmoothing, Targets};
 use crate::sample::{ControlTarget, Sample};
 
+/// Steps of the decoder that say a size.
+const SIZES: usize = 2;
+
 /// Weights of the parts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -47,6 +50,9 @@ pub struct LossConfig {
     /// Width of the label smoothing over neighbouring bins, as a standard deviation in bins; 0 is
     /// none (paper).
     pub smoothing_bins: f64,
+    /// True leaves out of the smoothing what must be exact: sizes, and objects that stand (below
+    /// 0.3 m/s). A smoothed target gives a parked car a chance to pull out at every step.
+    pub exact_standing: bool,
     /// Most agents per sample that a trajectory head is asked about (released code: 512 per batch).
     pub max_trajectories: usize,
 }
@@ -62,6 +68,7 @@ impl Default for LossConfig {
             reconstruction: 1.0,
             unknown: 1.0,
             smoothing_bins: 0.0,
+            exact_standing: false,
             max_trajectories: 128,
         }
     }
@@ -324,6 +331,10 @@ fn state_loss(
                 sigma_bins: config.smoothing_bins as f32,
                 circular: field.is_circular(),
             }),
+            exact: match config.exact_standing {
+                true => targets.iter().map(|t| step < SIZES || t.stands).collect(),
+                false => Vec::new(),
+            },
         };
         (StateDecoder::rows_of(field), asked)
     });

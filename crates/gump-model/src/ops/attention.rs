@@ -11,7 +11,9 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp3, D, DType, Layout, Result, Shape, Tensor, bail,
 };
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{
     dot, exp, exp_shifted_sum, for_pieces, for_pieces2, for_pieces3, max, rows_per_task,
 };
@@ -255,6 +257,7 @@ const TASK_PRODUCTS: usize = 64 * 1024;
 
 struct Attention {
     view: View,
+    operands: Operands,
     /// Logarithm of the softmax sum of each row, `[B, H, Tq]`, kept for the gradient.
     log_sums: OnceLock<Vec<f32>>,
 }
@@ -263,6 +266,7 @@ impl Attention {
     fn new(view: View) -> Self {
         Self {
             view,
+            operands: Operands::current(),
             log_sums: OnceLock::new(),
         }
     }
@@ -460,6 +464,11 @@ impl Attention {
         let (b, column) = (head / view.n_heads, head % view.n_heads * d);
         let keys = b * view.tk * of_keys + column;
         let block = view.block();
+        let tk = view.visible(b, view.tq.saturating_sub(1));
+        let turned = Mat::strided(&k[keys..], tk, d, of_keys).t();
+        let turned = Right::new(turned, self.operands);
+        let values = Mat::strided(&v[keys..], tk, d, of_keys);
+        let values = Right::new(values, self.operands);
         for start in (0..view.tq).step_by(block) {
             let rows = block.min(view.tq - start);
             let n = view.visible(b, start + rows - 1);
@@ -469,12 +478,11 @@ impl Attention {
             scores.resize(block * view.tk, 0.0);
             let scores = &mut scores[..rows * n];
             let queries = (b * view.tq + start) * of_queries + column;
-            gemm(
+            turned.product(
                 MatMut::new(scores, rows, n),
                 Store::Replace,
                 view.scale(),
                 Mat::strided(&q[queries..], rows, d, of_queries),
-                Mat::strided(&k[keys..], n, d, of_keys).t(),
                 Threads::One,
             );
             let mut reciprocals = [0.0; 64];
@@ -494,12 +502,11 @@ impl Attention {
                 },
             );
             let out = &mut out[start * d..(start + rows) * d];
-            gemm(
+            values.product(
                 MatMut::new(out, rows, d),
                 Store::Replace,
                 1.0,
                 Mat::new(scores, rows, n),
-                Mat::strided(&v[keys..], n, d, of_keys),
                 Threads::One,
             );
             for (row, reciprocal) in out.chunks_exact_mut(d).zip(reciprocals) {
@@ -527,6 +534,11 @@ impl Attention {
         let keys = b * view.tk * of_keys + column;
         let log_sums = &inputs.log_sums[head * view.tq..];
         let block = view.block();
+        let (one, by) = (Threads::One, self.operands);
+        let tk = view.visible(b, view.tq.saturating_sub(1));
+        let k = Mat::strided(&inputs.k[keys..], tk, d, of_keys);
+        let v = Mat::strided(&inputs.v[keys..], tk, d, of_keys);
+        let [k_turned, v_turned, k] = [k.t(), v.t(), k].map(|right| Right::new(right, by));
         for start in (0..view.tq).step_by(block) {
             let rows = block.min(view.tq - start);
             let n = view.visible(b, start + rows - 1);
@@ -540,27 +552,12 @@ impl Attention {
             let results = (b * view.tq + start) * c + column;
             let q = Mat::strided(&inputs.q[queries..], rows, d, of_queries);
             let d_out = Mat::strided(&inputs.d_out[results..], rows, d, c);
-            let k = Mat::strided(&inputs.k[keys..], n, d, of_keys);
-            let v = Mat::strided(&inputs.v[keys..], n, d, of_keys);
             let scale = view.scale();
-            let one = Threads::One;
             // Scores, and the gradient that reaches the probabilities.
-            gemm(
-                MatMut::new(p, rows, n),
-                Store::Replace,
-                scale,
-                q,
-                k.t(),
-                one,
-            );
-            gemm(
-                MatMut::new(ds, rows, n),
-                Store::Replace,
-                1.0,
-                d_out,
-                v.t(),
-                one,
-            );
+            let scores = MatMut::new(p, rows, n);
+            k_turned.product(scores, Store::Replace, scale, q, one);
+            let slopes = MatMut::new(ds, rows, n);
+            v_turned.product(slopes, Store::Replace, 1.0, d_out, one);
             wide(
                 #[inline(always)]
                 || {
@@ -581,9 +578,17 @@ impl Attention {
             );
             let (p, ds) = (Mat::new(p, rows, n), Mat::new(ds, rows, n));
             let dq = MatMut::new(&mut dq[start * d..], rows, d);
-            gemm(dq, Store::Replace, scale, ds, k, one);
-            gemm(MatMut::new(dk, n, d), Store::Add, scale, ds.t(), q, one);
-            gemm(MatMut::new(dv, n, d), Store::Add, 1.0, p.t(), d_out, one);
+            k.product(dq, Store::Replace, scale, ds, one);
+            gemm(MatMut::new(dk, n, d), Store::Add, scale, ds.t(), q, one, by);
+            gemm(
+                MatMut::new(dv, n, d),
+                Store::Add,
+                1.0,
+                p.t(),
+                d_out,
+                one,
+                by,
+            );
         }
     }
 }

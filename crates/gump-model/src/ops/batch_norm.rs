@@ -5,7 +5,7 @@
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::wide;
+use super::kernels::wide;
 use super::rows::{dot_from, for_pieces, sum, sum_squares_from};
 use super::{Host, elements, fusible, gradient, output};
 

@@ -7,7 +7,9 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{add_partials, add_to, for_pieces, for_pieces2, sum};
 use super::{Host, elements, fusible, gradient, output};
 
@@ -68,6 +70,7 @@ struct Conv {
     padding: usize,
     out_h: usize,
     out_w: usize,
+    operands: Operands,
 }
 
 impl Conv {
@@ -107,6 +110,7 @@ impl Conv {
             padding,
             out_h: (h + 2 * padding - kh) / stride + 1,
             out_w: (w + 2 * padding - kw) / stride + 1,
+            operands: Operands::current(),
         })
     }
 
@@ -174,6 +178,9 @@ impl Conv {
     /// Lays out the patches under output rows `first..first + count` as columns.
     fn gather(&self, x: &[f32], (first, count): (usize, usize), cols: &mut [f32]) {
         let n = count * self.out_w;
+        if (self.kw, self.stride, self.padding) == (4, 4, 0) {
+            return self.gather_fours(x, first, n, cols);
+        }
         let rows_per_piece = match self.threads() {
             Threads::Pool => (16 * 1024usize).div_ceil(n),
             Threads::One => self.patch(),
@@ -206,6 +213,44 @@ impl Conv {
                 }
             }
         });
+    }
+
+    /// [`Self::gather`] of patches that stand side by side and are four wide: a line of pixels is
+    /// dealt out to four rows at once.
+    fn gather_fours(&self, x: &[f32], first: usize, n: usize, cols: &mut [f32]) {
+        let piece = match self.threads() {
+            Threads::Pool => 4 * n,
+            Threads::One => cols.len(),
+        };
+        for_pieces(cols, piece, |at, cols| {
+            for (i, rows) in cols.chunks_exact_mut(4 * n).enumerate() {
+                self.deal_fours(x, (at * piece / (4 * n) + i, first), rows);
+            }
+        });
+    }
+
+    /// The four rows of one channel and kernel row.
+    fn deal_fours(&self, x: &[f32], (i, first): (usize, usize), rows: &mut [f32]) {
+        let n = rows.len() / 4;
+        let (ci, ky) = (i / self.kh, i % self.kh);
+        let (low, high) = rows.split_at_mut(2 * n);
+        let ((a, b), (c, d)) = (low.split_at_mut(n), high.split_at_mut(n));
+        for j in 0..n / self.out_w {
+            let y = (first + j) * self.stride + ky;
+            let line = &x[(ci * self.h + y) * self.w..][..4 * self.out_w];
+            let out = j * self.out_w..(j + 1) * self.out_w;
+            let (a, b) = (&mut a[out.clone()], &mut b[out.clone()]);
+            let (c, d) = (&mut c[out.clone()], &mut d[out]);
+            wide(
+                #[inline(always)]
+                || {
+                    let outs = a.iter_mut().zip(b).zip(c.iter_mut().zip(d));
+                    for (((a, b), (c, d)), four) in outs.zip(line.as_chunks::<4>().0) {
+                        [*a, *b, *c, *d] = *four;
+                    }
+                },
+            );
+        }
     }
 
     /// Adds columns back to the pixels they came from: the gradient of [`Self::gather`].
@@ -278,6 +323,7 @@ impl Conv {
                     Mat::new(weight, self.c_out, self.patch()),
                     self.columns(x, band, &mut cols),
                     self.threads(),
+                    self.operands,
                 );
             }
         });
@@ -321,6 +367,7 @@ impl Conv {
                             dy,
                             self.columns(x, band, &mut cols).t(),
                             self.threads(),
+                            self.operands,
                         );
                         if wants_dx {
                             self.backward_image(w, dy, band, &mut cols, dx);
@@ -353,11 +400,27 @@ impl Conv {
         if self.is_pointwise() {
             let dx = &mut dx[band.0 * self.out_w..];
             let dst = MatMut::strided(dx, self.c_in, n, self.positions());
-            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads());
+            gemm(
+                dst,
+                Store::Replace,
+                1.0,
+                weight,
+                dy,
+                self.threads(),
+                self.operands,
+            );
         } else {
             cols.resize(self.patch() * n, 0.0);
             let dst = MatMut::new(cols, self.patch(), n);
-            gemm(dst, Store::Replace, 1.0, weight, dy, self.threads());
+            gemm(
+                dst,
+                Store::Replace,
+                1.0,
+                weight,
+                dy,
+                self.threads(),
+                self.operands,
+            );
             self.scatter(cols, band, dx);
         }
     }

@@ -5,7 +5,7 @@
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
 
-use super::gemm::wide;
+use super::kernels::wide;
 use super::rows::{exp, for_pieces};
 use super::{Host, elements, fusible, gradient, output};
 

@@ -4,10 +4,14 @@
 //! the product over the inputs of all steps, which is one `linear`, and the stacking of layers,
 //! which is the network's.
 
+use std::sync::OnceLock;
+
 use candle_core::{CpuStorage, CustomOp3, D, Layout, Result, Shape, Tensor, bail};
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
-use super::rows::{column_sums, exp, for_pieces, for_pieces3, rows_per_task};
+use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
+use super::rows::{column_sums, exp, for_pieces2, for_pieces3, rows_per_task};
 use super::{Host, elements, fusible, gradient, output};
 
 /// All hidden states of a gated recurrent unit, as in PyTorch; at each step, with
@@ -42,7 +46,7 @@ pub fn gru(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Resu
     let affine = Tensor::cat(&[weight, &bias.unsqueeze(1)?], 1)?; // [3C, C + 1]
     x_gates
         .contiguous()?
-        .apply_op3(&h.contiguous()?, &affine, Gru)
+        .apply_op3(&h.contiguous()?, &affine, Gru::now())
 }
 
 fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
@@ -62,7 +66,20 @@ fn composed(x_gates: &Tensor, h: &Tensor, weight: &Tensor, bias: &Tensor) -> Res
     Tensor::stack(&states, 0)
 }
 
-struct Gru;
+struct Gru {
+    operands: Operands,
+    /// Per step and row what [`kept_row`] keeps, for the gradient.
+    kept: OnceLock<Vec<f32>>,
+}
+
+impl Gru {
+    fn now() -> Self {
+        Self {
+            operands: Operands::current(),
+            kept: OnceLock::new(),
+        }
+    }
+}
 
 /// Sizes of a sequence: steps, rows, channels.
 type Sizes = (usize, usize, usize);
@@ -74,13 +91,13 @@ fn halves(affine: &[f32], c: usize) -> (Mat<'_>, Vec<f32>) {
 }
 
 /// `out = h weight^T + bias`, `[N, 3C]`.
-fn hidden_gates(out: &mut [f32], h: &[f32], (weight, bias): (Mat<'_>, &[f32]), c: usize) {
+fn hidden_gates(out: &mut [f32], h: &[f32], (turned, bias): (&Right<'_>, &[f32]), c: usize) {
     for row in out.chunks_exact_mut(3 * c) {
         row.copy_from_slice(bias);
     }
     let n = h.len() / c;
     let (dst, h) = (MatMut::new(out, n, 3 * c), Mat::new(h, n, c));
-    gemm(dst, Store::Add, 1.0, h, weight.t(), Threads::Pool);
+    turned.product(dst, Store::Add, 1.0, h, Threads::Pool);
 }
 
 impl CustomOp3 for Gru {
@@ -101,8 +118,10 @@ impl CustomOp3 for Gru {
         let (n, c) = h_layout.shape().dims2()?;
         let steps = x_layout.dims()[0];
         let (weight, bias) = halves(elements(affine, affine_layout)?, c);
+        let turned = Right::new(weight.t(), self.operands);
         let mut states = vec![0.0; steps * n * c];
         let mut g = vec![0.0; n * 3 * c];
+        let mut kept = vec![0.0; steps * n * 4 * c];
         let piece = rows_per_task(4 * c);
         for step in 0..steps {
             let (before, states) = states.split_at_mut(step * n * c);
@@ -111,22 +130,29 @@ impl CustomOp3 for Gru {
             } else {
                 &before[(step - 1) * n * c..]
             };
-            hidden_gates(&mut g, h, (weight, &bias), c);
+            hidden_gates(&mut g, h, (&turned, &bias), c);
             let (x, g) = (&x[step * n * 3 * c..], &g);
-            for_pieces(&mut states[..n * c], piece * c, |i, out| {
-                let at = i * piece * c..i * piece * c + out.len();
-                out.copy_from_slice(&h[at]);
-                wide(
-                    #[inline(always)]
-                    || {
-                        for (row, h) in out.chunks_exact_mut(c).enumerate() {
-                            let row = i * piece + row;
-                            gru_row(&x[row * 3 * c..], &g[row * 3 * c..], h);
-                        }
-                    },
-                );
-            });
+            let of_step = step * n * 4 * c..(step + 1) * n * 4 * c;
+            for_pieces2(
+                (&mut states[..n * c], piece * c),
+                (&mut kept[of_step], piece * 4 * c),
+                |i, out, kept| {
+                    let at = i * piece * c..i * piece * c + out.len();
+                    out.copy_from_slice(&h[at]);
+                    wide(
+                        #[inline(always)]
+                        || {
+                            let rows = out.chunks_exact_mut(c).zip(kept.chunks_exact_mut(4 * c));
+                            for (row, (h, kept)) in rows.enumerate() {
+                                let row = i * piece + row;
+                                kept_row(gates(x, row, c), gates(g, row, c), h, kept);
+                            }
+                        },
+                    );
+                },
+            );
         }
+        let _ = self.kept.set(kept);
         Ok(output(states, (steps, n, c)))
     }
 
@@ -141,16 +167,15 @@ impl CustomOp3 for Gru {
         let d_states = d_states.contiguous()?;
         let sizes = states.dims3()?;
         let hosts = [
-            Host::new(x)?,
             Host::new(h)?,
             Host::new(affine)?,
             Host::new(states)?,
             Host::new(&d_states)?,
         ];
-        let [x_all, first, weights, states, d_states] = &hosts;
+        let [first, weights, states, d_states] = &hosts;
         let (dx, dh, d_affine) = backward(
-            sizes,
-            x_all.slice()?,
+            (sizes, self.operands),
+            self.kept.get().expect("forward ran before backward"),
             first.slice()?,
             weights.slice()?,
             states.slice()?,
@@ -166,18 +191,18 @@ impl CustomOp3 for Gru {
 
 /// Gradients of the gates, of the first state and of the matrix with its bias.
 fn backward(
-    (steps, n, c): Sizes,
-    x: &[f32],
+    ((steps, n, c), operands): (Sizes, Operands),
+    kept: &[f32],
     first: &[f32],
     affine: &[f32],
     states: &[f32],
     d_states: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-    let (weight, bias) = halves(affine, c);
+    let (weight, _) = halves(affine, c);
+    let straight = Right::new(weight, operands);
     let mut dx = vec![0.0; steps * n * 3 * c];
     let mut dg = vec![0.0; steps * n * 3 * c];
     let mut dh = vec![0.0; n * c];
-    let mut g = vec![0.0; n * 3 * c];
     let piece = rows_per_task(8 * c);
     for step in (0..steps).rev() {
         let before = if step == 0 {
@@ -185,8 +210,8 @@ fn backward(
         } else {
             &states[(step - 1) * n * c..step * n * c]
         };
-        hidden_gates(&mut g, before, (weight, &bias), c);
-        let (x, d_states) = (&x[step * n * 3 * c..], &d_states[step * n * c..]);
+        let d_states = &d_states[step * n * c..];
+        let kept = &kept[step * n * 4 * c..(step + 1) * n * 4 * c];
         let of_step = step * n * 3 * c..(step + 1) * n * 3 * c;
         for_pieces3(
             (&mut dx[of_step.clone()], piece * 3 * c),
@@ -202,11 +227,11 @@ fn backward(
                             .zip(dh.chunks_exact_mut(c));
                         for (row, ((dx, dg), dh)) in rows.enumerate() {
                             let row = i * piece + row;
-                            for (dh, d) in dh.iter_mut().zip(&d_states[row * c..]) {
+                            for (dh, d) in dh.iter_mut().zip(&d_states[row * c..(row + 1) * c]) {
                                 *dh += d;
                             }
-                            let (x, g) = (gates(x, row, c), gates(&g, row, c));
-                            backward_row(x, g, &before[row * c..(row + 1) * c], dx, dg, dh);
+                            let kept = &kept[row * 4 * c..(row + 1) * 4 * c];
+                            backward_row(kept, &before[row * c..(row + 1) * c], dx, dg, dh);
                         }
                     },
                 );
@@ -215,7 +240,7 @@ fn backward(
         // What reaches the state before through the gates.
         let dg = Mat::new(&dg[of_step], n, 3 * c);
         let dst = MatMut::new(&mut dh, n, c);
-        gemm(dst, Store::Add, 1.0, dg, weight, Threads::Pool);
+        straight.product(dst, Store::Add, 1.0, dg, Threads::Pool);
     }
     let mut d_affine = vec![0.0; 3 * c * (c + 1)];
     let sums = column_sums(&dg, 3 * c);
@@ -227,7 +252,15 @@ fn backward(
         let rows = dg.len() / (3 * c);
         let dst = MatMut::strided(&mut d_affine, 3 * c, c, c + 1);
         let (dg, before) = (Mat::new(dg, rows, 3 * c), Mat::new(before, rows, c));
-        gemm(dst, Store::Add, 1.0, dg.t(), before, Threads::Pool);
+        gemm(
+            dst,
+            Store::Add,
+            1.0,
+            dg.t(),
+            before,
+            Threads::Pool,
+            operands,
+        );
     }
     (dx, dh, d_affine)
 }
@@ -238,9 +271,46 @@ pub(crate) fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
     let c = h.len();
     let (x, g) = (gates(x_gates, 0, c), gates(h_gates, 0, c));
     for (j, h) in h.iter_mut().enumerate() {
-        let [_, z, n] = cell(x, g, j);
-        *h = (1.0 - z) * n + z * *h;
+        let r = sigmoid(x[0][j] + g[0][j]);
+        let z = sigmoid(x[1][j] + g[1][j]);
+        *h = next(z, candidate(x[2][j], r, g[2][j]), *h);
     }
+}
+
+/// As [`gru_row`], which also keeps what the gradient asks for: `[4C]`, both sigmoids, the candidate
+/// and the candidate's hidden gate. One loop per gate, each over slices of one length, so that all
+/// are compiled to vectors.
+#[inline(always)]
+fn kept_row(x: [&[f32]; 3], g: [&[f32]; 3], h: &mut [f32], kept: &mut [f32]) {
+    let [r, z, n, gate] = quarters_mut(kept);
+    for ((r, x), g) in r.iter_mut().zip(x[0]).zip(g[0]) {
+        *r = sigmoid(x + g);
+    }
+    for ((z, x), g) in z.iter_mut().zip(x[1]).zip(g[1]) {
+        *z = sigmoid(x + g);
+    }
+    gate.copy_from_slice(g[2]);
+    for (((n, x), g), r) in n.iter_mut().zip(x[2]).zip(&*gate).zip(&*r) {
+        *n = candidate(*x, *r, *g);
+    }
+    for ((h, z), n) in h.iter_mut().zip(&*z).zip(&*n) {
+        *h = next(*z, *n, *h);
+    }
+}
+
+#[inline(always)]
+fn quarters_mut(row: &mut [f32]) -> [&mut [f32]; 4] {
+    let (low, high) = row.split_at_mut(row.len() / 2);
+    let (a, b) = low.split_at_mut(low.len() / 2);
+    let (c, d) = high.split_at_mut(high.len() / 2);
+    [a, b, c, d]
+}
+
+#[inline(always)]
+fn thirds_mut(row: &mut [f32]) -> [&mut [f32]; 3] {
+    let (a, rest) = row.split_at_mut(row.len() / 3);
+    let (b, c) = rest.split_at_mut(rest.len() / 2);
+    [a, b, c]
 }
 
 /// The three gate rows of row `row`.
@@ -250,13 +320,14 @@ fn gates(all: &[f32], row: usize, c: usize) -> [&[f32]; 3] {
     [&row[..c], &row[c..2 * c], &row[2 * c..]]
 }
 
-/// Reset, update and candidate at channel `j`.
 #[inline(always)]
-fn cell(x: [&[f32]; 3], g: [&[f32]; 3], j: usize) -> [f32; 3] {
-    let r = sigmoid(x[0][j] + g[0][j]);
-    let z = sigmoid(x[1][j] + g[1][j]);
-    let n = 2.0 * sigmoid(2.0 * (x[2][j] + r * g[2][j])) - 1.0;
-    [r, z, n]
+fn candidate(x: f32, r: f32, g: f32) -> f32 {
+    2.0 * sigmoid(2.0 * (x + r * g)) - 1.0
+}
+
+#[inline(always)]
+fn next(z: f32, n: f32, h: f32) -> f32 {
+    (1.0 - z) * n + z * h
 }
 
 #[inline(always)]
@@ -265,35 +336,29 @@ fn sigmoid(x: f32) -> f32 {
 }
 
 /// `dh` comes as the gradient of the state after the step and leaves as what reaches the state
-/// before directly.
+/// before directly; `kept` is as [`kept_row`] left it.
 #[inline(always)]
-fn backward_row(
-    x: [&[f32]; 3],
-    g: [&[f32]; 3],
-    h: &[f32],
-    dx: &mut [f32],
-    dg: &mut [f32],
-    dh: &mut [f32],
-) {
+fn backward_row(kept: &[f32], h: &[f32], dx: &mut [f32], dg: &mut [f32], dh: &mut [f32]) {
     let c = h.len();
-    let (dx_r, dx) = dx.split_at_mut(c);
-    let (dx_z, dx_n) = dx.split_at_mut(c);
-    let (dg_r, dg) = dg.split_at_mut(c);
-    let (dg_z, dg_n) = dg.split_at_mut(c);
-    let (dx_n, dg_n, dh) = (&mut dx_n[..c], &mut dg_n[..c], &mut dh[..c]);
-    for j in 0..c {
-        let [r, z, n] = cell(x, g, j);
-        let d = dh[j];
-        let d_candidate = d * (1.0 - z) * (1.0 - n * n);
-        let d_update = d * (h[j] - n) * z * (1.0 - z);
-        let d_reset = d_candidate * g[2][j] * r * (1.0 - r);
-        dx_r[j] = d_reset;
-        dx_z[j] = d_update;
-        dx_n[j] = d_candidate;
-        dg_r[j] = d_reset;
-        dg_z[j] = d_update;
-        dg_n[j] = d_candidate * r;
-        dh[j] = d * z;
+    let [r, z, n, g] = [0, 1, 2, 3].map(|i| &kept[i * c..(i + 1) * c]);
+    let [dx_r, dx_z, dx_n] = thirds_mut(dx);
+    let [dg_r, dg_z, dg_n] = thirds_mut(dg);
+    for (((dx, d), z), n) in dx_n.iter_mut().zip(&*dh).zip(z).zip(n) {
+        *dx = d * (1.0 - z) * (1.0 - n * n);
+    }
+    for ((((dx, d), z), n), h) in dx_z.iter_mut().zip(&*dh).zip(z).zip(n).zip(h) {
+        *dx = d * (h - n) * z * (1.0 - z);
+    }
+    for (((dx, d), g), r) in dx_r.iter_mut().zip(&*dx_n).zip(g).zip(r) {
+        *dx = d * g * r * (1.0 - r);
+    }
+    for ((dg, d), r) in dg_n.iter_mut().zip(&*dx_n).zip(r) {
+        *dg = d * r;
+    }
+    dg_r.copy_from_slice(dx_r);
+    dg_z.copy_from_slice(dx_z);
+    for (dh, z) in dh.iter_mut().zip(z) {
+        *dh *= z;
     }
 }
 

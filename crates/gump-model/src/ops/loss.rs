@@ -11,7 +11,9 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, D, DType, Device, Layout, Result, Shape, Tensor, bail,
 };
 
-use super::gemm::{Mat, MatMut, Store, Threads, gemm, wide};
+use super::gemm::{Mat, MatMut, Right, Store, Threads, gemm};
+use super::kernels::wide;
+use super::operands::Operands;
 use super::rows::{exp, for_pieces, for_pieces2, max, rows_per_task, sum_exp_shifted};
 use super::{Host, elements, fusible, gradient, linear, output};
 
@@ -92,6 +94,7 @@ pub fn masked_cross_entropy(
         bins: targets.to_device(&Device::Cpu)?.to_vec1::<u32>()?,
         weights: weights.to_vec1::<f32>()?,
         smoothing,
+        exact: Vec::new(),
     };
     asked.check(n, v)?;
     let op = CrossEntropy {
@@ -111,6 +114,8 @@ pub struct Targets {
     pub weights: Vec<f32>,
     /// How each class is spread over its neighbours, if it is.
     pub smoothing: Option<OrdinalSmoothing>,
+    /// Rows whose class is not spread all the same; none if it is empty.
+    pub exact: Vec<bool>,
 }
 
 impl Targets {
@@ -119,6 +124,12 @@ impl Targets {
         if self.bins.len() != n || self.weights.len() != n {
             let (bins, weights) = (self.bins.len(), self.weights.len());
             bail!("cross entropy of {n} rows: {bins} targets, {weights} weights");
+        }
+        if !self.exact.is_empty() && self.exact.len() != n {
+            bail!(
+                "cross entropy of {n} rows: {} marks of exact ones",
+                self.exact.len()
+            );
         }
         let is_wrong = |s: OrdinalSmoothing| !(s.sigma_bins > 0.0 && s.sigma_bins.is_finite());
         if self.smoothing.is_some_and(is_wrong) {
@@ -138,9 +149,13 @@ impl Targets {
         1.0 / total.max(1e-9)
     }
 
+    fn is_exact(&self, row: usize) -> bool {
+        self.exact.get(row).copied().unwrap_or(false)
+    }
+
     fn spread(&self, row: usize, v: usize, bins: &mut Vec<(usize, f32)>) {
         let target = self.bins[row] as usize;
-        match self.smoothing {
+        match self.smoothing.filter(|_| !self.is_exact(row)) {
             Some(s) => s.spread(target, v, bins),
             None => {
                 bins.clear();
@@ -315,6 +330,7 @@ pub fn linear_cross_entropy(
     let op = LinearCrossEntropy {
         asked,
         learns: x.track_op() || weight.track_op(),
+        operands: Operands::current(),
         slopes: OnceLock::new(),
     };
     x.contiguous()?.apply_op2(&weight.contiguous()?, op)
@@ -327,23 +343,45 @@ fn composed_steps(
 ) -> Result<Tensor> {
     let step = |(step, (rows, asked)): (usize, &(Range<usize>, Targets))| {
         let rows = weight.narrow(0, rows.start, rows.len())?;
+        let logits = linear(&x.get(step)?, &rows, None)?;
         let bins = Tensor::from_slice(&asked.bins, asked.bins.len(), x.device())?;
-        let weights = Tensor::from_slice(&asked.weights, asked.weights.len(), x.device())?;
-        masked_cross_entropy(
-            &linear(&x.get(step)?, &rows, None)?,
-            &bins,
-            &weights,
-            asked.smoothing,
-        )
+        // The mean over all rows from those of the exact ones and of the others.
+        let part = |exact: bool, smoothing| {
+            let of_part = |row: usize| asked.is_exact(row) == exact;
+            let kept = asked.weights.iter().enumerate();
+            let weights: Vec<f32> = kept
+                .map(|(i, w)| if of_part(i) { *w } else { 0.0 })
+                .collect();
+            let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+            let weights = Tensor::new(weights, x.device())?;
+            masked_cross_entropy(&logits, &bins, &weights, smoothing)? * (sum * asked.scale())
+        };
+        part(false, asked.smoothing)? + part(true, None)?
     };
     let losses = asked.iter().enumerate().map(step);
     Tensor::stack(&losses.collect::<Result<Vec<_>>>()?, 0)
+}
+
+/// The right matrix of some rows, which several steps share; `mat` if none had them yet.
+fn packed_once<'a, 'b>(
+    packed: &'b mut Vec<(Range<usize>, Right<'a>)>,
+    rows: &Range<usize>,
+    mat: Mat<'a>,
+    operands: Operands,
+) -> &'b Right<'a> {
+    let known = packed.iter().position(|(known, _)| known == rows);
+    let at = known.unwrap_or(packed.len());
+    if known.is_none() {
+        packed.push((rows.clone(), Right::new(mat, operands)));
+    }
+    &packed[at].1
 }
 
 struct LinearCrossEntropy {
     asked: Vec<(Range<usize>, Targets)>,
     /// Whether anything asks for gradients.
     learns: bool,
+    operands: Operands,
     /// Gradients of the logits per step, `[N, V]`, as they are where the loss itself is asked for.
     slopes: OnceLock<Vec<Vec<f32>>>,
 }
@@ -364,16 +402,16 @@ impl CustomOp2 for LinearCrossEntropy {
         let (_, n, c) = x_layout.shape().dims3()?;
         let mut means = Vec::new();
         let mut slopes = Vec::new();
+        let mut packed = Vec::new();
         for (step, (rows, asked)) in self.asked.iter().enumerate() {
             let v = rows.len();
             let mut logits = vec![0.0; n * v];
-            let weight = Mat::new(&weight[rows.start * c..rows.end * c], v, c);
-            gemm(
+            let turned = Mat::new(&weight[rows.start * c..rows.end * c], v, c).t();
+            packed_once(&mut packed, rows, turned, self.operands).product(
                 MatMut::new(&mut logits, n, v),
                 Store::Replace,
                 1.0,
                 Mat::new(&x[step * n * c..(step + 1) * n * c], n, c),
-                weight.t(),
                 Threads::Pool,
             );
             let scale = asked.scale();
@@ -424,16 +462,17 @@ impl CustomOp2 for LinearCrossEntropy {
         let slopes = self.slopes.get().expect("forward ran before backward");
         let mut dx = vec![0.0; x_all.len()];
         let mut dw = vec![0.0; w.len()];
+        let mut packed = Vec::new();
         for (step, ((rows, _), slope)) in self.asked.iter().zip(slopes).enumerate() {
             let v = rows.len();
             let (at, of_rows) = (step * n * c, rows.start * c..rows.end * c);
             let slope = Mat::new(slope, n, v);
-            gemm(
+            let straight = Mat::new(&w[of_rows.clone()], v, c);
+            packed_once(&mut packed, rows, straight, self.operands).product(
                 MatMut::new(&mut dx[at..at + n * c], n, c),
                 Store::Replace,
                 grad[step],
                 slope,
-                Mat::new(&w[of_rows.clone()], v, c),
                 Threads::Pool,
             );
             gemm(
@@ -443,6 +482,7 @@ impl CustomOp2 for LinearCrossEntropy {
                 slope.t(),
                 Mat::new(&x_all[at..at + n * c], n, c),
                 Threads::Pool,
+                self.operands,
             );
         }
         Ok((Some(gradient(dx, x)?), Some(gradient(dw, weight)?)))
@@ -498,6 +538,8 @@ mod tests {
                 bins: bins.to_vec1().unwrap(),
                 weights: weights.to_vec1().unwrap(),
                 smoothing,
+                // Every third is exact.
+                exact: (0..33).map(|row| row % 3 == 0).collect(),
             };
             (of, asked)
         };

@@ -5,45 +5,65 @@
 //! over rayon. On other devices and for other types every function falls back to candle's own
 //! operations with the same result. What does not: layers with parameters, the network itself.
 //!
-//! One file per family; start with `norm` (the simplest), then `attention`. `rows` and `gemm`
-//! hold the arithmetic, and `gemm` holds all the `unsafe`.
+//! One file per family; start with `norm` (the simplest), then `attention`. `rows`, `gemm` and
+//! `kernels` hold the arithmetic, and the last two all the `unsafe`. `operands` says in which form
+//! numbers are multiplied.
 //!
 //! Results on a CPU are bit-identical for any number of threads: work is cut by shape, and sums
 //! are added in a fixed order. Gradients cannot be differentiated again.
 
+mod absolute;
 mod attention;
 mod batch_norm;
 mod conv;
+mod deferred;
+mod edge_attention;
 mod gelu;
 mod gemm;
 mod gru;
+mod kernels;
 mod linear;
 mod loss;
 mod norm;
+mod operands;
 pub(crate) mod panels;
 mod rows;
+mod table;
 
+pub use absolute::mean_absolute_difference;
 pub use attention::{
     causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
 };
 pub use batch_norm::batch_norm;
 pub use conv::conv2d;
+pub use edge_attention::{Edges, edge_attention};
 pub use gelu::gelu;
 pub use gemm::square_product;
 pub use gru::gru;
+pub use kernels::{Choice, Kernel};
 pub use linear::{linear, reduced_linear};
 pub use loss::{OrdinalSmoothing, Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
+pub use table::{embedding_sum, table_rows};
 
+pub(crate) use deferred::Deferred;
+pub(crate) use edge_attention::{Heads, attend};
 pub(crate) use gelu::gelu_row;
-pub(crate) use gemm::{tile, wide};
 pub(crate) use gru::gru_row;
+pub(crate) use kernels::{tile, wide};
 pub(crate) use norm::normalize_row;
+pub(crate) use operands::Operands;
 pub(crate) use rows::{count_from, exp_shifted_sum, max};
 
 use candle_core::{
     CpuStorage, DType, Layout, Result, Shape, Storage, StorageRef, Tensor, WithDType, bail,
 };
+
+/// Runs `f`; what it builds of these operations multiplies numbers rounded to bfloat16, forward and
+/// backward, on a CPU. Sums stay f32.
+pub fn in_bfloat16<R>(f: impl FnOnce() -> R) -> R {
+    Operands::Bf16.during(f)
+}
 
 /// Whether the fused path takes these tensors: f32 on a CPU, all of them.
 fn fusible(tensors: &[&Tensor]) -> bool {
@@ -84,6 +104,16 @@ impl<'a> Host<'a> {
             _ => bail!("fused operations take CPU tensors"),
         }
     }
+}
+
+/// The sum of the squares of a tensor's elements.
+pub(crate) fn sum_of_squares(tensor: &Tensor) -> Result<f64> {
+    let tensor = tensor.contiguous()?;
+    if fusible(&[&tensor]) {
+        return Ok(rows::squares(Host::new(&tensor)?.slice()?));
+    }
+    let sum = tensor.sqr()?.sum_all()?.to_dtype(DType::F32)?;
+    Ok(f64::from(sum.to_scalar::<f32>()?))
 }
 
 /// Wraps computed elements as the output of a custom operation.

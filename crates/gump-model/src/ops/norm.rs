@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp3, D, Layout, Result, Shape, Tensor};
 
-use super::gemm::wide;
+use super::kernels::wide;
 use super::rows::{
     add_partials, dot, for_pieces2, for_pieces3, rows_per_partial, rows_per_task, sum,
     sum_squares_from,

@@ -10,7 +10,8 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::gemm::{byte_tile, tile, wide};
+use super::gemm::{Mat, MatMut, Store, Threads};
+use super::kernels::{BYTE_ROWS, Packed, byte_tile, byte_tiles, has_unit, tile, wide};
 
 /// Columns of a panel: two vectors of 512 bits.
 pub(crate) const PANEL: usize = 32;
@@ -28,7 +29,8 @@ pub enum Precision {
     /// 32 bits, as trained.
     #[default]
     F32,
-    /// Weights rounded to bfloat16, 16 bits; sums in f32.
+    /// Weights rounded to bfloat16, 16 bits; sums in f32. Where the processor has a unit for
+    /// bfloat16, the inputs of a product are rounded too, row by row as they come.
     Bf16,
     /// Weights in 8 bits with a scale per output; the inputs of a product are quantised to 8 bits
     /// row by row as they come; sums are exact integers.
@@ -63,6 +65,8 @@ enum Weights {
     F32(Vec<f32>),
     /// `[in, PANEL]` each, the upper halves of f32.
     Bf16(Vec<u16>),
+    /// As this processor's unit for bfloat16 takes them.
+    Pairs(Packed),
     /// `[in / 4, PANEL, 4]` each, `in` rounded up.
     Int8 {
         weights: Vec<i8>,
@@ -98,6 +102,9 @@ impl Panels {
         padded.resize(columns, 0.0);
         let weights = match precision {
             Precision::F32 => Weights::F32(interleave(weight, n_in, |w| w)),
+            Precision::Bf16 if has_unit() => {
+                Weights::Pairs(Packed::new(Mat::new(weight, n_out, n_in).t()))
+            }
             Precision::Bf16 => Weights::Bf16(interleave(weight, n_in, round_bf16)),
             Precision::Int8 => bytes(weight, n_in),
         };
@@ -107,6 +114,11 @@ impl Panels {
             weights,
             bias: padded,
         }
+    }
+
+    /// Columns of what is multiplied.
+    pub(crate) fn n_in(&self) -> usize {
+        self.n_in
     }
 
     /// Columns of the result.
@@ -119,6 +131,7 @@ impl Panels {
         match &self.weights {
             Weights::F32(w) => 4 * w.len(),
             Weights::Bf16(w) => 2 * w.len(),
+            Weights::Pairs(packed) => packed.bytes(),
             Weights::Int8 {
                 weights, scales, ..
             } => weights.len() + 8 * scales.len(),
@@ -153,6 +166,17 @@ impl Panels {
                     );
                     self.panel_product(x, p, &room.panel, y);
                 }
+            }
+            Weights::Pairs(packed) => {
+                let (rows, bias) = (x.len() / self.n_in, &self.bias[..self.n_out]);
+                for row in y.chunks_exact_mut(self.n_out) {
+                    row.copy_from_slice(bias);
+                }
+                let (x, y) = (
+                    Mat::new(x, rows, self.n_in),
+                    MatMut::new(y, rows, self.n_out),
+                );
+                packed.product(y, Store::Add, 1.0, x, Threads::One);
             }
             Weights::Int8 {
                 weights,
@@ -257,7 +281,17 @@ impl Panels {
                     },
                 );
             };
-            in_groups(rows, |group| match group {
+            let mut done = 0;
+            for sixteen in room.bytes.chunks_exact(BYTE_ROWS * depth) {
+                let Some(sums) = byte_tiles(sixteen, panel) else {
+                    break;
+                };
+                (done..).zip(&sums).for_each(|(r, sums)| store(r, sums));
+                done += BYTE_ROWS;
+            }
+            let row = |r: usize| row(done + r);
+            let mut store = |r: usize, sums: &[i32; PANEL]| store(done + r, sums);
+            in_groups(rows - done, |group| match group {
                 Group::Many(rows) => {
                     let sums = byte_tile::<ROWS>(rows.map(row), panel);
                     rows.into_iter()

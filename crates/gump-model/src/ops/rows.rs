@@ -9,7 +9,7 @@
 
 use rayon::prelude::*;
 
-use super::gemm::wide;
+use super::kernels::wide;
 
 /// Independent accumulators of a sum; two 512-bit vectors.
 const LANES: usize = 32;
@@ -179,6 +179,18 @@ pub(super) fn sum_squares_from(x: &[f32], centre: f32) -> f32 {
         *lane += d * d;
     }
     fold_lanes(&lanes)
+}
+
+/// Sum of the squares of many numbers, in f64 over pieces.
+pub(super) fn squares(x: &[f32]) -> f64 {
+    let piece = |x: &[f32]| {
+        let square = wide(
+            #[inline(always)]
+            || dot(x, x),
+        );
+        f64::from(square)
+    };
+    x.chunks(TASK_ELEMENTS).map(piece).sum()
 }
 
 /// Inner product of two rows of one length.

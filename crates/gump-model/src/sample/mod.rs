@@ -4,6 +4,7 @@
 //! tokenized, so that map and agents cannot fall out of register. Which frames are shown is said in
 //! `window`, what is asked in `targets`.
 
+mod hidden;
 mod targets;
 #[cfg(test)]
 mod tests;
@@ -13,7 +14,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use gump_raster::{Raster, RasterSpec, rasterize};
-use gump_scene::{Agent, AgentId, Frame, Rng, Scenario, ScenarioTag, SceneState, Seed};
+use gump_scene::{Agent, AgentId, Frame, MapGraph, Rng, Scenario, ScenarioTag, SceneState, Seed};
 use gump_tokenizer::{
     Field, Identities, MAX_PROMPTS, QuantizedState, Slot, TokenFrame, TokenSequence, Tokenizer,
     TokenizerConfig,
@@ -21,11 +22,13 @@ use gump_tokenizer::{
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
-use crate::batch::{PlacedSlot, place};
+use crate::batch::{PlacedSlot, place_exactly};
 use crate::drift;
+use crate::exact::ExactFrames;
 use crate::network::Network;
 use crate::surroundings::Survey;
 
+use self::hidden::Hidden;
 pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
 use self::targets::{class_targets, control_targets, light_targets, targets};
 pub(crate) use self::window::Driven;
@@ -37,6 +40,9 @@ pub(crate) const TOKEN_DT: f64 = 0.5;
 pub(crate) const HISTORY: usize = 3;
 /// Frames a rollout may be away from its frame of reference: 8 s.
 pub(crate) const LONGEST_ROLLOUT: usize = 16;
+
+/// Separates the stream of what is hidden from those of other choices.
+const HIDDEN: u64 = 1 << 32;
 
 /// How samples are drawn from scenarios.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -73,6 +79,14 @@ pub struct SampleConfig {
     pub shuffle_ids: bool,
     /// Probability of leaving out the prompts.
     pub prompt_dropout: f64,
+    /// Probability of showing no speed limit of the map, as of a source that states none.
+    pub hide_limits: f64,
+    /// Likewise of stop signs.
+    pub hide_stop_signs: f64,
+    /// Likewise of lights.
+    pub hide_lights: f64,
+    /// Likewise of sizes: all objects have the usual ones of their kinds.
+    pub hide_sizes: f64,
     /// Probability that the window begins with the frame of reference, as a scene to generate does.
     pub from_reference: f64,
 }
@@ -94,6 +108,10 @@ impl Default for SampleConfig {
             surrogate_noise: 0.5,
             shuffle_ids: true,
             prompt_dropout: 0.5,
+            hide_limits: 0.3,
+            hide_stop_signs: 0.1,
+            hide_lights: 0.1,
+            hide_sizes: 0.1,
             from_reference: 0.25,
         }
     }
@@ -114,6 +132,10 @@ impl SampleConfig {
             surrogate_noise: 0.0,
             shuffle_ids: false,
             prompt_dropout: 1.0,
+            hide_limits: 0.0,
+            hide_stop_signs: 0.0,
+            hide_lights: 0.0,
+            hide_sizes: 0.0,
             from_reference: 0.0,
             ..Self::default()
         }
@@ -203,6 +225,10 @@ pub(crate) fn draw(
             Some(thin(frame, &window, most))
         })
         .collect();
+    // A stream of its own, so that what is hidden changes nothing else of the sample.
+    let hidden = Hidden::draw(config, &mut seed.fork(HIDDEN).rng());
+    let frames: Vec<Frame> = frames.iter().map(|frame| hidden.frame(frame)).collect();
+    let map = hidden.map(&scenario.map);
     let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
     let views: Vec<&Frame> = frames.iter().collect();
     let (centre, pose) = (window.centre, window.world_from_scene);
@@ -212,7 +238,7 @@ pub(crate) fn draw(
         Identities::ranked(&views, centre, pose)
     };
     let encoded = reader.tokenizer.encode(
-        &scenario.map,
+        &map,
         &views,
         window.centre,
         window.world_from_scene,
@@ -220,11 +246,17 @@ pub(crate) fn draw(
     );
     let prompts = prompts(&window, config, &mut rng);
     let sequence = TokenSequence::new(prompts, encoded.sequence.frames().to_vec()).ok()?;
-    let mut slots = place(&sequence);
-    let (states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
+    let n = sequence.frames().len();
+    let exact = ExactFrames::last(n, &frames, &identities, pose);
+    let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
+    let (mut states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
+    if hidden.sizes {
+        // Nobody should learn that objects have these sizes.
+        states.iter_mut().for_each(StateTarget::forget_size);
+    }
     let mut sample = Sample {
-        raster: draw_raster(&window, &reader.spec),
-        survey: Arc::new(Survey::new(&scenario.map, window.world_from_scene)),
+        raster: draw_raster(&window, &map, hidden, &reader.spec),
+        survey: Arc::new(Survey::new(&map, window.world_from_scene)),
         slots: Vec::new(),
         states,
         control: control_targets(&slots),
@@ -319,16 +351,26 @@ fn prompts(window: &Window<'_>, config: &SampleConfig, rng: &mut Rng) -> Vec<Opt
     tags.into_iter().take(MAX_PROMPTS).map(Some).collect()
 }
 
-fn draw_raster(window: &Window<'_>, spec: &RasterSpec) -> Raster {
+fn draw_raster(
+    window: &Window<'_>,
+    map: &Arc<MapGraph>,
+    hidden: Hidden,
+    spec: &RasterSpec,
+) -> Raster {
     let scenario = window.scenario;
+    let log = &scenario.log[..=window.reference];
+    let shown: Vec<Frame> = match hidden.shows_frames() {
+        true => Vec::new(),
+        false => log.iter().map(|frame| hidden.frame(frame)).collect(),
+    };
     let scene = SceneState {
-        map: &scenario.map,
+        map,
         // The route is the ego's; another centre has none.
         route: scenario
             .route
             .as_ref()
             .filter(|_| window.centre == scenario.ego),
-        history: &scenario.log[..=window.reference],
+        history: if hidden.shows_frames() { log } else { &shown },
         ego: window.centre,
         dt: scenario.dt,
     };

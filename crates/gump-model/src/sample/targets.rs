@@ -9,6 +9,9 @@ use crate::batch::PlacedSlot;
 use crate::decoder::{CONTROL_KEYS, STEPS};
 use crate::trajectory::{FUTURE, PAST, POSE};
 
+/// Slower objects stand, metres per second: above the jitter of recorded boxes.
+const STANDING_M_PER_S: f64 = 0.3;
+
 /// What the decoder should say at a key.
 #[derive(Clone, Debug)]
 pub(crate) struct StateTarget {
@@ -18,9 +21,16 @@ pub(crate) struct StateTarget {
     pub(crate) bins: [Option<u16>; STEPS.len()],
     /// False if the window has not shown the object before, so that it could be anywhere.
     pub(crate) is_known: bool,
+    /// True of an object that the log shows slower than 0.3 m/s.
+    pub(crate) stands: bool,
 }
 
 impl StateTarget {
+    /// Asks for no size.
+    pub(crate) fn forget_size(&mut self) {
+        self.bins[..2].fill(None);
+    }
+
     /// The token of a step, PAD where the log has nothing.
     pub(crate) fn token(&self, step: usize) -> u32 {
         self.bins[step].map_or(PAD, |bin| STEPS[step].token(bin))
@@ -70,7 +80,7 @@ pub(super) fn targets(
         };
         let frame = placed.frame;
         let anchor = match anchored {
-            true => window.anchor(placed.last, frame, id),
+            true => placed.last_pose().map_or(Anchor::SCENE, Anchor::at),
             false => Anchor::SCENE,
         };
         let mut chunk = std::array::from_fn(|pose| window.expected(frame, -1, pose + 1, id));
@@ -79,6 +89,7 @@ pub(super) fn targets(
             key: i,
             bins: anchor.bins(value, chunk),
             is_known: placed.last.is_some(),
+            stands: chunk[0].is_some_and(|state| state.speed() < STANDING_M_PER_S),
         });
         let seen = |offset: isize| {
             let agent = window.seen(frame, offset)?.agent(id)?;

@@ -4,6 +4,7 @@ use super::targets::{CONTROL_BEGIN, CONTROL_LIGHTS_END, CONTROL_NEWBORN};
 use super::*;
 use crate::closed_loop::Drive;
 use crate::decoder::STEPS;
+use gump_raster::Layer;
 use gump_scene::fixture;
 
 fn reader() -> Reader {
@@ -214,4 +215,74 @@ fn blanked_frames_have_no_targets() {
             .iter()
             .all(|p| p.frame == 0 || matches!(p.slot, Slot::Pad))
     );
+}
+
+#[test]
+fn what_is_hidden_is_unknown_and_what_is_asked_stays() {
+    let mut scenario = scenario();
+    let mut parts = scenario.map.parts().clone();
+    parts.lanes[0].speed_limit = Some(10.0);
+    parts.stop_signs.push(gump_scene::StopSign {
+        id: 90,
+        position: gump_geometry::dvec3(30.0, 2.0, 0.0),
+        lanes: vec![gump_scene::LaneId(1)],
+    });
+    scenario.map = Arc::new(MapGraph::new(parts).unwrap());
+    let drawn = |share: f64| {
+        let config = SampleConfig {
+            hide_limits: share,
+            hide_stop_signs: share,
+            hide_lights: share,
+            hide_sizes: share,
+            ..SampleConfig::plain(4)
+        };
+        draw(&scenario, None, &reader(), &config, Seed(1)).expect("a sample can be drawn")
+    };
+    let (told, hidden) = (drawn(0.0), drawn(1.0));
+    let lights = |sample: &Sample| {
+        let is_light = |placed: &&PlacedSlot| matches!(placed.slot, Slot::Light(_));
+        sample.slots.iter().filter(is_light).count()
+    };
+    assert_eq!((lights(&told), lights(&hidden)), (4, 0));
+    assert!(hidden.lights.is_empty());
+    let layers = reader().spec.layers;
+    let most = |sample: &Sample, layer: Layer| {
+        let plane = layers.iter().position(|one| *one == layer).unwrap();
+        let plane = sample.raster.data.chunks(16 * 16).nth(plane).unwrap();
+        plane.iter().copied().fold(0.0, f32::max)
+    };
+    for layer in [Layer::StopLine, Layer::TrafficLightOccupancy] {
+        assert_eq!(
+            (most(&told, layer), most(&hidden, layer)),
+            (1.0, 0.0),
+            "{layer}"
+        );
+    }
+    // Lane 2 states no limit, and hidden ones look the same.
+    let typical = (gump_scene::TYPICAL_SPEED_LIMIT / 24.0) as f32;
+    assert_eq!(most(&hidden, Layer::SpeedLimit), typical);
+    let unstated = scenario.map.unstated();
+    assert!(
+        !unstated.stop_signs && !unstated.lights,
+        "the scene itself stays"
+    );
+    let sizes = |sample: &Sample| {
+        let exact = sample.slots.iter().filter_map(|placed| placed.exact);
+        exact.filter(|exact| exact.has_size).count()
+    };
+    assert!(sizes(&told) > 0);
+    assert_eq!(sizes(&hidden), 0);
+    // Without the lights, every target stands so much earlier; its words are the same, but sizes,
+    // which nobody is to learn.
+    assert_eq!(told.states.len(), hidden.states.len());
+    for (told, hidden) in told.states.iter().zip(&hidden.states) {
+        assert_eq!(told.bins[2..], hidden.bins[2..]);
+        assert_eq!(hidden.bins[..2], [None, None]);
+    }
+}
+
+#[test]
+fn old_configurations_hide_what_new_ones_do() {
+    let config: SampleConfig = toml::from_str("frames = 4").unwrap();
+    assert_eq!((config.hide_limits, config.hide_lights), (0.3, 0.1));
 }

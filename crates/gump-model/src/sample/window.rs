@@ -3,11 +3,9 @@
 
 use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario};
-use gump_tokenizer::QuantizedState;
 use rand::Rng as _;
 
 use super::{HISTORY, LONGEST_ROLLOUT, SampleConfig, stride_of};
-use crate::anchor::Anchor;
 use crate::closed_loop::Drive;
 
 /// How far the centre may be from its own reference pose, metres; a rollout re-centres before.
@@ -74,15 +72,6 @@ impl Window<'_> {
             );
         }
         Some(self.state(&agent))
-    }
-
-    /// In whose frame the chunk of an object is asked for that was last shown as `last`: where it
-    /// was a frame ago, to the millimetre, as a rollout knows it.
-    pub(super) fn anchor(&self, last: Option<QuantizedState>, frame: usize, id: AgentId) -> Anchor {
-        last.map_or(Anchor::SCENE, |last| {
-            let before = self.seen(frame, -1).and_then(|frame| frame.agent(id));
-            Anchor::at(before.map_or(last.pose(), |agent| self.state(agent).pose))
-        })
     }
 
     /// An agent in scene coordinates.

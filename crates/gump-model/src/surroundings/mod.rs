@@ -7,19 +7,24 @@
 //! the window showed before: the states of the frame before and the lights of the key's own frame.
 //!
 //! Lengths are divided by a typical one, so that numbers stay within a few units of zero; what is
-//! not there is zeros.
+//! not there is zeros. What is not known is no zero: a stand-in holds its place, and a network with
+//! `unknown_marks` is shown a mark beside it.
 
+mod edges;
 mod survey;
 #[cfg(test)]
 mod tests;
 
 use gump_geometry::{DVec2, Pose, angle_difference};
-use gump_scene::{AgentKind, LightState};
+use gump_scene::{AgentKind, LightState, TYPICAL_SPEED_LIMIT};
 use gump_tokenizer::{Field, Key, QuantizedState, Slot, TokenLight, class_index};
 
 use self::survey::{LANE_STEP_M, N_PATHS, PATH_POINTS};
+use crate::ModelConfig;
 use crate::batch::PlacedSlot;
+use crate::exact::Exact;
 
+pub(crate) use self::edges::{Edge, metres_across, metres_off};
 pub(crate) use self::survey::Survey;
 
 /// Points of a path that are shown, as indices: 0, 4, 8, 14, 22, 32 and 44 m ahead.
@@ -41,37 +46,60 @@ const OWN_NUMBERS: usize = 11;
 /// To the left and to the right: there is a lane, how far, in which direction.
 const BESIDE_NUMBERS: usize = 6;
 
-/// Numbers that an object sees.
-pub(crate) const N_NUMBERS: usize = OWN_NUMBERS
+/// Numbers that an object sees without the marks.
+const N_PLAIN: usize = OWN_NUMBERS
     + N_PATHS * PATH_NUMBERS
     + BESIDE_NUMBERS
     + SECTORS
     + N_NEIGHBOURS * NEIGHBOUR_NUMBERS;
+/// Marks of what is not known, after all others: the limit of each path, stop signs, lights, its own
+/// size and that of each neighbour.
+const N_MARKS: usize = N_PATHS + 2 + 1 + N_NEIGHBOURS;
 
-/// What an object sees.
-pub(crate) type Surroundings = [f32; N_NUMBERS];
+/// What an object sees, the marks last.
+pub(crate) type Surroundings = [f32; N_PLAIN + N_MARKS];
+
+/// The first so many numbers of what an object sees are shown to such a network.
+pub(crate) fn n_numbers(config: &ModelConfig) -> usize {
+    if config.unknown_marks {
+        N_PLAIN + N_MARKS
+    } else {
+        N_PLAIN
+    }
+}
 
 /// An object as the window shows it.
 #[derive(Clone, Copy, Debug)]
 struct Seen {
     key: Key,
-    state: QuantizedState,
     pose: Pose,
     velocity: DVec2,
     length: f64,
     width: f64,
+    has_size: bool,
 }
 
 impl Seen {
-    fn new(key: Key, state: QuantizedState) -> Self {
+    fn new(key: Key, state: QuantizedState, exact: Option<Exact>) -> Self {
+        if let Some(exact) = exact {
+            let [length, width] = exact.size();
+            return Self {
+                key,
+                pose: exact.pose(),
+                velocity: exact.velocity(),
+                length,
+                width,
+                has_size: exact.has_size,
+            };
+        }
         let size = |field: Field| field.dequantize(state.get(field));
         Self {
             key,
-            state,
             pose: state.pose(),
             velocity: state.velocity(),
             length: size(Field::Length),
             width: size(Field::Width),
+            has_size: true,
         }
     }
 }
@@ -87,7 +115,7 @@ pub(crate) fn look_around(
     let mut frame = None;
     // The last frame that showed anybody before the present one, and the present one.
     let (mut others, mut now): (Vec<Seen>, Vec<Seen>) = (Vec::new(), Vec::new());
-    let mut before: Vec<Option<QuantizedState>> = Vec::new();
+    let mut before: Vec<Option<Pose>> = Vec::new();
     let mut lights: Vec<TokenLight> = Vec::new();
     for (i, placed) in slots.iter().enumerate() {
         if frame != Some(placed.frame) {
@@ -96,7 +124,7 @@ pub(crate) fn look_around(
                 for seen in &others {
                     let id = usize::from(seen.key.id);
                     before.resize(before.len().max(id + 1), None);
-                    before[id] = Some(seen.state);
+                    before[id] = Some(seen.pose);
                 }
                 others = std::mem::take(&mut now);
             }
@@ -104,7 +132,9 @@ pub(crate) fn look_around(
         }
         match (placed.slot, placed.key) {
             (Slot::Light(light), _) => lights.push(light),
-            (Slot::Value(state), Some(key)) => now.push(Seen::new(key, state)),
+            (Slot::Value(state), Some(key)) => {
+                now.push(Seen::new(key, state, placed.exact));
+            }
             (Slot::Key(key), _) if i >= from => {
                 if let Some(last) = placed.last {
                     let scene = Around {
@@ -113,7 +143,7 @@ pub(crate) fn look_around(
                         lights: &lights,
                     };
                     let earlier = before.get(usize::from(key.id)).copied().flatten();
-                    seen.push((i, scene.of(Seen::new(key, last), earlier)));
+                    seen.push((i, scene.of(Seen::new(key, last, placed.exact), earlier)));
                 }
             }
             _ => {}
@@ -130,9 +160,10 @@ struct Around<'a> {
 }
 
 impl Around<'_> {
-    fn of(&self, own: Seen, earlier: Option<QuantizedState>) -> Surroundings {
-        let mut numbers = [0.0; N_NUMBERS];
-        let mut writer = Writer(&mut numbers);
+    fn of(&self, own: Seen, earlier: Option<Pose>) -> Surroundings {
+        let mut all = [0.0; N_PLAIN + N_MARKS];
+        let (numbers, marks) = all.split_at_mut(N_PLAIN);
+        let mut writer = Writer(numbers);
         let own_from_scene = own.pose.inverse();
         own_motion(writer.next(OWN_NUMBERS), &own, earlier);
         // People on foot follow no lane.
@@ -154,8 +185,29 @@ impl Around<'_> {
             writer.next(BESIDE_NUMBERS),
         );
         self.edges(own_from_scene, own.pose.position, writer.next(SECTORS));
-        self.neighbours(&own, own_from_scene, &mut writer);
-        numbers
+        let near = self.nearest(&own);
+        neighbours(&near, own_from_scene, &mut writer);
+        self.mark(&own, &paths, &near, marks);
+        all
+    }
+
+    /// Marks what is not known.
+    fn mark(&self, own: &Seen, paths: &[survey::Path], near: &[&Seen], marks: &mut [f32]) {
+        let mark = |is_unknown: bool| f64::from(u8::from(is_unknown));
+        let mut writer = Writer(marks);
+        for i in 0..N_PATHS {
+            let limit = paths.get(i).map(|path| self.survey.limit_at(path[0]));
+            writer.put([mark(limit == Some(None))]);
+        }
+        let unstated = self.survey.unstated;
+        writer.put([
+            mark(unstated.stop_signs),
+            mark(unstated.lights),
+            mark(!own.has_size),
+        ]);
+        for i in 0..N_NEIGHBOURS {
+            writer.put([mark(near.get(i).is_some_and(|other| !other.has_size))]);
+        }
     }
 
     fn path(&self, path: &[u32], own: &Seen, own_from_scene: Pose, out: &mut [f32]) {
@@ -174,8 +226,8 @@ impl Around<'_> {
                 ]);
             }
         }
-        let limit = self.survey.lane_of(path[0]).speed_limit;
-        writer.put([limit.unwrap_or(0.0) / 15.0]);
+        let limit = self.survey.limit_at(path[0]);
+        writer.put([limit.unwrap_or(TYPICAL_SPEED_LIMIT) / 15.0]);
         let away = |step: usize| step as f64 * LANE_STEP_M;
         let nearness = |metres: f64| 1.0 - metres / away(PATH_POINTS);
         let light = path.iter().enumerate().find_map(|(step, &index)| {
@@ -282,7 +334,7 @@ impl Around<'_> {
     fn edges(&self, own_from_scene: Pose, position: DVec2, out: &mut [f32]) {
         let mut nearest = [EDGE_REACH_M * EDGE_REACH_M; SECTORS];
         for edge in self.survey.edges_near(position, EDGE_REACH_M) {
-            let local = own_from_scene * edge;
+            let local = own_from_scene * edge.from;
             let away = local.length_squared();
             if away < EDGE_REACH_M * EDGE_REACH_M {
                 let turns = local.y.atan2(local.x) / std::f64::consts::TAU;
@@ -295,7 +347,8 @@ impl Around<'_> {
         }
     }
 
-    fn neighbours(&self, own: &Seen, own_from_scene: Pose, writer: &mut Writer<'_>) {
+    /// The nearest of the others, the nearest first.
+    fn nearest(&self, own: &Seen) -> Vec<&Seen> {
         let mut near: Vec<(f64, &Seen)> = self
             .others
             .iter()
@@ -309,29 +362,34 @@ impl Around<'_> {
             .filter(|(away, _)| *away < NEIGHBOUR_REACH_M * NEIGHBOUR_REACH_M)
             .collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.key.id.cmp(&b.1.key.id)));
-        for (_, other) in near.into_iter().take(N_NEIGHBOURS) {
-            let pose = own_from_scene * other.pose;
-            let direction = pose.direction();
-            let velocity = own_from_scene.rotate(other.velocity);
-            let is = |kind: AgentKind| f64::from(u8::from(other.key.kind == kind));
-            writer.put([
-                1.0,
-                pose.position.x / 20.0,
-                pose.position.y / 20.0,
-                direction.x,
-                direction.y,
-                velocity.x / 10.0,
-                velocity.y / 10.0,
-                other.length / 5.0,
-                other.width / 2.0,
-                is(AgentKind::Pedestrian),
-                is(AgentKind::Bicycle),
-            ]);
-        }
+        let nearest = near.into_iter().take(N_NEIGHBOURS);
+        nearest.map(|(_, other)| other).collect()
     }
 }
 
-fn own_motion(out: &mut [f32], own: &Seen, earlier: Option<QuantizedState>) {
+fn neighbours(near: &[&Seen], own_from_scene: Pose, writer: &mut Writer<'_>) {
+    for other in near {
+        let pose = own_from_scene * other.pose;
+        let direction = pose.direction();
+        let velocity = own_from_scene.rotate(other.velocity);
+        let is = |kind: AgentKind| f64::from(u8::from(other.key.kind == kind));
+        writer.put([
+            1.0,
+            pose.position.x / 20.0,
+            pose.position.y / 20.0,
+            direction.x,
+            direction.y,
+            velocity.x / 10.0,
+            velocity.y / 10.0,
+            other.length / 5.0,
+            other.width / 2.0,
+            is(AgentKind::Pedestrian),
+            is(AgentKind::Bicycle),
+        ]);
+    }
+}
+
+fn own_motion(out: &mut [f32], own: &Seen, earlier: Option<Pose>) {
     let mut writer = Writer(out);
     let own_from_scene = own.pose.inverse();
     let velocity = own_from_scene.rotate(own.velocity);
@@ -347,7 +405,7 @@ fn own_motion(out: &mut [f32], own: &Seen, earlier: Option<QuantizedState>) {
         is(2),
     ]);
     if let Some(earlier) = earlier {
-        let came_from = own_from_scene * earlier.pose();
+        let came_from = own_from_scene * earlier;
         writer.put([
             1.0,
             came_from.position.x / 5.0,

@@ -1,10 +1,12 @@
 //! A map laid out for looking around from many places: lanes as points two metres apart and road
-//! edges as points, both in a grid, in the scene frame.
+//! edges as short stretches, both in a grid, in the scene frame.
 
 use std::collections::HashMap;
 
 use gump_geometry::{DVec2, Pose, angle_difference};
-use gump_scene::{LaneId, MapGraph};
+use gump_scene::{LaneId, MapGraph, Unstated};
+
+use super::edges::Edge;
 
 /// Distance between the points of a lane, metres.
 pub(super) const LANE_STEP_M: f64 = 2.0;
@@ -12,8 +14,6 @@ pub(super) const LANE_STEP_M: f64 = 2.0;
 pub(super) const PATH_POINTS: usize = 23;
 /// Most paths that an object is shown.
 pub(super) const N_PATHS: usize = 3;
-/// Distance between the points of a road edge, metres.
-const EDGE_STEP_M: f64 = 1.5;
 /// Half of the side of the ground that is laid out, metres: the window of tokens and what its
 /// outermost objects see.
 const HALF_SIDE_M: f64 = 128.0;
@@ -46,7 +46,7 @@ pub(super) struct LaneRun {
     n: u32,
     successors: Vec<u32>,
     /// Metres per second.
-    pub(super) speed_limit: Option<f64>,
+    speed_limit: Option<f64>,
     /// Where a stop sign wants traffic to stop.
     stop: Option<u32>,
 }
@@ -60,15 +60,20 @@ pub(crate) struct Survey {
     points: Vec<LanePoint>,
     lanes: Vec<LaneRun>,
     lane_cells: Cells,
-    edges: Vec<DVec2>,
+    edges: Vec<Edge>,
     edge_cells: Cells,
+    /// What the map has no word for.
+    pub(super) unstated: Unstated,
 }
 
 impl Survey {
     /// Lays out what lies around the origin of a scene.
     pub(crate) fn new(map: &MapGraph, world_from_scene: Pose) -> Self {
         let scene_from_world = world_from_scene.inverse();
-        let mut survey = Self::default();
+        let mut survey = Self {
+            unstated: map.unstated(),
+            ..Self::default()
+        };
         let known = map.lanes().iter().filter(|lane| {
             let local = |p: &DVec2| scene_from_world * *p;
             let within = |p: DVec2| p.abs().max_element() < HALF_SIDE_M;
@@ -104,14 +109,13 @@ impl Survey {
             });
         }
         for edge in map.road_edges() {
-            let points = edge.line.resample(EDGE_STEP_M);
-            let local = points.points().iter().map(|&p| scene_from_world * p);
+            let stretches = Edge::of(&edge.line, scene_from_world).into_iter();
             survey
                 .edges
-                .extend(local.filter(|p| p.abs().max_element() < HALF_SIDE_M));
+                .extend(stretches.filter(|edge| edge.from.abs().max_element() < HALF_SIDE_M));
         }
         survey.lane_cells = Cells::new(survey.points.iter().map(|point| point.pose.position));
-        survey.edge_cells = Cells::new(survey.edges.iter().copied());
+        survey.edge_cells = Cells::new(survey.edges.iter().map(|edge| edge.from));
         survey
     }
 
@@ -119,7 +123,12 @@ impl Survey {
         self.points[index as usize]
     }
 
-    pub(super) fn lane_of(&self, index: u32) -> &LaneRun {
+    /// The speed limit at a point, if its lane states one, metres per second.
+    pub(super) fn limit_at(&self, index: u32) -> Option<f64> {
+        self.lane_of(index).speed_limit
+    }
+
+    fn lane_of(&self, index: u32) -> &LaneRun {
         &self.lanes[self.point(index).lane as usize]
     }
 
@@ -138,8 +147,8 @@ impl Survey {
         self.lane_cells.near(position, radius)
     }
 
-    /// All points of road edges in the cells within `radius` metres of `position`.
-    pub(crate) fn edges_near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = DVec2> {
+    /// All stretches of road edges that start in the cells within `radius` metres of `position`.
+    pub(crate) fn edges_near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = Edge> {
         self.edge_cells
             .near(position, radius)
             .map(|i| self.edges[i as usize])

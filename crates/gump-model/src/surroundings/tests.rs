@@ -97,9 +97,59 @@ fn points_are_found_where_they_are() {
     let survey = Survey::new(&scenario.map, Pose::default());
     let near = survey
         .edges_near(dvec2(0.0, 0.0), 10.0)
-        .filter(|p| p.length() < 10.0)
+        .filter(|edge| edge.from.length() < 10.0)
         .count();
     // The edge passes two metres to the right.
     assert!((12..=15).contains(&near), "{near}");
     assert_eq!(survey.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
+}
+
+/// Everything the ego sees last.
+fn ego_sees(scenario: &Scenario) -> Surroundings {
+    let slots = slots(scenario);
+    let is_ego = |i: usize| matches!(slots[i].slot, Slot::Key(key) if key.is_ego());
+    let last = seen(scenario).into_iter().rfind(|(i, _)| is_ego(*i));
+    last.expect("the ego is in every frame").1
+}
+
+#[test]
+fn an_unknown_limit_is_a_mark_and_no_zero() {
+    let text = |speed: &str| {
+        format!(
+            "lane 1: -100,0 100,0 {speed}
+             ego vehicle 0: 0,0 velocity 8,0
+             agent vehicle 1: 20,0 velocity 5,0"
+        )
+    };
+    let known = ego_sees(&fixture::scenario(&text("speed 13.4")).unwrap());
+    let unknown = ego_sees(&fixture::scenario(&text("")).unwrap());
+    // Without marks a limit that nobody states is a usual one.
+    assert_eq!(known[..N_PLAIN], unknown[..N_PLAIN]);
+    let marks = |seen: Surroundings| seen[N_PLAIN..N_PLAIN + N_PATHS].to_vec();
+    assert_eq!(marks(known), [0.0; N_PATHS]);
+    assert_eq!(marks(unknown), [1.0, 0.0, 0.0], "there is one path");
+}
+
+#[test]
+fn what_the_source_has_no_word_for_is_marked() {
+    let mut scenario = scenario();
+    let rest = |scenario: &Scenario| ego_sees(scenario)[N_PLAIN + N_PATHS..].to_vec();
+    assert_eq!(rest(&scenario), [0.0; N_MARKS - N_PATHS]);
+    let mut parts = scenario.map.parts().clone();
+    parts.unstated.lights = true;
+    scenario.map = std::sync::Arc::new(gump_scene::MapGraph::new(parts).unwrap());
+    // The first neighbour is said to be of the usual size, by whoever could not measure it.
+    for frame in &mut scenario.log {
+        let agents = frame.agents().iter().map(|agent| {
+            let mut agent = *agent;
+            if agent.id.0 == 4 {
+                [agent.length, agent.width, _] = agent.kind.usual_size();
+            }
+            agent
+        });
+        *frame = gump_scene::Frame::new(agents.collect(), frame.lights().to_vec());
+    }
+    let mut expected = [0.0; N_MARKS - N_PATHS];
+    (expected[1], expected[3]) = (1.0, 1.0);
+    assert_eq!(rest(&scenario), expected);
 }

@@ -27,8 +27,8 @@ pub struct TrainConfig {
     /// forgets where it began.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema: Option<f64>,
-    /// Whether a device multiplies the network's matrices in bfloat16; parameters, sums, norms and
-    /// the optimiser stay in 32 bits. Not for a processor, which would gain nothing.
+    /// Whether matrices are multiplied in bfloat16, forward and backward; parameters, sums, norms and
+    /// the optimiser stay in 32 bits. On a processor without a unit for bfloat16 it saves no time.
     pub mixed_precision: bool,
     /// How samples are drawn.
     pub sample: SampleConfig,

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::peers::Peers;
 use crate::ModelError;
 use crate::loss::LossParts;
+use crate::ops::Deferred;
 use crate::parameters::Parameters;
 
 /// Gradients by the names of their parameters; one that nothing reached is not there.
@@ -22,29 +23,38 @@ pub(super) struct Found {
     pub(super) tokens: usize,
 }
 
+/// What a part of the batch found.
+pub(super) struct Part {
+    pub(super) gradients: GradStore,
+    /// Gradients of matrices that are still to be computed.
+    pub(super) deferred: Deferred,
+    pub(super) loss: LossParts,
+    pub(super) tokens: usize,
+}
+
 impl Found {
     /// Adds what parts of the batch found, in their order.
-    pub(super) fn add(
-        &mut self,
-        parameters: &Parameters,
-        parts: &[(GradStore, LossParts, usize)],
-    ) -> Result<()> {
+    pub(super) fn add(&mut self, parameters: &Parameters, parts: &[Part]) -> Result<()> {
         let trainable: Vec<_> = parameters.trainable().collect();
         let sums = trainable.into_par_iter().map(|(name, var)| {
             let mut sum = self.gradients.get(name).cloned();
-            for gradient in parts.iter().filter_map(|(store, ..)| store.get(var)) {
-                sum = Some(match sum {
-                    Some(sum) => (sum + gradient)?,
-                    None => gradient.clone(),
-                });
+            for part in parts {
+                if let Some(gradient) = part.gradients.get(var) {
+                    sum = Some(match sum {
+                        Some(sum) => (sum + gradient)?,
+                        None => gradient.clone(),
+                    });
+                }
             }
+            let deferred = parts.iter().map(|part| &part.deferred);
+            let sum = Deferred::take_in(deferred, var, sum)?;
             Ok(sum.map(|sum| (name.to_owned(), sum)))
         });
         let sums: Vec<_> = sums.collect::<Result<_>>()?;
         self.gradients = sums.into_iter().flatten().collect();
-        for (_, loss, tokens) in parts {
-            self.loss.add(loss);
-            self.tokens += tokens;
+        for part in parts {
+            self.loss.add(&part.loss);
+            self.tokens += part.tokens;
         }
         Ok(())
     }

@@ -10,6 +10,7 @@ use super::gradients::Gradients;
 use crate::ModelError;
 use crate::checkpoint::{self, Precision};
 use crate::network::Network;
+use crate::ops::Operands;
 use crate::optimizer::{AdamW, move_average};
 use crate::parameters::Parameters;
 
@@ -21,6 +22,8 @@ pub(super) struct Learner {
     optimizer: AdamW,
     /// Steps done.
     pub(super) step: usize,
+    /// In which form a processor's products take their operands; a device's network knows itself.
+    pub(super) operands: Operands,
     /// The weights that drove, for a resumed run to drive the same; empty without closed loop.
     drivers: BTreeMap<String, Tensor>,
 }
@@ -41,6 +44,7 @@ impl Learner {
             network,
             average,
             step: 0,
+            operands: Operands::F32,
             drivers,
         })
     }
@@ -79,6 +83,7 @@ impl Learner {
             average,
             optimizer,
             step,
+            operands: Operands::F32,
             drivers,
         };
         Ok((learner, config))
@@ -118,17 +123,18 @@ impl Learner {
         self.average.unwrap_or(self.network)
     }
 
-    /// Lets a device multiply in fewer bits, if the run is to.
+    /// Lets products take operands of fewer bits, if the run is to.
     ///
-    /// Error: [`ModelError::Config`] on a processor.
+    /// Error: a tensor error.
     pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, ModelError> {
         if !config.mixed_precision {
             return Ok(self);
         }
         if self.network.device().is_cpu() {
-            let what = "mixed_precision needs a device that multiplies bfloat16, and a processor \
-                        does not: leave it away, or use --device cuda";
-            return Err(ModelError::Config(what.into()));
+            return Ok(Self {
+                operands: Operands::Bf16,
+                ..self
+            });
         }
         Ok(Self {
             network: self.network.multiplying_in(DType::BF16)?,

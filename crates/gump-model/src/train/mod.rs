@@ -23,8 +23,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 pub use self::config::{ModelChoice, RunConfig, TrainConfig};
-use self::gradients::Found;
 pub(crate) use self::gradients::Gradients;
+use self::gradients::{Found, Part};
 use self::learner::Learner;
 pub use self::peers::{Alone, Peers};
 #[cfg(feature = "mpi")]
@@ -36,6 +36,7 @@ use crate::config::ModelConfig;
 use crate::loss::{Counts, LossConfig, LossParts, loss};
 use crate::mct::Dropout;
 use crate::network::Network;
+use crate::ops::Deferred;
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::Scenes;
 
@@ -192,6 +193,7 @@ impl Trainer {
     /// Loss and gradients of a batch, of which these are this process's samples.
     fn differentiate(&self, samples: &[Sample]) -> Result<Found, ModelError> {
         let (network, config) = (&self.learner.network, &self.config.loss);
+        let operands = self.learner.operands;
         let whole = self.total(Counts::of(samples, &self.config.loss))?;
         let seed = Seed(self.config.seed).fork(2);
         let seed = seed.fork(self.learner.step as u64);
@@ -202,10 +204,16 @@ impl Trainer {
             let alone = network.samples_together(samples.len());
             let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
                 let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
-                let (total, parts) =
-                    loss(network, samples, config, &whole, true, dropout.as_ref())?;
+                let deferred = Deferred::default();
+                let build = || loss(network, samples, config, &whole, true, dropout.as_ref());
+                let (total, loss) = operands.during(|| deferred.during(build))?;
                 let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
-                Ok((total.backward()?, parts, tokens))
+                Ok(Part {
+                    gradients: total.backward()?,
+                    deferred,
+                    loss,
+                    tokens,
+                })
             });
             let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
             found.add(network.parameters(), &parts)?;

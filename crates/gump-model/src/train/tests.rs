@@ -11,6 +11,7 @@ use gump_scene::{Scenario, Seed, fixture};
 
 use crate::closed_loop::ClosedLoopConfig;
 use crate::config::{Encoder, ModelConfig, VisualConfig};
+use crate::ops::Operands;
 use crate::sample::SampleConfig;
 use crate::sampling::{Mode, SamplingConfig};
 use crate::train::{Found, Peers, TrainConfig, Trainer};
@@ -123,27 +124,73 @@ fn half_the_bits_find_the_same_gradient() {
     let half = trainer.differentiate(&samples).unwrap();
     let [a, b] = [&whole, &half].map(|found| found.loss.total);
     assert!(a != b && (a - b).abs() < 0.01 * a, "{a} and {b}");
+    // Operands are rounded to 8 bits, and a network that has learned nothing cancels much.
+    let cosine = cosine(&whole, &half);
+    assert!(cosine > 0.997, "{cosine}");
+}
+
+/// Of the angle between two gradients.
+fn cosine(a: &Found, b: &Found) -> f64 {
     let numbers = |found: &Found| -> Vec<f64> {
         let all = found.gradients.values();
         all.flat_map(|t| t.flatten_all().unwrap().to_vec1::<f32>().unwrap())
             .map(f64::from)
             .collect()
     };
-    let (a, b) = (numbers(&whole), numbers(&half));
+    let (a, b) = (numbers(a), numbers(b));
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let cosine = dot(&a, &b) / (dot(&a, &a) * dot(&b, &b)).sqrt();
-    assert!(cosine > 0.999, "{cosine}");
+    dot(&a, &b) / (dot(&a, &a) * dot(&b, &b)).sqrt()
+}
+
+fn mixed(steps: usize) -> TrainConfig {
+    TrainConfig {
+        mixed_precision: true,
+        ..config(steps)
+    }
 }
 
 #[test]
-fn a_processor_mixes_no_precisions() {
-    let config = TrainConfig {
-        mixed_precision: true,
-        ..config(4)
+fn a_processor_in_bfloat16_finds_the_same_gradient() {
+    let mut trainer = trainer(4, 2.0);
+    let samples = trainer.next.recv().unwrap().unwrap();
+    let whole = trainer.differentiate(&samples).unwrap();
+    trainer.learner.operands = Operands::Bf16;
+    let half = trainer.differentiate(&samples).unwrap();
+    let [a, b] = [&whole, &half].map(|found| found.loss.total);
+    assert!(a != b && (a - b).abs() < 0.01 * a, "{a} and {b}");
+    // Operands are rounded to 8 bits, and a network that has learned nothing cancels much.
+    let cosine = cosine(&whole, &half);
+    assert!(cosine > 0.997, "{cosine}");
+}
+
+#[test]
+fn mixed_precision_resumes_exactly() {
+    check_resumed(&mixed(6));
+}
+
+#[test]
+fn mixed_precision_has_the_same_bits_on_any_number_of_threads() {
+    let after = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        pool.build().unwrap().install(|| {
+            let scenes = vec![scenario(2.0)];
+            let mut trainer = Trainer::new(model(), mixed(6), scenes, &Device::Cpu).unwrap();
+            let losses: Vec<f64> = (0..3).map(|_| trainer.step().unwrap().loss.total).collect();
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("run.safetensors");
+            trainer.save(&path).unwrap();
+            (losses, bits(&path))
+        })
     };
-    let refused = Trainer::new(model(), config, vec![scenario(1.0)], &Device::Cpu);
-    let error = refused.err().unwrap().to_string();
-    assert!(error.contains("--device cuda"), "{error}");
+    assert!(after(1) == after(2));
+}
+
+#[test]
+fn mixed_precision_overfits_one_window() {
+    let scenes = vec![scenario(0.5)];
+    let mut trainer = Trainer::new(model(), mixed(300), scenes, &Device::Cpu).unwrap();
+    let last = overfit(&mut trainer, 300);
+    assert!(last.state < 0.05, "{last:?}");
 }
 
 #[test]

@@ -73,7 +73,8 @@ impl State {
         self.look(moment, config)?;
         let lane = self.starting_lane(moment.ego)?;
         self.lay_lines(lane, config)?;
-        let limit = self.map.lane(lane).and_then(|lane| lane.speed_limit);
+        let lane = self.map.lane(lane);
+        let limit = lane.and_then(|lane| lane.speed_limit.or(lane.kind.usual_speed_limit()));
         let limit = limit.unwrap_or(config.fallback_speed);
         Ok(config.speed_fractions.iter().map(|f| f * limit).collect())
     }

@@ -51,7 +51,7 @@ pub struct PdmConfig {
     pub speed_fractions: Vec<f64>,
     /// Lines to follow, metres to the left of the centre.
     pub lateral_offsets: Vec<f64>,
-    /// The limit of a lane that states none, metres per second.
+    /// The limit of a lane that states neither one nor of what kind it is, metres per second.
     pub fallback_speed: f64,
     /// The car-following law; of its limits only the two accelerations are used.
     pub law: IdmConfig,

@@ -1,7 +1,7 @@
 //! Lane centre lines, lane surfaces and the route.
 
 use gump_geometry::{DVec2, dvec2};
-use gump_scene::{Lane, MapGraph, SceneState};
+use gump_scene::{Lane, MapGraph, SceneState, TYPICAL_SPEED_LIMIT};
 
 use super::Plane;
 use crate::pixel_frame::PixelFrame;
@@ -49,7 +49,8 @@ pub(crate) struct LaneSurfaces {
 pub(crate) struct SurfaceSegment {
     /// Cosine and sine of its direction in the raster frame.
     pub(crate) direction: [f32; 2],
-    /// Speed limit over [`SPEED_SCALE`], in [0, 1]; 0 if not stated.
+    /// Speed limit over [`SPEED_SCALE`], in [0, 1]; [`TYPICAL_SPEED_LIMIT`] where none is stated,
+    /// since 0 would say that nobody may move.
     pub(crate) speed_limit: f32,
 }
 
@@ -61,7 +62,7 @@ impl LaneSurfaces {
         let mut centres = Vec::new();
         let lanes = map.lanes().iter();
         for lane in lanes.filter(|lane| frame.may_show_line(&lane.centerline, lane.width)) {
-            let limit = lane.speed_limit.unwrap_or(0.0) / SPEED_SCALE;
+            let limit = lane.speed_limit.unwrap_or(TYPICAL_SPEED_LIMIT) / SPEED_SCALE;
             for quad in ribbon(lane, frame.metres_per_px) {
                 let along = (quad.to - quad.from).normalize_or_zero();
                 segments.push(SurfaceSegment {

@@ -34,6 +34,7 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
         areas: old.areas().to_vec(),
         stop_signs: old.stop_signs().to_vec(),
         drivable: old.drivable().to_vec(),
+        unstated: old.unstated(),
     };
     for lane in &mut parts.lanes {
         lane.outline = lane.surface().map(|polygon| polygon.into_owned());

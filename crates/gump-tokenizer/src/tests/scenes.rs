@@ -199,10 +199,10 @@ fn too_many_agents_lose_their_farthest() {
 fn lights_are_numbered_as_now_and_unknown_where_unseen() {
     use LightState::{Green, Red, Unknown, Yellow};
     let (scenario, pose) = scenario(
-        "lane 1: 30,0 60,0
+        "lane 1: 99,0 120,0
          lane 2: 20,0 60,0
          lane 3: 10,0 60,0
-         lane 4: 51,0 60,0
+         lane 4: 101,0 120,0
          ego vehicle 0: 0,0",
     );
     let with = |lights: &[(i64, LightState)]| {
@@ -224,7 +224,7 @@ fn lights_are_numbered_as_now_and_unknown_where_unseen() {
     };
     assert_eq!(states(0), [(1, Unknown), (2, Red), (3, Red)]);
     assert_eq!(states(1), [(1, Green), (2, Yellow), (3, Unknown)]);
-    let shared = gump_scene::light_indices_of(&scenario.map, &now, pose.position, 50.0);
+    let shared = gump_scene::light_indices_of(&scenario.map, &now, pose.position, 100.0);
     for (index, light) in shared {
         assert_eq!(
             encoded.lights[index - 1],

@@ -242,12 +242,13 @@ function drawHeatPanel() {
 function drawAgentPanel() {
   if (ui.selected < 0) return;
   drawHeatPanel();
-  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width, realism } = facts.agents[ui.selected];
+  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
   const degrees = h => ((h * 180 / Math.PI) % 360 + 540) % 360 - 180;
   const rows = s ? [
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
     ['position', `${(s.x + facts.origin[0]).toFixed(1)}, ${(s.y + facts.origin[1]).toFixed(1)} m`], ['size', `${length.toFixed(1)} \u00d7 ${width.toFixed(1)} m`],
     ...(realism === null ? [] : [['realism', `${realism.toFixed(2)} of 1`]]),
+    ...(deeds === null ? [] : [['in futures', deeds]]),
   ] : [['', 'not there at this time']];
   $('state').replaceChildren(...rows.flatMap(([name, value]) => {
     const dt = document.createElement('dt'), dd = document.createElement('dd');

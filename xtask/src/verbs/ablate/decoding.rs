@@ -1,8 +1,8 @@
 //! `ablate temperature|decay|history|chunking|quantization`: how decoding changes realism, and what
 //! it costs.
 //!
-//! One knob at a time; scenes, seeds and weights stay. Realism is that of the Waymo Sim Agents
-//! Challenge, since displacements alone would reward timid futures.
+//! One knob at a time, under rules and without; scenes, seeds and weights stay. Realism is that of
+//! the Waymo Sim Agents Challenge, since displacements alone would reward timid futures.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,11 @@ use gump_model::{Mode, Precision, SamplingConfig, Surrogate};
 use gump_scene::Seed;
 use gump_viz::{Chart, Series};
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
@@ -66,7 +68,7 @@ pub(super) struct Cost {
 }
 
 /// One setting of a knob: what the table calls it, its place on the axis, how to decode.
-type Setting = (String, f64, SamplingConfig);
+type Setting = (String, f64, Decoding);
 
 impl Knob {
     /// What the horizontal axis says.
@@ -85,11 +87,9 @@ impl Knob {
         !matches!(self, Self::Chunking | Self::Precision)
     }
 
-    fn settings(self, base: &SamplingConfig) -> Vec<Setting> {
-        let with = |value: f64, change: &dyn Fn(&mut SamplingConfig)| {
-            let mut config = base.clone();
-            change(&mut config);
-            (value.to_string(), value, config)
+    fn settings(self, base: &Decoding) -> Vec<Setting> {
+        let with = |value: f64, turn: &dyn Fn(&mut SamplingConfig)| {
+            (value.to_string(), value, base.turned(turn))
         };
         match self {
             Self::Temperature => [0.3, 0.5, 0.7, 0.9, 1.1, 1.3]
@@ -102,19 +102,19 @@ impl Knob {
                 .map(|frames| with(frames as f64, &|config| config.history = frames))
                 .into(),
             Self::Chunking => {
-                let average = if base.decay > 0.0 { base.decay } else { 1.2 };
+                let decay = base.sampling.decay;
+                let average = if decay > 0.0 { decay } else { 1.2 };
                 let ways = [
                     ("one pose", Surrogate::ConstantVelocity, 0.0),
                     ("surrogates from chunks", Surrogate::Chunk, 0.0),
                     ("chunks averaged", Surrogate::Chunk, average),
                 ];
                 let setting = |(i, (name, surrogate, decay)): (usize, (&str, _, _))| {
-                    let config = SamplingConfig {
-                        surrogate,
-                        decay,
-                        ..base.clone()
-                    };
-                    (name.to_owned(), (i + 1) as f64, config)
+                    let turned = base.turned(|config| {
+                        config.surrogate = surrogate;
+                        config.decay = decay;
+                    });
+                    (name.to_owned(), (i + 1) as f64, turned)
                 };
                 ways.into_iter().enumerate().map(setting).collect()
             }
@@ -125,11 +125,8 @@ impl Knob {
                     ("int8", Precision::Int8),
                 ];
                 let setting = |(i, (name, precision)): (usize, (&str, _))| {
-                    let config = SamplingConfig {
-                        precision,
-                        ..base.clone()
-                    };
-                    (name.to_owned(), (i + 1) as f64, config)
+                    let turned = base.turned(|config| config.precision = precision);
+                    (name.to_owned(), (i + 1) as f64, turned)
                 };
                 forms.into_iter().enumerate().map(setting).collect()
             }
@@ -147,49 +144,85 @@ impl Args {
         let procedural = || shipped::data().join("procedural.tfrecord.gz");
         let path = self.scenarios.clone().unwrap_or_else(procedural);
         run.setting("scenarios", path.display().to_string())?;
-        let settings = knob.settings(&self.draw.resolve(Mode::PartialAr)?);
-        let (mut rows, mut first) = (Vec::new(), None);
-        let (mut curve, mut ways) = (Series::default(), Vec::new());
-        for (name, at, sampling) in settings {
-            let bits = sampling.precision.bits();
-            let n = self.rollouts_per_scenario.get();
-            let (scores, cost) = run.phase(&name, |run| score(run, &path, &world, sampling, n))?;
-            let mean = Scores::mean(&scores)
-                .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
-            let metametrics: Vec<f64> = scores.iter().map(|scores| scores.metametric).collect();
-            let interval = interval(&metametrics, Seed(0));
-            curve.points.push((at, mean.metametric));
-            let span = interval.map(|interval| (at, interval.low, interval.high));
-            curve.spans.extend(span);
-            ways.push(name.clone());
-            rows.push(json!({
-                "setting": name,
-                "metametric": mean.metametric,
-                "low": interval.map(|interval| interval.low),
-                "high": interval.map(|interval| interval.high),
-                "kinematic": mean.kinematic,
-                "interactive": mean.interactive,
-                "map_based": mean.map_based,
-                "min_ade": mean.min_ade,
-                "ade": mean.ade,
-                "collision_rate": mean.collision_rate,
-                "offroad_rate": mean.offroad_rate,
-                "bits": bits,
-                "ratio": *first.get_or_insert(cost.cpu) / cost.cpu,
-                "frames_per_second": 1.0 / cost.wall,
-                "cpu_milliseconds_per_frame": 1e3 * cost.cpu,
-            }));
+        let (mut rows, mut curves, mut ways) = (Vec::new(), Vec::new(), Vec::new());
+        let mut digests = Vec::new();
+        for base in self.draw.decodings(Mode::PartialAr)? {
+            let (mut first, mut curve) = (None, Series::default());
+            curve.name = base.name.into();
+            ways.clear();
+            for (name, at, decoding) in knob.settings(&base) {
+                let phase = format!("{name}, {}", base.name);
+                let judged = run.phase(&phase, |run| {
+                    let n = self.rollouts_per_scenario.get();
+                    score(run, &path, &world, &decoding, n)
+                })?;
+                let (mut row, low_high) = judged.row(&path)?;
+                row["setting"] = json!(name);
+                row["decoding"] = json!(base.name);
+                row["bits"] = json!(decoding.sampling.precision.bits());
+                let cpu = judged.cost.cpu;
+                row["ratio"] = json!(*first.get_or_insert(cpu) / cpu);
+                let digest = judged.digest;
+                digests.push(json!({"setting": name, "decoding": base.name, "digest": digest}));
+                let mean = row["metametric"].as_f64().unwrap_or(f64::NAN);
+                curve.points.push((at, mean));
+                curve
+                    .spans
+                    .extend(low_high.map(|(low, high)| (at, low, high)));
+                ways.push(name);
+                rows.push(row);
+            }
+            curves.push(curve);
         }
         run.result("rows", rows)?;
+        run.result("digests", digests)?;
         let chart = Chart {
             x_label: knob.label().into(),
             y_label: "realism (2025), mean and 95 % interval".into(),
             markers: true,
             ways: if knob.is_numeric() { Vec::new() } else { ways },
-            series: vec![curve],
+            series: curves,
             ..Chart::default()
         };
         Ok(chart.save(&run.path("realism"))?)
+    }
+}
+
+/// What rollouts of every scenario got, and what they cost.
+pub(super) struct Judged {
+    pub(super) scores: Vec<Scores>,
+    cost: Cost,
+    digest: Option<String>,
+}
+
+impl Judged {
+    /// Means, and the ends of the interval of the mean realism.
+    ///
+    /// Error: no scenarios.
+    fn row(&self, path: &Path) -> anyhow::Result<(Value, Option<(f64, f64)>)> {
+        let mean = Scores::mean(&self.scores)
+            .with_context(|| format!("expected scenarios, found none: {}", path.display()))?;
+        let metametrics: Vec<f64> = self.scores.iter().map(|s| s.metametric).collect();
+        let interval = interval(&metametrics, Seed(0)).map(|i| (i.low, i.high));
+        let row = json!({
+            "setting": null,
+            "decoding": null,
+            "metametric": mean.metametric,
+            "low": interval.map(|(low, _)| low),
+            "high": interval.map(|(_, high)| high),
+            "kinematic": mean.kinematic,
+            "interactive": mean.interactive,
+            "map_based": mean.map_based,
+            "min_ade": mean.min_ade,
+            "ade": mean.ade,
+            "collision_rate": mean.collision_rate,
+            "offroad_rate": mean.offroad_rate,
+            "bits": null,
+            "ratio": null,
+            "frames_per_second": 1.0 / self.cost.wall,
+            "cpu_milliseconds_per_frame": 1e3 * self.cost.cpu,
+        });
+        Ok((row, interval))
     }
 }
 
@@ -200,30 +233,37 @@ pub(super) fn score(
     run: &Run,
     scenarios: &Path,
     world: &WorldName,
-    sampling: SamplingConfig,
+    decoding: &Decoding,
     n: usize,
-) -> anyhow::Result<(Vec<Scores>, Cost)> {
+) -> anyhow::Result<Judged> {
     let config = Config::of(Year::Y2025);
-    let mut source = Source::world(world.clone(), sampling, n, run.seed());
+    let mut source = Source::world(world.clone(), decoding.clone(), n, run.seed());
     let progress = run.progress("evaluating", 0, "scenarios");
-    let (mut all, mut cost, mut frames) = (Vec::new(), Cost::default(), 0.0);
-    for recorded in recordings(scenarios, source.read_options(), |_| true)? {
+    let (mut scores, mut digests) = (Vec::new(), Vec::new());
+    let (mut cost, mut frames) = (Cost::default(), 0.0);
+    let scenarios = [scenarios.to_owned()];
+    for recorded in recordings(&scenarios, source.read_options(), |_| true)? {
         stop_if_interrupted()?;
         let recorded = recorded?;
         let (cpu, began) = (cpu_seconds(), Instant::now());
-        let rollouts = source.rollouts(run, &recorded, config.mode)?;
+        let found = source.rollouts(run, &recorded, config.mode)?;
         let wall = began.elapsed().as_secs_f64();
         let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
         cost.cpu += cpu.map_or(wall, spent);
         cost.wall += wall;
         frames += n as f64 * FRAMES;
         let reference = Reference::new(&recorded.log, &config)?;
-        all.push(reference.evaluate(&rollouts)?.scores);
+        scores.push(reference.evaluate(&found.rollouts)?.scores);
+        digests.extend(found.digest);
         progress.advance(1);
     }
     cost.cpu /= frames;
     cost.wall /= frames;
-    Ok((all, cost))
+    Ok(Judged {
+        scores,
+        cost,
+        digest: futures::digest_of(digests.iter().map(String::as_str)),
+    })
 }
 
 #[cfg(test)]
@@ -232,22 +272,23 @@ mod tests {
 
     #[test]
     fn a_knob_turns_nothing_else() {
-        let base = SamplingConfig {
+        let config = SamplingConfig {
             decay: 1.2,
             ..SamplingConfig::default()
         };
-        let strip = |config: SamplingConfig| SamplingConfig {
-            temperature: base.temperature,
-            ..config
-        };
+        let base = Decoding::of(config.clone());
         let settings = Knob::Temperature.settings(&base);
         assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
-        for (_, at, config) in settings {
-            assert_eq!(config.temperature, at);
-            assert_eq!(strip(config), base);
+        for (_, at, decoding) in settings {
+            assert_eq!(decoding.sampling.temperature, at);
+            let back = decoding.turned(|turned| turned.temperature = config.temperature);
+            assert_eq!(back, base);
         }
         let chunking = Knob::Chunking.settings(&base);
         assert_eq!(chunking[2].2, base);
-        assert_eq!(chunking[0].2.surrogate, Surrogate::ConstantVelocity);
+        assert_eq!(
+            chunking[0].2.sampling.surrogate,
+            Surrogate::ConstantVelocity
+        );
     }
 }

@@ -9,13 +9,14 @@ use anyhow::Context as _;
 use gump_metrics::interval;
 use gump_metrics::wosac::Scores;
 use gump_model::checkpoint::{self, Precision};
-use gump_model::{Mode, ModelConfig, RunConfig, SamplingConfig, TrainConfig, Trainer};
+use gump_model::{Mode, ModelConfig, RunConfig, TrainConfig, Trainer};
 use gump_scene::{Scenario, Seed};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::decoding;
 use crate::dataset::{self, Part, Split, Training};
+use crate::decoding::Decoding;
 use crate::run::{Run, stop_if_interrupted};
 use crate::shipped;
 use crate::worlds::{Draw, WorldName};
@@ -51,7 +52,8 @@ pub(super) struct Learned {
     pub(super) parameters: f64,
     /// The held-out loss after so many tokens.
     pub(super) losses: Vec<(f64, f64)>,
-    scores: Vec<Scores>,
+    /// The scores of each decoding, under its name.
+    scores: Vec<(&'static str, Vec<Scores>)>,
     seconds: f64,
 }
 
@@ -60,7 +62,7 @@ pub(super) struct Class<'a> {
     lesson: &'a Lesson,
     held_out: PathBuf,
     scenes: Vec<Scenario>,
-    sampling: SamplingConfig,
+    decodings: Vec<Decoding>,
 }
 
 impl Lesson {
@@ -80,7 +82,7 @@ impl Lesson {
         Ok(Class {
             lesson: self,
             scenes: dataset::read(&[Part::whole(&held_out)], &progress)?,
-            sampling: self.draw.resolve(Mode::PartialAr)?,
+            decodings: self.draw.decodings(Mode::PartialAr)?,
             held_out,
         })
     }
@@ -113,10 +115,13 @@ impl Class<'_> {
         })?;
         learned.seconds = began.elapsed().as_secs_f64();
         let n = self.lesson.rollouts_per_scenario.get();
-        (learned.scores, _) = run.phase(&format!("score {name}"), |run| {
-            let world = WorldName::Model(weights.clone());
-            decoding::score(run, &self.held_out, &world, self.sampling.clone(), n)
-        })?;
+        for way in &self.decodings {
+            let judged = run.phase(&format!("score {name}, {}", way.name), |run| {
+                let world = WorldName::Model(weights.clone());
+                decoding::score(run, &self.held_out, &world, way, n)
+            })?;
+            learned.scores.push((way.name, judged.scores));
+        }
         Ok(learned)
     }
 
@@ -170,24 +175,41 @@ impl Learned {
         }
     }
 
-    /// The row of a table: what was learned in the end, and the realism of 2025.
+    /// The row of a table: what was learned in the end, and the realism of 2025; beside that under
+    /// rules, that of the network alone.
     pub(super) fn row(&self) -> anyhow::Result<Value> {
-        let mean = Scores::mean(&self.scores).context("--scenarios: expected some, found none")?;
-        let metametrics: Vec<f64> = self.scores.iter().map(|s| s.metametric).collect();
-        let interval = interval(&metametrics, Seed(0));
         let (tokens, loss) = self.losses.last().context("no loss was measured")?;
-        Ok(json!({
+        let mut row = json!({
             "parameters": self.parameters,
             "tokens": tokens,
             "loss": loss,
-            "metametric": mean.metametric,
-            "low": interval.map(|interval| interval.low),
-            "high": interval.map(|interval| interval.high),
-            "min_ade": mean.min_ade,
-            "collision_rate": mean.collision_rate,
-            "offroad_rate": mean.offroad_rate,
-            "training_seconds": self.seconds,
-        }))
+        });
+        for (i, (name, scores)) in self.scores.iter().enumerate() {
+            let mean = Scores::mean(scores).context("--scenarios: expected some, found none")?;
+            let metametrics: Vec<f64> = scores.iter().map(|s| s.metametric).collect();
+            let interval = interval(&metametrics, Seed(0));
+            let numbers = [
+                ("metametric", Some(mean.metametric)),
+                ("low", interval.map(|interval| interval.low)),
+                ("high", interval.map(|interval| interval.high)),
+                ("min_ade", Some(mean.min_ade)),
+                ("collision_rate", Some(mean.collision_rate)),
+                ("offroad_rate", Some(mean.offroad_rate)),
+            ];
+            for (key, number) in numbers {
+                let key = if i == 0 {
+                    key.into()
+                } else {
+                    format!("{name}_{key}")
+                };
+                row[key] = json!(number);
+            }
+            if i == 0 {
+                row["decoding"] = json!(name);
+            }
+        }
+        row["training_seconds"] = json!(self.seconds);
+        Ok(row)
     }
 }
 

@@ -45,7 +45,10 @@ impl Args {
             None => shipped::data().join("procedural.tfrecord.gz"),
         };
         run.setting("scenarios", &path)?;
-        let first = recordings(&path, ReadOptions::STATED, |index| index == 0)?.next();
+        let first = recordings(std::slice::from_ref(&path), ReadOptions::STATED, |index| {
+            index == 0
+        })?
+        .next();
         let log = first.context("expected a scenario, found none")??.log;
         let official = OFFICIAL.iter().find(|(id, _)| *id == log.scenario);
         let official = official.filter(|_| self.rollouts.get() == 32).map(|o| o.1);

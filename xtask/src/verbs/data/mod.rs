@@ -1,5 +1,6 @@
 //! `data`: look into scenario files, check, count and convert them, make new ones.
 
+mod benchmark;
 mod convert;
 mod inspect;
 mod stats;
@@ -21,4 +22,6 @@ pub(crate) enum Verb {
     Convert(convert::Args),
     /// Make up scenarios that are free of any recording's licence
     Synthesize(synthesize::Args),
+    /// The scenes of a frozen list, made anew or looked for, and held to its sums
+    Benchmark(benchmark::Args),
 }

@@ -5,11 +5,12 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use gump_scene::Scenario;
+use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, RoadFamily, SumoDemand, SynthesisConfig};
 use rayon::prelude::*;
 use serde::Serialize;
 
+use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::fresh::profile_of_name;
 use crate::run::{self, Common, Run};
@@ -77,6 +78,7 @@ enum Kind {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.check()?;
+        check_seed(run.seed())?;
         let mut made = Made::default();
         match self.kind {
             Kind::Procedural => self.procedural(run, &mut made)?,
@@ -244,6 +246,22 @@ impl Args {
         run.result("runs", next)?;
         Ok(())
     }
+}
+
+/// Error: [`WrongArguments`] for a seed of the frozen sets.
+fn check_seed(seed: Seed) -> anyhow::Result<()> {
+    let reserved = benchmark::RESERVED;
+    if !reserved.contains(&seed.0) {
+        return Ok(());
+    }
+    let why = format!(
+        "--seed: expected none from {} to {}, found {}: those are of the frozen sets, \
+         which `data benchmark` makes and training never sees",
+        reserved.start,
+        reserved.end - 1,
+        seed.0
+    );
+    Err(WrongArguments(why).into())
 }
 
 /// What a run made, counted.

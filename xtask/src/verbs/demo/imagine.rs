@@ -8,6 +8,7 @@ use gump_viz::{Camera, CandidatePath, FilmSpec, overlay_film};
 use serde_json::{Value, json};
 
 use super::Demo;
+use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::imagine;
 use crate::run::Run;
@@ -24,26 +25,28 @@ const PLANNED: usize = 2;
 
 pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let scenario = &demo.scenario;
+    let ruled = Decoding::of(demo.sampling.clone());
+    let raw = ruled.without_rules();
     let worlds = [
-        ("learned", shipped::world(), FUTURES),
-        ("idm", WorldName::Idm, FUTURES),
-        ("constant-velocity", WorldName::ConstantVelocity, FUTURES),
-        ("log", WorldName::Log, 1),
+        ("learned", shipped::world(), FUTURES, &ruled),
+        ("learned (raw)", shipped::world(), FUTURES, &raw),
+        ("idm", WorldName::Idm, FUTURES, &ruled),
+        (
+            "constant-velocity",
+            WorldName::ConstantVelocity,
+            FUTURES,
+            &ruled,
+        ),
+        ("log", WorldName::Log, 1, &ruled),
     ];
     let (mut rows, mut table, mut learned) = (Vec::new(), Vec::new(), Vec::new());
-    for (name, world, n_futures) in worlds {
+    for (name, world, n_futures, decoding) in worlds {
         if world == WorldName::Log && scenario.future().is_empty() {
             continue;
         }
-        let world = World::build(run.device(), &world, scenario, &demo.sampling)?;
-        let imagined = imagine(
-            run,
-            &world,
-            scenario.present(),
-            n_futures,
-            SECONDS,
-            run.seed(),
-        )?;
+        let world = World::build(run.device(), &world, scenario, &decoding.sampling)?;
+        let config = decoding.frames(SECONDS);
+        let imagined = imagine(run, &world, scenario, n_futures, &config, run.seed())?;
         let total = summarize(&imagined.rollouts, Some(scenario)).total();
         rows.push(json!({
             "world": name,
@@ -74,7 +77,8 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         .section("How good they are")
         .prose(
             "Collisions and off-road driving as shares of agents; displacement from what really \
-             happened in metres, of the average and of the best future. The log is what happened.",
+             happened in metres, of the average and of the best future. The log is what happened; \
+             raw is the network alone, without the rules that hold its draws back.",
         )
         .table(
             &[

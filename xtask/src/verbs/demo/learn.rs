@@ -55,7 +55,7 @@ pub(super) fn network(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
 pub(super) fn train(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let progress = run.progress("training", STEPS as u64, "steps");
     let read = |split| dataset::read(&dataset::parts(&shipped::data(), split)?, &progress);
-    let (scenarios, validation) = (read(Split::Train)?, read(Split::Validation)?);
+    let (scenarios, validation) = (read(Split::Train)?, read(Split::Tune)?);
     drop(progress);
     let shipped = checkpoint::load(&shipped::weights(), &Device::Cpu)?;
     let model = shipped.config().clone();

@@ -14,6 +14,7 @@ use gump_viz::{CandidatePath, Page, Viewer};
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::decoding::Decoding;
 use crate::machine;
 use crate::run::{Common, Run};
 use crate::shipped;
@@ -74,7 +75,7 @@ impl Args {
         shipped::check_weights()?;
         let name = match &self.scenario {
             Some(name) => name.clone(),
-            None => shipped::scenario()?,
+            None => shipped::scenario(),
         };
         run.setting("scenario", &name)?;
         let mut demo = Demo {
@@ -130,8 +131,8 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
         &demo.scenario,
         &demo.sampling,
     )?;
-    let scene = demo.scenario.present();
-    told::heat(run, &mut viewer, world, scene, 1, imagine::SECONDS)?;
+    let config = Decoding::of(demo.sampling.clone()).frames(imagine::SECONDS);
+    told::heat(run, &mut viewer, world, &demo.scenario, 1, &config)?;
     for candidate in &demo.candidates {
         viewer.candidate(candidate.clone());
     }

@@ -1,7 +1,6 @@
 //! `evaluate closed-loop`: how well a planner drives, as nuPlan scores it.
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
 
@@ -17,6 +16,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::ranking;
+use crate::benchmark::{Found, Scenes};
 use crate::charts;
 use crate::cli::WrongArguments;
 use crate::futures;
@@ -41,9 +41,9 @@ pub(super) const COLUMNS: [(&str, &str); 8] = [
 /// Arguments of `evaluate closed-loop`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// A file or folder of scenarios
+    /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// Who plans; several, apart by commas, for several rows
     #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
@@ -168,6 +168,8 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
         let sampling = self.sampling.resolve()?;
+        let found = run.phase("find", |_| self.scenarios.find())?;
+        run.result("set", &found.set)?;
         let learned = |world: &&WorldName| matches!(world, WorldName::Model(_));
         let imagination = self
             .imagination
@@ -187,6 +189,7 @@ impl Args {
             for &planner in &self.planner {
                 let drive = Drive {
                     args: self,
+                    found: &found,
                     world,
                     surroundings: &surroundings,
                     imagination: imagined.imagination(),
@@ -229,6 +232,7 @@ type Build<'b, 'd> = &'b (dyn Fn(&Case, Seed) -> anyhow::Result<Box<dyn Explain 
 /// What the drives of one row share.
 struct Drive<'a> {
     args: &'a Args,
+    found: &'a Found,
     world: &'a WorldName,
     surroundings: &'a Surroundings,
     imagination: &'a dyn WorldModel,
@@ -281,7 +285,7 @@ impl Drive<'_> {
         build: Build<'_, 'd>,
     ) -> anyhow::Result<Vec<Entry>> {
         let args = self.args;
-        let cases = recordings::open(&args.scenarios)?;
+        let cases = recordings::open_all(&self.found.paths)?;
         let cases = cases.take(args.limit()).take_while(|_| !interrupted());
         let label = format!("{name} among {}", self.world);
         let total = args.limit.map_or(0, NonZeroUsize::get) as u64;

@@ -6,7 +6,7 @@
 //! were recorded. Prompts are judged on scenes of their own.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
 use gump_metrics::{Interval, intervals};
@@ -21,6 +21,7 @@ use serde_json::{Value, json};
 
 use super::sources::{Case, Makers, Source};
 use super::{long, prompts};
+use crate::benchmark::{Found, Scenes};
 use crate::charts;
 use crate::dataset::{self, Split};
 use crate::run::{Common, Run, stop_if_interrupted};
@@ -30,9 +31,9 @@ use crate::verbs::generate;
 /// Arguments of `evaluate generation`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// A file or folder of scenarios
+    /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// Further scenes per scenario, each around another vehicle at another time
     #[arg(long, value_name = "N", default_value_t = 0)]
     centres: usize,
@@ -86,7 +87,9 @@ impl Args {
             ..MmdProtocol::gump()
         };
         let seed = run.seed();
-        let scenarios = run.phase("read", |_| read(&self.scenarios, self.limit, &protocol))?;
+        let found = run.phase("find", |_| self.scenarios.find())?;
+        run.result("set", &found.set)?;
+        let scenarios = run.phase("read", |_| read(&found, self.limit, &protocol))?;
         let bank = run.phase("bank", |_| self.bank(&protocol))?;
         anyhow::ensure!(
             scenarios.len() > 1,
@@ -149,22 +152,24 @@ impl Args {
     /// The recordings that are retrieved.
     fn bank(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
         if let Some(path) = &self.bank {
-            return read(path, None, protocol);
+            return read(&Found::path(path), None, protocol);
         }
         let parts = dataset::parts(&shipped::data(), Split::Train)?;
-        let parts = parts.iter().map(|part| read(&part.path, None, protocol));
+        let parts = parts
+            .iter()
+            .map(|part| read(&Found::path(&part.path), None, protocol));
         Ok(parts.collect::<anyhow::Result<Vec<_>>>()?.concat())
     }
 }
 
-/// The scenarios of a file or folder that take part.
+/// The scenarios that take part.
 fn read(
-    path: &Path,
+    found: &Found,
     limit: Option<usize>,
     protocol: &MmdProtocol,
 ) -> anyhow::Result<Vec<Scenario>> {
     let mut scenarios = Vec::new();
-    for record in gump_data::open(path)? {
+    for record in found.open(gump_data::ReadOptions::ALL)? {
         stop_if_interrupted()?;
         let scenario = record?.scenario;
         let present = scenario.present();

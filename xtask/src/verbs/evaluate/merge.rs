@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{ledger, motion, wosac};
+use super::{behaviour, ledger, motion, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
@@ -12,6 +12,7 @@ type Tell = fn(&mut Run, &[PathBuf]) -> anyhow::Result<()>;
 
 /// Benchmarks that can be sharded, by the name in their ledgers.
 const BENCHMARKS: &[(&str, Tell)] = &[
+    (behaviour::BENCHMARK, behaviour::tell_merged),
     (motion::NAME, motion::tell_merged),
     (wosac::BENCHMARK, wosac::tell_merged),
 ];

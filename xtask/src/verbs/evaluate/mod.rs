@@ -4,6 +4,7 @@
 //! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of `BENCHMARKS` in [`merge`].
 
+pub(crate) mod behaviour;
 mod closed_loop;
 pub(crate) mod generation;
 mod ledger;
@@ -27,6 +28,8 @@ pub(crate) enum Verb {
     Motion(motion::Args),
     /// Realism: the Waymo Sim Agents Challenge
     Wosac(wosac::Args),
+    /// What a driver would notice, in worlds and in the log: parked cars that move, overlaps, slip
+    Behaviour(behaviour::Args),
     /// Generated scenes: likeness to recorded ones, overlaps, prompts
     Generation(generation::Args),
     /// How well a planner drives, as nuPlan scores it

@@ -1,7 +1,6 @@
 //! `evaluate open-loop`: how near a planner's plans are to what was driven, as nuPlan scores it.
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
 
 use gump_metrics::interval;
 use gump_metrics::nuplan::{OpenLoop, Scoring};
@@ -11,6 +10,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
+use crate::benchmark::{Found, Scenes};
 use crate::charts;
 use crate::planners::{PlannerName, Surroundings, Thinking};
 use crate::recordings::{self, Case, Named};
@@ -23,9 +23,9 @@ const HORIZON: f64 = 8.0;
 /// Arguments of `evaluate open-loop`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// A file or folder of scenarios
+    /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// Who plans; several for several rows
     #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
@@ -54,9 +54,12 @@ impl Args {
         let surroundings = run.phase("load", |run| {
             Surroundings::load_imagination(run.device(), &self.world, &sampling)
         })?;
+        let found = run.phase("find", |_| self.scenarios.find())?;
+        run.result("set", &found.set)?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         for &planner in &self.planner {
-            let outcomes = run.phase("plan", |run| self.plan(run, planner, &surroundings))?;
+            let outcomes =
+                run.phase("plan", |run| self.plan(run, &found, planner, &surroundings))?;
             rows.push(row(planner.name(), &outcomes, run));
             scenarios.extend(outcomes.iter().map(|outcome| tell(planner.name(), outcome)));
         }
@@ -77,10 +80,11 @@ impl Args {
     fn plan(
         &self,
         run: &Run,
+        found: &Found,
         planner: PlannerName,
         surroundings: &Surroundings,
     ) -> anyhow::Result<Vec<Outcome>> {
-        let cases = recordings::open(&self.scenarios)?;
+        let cases = recordings::open_all(&found.paths)?;
         let limit = self.limit.map(NonZeroUsize::get);
         let cases = cases.take(limit.unwrap_or(usize::MAX));
         let progress = run.progress(planner.name(), limit.unwrap_or(0) as u64, "scenarios");

@@ -11,6 +11,7 @@ use gump_data::{ReadOptions, open_with};
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
+use crate::futures;
 use crate::imagine::imagine;
 use crate::rollout_files;
 use crate::run::{self, Common, Run};
@@ -141,8 +142,14 @@ impl Args {
             archive: ArchiveWriter::create(&path, metadata),
             check: SubmissionCheck::default(),
             expected: &expected,
+            digests: Vec::new(),
         };
         run.phase("pack", |run| self.pack(run, &mut packer))?;
+        if let Some(world) = &self.source.world {
+            run.result("decoding", self.sampling.decoding(world)?.name)?;
+            let digests = packer.digests.iter().map(String::as_str);
+            run.result("digest", futures::digest_of(digests))?;
+        }
         packer.check.finish(&expected);
         if packer.check.n_problems > 0 {
             return tell(run, &packer.check);
@@ -175,14 +182,16 @@ impl Args {
             }
         }
         if let Some(world) = &self.source.world {
-            let mut worlds = Worlds::new(run.device(), world, self.sampling.resolve()?);
+            let decoding = self.sampling.decoding(world)?;
+            let mut worlds = Worlds::new(run.device(), world, decoding.sampling.clone());
             let scenarios = open_with(&self.scenarios, ReadOptions::ALL)?;
             for (index, record) in scenarios.enumerate() {
                 let scenario = record?.scenario;
                 let seed = run.seed().fork(index as u64);
-                let seconds = N_STEPS as f64 * scenario.dt;
-                let (world, scene) = (worlds.of(&scenario)?, scenario.present());
-                let imagined = imagine(run, world, scene, N_FUTURES, seconds, seed)?;
+                let config = decoding.frames(N_STEPS as f64 * scenario.dt);
+                let world = worlds.of(&scenario)?;
+                let imagined = imagine(run, world, &scenario, N_FUTURES, &config, seed)?;
+                packer.digests.push(futures::digest(&imagined.rollouts));
                 let (rollouts, _) = rollouts_to_proto(&scenario.id, &imagined.rollouts)?;
                 packer.add(&rollouts)?;
             }
@@ -196,6 +205,8 @@ struct Packer<'a> {
     archive: ArchiveWriter,
     check: SubmissionCheck,
     expected: &'a ExpectedScenarios,
+    /// Of the futures that were imagined.
+    digests: Vec<String>,
 }
 
 impl Packer<'_> {

@@ -16,6 +16,7 @@ use serde_json::{Map, Value, json};
 
 use self::realism::Judge;
 use self::stages::Stage;
+use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::dataset::{self, Part, Split, Training};
 use crate::fresh::Stream;
@@ -230,29 +231,47 @@ impl Args {
             Some(stream) => Training::fresh(stream.clone(), stage.config.train.batch),
             None => Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?,
         };
+        warn_of_frozen(run, &training)?;
         let validation = match (&self.validation, stream) {
             (Some(path), _) => vec![Part::whole(path)],
             (None, Some(stream)) => return Ok((training, stream.validation(VALIDATION_SAMPLES))),
-            (None, None) => dataset::parts(&stage.data, Split::Validation)?,
+            (None, None) => dataset::parts(&stage.data, Split::Tune)?,
         };
         let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
         Ok((training, validation))
     }
 }
 
-/// The weights to go on from.
+/// Says so if the network is to learn from scenes of a frozen set.
+///
+/// Error: a list of this repository that cannot be read.
+fn warn_of_frozen(run: &Run, training: &Training) -> anyhow::Result<()> {
+    let frozen = benchmark::frozen_ids()?;
+    let sets = training.ids().filter_map(|id| Some((id, frozen.get(id)?)));
+    let found: Vec<_> = sets.collect();
+    if let Some((id, set)) = found.first() {
+        run.say(&format!(
+            "warning: {} training scenes are of frozen sets, {id} of {set} for one: \
+             what these weights score there says nothing",
+            found.len()
+        ));
+    }
+    Ok(())
+}
+
+/// The weights to go on from; those without marks of what is not known grow them where the
+/// configuration has them.
 ///
 /// Error: [`WrongArguments`] if they are of another model than the configuration.
 fn load(weights: &Path, stage: &Stage, device: &Device) -> anyhow::Result<Network> {
-    let network = checkpoint::load(weights, device)?;
-    if *network.config() != stage.config.model()? {
+    let network = checkpoint::load_to_grow(weights, &stage.config.model()?, device)?;
+    network.ok_or_else(|| {
         let wrong = format!(
             "{} holds another model than the configuration",
             weights.display()
         );
-        return Err(WrongArguments(wrong).into());
-    }
-    Ok(network)
+        WrongArguments(wrong).into()
+    })
 }
 
 /// What a stage is validated on.

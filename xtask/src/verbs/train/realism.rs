@@ -49,7 +49,7 @@ impl<'a> Judge<'a> {
         self.scenes.len()
     }
 
-    /// Mean scores over the scenes.
+    /// Mean scores over the scenes, under the default rules.
     ///
     /// Error: what the world reports, or Ctrl-C.
     pub(super) fn score(&self, trainer: &Trainer) -> anyhow::Result<Option<Scores>> {
@@ -58,7 +58,7 @@ impl<'a> Judge<'a> {
         for (i, (scenario, log)) in self.scenes.iter().enumerate() {
             stop_if_interrupted()?;
             let start = Start {
-                scene: scenario.present(),
+                scene: scenario.present().unguided(),
                 n_futures: self.rollouts,
                 seed: self.seed.fork(i as u64),
             };

@@ -122,8 +122,8 @@ pub(super) struct Follower {
     /// Arc length of the box centre.
     s: f64,
     speed: f64,
-    /// Desired speed where no limit is stated.
-    own_speed: f64,
+    /// Speed at the start: nobody drives slower than that for a limit that is not stated.
+    start_speed: f64,
     /// Up to here lights of unknown colour are what it waits for.
     waits_until: f64,
     place: Placement,
@@ -207,7 +207,7 @@ impl Follower {
             path,
             s,
             speed,
-            own_speed: ground.config.target_velocity.max(speed),
+            start_speed: speed,
             waits_until: if speed < WAITING {
                 s + agent.length / 2.0 + WAITING_REACH
             } else {
@@ -286,7 +286,9 @@ impl Follower {
 
     fn desired_speed(&self, config: &IdmConfig) -> f64 {
         let (limit, curve) = self.path.speeds_at(self.s);
-        let wanted = limit.unwrap_or(self.own_speed).min(curve).max(1.0);
+        let guess = limit.usual.unwrap_or(config.target_velocity);
+        let limit = limit.stated.unwrap_or(guess.max(self.start_speed));
+        let wanted = limit.min(curve).max(1.0);
         wanted.max(gentle_speed(config, self.speed))
     }
 

@@ -26,8 +26,9 @@ use road::Road;
 /// Parameters of the law and of the driver around it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct IdmConfig {
-    /// Desired speed where a lane states no limit, metres per second; a vehicle that is faster at
-    /// the start keeps its own.
+    /// Desired speed where a lane states neither a limit nor of what kind it is, metres per second;
+    /// lanes of a kind have its usual limit, and a vehicle that is faster at the start keeps its own
+    /// speed.
     pub target_velocity: f64,
     /// Gap kept at standstill, metres.
     pub min_gap: f64,

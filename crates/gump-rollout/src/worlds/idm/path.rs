@@ -24,13 +24,31 @@ pub(super) struct Path {
     stops: Vec<Stop>,
 }
 
+/// How fast a lane lets drive.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Limit {
+    /// What the map states, metres per second.
+    pub(super) stated: Option<f64>,
+    /// What lanes of its kind usually have, if the kind is stated.
+    pub(super) usual: Option<f64>,
+}
+
+impl Limit {
+    fn of(lane: &Lane) -> Self {
+        Self {
+            stated: lane.speed_limit,
+            usual: lane.kind.usual_speed_limit(),
+        }
+    }
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Vertex {
     point: DVec2,
     s: f64,
     heading: f64,
     /// Speed limit from here on.
-    limit: Option<f64>,
+    limit: Limit,
     /// Speed that lets the vehicle take every curve ahead.
     curve_speed: f64,
 }
@@ -85,7 +103,7 @@ impl Path {
             return;
         };
         let start = self.end();
-        self.push_points(center, lane.speed_limit);
+        self.push_points(center, Limit::of(lane));
         self.last_lane = Some(id);
         self.push_stop(lane, start, lights);
     }
@@ -98,7 +116,7 @@ impl Path {
         lanes: &[LaneId],
         lights: &[Light],
     ) {
-        self.push_points(points, None);
+        self.push_points(points, Limit::default());
         let mut start = 0.0;
         for lane in lanes.iter().filter_map(|&id| road.lane(id)) {
             let center = lane.centerline.points();
@@ -112,7 +130,7 @@ impl Path {
             };
             for vertex in &mut self.vertices {
                 if start <= vertex.s && vertex.s < end {
-                    vertex.limit = lane.speed_limit;
+                    vertex.limit = Limit::of(lane);
                 }
             }
             self.last_lane = Some(lane.id);
@@ -121,7 +139,7 @@ impl Path {
         }
     }
 
-    fn push_points(&mut self, points: &[DVec2], limit: Option<f64>) {
+    fn push_points(&mut self, points: &[DVec2], limit: Limit) {
         for &point in points {
             let s = match self.vertices.last_mut() {
                 Some(last) => {
@@ -238,11 +256,11 @@ impl Path {
         }
     }
 
-    /// The speed limit at `s`, if stated, and the speed that curves allow.
-    pub(super) fn speeds_at(&self, s: f64) -> (Option<f64>, f64) {
+    /// The speed limit at `s` and the speed that curves allow.
+    pub(super) fn speeds_at(&self, s: f64) -> (Limit, f64) {
         let i = self.segment(s);
         let (Some(a), Some(b)) = (self.vertices.get(i), self.vertices.get(i + 1)) else {
-            return (None, f64::INFINITY);
+            return (Limit::default(), f64::INFINITY);
         };
         if s >= b.s {
             // Past the end nothing is known of curves.
@@ -293,6 +311,13 @@ mod tests {
     use gump_scene::fixture;
     use std::f64::consts::FRAC_PI_2;
 
+    fn stated(limit: f64) -> Limit {
+        Limit {
+            stated: Some(limit),
+            usual: None,
+        }
+    }
+
     /// 40 m east, a quarter circle of radius 10 m to the left, 40 m north.
     fn bend() -> Path {
         let mut points = vec![dvec2(0.0, 0.0)];
@@ -302,7 +327,7 @@ mod tests {
         }));
         points.push(dvec2(50.0, 50.0));
         let mut path = Path::new();
-        path.push_points(&super::super::road::simplify(&points), Some(13.0));
+        path.push_points(&super::super::road::simplify(&points), stated(13.0));
         path.finish(&IdmConfig::default(), 0.0);
         path
     }
@@ -330,7 +355,7 @@ mod tests {
     fn curves_ask_for_slow_driving_in_time() {
         let path = bend();
         let (limit, slow) = path.speeds_at(48.0);
-        assert_eq!(limit, Some(13.0));
+        assert_eq!(limit.stated, Some(13.0));
         // sqrt(3 m/s² * 10 m) = 5.5 m/s, up to the corners of the simplified line.
         assert!((4.5..6.5).contains(&slow), "{slow}");
         let (_, before) = path.speeds_at(20.0);

@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use gump_data::{ReadOptions, open_with};
+use gump_data::ReadOptions;
 use gump_metrics::motion::{
     MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
     forecast,
@@ -23,6 +23,9 @@ use self::source::Predictions;
 use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
 use super::shard::Shard;
+use crate::benchmark::{Found, Scenes};
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::worlds::{Sampling, WorldName, Worlds};
@@ -35,9 +38,9 @@ pub(crate) const NAME: &str = "motion";
 /// Arguments of `evaluate motion`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Scenarios with their futures: a file or a folder
+    /// Scenarios with their futures: a file, a folder, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     #[command(flatten)]
     #[serde(flatten)]
     source: Source,
@@ -98,11 +101,12 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
-        let header = self.header(run)?;
+        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let header = self.header(run, &scenarios, forecaster.decoding())?;
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
-        let mut records = self.open()?.enumerate();
+        let mut records = self.open(&scenarios)?.enumerate();
         while let Some((index, record)) = run.phase("read", |_| Ok(records.next()))? {
             run::stop_if_interrupted()?;
             let mut scenario = record?.scenario;
@@ -114,17 +118,18 @@ impl Args {
             let predictions = run.phase("predict", |run| {
                 forecaster.predict(run, &scenario, &config, index)
             });
-            let scores = predictions.and_then(|predictions| {
+            let scores = predictions.and_then(|(predictions, digest)| {
                 run.phase("score", |_| {
-                    Ok(evaluate_predictions(&scenario, &predictions, &config)?)
+                    let scores = evaluate_predictions(&scenario, &predictions, &config)?;
+                    Ok((scores, digest))
                 })
             });
-            let scores: Option<Vec<PredictionScore>> =
+            let scores: Option<(Vec<PredictionScore>, Option<String>)> =
                 left_out.sift(scores, is_of_another_length)?;
-            let Some(scores) = scores else {
+            let Some((scores, digest)) = scores else {
                 continue;
             };
-            let scores = Scores::new(&scores, absent);
+            let scores = Scores::new(&scores, absent, digest);
             let id = scenario.id;
             ledger.enter(Entry { index, id, scores })?;
             progress.advance(1);
@@ -133,35 +138,46 @@ impl Args {
         forecaster.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(run, &entries, &config)
+        tell::tell(
+            run,
+            &scenarios.set,
+            &entries,
+            &config,
+            forecaster.decoding(),
+        )
     }
 
-    fn open(&self) -> anyhow::Result<gump_data::Reader> {
+    fn open(&self, scenarios: &Found) -> anyhow::Result<gump_data::Reader> {
         // Only worlds look at the map.
         let options = match self.source.world {
             Some(_) => ReadOptions::ALL,
             None => ReadOptions::STATED,
         };
-        Ok(open_with(&self.scenarios, options)?)
+        Ok(scenarios.open(options)?)
     }
 
     fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
         Ok(match (&self.source.rollouts, &self.source.world) {
             (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
-            (None, Some(name)) => Forecaster::World {
-                worlds: Worlds::new(device, name, self.sampling.resolve()?),
-                n_futures: self.futures.get(),
-            },
+            (None, Some(name)) => {
+                let decoding = self.sampling.decoding(name)?;
+                Forecaster::World {
+                    worlds: Worlds::new(device, name, decoding.sampling.clone()),
+                    n_futures: self.futures.get(),
+                    decoding,
+                }
+            }
             (None, None) => anyhow::bail!("expected --rollouts or --world"),
         })
     }
 
     /// Everything that the scores of a scenario depend on.
-    fn header(&self, run: &Run) -> anyhow::Result<Header> {
+    fn header(&self, run: &Run, scenarios: &Found, decoding: &str) -> anyhow::Result<Header> {
         let mut settings = toml::Table::new();
         let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
-        set("scenarios", self.scenarios.display().to_string().into());
+        set("scenarios", scenarios.set.clone().into());
         set("shapes", toml::Value::try_from(self.shapes)?);
+        set("decoding", decoding.into());
         set("seed", i64::try_from(run.seed().0)?.into());
         if let Some(path) = &self.source.rollouts {
             set("rollouts", path.display().to_string().into());
@@ -196,6 +212,7 @@ enum Forecaster<'a> {
     World {
         worlds: Worlds<'a>,
         n_futures: usize,
+        decoding: Decoding,
     },
 }
 
@@ -212,22 +229,37 @@ impl Forecaster<'_> {
         before - scenario.targets.len()
     }
 
+    /// How its futures are made; a file does not tell.
+    fn decoding(&self) -> &'static str {
+        match self {
+            Self::File(..) => Decoding::NONE,
+            Self::World { decoding, .. } => decoding.name,
+        }
+    }
+
+    /// Predictions, and the digest of the futures they were condensed from.
     fn predict(
         &mut self,
         run: &Run,
         scenario: &Scenario,
         config: &MotionConfig,
         index: usize,
-    ) -> anyhow::Result<Vec<Prediction>> {
+    ) -> anyhow::Result<(Vec<Prediction>, Option<String>)> {
         match self {
-            Self::File(predictions, path) => predictions.of(scenario, config, path),
-            Self::World { .. } if scenario.targets.is_empty() => Ok(Vec::new()),
-            Self::World { worlds, n_futures } => {
-                let seconds = config.n_steps as f64 * config.step_seconds;
+            Self::File(predictions, path) => Ok((predictions.of(scenario, config, path)?, None)),
+            Self::World { .. } if scenario.targets.is_empty() => Ok((Vec::new(), None)),
+            Self::World {
+                worlds,
+                n_futures,
+                decoding,
+            } => {
+                let frames = decoding.frames(config.n_steps as f64 * config.step_seconds);
                 let seed = run.seed().fork(index as u64);
-                let (world, scene) = (worlds.of(scenario)?, scenario.present());
-                let imagined = imagine(run, world, scene, *n_futures, seconds, seed)?;
-                Ok(forecast(scenario, &imagined.rollouts, config)?)
+                let world = worlds.of(scenario)?;
+                let imagined = imagine(run, world, scenario, *n_futures, &frames, seed)?;
+                let digest = futures::digest(&imagined.rollouts);
+                let predictions = forecast(scenario, &imagined.rollouts, config)?;
+                Ok((predictions, Some(digest)))
             }
         }
     }

@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 pub(super) struct Scores {
     /// Targets that could not be predicted because they were absent.
     pub(super) absent: usize,
+    /// Of the futures that predictions were condensed from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) digest: Option<String>,
     /// Every prediction.
     #[serde(default)]
     predictions: Vec<Line>,
@@ -36,7 +39,7 @@ struct AtHorizon {
 }
 
 impl Scores {
-    pub(super) fn new(scores: &[PredictionScore], absent: usize) -> Self {
+    pub(super) fn new(scores: &[PredictionScore], absent: usize, digest: Option<String>) -> Self {
         let line = |score: &PredictionScore| Line {
             agents: score.agents.iter().map(|agent| agent.0).collect(),
             class: score.kind.name().into(),
@@ -45,6 +48,7 @@ impl Scores {
         };
         Self {
             absent,
+            digest,
             predictions: scores.iter().map(line).collect(),
         }
     }
@@ -150,7 +154,7 @@ mod tests {
                 },
             ],
         }];
-        let kept = Scores::new(&scores, 2);
+        let kept = Scores::new(&scores, 2, Some("c0de".into()));
         let text = toml::to_string(&kept).unwrap();
         let read: Scores = toml::from_str(&text).unwrap();
         assert_eq!(read, kept);
@@ -159,7 +163,7 @@ mod tests {
             let broken: Scores = toml::from_str(&text.replace(from, to)).unwrap();
             assert!(broken.scores().is_err(), "{to}");
         }
-        let nothing = Scores::new(&[], 0);
+        let nothing = Scores::new(&[], 0, None);
         let text = toml::to_string(&nothing).unwrap();
         assert_eq!(toml::from_str::<Scores>(&text).unwrap(), nothing);
     }

@@ -13,6 +13,8 @@ use serde_json::{Map, Value, json};
 use super::scores::Scores;
 use super::{NAME, Shapes};
 use crate::charts;
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::run::Run;
 use crate::verbs::evaluate::ledger::{self, Entry};
 
@@ -32,8 +34,10 @@ const CHARTS: [(&str, &str, &[&str]); 2] = [
 /// Fills the report of a run.
 pub(super) fn tell(
     run: &mut Run,
+    set: &str,
     entries: &[Entry<Scores>],
     config: &MotionConfig,
+    decoding: &str,
 ) -> anyhow::Result<()> {
     let tallies = entries.iter().map(|entry| {
         let scores = entry.scores.scores();
@@ -49,9 +53,13 @@ pub(super) fn tell(
     })?;
     let absent: usize = entries.iter().map(|entry| entry.scores.absent).sum();
     run.result("benchmark", NAME)?;
+    run.result("set", set)?;
+    run.result("decoding", decoding)?;
     run.result("scenarios", entries.len())?;
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
+    let digests = entries.iter().filter_map(|e| e.scores.digest.as_deref());
+    run.result("digest", futures::digest_of(digests))?;
     let table: Vec<Value> = rows.iter().map(|row| Value::Object(line(row))).collect();
     let intervals = interval_lines(&rows, &spans);
     for (stem, label, columns) in CHARTS {
@@ -71,7 +79,11 @@ pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<
         .get("seed")
         .and_then(toml::Value::as_integer);
     run.reseed(seed.and_then(|seed| u64::try_from(seed).ok()).unwrap_or(0));
-    tell(run, &entries, &Shapes::deserialize(shapes)?.config())
+    let setting = |key: &str| header.settings.get(key).and_then(toml::Value::as_str);
+    let set = setting("scenarios").unwrap_or_default();
+    let decoding = setting("decoding").unwrap_or(Decoding::NONE);
+    let config = Shapes::deserialize(shapes)?.config();
+    tell(run, set, &entries, &config, decoding)
 }
 
 fn merged<'a>(tallies: impl Iterator<Item = &'a MotionTally>) -> MotionTally {

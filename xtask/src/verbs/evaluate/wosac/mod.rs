@@ -7,6 +7,7 @@
 mod recording;
 mod rollouts;
 mod tell;
+mod worst;
 
 use std::io::Write as _;
 use std::num::NonZeroUsize;
@@ -23,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
 use super::shard::Shard;
+use crate::benchmark::{Found, Scenes};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
 use crate::tables;
@@ -30,6 +32,7 @@ use crate::worlds::{Sampling, WorldName};
 pub(crate) use recording::{Recorded, recordings};
 pub(crate) use rollouts::Source;
 pub(crate) use tell::tell_merged;
+use worst::Worst;
 
 /// Name of the benchmark in ledgers.
 pub(crate) const BENCHMARK: &str = "wosac";
@@ -37,9 +40,9 @@ pub(crate) const BENCHMARK: &str = "wosac";
 /// Arguments of `evaluate wosac`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// File or directory of recorded scenarios
+    /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    scenarios: Scenes,
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", required_unless_present = "rollouts")]
     world: Option<WorldName>,
@@ -55,8 +58,9 @@ pub(crate) struct Args {
     /// Evaluate part K of N; put the parts together with `evaluate merge`
     #[arg(long, value_name = "K/N")]
     shard: Option<Shard>,
-    /// Also say what lowered the scores and when, in explain.jsonl, agents.parquet and the dearest in
-    /// the report
+    /// Also say what lowered the scores of the first row and when, in explain.jsonl, agents.parquet
+    /// and the largest losses in the report, and which agents do what no driver would, in
+    /// conduct.parquet
     #[arg(long)]
     explain: bool,
     #[command(flatten)]
@@ -111,8 +115,8 @@ pub(crate) struct Settings {
     pub(crate) year: String,
     /// How many rollouts a world imagines.
     pub(crate) rollouts_per_scenario: usize,
-    /// File names, without the folders that differ between machines.
-    scenarios: String,
+    /// The set, without the folders that differ between machines.
+    pub(crate) scenarios: String,
     rollouts: String,
     /// How a learned world decodes, as JSON.
     sampling: String,
@@ -124,9 +128,21 @@ pub(crate) struct Settings {
 pub(crate) struct Scored {
     /// Wall seconds that scoring took, without imagining.
     pub(crate) seconds: f64,
-    pub(crate) evaluated: Scores,
+    /// One for each decoding, in order.
+    pub(crate) evaluated: Vec<Evaluated>,
     pub(crate) oracle: Scores,
     pub(crate) constant_velocity: Scores,
+}
+
+/// What is evaluated, decoded in one way.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Evaluated {
+    /// `ruled`, `raw` or `paper`; `-` where nothing is decoded.
+    pub(crate) decoding: String,
+    /// Of the rollouts, if a world imagined them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) digest: Option<String>,
+    pub(crate) scores: Scores,
 }
 
 /// What one agent cost in one scenario, as it is written.
@@ -149,28 +165,20 @@ const N_EXPLAINED: usize = 20;
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let sampling = self.sampling.resolve()?;
         let shard = self.shard.unwrap_or(Shard::WHOLE);
-        let settings = self.settings(run)?;
+        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let settings = self.settings(run, &scenarios)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard,
             settings: toml::Table::try_from(&settings)?,
         };
         let config = Config::of(self.year.year());
-        let mut source = match (&self.world, &self.rollouts) {
-            (_, Some(path)) => run.phase("index rollouts", |_| Source::files(path))?,
-            (Some(world), None) => {
-                let n = self.rollouts_per_scenario.get();
-                Source::world(world.clone(), sampling, n, run.seed())
-            }
-            (None, None) => {
-                let wrong = "expected --world or --rollouts, found neither";
-                return Err(WrongArguments(wrong.into()).into());
-            }
-        };
+        let mut sources = self.sources(run)?;
+        let options = sources[0].read_options();
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
+        let mut worst = self.explain.then(Worst::default);
         run.phase("evaluate", |run| {
             let mut log = match self.explain {
                 true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
@@ -179,9 +187,10 @@ impl Args {
             let progress = run.progress("evaluating", 0, "scenarios");
             let kept = ledger.indices();
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
-            for recorded in recordings(&self.scenarios, source.read_options(), wanted)? {
+            for recorded in recordings(&scenarios.paths, options, wanted)? {
                 let scored = recorded.and_then(|recorded| {
-                    let scored = self.evaluate(run, &config, &recorded, &mut source)?;
+                    let scored =
+                        self.evaluate(run, &config, &recorded, &mut sources, worst.as_mut())?;
                     Ok((recorded, scored))
                 });
                 let scored = left_out.sift(scored, is_of_another_length)?;
@@ -212,17 +221,37 @@ impl Args {
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {shard}, found none: {}",
-            self.scenarios.display()
+            self.scenarios
         );
         tell::tell(run, &settings, &entries)?;
         if self.explain {
             run.result("explain", &explained)?;
             tabulate(run)?;
         }
+        if let Some(worst) = worst {
+            worst.tell(run)?;
+        }
         Ok(())
     }
 
-    fn settings(&self, run: &Run) -> anyhow::Result<Settings> {
+    /// Where rollouts come from, once for each decoding; at least one.
+    fn sources(&self, run: &mut Run) -> anyhow::Result<Vec<Source>> {
+        match (&self.world, &self.rollouts) {
+            (_, Some(path)) => Ok(vec![run.phase("index rollouts", |_| Source::files(path))?]),
+            (Some(world), None) => {
+                let (n, seed) = (self.rollouts_per_scenario.get(), run.seed());
+                let decodings = self.sampling.decodings(world)?.into_iter();
+                let sources = decodings.map(|way| Source::world(world.clone(), way, n, seed));
+                Ok(sources.collect())
+            }
+            (None, None) => {
+                let wrong = "expected --world or --rollouts, found neither";
+                Err(WrongArguments(wrong.into()).into())
+            }
+        }
+    }
+
+    fn settings(&self, run: &Run, scenarios: &Found) -> anyhow::Result<Settings> {
         let name = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default();
             name.to_string_lossy().into_owned()
@@ -232,7 +261,7 @@ impl Args {
             world: world.unwrap_or_else(|| "rollouts".into()),
             year: self.year.year().name().into(),
             rollouts_per_scenario: self.rollouts_per_scenario.get(),
-            scenarios: name(&self.scenarios),
+            scenarios: scenarios.set.clone(),
             rollouts: self.rollouts.as_ref().map(name).unwrap_or_default(),
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
@@ -244,32 +273,51 @@ impl Args {
         run: &Run,
         config: &Config,
         recorded: &Recorded,
-        source: &mut Source,
+        sources: &mut [Source],
+        mut worst: Option<&mut Worst>,
     ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
-        let rollouts = source
-            .rollouts(run, recorded, config.mode)
-            .with_context(|| format!("cannot evaluate scenario {id}"))?;
+        let found = sources.iter_mut().map(|source| {
+            let found = source.rollouts(run, recorded, config.mode);
+            let found = found.with_context(|| format!("cannot evaluate scenario {id}"))?;
+            Ok((source.decoding(), found))
+        });
+        let found = found.collect::<anyhow::Result<Vec<_>>>()?;
         let baseline = constant_velocity(recorded, config.mode)
             .with_context(|| format!("cannot evaluate scenario {id}"))?;
         let oracle = recorded.log.oracle(n, config.mode == Mode::Generation);
         let began = Instant::now();
         let reference = Reference::new(&recorded.log, config)?;
-        let evaluation = reference.evaluate(&rollouts)?;
-        let seconds = began.elapsed().as_secs_f64();
+        let (mut evaluated, mut blames) = (Vec::new(), None);
+        for (decoding, found) in found {
+            let evaluation = reference.evaluate(&found.rollouts)?;
+            if blames.is_none() {
+                let of_first = evaluation.explain();
+                if let Some(worst) = worst.take().filter(|_| config.mode == Mode::SimAgents) {
+                    worst.add(&recorded.scenario, &found.rollouts, &evaluation, &of_first);
+                }
+                blames = Some(of_first);
+            }
+            evaluated.push(Evaluated {
+                decoding: decoding.into(),
+                digest: found.digest,
+                scores: evaluation.scores,
+            });
+        }
+        let seconds = began.elapsed().as_secs_f64() / evaluated.len() as f64;
         let scores = Scored {
             seconds,
             oracle: reference.evaluate(&oracle)?.scores,
             constant_velocity: reference.evaluate(&baseline.repeated(n))?.scores,
-            evaluated: evaluation.scores.clone(),
+            evaluated,
         };
         let entry = Entry {
             index: recorded.index,
             id: id.clone(),
             scores,
         };
-        Ok((entry, evaluation.explain()))
+        Ok((entry, blames.unwrap_or_default()))
     }
 }
 
@@ -279,7 +327,7 @@ fn constant_velocity(
     mode: Mode,
 ) -> anyhow::Result<gump_metrics::wosac::Rollouts> {
     let start = Start {
-        scene: recorded.scenario.present(),
+        scene: recorded.scenario.present().unguided(),
         n_futures: 1,
         seed: gump_scene::Seed(0),
     };

@@ -4,7 +4,9 @@
 //! which signals flash and when they were not seen, the order of the map. Other formats are scored
 //! as scenarios, with the lights as recorded.
 
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
@@ -25,24 +27,52 @@ pub(crate) struct Recorded {
     pub(crate) log: Log,
 }
 
-/// The `wanted` scenarios of a file or directory in order; holds one at a time.
+/// The `wanted` scenarios of files or directories in order; holds one at a time. Their indices go on
+/// from one path to the next.
 ///
 /// Waymo's messages are filled as `options` say, other formats as far as can be: some state
 /// neither an ego nor whom to predict nor edges of the road.
 ///
 /// Error: a path without scenarios; of single scenarios the iterator tells.
 pub(crate) fn recordings<'a>(
-    path: &Path,
+    paths: &'a [PathBuf],
     options: ReadOptions,
     wanted: impl Fn(usize) -> bool + 'a,
-) -> anyhow::Result<Box<dyn Iterator<Item = anyhow::Result<Recorded>> + 'a>> {
+) -> anyhow::Result<Recordings<'a>> {
+    let (next, wanted): (_, Rc<dyn Fn(usize) -> bool>) = (Rc::default(), Rc::new(wanted));
+    let open = move |path: &PathBuf| of_path(path, options, Rc::clone(&wanted), Rc::clone(&next));
+    let (first, others) = paths
+        .split_first()
+        .context("expected scenarios, found none")?;
+    // A single path that holds none is told at once; others are opened as they are reached.
+    let first = open(first)?;
+    Ok(Box::new(first.chain(others.iter().flat_map(
+        move |path| match open(path) {
+            Ok(recordings) => recordings,
+            Err(error) => Box::new(std::iter::once(Err(error))),
+        },
+    ))))
+}
+
+/// Recorded scenarios, one at a time.
+type Recordings<'a> = Box<dyn Iterator<Item = anyhow::Result<Recorded>> + 'a>;
+
+/// The scenarios of one path, numbered from `next` on.
+fn of_path<'a>(
+    path: &Path,
+    options: ReadOptions,
+    wanted: Rc<dyn Fn(usize) -> bool + 'a>,
+    next: Rc<Cell<usize>>,
+) -> anyhow::Result<Recordings<'a>> {
     let files = waymo_files(path)?;
+    let number = move || next.replace(next.get() + 1);
     if files.is_empty() {
         let recorded_lights = ReadOptions {
             infer_light_gaps: false,
             ..ReadOptions::ALL
         };
-        let records = gump_data::open_with(path, recorded_lights)?.enumerate();
+        let records = gump_data::open_with(path, recorded_lights)?;
+        let records = records.map(move |record| (number(), record));
         let records = records.filter(move |(index, _)| wanted(*index));
         return Ok(Box::new(records.map(|(index, record)| {
             let scenario = record?.scenario;
@@ -62,10 +92,13 @@ pub(crate) fn recordings<'a>(
         };
         error.into_iter().chain(reader.into_iter().flatten())
     });
-    let payloads = payloads.enumerate().filter(move |(index, payload)| {
-        // What is broken is always told.
-        wanted(*index) || payload.is_err()
-    });
+    let payloads =
+        payloads
+            .map(move |payload| (number(), payload))
+            .filter(move |(index, payload)| {
+                // What is broken is always told.
+                wanted(*index) || payload.is_err()
+            });
     Ok(Box::new(payloads.map(move |(index, payload)| {
         let payload = payload?;
         recorded(index, &payload.bytes, options).with_context(|| format!("{}", payload.place))

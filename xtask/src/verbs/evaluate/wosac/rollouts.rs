@@ -8,11 +8,12 @@ use gump_data::ReadOptions;
 use gump_data::submission::read_rollouts;
 use gump_data::womd::proto::{ScenarioRollouts, SimulatedTrajectory};
 use gump_metrics::wosac::{Mode, Rollouts, Trajectory};
-use gump_model::SamplingConfig;
 use gump_scene::{AgentId, Seed};
 
 use super::Recorded;
 use super::recording::kind;
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::imagine::imagine;
 use crate::run::Run;
 use crate::worlds::{World, WorldName};
@@ -20,11 +21,18 @@ use crate::worlds::{World, WorldName};
 /// Seconds that the challenge asks for.
 const HORIZON_S: f64 = 8.0;
 
+/// Rollouts of one scenario.
+pub(crate) struct Found {
+    pub(crate) rollouts: Rollouts,
+    /// Of what a world imagined; nothing is known of a file's rollouts but their paths.
+    pub(crate) digest: Option<String>,
+}
+
 /// Where rollouts come from.
 pub(crate) enum Source {
     World {
         name: WorldName,
-        sampling: SamplingConfig,
+        decoding: Decoding,
         n_rollouts: usize,
         seed: Seed,
         /// The world, once it is built, unless it knows the log.
@@ -42,13 +50,13 @@ impl Source {
     /// Imagines rollouts.
     pub(crate) fn world(
         name: WorldName,
-        sampling: SamplingConfig,
+        decoding: Decoding,
         n_rollouts: usize,
         seed: Seed,
     ) -> Self {
         Self::World {
             name,
-            sampling,
+            decoding,
             n_rollouts,
             seed,
             built: None,
@@ -100,6 +108,14 @@ impl Source {
         })
     }
 
+    /// How rollouts are made; files do not tell.
+    pub(crate) fn decoding(&self) -> &'static str {
+        match self {
+            Self::World { decoding, .. } => decoding.name,
+            Self::Files { .. } => Decoding::NONE,
+        }
+    }
+
     /// Which gaps of Waymo's messages matter.
     pub(crate) fn read_options(&self) -> ReadOptions {
         match self {
@@ -116,17 +132,18 @@ impl Source {
         run: &Run,
         recorded: &Recorded,
         mode: Mode,
-    ) -> anyhow::Result<Rollouts> {
+    ) -> anyhow::Result<Found> {
         let scenario = &recorded.scenario;
         match self {
             Self::World {
                 name,
-                sampling,
+                decoding,
                 n_rollouts,
                 seed,
                 built,
             } => {
                 if built.is_none() || *name == WorldName::Log {
+                    let sampling = &decoding.sampling;
                     *built = Some(World::build(run.device(), name, scenario, sampling)?);
                 }
                 let world = built.as_ref().context("the world has just been built")?;
@@ -136,9 +153,13 @@ impl Source {
                     WorldName::Idm | WorldName::Model(_) => (*n_rollouts, 1),
                 };
                 let seed = seed.fork(recorded.index as u64);
-                let imagined = imagine(run, world, scenario.present(), n, HORIZON_S, seed)?;
+                let frames = decoding.frames(HORIZON_S);
+                let imagined = imagine(run, world, scenario, n, &frames, seed)?;
                 let rollouts = Rollouts::of(&scenario.id, &imagined.rollouts, mode)?;
-                Ok(rollouts.repeated(copies))
+                Ok(Found {
+                    rollouts: rollouts.repeated(copies),
+                    digest: Some(futures::digest(&imagined.rollouts)),
+                })
             }
             Self::Files {
                 folder,
@@ -156,7 +177,10 @@ impl Source {
                     .into_iter()
                     .find(|message| message.scenario_id() == scenario.id)
                     .with_context(|| format!("the file has changed: {}", file.display()))?;
-                Ok(rollouts(message, mode))
+                Ok(Found {
+                    rollouts: rollouts(message, mode),
+                    digest: None,
+                })
             }
         }
     }

@@ -11,6 +11,8 @@ use serde_json::{Map, Value, json};
 
 use super::{Scored, Settings};
 use crate::charts;
+use crate::decoding::Decoding;
+use crate::futures;
 use crate::run::Run;
 use crate::tables;
 use crate::verbs::evaluate::ledger::{self, Entry};
@@ -27,36 +29,84 @@ pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<
     tell(run, &settings, &entries)
 }
 
+/// A world under one decoding: what it got in every scenario.
+struct Told {
+    world: String,
+    decoding: String,
+    /// Of all rollouts, where they were imagined.
+    digest: Option<String>,
+    scores: Vec<Scores>,
+}
+
+impl Told {
+    /// What it is called beside the others.
+    fn label(&self) -> String {
+        Decoding::label(&self.world, &self.decoding)
+    }
+
+    fn row(&self, year: &str, scores: &Scores, scenarios: usize) -> Value {
+        row((&self.world, &self.decoding), year, scenarios, scores)
+    }
+}
+
+/// What is evaluated in every decoding, then the log and the baseline.
+fn told(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Told> {
+    let decodings = entries.first().map_or(&[][..], |e| &e.scores.evaluated);
+    let evaluated = decodings.iter().enumerate().map(|(i, first)| {
+        let of = entries.iter().filter_map(|e| e.scores.evaluated.get(i));
+        let digests = of.clone().filter_map(|found| found.digest.as_deref());
+        Told {
+            world: settings.world.clone(),
+            decoding: first.decoding.clone(),
+            digest: futures::digest_of(digests),
+            scores: of.map(|found| found.scores.clone()).collect(),
+        }
+    });
+    let other = |world: &str, pick: fn(&Scored) -> &Scores| Told {
+        world: world.into(),
+        decoding: Decoding::NONE.into(),
+        digest: None,
+        scores: entries.iter().map(|e| pick(&e.scores).clone()).collect(),
+    };
+    let mut told: Vec<Told> = evaluated.collect();
+    told.push(other(ORACLE, |scored| &scored.oracle));
+    if settings.world != CONSTANT_VELOCITY {
+        told.push(other(CONSTANT_VELOCITY, |scored| &scored.constant_velocity));
+    }
+    told
+}
+
 /// Totals, intervals and the time it took.
 pub(crate) fn tell(
     run: &mut Run,
     settings: &Settings,
     entries: &[Entry<Scored>],
 ) -> anyhow::Result<()> {
-    let of = |pick: fn(&Scored) -> &Scores| -> Vec<Scores> {
-        entries.iter().map(|e| pick(&e.scores).clone()).collect()
-    };
-    let mut worlds = vec![
-        (settings.world.as_str(), of(|scored| &scored.evaluated)),
-        (ORACLE, of(|scored| &scored.oracle)),
-    ];
-    if settings.world != CONSTANT_VELOCITY {
-        worlds.push((CONSTANT_VELOCITY, of(|scored| &scored.constant_velocity)));
-    }
+    let worlds = told(settings, entries);
     per_scenario(settings, entries, &worlds).write(&run.path("scores.parquet"))?;
+    run.result("set", &settings.scenarios)?;
     run.result("scenarios", entries.len())?;
-    let rows = worlds.iter().filter_map(|(world, scores)| {
-        let mean = Scores::mean(scores)?;
-        Some(row(world, &settings.year, scores.len(), &mean))
+    let rows = worlds.iter().filter_map(|world| {
+        let mean = Scores::mean(&world.scores)?;
+        Some(world.row(&settings.year, &mean, world.scores.len()))
     });
     run.result("rows", rows.collect::<Vec<_>>())?;
-    let intervals = intervals(&worlds);
-    let names: Vec<&str> = worlds.iter().map(|(world, _)| *world).collect();
+    let imagined = worlds.iter().filter(|world| world.digest.is_some());
+    let digests = imagined.map(|w| json!({"decoding": w.decoding, "digest": w.digest}));
+    run.result("digests", digests.collect::<Vec<_>>())?;
+    let labelled: Vec<(String, &[Scores])> = worlds
+        .iter()
+        .map(|world| (world.label(), &world.scores[..]))
+        .collect();
+    let intervals = intervals(&labelled);
+    let names: Vec<&str> = labelled.iter().map(|(name, _)| name.as_str()).collect();
     charts::save(run, "realism", &chart(&intervals, &names))?;
     run.result("intervals", intervals)?;
-    let undefined = entries
-        .iter()
-        .filter(|e| e.scores.evaluated.metametric.is_nan());
+    let is_undefined = |e: &&Entry<Scored>| {
+        let mut evaluated = e.scores.evaluated.iter();
+        evaluated.any(|found| found.scores.metametric.is_nan())
+    };
+    let undefined = entries.iter().filter(is_undefined);
     let undefined: Vec<&str> = undefined.map(|entry| entry.id.as_str()).collect();
     if let Some(first) = undefined.first() {
         run.say(&format!(
@@ -69,13 +119,14 @@ pub(crate) fn tell(
     run.result("seconds_per_scenario", seconds / entries.len() as f64)
 }
 
-fn row(world: &str, year: &str, scenarios: usize, scores: &Scores) -> Value {
+fn row((world, decoding): (&str, &str), year: &str, scenarios: usize, scores: &Scores) -> Value {
     let components = scores.components.iter();
     let components: Map<String, Value> = components
         .map(|(component, score)| (component.name().into(), json!(score)))
         .collect();
     json!({
         "world": world,
+        "decoding": decoding,
         "year": year,
         "scenarios": scenarios,
         "metametric": scores.metametric,
@@ -92,18 +143,17 @@ fn row(world: &str, year: &str, scenarios: usize, scores: &Scores) -> Value {
 }
 
 /// A row per world and scenario, in the order of the worlds.
-fn per_scenario(
-    settings: &Settings,
-    entries: &[Entry<Scored>],
-    worlds: &[(&str, Vec<Scores>)],
-) -> Table {
-    let rows = worlds.iter().flat_map(|(world, scores)| {
-        entries.iter().zip(scores).map(move |(entry, scores)| {
-            let mut told = row(world, &settings.year, 1, scores);
-            told["scenario_id"] = json!(entry.id);
-            told["index"] = json!(entry.index);
-            told
-        })
+fn per_scenario(settings: &Settings, entries: &[Entry<Scored>], worlds: &[Told]) -> Table {
+    let rows = worlds.iter().flat_map(|world| {
+        entries
+            .iter()
+            .zip(&world.scores)
+            .map(move |(entry, scores)| {
+                let mut told = world.row(&settings.year, scores, 1);
+                told["scenario_id"] = json!(entry.id);
+                told["index"] = json!(entry.index);
+                told
+            })
     });
     tables::of_rows(&rows.collect::<Vec<_>>())
 }
@@ -125,7 +175,7 @@ fn chart(intervals: &[Value], worlds: &[&str]) -> Bars {
 }
 
 /// One line per number: mean and 95 % interval over scenarios for every world.
-fn intervals(worlds: &[(&str, Vec<Scores>)]) -> Vec<Value> {
+fn intervals(worlds: &[(String, &[Scores])]) -> Vec<Value> {
     type Number = Box<dyn Fn(&Scores) -> Option<f64>>;
     let mut numbers: Vec<(&str, Number)> = vec![
         ("metametric", Box::new(|s| Some(s.metametric))),
@@ -149,7 +199,7 @@ fn intervals(worlds: &[(&str, Vec<Scores>)]) -> Vec<Value> {
             let mean = values.iter().sum::<f64>() / values.len() as f64;
             // Not the run's seed: an interval says nothing about the worlds' chance.
             let interval = interval(&values, Seed(0));
-            line.insert((*world).into(), json!(mean));
+            line.insert(world.clone(), json!(mean));
             line.insert(format!("{world} low"), json!(interval.map(|i| i.low)));
             line.insert(format!("{world} high"), json!(interval.map(|i| i.high)));
         }

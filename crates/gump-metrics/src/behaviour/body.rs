@@ -1,0 +1,96 @@
+//! What bodies do that no body can: accelerate too hard, slide sideways.
+
+use gump_geometry::{Pose, angle_difference};
+use gump_scene::AgentKind;
+
+use super::track::Track;
+use super::{Class, Counter, MOVES, Measure, vehicles};
+
+/// Dry tyres on dry asphalt brake with 8 to 9 m/s² and cars accelerate with less.
+const HARD: f64 = 8.0;
+/// Half of the time over which a velocity is measured, and half of that between two of them,
+/// seconds. Positions 5 cm off then are an acceleration of 0.4 m/s².
+const REACH_S: f64 = 0.25;
+/// Events with less in between are one, seconds.
+const APART_S: f64 = 0.5;
+/// Faster sideways is sliding, m/s.
+const SLIDES: f64 = 0.5;
+/// Sliding for at least so long is an incident, seconds.
+const SLIDE_S: f64 = 0.3;
+
+impl Counter<'_> {
+    pub(super) fn body(&mut self) {
+        let reach = self.take.steps(REACH_S);
+        for track in self.tracks {
+            self.accelerations(track, reach);
+        }
+        for track in vehicles(self.tracks) {
+            self.slips(track, reach);
+        }
+    }
+
+    fn accelerations(&mut self, track: &Track, reach: usize) {
+        let between = 2.0 * reach as f64 * self.take.dt;
+        let apart = self.take.steps(APART_S);
+        let (mut n_judged, mut last, mut n): (usize, Option<usize>, usize) = (0, None, 0);
+        for k in self.take.ahead() {
+            let before = k.checked_sub(reach).and_then(|k| track.velocity(k, reach));
+            let Some((before, after)) = before.zip(track.velocity(k + reach, reach)) else {
+                continue;
+            };
+            n_judged += 1;
+            if before.distance(after) > HARD * between {
+                if last.is_none_or(|last| k - last > apart) {
+                    n += 1;
+                    self.note(Measure::HardAcceleration, track.id, None, k);
+                }
+                last = Some(k);
+            }
+        }
+        let (class, minutes) = (Class::of(track.kind), self.minutes(n_judged));
+        self.add(Measure::HardAcceleration, class, n as f64, minutes);
+    }
+
+    fn slips(&mut self, track: &Track, reach: usize) {
+        debug_assert_eq!(
+            track.kind,
+            AgentKind::Vehicle,
+            "others step where they like"
+        );
+        let long = self.take.steps(SLIDE_S);
+        let (mut n_moving, mut n_sliding, mut run) = (0, 0, 0);
+        for k in self.take.ahead() {
+            let slides = self.slip(track, k, reach);
+            n_moving += usize::from(slides.is_some());
+            let slides = slides.is_some_and(|speed| speed > SLIDES);
+            n_sliding += usize::from(slides);
+            run = if slides { run + 1 } else { 0 };
+            if run == long {
+                self.note(Measure::Slip, track.id, None, k + 1 - long);
+            }
+        }
+        let (class, events) = (Class::Vehicle, n_sliding as f64);
+        self.add(Measure::Slip, class, events, n_moving as f64);
+    }
+
+    /// How fast a vehicle slides at a frame, m/s; `None` unless it moves.
+    ///
+    /// A car that turns about its rear axle moves its middle sideways by the turn rate times the
+    /// distance between the two, which is somewhere between nothing and half of its length: no slip
+    /// at all if any such place for the axle explains the motion.
+    fn slip(&self, track: &Track, k: usize, reach: usize) -> Option<f64> {
+        let velocity = track.velocity(k, reach)?;
+        if velocity.length_squared() <= MOVES * MOVES {
+            return None;
+        }
+        let (before, after): (Pose, Pose) = (track.pose(k - reach)?, track.pose(k + reach)?);
+        let turn = angle_difference(after.heading, before.heading);
+        // The mean over the window, which a tracker's jitter moves less than a single heading.
+        let middle = angle_difference(track.pose(k)?.heading, before.heading);
+        let heading = before.heading + (turn + middle) / 3.0;
+        let (sin, cos) = heading.sin_cos();
+        let sideways = velocity.y * cos - velocity.x * sin;
+        let most = turn / (2.0 * reach as f64 * self.take.dt) * track.length / 2.0;
+        Some((sideways - sideways.clamp(most.min(0.0), most.max(0.0))).abs())
+    }
+}

@@ -1,0 +1,130 @@
+//! Stops that nothing asks for.
+//!
+//! Reasons to stop, each enough: the vehicle is not on a lane (over 1 m beside the centre line or
+//! 30 degrees off it, as who parks); anybody or anything ahead within 15 m of the front bumper and
+//! half a metre of its way, people and bicycles within 3 m; ahead within 25 m a light that is not
+//! green, a stop line, a stop sign or the end of the road; an intersection within 15 m and someone
+//! within 50 m who moves another way and comes nearer. A stop is free if there is no reason as it begins, at its end
+//! and in between.
+
+use std::f64::consts::FRAC_PI_6;
+
+use gump_geometry::{Pose, angle_difference};
+use gump_scene::{Agent, AgentKind, Frame, LightState, MapGraph};
+
+use super::reach::{Ahead, ahead, nearest};
+use super::track::Track;
+use super::{Counter, MOVES, STANDS};
+use crate::red_light::stop_line;
+
+/// Farther beside the centre line one is not on the lane, metres.
+const ON_LANE_M: f64 = 1.0;
+/// How far ahead of the front bumper others matter, and lights, signs and the end of the road.
+const OTHERS_M: f64 = 15.0;
+const ROAD_M: f64 = 25.0;
+/// How far beside the way others matter, from the side of the vehicle, metres.
+const BESIDE_M: f64 = 0.5;
+const PEOPLE_BESIDE_M: f64 = 3.0;
+/// How near an intersection is given way at, and how near those are who are given way, metres.
+const JUNCTION_M: f64 = 15.0;
+const CROSSING_M: f64 = 50.0;
+/// A little behind the front bumper still is ahead, metres: boxes are not exact.
+const BEHIND_M: f64 = 1.0;
+/// Signs that name no lane stand within so far of the way, metres.
+const SIGN_M: f64 = 10.0;
+
+impl Counter<'_> {
+    /// Whether a vehicle that stands from one frame to another has no reason.
+    pub(super) fn is_free(&self, track: &Track, from: usize, until: usize) -> bool {
+        let moments = [from, (from + until) / 2, until];
+        moments.into_iter().all(|k| {
+            let frame = self.take.frames[k];
+            let place = track.pose(k);
+            place.is_some_and(|pose| {
+                let other = |agent: &&Agent| agent.id != track.id;
+                let others: Vec<&Agent> = frame.agents().iter().filter(other).collect();
+                has_no_reason(self.map, frame, &others, track, pose)
+            })
+        })
+    }
+}
+
+fn has_no_reason(
+    map: &MapGraph,
+    frame: &Frame,
+    others: &[&Agent],
+    track: &Track,
+    pose: Pose,
+) -> bool {
+    let Some((lane, place)) = nearest(map, pose, ON_LANE_M, FRAC_PI_6) else {
+        return false;
+    };
+    let front_m = place.arc_length + track.length / 2.0;
+    let (way, goes_on) = ahead(map, lane, front_m, ROAD_M);
+    let asks = |part: &Ahead<'_>| {
+        is_ruled(map, frame, part)
+            || others
+                .iter()
+                .any(|other| is_in_way(part, other, track.width))
+    };
+    goes_on && !way.iter().any(asks) && !gives_way(&way, others, pose)
+}
+
+/// A light that is not green, a stop line or a stop sign.
+fn is_ruled(map: &MapGraph, frame: &Frame, part: &Ahead<'_>) -> bool {
+    let line = &part.lane.centerline;
+    let is_ahead = |arc_m: f64| (-BEHIND_M..=ROAD_M).contains(&(part.base_m + arc_m));
+    let light = frame.light(part.lane.id).is_some_and(|light| {
+        let at = line.project(stop_line(part.lane, light).position);
+        light.state != LightState::Green && is_ahead(at.arc_length)
+    });
+    let stop = map.stop_lines(part.lane.id).next().is_some();
+    light
+        || stop
+        || map.stop_signs().iter().any(|sign| {
+            let at = line.project(sign.position.truncate());
+            let rules = if sign.lanes.is_empty() {
+                at.distance <= SIGN_M
+            } else {
+                sign.lanes.contains(&part.lane.id)
+            };
+            rules && is_ahead(at.arc_length)
+        })
+}
+
+fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
+    let is_soft = matches!(other.kind, AgentKind::Pedestrian | AgentKind::Bicycle);
+    let beside = if is_soft { PEOPLE_BESIDE_M } else { BESIDE_M };
+    let within = width / 2.0 + beside;
+    let own = other.oriented_box();
+    let corners = own.corners().into_iter();
+    // Far boxes need no corners.
+    let centre = part.lane.centerline.project(other.state.pose.position);
+    if centre.distance > within + other.length.hypot(other.width) / 2.0 {
+        return false;
+    }
+    corners.chain([other.state.pose.position]).any(|point| {
+        let at = part.lane.centerline.project(point);
+        let ahead = part.base_m + at.arc_length;
+        at.distance <= within && (-BEHIND_M..=OTHERS_M).contains(&ahead)
+    })
+}
+
+/// At an intersection, someone who moves another way and comes nearer.
+fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
+    let junction = |part: &Ahead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
+    let crosses = |other: &&Agent| {
+        let state = other.state;
+        let speed = if other.kind == AgentKind::Vehicle {
+            MOVES
+        } else {
+            STANDS
+        };
+        let towards = pose.position - state.pose.position;
+        state.speed() > speed
+            && towards.length() <= CROSSING_M
+            && towards.dot(state.velocity) > 0.0
+            && angle_difference(state.velocity.to_angle(), pose.heading).abs() > FRAC_PI_6
+    };
+    way.iter().any(junction) && others.iter().any(crosses)
+}

@@ -1,0 +1,222 @@
+//! Lights that are passed at red, and lights that contradict one another.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::{FRAC_PI_4, FRAC_PI_6};
+
+use gump_geometry::{DVec2, Polyline, Pose, angle_difference, segments_intersect};
+use gump_scene::{Lane, LaneId, Light, LightState, MapGraph, Scenario};
+
+use super::track::{Take, Track};
+use super::{Class, Counter, Measure, vehicles};
+use crate::red_light::{passes, stop_line};
+
+/// Lines passed within so long of the first belong to one passage, seconds: the lanes that fork
+/// from an approach have a line each.
+const ONE_PASSAGE_S: f64 = 1.0;
+/// After how long, or how far, it is looked which of them a vehicle followed: seconds, metres.
+const FOLLOWED_S: f64 = 2.0;
+const FOLLOWED_M: f64 = 8.0;
+/// Metres that a radian between a vehicle and a lane counts for when the lane it follows is sought.
+const M_PER_RADIAN: f64 = 3.0;
+/// Lanes that start so near to one another fork and do not cross, metres.
+const FORK_M: f64 = 2.0;
+
+/// A light that rules a lane, frame by frame.
+struct Gate<'a> {
+    lane: &'a Lane,
+    /// Middle of the stop line, heading along the lane.
+    line: Pose,
+    states: Vec<Option<LightState>>,
+}
+
+/// A vehicle over a line.
+struct Crossing<'a> {
+    k: usize,
+    gate: &'a Gate<'a>,
+}
+
+impl Counter<'_> {
+    pub(super) fn red_lights(&mut self) {
+        let gates = gates(self.map, self.take);
+        for track in vehicles(self.tracks) {
+            let crossings = self.crossings(track, &gates);
+            let mut rest = crossings.as_slice();
+            while let Some(first) = rest.first() {
+                let until = first.k + self.take.steps(ONE_PASSAGE_S);
+                let n = rest.iter().take_while(|c| c.k <= until).count();
+                let (passage, later) = rest.split_at(n);
+                rest = later;
+                self.passage(track, passage);
+            }
+        }
+    }
+
+    /// Every line that a vehicle passes, in order of time.
+    fn crossings<'g>(&self, track: &Track, gates: &'g [Gate<'g>]) -> Vec<Crossing<'g>> {
+        let Some((low, high)) = track.bounds() else {
+            return Vec::new();
+        };
+        let mut crossings = Vec::new();
+        for gate in gates {
+            let (at, width) = (gate.line.position, gate.lane.width);
+            let is_far = at.cmplt(low - width).any() || at.cmpgt(high + width).any();
+            if is_far {
+                continue;
+            }
+            for k in self.take.ahead() {
+                let Some((before, now)) = track.pose(k - 1).zip(track.pose(k)) else {
+                    continue;
+                };
+                if passes(gate.line, width, before.position, now) {
+                    crossings.push(Crossing { k, gate });
+                }
+            }
+        }
+        crossings.sort_by_key(|crossing| (crossing.k, crossing.gate.lane.id));
+        crossings
+    }
+
+    /// Counts one passage by the light of the lane that is followed.
+    fn passage(&mut self, track: &Track, passage: &[Crossing<'_>]) {
+        let Some(last) = passage.last() else {
+            return;
+        };
+        let Some(pose) = self.followed_to(track, last.k) else {
+            return;
+        };
+        let off = |crossing: &&Crossing<'_>| {
+            let centre = &crossing.gate.lane.centerline;
+            let at = centre.project(pose.position);
+            let heading = centre.pose_at(at.arc_length).heading;
+            at.distance + M_PER_RADIAN * angle_difference(pose.heading, heading).abs()
+        };
+        let followed = passage.iter().min_by(|a, b| off(a).total_cmp(&off(b)));
+        let Some((k, state)) = followed.and_then(|c| Some((c.k, c.gate.states[c.k]?))) else {
+            return;
+        };
+        let is_red = state == LightState::Red;
+        if state != LightState::Unknown {
+            let events = f64::from(u8::from(is_red));
+            self.add(Measure::RedLight, Class::Vehicle, events, 1.0);
+        }
+        if is_red {
+            self.note(Measure::RedLight, track.id, None, k);
+        }
+    }
+
+    /// Where a vehicle is once it can be told which lane it took.
+    fn followed_to(&self, track: &Track, k: usize) -> Option<Pose> {
+        let from = track.pose(k)?;
+        let later = (k..=k + self.take.steps(FOLLOWED_S)).filter_map(|k| track.pose(k));
+        let mut last = from;
+        for pose in later {
+            last = pose;
+            if pose.position.distance(from.position) >= FOLLOWED_M {
+                break;
+            }
+        }
+        Some(last)
+    }
+
+    pub(super) fn conflicting_greens(&mut self) {
+        let (mut known, mut both) = (0, 0);
+        for &(a, b) in &self.behaviour.crossing {
+            for k in self.take.ahead() {
+                let state = |lane| {
+                    let light = self.take.frames[k].light(lane)?;
+                    Some(light.state).filter(|state| *state != LightState::Unknown)
+                };
+                let Some(states) = state(a).zip(state(b)) else {
+                    continue;
+                };
+                known += 1;
+                both += usize::from(states == (LightState::Green, LightState::Green));
+            }
+        }
+        if known > 0 {
+            let (events, of) = (both as f64, known as f64);
+            self.add(Measure::ConflictingGreen, Class::Light, events, of);
+        }
+    }
+}
+
+/// All lights of a take that rule a lane of the map, by lane.
+fn gates<'a>(map: &'a MapGraph, take: &Take<'_>) -> Vec<Gate<'a>> {
+    let mut gates: BTreeMap<LaneId, Gate<'a>> = BTreeMap::new();
+    for (k, frame) in take.frames.iter().enumerate() {
+        for light in frame.lights() {
+            let Some(lane) = map.lane(light.lane) else {
+                continue;
+            };
+            let gate = gates.entry(light.lane).or_insert_with(|| Gate {
+                lane,
+                line: stop_line(lane, light),
+                states: vec![None; take.frames.len()],
+            });
+            gate.states[k] = Some(light.state);
+        }
+    }
+    gates.into_values().collect()
+}
+
+/// Pairs of lanes whose lights must not be green at once: their ways cross, and they come from
+/// roads that lie across one another. Who turns left before oncoming traffic gives way at green, so
+/// opposite roads do not count.
+pub(super) fn crossing(scenario: &Scenario) -> Vec<(LaneId, LaneId)> {
+    let mut lights: BTreeMap<LaneId, &Light> = BTreeMap::new();
+    for light in scenario.log.iter().flat_map(|frame| frame.lights()) {
+        lights.entry(light.lane).or_insert(light);
+    }
+    let lanes: BTreeSet<LaneId> = lights.keys().copied().collect();
+    let ways: Vec<(LaneId, f64, Vec<Polyline>)> = lanes
+        .into_iter()
+        .filter_map(|id| {
+            let lane = scenario.map.lane(id)?;
+            let line = stop_line(lane, lights[&id]);
+            Some((id, line.heading, ways(&scenario.map, lane, line)))
+        })
+        .collect();
+    let mut pairs = Vec::new();
+    for (i, (a, heading, own)) in ways.iter().enumerate() {
+        for (b, other_heading, others) in &ways[i + 1..] {
+            let between = angle_difference(*heading, *other_heading).abs();
+            let is_across = (FRAC_PI_4..=3.0 * FRAC_PI_4).contains(&between);
+            let meet = || {
+                own.iter()
+                    .any(|one| others.iter().any(|other| cross(one, other)))
+            };
+            if is_across && meet() {
+                pairs.push((*a, *b));
+            }
+        }
+    }
+    pairs
+}
+
+/// Where the traffic of a light goes once it has passed the line: the rest of its lane, or where
+/// the line is at its end, the lanes that follow.
+fn ways(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
+    let centre = &lane.centerline;
+    let from = centre.project(line.position).arc_length;
+    if from < centre.length() - FORK_M {
+        return vec![centre.slice(from, centre.length())];
+    }
+    let next = map.successors(lane.id);
+    next.map(|lane| lane.centerline.clone()).collect()
+}
+
+/// True if two ways cross at more than 30 degrees; where they fork or join they do not.
+fn cross(one: &Polyline, other: &Polyline) -> bool {
+    let ends = |line: &Polyline| (line.points()[0], line.points()[line.points().len() - 1]);
+    let ((a, b), (c, d)) = (ends(one), ends(other));
+    let near = |p: DVec2, q: DVec2| p.distance(q) < FORK_M;
+    if near(a, c) || near(b, d) {
+        return false;
+    }
+    one.segments().any(|(a, b)| {
+        other.segments().any(|(c, d)| {
+            let angle = angle_difference((b - a).to_angle(), (d - c).to_angle()).abs();
+            angle > FRAC_PI_6 && segments_intersect(a, b, c, d)
+        })
+    })
+}

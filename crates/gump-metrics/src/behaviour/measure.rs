@@ -1,0 +1,288 @@
+//! What is counted, of whom, and per what.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use gump_scene::{AgentId, AgentKind};
+
+/// What a driver would notice. The definitions are in the table of the [module](super).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Measure {
+    /// A vehicle that stands for the whole log gets away from its place.
+    ParkedMove,
+    /// A vehicle stops where nothing asks it to.
+    FreeRoadStop,
+    /// Two boxes overlap that did not in the present.
+    NewOverlap,
+    /// A change of velocity that no tyre can give.
+    HardAcceleration,
+    /// A vehicle slides sideways.
+    Slip,
+    /// A stop line is passed at red.
+    RedLight,
+    /// A vehicle goes over to the lane beside its own.
+    LaneChange,
+    /// Who stood moves.
+    SetOff,
+    /// Who stands at a moment.
+    Standing,
+    /// Lights of crossing approaches are green at once.
+    ConflictingGreen,
+}
+
+impl Measure {
+    /// All, in the order of tables.
+    pub const ALL: [Self; 10] = [
+        Self::ParkedMove,
+        Self::FreeRoadStop,
+        Self::NewOverlap,
+        Self::HardAcceleration,
+        Self::Slip,
+        Self::RedLight,
+        Self::LaneChange,
+        Self::SetOff,
+        Self::Standing,
+        Self::ConflictingGreen,
+    ];
+
+    /// Name in reports, `snake_case`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::ParkedMove => "parked_move",
+            Self::FreeRoadStop => "free_road_stop",
+            Self::NewOverlap => "new_overlap",
+            Self::HardAcceleration => "hard_acceleration",
+            Self::Slip => "slip",
+            Self::RedLight => "red_light",
+            Self::LaneChange => "lane_change",
+            Self::SetOff => "set_off",
+            Self::Standing => "standing",
+            Self::ConflictingGreen => "conflicting_green",
+        }
+    }
+
+    /// The measure of that name.
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|measure| measure.name() == name)
+    }
+
+    /// What its value is a number of events per.
+    pub fn per(self) -> &'static str {
+        match self {
+            Self::ParkedMove => "parked vehicle",
+            Self::FreeRoadStop | Self::LaneChange => "minute of moving",
+            Self::NewOverlap | Self::Standing => "agent",
+            Self::HardAcceleration | Self::SetOff => "minute",
+            Self::Slip => "time of moving",
+            Self::RedLight => "passage of a light",
+            Self::ConflictingGreen => "time of crossing lights",
+        }
+    }
+
+    /// True if the value is a rate per minute, false if it is a share or a count per agent.
+    pub fn is_rate(self) -> bool {
+        self.per().starts_with("minute")
+    }
+
+    /// True if the value depends on how far one looks, so that a log which ends sooner has none.
+    pub fn needs_whole_horizon(self) -> bool {
+        matches!(self, Self::ParkedMove | Self::NewOverlap)
+    }
+}
+
+impl fmt::Display for Measure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Of whom something is counted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Class {
+    /// Everyone.
+    All,
+    /// Vehicles; of pairs those of two vehicles.
+    Vehicle,
+    /// People on foot; of pairs those with at least one.
+    Pedestrian,
+    /// Bicycles; of pairs those with one and without people on foot.
+    Bicycle,
+    /// Traffic lights.
+    Light,
+}
+
+impl Class {
+    /// All, in the order of tables.
+    pub const ALL: [Self; 5] = [
+        Self::All,
+        Self::Vehicle,
+        Self::Pedestrian,
+        Self::Bicycle,
+        Self::Light,
+    ];
+
+    /// Name in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::All => "all",
+            Self::Vehicle => "vehicle",
+            Self::Pedestrian => "pedestrian",
+            Self::Bicycle => "bicycle",
+            Self::Light => "light",
+        }
+    }
+
+    /// The class of that name.
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|class| class.name() == name)
+    }
+
+    /// The class of an agent.
+    pub(super) fn of(kind: AgentKind) -> Self {
+        match kind {
+            AgentKind::Vehicle => Self::Vehicle,
+            AgentKind::Pedestrian => Self::Pedestrian,
+            AgentKind::Bicycle => Self::Bicycle,
+            _ => Self::All,
+        }
+    }
+
+    /// The class of a pair.
+    pub(super) fn of_pair(a: AgentKind, b: AgentKind) -> Self {
+        let has = |kind| a == kind || b == kind;
+        if has(AgentKind::Pedestrian) {
+            Self::Pedestrian
+        } else if has(AgentKind::Bicycle) {
+            Self::Bicycle
+        } else {
+            Self::Vehicle
+        }
+    }
+}
+
+impl fmt::Display for Class {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// One line of a table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Key {
+    /// What.
+    pub measure: Measure,
+    /// Of whom.
+    pub class: Class,
+    /// At which second after the present for [`Measure::Standing`], else how far is looked.
+    pub seconds: u32,
+}
+
+/// How often, and per how much.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Count {
+    /// Events.
+    pub events: f64,
+    /// What they are counted per, in the unit of [`Measure::per`].
+    pub of: f64,
+}
+
+impl Count {
+    /// Events per unit; `None` where there was nothing to count.
+    pub fn rate(self) -> Option<f64> {
+        (self.of > 0.0).then(|| self.events / self.of)
+    }
+}
+
+/// Counts by key. Those of several futures, scenarios or machines add up.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tally(pub BTreeMap<Key, Count>);
+
+impl Tally {
+    /// The count of a key; none is a count of nothing.
+    pub fn count(&self, measure: Measure, class: Class, seconds: u32) -> Count {
+        let key = Key {
+            measure,
+            class,
+            seconds,
+        };
+        self.0.get(&key).copied().unwrap_or_default()
+    }
+
+    /// Adds to a key.
+    pub fn add(&mut self, key: Key, count: Count) {
+        let sum = self.0.entry(key).or_default();
+        sum.events += count.events;
+        sum.of += count.of;
+    }
+
+    /// Adds the counts of another tally.
+    pub fn merge(&mut self, other: &Self) {
+        for (&key, &count) in &other.0 {
+            self.add(key, count);
+        }
+    }
+}
+
+/// Something that happened in a future.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Incident {
+    /// What.
+    pub measure: Measure,
+    /// Who did it.
+    pub agent: AgentId,
+    /// With whom, of an overlap.
+    pub other: Option<AgentId>,
+    /// Seconds after the present.
+    pub at_s: f64,
+}
+
+/// What one future, or the log, shows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Seen {
+    /// The counts.
+    pub tally: Tally,
+    /// What happened, by measure and agent. Who merely stands has done nothing.
+    pub incidents: Vec<Incident>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_read_as_they_are_written() {
+        for measure in Measure::ALL {
+            assert_eq!(Measure::of_name(measure.name()), Some(measure));
+        }
+        for class in Class::ALL {
+            assert_eq!(Class::of_name(class.name()), Some(class));
+        }
+        assert_eq!(
+            (Measure::of_name("speed"), Class::of_name("bus")),
+            (None, None)
+        );
+    }
+
+    #[test]
+    fn tallies_add_up() {
+        let key = Key {
+            measure: Measure::Slip,
+            class: Class::Vehicle,
+            seconds: 8,
+        };
+        let mut tally = Tally::default();
+        assert_eq!(tally.count(Measure::Slip, Class::Vehicle, 8).rate(), None);
+        let count = Count {
+            events: 1.0,
+            of: 4.0,
+        };
+        tally.add(key, count);
+        let other = tally.clone();
+        tally.merge(&other);
+        let found = tally.count(Measure::Slip, Class::Vehicle, 8);
+        assert_eq!(
+            (found.events, found.of, found.rate()),
+            (2.0, 8.0, Some(0.25))
+        );
+    }
+}

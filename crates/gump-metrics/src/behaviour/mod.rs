@@ -1,0 +1,203 @@
+//! What a driver would notice in traffic, counted alike in futures and in the log.
+//!
+//! Realism asks how likely the log is under many futures. A parked car that pulls out in each of
+//! them costs little there: most of its steps still are likely. Here it is counted as what it is.
+//!
+//! | measure | event | per |
+//! |---|---|---|
+//! | `parked_move` | a vehicle that stood for the whole log (never over 0.5 m from its present place, seen in at least half of the frames) gets over 2 m away from it | vehicle that stood |
+//! | `free_road_stop` | a vehicle that has moved stands for at least 1 s, for no reason that can be seen: `free_road.rs` lists the reasons | minute that vehicles move |
+//! | `new_overlap` | a pair of boxes is over 0.1 m deep in one another and did not overlap in the present; each pair once | agent, of all classes |
+//! | `hard_acceleration` | the velocity changes by more than 8 m/s² over half a second; times less than 0.5 s apart are one event | minute that agents are there |
+//! | `slip` | a vehicle faster than 1 m/s slides sideways at more than 0.5 m/s wherever its rear axle may be | time that vehicles move |
+//! | `red_light` | a vehicle passes the stop line of the lane that it then follows at red | passage of a line whose light is known |
+//! | `lane_change` | a vehicle goes over to a lane beside its own, each held for a second, outside of intersections | minute that vehicles move |
+//! | `set_off` | who stood for a second goes faster than 1 m/s | minute that agents are there |
+//! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
+//! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
+//!
+//! To *stand* and to *move* is to get less than 0.3 m, more than 1 m away from one's place within a
+//! second. Speeds are those of positions, never those that a tracker or a network states. Counted
+//! are agents that move by themselves and are there in the present; where agents come and leave,
+//! see [`Behaviour::with_newcomers`]. What ends before the horizon has no `parked_move` and no
+//! `new_overlap`, which grow with time.
+//!
+//! Lights rule lanes, not turns: turning right at red after a stop, where the law allows it, counts
+//! as a red light here. The log does it too, and that is why it stands beside.
+//!
+//! Start with [`Behaviour`]. [`Conduct`] says which agents do such things, [`judge`] sets that
+//! beside realism.
+//!
+//! ```
+//! use gump_metrics::behaviour::{Behaviour, Class, Measure};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: -50,0 250,0
+//!      ego vehicle 0: 0,0 velocity 8,0
+//!      agent vehicle 1: 40,0",
+//! ).unwrap();
+//! let tally = Behaviour::new(&scenario, 8).log().tally;
+//! // The ego drives into the one that stands: one pair, two agents.
+//! assert_eq!(tally.count(Measure::NewOverlap, Class::All, 8).rate(), Some(0.5));
+//! assert_eq!(tally.count(Measure::Standing, Class::Vehicle, 4).rate(), Some(0.5));
+//! ```
+
+mod body;
+mod conduct;
+mod free_road;
+mod lane_change;
+mod lights;
+mod measure;
+mod overlap;
+mod paths;
+mod reach;
+mod standing;
+#[cfg(test)]
+mod tests;
+mod track;
+
+use std::collections::BTreeSet;
+
+use gump_scene::{AgentId, AgentKind, LaneId, MapGraph, Rollout, Scenario};
+use rayon::prelude::*;
+
+pub use conduct::{Conduct, Deed, Judged, judge};
+pub use measure::{Class, Count, Incident, Key, Measure, Seen, Tally};
+pub use paths::of_paths;
+use track::{Take, Track};
+
+/// Moments at which it is counted who stands, seconds after the present.
+pub const MOMENTS: [u32; 8] = [2, 4, 8, 10, 20, 30, 40, 60];
+
+/// What is slower stands, m/s.
+const STANDS: f64 = 0.3;
+/// What is faster moves, m/s. Between the two nothing is decided.
+const MOVES: f64 = 1.0;
+
+/// Counts what the futures of one scenario show.
+pub struct Behaviour<'a> {
+    scenario: &'a Scenario,
+    horizon_s: u32,
+    newcomers: bool,
+    /// Vehicles that stand for the whole log.
+    parked: BTreeSet<AgentId>,
+    /// Pairs of lanes with lights that must not be green at once.
+    crossing: Vec<(LaneId, LaneId)>,
+}
+
+impl<'a> Behaviour<'a> {
+    /// Looks `horizon_s` seconds ahead from the present of `scenario`.
+    pub fn new(scenario: &'a Scenario, horizon_s: u32) -> Self {
+        Self {
+            scenario,
+            horizon_s,
+            newcomers: false,
+            parked: standing::parked(scenario),
+            crossing: lights::crossing(scenario),
+        }
+    }
+
+    /// Counts also those who are not there in the present, in futures and in the log: for worlds in
+    /// which agents come and leave.
+    pub fn with_newcomers(self) -> Self {
+        Self {
+            newcomers: true,
+            ..self
+        }
+    }
+
+    /// What the log shows; nothing if it ends with the present.
+    pub fn log(&self) -> Seen {
+        self.see(&Take::of_log(self.scenario, self.horizon_s.into()))
+    }
+
+    /// What a future shows, which began in the present of the scenario.
+    pub fn of(&self, rollout: &Rollout) -> Seen {
+        self.see(&Take::of_rollout(rollout, self.horizon_s.into()))
+    }
+
+    /// The counts of several futures added up.
+    pub fn tally(&self, rollouts: &[Rollout]) -> Tally {
+        let seen: Vec<Tally> = rollouts.par_iter().map(|one| self.of(one).tally).collect();
+        let mut sum = Tally::default();
+        for tally in &seen {
+            sum.merge(tally);
+        }
+        sum
+    }
+
+    /// Vehicles that stand for the whole log.
+    pub fn parked(&self) -> impl Iterator<Item = AgentId> + '_ {
+        self.parked.iter().copied()
+    }
+
+    fn see(&self, take: &Take<'_>) -> Seen {
+        let mut counter = Counter {
+            behaviour: self,
+            take,
+            tracks: &take.tracks(self.newcomers),
+            map: &self.scenario.map,
+            seen: Seen::default(),
+        };
+        counter.standing();
+        counter.stops_and_starts();
+        counter.body();
+        counter.overlaps();
+        counter.lane_changes();
+        counter.red_lights();
+        counter.conflicting_greens();
+        let mut seen = counter.seen;
+        seen.incidents.sort_by(|a, b| {
+            (a.measure, a.agent)
+                .cmp(&(b.measure, b.agent))
+                .then(a.at_s.total_cmp(&b.at_s))
+        });
+        seen
+    }
+}
+
+/// One future or log while it is counted.
+struct Counter<'a> {
+    behaviour: &'a Behaviour<'a>,
+    take: &'a Take<'a>,
+    tracks: &'a [Track],
+    map: &'a MapGraph,
+    seen: Seen,
+}
+
+impl Counter<'_> {
+    /// Adds to a line of the table that is about the whole horizon.
+    fn add(&mut self, measure: Measure, class: Class, events: f64, of: f64) {
+        if measure.needs_whole_horizon() && !self.take.is_whole {
+            return;
+        }
+        let key = Key {
+            measure,
+            class,
+            seconds: self.behaviour.horizon_s,
+        };
+        self.seen.tally.add(key, Count { events, of });
+    }
+
+    /// Notes that an agent did something at frame `k`.
+    fn note(&mut self, measure: Measure, agent: AgentId, other: Option<AgentId>, k: usize) {
+        self.seen.incidents.push(Incident {
+            measure,
+            agent,
+            other,
+            at_s: self.take.at_s(k),
+        });
+    }
+
+    /// Minutes of so many frames.
+    fn minutes(&self, frames: usize) -> f64 {
+        frames as f64 * self.take.dt / 60.0
+    }
+}
+
+/// Vehicles among tracks.
+fn vehicles(tracks: &[Track]) -> impl Iterator<Item = &Track> {
+    tracks
+        .iter()
+        .filter(|track| track.kind == AgentKind::Vehicle)
+}

@@ -1,0 +1,172 @@
+//! Who stands, who sets off, who stops.
+
+use std::collections::BTreeSet;
+
+use gump_scene::{Agent, AgentId, AgentKind, Scenario};
+
+use super::{Class, Counter, Key, MOMENTS, MOVES, Measure, STANDS, vehicles};
+use crate::behaviour::Count;
+use crate::behaviour::track::Track;
+
+/// What a tracker's box may wander while the vehicle stands, metres.
+const DRIFT_M: f64 = 0.5;
+/// Farther from its place a parked vehicle has moved, metres.
+const AWAY_M: f64 = 2.0;
+/// How much of the log a parked vehicle must be seen in.
+const SEEN_SHARE: f64 = 0.5;
+/// How long one stands after [`Track::pace`] says so for the first time, seconds, until it is a stop.
+const STOP_S: f64 = 1.0;
+
+/// Vehicles of the present that stand for the whole log, as far as it sees them.
+pub(super) fn parked(scenario: &Scenario) -> BTreeSet<AgentId> {
+    let n_seen = |agent: &Agent| {
+        let mut n = 0;
+        for frame in &scenario.log {
+            let Some(seen) = frame.agent(agent.id) else {
+                continue;
+            };
+            let place = seen.state.pose.position;
+            if place.distance(agent.state.pose.position) > DRIFT_M {
+                return 0;
+            }
+            n += 1;
+        }
+        n
+    };
+    let enough = SEEN_SHARE * scenario.log.len() as f64;
+    let vehicles = scenario.log[scenario.now].agents().iter();
+    vehicles
+        .filter(|agent| agent.kind == AgentKind::Vehicle && n_seen(agent) as f64 >= enough)
+        .map(|agent| agent.id)
+        .collect()
+}
+
+/// What a walk over the paces of a track finds.
+#[derive(Default)]
+struct Walk {
+    /// Frames ahead in which it is known how fast it goes, and in which it moves.
+    known: usize,
+    moving: usize,
+    /// Frames at which it sets off.
+    starts: Vec<usize>,
+    /// Frames at which it comes to stand, and those at which that is a stop.
+    stops: Vec<(usize, usize)>,
+}
+
+impl Counter<'_> {
+    pub(super) fn standing(&mut self) {
+        let scenario = self.behaviour.scenario;
+        for seconds in MOMENTS {
+            if seconds > self.behaviour.horizon_s {
+                break;
+            }
+            let ahead = self.take.steps(seconds.into());
+            let k = self.take.now + ahead;
+            // Where the log goes on, agents count that it still sees: who drives out of its sight
+            // moves, and would be missed in the log only.
+            let logged = scenario.log.get(scenario.now + ahead);
+            let newcomers = self.behaviour.newcomers;
+            for track in self.tracks {
+                let is_logged = logged.is_none_or(|frame| frame.agent(track.id).is_some());
+                let Some(pace) = track.pace(k).filter(|_| newcomers || is_logged) else {
+                    continue;
+                };
+                let key = Key {
+                    measure: Measure::Standing,
+                    class: Class::of(track.kind),
+                    seconds,
+                };
+                let events = f64::from(u8::from(pace < STANDS));
+                self.seen.tally.add(key, Count { events, of: 1.0 });
+            }
+        }
+    }
+
+    pub(super) fn stops_and_starts(&mut self) {
+        let has_lanes = !self.map.lanes().is_empty();
+        for track in self.tracks {
+            let class = Class::of(track.kind);
+            let walk = self.walk(track);
+            let (known, moving) = (self.minutes(walk.known), self.minutes(walk.moving));
+            self.add(Measure::SetOff, class, walk.starts.len() as f64, known);
+            for &k in &walk.starts {
+                self.note(Measure::SetOff, track.id, None, k);
+            }
+            if class != Class::Vehicle || !has_lanes {
+                continue;
+            }
+            let mut n = 0;
+            for &(from, until) in &walk.stops {
+                if self.is_free(track, from, until) {
+                    self.note(Measure::FreeRoadStop, track.id, None, from);
+                    n += 1;
+                }
+            }
+            self.add(Measure::FreeRoadStop, class, f64::from(n), moving);
+            self.add(Measure::LaneChange, class, 0.0, moving);
+        }
+        self.parked_moves();
+    }
+
+    fn parked_moves(&mut self) {
+        for track in vehicles(self.tracks) {
+            let Some(place) = track.pose(self.take.now) else {
+                continue;
+            };
+            if !self.behaviour.parked.contains(&track.id) {
+                continue;
+            }
+            let is_away = |&k: &usize| {
+                let pose = track.pose(k);
+                pose.is_some_and(|pose| pose.position.distance(place.position) > AWAY_M)
+            };
+            let away = self.take.ahead().find(is_away);
+            let events = f64::from(u8::from(away.is_some()));
+            self.add(Measure::ParkedMove, Class::Vehicle, events, 1.0);
+            if let Some(k) = away {
+                self.note(Measure::ParkedMove, track.id, None, k);
+            }
+        }
+    }
+
+    fn walk(&self, track: &Track) -> Walk {
+        let (now, take) = (self.take.now, self.take);
+        let stop_steps = take.steps(STOP_S);
+        let (mut has_stood, mut has_moved) = (false, false);
+        let mut since: Option<usize> = None;
+        let mut walk = Walk::default();
+        for k in 0..take.frames.len() {
+            let Some(pace) = track.pace(k) else {
+                since = None;
+                continue;
+            };
+            let stands = pace < STANDS;
+            if k > now {
+                walk.known += 1;
+                walk.moving += usize::from(pace > MOVES);
+            }
+            if !stands {
+                since = None;
+            }
+            if pace > MOVES {
+                if has_stood && k > now {
+                    walk.starts.push(k);
+                }
+                (has_stood, has_moved) = (false, true);
+            }
+            if stands {
+                has_stood = true;
+                let first = *since.get_or_insert(k);
+                // It stands since before the pace says so for the first time.
+                let began = first.saturating_sub(track.pace_steps());
+                if has_moved && k - first >= stop_steps {
+                    has_moved = false;
+                    if began >= now {
+                        walk.stops.push((began, k));
+                    }
+                }
+            }
+        }
+        walk
+    }
+}

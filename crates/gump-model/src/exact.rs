@@ -1,0 +1,102 @@
+//! Objects as they are, beside the bins in which tokens say them.
+//!
+//! A token rounds a place to 20 cm and a heading to 1.8 degrees. What an object says is read from
+//! its exact pose (`anchor`), so what it sees around itself must be seen from there, too: the slots
+//! of a window carry both.
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use gump_geometry::{DVec2, Pose, dvec2};
+use gump_scene::{Agent, AgentState, Frame};
+use gump_tokenizer::Identities;
+
+/// An object at one instant, scene frame, metres, radians and metres per second.
+///
+/// 32 bits tell micrometres within a scene, and hold the same numbers whether a state went through
+/// the world frame or not, so that caches know a slot again.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Exact {
+    place: [f32; 3],
+    velocity: [f32; 2],
+    size: [f32; 2],
+    /// False for one whose size its source does not state.
+    pub(crate) has_size: bool,
+}
+
+impl Exact {
+    /// A state in the scene frame of an agent of this size.
+    pub(crate) fn new(state: AgentState, agent: &Agent) -> Self {
+        let Pose { position, heading } = state.pose;
+        Self {
+            place: [position.x as f32, position.y as f32, heading as f32],
+            velocity: state.velocity.as_vec2().to_array(),
+            size: [agent.length as f32, agent.width as f32],
+            has_size: !agent.has_usual_size(),
+        }
+    }
+
+    /// The same object in another state.
+    pub(crate) fn with_state(self, state: AgentState) -> Self {
+        let Pose { position, heading } = state.pose;
+        Self {
+            place: [position.x as f32, position.y as f32, heading as f32],
+            velocity: state.velocity.as_vec2().to_array(),
+            ..self
+        }
+    }
+
+    pub(crate) fn pose(&self) -> Pose {
+        let [x, y, heading] = self.place.map(f64::from);
+        Pose::new(x, y, heading)
+    }
+
+    pub(crate) fn velocity(&self) -> DVec2 {
+        let [x, y] = self.velocity.map(f64::from);
+        dvec2(x, y)
+    }
+
+    /// Length and width.
+    pub(crate) fn size(&self) -> [f64; 2] {
+        self.size.map(f64::from)
+    }
+}
+
+/// The objects of consecutive frames by the ids of their keys.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ExactFrames(Vec<BTreeMap<u16, Exact>>);
+
+impl ExactFrames {
+    /// The last `n` of these frames of the world; where there are fewer, nothing is known of the
+    /// first.
+    pub(crate) fn last(
+        n: usize,
+        frames: &[Frame],
+        identities: &Identities,
+        world_from_scene: Pose,
+    ) -> Self {
+        let scene_from_world = world_from_scene.inverse();
+        let exact = |agent: &Agent| {
+            let state = AgentState {
+                pose: scene_from_world * agent.state.pose,
+                velocity: scene_from_world.rotate(agent.state.velocity),
+            };
+            Some((identities.key(agent.id)?, Exact::new(state, agent)))
+        };
+        let of = |frame: &Frame| frame.agents().iter().filter_map(exact).collect();
+        let known = frames.len().min(n);
+        let unknown = std::iter::repeat_with(BTreeMap::new).take(n - known);
+        Self(
+            unknown
+                .chain(frames[frames.len() - known..].iter().map(of))
+                .collect(),
+        )
+    }
+
+    /// What the object with this id was in a frame.
+    pub(crate) fn of(&self, frame: usize, id: u16) -> Option<Exact> {
+        self.0.get(frame)?.get(&id).copied()
+    }
+}

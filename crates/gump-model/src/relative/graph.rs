@@ -1,0 +1,502 @@
+//! Agents at instants as nodes, and what each of them sees as edges.
+//!
+//! A node is an agent at one frame. Its edges lead to its own past, to its nearest neighbours at
+//! that frame and to pieces of the map; every edge carries numbers in the frame of the node alone.
+//! Training and imagining build nodes and edges here, so that both see the same.
+
+use gump_geometry::{DVec2, Pose};
+use gump_scene::{AgentKind, LightState};
+use gump_tokenizer::class_index;
+
+use super::grid::STILL_M;
+use super::map::{PATHS, PieceKind, VectorMap};
+use crate::sample::TOKEN_DT;
+
+/// Numbers of a node.
+pub(super) const NODE_NUMBERS: usize = 28;
+/// Numbers of an edge.
+pub(super) const EDGE_NUMBERS: usize = 44;
+
+/// Frames of its own past that a node sees beside itself.
+pub(super) const PAST: usize = 6;
+/// Neighbours that a node sees, the nearest.
+const NEIGHBOURS: usize = 12;
+/// How far a neighbour may be, metres.
+const NEIGHBOUR_REACH_M: f64 = 60.0;
+/// Pieces of lanes beside the paths ahead, the nearest.
+const LANES: usize = 10;
+/// Pieces of road edges, the nearest.
+const EDGES: usize = 8;
+/// Areas, the nearest.
+const AREAS: usize = 4;
+/// How far those may be, metres.
+const MAP_REACH_M: f64 = 40.0;
+
+/// What an agent is.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Body {
+    pub(super) kind: AgentKind,
+    /// Metres.
+    pub(super) length: f64,
+    pub(super) width: f64,
+    /// False tells the network that the size is not known.
+    pub(super) sized: bool,
+}
+
+/// An agent at a frame, as it is shown.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Shown {
+    pub(super) body: Body,
+    pub(super) pose: Pose,
+    /// The last half second: this pose in the frame of the one before; from the stated velocity for
+    /// one not seen before.
+    pub(super) step: Pose,
+    /// The half second before that, if it was seen.
+    pub(super) earlier: Option<Pose>,
+    /// Whether `step` was seen.
+    pub(super) tracked: bool,
+    /// For how long it has stood, seconds.
+    pub(super) stood: f64,
+}
+
+impl Shown {
+    /// An agent seen for the first time, with its stated velocity.
+    pub(super) fn first(body: Body, pose: Pose, velocity: DVec2) -> Self {
+        let local = pose.inverse().rotate(velocity) * TOKEN_DT;
+        Self {
+            body,
+            pose,
+            step: still_or(Pose {
+                position: local,
+                heading: 0.0,
+            }),
+            earlier: None,
+            tracked: false,
+            stood: 0.0,
+        }
+    }
+
+    /// The same agent half a second later.
+    pub(super) fn then(&self, pose: Pose) -> Self {
+        let step = still_or(self.pose.inverse() * pose);
+        let stands = step.position == DVec2::ZERO;
+        Self {
+            body: self.body,
+            pose,
+            step,
+            earlier: Some(self.step).filter(|_| self.tracked),
+            tracked: true,
+            stood: if stands { self.stood + TOKEN_DT } else { 0.0 },
+        }
+    }
+
+    /// World frame, metres per second: the mean over the last half second.
+    pub(super) fn velocity(&self) -> DVec2 {
+        // The step is told in the frame it began in, which is turned by as much as it turned.
+        let began = self.pose.heading - self.step.heading;
+        DVec2::from_angle(began).rotate(self.step.position) / TOKEN_DT
+    }
+
+    fn stands(&self) -> bool {
+        self.step.position == DVec2::ZERO
+    }
+
+    /// The numbers of its node.
+    pub(super) fn numbers(&self) -> [f32; NODE_NUMBERS] {
+        let mut out = [0.0; NODE_NUMBERS];
+        let mut writer = Writer(&mut out);
+        let body = self.body;
+        let class = class_index(body.kind);
+        writer.put((0..3).map(|i| mark(class == i)));
+        writer.put([
+            mark(!body.sized),
+            if body.sized { body.length / 5.0 } else { 0.0 },
+            if body.sized { body.width / 2.0 } else { 0.0 },
+        ]);
+        writer.put([mark(self.tracked), mark(self.stands())]);
+        put_step(&mut writer, self.step);
+        writer.put([mark(self.earlier.is_some())]);
+        let earlier = self.earlier.unwrap_or(Pose::IDENTITY);
+        put_step(&mut writer, earlier);
+        let faster = self.step.position.x - earlier.position.x;
+        let change = if self.earlier.is_some() { faster } else { 0.0 };
+        writer.put([
+            change,
+            bend(change * 5.0),
+            (self.stood / 5.0).min(2.0),
+            bend(self.stood),
+            self.velocity().length() / 10.0,
+        ]);
+        out
+    }
+}
+
+/// A step that is no more than jitter is none.
+fn still_or(step: Pose) -> Pose {
+    match step.position.length() < STILL_M {
+        true => Pose::IDENTITY,
+        false => step,
+    }
+}
+
+fn put_step(writer: &mut Writer<'_>, step: Pose) {
+    let p = step.position;
+    writer.put([
+        p.x / 5.0,
+        bend(p.x / 0.5),
+        p.y,
+        bend(p.y * 10.0),
+        step.heading * 2.0,
+        bend(step.heading * 20.0),
+        bend(step.heading * 100.0),
+    ]);
+}
+
+/// The lights of a frame, by piece of the map, and for how long they have shown their colour.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Lights {
+    /// Sorted by lane: the colour, and seconds since it changed where that was seen.
+    pub(super) by_lane: Vec<(gump_scene::LaneId, LightState, Option<f64>)>,
+}
+
+impl Lights {
+    fn of(&self, lane: Option<gump_scene::LaneId>) -> Option<(LightState, Option<f64>)> {
+        let lane = lane?;
+        let at = self.by_lane.binary_search_by_key(&lane, |light| light.0);
+        at.ok().map(|i| (self.by_lane[i].1, self.by_lane[i].2))
+    }
+}
+
+/// The numbers of an edge.
+pub(super) type EdgeRow = [f32; EDGE_NUMBERS];
+
+/// Relative pose, in numbers that are fine near and coarse far away.
+const RELATIVE: usize = 10;
+/// Marks of the kind of an edge.
+const KINDS: usize = 5;
+const OF_PAST: usize = KINDS + RELATIVE;
+const OF_NEIGHBOUR: usize = OF_PAST + 1;
+const OF_PATH: usize = OF_NEIGHBOUR + 12;
+const OF_LANE: usize = OF_PATH + 6;
+
+/// A place and a direction, whose sine and cosine are taken once for many edges.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Axes {
+    pub(super) origin: DVec2,
+    pub(super) direction: DVec2,
+}
+
+impl Axes {
+    pub(super) fn of(pose: Pose) -> Self {
+        Self {
+            origin: pose.position,
+            direction: pose.direction(),
+        }
+    }
+
+    /// A vector along these axes.
+    pub(super) fn turn(self, vector: DVec2) -> DVec2 {
+        let (ahead, left) = (self.direction.dot(vector), self.direction.perp_dot(vector));
+        DVec2::new(ahead, left)
+    }
+
+    /// A point seen from here.
+    pub(super) fn see(self, point: DVec2) -> DVec2 {
+        self.turn(point - self.origin)
+    }
+}
+
+/// An edge of this kind to something at `to`, seen from `from`.
+fn relative(kind: usize, from: Axes, to: Axes) -> EdgeRow {
+    let mut out = [0.0; EDGE_NUMBERS];
+    out[kind] = 1.0;
+    let (p, direction) = (from.see(to.origin), from.turn(to.direction));
+    let away = p.length();
+    // Fine where directions are nearly equal; the same at both ends of a turn of half a circle.
+    let bent = 10.0 * direction.y;
+    let near = fast_exp(-away / 12.0);
+    Writer(&mut out[KINDS..]).put([
+        p.x / 30.0,
+        p.y / 30.0,
+        bend(p.x / 6.0),
+        bend(p.y / 2.0),
+        direction.x,
+        direction.y,
+        bend(bent),
+        away / 30.0,
+        near * near * near * near,
+        near,
+    ]);
+    out
+}
+
+/// From -1 to 1, steep around 0.
+fn bend(x: f64) -> f64 {
+    x / (1.0 + x.abs())
+}
+
+/// e to a number that is not above 0.
+fn fast_exp(x: f64) -> f64 {
+    f64::from((x as f32).exp())
+}
+
+/// The edge to the node's own state `ago` frames before; 0 is itself.
+pub(super) fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
+    let mut out = relative(0, Axes::of(now.pose), Axes::of(then.pose));
+    out[OF_PAST] = ago as f32 / PAST as f32;
+    out
+}
+
+/// What a node sees beside its past.
+#[derive(Debug, Default)]
+pub(super) struct View {
+    /// Index among the agents of the frame.
+    pub(super) neighbours: Vec<(usize, EdgeRow)>,
+    pub(super) pieces: Vec<(u32, EdgeRow)>,
+}
+
+/// What agent `i` of those of a frame sees.
+pub(super) fn look(map: &VectorMap, lights: &Lights, agents: &[Shown], i: usize) -> View {
+    let own = &agents[i];
+    let mut view = View::default();
+    let paths = match own.body.kind {
+        AgentKind::Pedestrian => Vec::new(),
+        _ => map.paths(own.pose),
+    };
+    neighbours(map, agents, i, &paths, &mut view);
+    pieces(map, lights, own, &paths, &mut view);
+    view
+}
+
+type Paths = [Vec<(u32, f64)>];
+
+fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: &mut View) {
+    let own = &agents[i];
+    let mut near: Vec<(f64, usize)> = agents
+        .iter()
+        .enumerate()
+        .filter(|(j, _)| *j != i)
+        .map(|(j, other)| (other.pose.position.distance(own.pose.position), j))
+        .filter(|(away, _)| *away < NEIGHBOUR_REACH_M)
+        .collect();
+    near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    near.truncate(NEIGHBOURS);
+    let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
+    for (_, j) in near {
+        let other = &agents[j];
+        let mut row = relative(1, from, Axes::of(other.pose));
+        let place = from.see(other.pose.position);
+        let velocity = from.turn(other.velocity() - own_velocity);
+        let (body, class) = (other.body, class_index(other.body.kind));
+        // When they are nearest if both keep their velocities, and how near.
+        let speed = velocity.length_squared();
+        let soon = match speed > 0.01 {
+            true => (-place.dot(velocity) / speed).clamp(0.0, 8.0),
+            false => 0.0,
+        };
+        let nearest = (place + velocity * soon).length();
+        let ahead = place.x.abs() - 0.5 * (own.body.length + body.length);
+        let aside = place.y.abs() - 0.5 * (own.body.width + body.width);
+        Writer(&mut row[OF_NEIGHBOUR..]).put([
+            velocity.x / 10.0,
+            velocity.y / 5.0,
+            body.length / 5.0,
+            body.width / 2.0,
+            mark(class == 1),
+            mark(class == 2),
+            mark(other.stands()),
+            bend(ahead / 3.0),
+            bend(aside),
+            fast_exp(-soon / 2.0),
+            bend(nearest / 2.0),
+            mark(other.tracked),
+        ]);
+        on_paths(map, other, paths, &mut row);
+        view.neighbours.push((j, row));
+    }
+}
+
+/// Marks on which paths somebody is, and how far ahead.
+fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
+    for (k, path) in paths.iter().enumerate().take(PATHS) {
+        let at = path.iter().find_map(|&(i, away)| {
+            let piece = &map.pieces[i as usize];
+            let local = piece.axes.see(other.pose.position);
+            if local.x.abs() > 6.0 || local.y.abs() > 8.0 {
+                return None;
+            }
+            let (distance, _) = piece.offset(other.pose.position);
+            (distance < 0.5 * other.body.width + 1.2).then_some(away + local.x)
+        });
+        if let Some(away) = at.filter(|away| *away > 0.0) {
+            row[OF_PATH + k] = 1.0;
+            row[OF_PATH + 3] = (away / 30.0) as f32;
+            row[OF_PATH + 4] = bend(away / 6.0) as f32;
+        }
+    }
+}
+
+fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &mut View) {
+    let axes = Axes::of(own.pose);
+    // Of a piece on several paths the first distance, which all share.
+    let mut ahead: Vec<(u32, f64, [bool; PATHS])> = Vec::new();
+    for (k, path) in paths.iter().enumerate().take(PATHS) {
+        for &(piece, away) in path {
+            match ahead.iter_mut().find(|known| known.0 == piece) {
+                Some(known) => known.2[k] = true,
+                None => ahead.push((piece, away, std::array::from_fn(|i| i == k))),
+            }
+        }
+    }
+    for &(i, away, on) in &ahead {
+        let mut row = map_edge(map, lights, axes, i);
+        for (k, on) in on.into_iter().enumerate() {
+            row[OF_PATH + k] = f32::from(u8::from(on));
+        }
+        row[OF_PATH + 3] = (away / 30.0) as f32;
+        row[OF_PATH + 4] = bend(away / 6.0) as f32;
+        row[OF_PATH + 5] = 1.0;
+        view.pieces.push((i, row));
+    }
+    let from = own.pose.position;
+    let mut near: [Vec<(f64, u32)>; 3] = Default::default();
+    for i in map.near(from, MAP_REACH_M) {
+        if ahead.iter().any(|known| known.0 == i) {
+            continue;
+        }
+        let piece = &map.pieces[i as usize];
+        let end = |k: usize| piece.line[k].distance_squared(from);
+        let away = end(0).min(end(2)).min(end(4));
+        if away < MAP_REACH_M * MAP_REACH_M {
+            let kind = match piece.kind {
+                PieceKind::Lane => 0,
+                PieceKind::Edge => 1,
+                PieceKind::Area => 2,
+            };
+            near[kind].push((away, i));
+        }
+    }
+    for (near, most) in near.iter_mut().zip([LANES, EDGES, AREAS]) {
+        if near.len() > most {
+            near.select_nth_unstable_by(most, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            near.truncate(most);
+        }
+        near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        for &(_, i) in near.iter() {
+            view.pieces.push((i, map_edge(map, lights, axes, i)));
+        }
+    }
+}
+
+fn map_edge(map: &VectorMap, lights: &Lights, from: Axes, i: u32) -> EdgeRow {
+    let piece = &map.pieces[i as usize];
+    let kind = match piece.kind {
+        PieceKind::Lane => 2,
+        PieceKind::Edge => 3,
+        PieceKind::Area => 4,
+    };
+    let mut row = relative(kind, from, piece.axes);
+    let (distance, left) = piece.offset(from.origin);
+    let (light, elapsed) = match lights.of(piece.lane) {
+        Some((state, elapsed)) => (Some(state), elapsed),
+        None => (None, None),
+    };
+    Writer(&mut row[OF_LANE..]).put([
+        bend(distance / 3.0),
+        bend(left),
+        bend(left * 4.0),
+        mark(light == Some(LightState::Green)),
+        mark(light == Some(LightState::Yellow)),
+        mark(light == Some(LightState::Red)),
+        mark(light == Some(LightState::Unknown)),
+        elapsed.map_or(0.0, |s| bend(s / 8.0)),
+        mark(light.is_some() && elapsed.is_none()),
+        mark(piece.starts_lane),
+    ]);
+    row
+}
+
+fn mark(is: bool) -> f64 {
+    f64::from(u8::from(is))
+}
+
+/// Writes numbers one after another, held within a few units of zero.
+struct Writer<'a>(&'a mut [f32]);
+
+impl Writer<'_> {
+    fn put(&mut self, numbers: impl IntoIterator<Item = f64>) {
+        for number in numbers {
+            let (first, rest) = std::mem::take(&mut self.0).split_at_mut(1);
+            first[0] = number.clamp(-6.0, 6.0) as f32;
+            self.0 = rest;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAR: Body = Body {
+        kind: AgentKind::Vehicle,
+        length: 4.5,
+        width: 2.0,
+        sized: true,
+    };
+
+    #[test]
+    fn what_is_seen_does_not_depend_on_the_place() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 100,0 speed 15 next 2
+             lane 2: 100,0 180,30
+             ego vehicle 0: 10,0 velocity 8,0",
+        )
+        .unwrap();
+        let turned = |pose: Pose| {
+            let line = |points: &gump_geometry::Polyline| {
+                let moved = points.points().iter().map(|&p| pose * p).collect();
+                gump_geometry::Polyline::new(moved).unwrap()
+            };
+            let mut parts = scenario.map.parts().clone();
+            for lane in &mut parts.lanes {
+                lane.centerline = line(&lane.centerline);
+            }
+            let map = gump_scene::MapGraph::new(parts).unwrap();
+            let map = VectorMap::new(&map, pose.position, 300.0, Default::default());
+            let agents = [(10.0, 0.4), (40.0, 0.0), (95.0, -1.0)].map(|(x, y)| {
+                let was = Shown::first(CAR, pose * Pose::new(x, y, 0.05), pose.rotate(DVec2::X));
+                was.then(pose * Pose::new(x + 2.0, y, 0.0))
+            });
+            let view = look(&map, &Lights::default(), &agents, 0);
+            (agents[0].numbers(), view)
+        };
+        let (own, here) = turned(Pose::IDENTITY);
+        let (own_there, there) = turned(Pose::new(4000.0, -700.0, 2.0));
+        let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-4);
+        assert!(close(&own, &own_there), "{own:?} {own_there:?}");
+        assert_eq!(
+            (here.neighbours.len(), here.pieces.len()),
+            (2, there.pieces.len())
+        );
+        assert!(here.pieces.len() > 8, "{}", here.pieces.len());
+        for (a, b) in here.neighbours.iter().zip(&there.neighbours) {
+            assert!(close(&a.1, &b.1), "{:?} {:?}", a.1, b.1);
+        }
+        for (a, b) in here.pieces.iter().zip(&there.pieces) {
+            assert!(close(&a.1, &b.1), "{:?} {:?}", a.1, b.1);
+        }
+        // The car 30 m ahead in the lane is on the path.
+        assert_eq!(here.neighbours[0].1[OF_PATH], 1.0);
+    }
+
+    #[test]
+    fn jitter_is_standing_and_velocity_is_displacement() {
+        let was = Shown::first(CAR, Pose::new(5.0, 5.0, 1.0), DVec2::ZERO);
+        let is = was.then(Pose::new(5.03, 4.98, 1.01));
+        assert!(is.stands() && is.stood == TOKEN_DT);
+        assert_eq!(is.velocity(), DVec2::ZERO);
+        let moved = is.then(Pose::new(7.03, 4.98, 1.2));
+        assert!((moved.velocity() - DVec2::new(4.0, 0.0)).length() < 1e-9);
+        assert_eq!(moved.stood, 0.0);
+    }
+}

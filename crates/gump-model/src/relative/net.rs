@@ -1,0 +1,287 @@
+//! The network: nodes attend along their edges, layer by layer, and a short recurrence says the
+//! next move field by field.
+//!
+//! Shapes: `N` nodes, `M` pieces of the map, `E` edges, `C` width, `F` features per edge, `H` heads.
+
+use std::sync::Arc;
+
+use candle_core::{Device, Result, Tensor};
+
+use super::RelativeConfig;
+use super::graph::{EDGE_NUMBERS, NODE_NUMBERS};
+use super::grid::{ALL_BINS, BINS, FIELDS, first_bin};
+use super::map::PIECE_NUMBERS;
+use super::sample::Sample;
+use crate::ModelError;
+use crate::mct::{LayerNorm, Linear, TABLE_DEVIATION};
+use crate::ops::{self, OrdinalSmoothing, Targets};
+use crate::parameters::{Init, Parameters, Scope};
+
+/// Two layers with a smooth bend between them.
+#[derive(Debug)]
+pub(super) struct Mlp {
+    pub(super) first: Linear,
+    pub(super) second: Linear,
+}
+
+impl Mlp {
+    fn new(mut scope: Scope<'_>, sizes: [usize; 3]) -> std::result::Result<Self, ModelError> {
+        Ok(Self {
+            first: Linear::new(&mut scope, "first", sizes[0], sizes[1])?,
+            second: Linear::new(&mut scope, "second", sizes[1], sizes[2])?,
+        })
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        self.second.forward(&ops::gelu(&self.first.forward(x)?)?)
+    }
+}
+
+/// Attention along edges and a feed-forward part, each before a norm.
+#[derive(Debug)]
+pub(super) struct Layer {
+    pub(super) norm: LayerNorm,
+    /// To the queries and their part for edge features, `[H d + H F]`.
+    pub(super) queries: Linear,
+    /// To keys and values of nodes, `[2 H d]`.
+    pub(super) sources: Linear,
+    /// To those of pieces of the map.
+    pub(super) piece_sources: Linear,
+    /// From averages of values and of edge features.
+    pub(super) out: Linear,
+    pub(super) norm_mlp: LayerNorm,
+    pub(super) mlp_in: Linear,
+    pub(super) mlp_out: Linear,
+}
+
+impl Layer {
+    fn new(mut scope: Scope<'_>, config: &RelativeConfig) -> std::result::Result<Self, ModelError> {
+        let (c, attended) = (
+            config.width,
+            config.width + config.heads * config.edge_width,
+        );
+        let zero = Some(Init::Constant(0.0));
+        let residual = Init::Normal(TABLE_DEVIATION / (2.0 * config.layers as f64).sqrt());
+        Ok(Self {
+            norm: LayerNorm::new(&mut scope, "norm", c)?,
+            queries: Linear::with(&mut scope, "queries", c, attended, Init::Xavier, zero)?,
+            sources: Linear::with(&mut scope, "sources", c, 2 * c, Init::Xavier, zero)?,
+            piece_sources: Linear::with(&mut scope, "piece_sources", c, 2 * c, Init::Xavier, zero)?,
+            out: Linear::with(&mut scope, "out", attended, c, residual, zero)?,
+            norm_mlp: LayerNorm::new(&mut scope, "norm_mlp", c)?,
+            mlp_in: Linear::with(&mut scope, "mlp_in", c, 4 * c, Init::Xavier, zero)?,
+            mlp_out: Linear::with(&mut scope, "mlp_out", 4 * c, c, residual, zero)?,
+        })
+    }
+
+    fn forward(
+        &self,
+        x: &Tensor,
+        pieces: &Tensor,
+        features: &Tensor,
+        edges: &Arc<ops::Edges>,
+        heads: usize,
+    ) -> Result<Tensor> {
+        let normed = self.norm.forward(x)?; // [N, C]
+        let sources = Tensor::cat(
+            &[
+                &self.sources.forward(&normed)?,
+                &self.piece_sources.forward(pieces)?,
+            ],
+            0,
+        )?; // [N + M, 2C]
+        let queries = self.queries.forward(&normed)?; // [N, C + HF]
+        let attended = ops::edge_attention(&queries, &sources, features, edges, heads)?;
+        let x = (x + self.out.forward(&attended)?)?;
+        let hidden = ops::gelu(&self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?)?;
+        &x + self.mlp_out.forward(&hidden)?
+    }
+}
+
+/// From the hidden vector of a node to its next move, field by field.
+#[derive(Debug)]
+pub(super) struct MoveDecoder {
+    /// Rows by which bins enter, [ALL_BINS, C].
+    pub(super) table: Tensor,
+    /// What each step adds, [FIELDS, C].
+    pub(super) slots: Tensor,
+    pub(super) input: Linear,
+    pub(super) hidden: Linear,
+    /// [ALL_BINS, C]
+    pub(super) head: Linear,
+}
+
+impl MoveDecoder {
+    fn new(mut scope: Scope<'_>, c: usize) -> std::result::Result<Self, ModelError> {
+        let fan = Init::FanIn(c);
+        Ok(Self {
+            table: scope.get("table", (ALL_BINS, c), Init::Normal(TABLE_DEVIATION))?,
+            slots: scope.get("slots", (FIELDS, c), Init::Normal(TABLE_DEVIATION))?,
+            input: Linear::with(&mut scope, "input", c, 3 * c, fan, Some(fan))?,
+            hidden: Linear::with(&mut scope, "hidden", c, 3 * c, fan, Some(fan))?,
+            head: Linear::with(&mut scope, "head", c, ALL_BINS, Init::Normal(0.02), None)?,
+        })
+    }
+
+    /// Outputs of all steps with the true bins as input, [FIELDS, K, C]; `rows` are those of the
+    /// table that the first three bins of each node stand in, [FIELDS - 1, K].
+    fn forced(&self, hidden: &Tensor, rows: &Tensor) -> Result<Tensor> {
+        let (k, c) = hidden.dims2()?;
+        let embedded = self
+            .table
+            .index_select(&rows.flatten_all()?, 0)?
+            .reshape((FIELDS - 1, k, c))?
+            .pad_with_zeros(0, 1, 0)?;
+        let inputs = embedded.broadcast_add(&self.slots.reshape((FIELDS, 1, c))?)?;
+        let gates = self.input.forward(&inputs)?; // [FIELDS, K, 3C]
+        let bias = self.hidden.bias().expect("it was built with one");
+        ops::gru(&gates, hidden, self.hidden.weight(), bias)
+    }
+}
+
+/// A traffic model in which everything is relative.
+#[derive(Debug)]
+pub struct RelativeNetwork {
+    config: RelativeConfig,
+    parameters: Parameters,
+    pub(super) nodes: Mlp,
+    pub(super) pieces: Mlp,
+    pub(super) edges: Mlp,
+    pub(super) layers: Vec<Layer>,
+    pub(super) norm: LayerNorm,
+    pub(super) decoder: MoveDecoder,
+}
+
+impl RelativeNetwork {
+    /// A network that has learned nothing yet.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if the configuration contradicts itself.
+    pub fn random(
+        config: RelativeConfig,
+        seed: gump_scene::Seed,
+        device: &Device,
+    ) -> std::result::Result<Self, ModelError> {
+        Self::build(config, Parameters::random(seed, device))
+    }
+
+    /// The network that `config` describes, with the given parameters.
+    ///
+    /// # Errors
+    /// A tensor that is missing, too many or of another shape, by name.
+    pub fn build(
+        config: RelativeConfig,
+        mut parameters: Parameters,
+    ) -> std::result::Result<Self, ModelError> {
+        config.validate()?;
+        let c = config.width;
+        let mut root = parameters.root();
+        let nodes = Mlp::new(root.part("nodes"), [NODE_NUMBERS, 2 * c, c])?;
+        let pieces = Mlp::new(root.part("pieces"), [PIECE_NUMBERS, c, c])?;
+        let sizes = [EDGE_NUMBERS, config.edge_hidden, config.edge_width];
+        let edges = Mlp::new(root.part("edges"), sizes)?;
+        let layers = (0..config.layers)
+            .map(|i| Layer::new(root.part(format!("layers.{i}")), &config))
+            .collect::<std::result::Result<_, _>>()?;
+        let norm = LayerNorm::new(&mut root, "norm", c)?;
+        let decoder = MoveDecoder::new(root.part("decoder"), c)?;
+        if let Some(name) = parameters.unused().first() {
+            return Err(ModelError::Config(format!(
+                "the checkpoint's tensor \"{name}\" has no place in it"
+            )));
+        }
+        Ok(Self {
+            config,
+            parameters,
+            nodes,
+            pieces,
+            edges,
+            layers,
+            norm,
+            decoder,
+        })
+    }
+
+    /// The shape it was built from.
+    pub fn config(&self) -> &RelativeConfig {
+        &self.config
+    }
+
+    /// Its numbers.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// What every node of a sample ends with, [N, C].
+    pub(super) fn hidden(&self, sample: &Sample) -> Result<Tensor> {
+        let device = self.parameters.device();
+        let tensor = |numbers: &[f32], width: usize| {
+            Tensor::from_slice(numbers, (numbers.len() / width, width), device)
+        };
+        let mut x = self.nodes.forward(&tensor(&sample.nodes, NODE_NUMBERS)?)?; // [N, C]
+        let pieces = self
+            .pieces
+            .forward(&tensor(&sample.pieces, PIECE_NUMBERS)?)?; // [M, C]
+        let features = self
+            .edges
+            .forward(&tensor(&sample.edge_numbers, EDGE_NUMBERS)?)?; // [E, F]
+        for layer in &self.layers {
+            x = layer.forward(&x, &pieces, &features, &sample.edges, self.config.heads)?;
+        }
+        self.norm.forward(&x)
+    }
+
+    /// The mean over the weight of all moves of a batch, of which this sample has a share: to
+    /// differentiate, and the sums of the fields' cross-entropies as numbers, nats.
+    ///
+    /// `total` is the weight of all moves of the batch.
+    pub(super) fn loss(
+        &self,
+        sample: &Sample,
+        total: f64,
+        smoothing_bins: f64,
+    ) -> Result<(Tensor, [f64; FIELDS])> {
+        let device = self.parameters.device();
+        let targets = &sample.targets;
+        let k = targets.len();
+        let nodes: Vec<u32> = targets.iter().map(|target| target.node).collect();
+        let hidden = self
+            .hidden(sample)?
+            .index_select(&Tensor::new(nodes, device)?, 0)?;
+        let rows = (0..FIELDS - 1).flat_map(|field| {
+            let first = first_bin(field) as u32;
+            targets
+                .iter()
+                .map(move |t| first + u32::from(t.bins[field]))
+        });
+        let rows = Tensor::from_vec(rows.collect::<Vec<u32>>(), (FIELDS - 1, k), device)?;
+        let outputs = self.decoder.forced(&hidden, &rows)?;
+        let weight = |field: usize, target: &super::sample::Target| {
+            let counts = field == 0 || target.bins[0] != super::grid::STANDS;
+            if counts { target.weight } else { 0.0 }
+        };
+        let asked = (0..FIELDS).map(|field| {
+            let asked = Targets {
+                bins: targets.iter().map(|t| u32::from(t.bins[field])).collect(),
+                weights: targets.iter().map(|t| weight(field, t)).collect(),
+                smoothing: (field > 0 && smoothing_bins > 0.0).then(|| OrdinalSmoothing {
+                    sigma_bins: smoothing_bins as f32,
+                    circular: false,
+                }),
+                exact: Vec::new(),
+            };
+            let first = first_bin(field);
+            (first..first + BINS[field], asked)
+        });
+        let matrix = self.decoder.head.weight();
+        let means = ops::linear_cross_entropy(&outputs, matrix, asked.collect())?; // [FIELDS]
+        let shares: Vec<f64> = (0..FIELDS)
+            .map(|field| targets.iter().map(|t| f64::from(weight(field, t))).sum())
+            .collect();
+        let values = means.to_vec1::<f32>()?;
+        let sums = std::array::from_fn(|field| shares[field] * f64::from(values[field]));
+        let shares: Vec<f32> = shares.iter().map(|s| (s / total) as f32).collect();
+        let loss = (means * Tensor::new(shares, device)?)?.sum_all()?;
+        Ok((loss, sums))
+    }
+}

@@ -1,0 +1,415 @@
+//! One training sample: a run of frames of a scenario as a graph, and the next move of every node.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_geometry::{DVec2, Pose, wrap_angle};
+use gump_scene::{AgentId, AgentKind, Frame, LaneId, LightState, Rng, Scenario, Seed};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+use super::graph::{
+    Body, EDGE_NUMBERS, EdgeRow, Lights, NODE_NUMBERS, PAST, Shown, look, past_edge,
+};
+use super::grid::{FIELDS, quantize};
+use super::map::{Hidden, PIECE_NUMBERS, VectorMap};
+use crate::ops::Edges;
+use crate::sample::stride_of;
+
+/// How samples are drawn from scenarios.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SampleConfig {
+    /// Consecutive frames at 2 Hz, at most; shorter logs give what they have.
+    pub frames: usize,
+    /// Samples keep at most this many agents, those nearest to a randomly chosen one.
+    pub max_agents: usize,
+    /// Probability that what drives is shown a little off its way, with the way back asked for.
+    pub perturbed: f64,
+    /// The farthest that it is pushed to a side at once, metres.
+    pub push_m: f64,
+    /// Probability that a sample does not tell the speed limits of its lanes.
+    pub hide_limits: f64,
+    /// Probability that a sample does not tell its stop signs.
+    pub hide_stop_signs: f64,
+    /// Probability that a sample does not tell its lights.
+    pub hide_lights: f64,
+    /// Probability that the size of an agent is not told.
+    pub hide_size: f64,
+    /// Probability that an agent is seen late or lost early.
+    pub cut_tracks: f64,
+}
+
+impl Default for SampleConfig {
+    fn default() -> Self {
+        Self {
+            frames: 18,
+            max_agents: 64,
+            perturbed: 0.5,
+            push_m: 0.8,
+            hide_limits: 0.3,
+            hide_stop_signs: 0.1,
+            hide_lights: 0.05,
+            hide_size: 0.02,
+            cut_tracks: 0.1,
+        }
+    }
+}
+
+impl SampleConfig {
+    /// Nothing hidden and nothing pushed: to validate.
+    pub fn plain() -> Self {
+        Self {
+            perturbed: 0.0,
+            hide_limits: 0.0,
+            hide_stop_signs: 0.0,
+            hide_lights: 0.0,
+            hide_size: 0.0,
+            cut_tracks: 0.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// A graph and what its nodes should say.
+#[derive(Debug, Default)]
+pub(crate) struct Sample {
+    /// `[nodes, NODE_NUMBERS]`
+    pub(super) nodes: Vec<f32>,
+    /// `[edges, EDGE_NUMBERS]`
+    pub(super) edge_numbers: Vec<f32>,
+    /// Sources are nodes, then pieces.
+    pub(super) edges: Arc<Edges>,
+    /// `[pieces, PIECE_NUMBERS]`: those that somebody sees.
+    pub(super) pieces: Vec<f32>,
+    pub(super) targets: Vec<Target>,
+}
+
+impl Sample {
+    /// Number of nodes.
+    pub(crate) fn n_nodes(&self) -> usize {
+        self.nodes.len() / NODE_NUMBERS
+    }
+}
+
+/// What a node should say.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Target {
+    pub(super) node: u32,
+    pub(super) bins: [u16; FIELDS],
+    pub(super) weight: f32,
+}
+
+/// Weight of the first move of somebody of whom only one instant was seen.
+const UNTRACKED: f32 = 0.3;
+/// Share of an offset from its way that is left half a second later.
+const SLACK: f64 = 0.6;
+/// Slower agents are not pushed, metres per second: nothing moves sideways on the spot.
+const SLOWEST: f64 = 2.0;
+/// Radians of turn per metre of push.
+const TURN: f64 = 0.1;
+/// How far the map is laid out, metres.
+const MAP_M: f64 = 180.0;
+
+/// An agent over the frames of a sample.
+struct Track {
+    body: Body,
+    /// By frame: the pose that is shown and the state, with how far it is pushed.
+    states: Vec<Option<(Pose, Pose, DVec2, Off)>>,
+}
+
+/// How far an agent is shown off its way.
+#[derive(Clone, Copy, Debug, Default)]
+struct Off {
+    left_m: f64,
+    turn: f64,
+}
+
+/// Draws a sample; `None` for a scenario too short for one.
+pub(crate) fn draw(scenario: &Scenario, config: &SampleConfig, seed: Seed) -> Option<Sample> {
+    let mut rng = seed.rng();
+    let stride = stride_of(scenario.dt);
+    let most = (scenario.log.len().checked_sub(1)?) / stride + 1;
+    let n_frames = config.frames.min(most);
+    if n_frames < 3 {
+        return None;
+    }
+    let last_start = scenario.log.len() - 1 - (n_frames - 1) * stride;
+    let start = rng.random_range(0..=last_start);
+    let frames: Vec<&Frame> = (0..n_frames)
+        .map(|i| &scenario.log[start + i * stride])
+        .collect();
+    let (ids, centre) = chosen(&frames, scenario.ego, config.max_agents, &mut rng)?;
+    let hidden = Hidden {
+        limits: rng.random_bool(config.hide_limits),
+        stop_signs: rng.random_bool(config.hide_stop_signs),
+    };
+    let hides_lights = rng.random_bool(config.hide_lights);
+    let map = VectorMap::new(&scenario.map, centre, MAP_M, hidden);
+    let tracks: Vec<Track> = ids
+        .iter()
+        .map(|id| track(&frames, *id, config, &mut rng))
+        .collect();
+    let lights = match hides_lights {
+        true => vec![Lights::default(); n_frames],
+        false => lights(scenario, start, stride, n_frames),
+    };
+    Some(assemble(&map, &tracks, &lights))
+}
+
+/// The agents of a sample, and the place it is about.
+fn chosen(
+    frames: &[&Frame],
+    ego: AgentId,
+    most: usize,
+    rng: &mut Rng,
+) -> Option<(Vec<AgentId>, DVec2)> {
+    let middle = frames[frames.len() / 2].agents();
+    let moving = || middle.iter().filter(|agent| agent.kind.is_moving());
+    let n = moving().count();
+    let own = moving().find(|agent| agent.id == ego);
+    let centre = match own.filter(|_| rng.random_bool(0.5)) {
+        Some(own) => own,
+        None => moving().nth(rng.random_range(0..n.max(1)))?,
+    };
+    let centre = centre.state.pose.position;
+    let mut nearest: BTreeMap<AgentId, f64> = BTreeMap::new();
+    for agent in frames.iter().flat_map(|frame| frame.agents()) {
+        let away = agent.state.pose.position.distance(centre);
+        if agent.kind.is_moving() {
+            let known = nearest.entry(agent.id).or_insert(away);
+            *known = known.min(away);
+        }
+    }
+    let mut by_distance: Vec<(f64, AgentId)> = nearest.into_iter().map(|(id, d)| (d, id)).collect();
+    by_distance.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    by_distance.truncate(most);
+    Some((by_distance.into_iter().map(|(_, id)| id).collect(), centre))
+}
+
+fn track(frames: &[&Frame], id: AgentId, config: &SampleConfig, rng: &mut Rng) -> Track {
+    let n = frames.len();
+    let (mut from, mut to) = (0, n);
+    if rng.random_bool(config.cut_tracks) {
+        match rng.random_bool(0.7) {
+            true => from = rng.random_range(0..n),
+            false => to = rng.random_range(1..=n),
+        }
+    }
+    let sized = !rng.random_bool(config.hide_size);
+    let reach = match rng.random_bool(config.perturbed) {
+        true => config.push_m * rng.random::<f64>(),
+        false => 0.0,
+    };
+    let mut off = Off::default();
+    let mut body = None;
+    let states = (0..n).map(|t| {
+        let agent = frames[t].agent(id).filter(|_| (from..to).contains(&t))?;
+        body.get_or_insert(Body {
+            kind: agent.kind,
+            length: agent.length,
+            width: agent.width,
+            sized,
+        });
+        let drives = matches!(agent.kind, AgentKind::Vehicle | AgentKind::Bicycle);
+        if reach > 0.0 && drives && agent.state.speed() >= SLOWEST {
+            let mut within = |bound: f64| bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0);
+            off.left_m = SLACK * off.left_m + within(reach);
+            off.turn = SLACK * off.turn + within(TURN * reach);
+        } else {
+            off = Off::default();
+        }
+        let pose = agent.state.pose;
+        Some((pose, pushed(pose, off, 1.0), agent.state.velocity, off))
+    });
+    let states: Vec<_> = states.collect();
+    Track {
+        body: body.unwrap_or(Body {
+            kind: AgentKind::Vehicle,
+            length: 0.0,
+            width: 0.0,
+            sized,
+        }),
+        states,
+    }
+}
+
+/// A pose, off its way by a share of `off`.
+fn pushed(pose: Pose, off: Off, share: f64) -> Pose {
+    Pose {
+        position: pose.position + pose.rotate(DVec2::new(0.0, share * off.left_m)),
+        heading: wrap_angle(pose.heading + share * off.turn),
+    }
+}
+
+/// The lights of the frames; how long they have shown their colour is told as far as the log up to
+/// then shows a change.
+fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> Vec<Lights> {
+    let mut known: BTreeMap<LaneId, (LightState, Option<usize>)> = BTreeMap::new();
+    let mut lights = Vec::with_capacity(n_frames);
+    for (i, frame) in scenario.log[..=start + (n_frames - 1) * stride]
+        .iter()
+        .enumerate()
+    {
+        for light in frame.lights() {
+            let entry = known.entry(light.lane).or_insert((light.state, None));
+            if entry.0 != light.state {
+                let seen = entry.0 != LightState::Unknown;
+                *entry = (light.state, Some(i).filter(|_| seen));
+            }
+        }
+        if i >= start && (i - start) % stride == 0 {
+            let now = frame.lights().iter().map(|light| {
+                let since = known.get(&light.lane).and_then(|entry| entry.1);
+                let elapsed = since.map(|since| (i - since) as f64 * scenario.dt);
+                (light.lane, light.state, elapsed)
+            });
+            lights.push(Lights {
+                by_lane: now.collect(),
+            });
+        }
+    }
+    lights
+}
+
+fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
+    let n_frames = lights.len();
+    // Nodes frame by frame: which agents, how they are shown, and the first node of each frame.
+    let mut shown: Vec<Vec<Option<Shown>>> = Vec::with_capacity(n_frames);
+    let mut node_of: Vec<Vec<Option<u32>>> = Vec::with_capacity(n_frames);
+    let mut n_nodes = 0;
+    for t in 0..n_frames {
+        let of_frame = tracks.iter().enumerate().map(|(a, track)| {
+            let (_, pose, velocity, _) = track.states[t]?;
+            let before = (t > 0).then(|| shown[t - 1][a]).flatten();
+            Some(match before {
+                Some(before) => before.then(pose),
+                None => Shown::first(track.body, pose, velocity),
+            })
+        });
+        let of_frame: Vec<Option<Shown>> = of_frame.collect();
+        let numbered = of_frame.iter().map(|shown| {
+            shown.map(|_| {
+                n_nodes += 1;
+                n_nodes - 1
+            })
+        });
+        node_of.push(numbered.collect());
+        shown.push(of_frame);
+    }
+    let mut sample = Sample::default();
+    let mut graph = Edges {
+        offsets: vec![0],
+        sources: Vec::new(),
+    };
+    let mut piece_rows: BTreeMap<u32, u32> = BTreeMap::new();
+    for t in 0..n_frames {
+        let present: Vec<usize> = (0..tracks.len())
+            .filter(|&a| shown[t][a].is_some())
+            .collect();
+        let agents: Vec<Shown> = present.iter().filter_map(|&a| shown[t][a]).collect();
+        for (i, &a) in present.iter().enumerate() {
+            let own = &agents[i];
+            sample.nodes.extend(own.numbers());
+            let mut push = |source: u32, row: &EdgeRow| {
+                graph.sources.push(source);
+                sample.edge_numbers.extend(row);
+            };
+            for ago in 0..=PAST.min(t) {
+                let (Some(then), Some(node)) = (&shown[t - ago][a], node_of[t - ago][a]) else {
+                    break;
+                };
+                push(node, &past_edge(own, then, ago));
+            }
+            let view = look(map, &lights[t], &agents, i);
+            for (j, row) in &view.neighbours {
+                let node = node_of[t][present[*j]].expect("a neighbour is present");
+                push(node, row);
+            }
+            for (piece, row) in &view.pieces {
+                let next = piece_rows.len() as u32;
+                let at = *piece_rows.entry(*piece).or_insert(next);
+                push(n_nodes + at, row);
+            }
+            graph.offsets.push(graph.sources.len() as u32);
+            if let Some(target) = target(tracks, a, t, own) {
+                let node = node_of[t][a].expect("the agent is present");
+                sample.targets.push(Target { node, ..target });
+            }
+        }
+    }
+    let mut by_row: Vec<(u32, u32)> = piece_rows.into_iter().map(|(p, row)| (row, p)).collect();
+    by_row.sort_unstable();
+    for (_, piece) in by_row {
+        let at = piece as usize * PIECE_NUMBERS;
+        sample.pieces.extend(&map.numbers[at..at + PIECE_NUMBERS]);
+    }
+    debug_assert_eq!(
+        sample.edge_numbers.len(),
+        graph.sources.len() * EDGE_NUMBERS
+    );
+    sample.edges = Arc::new(graph);
+    sample
+}
+
+/// What agent `a` should say at frame `t`, if it is there at the next.
+fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
+    let states = &tracks[a].states;
+    let (now, ..) = states[t]?;
+    let (next, ..) = (*states.get(t + 1)?)?;
+    let off = states[t]?.3;
+    let moved = now.inverse() * next;
+    let step = match moved.position.length() < super::grid::STILL_M {
+        true => moved,
+        false => own.pose.inverse() * pushed(next, off, SLACK),
+    };
+    Some(Target {
+        node: 0,
+        bins: quantize(step),
+        weight: if own.tracked { 1.0 } else { UNTRACKED },
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_scene::fixture;
+
+    #[test]
+    fn nodes_see_the_past_only() {
+        let scenario = fixture::scenario(
+            "lane 1: 0,0 200,0 speed 15
+             ego vehicle 0: 10,0 velocity 8,0
+             agent vehicle 1: 30,0 velocity 0,0
+             agent pedestrian 2: 40,5 velocity 0,-1",
+        )
+        .unwrap();
+        let sample = draw(&scenario, &SampleConfig::plain(), Seed(3)).unwrap();
+        let (nodes, edges) = (sample.n_nodes(), &sample.edges);
+        assert!(nodes % 3 == 0 && nodes >= 9, "{nodes}");
+        assert_eq!(edges.n_nodes(), nodes);
+        let frame = |node: usize| node / 3;
+        for node in 0..nodes {
+            let of = edges.offsets[node] as usize..edges.offsets[node + 1] as usize;
+            for &source in &edges.sources[of] {
+                let is_piece = source as usize >= nodes;
+                assert!(is_piece || frame(source as usize) <= frame(node));
+            }
+        }
+        // Everybody but those of the last frame has a next move; the parked car stands.
+        assert_eq!(sample.targets.len(), nodes - 3);
+        let parked = sample.targets.iter().find(|t| t.node % 3 == 1).unwrap();
+        assert_eq!(parked.bins[0], super::super::grid::STANDS);
+    }
+
+    #[test]
+    fn one_seed_one_sample() {
+        let scenario = fixture::scenario("ego vehicle 0: 0,0 velocity 8,0").unwrap();
+        let drawn = |seed| {
+            let sample = draw(&scenario, &SampleConfig::default(), Seed(seed)).unwrap();
+            (sample.nodes, sample.edge_numbers, sample.targets.len())
+        };
+        assert_eq!(drawn(1), drawn(1));
+        assert_ne!(drawn(1), drawn(2));
+    }
+}

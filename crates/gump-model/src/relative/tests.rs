@@ -1,0 +1,159 @@
+//! The relative network against itself: in training and rolled out, resumed and unbroken.
+
+use candle_core::Device;
+use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
+use gump_scene::{Scenario, Seed, fixture};
+
+use super::graph::NODE_NUMBERS;
+use super::sample::{SampleConfig, draw};
+use super::*;
+
+fn config() -> RelativeConfig {
+    RelativeConfig {
+        width: 32,
+        layers: 2,
+        heads: 2,
+        edge_width: 16,
+        edge_hidden: 24,
+    }
+}
+
+fn scenario() -> Scenario {
+    fixture::scenario(
+        "lane 1: 0,0 60,0 speed 15 next 2,3
+         lane 2: 60,0 140,0
+         lane 3: 60,0 75,5 80,20 80,60
+         edge: 0,-3 140,-3
+         ego vehicle 0: 10,0 velocity 8,0
+         agent vehicle 1: 30,0 velocity 0,0
+         agent vehicle 2: 50,0 velocity 6,0
+         agent bicycle 3: 20,-2 velocity 4,0
+         agent pedestrian 4: 40,5 velocity 0,-1",
+    )
+    .unwrap()
+}
+
+/// The scenario up to its present, and nothing hidden or pushed: both sides see the same frames.
+#[test]
+fn rolled_out_it_computes_what_it_computes_in_training() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let whole = scenario();
+    let mut seen = whole.clone();
+    seen.log.truncate(whole.now + 1);
+    let sample = draw(&seen, &SampleConfig::plain(), Seed(1)).unwrap();
+    let trained = network.hidden(&sample).unwrap().to_vec2::<f32>().unwrap();
+    let world = RelativeWorld::new(&network, RelativeSampling::default()).unwrap();
+    let (numbers, hidden) = world.read_present(whole.present()).unwrap();
+    let n = numbers.len() / NODE_NUMBERS;
+    assert_eq!(n, 5);
+    let last = &sample.nodes[sample.nodes.len() - n * NODE_NUMBERS..];
+    for (i, own) in numbers.chunks_exact(NODE_NUMBERS).enumerate() {
+        let same = |row: &[f32]| row.iter().zip(own).all(|(a, b)| (a - b).abs() < 1e-5);
+        let row = last.chunks_exact(NODE_NUMBERS).position(same);
+        let row = trained.len() - n + row.expect("the same agents are shown alike");
+        for (a, b) in trained[row].iter().zip(&hidden[i * 32..]) {
+            assert!((a - b).abs() < 1e-3, "agent {i}: {a} {b}");
+        }
+    }
+}
+
+#[test]
+fn futures_are_seeded_and_a_driven_ego_is_where_it_is_driven() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let world = RelativeWorld::new(&network, RelativeSampling::default()).unwrap();
+    let scenario = scenario();
+    let start = |n_futures, seed| Start {
+        scene: scenario.present(),
+        n_futures,
+        seed: Seed(seed),
+    };
+    let config = SimulateConfig {
+        seconds: 2.0,
+        ..SimulateConfig::default()
+    };
+    let run = |n, seed| simulate(&world, &[start(n, seed)], None, &config).unwrap();
+    let states = |rollout: &gump_scene::Rollout| format!("{:?}", rollout.last().now());
+    let (two, three) = (run(2, 7), run(3, 7));
+    assert_eq!(states(&two[1]), states(&three[1]));
+    assert_ne!(states(&three[0]), states(&three[1]));
+    let mut session = world.open(&[start(2, 0)]).unwrap();
+    let mut ego = scenario.present().ego_now().state;
+    ego.pose.position.x += 3.0;
+    let frames = session.step(Some(&[ego, ego])).unwrap();
+    assert_eq!(frames[1].agent(scenario.ego).unwrap().state, ego);
+    assert!(session.keep(&[1]));
+    assert_eq!(session.step(None).unwrap().len(), 1);
+}
+
+fn train_config(steps: usize) -> RelativeTrainConfig {
+    RelativeTrainConfig {
+        steps,
+        batch: 2,
+        optimizer: crate::OptimizerConfig {
+            learning_rate: 3e-3,
+            warmup: 5,
+            ..crate::OptimizerConfig::default()
+        },
+        ..RelativeTrainConfig::default()
+    }
+}
+
+#[test]
+fn it_learns_a_scene() {
+    let trainer = |steps| {
+        RelativeTrainer::new(
+            config(),
+            train_config(steps),
+            vec![scenario()],
+            &Device::Cpu,
+        )
+        .unwrap()
+    };
+    let mut trainer = trainer(120);
+    let first = trainer.step().unwrap().loss;
+    let last = (1..120)
+        .map(|_| trainer.step().unwrap().loss)
+        .last()
+        .unwrap();
+    assert!(last < 0.5 * first, "{first} to {last}");
+    let fields = trainer.validate(&[scenario()]).unwrap();
+    assert!(fields.iter().sum::<f64>() < first, "{fields:?}");
+}
+
+#[test]
+fn a_resumed_run_ends_in_the_same_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let steps = 6;
+    let new = || {
+        RelativeTrainer::new(
+            config(),
+            train_config(steps),
+            vec![scenario()],
+            &Device::Cpu,
+        )
+        .unwrap()
+    };
+    let mut whole = new();
+    (0..steps).for_each(|_| drop(whole.step().unwrap()));
+    let mut broken = new();
+    (0..steps / 2).for_each(|_| drop(broken.step().unwrap()));
+    broken.save(&path).unwrap();
+    let mut resumed = RelativeTrainer::resume(&path, vec![scenario()], &Device::Cpu).unwrap();
+    assert_eq!(resumed.steps_done(), steps / 2);
+    (steps / 2..steps).for_each(|_| drop(resumed.step().unwrap()));
+    let weights = |trainer: &RelativeTrainer| {
+        let all = trainer.network().parameters().all();
+        all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(weights(&whole), weights(&resumed));
+    assert!(is_relative(&path).unwrap());
+    assert_eq!(load(&path, &Device::Cpu).unwrap().config(), &config());
+    // The other architecture refuses the file with a sentence.
+    let error = checkpoint::load(&path, &Device::Cpu).unwrap_err();
+    assert!(
+        error.to_string().contains("configuration is not valid"),
+        "{error}"
+    );
+}

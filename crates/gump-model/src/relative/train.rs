@@ -1,0 +1,375 @@
+//! Training of the relative network: draw samples, differentiate, step, save, resume exactly.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, channel};
+
+use candle_core::{Device, Tensor};
+use gump_scene::{Scenario, Seed};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::RelativeConfig;
+use super::grid::FIELDS;
+use super::net::RelativeNetwork;
+use super::sample::{Sample, SampleConfig, draw};
+use crate::ModelError;
+use crate::checkpoint::{self, Precision};
+use crate::optimizer::{AdamW, OptimizerConfig, move_average};
+use crate::parameters::Parameters;
+use crate::scenes::Scenes;
+use crate::train::Gradients;
+
+/// How to train.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeTrainConfig {
+    /// Optimiser steps of the whole run.
+    pub steps: usize,
+    /// Samples per step.
+    pub batch: usize,
+    /// Where all randomness comes from.
+    pub seed: u64,
+    /// Share of the old in a moving average of the weights, which is what is validated and shipped.
+    pub ema: f64,
+    /// Width of the smoothing of targets over neighbouring bins of moves, standard deviation in bins;
+    /// standing is never smoothed.
+    pub smoothing_bins: f64,
+    /// How samples are drawn.
+    pub sample: SampleConfig,
+    /// How steps are taken.
+    pub optimizer: OptimizerConfig,
+}
+
+impl Default for RelativeTrainConfig {
+    fn default() -> Self {
+        Self {
+            steps: 20_000,
+            batch: 4,
+            seed: 0,
+            ema: 0.999,
+            smoothing_bins: 0.7,
+            sample: SampleConfig::default(),
+            optimizer: OptimizerConfig {
+                learning_rate: 1e-3,
+                clip: 1.0,
+                ..OptimizerConfig::default()
+            },
+        }
+    }
+}
+
+/// What one step did.
+#[derive(Clone, Debug, Serialize)]
+pub struct RelativeStep {
+    /// Steps done, this one included.
+    pub step: usize,
+    /// Mean over moves, nats: all fields together.
+    pub loss: f64,
+    /// The same by field: stands, ahead, left, turn.
+    pub fields: [f64; FIELDS],
+    /// Norm of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Agents at frames that were presented.
+    pub nodes: usize,
+}
+
+/// A training run.
+pub struct RelativeTrainer {
+    network: RelativeNetwork,
+    average: RelativeNetwork,
+    optimizer: AdamW,
+    config: RelativeTrainConfig,
+    step: usize,
+    source: Arc<Source>,
+    next: Receiver<Result<Vec<Sample>, ModelError>>,
+}
+
+struct Source {
+    scenarios: Box<dyn Scenes>,
+    config: SampleConfig,
+    seed: Seed,
+    batch: usize,
+}
+
+impl Source {
+    fn samples(&self, step: usize) -> Result<Vec<Sample>, ModelError> {
+        const ATTEMPTS: u64 = 64;
+        let seed = self.seed.fork(step as u64);
+        let drawn = (0..self.batch).map(|i| {
+            let seed = seed.fork(i as u64);
+            for attempt in 0..ATTEMPTS {
+                let seed = seed.fork(attempt);
+                let scenario = self.scenarios.pick(step, seed.fork(0).0);
+                let scenario = self.scenarios.get(scenario)?;
+                let sample = draw(&scenario, &self.config, seed.fork(1));
+                if let Some(sample) = sample.filter(|sample| !sample.targets.is_empty()) {
+                    return Ok(sample);
+                }
+            }
+            Err(ModelError::NoData { frames: 3 })
+        });
+        drawn.collect()
+    }
+}
+
+fn prefetch(source: &Arc<Source>, step: usize) -> Receiver<Result<Vec<Sample>, ModelError>> {
+    let (sender, receiver) = channel();
+    let source = Arc::clone(source);
+    // A receiver that is gone belongs to a trainer that is gone.
+    std::thread::spawn(move || drop(sender.send(source.samples(step))));
+    receiver
+}
+
+impl RelativeTrainer {
+    /// Starts a run on a new network.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn new(
+        model: RelativeConfig,
+        config: RelativeTrainConfig,
+        scenarios: impl Scenes + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let network = RelativeNetwork::random(model, Seed(config.seed).fork(0), device)?;
+        Self::continuing(network, config, scenarios)
+    }
+
+    /// Starts a run on a network that has learned something already, with a fresh optimiser.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn continuing(
+        network: RelativeNetwork,
+        config: RelativeTrainConfig,
+        scenarios: impl Scenes + 'static,
+    ) -> Result<Self, ModelError> {
+        let average = build_like(&network, copies(&network)?)?;
+        let optimizer = AdamW::new(network.parameters())?;
+        Self::assemble(network, average, optimizer, config, 0, Box::new(scenarios))
+    }
+
+    /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
+    ///
+    /// # Errors
+    /// A file that is not a run's checkpoint, or no scenario to train on.
+    pub fn resume(
+        path: &Path,
+        scenarios: impl Scenes + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let mut archive = checkpoint::read(path)?;
+        let model = super::config(&archive)?;
+        let text = archive.entry("step")?;
+        let step: usize = text
+            .parse()
+            .map_err(|_| archive.error(format!("its step is \"{text}\", expected a number")))?;
+        let config: RelativeTrainConfig =
+            serde_json::from_str(archive.entry("train")?).map_err(|error| {
+                archive.error(format!("its training configuration is not valid ({error})"))
+            })?;
+        let mut moments = archive.take(checkpoint::OPTIMIZER);
+        let trained = archive.take(checkpoint::TRAINED);
+        let build =
+            |weights| RelativeNetwork::build(model.clone(), Parameters::loaded(weights, device));
+        let (network, average) = (build(trained)?, build(archive.tensors)?);
+        let optimizer = AdamW::restore(network.parameters(), step, |name| {
+            let tensor = moments.remove(name);
+            tensor.ok_or_else(|| ModelError::MissingTensor {
+                name: name.to_owned(),
+            })
+        })?;
+        Self::assemble(
+            network,
+            average,
+            optimizer,
+            config,
+            step,
+            Box::new(scenarios),
+        )
+    }
+
+    fn assemble(
+        network: RelativeNetwork,
+        average: RelativeNetwork,
+        optimizer: AdamW,
+        config: RelativeTrainConfig,
+        step: usize,
+        scenarios: Box<dyn Scenes>,
+    ) -> Result<Self, ModelError> {
+        config.optimizer.validate()?;
+        if scenarios.is_empty() {
+            return Err(ModelError::NoData { frames: 3 });
+        }
+        let source = Arc::new(Source {
+            scenarios,
+            config: config.sample.clone(),
+            seed: Seed(config.seed).fork(1),
+            batch: config.batch.max(1),
+        });
+        let next = prefetch(&source, step);
+        Ok(Self {
+            network,
+            average,
+            optimizer,
+            config,
+            step,
+            source,
+            next,
+        })
+    }
+
+    /// One optimiser step.
+    ///
+    /// # Errors
+    /// [`ModelError::LossNotFinite`] before anything is changed, or what drawing samples reports.
+    pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
+        let drawn = self.next.recv();
+        let samples = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
+        self.next = prefetch(&self.source, self.step + 1);
+        let total = weight(&samples);
+        let (network, smoothing) = (&self.network, self.config.smoothing_bins);
+        let parts = samples.par_iter().map(|sample| {
+            let (loss, sums) = network.loss(sample, total, smoothing)?;
+            Ok((loss.backward()?, sums))
+        });
+        let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+        let fields = mean_fields(parts.iter().map(|part| &part.1), total);
+        let loss: f64 = fields.iter().sum();
+        if !loss.is_finite() {
+            let field = "move".to_owned();
+            return Err(ModelError::LossNotFinite {
+                step: self.step,
+                field,
+            });
+        }
+        let mut gradients = Gradients::new();
+        for (name, var) in self.network.parameters().trainable() {
+            let mut of_samples = parts.iter().filter_map(|(store, _)| store.get(var));
+            let Some(first) = of_samples.next() else {
+                continue;
+            };
+            let sum = of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?;
+            gradients.insert(name.to_owned(), sum);
+        }
+        let rate = self.config.optimizer.rate(self.step, self.config.steps);
+        let parameters = self.network.parameters();
+        let gradient_norm =
+            self.optimizer
+                .step(parameters, &gradients, &self.config.optimizer, rate)?;
+        self.step += 1;
+        let t = self.step as f64;
+        let share = self.config.ema.min((1.0 + t) / (10.0 + t));
+        move_average(self.average.parameters(), parameters, share)?;
+        Ok(RelativeStep {
+            step: self.step,
+            loss,
+            fields,
+            gradient_norm,
+            nodes: samples.iter().map(Sample::n_nodes).sum(),
+        })
+    }
+
+    /// The loss on other scenarios, nothing hidden, nothing smoothed; by field, nats.
+    ///
+    /// # Errors
+    /// No scenario long enough, or a tensor error.
+    pub fn validate(&self, scenarios: &[Scenario]) -> Result<[f64; FIELDS], ModelError> {
+        let config = SampleConfig {
+            max_agents: self.config.sample.max_agents,
+            ..SampleConfig::plain()
+        };
+        let samples: Vec<Sample> = scenarios
+            .par_iter()
+            .enumerate()
+            .filter_map(|(i, scenario)| draw(scenario, &config, Seed(0).fork(i as u64)))
+            .filter(|sample| !sample.targets.is_empty())
+            .collect();
+        if samples.is_empty() {
+            return Err(ModelError::NoData { frames: 3 });
+        }
+        let total = weight(&samples);
+        let network = &self.average;
+        let sums = samples
+            .par_iter()
+            .map(|sample| Ok(network.loss(sample, total, 0.0)?.1));
+        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        Ok(mean_fields(sums.iter(), total))
+    }
+
+    /// Writes everything a resumed run needs; it can be loaded as a network, too.
+    ///
+    /// # Errors
+    /// [`ModelError::Io`]; the previous file is intact.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        let named = |prefix: &str, network: &RelativeNetwork| -> BTreeMap<String, Tensor> {
+            let all = network.parameters().all();
+            all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))
+                .collect()
+        };
+        let mut tensors = named("", &self.average);
+        tensors.extend(named(checkpoint::TRAINED, &self.network));
+        let state = self.optimizer.state();
+        tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
+        let mut header = super::header(self.network.config())?;
+        let config =
+            serde_json::to_string(&self.config).map_err(|e| ModelError::Config(e.to_string()))?;
+        header.insert("train".to_owned(), config);
+        header.insert("step".to_owned(), self.step.to_string());
+        checkpoint::write(path, tensors, header, Precision::Full)
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> usize {
+        self.step
+    }
+
+    /// How it trains.
+    pub fn config(&self) -> &RelativeTrainConfig {
+        &self.config
+    }
+
+    /// The network to use, as it is now: the moving average.
+    pub fn network(&self) -> &RelativeNetwork {
+        &self.average
+    }
+
+    /// A copy of it, for a world that imagines while training goes on.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn snapshot(&self) -> Result<RelativeNetwork, ModelError> {
+        build_like(&self.average, copies(&self.average)?)
+    }
+}
+
+fn weight(samples: &[Sample]) -> f64 {
+    let targets = samples.iter().flat_map(|sample| &sample.targets);
+    targets.map(|target| f64::from(target.weight)).sum()
+}
+
+fn mean_fields<'a>(sums: impl Iterator<Item = &'a [f64; FIELDS]>, total: f64) -> [f64; FIELDS] {
+    let mut mean = [0.0; FIELDS];
+    for sums in sums {
+        for (mean, sum) in mean.iter_mut().zip(sums) {
+            *mean += sum / total;
+        }
+    }
+    mean
+}
+
+fn copies(network: &RelativeNetwork) -> Result<BTreeMap<String, Tensor>, ModelError> {
+    let all = network.parameters().all();
+    all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
+        .collect()
+}
+
+fn build_like(
+    network: &RelativeNetwork,
+    weights: BTreeMap<String, Tensor>,
+) -> Result<RelativeNetwork, ModelError> {
+    let parameters = Parameters::loaded(weights, network.parameters().device());
+    RelativeNetwork::build(network.config().clone(), parameters)
+}

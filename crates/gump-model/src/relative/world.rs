@@ -1,0 +1,363 @@
+//! The relative network as a world: scenes in, futures out.
+//!
+//! A future keeps its agents with what the network remembers of them; the map is laid out and
+//! computed once for all futures of a scene. Agents of kinds that are not predicted go on with
+//! constant velocity, and lights hold.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_geometry::DVec2;
+use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light, LightState, SceneState, Seed};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::engine::{AgentMemory, Draw, Engine, KEPT, MapMemory, Present, Workspace};
+use super::graph::{Body, Lights, PAST, Shown, look, past_edge};
+use super::grid::dequantize;
+use super::map::{Hidden, VectorMap};
+use super::net::RelativeNetwork;
+use crate::ModelError;
+use crate::ops::panels::Precision;
+use crate::sample::TOKEN_DT;
+
+/// How far around the ego the map is laid out, metres.
+const MAP_M: f64 = 300.0;
+
+/// How futures are drawn.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeSampling {
+    /// Divides the logits; above 1 is bolder.
+    pub temperature: f64,
+    /// Draws are among the likeliest bins that together have this probability.
+    pub top_p: f64,
+    /// In which form the weights are multiplied.
+    pub precision: Precision,
+}
+
+impl Default for RelativeSampling {
+    fn default() -> Self {
+        Self {
+            temperature: 1.0,
+            top_p: 1.0,
+            precision: Precision::F32,
+        }
+    }
+}
+
+/// A trained relative network that rolls traffic out.
+#[derive(Debug)]
+pub struct RelativeWorld {
+    engine: Engine,
+    sampling: RelativeSampling,
+}
+
+impl RelativeWorld {
+    /// A world that draws as `sampling` says.
+    ///
+    /// # Errors
+    /// A network that is not in main memory as f32.
+    pub fn new(network: &RelativeNetwork, sampling: RelativeSampling) -> Result<Self, ModelError> {
+        Ok(Self {
+            engine: Engine::new(network, sampling.precision)?,
+            sampling,
+        })
+    }
+
+    /// The futures of a start, with the scene they share.
+    fn begin(&self, start: &Start<'_>) -> Result<(Arc<Scene>, Vec<Future>), ModelError> {
+        let scene = Arc::new(Scene::new(&self.engine, start.scene));
+        let first = Future::begin(&self.engine, &scene, start.scene)?;
+        let futures = (0..start.n_futures).map(|k| Future {
+            seed: start.seed.fork(k as u64),
+            ..first.clone()
+        });
+        Ok((Arc::clone(&scene), futures.collect()))
+    }
+}
+
+#[cfg(test)]
+impl RelativeWorld {
+    /// The numbers of the present's nodes and what they end with, agents in the order of their ids.
+    pub(super) fn read_present(
+        &self,
+        scene: SceneState<'_>,
+    ) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
+        let shared = Arc::new(Scene::new(&self.engine, scene));
+        let future = Future::begin(&self.engine, &shared, scene)?;
+        let numbers = future
+            .members
+            .iter()
+            .flat_map(|member| member.now().numbers());
+        Ok((numbers.collect(), future.hidden))
+    }
+}
+
+impl WorldModel for RelativeWorld {
+    fn name(&self) -> &str {
+        "model"
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        let begun = starts.par_iter().map(|start| self.begin(start));
+        let begun: Vec<_> = begun.collect::<Result<_, _>>()?;
+        Ok(Box::new(RelativeSession {
+            world: self,
+            futures: begun.into_iter().flat_map(|(_, futures)| futures).collect(),
+        }))
+    }
+}
+
+/// What all futures of a start share.
+#[derive(Debug)]
+struct Scene {
+    map: VectorMap,
+    memory: MapMemory,
+    ego: AgentId,
+}
+
+impl Scene {
+    fn new(engine: &Engine, scene: SceneState<'_>) -> Self {
+        let centre = scene.ego_now().state.pose.position;
+        let map = VectorMap::new(scene.map, centre, MAP_M, Hidden::default());
+        Self {
+            memory: engine.remember(&map),
+            map,
+            ego: scene.ego,
+        }
+    }
+}
+
+/// An agent of a future.
+#[derive(Clone, Debug)]
+struct Member {
+    agent: Agent,
+    /// The last frames it was seen in without a gap, the latest last; at most [`KEPT`].
+    shown: Vec<Shown>,
+    memory: AgentMemory,
+}
+
+/// One future in progress.
+#[derive(Clone, Debug)]
+struct Future {
+    scene: Arc<Scene>,
+    seed: Seed,
+    /// Frames read so far.
+    frames: usize,
+    members: Vec<Member>,
+    /// Those who are not predicted.
+    others: Vec<Agent>,
+    lights: Vec<Light>,
+    shown_lights: Lights,
+    /// What the present's nodes ended with, `[members, C]`.
+    hidden: Vec<f32>,
+}
+
+impl Future {
+    /// The present of a scene, its history read.
+    fn begin(
+        engine: &Engine,
+        scene: &Arc<Scene>,
+        state: SceneState<'_>,
+    ) -> Result<Self, ModelError> {
+        let stride = (TOKEN_DT / state.dt).round().max(1.0) as usize;
+        if (stride as f64 * state.dt - TOKEN_DT).abs() > 1e-3 {
+            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", state.dt);
+            return Err(ModelError::Scene(what));
+        }
+        let frames = state.strided_history(stride, KEPT);
+        let (predicted, others): (Vec<Agent>, Vec<Agent>) = state
+            .now()
+            .agents()
+            .iter()
+            .partition(|agent| agent.kind.is_moving());
+        let mut future = Self {
+            scene: Arc::clone(scene),
+            seed: Seed(0),
+            frames: 0,
+            members: Vec::new(),
+            others,
+            lights: state.now().lights().to_vec(),
+            shown_lights: Lights::default(),
+            hidden: Vec::new(),
+        };
+        let now = state.history.len() - 1;
+        let mut room = Workspace::default();
+        for (i, frame) in frames.iter().enumerate() {
+            let index = now - (frames.len() - 1 - i) * stride;
+            future.shown_lights = lights_at(&state.history[..=index], state.dt);
+            future.see(engine, frame, &predicted);
+            future.read(engine, &mut room);
+        }
+        Ok(future)
+    }
+
+    /// Takes in a frame of history: of those who are there now, whoever is in it.
+    fn see(&mut self, engine: &Engine, frame: &Frame, predicted: &[Agent]) {
+        let mut before: BTreeMap<AgentId, Member> = std::mem::take(&mut self.members)
+            .into_iter()
+            .map(|member| (member.agent.id, member))
+            .collect();
+        for agent in predicted.iter().filter_map(|a| frame.agent(a.id)) {
+            let state = agent.state;
+            let member = match before.remove(&agent.id) {
+                Some(mut member) => {
+                    member.push(state);
+                    member
+                }
+                None => Member {
+                    agent: *agent,
+                    shown: vec![Shown::first(body(agent), state.pose, state.velocity)],
+                    memory: engine.blank(),
+                },
+            };
+            self.members.push(member);
+        }
+    }
+
+    /// Lets the network read the present.
+    fn read(&mut self, engine: &Engine, room: &mut Workspace) {
+        let agents: Vec<Shown> = self.members.iter().map(Member::now).collect();
+        let (map, lights) = (&self.scene.map, &self.shown_lights);
+        let present = self.members.iter_mut().enumerate().map(|(i, member)| {
+            let now = &agents[i];
+            let past = member.shown.iter().rev().take(PAST + 1).enumerate();
+            Present {
+                numbers: now.numbers(),
+                past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
+                view: look(map, lights, &agents, i),
+                memory: &mut member.memory,
+            }
+        });
+        let mut present: Vec<Present<'_>> = present.collect();
+        let t = self.frames;
+        engine.read(&mut present, t, &self.scene.memory, room, &mut self.hidden);
+        self.frames += 1;
+    }
+
+    /// Goes on by half a second.
+    fn step(&mut self, engine: &Engine, draw: Draw, ego: Option<AgentState>, room: &mut Workspace) {
+        let seed = self.seed.fork(self.frames as u64);
+        let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
+        let streams: Vec<Seed> = self.members.iter().map(stream).collect();
+        let moves = engine.decide(&self.hidden, &streams, draw, room);
+        let id = self.scene.ego;
+        for (member, bins) in self.members.iter_mut().zip(moves) {
+            let driven = ego.filter(|_| member.agent.id == id);
+            let state = driven.unwrap_or_else(|| AgentState {
+                pose: member.now().pose * dequantize(bins),
+                velocity: DVec2::ZERO,
+            });
+            member.push(state);
+            if let Some(driven) = driven {
+                member.agent.state = driven;
+            }
+        }
+        for other in &mut self.others {
+            other.state.pose.position += other.state.velocity * TOKEN_DT;
+        }
+        for light in &mut self.shown_lights.by_lane {
+            light.2 = light.2.map(|elapsed| elapsed + TOKEN_DT);
+        }
+        self.read(engine, room);
+    }
+
+    fn frame(&self) -> Frame {
+        let agents = self.members.iter().map(|member| member.agent);
+        let all = agents.chain(self.others.iter().copied()).collect();
+        Frame::new(all, self.lights.clone())
+    }
+}
+
+impl Member {
+    fn now(&self) -> Shown {
+        *self.shown.last().expect("a member has been seen")
+    }
+
+    /// Half a second later it is here; its velocity is what it moved by.
+    fn push(&mut self, state: AgentState) {
+        let next = self.now().then(state.pose);
+        self.agent.state = AgentState {
+            pose: state.pose,
+            velocity: next.velocity(),
+        };
+        self.shown.push(next);
+        let n = self.shown.len();
+        self.shown.drain(..n.saturating_sub(KEPT));
+    }
+}
+
+fn body(agent: &Agent) -> Body {
+    Body {
+        kind: agent.kind,
+        length: agent.length,
+        width: agent.width,
+        sized: true,
+    }
+}
+
+/// The lights of the last frame, and how long they have shown their colour as far as was seen.
+fn lights_at(history: &[Frame], dt: f64) -> Lights {
+    let Some((now, before)) = history.split_last() else {
+        return Lights::default();
+    };
+    let by_lane = now.lights().iter().map(|light| {
+        let mut shown = 0;
+        let changed = before.iter().rev().find_map(|frame| {
+            let then = frame.light(light.lane)?.state;
+            shown += 1;
+            (then != light.state).then_some(then)
+        });
+        let seen = changed.is_some_and(|then| then != LightState::Unknown);
+        let elapsed = seen.then_some((shown - 1) as f64 * dt);
+        (light.lane, light.state, elapsed)
+    });
+    Lights {
+        by_lane: by_lane.collect(),
+    }
+}
+
+/// Futures in progress.
+struct RelativeSession<'a> {
+    world: &'a RelativeWorld,
+    futures: Vec<Future>,
+}
+
+impl Session for RelativeSession<'_> {
+    fn dt(&self) -> f64 {
+        TOKEN_DT
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        let engine = &self.world.engine;
+        let draw = Draw {
+            temperature: self.world.sampling.temperature,
+            top_p: self.world.sampling.top_p,
+        };
+        let frames = self.futures.par_iter_mut().enumerate().map_init(
+            Workspace::default,
+            |room, (i, future)| {
+                future.step(engine, draw, ego.map(|ego| ego[i]), room);
+                future.frame()
+            },
+        );
+        Ok(frames.collect())
+    }
+
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let mut at = 0;
+        self.futures.retain(|_| {
+            at += 1;
+            futures.binary_search(&(at - 1)).is_ok()
+        });
+        true
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        let (_, mut fresh) = self.world.begin(&start)?;
+        self.futures[future] = fresh.swap_remove(0);
+        Ok(())
+    }
+}

@@ -1,0 +1,56 @@
+//! Trains the network with relative attention: `train_relative [DATA OUT STEPS WIDTH LAYERS]`.
+//!
+//! Without arguments it takes a few steps on shipped scenes, to be seen at work. A run whose file is
+//! there goes on; `model:OUT` is then a world for `cargo xtask simulate` and `evaluate`.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use gump_model::relative::{RelativeConfig, RelativeTrainConfig, RelativeTrainer};
+use gump_scene::Scenario;
+
+fn main() -> anyhow::Result<()> {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let shipped = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../datasets/mini/procedural.tfrecord.gz"
+    );
+    let data = args.first().map_or(shipped, String::as_str);
+    let out = args.get(1).map(PathBuf::from);
+    let number = |i: usize, usual: usize| args.get(i).map_or(Ok(usual), |text| text.parse());
+    let width = number(3, 64)?;
+    let model = RelativeConfig {
+        width,
+        heads: width / 32,
+        layers: number(4, 2)?,
+        ..RelativeConfig::default()
+    };
+    let config = RelativeTrainConfig {
+        steps: number(2, 6)?,
+        ..RelativeTrainConfig::default()
+    };
+    let records = gump_data::open(data.as_ref())?;
+    let scenarios: Result<Vec<Scenario>, _> = records.map(|r| r.map(|r| r.scenario)).collect();
+    let device = gump_model::Device::Cpu;
+    let mut trainer = match out.as_ref().filter(|out| out.is_file()) {
+        Some(run) => RelativeTrainer::resume(run, scenarios?, &device)?,
+        None => RelativeTrainer::new(model, config, scenarios?, &device)?,
+    };
+    println!("{} parameters", trainer.network().parameters().count());
+    let (began, mut nodes) = (Instant::now(), 0);
+    while trainer.steps_done() < trainer.config().steps {
+        let step = trainer.step()?;
+        nodes += step.nodes;
+        if step.step.is_multiple_of(50) || step.step == trainer.config().steps {
+            let rate = nodes as f64 / began.elapsed().as_secs_f64();
+            println!(
+                "step {} loss {:.3}, {rate:.0} agents at frames a second",
+                step.step, step.loss
+            );
+        }
+        if let Some(out) = out.as_ref().filter(|_| step.step.is_multiple_of(250)) {
+            trainer.save(out)?;
+        }
+    }
+    out.map_or(Ok(()), |out| Ok(trainer.save(&out)?))
+}

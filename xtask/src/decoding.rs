@@ -1,0 +1,116 @@
+//! Ways of decoding: the network alone, under rules, and as in the paper.
+//!
+//! Realism is told of the network alone beside what rules make of it, for rules that look at the
+//! same edges and boxes as a score raise the score by themselves. The flags are in `worlds`.
+
+use gump_model::SamplingConfig;
+use gump_rollout::SimulateConfig;
+
+use crate::worlds::WorldName;
+
+/// How the futures of a world are made.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Decoding {
+    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
+    pub(crate) name: &'static str,
+    /// How a network draws.
+    pub(crate) sampling: SamplingConfig,
+    /// How its frames become those of the scene, but for the length.
+    frames: SimulateConfig,
+}
+
+impl Decoding {
+    /// The name for worlds that decode nothing.
+    pub(crate) const NONE: &str = "-";
+
+    /// A decoding with the name it deserves: `raw` if no rule corrects it.
+    pub(crate) fn of(sampling: SamplingConfig) -> Self {
+        Self {
+            name: if sampling.has_rules() { "ruled" } else { "raw" },
+            sampling,
+            frames: SimulateConfig::default(),
+        }
+    }
+
+    /// The paper's decoding, its interpolation included.
+    pub(crate) fn paper(sampling: SamplingConfig) -> Self {
+        Self {
+            name: "paper",
+            sampling,
+            frames: SimulateConfig::compat(),
+        }
+    }
+
+    /// The same for a world: one that follows rules decodes nothing.
+    pub(crate) fn for_world(self, world: &WorldName) -> Self {
+        match world {
+            WorldName::Model(_) => self,
+            WorldName::Log | WorldName::Idm | WorldName::ConstantVelocity => Self {
+                name: Self::NONE,
+                frames: SimulateConfig::default(),
+                ..self
+            },
+        }
+    }
+
+    /// The network alone, decoded the same otherwise.
+    pub(crate) fn without_rules(&self) -> Self {
+        Self::of(self.sampling.clone().without_rules())
+    }
+
+    /// The same way with one thing turned.
+    pub(crate) fn turned(&self, turn: impl FnOnce(&mut SamplingConfig)) -> Self {
+        let mut turned = self.clone();
+        turn(&mut turned.sampling);
+        turned
+    }
+
+    /// How frames become those of the scene, for so many seconds.
+    pub(crate) fn frames(&self, seconds: f64) -> SimulateConfig {
+        SimulateConfig {
+            seconds,
+            ..self.frames.clone()
+        }
+    }
+
+    /// What a world is called beside others: with the decoding, unless that is the usual one.
+    pub(crate) fn label(world: &str, name: &str) -> String {
+        match name {
+            Self::NONE | "ruled" => world.to_owned(),
+            name => format!("{world} ({name})"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_rollout::Interpolation;
+
+    #[test]
+    fn what_each_decoding_sets_is_pinned() {
+        let ruled = Decoding::of(SamplingConfig::default());
+        assert_eq!(ruled.name, "ruled");
+        assert_eq!((ruled.sampling.redraws, ruled.sampling.limits), (12, true));
+        assert_eq!(ruled.frames(8.0), SimulateConfig::default());
+        let raw = ruled.without_rules();
+        assert_eq!(raw.name, "raw");
+        assert_eq!(raw.sampling, SamplingConfig::raw());
+        assert_eq!(raw.frames(8.0), ruled.frames(8.0));
+        let paper = Decoding::paper(SamplingConfig::paper());
+        let expected = SimulateConfig {
+            seconds: 3.0,
+            interpolation: Interpolation::Linear,
+            smoothing_window: 9,
+            relative_elevation: true,
+        };
+        assert_eq!((paper.name, paper.frames(3.0)), ("paper", expected));
+        let idm = paper.for_world(&WorldName::Idm);
+        assert_eq!(
+            (idm.name, idm.frames(8.0)),
+            ("-", SimulateConfig::default())
+        );
+        assert_eq!(Decoding::label("w", "ruled"), "w");
+        assert_eq!(Decoding::label("w", "raw"), "w (raw)");
+    }
+}

@@ -1,0 +1,255 @@
+//! The report of an evaluation, from the entries of its ledger alone.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use gump_metrics::behaviour::{Count, Key, Measure, Tally};
+use gump_metrics::{Interval, intervals};
+use gump_scene::Seed;
+use gump_viz::Bars;
+use serde_json::{Map, Value, json};
+
+use super::{Counted, Named, Settings};
+use crate::charts;
+use crate::decoding::Decoding;
+use crate::run::Run;
+use crate::table;
+use crate::verbs::evaluate::ledger::{self, Entry};
+
+/// Draws of scenarios for an interval; its ends move by a few percent of its width with the seed.
+const DRAWS: usize = 1000;
+
+/// A chart: its name, what its axis says, and which measures are on it.
+type Chart = (&'static str, &'static str, fn(Measure) -> bool);
+
+const CHARTS: [Chart; 3] = [
+    (
+        "shares",
+        "share, or number per agent, with 95 % intervals over scenarios",
+        |measure| !measure.is_rate() && measure != Measure::Standing,
+    ),
+    (
+        "rates",
+        "events per minute, with 95 % intervals over scenarios",
+        Measure::is_rate,
+    ),
+    (
+        "standing",
+        "share that stands, with 95 % intervals over scenarios",
+        |measure| measure == Measure::Standing,
+    ),
+];
+
+/// Puts shards together and tells the whole.
+pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
+    let (header, entries) = ledger::unite::<Counted>(folders)?;
+    tell(run, &header.settings.try_into()?, &entries)
+}
+
+/// One number of one column.
+#[derive(Clone, Copy, Default)]
+struct Told {
+    count: Count,
+    span: Option<Interval>,
+}
+
+/// The log or a world, over all scenarios.
+struct Column {
+    name: Option<Named>,
+    told: Vec<Told>,
+}
+
+impl Column {
+    /// Adds up `tallies`, one per scenario, for every key.
+    fn of(name: Option<Named>, keys: &[Key], tallies: &[Tally]) -> Self {
+        let sums = |drawn: &mut dyn Iterator<Item = usize>| {
+            let mut sums = vec![Count::default(); keys.len()];
+            for i in drawn {
+                for (sum, key) in sums.iter_mut().zip(keys) {
+                    let count = tallies[i].0.get(key).copied().unwrap_or_default();
+                    sum.events += count.events;
+                    sum.of += count.of;
+                }
+            }
+            sums
+        };
+        // Not the run's seed: an interval says nothing about the worlds' chance.
+        let spans = intervals(tallies.len(), DRAWS, Seed(0), |drawn| {
+            let sums = sums(&mut drawn.iter().copied());
+            sums.into_iter().map(Count::rate).collect()
+        });
+        let counts = sums(&mut (0..tallies.len())).into_iter().enumerate();
+        let told = counts.map(|(i, count)| Told {
+            count,
+            span: spans.get(i).copied().flatten(),
+        });
+        Self {
+            name,
+            told: told.collect(),
+        }
+    }
+
+    fn is_same(&self, other: &Self) -> bool {
+        let mut counts = self.told.iter().zip(&other.told);
+        counts.all(|(a, b)| a.count == b.count)
+    }
+
+    /// What it is called beside the others.
+    fn label(&self) -> String {
+        let Some(name) = &self.name else {
+            return "log".into();
+        };
+        let world = charts::legend(&name.world);
+        match name.decoding.as_str() {
+            Decoding::NONE if world == "log" => "log replayed".into(),
+            Decoding::NONE => world,
+            decoding => format!("{world} ({decoding})"),
+        }
+    }
+}
+
+/// Totals, intervals, the table and the charts.
+pub(super) fn tell(
+    run: &mut Run,
+    settings: &Settings,
+    entries: &[Entry<Counted>],
+) -> anyhow::Result<()> {
+    let tallies = |pick: &dyn Fn(&Counted) -> Option<Tally>| -> Vec<Tally> {
+        let counted = entries.iter().map(|entry| pick(&entry.scores));
+        counted.map(Option::unwrap_or_default).collect()
+    };
+    for entry in entries {
+        for cells in entry.scores.worlds.iter().chain([&entry.scores.log]) {
+            cells.tally()?;
+        }
+    }
+    let logged = tallies(&|counted| counted.log.tally().ok());
+    let worlds: Vec<Vec<Tally>> = (0..settings.worlds.len())
+        .map(|i| tallies(&|counted| counted.worlds.get(i)?.tally().ok()))
+        .collect();
+    let all = worlds.iter().flatten().chain(&logged);
+    let counted = all.flat_map(|tally| &tally.0);
+    let counted = counted.filter(|(_, count)| count.of > 0.0);
+    let keys: BTreeSet<Key> = counted.map(|(key, _)| *key).collect();
+    let keys: Vec<Key> = keys.into_iter().collect();
+    let log = Column::of(None, &keys, &logged);
+    let worlds: Vec<Column> = settings
+        .worlds
+        .iter()
+        .zip(&worlds)
+        .map(|(name, tallies)| Column::of(Some(name.clone()), &keys, tallies))
+        .collect();
+    run.result("scenarios", entries.len())?;
+    run.result("set", &settings.scenarios)?;
+    run.result("futures", settings.futures)?;
+    let rows = worlds.iter().flat_map(|world| rows(world, &log, &keys));
+    run.result_untold("rows", rows.collect::<Vec<_>>())?;
+    // The log replayed is the log, unless the worlds go on for longer.
+    let others = worlds.iter().filter(|world| !world.is_same(&log));
+    let columns: Vec<&Column> = std::iter::once(&log).chain(others).collect();
+    run.say(&table::text(
+        &json!({ "behaviour": lines(&columns, &keys) }),
+    ));
+    for (stem, label, shows) in CHARTS {
+        charts::save(run, stem, &chart(label, &columns, &keys, shows))?;
+    }
+    Ok(())
+}
+
+/// The rows of one world.
+fn rows<'a>(
+    world: &'a Column,
+    log: &'a Column,
+    keys: &'a [Key],
+) -> impl Iterator<Item = Value> + 'a {
+    let told = keys.iter().zip(&world.told).zip(&log.told);
+    told.filter(|((_, told), _)| told.count.of > 0.0)
+        .map(|((key, told), logged)| {
+            let name = world.name.as_ref();
+            json!({
+                "world": name.map(|name| &name.world),
+                "decoding": name.map(|name| &name.decoding),
+                "class": key.class.name(),
+                "measure": key.measure.name(),
+                "seconds": key.seconds,
+                "per": key.measure.per(),
+                "value": told.count.rate(),
+                "log": logged.count.rate(),
+                "low": told.span.map(|span| span.low),
+                "high": told.span.map(|span| span.high),
+                "log_low": logged.span.map(|span| span.low),
+                "log_high": logged.span.map(|span| span.high),
+                "events": told.count.events,
+                "of": told.count.of,
+            })
+        })
+}
+
+/// The table for reading: a line per number, a column for the log and each world.
+fn lines(columns: &[&Column], keys: &[Key]) -> Vec<Value> {
+    let line = |(i, key): (usize, &Key)| {
+        let head = [
+            ("measure", json!(key.measure.name())),
+            ("class", json!(key.class.name())),
+            ("s", json!(key.seconds)),
+            ("per", json!(key.measure.per())),
+        ];
+        let mut line: Map<String, Value> = head
+            .map(|(name, value)| (name.to_owned(), value))
+            .into_iter()
+            .collect();
+        for column in columns {
+            line.insert(column.label(), json!(cell(column.told[i])));
+        }
+        Value::Object(line)
+    };
+    keys.iter().enumerate().map(line).collect()
+}
+
+/// A number with its interval if it has any width, `-` where nothing was counted.
+fn cell(told: Told) -> String {
+    let Some(rate) = told.count.rate() else {
+        return "-".into();
+    };
+    let short = |x: f64| {
+        if x == 0.0 {
+            return "0".into();
+        }
+        let digits = if x >= 9.95 {
+            1
+        } else if x >= 0.995 {
+            2
+        } else {
+            3
+        };
+        format!("{x:.digits$}")
+    };
+    match told.span.filter(|span| span.low < span.high) {
+        Some(span) => format!("{} ({}-{})", short(rate), short(span.low), short(span.high)),
+        None => short(rate),
+    }
+}
+
+fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure) -> bool) -> Bars {
+    let shown: Vec<usize> = (0..keys.len())
+        .filter(|&i| shows(keys[i].measure))
+        .collect();
+    let names = shown.iter().map(|&i| {
+        let Key {
+            measure,
+            class,
+            seconds,
+        } = keys[i];
+        match measure {
+            Measure::Standing => format!("{class}, {seconds} s"),
+            _ => format!("{}, {class}", measure.name().replace('_', " ")),
+        }
+    });
+    let legend = columns.iter().map(|column| column.label()).collect();
+    charts::bars(label, names.collect(), legend, |row, column| {
+        let told = columns[column].told[shown[row]];
+        let span = told.span.map(|span| (span.low, span.high));
+        let value = told.count.rate()?;
+        Some(gump_viz::Bar { value, span })
+    })
+}

@@ -1,0 +1,43 @@
+//! Worlds and how they decode: a learned one as it is used and without its rules.
+
+use super::Named;
+use crate::decoding::Decoding;
+use crate::worlds::{Sampling, WorldName};
+
+/// One column of the table.
+pub(super) struct Way {
+    pub(super) world: WorldName,
+    pub(super) decoding: Decoding,
+}
+
+/// Every way that the table shows of some worlds.
+///
+/// Error: sampling flags that do not fit.
+pub(super) fn ways(worlds: &[WorldName], sampling: &Sampling) -> anyhow::Result<Vec<Way>> {
+    let mut ways = Vec::new();
+    for world in worlds {
+        let decodings = sampling.decodings(world)?.into_iter();
+        ways.extend(decodings.map(|decoding| Way {
+            world: world.clone(),
+            decoding,
+        }));
+    }
+    Ok(ways)
+}
+
+impl Way {
+    /// How many futures are imagined where `n` are asked for: worlds without chance have one.
+    pub(super) fn futures(&self, n: usize) -> usize {
+        match self.world {
+            WorldName::Log | WorldName::ConstantVelocity => 1,
+            WorldName::Idm | WorldName::Model(_) => n,
+        }
+    }
+
+    pub(super) fn named(&self) -> Named {
+        Named {
+            world: self.world.to_string(),
+            decoding: self.decoding.name.into(),
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! Who is to be looked at first: what agents cost a score, and what they do in the rollouts.
+
+use std::collections::BTreeMap;
+
+use gump_metrics::behaviour::{Behaviour, Judged, judge, of_paths};
+use gump_metrics::wosac::{Blame, Evaluation, Rollouts};
+use gump_scene::{AgentId, Scenario};
+use serde_json::{Value, json};
+
+use crate::run::Run;
+use crate::tables;
+
+/// How far the challenge looks, seconds.
+const HORIZON_S: u32 = 8;
+/// Agents shown in the report.
+const N_SHOWN: usize = 20;
+
+/// Agents of all scenarios.
+#[derive(Default)]
+pub(super) struct Worst {
+    rows: Vec<Row>,
+}
+
+struct Row {
+    scenario: String,
+    judged: Judged,
+    /// What realism lacks because of the agent, over all components.
+    cost: f64,
+}
+
+impl Worst {
+    /// Adds the agents of one scenario: those who are scored, and those who do what no driver would.
+    pub(super) fn add(
+        &mut self,
+        scenario: &Scenario,
+        rollouts: &Rollouts,
+        evaluation: &Evaluation<'_>,
+        blames: &[Blame],
+    ) {
+        let mut costs: BTreeMap<AgentId, f64> = BTreeMap::new();
+        for blame in blames {
+            *costs.entry(blame.agent).or_default() += blame.cost;
+        }
+        let conduct = Behaviour::new(scenario, HORIZON_S).conduct(&of_paths(scenario, rollouts));
+        for judged in judge(&evaluation.realism(), conduct) {
+            if judged.realism.is_none() && judged.conduct.any == 0.0 {
+                continue;
+            }
+            self.rows.push(Row {
+                scenario: scenario.id.clone(),
+                cost: costs.get(&judged.conduct.agent).copied().unwrap_or(0.0),
+                judged,
+            });
+        }
+    }
+
+    /// Writes all as a table and the worst into the report.
+    pub(super) fn tell(mut self, run: &mut Run) -> anyhow::Result<()> {
+        self.rows.sort_by(|a, b| {
+            let order = a.judged.plausibility.total_cmp(&b.judged.plausibility);
+            order.then(b.cost.total_cmp(&a.cost))
+        });
+        let rows: Vec<Value> = self.rows.iter().map(Row::tell).collect();
+        if !rows.is_empty() {
+            tables::of_rows(&rows).write(&run.path("conduct.parquet"))?;
+        }
+        run.result("worst_agents", &rows[..rows.len().min(N_SHOWN)])
+    }
+}
+
+impl Row {
+    fn tell(&self) -> Value {
+        let Judged {
+            conduct,
+            realism,
+            plausibility,
+        } = &self.judged;
+        let deeds = conduct.deeds.iter();
+        let deeds = deeds.map(|(deed, share)| format!("{} {share:.2}", deed.name()));
+        json!({
+            "scenario": self.scenario,
+            "agent": conduct.agent.0,
+            "class": conduct.kind.name(),
+            "plausibility": plausibility,
+            "realism": realism,
+            "cost": self.cost,
+            "deeds": deeds.collect::<Vec<_>>().join(", "),
+        })
+    }
+}
