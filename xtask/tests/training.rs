@@ -153,6 +153,34 @@ fn a_full_disk_and_a_kill_leave_the_last_checkpoint() {
 }
 
 #[test]
+fn a_resumed_run_goes_on_at_its_place_among_fresh_scenes() {
+    let place = Workplace::new();
+    let train = |words: &str| {
+        let words = format!(
+            "train --validation held-out --realism-rollouts 0 --quiet --config c.toml {words}"
+        );
+        let mut command = place.command(env!("CARGO_BIN_EXE_xtask"));
+        command.args(words.split(' ')).output().unwrap()
+    };
+    let stream = "--data fresh:plain:3";
+    for words in [
+        "--out whole",
+        "--out parts --stop-at 3",
+        "--out parts --resume",
+    ] {
+        let output = train(&format!("{stream} {words}"));
+        assert!(output.status.success(), "{words}: {}", stderr(&output));
+    }
+    assert_eq!(losses(&place.path("parts")), losses(&place.path("whole")));
+    let output = train("--data fresh:plain:4 --out other");
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_ne!(losses(&place.path("other")), losses(&place.path("whole")));
+    let output = train("--data fresh:anything --out none");
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("profiles plain, recorded-like, found \"anything\""));
+}
+
+#[test]
 fn realism_is_told_of_scenes_on_which_it_is_defined() {
     let place = Workplace::new();
     let words = "c.toml --steps 2 --realism-rollouts 1";

@@ -274,6 +274,43 @@ fn verify_tells_sound_from_broken() {
 }
 
 #[test]
+fn the_distance_between_sets_is_told_for_scenes_and_for_tables() {
+    let place = Workplace::new();
+    place.report("data synthesize --scenes 2 --shards 1 --profile recorded-like --cache --seed 3");
+    assert_eq!(
+        place.files(),
+        ["report.json", "scenes-00000-of-00001.cache"]
+    );
+    let made = place.path("made");
+    fs::rename(place.path("out"), &made).unwrap();
+    let same = place.report("data stats made --against made --save-targets made.toml");
+    assert_eq!(same["results"]["distance_mean"], 0.0);
+    let rows = same["results"]["distances"].as_array().unwrap();
+    assert!(rows.len() > 40 && rows.iter().any(|row| row["measure"] == "parked"));
+    let from_table = place.report("data stats made --against made.toml");
+    assert!(from_table["results"]["distance_mean"].as_f64().unwrap() < 1e-3);
+    let scene = place.scene();
+    let far = place.report(&format!("data stats {scene} --against made.toml"));
+    let row = |measure: &str| {
+        let rows = far["results"]["distances"].as_array().unwrap();
+        let is = |row: &&Value| row["measure"] == measure && row["class"] == "vehicle";
+        rows.iter().find(is).unwrap().clone()
+    };
+    assert_eq!(row("standing")["mean"], 0.0);
+    assert!(row("standing")["distance"].as_f64().unwrap() > 0.5);
+    place.fails(
+        "data synthesize --kind sumo --profile recorded-like --scenes 1",
+        2,
+        &["--kind procedural"],
+    );
+    place.fails(
+        "data synthesize --profile real --scenes 1",
+        2,
+        &["recorded-like"],
+    );
+}
+
+#[test]
 fn stats_count_sources_classes_and_tags() {
     let place = Workplace::new();
     let scene = place.scene();

@@ -22,13 +22,13 @@ const DRIVEWAY: f64 = 16.0;
 
 /// Adds side roads and car parks, then decides along which roads vehicles park.
 pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
-    let n_side = rng.random_range(2..=7);
+    let n_side = rng.random_range(1..=6);
     add_some(plan, extent, n_side, add_side_road, rng);
-    let n_parks = rng.random_range(0..=5);
+    let n_parks = rng.random_range(1..=6);
     add_some(plan, extent, n_parks, add_car_park, rng);
     allow_parking(plan, rng);
     // Traffic is faster on wide roads than their plain plans have it.
-    let haste = rng.random_range(1.0..1.3);
+    let haste = rng.random_range(1.1..1.45);
     for road in plan.roads.iter_mut().filter(|road| road.forward > 1) {
         road.speed_limit *= haste;
     }
@@ -71,12 +71,12 @@ fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut
     let Some(reference) = [whole, 80.0].map(of_length).into_iter().find(clear) else {
         return false;
     };
-    let control = if rng.random_bool(0.75) {
+    let control = if rng.random_bool(0.9) {
         Control::MinorStop
     } else {
         Control::MinorYield
     };
-    let node = split(plan, at, control, rng.random_bool(0.3), rng);
+    let node = split(plan, at, control, rng.random_bool(0.15), rng);
     plan.roads.push(RoadPlan {
         reference,
         ends: [Some(node), None],
@@ -106,8 +106,7 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     if length < 35.0 {
         return false;
     }
-    let whole = bend(start, driveway + length, &[]);
-    let whole = Track::through(&whole);
+    let whole = Track::through(&bend(start, driveway + length, &[]));
     if !is_clear(plan, at.0, &whole, aisle.half_width(true)) {
         return false;
     }

@@ -27,24 +27,26 @@ use crate::{RoadFamily, SynthesisConfig};
 const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::SignalizedCrossing, 25),
     (RoadFamily::StopCrossing, 13),
-    (RoadFamily::TeeJunction, 11),
+    (RoadFamily::TeeJunction, 10),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 18),
-    (RoadFamily::CurvedRoad, 5),
-    (RoadFamily::OnRamp, 12),
-    (RoadFamily::MidBlockCrosswalk, 5),
-    (RoadFamily::Grid, 17),
+    (RoadFamily::Arterial, 20),
+    (RoadFamily::CurvedRoad, 4),
+    (RoadFamily::OnRamp, 14),
+    (RoadFamily::MidBlockCrosswalk, 4),
+    (RoadFamily::Grid, 16),
 ];
 /// Share of scenes whose map states no speed limits.
 const NO_LIMITS: f64 = 0.5;
 /// Share of scenes whose map states no stop signs, though drivers keep to the rule.
-const NO_SIGNS: f64 = 0.2;
+const NO_SIGNS: f64 = 0.12;
 /// Share of scenes with lights whose lights are not recorded.
 const NO_LIGHTS: f64 = 0.3;
 /// Share of scenes whose map has no lanes in car parks.
 const UNMAPPED_CAR_PARKS: f64 = 0.7;
 /// Limits below this are those of car parks, m/s.
 const CAR_PARK_SPEED: f64 = 6.0;
+/// Roads with a higher limit are wide and carry more traffic, m/s.
+const WIDE_ROAD_SPEED: f64 = 15.0;
 /// Metres from the centre of the scene within which the ego is chosen.
 const EGO_REACH: f64 = 60.0;
 
@@ -83,8 +85,8 @@ pub(crate) fn draw_scenario(
     let mut plan = draw_plan(family, config.extent_m, &mut rng);
     dress::dress(&mut plan, config.extent_m, &mut rng);
     let (mut network, trimmed) = Network::roads(&plan, &mut rng);
-    let n_lots = rng.random_range(0..=8);
-    network.lay_lots(&plan, &trimmed, n_lots, 1..=5, &mut rng);
+    let n_lots = rng.random_range(1..=11);
+    network.lay_lots(&plan, &trimmed, n_lots, 1..=6, &mut rng);
     let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
     let demand = draw_demand(config, &network, &driveways, &mut rng);
     let traffic_rng = seed.fork(attempt).fork(1).rng();
@@ -142,7 +144,12 @@ fn draw_demand(
         .sum();
     // One vehicle per 24 m of lane is as much as flows.
     let most = ((metres / 24.0) as usize).max(1);
-    let moving = draw_skewed(&config.vehicles, 1.3, config.density, rng).clamp(1, most);
+    let has_wide_roads = network
+        .lanes
+        .iter()
+        .any(|lane| lane.speed_limit > WIDE_ROAD_SPEED);
+    let busy = if has_wide_roads { 1.5 } else { 1.0 };
+    let moving = draw_skewed(&config.vehicles, 1.3, busy * config.density, rng).clamp(1, most);
     // How busy people and parking are goes together.
     let bustle = rng.random_range(0.0_f64..1.0);
     let people = draw_skewed(
@@ -156,7 +163,7 @@ fn draw_demand(
         parked: 0,
         people,
         bicycles: draw_skewed(&config.bicycles, 4.0, config.density, rng),
-        arrivals: rng.random_range(0.05..0.25) * config.density,
+        arrivals: rng.random_range(0.05..0.25) * busy * config.density,
         scenery: scenery::draw(network, config, (driveways, bustle), rng),
     }
 }
@@ -193,5 +200,16 @@ fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option
             && track.pose(now).is_some_and(near)
     };
     let able: Vec<&Track> = recording.tracks().filter(suits).collect();
-    (!able.is_empty()).then(|| able[rng.random_range(0..able.len())])
+    if able.is_empty() {
+        return None;
+    }
+    let mut draw = || able[rng.random_range(0..able.len())];
+    let first = draw();
+    // Recorders drive more than the traffic around them.
+    let other = draw();
+    Some(if first.distance_driven() < 1.0 {
+        other
+    } else {
+        first
+    })
 }

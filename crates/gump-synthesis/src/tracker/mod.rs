@@ -28,7 +28,8 @@ pub struct Tracker {
     pub begins_after_s: std::ops::Range<f64>,
     /// Seconds out of sight before a track is given up.
     pub coasts_s: std::ops::Range<f64>,
-    /// How often somebody in sight is lost all the same, per second, at the end of the range.
+    /// How often a vehicle in sight is lost all the same, per second, at the end of the range.
+    /// People and bicycles are lost more often, see `sight`.
     pub misses_per_s: f64,
     /// Multiplies all errors of pose, velocity and size; 0 shows everybody where they are.
     pub noise: f64,
@@ -39,11 +40,11 @@ impl Tracker {
     pub fn recorded_like() -> Self {
         Self {
             range_m: Some(79.0),
-            visible_share: 0.25,
+            visible_share: 0.3,
             open_m: 9.0..20.0,
             begins_after_s: 0.0..0.4,
             coasts_s: 0.1..0.8,
-            misses_per_s: 0.12,
+            misses_per_s: 0.2,
             noise: 1.0,
         }
     }

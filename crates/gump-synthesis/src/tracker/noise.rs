@@ -118,7 +118,8 @@ impl Noise {
         let pose = agent.state.pose;
         let turned = (self.heading * heading * scale * unsure).clamp(-MOST_HEADING, MOST_HEADING);
         let pushed = (self.velocity * velocity * scale).clamp_length_max(MOST_VELOCITY);
-        let moved = (self.position * position * scale).clamp_length_max(0.5);
+        // Places are known better than speeds: paths do not wave however bad the velocity.
+        let moved = (self.position * position * scale.min(2.0)).clamp_length_max(0.3);
         let state = AgentState {
             pose: gump_geometry::Pose {
                 position: pose.position + moved,

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use gump_geometry::{DVec2, angle_difference};
-use gump_scene::{Agent, AgentId, AreaKind, Scenario, Seed};
+use gump_scene::{Agent, AgentId, AgentKind, AreaKind, Scenario, Seed};
 use rand::Rng as _;
 
 use super::Tracker;
@@ -56,7 +56,10 @@ impl Sight {
                 visible.entry(id).or_insert_with(|| vec![0.0; n])[step] = share;
             }
         }
+        let frames = scenario.log.iter().flat_map(|frame| frame.agents());
+        let kinds: BTreeMap<AgentId, AgentKind> = frames.map(|a| (a.id, a.kind)).collect();
         let tracked = visible.into_iter().map(|(id, shares)| {
+            let (reach, misses) = ease(kinds[&id]);
             let ids_seed = seed.fork(1).fork(id.0 as u64);
             let distance = |step: usize| {
                 let frame = &scenario.log[step];
@@ -66,10 +69,14 @@ impl Sight {
                     a.state.pose.position.distance(e.state.pose.position)
                 })
             };
-            let near = |step| (distance(step) / range).clamp(0.0, 1.0);
+            let near = |step| (distance(step) / (range * reach)).clamp(0.0, 1.0);
+            let tracker = Tracker {
+                misses_per_s: tracker.misses_per_s * misses,
+                ..tracker.clone()
+            };
             (
                 id,
-                keep_track(&shares, near, tracker, scenario.dt, ids_seed),
+                keep_track(&shares, near, &tracker, scenario.dt, ids_seed),
             )
         });
         Self {
@@ -83,6 +90,16 @@ impl Sight {
             return true;
         };
         tracked.get(&id).is_some_and(|steps| steps[step])
+    }
+}
+
+/// How easily a kind is tracked: the share of the range in which it is, and how many times as often
+/// as a vehicle it is lost.
+fn ease(kind: AgentKind) -> (f64, f64) {
+    match kind {
+        AgentKind::Pedestrian => (0.92, 5.0),
+        AgentKind::Bicycle => (0.95, 2.5),
+        _ => (1.0, 1.0),
     }
 }
 
@@ -110,7 +127,7 @@ fn keep_track(
         }
         lost_s -= dt;
         let needed = tracker.visible_share * (0.5 + far);
-        if *share > needed && lost_s <= 0.0 {
+        if *share > needed && lost_s <= 0.0 && far < 1.0 {
             (seen_s, hidden_s) = (seen_s + dt, 0.0);
             if !on && seen_s > begins_after {
                 on = true;
@@ -118,7 +135,7 @@ fn keep_track(
             }
         } else {
             (hidden_s, seen_s) = (hidden_s + dt, 0.0);
-            if on && hidden_s > coasts || *share == 0.0 && far >= 1.0 {
+            if on && hidden_s > coasts || far >= 1.0 {
                 on = false;
                 begins_after = rng.random_range(tracker.begins_after_s.clone());
             }

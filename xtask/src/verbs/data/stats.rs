@@ -15,6 +15,8 @@ use crate::progress::Progress;
 use crate::run::{self, Common, Run};
 use crate::targets;
 
+/// Distributions with fewer observations on either side do not count in the mean distance.
+const ENOUGH: u64 = 30;
 /// Slower agents stand, metres per second.
 const STANDING: f64 = 0.5;
 
@@ -139,7 +141,10 @@ fn tell_distance(run: &mut Run, compared: &[Comparison]) -> anyhow::Result<()> {
         })
     };
     let mean = |of: fn(&Comparison) -> Option<f64>| {
-        let known: Vec<f64> = compared.iter().filter_map(of).collect();
+        let enough = compared
+            .iter()
+            .filter(|row| row.n.min(row.reference_n) >= ENOUGH);
+        let known: Vec<f64> = enough.filter_map(of).collect();
         known.iter().sum::<f64>() / (known.len() as f64).max(1.0)
     };
     run.result("distance_mean", mean(|row| row.wasserstein))?;

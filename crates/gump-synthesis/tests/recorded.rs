@@ -1,0 +1,160 @@
+//! What holds for scenes like recorded ones, checked on fifty of them.
+
+use std::sync::OnceLock;
+
+use gump_metrics::statistics::{Measure as M, Statistics};
+use gump_scene::{Agent, AgentKind, Scenario, Seed};
+use gump_synthesis::{Profile, Tracker, track};
+use rayon::prelude::*;
+
+const N: u64 = 50;
+const PROFILE: Profile = Profile::RecordedLike;
+
+/// Scenes as they are, without a tracker.
+fn clean() -> &'static [Scenario] {
+    static SCENES: OnceLock<Vec<Scenario>> = OnceLock::new();
+    SCENES.get_or_init(|| {
+        let scene = |k| PROFILE.synthesize_clean(&PROFILE.config(), Seed(77).fork(k));
+        (0..N).into_par_iter().map(scene).collect()
+    })
+}
+
+/// The same scenes as the tracker sees them.
+fn seen() -> Vec<Scenario> {
+    let scene = |k| PROFILE.synthesize(&PROFILE.config(), Seed(77).fork(k));
+    (0..N).into_par_iter().map(scene).collect()
+}
+
+fn is_parked(scene: &Scenario, agent: &Agent) -> bool {
+    let stays = |frame: &gump_scene::Frame| {
+        let there = frame.agent(agent.id);
+        there.is_none_or(|a| a.state.pose.position.distance(agent.state.pose.position) < 0.5)
+    };
+    agent.kind == AgentKind::Vehicle && scene.log.iter().all(stays)
+}
+
+#[test]
+fn every_scene_is_a_valid_scenario() {
+    for (clean, seen) in clean().iter().zip(seen()) {
+        for scene in [clean, &seen] {
+            scene.validate().unwrap();
+            assert_eq!((scene.log.len(), scene.now), (91, 10));
+            assert!(
+                scene
+                    .log
+                    .iter()
+                    .all(|frame| frame.agent(scene.ego).is_some())
+            );
+            assert!(scene.targets.contains(&scene.ego), "{}", scene.id);
+            let present = scene.present();
+            let is_there = |id: &&gump_scene::AgentId| present.now().agent(**id).is_some();
+            assert_eq!(
+                scene.targets.iter().filter(is_there).count(),
+                scene.targets.len()
+            );
+            let route = scene.route.as_ref().unwrap();
+            assert!(
+                route
+                    .lanes
+                    .iter()
+                    .all(|lane| scene.map.lane(*lane).is_some())
+            );
+        }
+        assert_eq!(clean.id, seen.id);
+        assert!(clean.id.starts_with("like-"));
+    }
+}
+
+#[test]
+fn boxes_never_overlap() {
+    for scene in clean() {
+        for (i, frame) in scene.log.iter().enumerate().step_by(5) {
+            let agents = frame.agents();
+            for (k, a) in agents.iter().enumerate() {
+                for b in &agents[k + 1..] {
+                    let reach = a.length + b.length;
+                    let near = a.state.pose.position.distance(b.state.pose.position) < reach;
+                    let apart = !near || !a.oriented_box().overlaps(&b.oriented_box());
+                    assert!(apart, "{}: {} and {} in frame {i}", scene.id, a.id, b.id);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn vehicles_park_beside_the_lanes_not_in_them() {
+    let (mut parked, mut in_lane) = (0, vec![]);
+    for scene in clean() {
+        let lanes = || scene.map.lanes().iter();
+        for agent in scene.log[0].agents().iter().filter(|a| is_parked(scene, a)) {
+            let position = agent.state.pose.position;
+            let distance = |lane: &gump_scene::Lane| lane.centerline.project(position).distance;
+            let nearest = lanes().map(distance).fold(f64::INFINITY, f64::min);
+            parked += 1;
+            if nearest < 2.0 {
+                in_lane.push((scene.id.as_str(), agent.id));
+            }
+        }
+    }
+    // Those that stand in a queue for all nine seconds, and the few that stopped to load.
+    assert!(
+        parked > 1000 && in_lane.len() * 5 < parked,
+        "{} of {parked}",
+        in_lane.len()
+    );
+}
+
+#[test]
+fn shares_are_those_of_recordings() {
+    let mut statistics = Statistics::default();
+    seen().iter().for_each(|scene| statistics.add(scene));
+    let check = |measure: M, class, range: std::ops::Range<f64>| {
+        let mean = statistics.get(measure, class).unwrap().mean();
+        assert!(
+            range.contains(&mean),
+            "{}: {mean}, expected {range:?}",
+            measure.name()
+        );
+    };
+    let [vehicle, person] = [AgentKind::Vehicle, AgentKind::Pedestrian].map(Some);
+    // Around the means of `configs/targets/waymo-like.toml`, as far as fifty scenes may vary.
+    check(M::Standing, vehicle, 0.62..0.87);
+    check(M::Parked, vehicle, 0.6..0.87);
+    check(M::ParkedOffLane, vehicle, 0.75..0.97);
+    check(M::Speed, vehicle, 5.5..12.5);
+    check(M::YawRate, vehicle, 0.03..0.09);
+    check(M::Length, vehicle, 4.6..4.9);
+    check(M::Agents, vehicle, 18.0..45.0);
+    check(M::Presence, vehicle, 0.4..0.75);
+    check(M::OnCrosswalk, person, 0.04..0.35);
+    check(M::Standing, person, 0.08..0.38);
+    check(M::EgoStands, None, 0.06..0.45);
+}
+
+#[test]
+fn threads_change_nothing() {
+    let make = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        let scene = |k| PROFILE.synthesize(&PROFILE.config(), Seed(5).fork(k));
+        pool.install(|| (0..8).into_par_iter().map(scene).collect::<Vec<_>>())
+    };
+    for (one, three) in make(1).iter().zip(&make(3)) {
+        assert_eq!((&one.id, &one.log), (&three.id, &three.log));
+        assert_eq!(one.map.lanes(), three.map.lanes());
+    }
+}
+
+#[test]
+fn what_is_seen_is_what_the_tracker_makes_of_the_clean_scene() {
+    for (k, clean) in clean().iter().enumerate().take(5) {
+        let seed = Seed(77).fork(k as u64);
+        let mut tracked = clean.clone();
+        track(&mut tracked, &Tracker::recorded_like(), seed.fork(u64::MAX));
+        let seen = PROFILE.synthesize(&PROFILE.config(), seed);
+        assert_eq!(tracked.log, seen.log);
+    }
+}
