@@ -4,7 +4,6 @@
 //! there goes on; `model:OUT` is then a world for `cargo xtask simulate` and `evaluate`.
 
 use std::path::PathBuf;
-use std::time::Instant;
 
 use gump_model::relative::{RelativeConfig, RelativeTrainConfig, RelativeTrainer};
 use gump_scene::Scenario;
@@ -37,16 +36,13 @@ fn main() -> anyhow::Result<()> {
         None => RelativeTrainer::new(model, config, scenarios?, &device)?,
     };
     println!("{} parameters", trainer.network().parameters().count());
-    let (began, mut nodes) = (Instant::now(), 0);
+    let mut nodes = 0;
     while trainer.steps_done() < trainer.config().steps {
         let step = trainer.step()?;
         nodes += step.nodes;
         if step.step.is_multiple_of(50) || step.step == trainer.config().steps {
-            let rate = nodes as f64 / began.elapsed().as_secs_f64();
-            println!(
-                "step {} loss {:.3}, {rate:.0} agents at frames a second",
-                step.step, step.loss
-            );
+            let (done, loss) = (step.step, step.loss);
+            println!("step {done} loss {loss:.3}, {nodes} agents at frames seen");
         }
         if let Some(out) = out.as_ref().filter(|_| step.step.is_multiple_of(250)) {
             trainer.save(out)?;

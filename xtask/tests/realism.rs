@@ -75,7 +75,7 @@ fn scores(scenarios: &[Scenario], world: &dyn WorldModel) -> Scores {
     let config = Config::of(Year::Y2025);
     let scores = scenarios.iter().map(|scenario| {
         let start = Start {
-            scene: scenario.present(),
+            scene: scenario.present().unguided(),
             n_futures: ROLLOUTS,
             seed: Seed(2025),
         };

@@ -1,8 +1,11 @@
 //! Frozen sets from the outside: made, held to their sums, scored on by name, refused where they differ.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+#[path = "../../tests/shared.rs"]
+mod shared_data;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use serde_json::Value;
@@ -153,9 +156,7 @@ fn seeds_of_frozen_sets_are_not_for_training() {
 #[test]
 fn recorded_scenes_of_two_formats_are_one_set() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let data: PathBuf = root.join("../shared/data");
-    if !data.exists() {
-        eprintln!("SKIPPED: ../shared/data is not beside the repository");
+    if shared_data::shared("data").is_none() {
         return;
     }
     let text = fs::read_to_string(root.join("datasets/benchmarks/recorded.toml")).unwrap();

@@ -1,7 +1,7 @@
 //! Frozen sets: lists of scenes that everybody scores on, and the scenes of a list.
 //!
 //! A list names scenes, it holds none: made ones by generator version, seed, network and sum
-//! ([`make`] makes them anew), recorded ones by id, file and sum. [`Scenes`] is what
+//! ([`make()`] makes them anew), recorded ones by id, file and sum. [`Scenes`] is what
 //! `--scenarios` takes; [`fingerprint`] is the sum of a scene.
 
 mod fingerprint;
@@ -193,7 +193,7 @@ impl List {
 }
 
 impl<'a> RecordedScene<'a> {
-    /// `None` for what is no "SHA256 FILE [ID]".
+    /// `None` for what is no `SHA256 FILE [ID]`.
     pub(crate) fn parse(line: &'a str) -> Option<Self> {
         let mut words = line.split(' ');
         let sha256 = words.next().filter(|sum| sum.len() == 64)?;

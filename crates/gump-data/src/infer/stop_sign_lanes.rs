@@ -56,8 +56,12 @@ pub(super) fn infer(parts: &mut MapParts, report: &mut ReadReport) {
 }
 
 #[cfg(test)]
+#[path = "../../../../tests/shared.rs"]
+mod shared_data;
+
+#[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{shared_data, *};
     use gump_geometry::dvec3;
     use gump_scene::{LaneId, StopSign};
 
@@ -105,11 +109,10 @@ mod tests {
     /// On Waymo's maps most of the lanes that signs state are found, and hardly any other.
     #[test]
     fn stated_lanes_are_found_from_the_places_of_signs() {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/waymo");
-        let Ok(reader) = crate::open(std::path::Path::new(folder)) else {
-            eprintln!("skipped: no recorded scenes beside the checkout");
+        let Some(folder) = shared_data::shared("data/waymo") else {
             return;
         };
+        let reader = crate::open(&folder).expect("the recorded scenes can be opened");
         let (mut stated, mut found, mut both) = (0, 0, 0);
         for scenario in reader {
             let map = scenario

@@ -463,7 +463,7 @@ mod tests {
             }
             let map = gump_scene::MapGraph::new(parts).unwrap();
             let map = VectorMap::new(&map, pose.position, 300.0, Default::default());
-            let agents = [(10.0, 0.4), (40.0, 0.0), (95.0, -1.0)].map(|(x, y)| {
+            let agents = [(10.0, 0.4), (40.0, 0.0), (55.0, -1.0)].map(|(x, y)| {
                 let was = Shown::first(CAR, pose * Pose::new(x, y, 0.05), pose.rotate(DVec2::X));
                 was.then(pose * Pose::new(x + 2.0, y, 0.0))
             });

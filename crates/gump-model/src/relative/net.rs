@@ -264,7 +264,7 @@ impl RelativeNetwork {
             let asked = Targets {
                 bins: targets.iter().map(|t| u32::from(t.bins[field])).collect(),
                 weights: targets.iter().map(|t| weight(field, t)).collect(),
-                smoothing: (field > 0 && smoothing_bins > 0.0).then(|| OrdinalSmoothing {
+                smoothing: (field > 0 && smoothing_bins > 0.0).then_some(OrdinalSmoothing {
                     sigma_bins: smoothing_bins as f32,
                     circular: false,
                 }),

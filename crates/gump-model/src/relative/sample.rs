@@ -258,7 +258,7 @@ fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> 
                 *entry = (light.state, Some(i).filter(|_| seen));
             }
         }
-        if i >= start && (i - start) % stride == 0 {
+        if i >= start && (i - start).is_multiple_of(stride) {
             let now = frame.lights().iter().map(|light| {
                 let since = known.get(&light.lane).and_then(|entry| entry.1);
                 let elapsed = since.map(|since| (i - since) as f64 * scenario.dt);
@@ -398,8 +398,13 @@ mod tests {
         }
         // Everybody but those of the last frame has a next move; the parked car stands.
         assert_eq!(sample.targets.len(), nodes - 3);
-        let parked = sample.targets.iter().find(|t| t.node % 3 == 1).unwrap();
-        assert_eq!(parked.bins[0], super::super::grid::STANDS);
+        let stands = |target: &&Target| target.bins[0] == super::super::grid::STANDS;
+        let standing = sample.targets.iter().filter(stands).count();
+        assert_eq!(
+            standing,
+            nodes / 3 - 1,
+            "the parked car, at every frame but the last"
+        );
     }
 
     #[test]

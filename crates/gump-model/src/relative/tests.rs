@@ -135,13 +135,13 @@ fn a_resumed_run_ends_in_the_same_weights() {
         .unwrap()
     };
     let mut whole = new();
-    (0..steps).for_each(|_| drop(whole.step().unwrap()));
+    (0..steps).for_each(|_| _ = whole.step().unwrap());
     let mut broken = new();
-    (0..steps / 2).for_each(|_| drop(broken.step().unwrap()));
+    (0..steps / 2).for_each(|_| _ = broken.step().unwrap());
     broken.save(&path).unwrap();
     let mut resumed = RelativeTrainer::resume(&path, vec![scenario()], &Device::Cpu).unwrap();
     assert_eq!(resumed.steps_done(), steps / 2);
-    (steps / 2..steps).for_each(|_| drop(resumed.step().unwrap()));
+    (steps / 2..steps).for_each(|_| _ = resumed.step().unwrap());
     let weights = |trainer: &RelativeTrainer| {
         let all = trainer.network().parameters().all();
         all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())

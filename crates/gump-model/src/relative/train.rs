@@ -77,7 +77,7 @@ pub struct RelativeStep {
 
 /// A training run.
 pub struct RelativeTrainer {
-    network: RelativeNetwork,
+    trained: RelativeNetwork,
     average: RelativeNetwork,
     optimizer: AdamW,
     config: RelativeTrainConfig,
@@ -211,7 +211,7 @@ impl RelativeTrainer {
         });
         let next = prefetch(&source, step);
         Ok(Self {
-            network,
+            trained: network,
             average,
             optimizer,
             config,
@@ -230,7 +230,7 @@ impl RelativeTrainer {
         let samples = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
         self.next = prefetch(&self.source, self.step + 1);
         let total = weight(&samples);
-        let (network, smoothing) = (&self.network, self.config.smoothing_bins);
+        let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
         let parts = samples.par_iter().map(|sample| {
             let (loss, sums) = network.loss(sample, total, smoothing)?;
             Ok((loss.backward()?, sums))
@@ -246,7 +246,7 @@ impl RelativeTrainer {
             });
         }
         let mut gradients = Gradients::new();
-        for (name, var) in self.network.parameters().trainable() {
+        for (name, var) in self.trained.parameters().trainable() {
             let mut of_samples = parts.iter().filter_map(|(store, _)| store.get(var));
             let Some(first) = of_samples.next() else {
                 continue;
@@ -255,7 +255,7 @@ impl RelativeTrainer {
             gradients.insert(name.to_owned(), sum);
         }
         let rate = self.config.optimizer.rate(self.step, self.config.steps);
-        let parameters = self.network.parameters();
+        let parameters = self.trained.parameters();
         let gradient_norm =
             self.optimizer
                 .step(parameters, &gradients, &self.config.optimizer, rate)?;
@@ -310,10 +310,10 @@ impl RelativeTrainer {
                 .collect()
         };
         let mut tensors = named("", &self.average);
-        tensors.extend(named(checkpoint::TRAINED, &self.network));
+        tensors.extend(named(checkpoint::TRAINED, &self.trained));
         let state = self.optimizer.state();
         tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
-        let mut header = super::header(self.network.config())?;
+        let mut header = super::header(self.trained.config())?;
         let config =
             serde_json::to_string(&self.config).map_err(|e| ModelError::Config(e.to_string()))?;
         header.insert("train".to_owned(), config);

@@ -42,7 +42,7 @@ const LOSSES: &str = "losses.csv";
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     /// A folder with a manifest.toml, or any file or folder of scenarios; a cache is not held in
-    /// memory; or fresh:PROFILE[:SEED], scenes made up on the way, none of which comes back
+    /// memory; or `fresh:PROFILE` or `fresh:PROFILE:SEED`, scenes made up on the way, none of which comes back
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
     /// Scenarios to validate on [default: the manifest's]
