@@ -124,7 +124,8 @@ fn half_the_bits_find_the_same_gradient() {
     let half = trainer.differentiate(&samples).unwrap();
     let [a, b] = [&whole, &half].map(|found| found.loss.total);
     assert!(a != b && (a - b).abs() < 0.01 * a, "{a} and {b}");
-    // Operands are rounded to 8 bits, and a network that has learned nothing cancels much.
+    // bfloat16 has three bits less than the float16 of the test above, whose bound is 0.999. Here
+    // it was 0.9981, the error spread evenly over the matrices.
     let cosine = cosine(&whole, &half);
     assert!(cosine > 0.997, "{cosine}");
 }
