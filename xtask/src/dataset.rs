@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use gump_data::cache::Cache;
 use gump_model::{ModelError, Scenes};
-use gump_scene::Scenario;
+use gump_scene::{Scenario, Seed};
 use serde::{Deserialize, Serialize};
 
 use crate::fresh::{Fresh, Stream};
@@ -193,6 +193,8 @@ pub(crate) struct Training {
     sources: Vec<(usize, Source)>,
     /// Takes the place of all sources.
     fresh: Option<Fresh>,
+    /// Takes the place of both: sets of which samples are drawn in these shares.
+    mixed: Vec<(f64, Training)>,
 }
 
 enum Source {
@@ -222,6 +224,7 @@ impl Training {
         Ok(Self {
             sources,
             fresh: None,
+            mixed: Vec::new(),
         })
     }
 
@@ -230,29 +233,55 @@ impl Training {
         Self {
             sources: Vec::new(),
             fresh: Some(Fresh::start(stream, batch)),
+            mixed: Vec::new(),
+        }
+    }
+
+    /// Samples of several sets, each with its share.
+    pub(crate) fn mixed(mut sets: Vec<(f64, Self)>) -> Self {
+        if sets.len() == 1 {
+            return sets.remove(0).1;
+        }
+        Self {
+            sources: Vec::new(),
+            fresh: None,
+            mixed: sets,
         }
     }
 
     /// The ids of all.
-    pub(crate) fn ids(&self) -> impl Iterator<Item = &str> {
+    pub(crate) fn ids(&self) -> Box<dyn Iterator<Item = &str> + '_> {
+        let of_mixed = self.mixed.iter().flat_map(|(_, set)| set.ids());
         let starts = std::iter::once(0).chain(self.sources.iter().map(|(end, _)| *end));
         let sources = self.sources.iter().zip(starts);
-        sources.flat_map(|((end, source), begin)| {
+        let own = sources.flat_map(|((end, source), begin)| {
             (0..end - begin).filter_map(move |i| match source {
                 Source::Held(held) => held.as_slice().get(i).map(|scene| scene.id.as_str()),
                 Source::Cached { cache, start } => cache.id(start + i),
             })
-        })
+        });
+        Box::new(own.chain(of_mixed))
     }
 }
 
 impl Scenes for Training {
     fn len(&self) -> usize {
         let held = self.sources.last().map_or(0, |(end, _)| *end);
-        self.fresh.as_ref().map_or(held, Fresh::len)
+        let own = self.fresh.as_ref().map_or(held, Fresh::len);
+        own + self.mixed.iter().map(|(_, set)| set.len()).sum::<usize>()
     }
 
     fn pick(&self, step: usize, draw: u64) -> usize {
+        if !self.mixed.is_empty() {
+            let (mut left, within) = uniform_and_rest(draw);
+            left *= self.mixed.iter().map(|(share, _)| share).sum::<f64>();
+            let chosen = self.mixed.iter().position(|(share, _)| {
+                left -= share;
+                left < 0.0
+            });
+            let i = chosen.unwrap_or(self.mixed.len() - 1);
+            return self.mixed[i].1.pick(step, within) * self.mixed.len() + i;
+        }
         match &self.fresh {
             Some(fresh) => fresh.pick(step, draw),
             None => (draw % self.len() as u64) as usize,
@@ -262,6 +291,10 @@ impl Scenes for Training {
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
         if let Some(fresh) = &self.fresh {
             return fresh.get(index);
+        }
+        if !self.mixed.is_empty() {
+            let n = self.mixed.len();
+            return self.mixed[index % n].1.get(index / n);
         }
         let missing = || ModelError::Scene(format!("there is no scenario {index}"));
         let i = self.sources.partition_point(|(end, _)| *end <= index);
@@ -275,6 +308,23 @@ impl Scenes for Training {
                 found.map(Cow::Owned).ok_or_else(missing)
             }
         }
+    }
+}
+
+/// A number in 0..1 from a number drawn at random, and another one drawn at random.
+fn uniform_and_rest(draw: u64) -> (f64, u64) {
+    let seed = Seed(draw);
+    let share = (seed.fork(0).0 >> 11) as f64 / (1u64 << 53) as f64;
+    (share, seed.fork(1).0)
+}
+
+/// `PATH=SHARE` as a path and a share; a path alone has 1.
+pub(crate) fn with_share(named: &Path) -> (PathBuf, f64) {
+    let split = named.to_str().and_then(|text| text.rsplit_once('='));
+    let share = split.and_then(|(path, share)| Some((path, share.parse::<f64>().ok()?)));
+    match share {
+        Some((path, share)) if share.is_finite() && share > 0.0 => (path.into(), share),
+        _ => (named.to_owned(), 1.0),
     }
 }
 

@@ -169,20 +169,16 @@ fn weigh<'a>(
     scores: &mut Vec<f32>,
 ) {
     let Heads { n, d, f } = heads;
-    scores.clear();
-    scores.resize(n * n_edges, 0.0);
     let (q, u) = query.split_at(n * d);
     let scale = heads.scale();
-    for e in 0..n_edges {
+    dots(n, n_edges, scores, |h, e, lanes| {
         let (key, feature) = (&source(e)[..n * d], &feature(e)[..f]);
-        for h in 0..n {
-            let mut lanes = Lanes::default();
-            lanes.add(&q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d]);
-            lanes.scale(scale);
-            lanes.add(&u[h * f..(h + 1) * f], feature);
-            scores[h * n_edges + e] = lanes.sum();
+        add_products(lanes, &q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d]);
+        for lane in lanes.iter_mut() {
+            *lane *= scale;
         }
-    }
+        add_products(lanes, &u[h * f..(h + 1) * f], feature);
+    });
     for scores in scores.chunks_exact_mut(n_edges.max(1)) {
         let sum = exp_shifted_sum(scores, max(scores));
         let by = 1.0 / sum;
@@ -190,51 +186,99 @@ fn weigh<'a>(
     }
 }
 
-/// A sum of products in sixteen fixed lanes: rows here are short.
-#[derive(Default)]
-struct Lanes([f32; 16]);
+/// Sixteen sums: rows here are short.
+type Lanes = [f32; 16];
 
-impl Lanes {
-    #[inline(always)]
-    fn add(&mut self, x: &[f32], y: &[f32]) {
-        let ((xs, x_tail), (ys, y_tail)) = (x.as_chunks::<16>(), y.as_chunks::<16>());
-        for (x, y) in xs.iter().zip(ys) {
-            for i in 0..16 {
-                self.0[i] += x[i] * y[i];
-            }
+/// Sums of products of all heads and edges, `[H, edges]`, whose lanes `add` fills.
+///
+/// Lanes are summed in a pass of their own. Where the compiler sees them summed right after they were
+/// filled it fills them in the order of the sum, a few at a time.
+#[inline(always)]
+fn dots(
+    n: usize,
+    n_edges: usize,
+    into: &mut Vec<f32>,
+    mut add: impl FnMut(usize, usize, &mut Lanes),
+) {
+    const ROWS: usize = 64;
+    into.clear();
+    into.resize(n * n_edges, 0.0);
+    let mut rows = [[0.0; 16]; ROWS];
+    let mut first = 0;
+    while first < n * n_edges {
+        let here = ROWS.min(n * n_edges - first);
+        for (i, lanes) in rows[..here].iter_mut().enumerate() {
+            *lanes = [0.0; 16];
+            // Edge by edge: a source's heads lie together.
+            let at = first + i;
+            add(at % n, at / n, lanes);
         }
-        for (i, (x, y)) in x_tail.iter().zip(y_tail).enumerate() {
-            self.0[i] += x * y;
+        std::hint::black_box(&mut rows);
+        for (i, lanes) in rows[..here].iter().enumerate() {
+            let at = first + i;
+            into[(at % n) * n_edges + at / n] = sum(lanes);
+        }
+        first += here;
+    }
+}
+
+/// `lanes += x * y`, element by element, in sixteen fixed lanes.
+#[inline(always)]
+fn add_products(lanes: &mut Lanes, x: &[f32], y: &[f32]) {
+    let ((xs, x_tail), (ys, y_tail)) = (x.as_chunks::<16>(), y.as_chunks::<16>());
+    for k in 0..xs.len().min(ys.len()) {
+        for i in 0..16 {
+            lanes[i] += xs[k][i] * ys[k][i];
         }
     }
-
-    #[inline(always)]
-    fn scale(&mut self, by: f32) {
-        self.0.iter_mut().for_each(|lane| *lane *= by);
+    for k in 0..x_tail.len().min(y_tail.len()) {
+        lanes[k] += x_tail[k] * y_tail[k];
     }
+}
 
-    #[inline(always)]
-    fn sum(mut self) -> f32 {
-        for width in [8, 4, 2, 1] {
-            for i in 0..width {
-                self.0[i] += self.0[i + width];
-            }
-        }
-        self.0[0]
+#[inline(always)]
+fn sum(x: &Lanes) -> f32 {
+    let (mut eight, mut four) = ([0.0; 8], [0.0; 4]);
+    for i in 0..8 {
+        eight[i] = x[i] + x[i + 8];
     }
+    for i in 0..4 {
+        four[i] = eight[i] + eight[i + 4];
+    }
+    (four[0] + four[2]) + (four[1] + four[3])
 }
 
 /// `out += by * x`
 #[inline(always)]
 fn add_scaled(out: &mut [f32], by: f32, x: &[f32]) {
     let ((outs, out_tail), (xs, x_tail)) = (out.as_chunks_mut::<16>(), x.as_chunks::<16>());
-    for (out, x) in outs.iter_mut().zip(xs) {
+    for k in 0..outs.len().min(xs.len()) {
+        let (mut now, x) = (outs[k], xs[k]);
         for i in 0..16 {
-            out[i] += by * x[i];
+            now[i] += by * x[i];
         }
+        outs[k] = now;
     }
-    for (out, x) in out_tail.iter_mut().zip(x_tail) {
-        *out += by * x;
+    for k in 0..out_tail.len().min(x_tail.len()) {
+        out_tail[k] += by * x_tail[k];
+    }
+}
+
+/// `out += by * x + again * y`
+#[inline(always)]
+fn add_both_scaled(out: &mut [f32], by: f32, x: &[f32], again: f32, y: &[f32]) {
+    let (x, y) = (&x[..out.len()], &y[..out.len()]);
+    let ((outs, out_tail), (xs, x_tail)) = (out.as_chunks_mut::<16>(), x.as_chunks::<16>());
+    let (ys, y_tail) = y.as_chunks::<16>();
+    for k in 0..outs.len() {
+        let (mut now, x, y) = (outs[k], xs[k], ys[k]);
+        for i in 0..16 {
+            now[i] += by * x[i] + again * y[i];
+        }
+        outs[k] = now;
+    }
+    for k in 0..out_tail.len() {
+        out_tail[k] += by * x_tail[k] + again * y_tail[k];
     }
 }
 
@@ -333,18 +377,13 @@ impl EdgeAttention {
         slopes: &mut Vec<f32>,
     ) {
         let Heads { n, d, f } = self.heads;
-        slopes.clear();
-        slopes.resize(n * n_edges, 0.0);
         let (d_values, d_averages) = d_out.split_at(n * d);
-        for e in 0..n_edges {
-            let (value, feature) = (&source(e)[n * d..], feature(e));
-            for h in 0..n {
-                let mut lanes = Lanes::default();
-                lanes.add(&d_values[h * d..(h + 1) * d], &value[h * d..(h + 1) * d]);
-                lanes.add(&d_averages[h * f..(h + 1) * f], feature);
-                slopes[h * n_edges + e] = lanes.sum();
-            }
-        }
+        dots(n, n_edges, slopes, |h, e, lanes| {
+            let (value, feature) = (&source(e)[n * d..2 * n * d], &feature(e)[..f]);
+            let of_head = h * d..(h + 1) * d;
+            add_products(lanes, &d_values[of_head.clone()], &value[of_head]);
+            add_products(lanes, &d_averages[h * f..(h + 1) * f], feature);
+        });
         let rows = slopes.chunks_exact_mut(n_edges.max(1));
         for (slopes, weights) in rows.zip(weights.chunks_exact(n_edges.max(1))) {
             let mean: f32 = slopes.iter().zip(weights).map(|(s, p)| s * p).sum();
@@ -394,8 +433,13 @@ impl EdgeAttention {
             );
             add_scaled(&mut d_value[of_head.clone()], p, &d_values[of_head]);
             add_scaled(&mut d_u[of_features.clone()], slope, at.feature);
-            add_scaled(d_feature, slope, &u[of_features.clone()]);
-            add_scaled(d_feature, p, &d_averages[of_features]);
+            add_both_scaled(
+                d_feature,
+                slope,
+                &u[of_features.clone()],
+                p,
+                &d_averages[of_features],
+            );
         }
     }
 }

@@ -19,8 +19,10 @@ pub(super) const EDGE_NUMBERS: usize = 44;
 
 /// Frames of its own past that a node sees beside itself.
 pub(super) const PAST: usize = 6;
-/// Neighbours that a node sees, the nearest.
-const NEIGHBOURS: usize = 12;
+/// Neighbours that a node sees: those who are nearest now and soon.
+const NEIGHBOURS: usize = 16;
+/// How soon, seconds.
+const SOON_S: f64 = 2.0;
 /// How far a neighbour may be, metres.
 const NEIGHBOUR_REACH_M: f64 = 60.0;
 /// Pieces of lanes beside the paths ahead, the nearest.
@@ -272,16 +274,21 @@ type Paths = [Vec<(u32, f64)>];
 
 fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: &mut View) {
     let own = &agents[i];
+    let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
+    // Of a row of parked cars the next few say enough; who comes closer counts as nearer.
     let mut near: Vec<(f64, usize)> = agents
         .iter()
         .enumerate()
         .filter(|(j, _)| *j != i)
-        .map(|(j, other)| (other.pose.position.distance(own.pose.position), j))
-        .filter(|(away, _)| *away < NEIGHBOUR_REACH_M)
+        .filter_map(|(j, other)| {
+            let place = other.pose.position - own.pose.position;
+            let away = place.length();
+            let soon = place + (other.velocity() - own_velocity) * SOON_S;
+            (away < NEIGHBOUR_REACH_M).then(|| (away + soon.length(), j))
+        })
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBOURS);
-    let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
     for (_, j) in near {
         let other = &agents[j];
         let mut row = relative(1, from, Axes::of(other.pose));

@@ -6,8 +6,9 @@
 //! kept. What a node ends with says the next half second of its agent, in the agent's own frame.
 //!
 //! `map` cuts the map into pieces, `graph` makes nodes and edges, `grid` has the bins of a move, `net`
-//! the network, `sample` and `train` how it learns, and `world` how it is rolled out.
+//! the network, `sample`, `drives` and `train` how it learns, and `world` how it is rolled out.
 
+mod drives;
 mod engine;
 mod graph;
 mod grid;
@@ -24,6 +25,7 @@ use std::path::Path;
 use candle_core::Device;
 use serde::{Deserialize, Serialize};
 
+pub use self::drives::RelativeDrives;
 pub use self::net::RelativeNetwork;
 pub use self::sample::SampleConfig as RelativeSampleConfig;
 pub use self::train::{RelativeStep, RelativeTrainConfig, RelativeTrainer};
@@ -111,7 +113,9 @@ pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError>
     let config = config(&archive)?;
     let weights = archive.tensors.into_iter();
     let weights = weights.filter(|(name, _)| !name.starts_with(checkpoint::OPTIMIZER));
-    let tensors = weights.filter(|(name, _)| !name.starts_with(checkpoint::TRAINED));
+    let tensors = weights.filter(|(name, _)| {
+        !name.starts_with(checkpoint::TRAINED) && !name.starts_with(train::DRIVER)
+    });
     RelativeNetwork::build(config, Parameters::loaded(tensors.collect(), device))
 }
 

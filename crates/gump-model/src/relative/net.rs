@@ -127,9 +127,7 @@ impl MoveDecoder {
     /// table that the first three bins of each node stand in, [FIELDS - 1, K].
     fn forced(&self, hidden: &Tensor, rows: &Tensor) -> Result<Tensor> {
         let (k, c) = hidden.dims2()?;
-        let embedded = self
-            .table
-            .index_select(&rows.flatten_all()?, 0)?
+        let embedded = ops::embedding_sum(&self.table, &rows.reshape(((), 1))?)?
             .reshape((FIELDS - 1, k, c))?
             .pad_with_zeros(0, 1, 0)?;
         let inputs = embedded.broadcast_add(&self.slots.reshape((FIELDS, 1, c))?)?;

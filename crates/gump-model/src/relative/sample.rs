@@ -8,10 +8,11 @@ use gump_scene::{AgentId, AgentKind, Frame, LaneId, LightState, Rng, Scenario, S
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
+use super::drives::Driver;
 use super::graph::{
     Body, EDGE_NUMBERS, EdgeRow, Lights, NODE_NUMBERS, PAST, Shown, look, past_edge,
 };
-use super::grid::{FIELDS, quantize};
+use super::grid::{FIELDS, STILL_M, quantize};
 use super::map::{Hidden, PIECE_NUMBERS, VectorMap};
 use crate::ops::Edges;
 use crate::sample::stride_of;
@@ -104,29 +105,70 @@ pub(super) struct Target {
 const UNTRACKED: f32 = 0.3;
 /// Share of an offset from its way that is left half a second later.
 const SLACK: f64 = 0.6;
+/// The same of being ahead of the log or behind it: the pace is an agent's own.
+const ALONG_SLACK: f64 = 0.8;
+/// Share of its last step that an agent still moves on its way to where the log stops.
+const BRAKING: f64 = 0.6;
 /// Slower agents are not pushed, metres per second: nothing moves sideways on the spot.
 const SLOWEST: f64 = 2.0;
+/// Who is faster is on its way somewhere, metres per second.
+const WALKING: f64 = 0.5;
 /// Radians of turn per metre of push.
 const TURN: f64 = 0.1;
 /// How far the map is laid out, metres.
 const MAP_M: f64 = 180.0;
 
 /// An agent over the frames of a sample.
-struct Track {
-    body: Body,
-    /// By frame: the pose that is shown and the state, with how far it is pushed.
-    states: Vec<Option<(Pose, Pose, DVec2, Off)>>,
+pub(super) struct Track {
+    pub(super) body: Body,
+    /// By frame, where it is there.
+    pub(super) states: Vec<Option<State>>,
+}
+
+/// An agent at a frame.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct State {
+    /// Where the log has it.
+    pub(super) logged: Pose,
+    /// Where it is shown.
+    pub(super) shown: Pose,
+    /// As the log has it, world frame, metres per second.
+    pub(super) velocity: DVec2,
+    off: Off,
+}
+
+impl State {
+    /// The same, shown where it was driven to.
+    pub(super) fn driven_to(self, shown: Pose) -> Self {
+        let off = self.logged.inverse() * shown;
+        Self {
+            shown,
+            off: Off {
+                ahead_m: off.position.x,
+                left_m: off.position.y,
+                turn: off.heading,
+            },
+            ..self
+        }
+    }
 }
 
 /// How far an agent is shown off its way.
 #[derive(Clone, Copy, Debug, Default)]
 struct Off {
+    ahead_m: f64,
     left_m: f64,
     turn: f64,
 }
 
-/// Draws a sample; `None` for a scenario too short for one.
-pub(crate) fn draw(scenario: &Scenario, config: &SampleConfig, seed: Seed) -> Option<Sample> {
+/// Draws a sample; `None` for a scenario too short for one. With a driver, its agents leave the log
+/// for where that takes them.
+pub(crate) fn draw(
+    scenario: &Scenario,
+    config: &SampleConfig,
+    driver: Option<&Driver>,
+    seed: Seed,
+) -> Option<Sample> {
     let mut rng = seed.rng();
     let stride = stride_of(scenario.dt);
     let most = (scenario.log.len().checked_sub(1)?) / stride + 1;
@@ -146,14 +188,23 @@ pub(crate) fn draw(scenario: &Scenario, config: &SampleConfig, seed: Seed) -> Op
     };
     let hides_lights = rng.random_bool(config.hide_lights);
     let map = VectorMap::new(&scenario.map, centre, MAP_M, hidden);
-    let tracks: Vec<Track> = ids
+    let driver = driver.filter(|driver| rng.random_bool(driver.config().share));
+    let perturbed = if driver.is_some() {
+        0.0
+    } else {
+        config.perturbed
+    };
+    let mut tracks: Vec<Track> = ids
         .iter()
-        .map(|id| track(&frames, *id, config, &mut rng))
+        .map(|id| track(&frames, *id, config, perturbed, &mut rng))
         .collect();
     let lights = match hides_lights {
         true => vec![Lights::default(); n_frames],
         false => lights(scenario, start, stride, n_frames),
     };
+    if let Some(driver) = driver {
+        driver.drive(&map, &lights, &mut tracks, seed.fork(0));
+    }
     Some(assemble(&map, &tracks, &lights))
 }
 
@@ -166,11 +217,14 @@ fn chosen(
 ) -> Option<(Vec<AgentId>, DVec2)> {
     let middle = frames[frames.len() / 2].agents();
     let moving = || middle.iter().filter(|agent| agent.kind.is_moving());
-    let n = moving().count();
+    let on_their_way = || moving().filter(|agent| agent.state.speed() > WALKING);
+    let (n, n_on_their_way) = (moving().count(), on_their_way().count());
     let own = moving().find(|agent| agent.id == ego);
-    let centre = match own.filter(|_| rng.random_bool(0.5)) {
-        Some(own) => own,
-        None => moving().nth(rng.random_range(0..n.max(1)))?,
+    // Most of what is recorded is parked; there is more to learn around those who are not.
+    let centre = match rng.random_range(0..10) {
+        0..6 if n_on_their_way > 0 => on_their_way().nth(rng.random_range(0..n_on_their_way))?,
+        6..9 if own.is_some() => own?,
+        _ => moving().nth(rng.random_range(0..n.max(1)))?,
     };
     let centre = centre.state.pose.position;
     let mut nearest: BTreeMap<AgentId, f64> = BTreeMap::new();
@@ -187,7 +241,13 @@ fn chosen(
     Some((by_distance.into_iter().map(|(_, id)| id).collect(), centre))
 }
 
-fn track(frames: &[&Frame], id: AgentId, config: &SampleConfig, rng: &mut Rng) -> Track {
+fn track(
+    frames: &[&Frame],
+    id: AgentId,
+    config: &SampleConfig,
+    perturbed: f64,
+    rng: &mut Rng,
+) -> Track {
     let n = frames.len();
     let (mut from, mut to) = (0, n);
     if rng.random_bool(config.cut_tracks) {
@@ -197,7 +257,7 @@ fn track(frames: &[&Frame], id: AgentId, config: &SampleConfig, rng: &mut Rng) -
         }
     }
     let sized = !rng.random_bool(config.hide_size);
-    let reach = match rng.random_bool(config.perturbed) {
+    let reach = match rng.random_bool(perturbed) {
         true => config.push_m * rng.random::<f64>(),
         false => 0.0,
     };
@@ -220,7 +280,12 @@ fn track(frames: &[&Frame], id: AgentId, config: &SampleConfig, rng: &mut Rng) -
             off = Off::default();
         }
         let pose = agent.state.pose;
-        Some((pose, pushed(pose, off, 1.0), agent.state.velocity, off))
+        Some(State {
+            logged: pose,
+            shown: pushed(pose, off),
+            velocity: agent.state.velocity,
+            off,
+        })
     });
     let states: Vec<_> = states.collect();
     Track {
@@ -234,11 +299,22 @@ fn track(frames: &[&Frame], id: AgentId, config: &SampleConfig, rng: &mut Rng) -
     }
 }
 
-/// A pose, off its way by a share of `off`.
-fn pushed(pose: Pose, off: Off, share: f64) -> Pose {
+/// A pose, off its way.
+fn pushed(pose: Pose, off: Off) -> Pose {
     Pose {
-        position: pose.position + pose.rotate(DVec2::new(0.0, share * off.left_m)),
-        heading: wrap_angle(pose.heading + share * off.turn),
+        position: pose.position + pose.rotate(DVec2::new(off.ahead_m, off.left_m)),
+        heading: wrap_angle(pose.heading + off.turn),
+    }
+}
+
+impl Off {
+    /// What is left of it half a second later.
+    fn then(self) -> Self {
+        Self {
+            ahead_m: ALONG_SLACK * self.ahead_m,
+            left_m: SLACK * self.left_m,
+            turn: SLACK * self.turn,
+        }
     }
 }
 
@@ -280,11 +356,11 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
     let mut n_nodes = 0;
     for t in 0..n_frames {
         let of_frame = tracks.iter().enumerate().map(|(a, track)| {
-            let (_, pose, velocity, _) = track.states[t]?;
+            let state = track.states[t]?;
             let before = (t > 0).then(|| shown[t - 1][a]).flatten();
             Some(match before {
-                Some(before) => before.then(pose),
-                None => Shown::first(track.body, pose, velocity),
+                Some(before) => before.then(state.shown),
+                None => Shown::first(track.body, state.shown, state.velocity),
             })
         });
         let of_frame: Vec<Option<Shown>> = of_frame.collect();
@@ -355,13 +431,16 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
 /// What agent `a` should say at frame `t`, if it is there at the next.
 fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     let states = &tracks[a].states;
-    let (now, ..) = states[t]?;
-    let (next, ..) = (*states.get(t + 1)?)?;
-    let off = states[t]?.3;
-    let moved = now.inverse() * next;
-    let step = match moved.position.length() < super::grid::STILL_M {
-        true => moved,
-        false => own.pose.inverse() * pushed(next, off, SLACK),
+    let State { logged, off, .. } = states[t]?;
+    let next = (*states.get(t + 1)?)?.logged;
+    let moved = logged.inverse() * next;
+    let stops = moved.position.length() < STILL_M;
+    let step = if stops {
+        // Who is behind goes on to where the log stands, if that is on the way.
+        let left = (-off.ahead_m).clamp(0.0, BRAKING * own.step.position.x.max(0.0));
+        Pose::new(left, 0.0, 0.0)
+    } else {
+        own.pose.inverse() * pushed(next, off.then())
     };
     Some(Target {
         node: 0,
@@ -384,7 +463,7 @@ mod tests {
              agent pedestrian 2: 40,5 velocity 0,-1",
         )
         .unwrap();
-        let sample = draw(&scenario, &SampleConfig::plain(), Seed(3)).unwrap();
+        let sample = draw(&scenario, &SampleConfig::plain(), None, Seed(3)).unwrap();
         let (nodes, edges) = (sample.n_nodes(), &sample.edges);
         assert!(nodes % 3 == 0 && nodes >= 9, "{nodes}");
         assert_eq!(edges.n_nodes(), nodes);
@@ -411,7 +490,7 @@ mod tests {
     fn one_seed_one_sample() {
         let scenario = fixture::scenario("ego vehicle 0: 0,0 velocity 8,0").unwrap();
         let drawn = |seed| {
-            let sample = draw(&scenario, &SampleConfig::default(), Seed(seed)).unwrap();
+            let sample = draw(&scenario, &SampleConfig::default(), None, Seed(seed)).unwrap();
             (sample.nodes, sample.edge_numbers, sample.targets.len())
         };
         assert_eq!(drawn(1), drawn(1));

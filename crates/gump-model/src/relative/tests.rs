@@ -40,7 +40,7 @@ fn rolled_out_it_computes_what_it_computes_in_training() {
     let whole = scenario();
     let mut seen = whole.clone();
     seen.log.truncate(whole.now + 1);
-    let sample = draw(&seen, &SampleConfig::plain(), Seed(1)).unwrap();
+    let sample = draw(&seen, &SampleConfig::plain(), None, Seed(1)).unwrap();
     let trained = network.hidden(&sample).unwrap().to_vec2::<f32>().unwrap();
     let world = RelativeWorld::new(&network, RelativeSampling::default()).unwrap();
     let (numbers, hidden) = world.read_present(whole.present()).unwrap();
@@ -121,14 +121,79 @@ fn it_learns_a_scene() {
 }
 
 #[test]
+fn half_precision_finds_nearly_the_same_losses() {
+    let losses = |mixed_precision| {
+        let config = RelativeTrainConfig {
+            mixed_precision,
+            ..train_config(10)
+        };
+        let new = RelativeTrainer::new(self::config(), config, vec![scenario()], &Device::Cpu);
+        let mut trainer = new.unwrap();
+        (0..10)
+            .map(|_| trainer.step().unwrap().loss)
+            .collect::<Vec<_>>()
+    };
+    let (exact, rounded) = (losses(false), losses(true));
+    assert_ne!(exact, rounded);
+    for (a, b) in exact.iter().zip(&rounded) {
+        assert!((a - b).abs() < 0.03 * a, "{exact:?} {rounded:?}");
+    }
+}
+
+/// Agents that are driven are somewhere else than logged, near enough to come back, and what they
+/// learn leads back.
+#[test]
+fn driven_agents_leave_the_log_and_learn_the_way_back() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let drives = |candidates| {
+        let config = RelativeDrives {
+            share: 1.0,
+            candidates,
+            ..RelativeDrives::default()
+        };
+        drives::Driver::new(&network, &config).unwrap()
+    };
+    let far = |driver: Option<&drives::Driver>| {
+        let sample = draw(&scenario(), &SampleConfig::plain(), driver, Seed(1)).unwrap();
+        let plain = draw(&scenario(), &SampleConfig::plain(), None, Seed(1)).unwrap();
+        assert_eq!(sample.targets.len(), plain.targets.len());
+        let differ = sample
+            .nodes
+            .iter()
+            .zip(&plain.nodes)
+            .filter(|(a, b)| a != b);
+        let bins =
+            |sample: &sample::Sample| -> Vec<_> { sample.targets.iter().map(|t| t.bins).collect() };
+        (differ.count(), bins(&sample) != bins(&plain))
+    };
+    assert_eq!(far(None), (0, false));
+    let (one, many) = (far(Some(&drives(1))), far(Some(&drives(64))));
+    assert!(one.0 > 0 && one.1, "{one:?}");
+    assert!(many.0 > 0, "{many:?}");
+}
+
+#[test]
 fn a_resumed_run_ends_in_the_same_weights() {
+    let closed_loop = RelativeDrives {
+        refresh: 2,
+        ..RelativeDrives::default()
+    };
+    for closed_loop in [None, Some(closed_loop)] {
+        resumes(&RelativeTrainConfig {
+            closed_loop,
+            ..train_config(6)
+        });
+    }
+}
+
+fn resumes(config: &RelativeTrainConfig) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.safetensors");
-    let steps = 6;
+    let steps = config.steps;
     let new = || {
         RelativeTrainer::new(
-            config(),
-            train_config(steps),
+            self::config(),
+            config.clone(),
             vec![scenario()],
             &Device::Cpu,
         )
@@ -149,7 +214,7 @@ fn a_resumed_run_ends_in_the_same_weights() {
     };
     assert_eq!(weights(&whole), weights(&resumed));
     assert!(is_relative(&path).unwrap());
-    assert_eq!(load(&path, &Device::Cpu).unwrap().config(), &config());
+    assert_eq!(load(&path, &Device::Cpu).unwrap().config(), &self::config());
     // The other architecture refuses the file with a sentence.
     let error = checkpoint::load(&path, &Device::Cpu).unwrap_err();
     assert!(

@@ -5,21 +5,27 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 
+use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
 use gump_scene::{Scenario, Seed};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::RelativeConfig;
+use super::drives::{Driver, RelativeDrives};
 use super::grid::FIELDS;
 use super::net::RelativeNetwork;
 use super::sample::{Sample, SampleConfig, draw};
 use crate::ModelError;
 use crate::checkpoint::{self, Precision};
+use crate::ops::{Deferred, Operands};
 use crate::optimizer::{AdamW, OptimizerConfig, move_average};
 use crate::parameters::Parameters;
 use crate::scenes::Scenes;
 use crate::train::Gradients;
+
+/// What names of the tensors that drive begin with in a checkpoint.
+pub(super) const DRIVER: &str = "driver.";
 
 /// How to train.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,6 +42,11 @@ pub struct RelativeTrainConfig {
     /// Width of the smoothing of targets over neighbouring bins of moves, standard deviation in bins;
     /// standing is never smoothed.
     pub smoothing_bins: f64,
+    /// Whether matrix products take their operands in bfloat16; sums and weights stay f32.
+    pub mixed_precision: bool,
+    /// Whether agents are driven by the network that learns, and how; without it samples show logs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub closed_loop: Option<RelativeDrives>,
     /// How samples are drawn.
     pub sample: SampleConfig,
     /// How steps are taken.
@@ -50,6 +61,8 @@ impl Default for RelativeTrainConfig {
             seed: 0,
             ema: 0.999,
             smoothing_bins: 0.7,
+            mixed_precision: false,
+            closed_loop: None,
             sample: SampleConfig::default(),
             optimizer: OptimizerConfig {
                 learning_rate: 1e-3,
@@ -57,6 +70,23 @@ impl Default for RelativeTrainConfig {
                 ..OptimizerConfig::default()
             },
         }
+    }
+}
+
+impl RelativeTrainConfig {
+    /// Checks that the numbers are in their ranges.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming the first that is not.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        if self.batch == 0 || self.steps == 0 {
+            let what = "batch and steps must be at least 1".to_owned();
+            return Err(ModelError::Config(what));
+        }
+        self.closed_loop
+            .as_ref()
+            .map_or(Ok(()), RelativeDrives::validate)?;
+        self.optimizer.validate()
     }
 }
 
@@ -71,6 +101,8 @@ pub struct RelativeStep {
     pub fields: [f64; FIELDS],
     /// Norm of the gradient before clipping.
     pub gradient_norm: f64,
+    /// Learning rate of the step.
+    pub learning_rate: f64,
     /// Agents at frames that were presented.
     pub nodes: usize,
 }
@@ -83,6 +115,8 @@ pub struct RelativeTrainer {
     config: RelativeTrainConfig,
     step: usize,
     source: Arc<Source>,
+    /// The network that drives the agents of samples, as it was at the last refresh.
+    driving: Option<RelativeNetwork>,
     next: Receiver<Result<Vec<Sample>, ModelError>>,
 }
 
@@ -94,7 +128,7 @@ struct Source {
 }
 
 impl Source {
-    fn samples(&self, step: usize) -> Result<Vec<Sample>, ModelError> {
+    fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, ModelError> {
         const ATTEMPTS: u64 = 64;
         let seed = self.seed.fork(step as u64);
         let drawn = (0..self.batch).map(|i| {
@@ -103,7 +137,7 @@ impl Source {
                 let seed = seed.fork(attempt);
                 let scenario = self.scenarios.pick(step, seed.fork(0).0);
                 let scenario = self.scenarios.get(scenario)?;
-                let sample = draw(&scenario, &self.config, seed.fork(1));
+                let sample = draw(&scenario, &self.config, driver, seed.fork(1));
                 if let Some(sample) = sample.filter(|sample| !sample.targets.is_empty()) {
                     return Ok(sample);
                 }
@@ -114,11 +148,15 @@ impl Source {
     }
 }
 
-fn prefetch(source: &Arc<Source>, step: usize) -> Receiver<Result<Vec<Sample>, ModelError>> {
+fn prefetch(
+    source: &Arc<Source>,
+    step: usize,
+    driver: Option<Driver>,
+) -> Receiver<Result<Vec<Sample>, ModelError>> {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.
-    std::thread::spawn(move || drop(sender.send(source.samples(step))));
+    std::thread::spawn(move || drop(sender.send(source.samples(step, driver.as_ref()))));
     receiver
 }
 
@@ -148,7 +186,9 @@ impl RelativeTrainer {
     ) -> Result<Self, ModelError> {
         let average = build_like(&network, copies(&network)?)?;
         let optimizer = AdamW::new(network.parameters())?;
-        Self::assemble(network, average, optimizer, config, 0, Box::new(scenarios))
+        let driving = driving(&average, &config)?;
+        let run = (network, average, driving);
+        Self::assemble(run, optimizer, config, 0, Box::new(scenarios))
     }
 
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
@@ -172,34 +212,29 @@ impl RelativeTrainer {
             })?;
         let mut moments = archive.take(checkpoint::OPTIMIZER);
         let trained = archive.take(checkpoint::TRAINED);
+        let driver = archive.take(DRIVER);
         let build =
             |weights| RelativeNetwork::build(model.clone(), Parameters::loaded(weights, device));
         let (network, average) = (build(trained)?, build(archive.tensors)?);
+        let driving = (!driver.is_empty()).then(|| build(driver)).transpose()?;
         let optimizer = AdamW::restore(network.parameters(), step, |name| {
             let tensor = moments.remove(name);
             tensor.ok_or_else(|| ModelError::MissingTensor {
                 name: name.to_owned(),
             })
         })?;
-        Self::assemble(
-            network,
-            average,
-            optimizer,
-            config,
-            step,
-            Box::new(scenarios),
-        )
+        let run = (network, average, driving);
+        Self::assemble(run, optimizer, config, step, Box::new(scenarios))
     }
 
     fn assemble(
-        network: RelativeNetwork,
-        average: RelativeNetwork,
+        (network, average, driving): (RelativeNetwork, RelativeNetwork, Option<RelativeNetwork>),
         optimizer: AdamW,
         config: RelativeTrainConfig,
         step: usize,
         scenarios: Box<dyn Scenes>,
     ) -> Result<Self, ModelError> {
-        config.optimizer.validate()?;
+        config.validate()?;
         if scenarios.is_empty() {
             return Err(ModelError::NoData { frames: 3 });
         }
@@ -207,9 +242,9 @@ impl RelativeTrainer {
             scenarios,
             config: config.sample.clone(),
             seed: Seed(config.seed).fork(1),
-            batch: config.batch.max(1),
+            batch: config.batch,
         });
-        let next = prefetch(&source, step);
+        let next = prefetch(&source, step, driver(driving.as_ref(), &config)?);
         Ok(Self {
             trained: network,
             average,
@@ -217,6 +252,7 @@ impl RelativeTrainer {
             config,
             step,
             source,
+            driving,
             next,
         })
     }
@@ -228,15 +264,30 @@ impl RelativeTrainer {
     pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
         let drawn = self.next.recv();
         let samples = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
-        self.next = prefetch(&self.source, self.step + 1);
+        let drives = self.config.closed_loop.as_ref();
+        if drives.is_some_and(|drives| self.step.is_multiple_of(drives.refresh)) {
+            self.driving = driving(&self.average, &self.config)?;
+        }
+        let driver = driver(self.driving.as_ref(), &self.config)?;
+        self.next = prefetch(&self.source, self.step + 1, driver);
         let total = weight(&samples);
         let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
+        let operands = match self.config.mixed_precision {
+            true => Operands::Bf16,
+            false => Operands::F32,
+        };
         let parts = samples.par_iter().map(|sample| {
-            let (loss, sums) = network.loss(sample, total, smoothing)?;
-            Ok((loss.backward()?, sums))
+            let deferred = Deferred::default();
+            let build = || network.loss(sample, total, smoothing);
+            let (loss, sums) = operands.during(|| deferred.during(build))?;
+            Ok(Part {
+                gradients: loss.backward()?,
+                deferred,
+                sums,
+            })
         });
         let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
-        let fields = mean_fields(parts.iter().map(|part| &part.1), total);
+        let fields = mean_fields(parts.iter().map(|part| &part.sums), total);
         let loss: f64 = fields.iter().sum();
         if !loss.is_finite() {
             let field = "move".to_owned();
@@ -245,15 +296,21 @@ impl RelativeTrainer {
                 field,
             });
         }
-        let mut gradients = Gradients::new();
-        for (name, var) in self.trained.parameters().trainable() {
-            let mut of_samples = parts.iter().filter_map(|(store, _)| store.get(var));
-            let Some(first) = of_samples.next() else {
-                continue;
+        let trainable: Vec<_> = self.trained.parameters().trainable().collect();
+        let sums = trainable.into_par_iter().map(|(name, var)| {
+            let mut of_samples = parts.iter().filter_map(|part| part.gradients.get(var));
+            let sum = match of_samples.next() {
+                Some(first) => {
+                    Some(of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?)
+                }
+                None => None,
             };
-            let sum = of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?;
-            gradients.insert(name.to_owned(), sum);
-        }
+            let deferred = parts.iter().map(|part| &part.deferred);
+            let sum = Deferred::take_in(deferred, var, sum)?;
+            Ok(sum.map(|sum| (name.to_owned(), sum)))
+        });
+        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        let gradients: Gradients = sums.into_iter().flatten().collect();
         let rate = self.config.optimizer.rate(self.step, self.config.steps);
         let parameters = self.trained.parameters();
         let gradient_norm =
@@ -268,6 +325,7 @@ impl RelativeTrainer {
             loss,
             fields,
             gradient_norm,
+            learning_rate: rate,
             nodes: samples.iter().map(Sample::n_nodes).sum(),
         })
     }
@@ -284,7 +342,7 @@ impl RelativeTrainer {
         let samples: Vec<Sample> = scenarios
             .par_iter()
             .enumerate()
-            .filter_map(|(i, scenario)| draw(scenario, &config, Seed(0).fork(i as u64)))
+            .filter_map(|(i, scenario)| draw(scenario, &config, None, Seed(0).fork(i as u64)))
             .filter(|sample| !sample.targets.is_empty())
             .collect();
         if samples.is_empty() {
@@ -311,6 +369,9 @@ impl RelativeTrainer {
         };
         let mut tensors = named("", &self.average);
         tensors.extend(named(checkpoint::TRAINED, &self.trained));
+        if let Some(driving) = &self.driving {
+            tensors.extend(named(DRIVER, driving));
+        }
         let state = self.optimizer.state();
         tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
         let mut header = super::header(self.trained.config())?;
@@ -319,6 +380,11 @@ impl RelativeTrainer {
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
         checkpoint::write(path, tensors, header, Precision::Full)
+    }
+
+    /// Ends the run and keeps the network to use.
+    pub fn into_network(self) -> RelativeNetwork {
+        self.average
     }
 
     /// Steps done.
@@ -343,6 +409,34 @@ impl RelativeTrainer {
     pub fn snapshot(&self) -> Result<RelativeNetwork, ModelError> {
         build_like(&self.average, copies(&self.average)?)
     }
+}
+
+/// The network that drives from now on, if any does.
+fn driving(
+    average: &RelativeNetwork,
+    config: &RelativeTrainConfig,
+) -> Result<Option<RelativeNetwork>, ModelError> {
+    let drives = config.closed_loop.as_ref();
+    let copied = drives.map(|_| build_like(average, copies(average)?));
+    copied.transpose()
+}
+
+fn driver(
+    driving: Option<&RelativeNetwork>,
+    config: &RelativeTrainConfig,
+) -> Result<Option<Driver>, ModelError> {
+    let both = driving.zip(config.closed_loop.as_ref());
+    both.map(|(network, drives)| Driver::new(network, drives))
+        .transpose()
+}
+
+/// What one sample of a step found.
+struct Part {
+    gradients: GradStore,
+    /// Gradients of matrices that are still to be computed.
+    deferred: Deferred,
+    /// Sums of the fields' cross-entropies, nats.
+    sums: [f64; FIELDS],
 }
 
 fn weight(samples: &[Sample]) -> f64 {

@@ -1,6 +1,7 @@
 //! `train`: a world model from scenarios, in one stage or several, by one process or several.
 
 mod realism;
+mod relative;
 mod stages;
 
 use std::path::{Path, PathBuf};
@@ -9,13 +10,15 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::train::{Peers as _, StepReport};
-use gump_model::{Device, LossParts, Network, RunConfig, Trainer};
+use gump_model::world::TransformerWorld;
+use gump_model::{Device, LossParts, Network, RunConfig, SamplingConfig, Trainer};
+use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use self::realism::Judge;
-use self::stages::Stage;
+use self::stages::{Files, Stage};
 use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::dataset::{self, Part, Split, Training};
@@ -51,7 +54,8 @@ pub(crate) struct Args {
     /// Weights to go on from, with a fresh optimiser and schedule
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
-    /// The size of the model: tiny, small, base or medium [default: tiny]
+    /// The size of the model: tiny, small, base or medium; or `relative`, the network with relative
+    /// attention throughout [default: tiny]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
     /// Optimiser steps
@@ -84,6 +88,9 @@ enum Begin {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        if relative::is_asked(self)? {
+            return relative::execute(self, run);
+        }
         let stages = self.stages()?;
         together(|processes| {
             if processes.rank() > 0 {
@@ -100,7 +107,7 @@ impl Args {
         run: &mut Run,
         processes: &Processes,
     ) -> anyhow::Result<()> {
-        let was_begun = |stage: &Stage| run.path(&stage.path(CHECKPOINT)).is_file();
+        let was_begun = |stage: &Stage| run.path(&stage.files.path(CHECKPOINT)).is_file();
         let mut resume = self.resume;
         let first = match self.resume {
             true => stages.iter().rposition(was_begun).unwrap_or(0),
@@ -136,7 +143,7 @@ impl Args {
         processes: &Processes,
     ) -> anyhow::Result<Network> {
         let (training, validation) = run.phase("read", |run| self.read(run, stage))?;
-        let checkpoint = run.path(&stage.path(CHECKPOINT));
+        let checkpoint = run.path(&stage.files.path(CHECKPOINT));
         let config = stage.config.train.clone();
         let mut losses = Losses::default();
         let trainer = match begin {
@@ -147,7 +154,7 @@ impl Args {
             Begin::Resume => {
                 let trainer = Trainer::resume(&checkpoint, training, run.device())?;
                 self.check_resumed(&trainer, &stage.config)?;
-                losses = Losses::read(&run.path(&stage.path(LOSSES)), trainer.steps_done())?;
+                losses = Losses::read(&run.path(&stage.files.path(LOSSES)), trainer.steps_done())?;
                 trainer
             }
         };
@@ -158,7 +165,7 @@ impl Args {
         let resumed_at = trainer.steps_done();
         let writes = processes.rank() == 0;
         if writes {
-            let folder = run.path(&stage.path(""));
+            let folder = run.path(&stage.files.path(""));
             std::fs::create_dir_all(&folder)
                 .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         }
@@ -172,11 +179,18 @@ impl Args {
         };
         let began = Instant::now();
         let trained = run.phase("train", |run| {
-            learn(run, stage, &mut trainer, &mut losses, &held_out, writes)
+            learn(
+                run,
+                &stage.files,
+                &mut trainer,
+                &mut losses,
+                &held_out,
+                writes,
+            )
         });
         // A failed step changes nothing, so what was learned before it is worth keeping.
         if writes {
-            run.phase("write", |run| write(run, stage, &trainer, &losses))?;
+            run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?;
         }
         trained?;
         run.result("parameters", trainer.network().parameters().count())?;
@@ -225,20 +239,96 @@ impl Args {
     }
 
     fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
+        self.read_data(run, &stage.data, stage.config.train.batch)
+    }
+
+    /// What is trained on, for steps of `batch` samples, and what is validated on.
+    fn read_data(
+        &self,
+        run: &Run,
+        data: &[PathBuf],
+        batch: usize,
+    ) -> anyhow::Result<(Training, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
-        let stream = Stream::of_name(&stage.data)?;
-        let training = match &stream {
-            Some(stream) => Training::fresh(stream.clone(), stage.config.train.batch),
-            None => Training::open(&dataset::parts(&stage.data, Split::Train)?, &progress)?,
-        };
-        warn_of_frozen(run, &training)?;
-        let validation = match (&self.validation, stream) {
-            (Some(path), _) => vec![Part::whole(path)],
-            (None, Some(stream)) => return Ok((training, stream.validation(VALIDATION_SAMPLES))),
-            (None, None) => dataset::parts(&stage.data, Split::Tune)?,
-        };
-        let validation = dataset::read_first(VALIDATION_SAMPLES, &validation, &progress)?;
-        Ok((training, validation))
+        let mut training = Vec::with_capacity(data.len());
+        let mut validation = Vec::new();
+        for named in data {
+            let (path, share) = dataset::with_share(named);
+            let (source, held_out) = match Stream::of_name(&path)? {
+                Some(stream) => {
+                    let held_out = match &self.validation {
+                        Some(_) => Vec::new(),
+                        None => stream.validation(VALIDATION_SAMPLES / data.len()),
+                    };
+                    let of_batch = (batch as f64 * share).ceil() as usize;
+                    (Training::fresh(stream, of_batch), held_out)
+                }
+                None => {
+                    let source = Training::open(&dataset::parts(&path, Split::Train)?, &progress)?;
+                    let held_out = match &self.validation {
+                        Some(_) => Vec::new(),
+                        None => dataset::parts(&path, Split::Tune)?,
+                    };
+                    let most = VALIDATION_SAMPLES / data.len();
+                    (source, dataset::read_first(most, &held_out, &progress)?)
+                }
+            };
+            warn_of_frozen(run, &source)?;
+            validation.extend(held_out);
+            training.push((share, source));
+        }
+        if let Some(path) = &self.validation {
+            let whole = [Part::whole(path)];
+            validation = dataset::read_first(VALIDATION_SAMPLES, &whole, &progress)?;
+        }
+        Ok((Training::mixed(training), validation))
+    }
+}
+
+/// A network in training, of either architecture.
+trait Learns {
+    fn steps(&self) -> usize;
+    fn steps_done(&self) -> usize;
+    fn step(&mut self) -> anyhow::Result<StepReport>;
+    /// True if any process says so.
+    fn any(&self, said: bool) -> anyhow::Result<bool>;
+    /// The loss on held-out scenarios, nats.
+    fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64>;
+    /// What it has learned, as a world.
+    fn world(&self) -> anyhow::Result<Box<dyn WorldModel>>;
+    /// Writes the checkpoint to resume from and the weights to use.
+    fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()>;
+}
+
+impl Learns for Trainer {
+    fn steps(&self) -> usize {
+        self.config().steps
+    }
+
+    fn steps_done(&self) -> usize {
+        Trainer::steps_done(self)
+    }
+
+    fn step(&mut self) -> anyhow::Result<StepReport> {
+        Ok(Trainer::step(self)?)
+    }
+
+    fn any(&self, said: bool) -> anyhow::Result<bool> {
+        Ok(Trainer::any(self, said)?)
+    }
+
+    fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64> {
+        Ok(Trainer::validate(self, scenarios, VALIDATION_SAMPLES)?.total)
+    }
+
+    fn world(&self) -> anyhow::Result<Box<dyn WorldModel>> {
+        let world = TransformerWorld::new(self.snapshot()?, SamplingConfig::default());
+        Ok(Box::new(world))
+    }
+
+    fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()> {
+        Trainer::save(self, checkpoint)?;
+        Ok(checkpoint::save(self.network(), weights, Precision::Half)?)
     }
 }
 
@@ -284,18 +374,18 @@ struct HeldOut<'a> {
 /// Steps until the run is done, it is to stop, or Ctrl-C.
 fn learn(
     run: &Run,
-    stage: &Stage,
-    trainer: &mut Trainer,
+    files: &Files,
+    trainer: &mut impl Learns,
     losses: &mut Losses,
     held_out: &HeldOut<'_>,
     writes: bool,
 ) -> anyhow::Result<()> {
-    let total = trainer.config().steps;
+    let total = trainer.steps();
     let progress = run.progress("training", total as u64, "steps");
     progress.advance(trainer.steps_done() as u64);
     let validate_every = (total / VALIDATIONS).max(1);
     let mut saved = Instant::now();
-    while trainer.steps_done() < total.min(stage.stop_at) {
+    while trainer.steps_done() < total.min(files.stop_at) {
         let step = trainer.steps_done();
         anyhow::ensure!(
             !trainer.any(run::interrupted())?,
@@ -308,15 +398,15 @@ fn learn(
         losses.push(report);
         let is_due = done.is_multiple_of(validate_every) || done == total;
         if is_due && !held_out.scenarios.is_empty() {
-            let loss = trainer.validate(held_out.scenarios, VALIDATION_SAMPLES)?;
+            let loss = trainer.validate(held_out.scenarios)?;
             let scores = match &held_out.judge {
-                Some(judge) => judge.score(trainer)?,
+                Some(judge) => judge.score(&*trainer.world()?)?,
                 None => None,
             };
-            losses.push_validation(done, loss.total, scores.as_ref());
+            losses.push_validation(done, loss, scores.as_ref());
         }
         if writes && saved.elapsed() > CHECKPOINT_EVERY {
-            write(run, stage, trainer, losses)?;
+            write(run, files, trainer, losses)?;
             saved = Instant::now();
         }
     }
@@ -324,12 +414,11 @@ fn learn(
 }
 
 /// The checkpoint to resume from, the weights to use, and the losses as data and as a picture.
-fn write(run: &Run, stage: &Stage, trainer: &Trainer, losses: &Losses) -> anyhow::Result<()> {
-    let path = |name: &str| run.path(&stage.path(name));
+fn write(run: &Run, files: &Files, trainer: &impl Learns, losses: &Losses) -> anyhow::Result<()> {
+    let path = |name: &str| run.path(&files.path(name));
     // First the losses: rows beyond the checkpoint are cut off when the run is resumed.
     losses.write(&path(LOSSES))?;
-    trainer.save(&path(CHECKPOINT))?;
-    checkpoint::save(trainer.network(), &path(WEIGHTS), Precision::Half)?;
+    trainer.save(&path(CHECKPOINT), &path(WEIGHTS))?;
     if let Some(chart) = losses.chart() {
         chart.save(&path("losses"))?;
     }

@@ -2,9 +2,7 @@
 //! the Waymo Sim Agents Challenge of 2025.
 
 use gump_metrics::wosac::{Config, Log, Reference, Rollouts, Scores, Year};
-use gump_model::world::TransformerWorld;
-use gump_model::{SamplingConfig, Trainer};
-use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Scenario, Seed};
 
 use crate::run::stop_if_interrupted;
@@ -49,11 +47,10 @@ impl<'a> Judge<'a> {
         self.scenes.len()
     }
 
-    /// Mean scores over the scenes, under the default rules.
+    /// Mean scores of a world over the scenes.
     ///
     /// Error: what the world reports, or Ctrl-C.
-    pub(super) fn score(&self, trainer: &Trainer) -> anyhow::Result<Option<Scores>> {
-        let world = TransformerWorld::new(trainer.snapshot()?, SamplingConfig::default());
+    pub(super) fn score(&self, world: &dyn WorldModel) -> anyhow::Result<Option<Scores>> {
         let mut all = Vec::with_capacity(self.scenes.len());
         for (i, (scenario, log)) in self.scenes.iter().enumerate() {
             stop_if_interrupted()?;
@@ -66,7 +63,7 @@ impl<'a> Judge<'a> {
                 seconds: HORIZON_S,
                 ..SimulateConfig::default()
             };
-            let imagined = simulate(&world, &[start], None, &config)
+            let imagined = simulate(world, &[start], None, &config)
                 .map_err(|error| anyhow::anyhow!("{}: {error}", scenario.id))?;
             let rollouts = Rollouts::of(&scenario.id, &imagined, self.config.mode)?;
             all.push(

@@ -1,11 +1,14 @@
 //! What is to be trained: a run of one stage, or of several that go on from each other.
 //!
 //! In the file, `[train]` holds for all stages, and each `[[stage]]` says what it does otherwise:
-//! `data` (a folder in `--data`, or a stream `fresh:PROFILE`), `stop_at` and its own `[stage.train]`.
+//! `data` (a folder in `--data`, a stream `fresh:PROFILE`, or a list of those, each with `=SHARE` if
+//! samples are not drawn from all alike), `stop_at` and its own `[stage.train]`.
 
 use std::path::{Path, PathBuf};
 
 use gump_model::{ClosedLoopConfig, ModelConfig, RunConfig, TrainConfig};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 use super::Args;
@@ -15,16 +18,23 @@ use crate::fresh::PREFIX;
 
 /// A part of a run with a schedule of its own.
 #[derive(Debug)]
-pub(super) struct Stage {
-    pub(super) config: RunConfig,
-    pub(super) data: PathBuf,
+pub(super) struct Stage<C = RunConfig> {
+    pub(super) config: C,
+    /// What it learns from, each with `=SHARE` if not in equal shares.
+    pub(super) data: Vec<PathBuf>,
+    pub(super) files: Files,
+}
+
+/// Where a stage ends and what it writes.
+#[derive(Debug)]
+pub(super) struct Files {
     /// The step to stop after.
     pub(super) stop_at: usize,
     /// Where its files go, from the folder of the run.
-    pub(super) folder: PathBuf,
+    folder: PathBuf,
 }
 
-impl Stage {
+impl Files {
     /// A file of the stage, from the folder of the run.
     pub(super) fn path(&self, name: &str) -> String {
         self.folder.join(name).display().to_string()
@@ -36,6 +46,17 @@ impl Args {
     ///
     /// Error: [`WrongArguments`] for a key that does not exist or does not fit.
     pub(super) fn stages(&self) -> anyhow::Result<Vec<Stage>> {
+        self.stages_of(&known_keys()?, |table| self.config(table))
+    }
+
+    /// The stages, whose configurations are read from tables with the keys of `known`.
+    ///
+    /// Error: [`WrongArguments`] for a key that does not exist or does not fit.
+    pub(super) fn stages_of<C>(
+        &self,
+        known: &Table,
+        config: impl Fn(&Table) -> anyhow::Result<C>,
+    ) -> anyhow::Result<Vec<Stage<C>>> {
         let mut table = match &self.common.config {
             Some(path) => config::tables(path)?,
             None => Table::new(),
@@ -45,24 +66,29 @@ impl Args {
             _ => Vec::new(),
         };
         let path = self.common.config.as_deref().unwrap_or(Path::new(""));
-        config::check_keys(path, &table, &known_keys()?)?;
+        config::check_keys(path, &table, known)?;
         if let Some(name) = &self.model {
             table.insert("model".into(), name.clone().into());
         }
         table.entry("model").or_insert_with(|| "tiny".into());
         if stages.is_empty() {
             return Ok(vec![Stage {
-                config: self.config(&table)?,
-                data: self.data.clone(),
-                stop_at: self.stop_at.unwrap_or(usize::MAX),
-                folder: PathBuf::new(),
+                config: config(&table)?,
+                data: vec![self.data.clone()],
+                files: Files {
+                    stop_at: self.stop_at.unwrap_or(usize::MAX),
+                    folder: PathBuf::new(),
+                },
             }]);
         }
         if self.stop_at.is_some() {
             let wrong = "--stop-at: the configuration says where each of its stages stops";
             return Err(WrongArguments(wrong.into()).into());
         }
-        let known = known_stage()?;
+        let mut known = known.clone();
+        known.remove("model");
+        known.insert("data".into(), "".into());
+        known.insert("stop_at".into(), 1.into());
         let stages = stages.into_iter().enumerate().map(|(i, stage)| {
             let Value::Table(mut stage) = stage else {
                 unreachable!("the file was checked to hold tables")
@@ -73,22 +99,33 @@ impl Args {
                 merge(&mut table, Table::from_iter([("train".to_owned(), train)]));
             }
             Ok(Stage {
-                config: self.config(&table)?,
-                data: match stage.get("data") {
-                    Some(Value::String(stream)) if stream.starts_with(PREFIX) => stream.into(),
-                    Some(Value::String(folder)) => self.data.join(folder),
-                    None => self.data.clone(),
-                    Some(other) => return Err(wrong(path, "data", "a folder", other)),
+                config: config(&table)?,
+                data: self.data_of(path, stage.get("data"))?,
+                files: Files {
+                    stop_at: match stage.get("stop_at") {
+                        Some(Value::Integer(step)) if *step > 0 => *step as usize,
+                        None => usize::MAX,
+                        Some(other) => return Err(wrong(path, "stop_at", "a step", other)),
+                    },
+                    folder: format!("stage-{}", i + 1).into(),
                 },
-                stop_at: match stage.get("stop_at") {
-                    Some(Value::Integer(step)) if *step > 0 => *step as usize,
-                    None => usize::MAX,
-                    Some(other) => return Err(wrong(path, "stop_at", "a step", other)),
-                },
-                folder: format!("stage-{}", i + 1).into(),
             })
         });
         stages.collect()
+    }
+
+    /// What a stage learns from.
+    fn data_of(&self, path: &Path, said: Option<&Value>) -> anyhow::Result<Vec<PathBuf>> {
+        let one = |said: &Value| match said {
+            Value::String(stream) if stream.starts_with(PREFIX) => Ok(stream.into()),
+            Value::String(folder) => Ok(self.data.join(folder)),
+            other => Err(wrong(path, "data", "a folder or a list of folders", other)),
+        };
+        match said {
+            None => Ok(vec![self.data.clone()]),
+            Some(Value::Array(all)) if !all.is_empty() => all.iter().map(one).collect(),
+            Some(said) => Ok(vec![one(said)?]),
+        }
     }
 
     fn config(&self, table: &Table) -> anyhow::Result<RunConfig> {
@@ -135,21 +172,13 @@ fn known_keys() -> anyhow::Result<Table> {
     Ok(known)
 }
 
-fn known_stage() -> anyhow::Result<Table> {
-    let mut known = known_keys()?;
-    known.remove("model");
-    known.insert("data".into(), "".into());
-    known.insert("stop_at".into(), 1.into());
-    Ok(known)
-}
-
 /// The first key in which two configurations differ, with both values.
-pub(super) fn difference(
-    asked: &TrainConfig,
-    begun: &TrainConfig,
+pub(super) fn difference<C: Serialize + DeserializeOwned>(
+    asked: &C,
+    begun: &C,
 ) -> anyhow::Result<Option<String>> {
     // Through JSON, as a checkpoint holds it, so that no number differs by its last digit.
-    let asked: TrainConfig = serde_json::from_str(&serde_json::to_string(asked)?)?;
+    let asked: C = serde_json::from_str(&serde_json::to_string(asked)?)?;
     let tables = [Table::try_from(&asked)?, Table::try_from(begun)?];
     Ok(first_difference(&tables[0], &tables[1]))
 }

@@ -1,0 +1,188 @@
+//! Drives in training: agents leave the log for where the network's own draws take them, and learn
+//! the way back.
+//!
+//! A network that learns from logs alone meets its own small errors for the first time when it is
+//! rolled out. Here it draws several next moves of every agent and takes the one nearest to the log
+//! (as CAT-K does, Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models",
+//! 2024), so that agents stay near enough to the log for its next states to be their targets.
+
+use serde::{Deserialize, Serialize};
+
+use gump_geometry::{Pose, angle_difference};
+use gump_scene::Seed;
+
+use super::engine::{AgentMemory, Draw, Engine, KEPT, Present, Workspace};
+use super::graph::{Lights, PAST, Shown, look, past_edge};
+use super::grid::dequantize;
+use super::map::VectorMap;
+use super::net::RelativeNetwork;
+use super::sample::Track;
+use crate::ModelError;
+use crate::ops::panels::Precision;
+
+/// Frames that are shown as logged before the network drives.
+const WARM_UP: usize = 2;
+/// Metres that a radian counts for in choosing the move nearest to the log.
+const METRES_PER_RADIAN: f64 = 2.0;
+
+/// How agents are driven by the network that learns.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeDrives {
+    /// Share of samples whose agents are driven; the others show the log.
+    pub share: f64,
+    /// Draws per agent and step, of which the nearest to the log is taken.
+    pub candidates: usize,
+    /// Divides the logits of the draws.
+    pub temperature: f64,
+    /// Steps after which the network drives as it is then.
+    pub refresh: usize,
+}
+
+impl Default for RelativeDrives {
+    fn default() -> Self {
+        Self {
+            share: 0.5,
+            candidates: 4,
+            temperature: 1.0,
+            refresh: 50,
+        }
+    }
+}
+
+impl RelativeDrives {
+    /// Error: [`ModelError::Config`] naming the first number out of its range.
+    pub(super) fn validate(&self) -> Result<(), ModelError> {
+        let fail = |what: &str| Err(ModelError::Config(format!("closed_loop: {what}")));
+        if !(0.0..=1.0).contains(&self.share) {
+            return fail("share must be between 0 and 1");
+        }
+        if self.candidates == 0 || self.refresh == 0 {
+            return fail("candidates and refresh must be at least 1");
+        }
+        if !self.temperature.is_finite() || self.temperature <= 0.0 {
+            return fail("temperature must be above 0");
+        }
+        Ok(())
+    }
+}
+
+/// A network as it was at a step, that drives.
+pub(crate) struct Driver {
+    engine: Engine,
+    config: RelativeDrives,
+}
+
+/// What is kept of an agent while it is driven.
+struct Member {
+    /// The last frames without a gap, the latest last; at most [`KEPT`].
+    shown: Vec<Shown>,
+    memory: AgentMemory,
+}
+
+impl Driver {
+    pub(super) fn new(
+        network: &RelativeNetwork,
+        config: &RelativeDrives,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            engine: Engine::new(network, Precision::F32)?,
+            config: config.clone(),
+        })
+    }
+
+    pub(super) fn config(&self) -> &RelativeDrives {
+        &self.config
+    }
+
+    /// Moves the agents of a sample to where the network drives them.
+    pub(super) fn drive(
+        &self,
+        map: &VectorMap,
+        lights: &[Lights],
+        tracks: &mut [Track],
+        seed: Seed,
+    ) {
+        let memory = self.engine.remember(map);
+        let mut members: Vec<Option<Member>> = tracks.iter().map(|_| None).collect();
+        let (mut room, mut hidden) = (Workspace::default(), Vec::new());
+        for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
+            for (track, member) in tracks.iter().zip(&mut members) {
+                *member = match (track.states[t], member.take()) {
+                    (None, _) => None,
+                    (Some(state), Some(member)) => Some(member.then(state.shown)),
+                    (Some(state), None) => Some(Member {
+                        shown: vec![Shown::first(track.body, state.shown, state.velocity)],
+                        memory: self.engine.blank(),
+                    }),
+                };
+            }
+            let mut present: Vec<&mut Member> = members.iter_mut().flatten().collect();
+            let agents: Vec<Shown> = present.iter().map(|member| member.now()).collect();
+            let read = present.iter_mut().enumerate().map(|(i, member)| {
+                let now = &agents[i];
+                let past = member.shown.iter().rev().take(PAST + 1).enumerate();
+                Present {
+                    numbers: now.numbers(),
+                    past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
+                    view: look(map, lights, &agents, i),
+                    memory: &mut member.memory,
+                }
+            });
+            let mut read: Vec<Present<'_>> = read.collect();
+            self.engine
+                .read(&mut read, t, &memory, &mut room, &mut hidden);
+            if t + 1 < WARM_UP {
+                continue;
+            }
+            let here: Vec<usize> = (0..tracks.len())
+                .filter(|&a| members[a].is_some())
+                .collect();
+            let moves = self.draws(&hidden, here.len(), seed.fork(t as u64), &mut room);
+            for (i, &a) in here.iter().enumerate() {
+                let Some(next) = tracks[a].states[t + 1] else {
+                    continue;
+                };
+                let candidates = moves.iter().map(|of_draw| agents[i].pose * of_draw[i]);
+                let nearest =
+                    candidates.min_by(|a, b| far(*a, next.logged).total_cmp(&far(*b, next.logged)));
+                let shown = nearest.expect("there is at least one candidate");
+                tracks[a].states[t + 1] = Some(next.driven_to(shown));
+            }
+        }
+    }
+
+    /// The candidates' moves of all agents, in the agents' frames.
+    fn draws(&self, hidden: &[f32], n: usize, seed: Seed, room: &mut Workspace) -> Vec<Vec<Pose>> {
+        let draw = Draw {
+            temperature: self.config.temperature,
+            top_p: 1.0,
+        };
+        let candidates = (0..self.config.candidates).map(|k| {
+            let of_draw = seed.fork(k as u64);
+            let streams: Vec<Seed> = (0..n).map(|i| of_draw.fork(i as u64)).collect();
+            let bins = self.engine.decide(hidden, &streams, draw, room);
+            bins.into_iter().map(dequantize).collect()
+        });
+        candidates.collect()
+    }
+}
+
+impl Member {
+    fn now(&self) -> Shown {
+        *self.shown.last().expect("a member has been seen")
+    }
+
+    fn then(mut self, pose: Pose) -> Self {
+        self.shown.push(self.now().then(pose));
+        let n = self.shown.len();
+        self.shown.drain(..n.saturating_sub(KEPT));
+        self
+    }
+}
+
+/// How far a pose is from another, metres.
+fn far(a: Pose, b: Pose) -> f64 {
+    a.position.distance(b.position)
+        + METRES_PER_RADIAN * angle_difference(a.heading, b.heading).abs()
+}

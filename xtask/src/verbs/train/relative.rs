@@ -1,0 +1,271 @@
+//! Training of the network with relative attention: the same files, flags and stages.
+
+use std::path::Path;
+
+use anyhow::Context as _;
+use gump_model::checkpoint::Precision;
+use gump_model::relative::{
+    self, RelativeConfig, RelativeNetwork, RelativeSampling, RelativeTrainConfig, RelativeTrainer,
+    RelativeWorld,
+};
+use gump_model::train::StepReport;
+use gump_model::{Device, LossParts};
+use gump_rollout::WorldModel;
+use gump_scene::{Scenario, Seed};
+use serde::Deserialize;
+use serde_json::{Map, json};
+use toml::Table;
+
+use super::realism::Judge;
+use super::stages::{self, Stage};
+use super::{Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, WINDOW, learn, write};
+use crate::cli::WrongArguments;
+use crate::losses::Losses;
+use crate::run::Run;
+
+/// The name of the architecture in `--model`.
+const NAME: &str = "relative";
+
+/// What a run of one stage is.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    #[serde(rename = "model")]
+    _model: String,
+    #[serde(default)]
+    relative: RelativeConfig,
+    #[serde(default)]
+    train: RelativeTrainConfig,
+}
+
+/// Whether the arguments mean this network: by name, or by the weights to go on from.
+///
+/// Error: weights that cannot be read.
+pub(super) fn is_asked(args: &Args) -> anyhow::Result<bool> {
+    match (&args.model, &args.from) {
+        (Some(name), _) => Ok(name == NAME),
+        (None, Some(weights)) => Ok(relative::is_relative(weights)?),
+        (None, None) => Ok(false),
+    }
+}
+
+/// Trains, in one stage or several.
+///
+/// Error: bad input, or a step that failed; what was learned before it is kept.
+pub(super) fn execute(args: &Args, run: &mut Run) -> anyhow::Result<()> {
+    let stages = args.stages_of(&known_keys()?, |table| config(args, table))?;
+    let was_begun = |stage: &Stage<Config>| run.path(&stage.files.path(CHECKPOINT)).is_file();
+    let mut resume = args.resume;
+    let first = match args.resume {
+        true => stages.iter().rposition(was_begun).unwrap_or(0),
+        false => 0,
+    };
+    let mut network = match &args.from {
+        Some(weights) => Some(from(weights, &stages[0].config, run.device())?),
+        None => None,
+    };
+    for stage in &stages[first..] {
+        network = Some(train(args, stage, resume, network, run)?);
+        resume = false;
+    }
+    let weights = run.path(WEIGHTS);
+    if let Some(network) = network.filter(|_| stages.len() > 1) {
+        relative::save(&network, &weights, Precision::Half)?;
+    }
+    run.result("resumed", args.resume)?;
+    run.result("weights", weights)
+}
+
+/// The weights to go on from.
+///
+/// Error: [`WrongArguments`] if they are of another shape than the configuration.
+fn from(weights: &Path, config: &Config, device: &Device) -> anyhow::Result<RelativeNetwork> {
+    let network = relative::load(weights, device)?;
+    if *network.config() != config.relative {
+        let wrong = format!(
+            "{} holds another model than the configuration",
+            weights.display()
+        );
+        return Err(WrongArguments(wrong).into());
+    }
+    Ok(network)
+}
+
+fn train(
+    args: &Args,
+    stage: &Stage<Config>,
+    resume: bool,
+    network: Option<RelativeNetwork>,
+    run: &mut Run,
+) -> anyhow::Result<RelativeNetwork> {
+    let config = stage.config.train.clone();
+    let batch = config.batch;
+    let (training, validation) =
+        run.phase("read", |run| args.read_data(run, &stage.data, batch))?;
+    let checkpoint = run.path(&stage.files.path(CHECKPOINT));
+    let mut losses = Losses::default();
+    let mut trainer = match (resume, network) {
+        (true, _) => {
+            let trainer = RelativeTrainer::resume(&checkpoint, training, run.device())?;
+            check_resumed(args, stage, &trainer)?;
+            let csv = run.path(&stage.files.path(LOSSES));
+            losses = Losses::read(&csv, trainer.steps_done())?;
+            trainer
+        }
+        (false, Some(network)) => RelativeTrainer::continuing(network, config, training)?,
+        (false, None) => {
+            let shape = stage.config.relative.clone();
+            RelativeTrainer::new(shape, config, training, run.device())?
+        }
+    };
+    run.setting("model", trainer.network().config())?;
+    run.setting("train", trainer.config())?;
+    run.reseed(trainer.config().seed);
+    let folder = run.path(&stage.files.path(""));
+    std::fs::create_dir_all(&folder)
+        .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+    let resumed_at = trainer.steps_done();
+    let seed = Seed(trainer.config().seed).fork(9);
+    let held_out = HeldOut {
+        scenarios: &validation,
+        judge: Judge::new(&validation, args.realism_rollouts, seed),
+    };
+    let began = std::time::Instant::now();
+    let trained = run.phase("train", |run| {
+        learn(
+            run,
+            &stage.files,
+            &mut trainer,
+            &mut losses,
+            &held_out,
+            true,
+        )
+    });
+    run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?;
+    trained?;
+    let tokens = losses.tokens_since(resumed_at);
+    run.result("parameters", trainer.network().parameters().count())?;
+    run.result("steps", trainer.steps_done())?;
+    run.result(
+        "tokens_per_second",
+        tokens as f64 / began.elapsed().as_secs_f64(),
+    )?;
+    run.result("loss_first", losses.mean_of_first(WINDOW))?;
+    run.result("loss_last", losses.mean_of_last(WINDOW))?;
+    run.result("validation_loss", losses.last_validation())?;
+    run.result("validation_realism", losses.last_realism())?;
+    if let Some(last) = losses.last() {
+        let names = ["stands", "ahead", "left", "turn"];
+        let fields = names.iter().zip(&last.loss.fields);
+        let told: Map<_, _> = fields
+            .map(|(name, loss)| ((*name).to_owned(), json!(loss)))
+            .collect();
+        run.result("loss_per_field", told)?;
+    }
+    Ok(trainer.into_network())
+}
+
+/// A run keeps the configuration it began with; asking for another one is a mistake.
+fn check_resumed(
+    args: &Args,
+    stage: &Stage<Config>,
+    trainer: &RelativeTrainer,
+) -> anyhow::Result<()> {
+    let begun = trainer.config();
+    for (flag, asked, begun) in [
+        ("--steps", args.steps, begun.steps),
+        ("--batch", args.batch, begun.batch),
+    ] {
+        if let Some(asked) = asked.filter(|&asked| asked != begun) {
+            let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
+            return Err(WrongArguments(wrong).into());
+        }
+    }
+    let Some(path) = &args.common.config else {
+        return Ok(());
+    };
+    let wrong = if *trainer.network().config() != stage.config.relative {
+        Some("another model than that of the run to resume".to_owned())
+    } else {
+        stages::difference(&stage.config.train, begun)?
+    };
+    match wrong {
+        Some(wrong) => Err(WrongArguments(format!("{}: {wrong}", path.display())).into()),
+        None => Ok(()),
+    }
+}
+
+fn config(args: &Args, table: &Table) -> anyhow::Result<Config> {
+    let wrong = |error: String| WrongArguments(error.trim().replace('\n', " "));
+    let mut table = table.clone();
+    table.insert("model".into(), NAME.into());
+    let mut config: Config =
+        toml::from_str(&table.to_string()).map_err(|error| wrong(error.message().to_owned()))?;
+    config.train.steps = args.steps.unwrap_or(config.train.steps);
+    config.train.batch = args.batch.unwrap_or(config.train.batch);
+    config.train.seed = args.common.seed.unwrap_or(config.train.seed);
+    let checked = config.relative.validate();
+    checked
+        .and_then(|()| config.train.validate())
+        .map_err(|error| wrong(error.to_string()))?;
+    Ok(config)
+}
+
+fn known_keys() -> anyhow::Result<Table> {
+    let mut known = Table::new();
+    known.insert("model".into(), NAME.into());
+    let shape = Table::try_from(RelativeConfig::default())?;
+    known.insert("relative".into(), shape.into());
+    let train = RelativeTrainConfig {
+        closed_loop: Some(relative::RelativeDrives::default()),
+        ..RelativeTrainConfig::default()
+    };
+    known.insert("train".into(), Table::try_from(train)?.into());
+    Ok(known)
+}
+
+impl Learns for RelativeTrainer {
+    fn steps(&self) -> usize {
+        self.config().steps
+    }
+
+    fn steps_done(&self) -> usize {
+        RelativeTrainer::steps_done(self)
+    }
+
+    fn step(&mut self) -> anyhow::Result<StepReport> {
+        let step = RelativeTrainer::step(self)?;
+        let loss = LossParts {
+            total: step.loss,
+            state: step.loss,
+            fields: step.fields.to_vec(),
+            ..LossParts::default()
+        };
+        Ok(StepReport {
+            step: step.step,
+            loss,
+            learning_rate: step.learning_rate,
+            gradient_norm: step.gradient_norm,
+            tokens: step.nodes,
+        })
+    }
+
+    fn any(&self, said: bool) -> anyhow::Result<bool> {
+        Ok(said)
+    }
+
+    fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64> {
+        let fields = RelativeTrainer::validate(self, scenarios)?;
+        Ok(fields.iter().sum())
+    }
+
+    fn world(&self) -> anyhow::Result<Box<dyn WorldModel>> {
+        let world = RelativeWorld::new(self.network(), RelativeSampling::default())?;
+        Ok(Box::new(world))
+    }
+
+    fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()> {
+        RelativeTrainer::save(self, checkpoint)?;
+        Ok(relative::save(self.network(), weights, Precision::Half)?)
+    }
+}
