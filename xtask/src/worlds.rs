@@ -14,6 +14,8 @@ use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
 use serde::{Serialize, Serializer};
 
+use crate::cli::WrongArguments;
+
 pub(crate) use flags::{Draw, PrecisionName, Sampling};
 
 /// Which world imagines.
@@ -66,8 +68,10 @@ impl Serialize for WorldName {
 pub(crate) enum World {
     /// One that follows rules.
     Rule(Box<dyn WorldModel>),
-    /// A trained network.
+    /// A trained network of sequences.
     Learned(Box<TransformerWorld>),
+    /// A trained network with relative attention.
+    Relative(Box<RelativeWorld>),
 }
 
 impl World {
@@ -100,13 +104,24 @@ impl World {
             WorldName::Idm => Self::Rule(Box::new(Idm::default())),
             WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
             WorldName::Model(path) if relative::is_relative(path)? => {
+                if sampling.life {
+                    let wrong = format!(
+                        "--life: the relative network in {} does not say who comes and leaves, \
+                         a sequence network does",
+                        path.display()
+                    );
+                    return Err(WrongArguments(wrong).into());
+                }
                 let network = relative::load(path, device)?;
+                let usual = RelativeSampling::default();
                 let sampling = RelativeSampling {
-                    temperature: sampling.temperature,
+                    temperature: sampling.temperature.unwrap_or(usual.temperature),
+                    redraws: sampling.redraws,
+                    limits: sampling.limits,
                     precision: sampling.precision,
-                    ..RelativeSampling::default()
+                    ..usual
                 };
-                Self::Rule(Box::new(RelativeWorld::new(&network, sampling)?))
+                Self::Relative(Box::new(RelativeWorld::new(&network, sampling)?))
             }
             WorldName::Model(path) => {
                 let network = checkpoint::load(path, device)?;
@@ -120,6 +135,7 @@ impl World {
         match self {
             Self::Rule(world) => &**world,
             Self::Learned(world) => &**world,
+            Self::Relative(world) => &**world,
         }
     }
 
@@ -127,7 +143,7 @@ impl World {
     pub(crate) fn follows_lanes(&self) -> bool {
         match self {
             Self::Rule(world) => world.name() == "idm",
-            Self::Learned(_) => true,
+            Self::Learned(_) | Self::Relative(_) => true,
         }
     }
 
@@ -135,6 +151,7 @@ impl World {
     pub(crate) fn watching(self, watch: Watch) -> Self {
         match self {
             Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
+            Self::Relative(world) => Self::Relative(Box::new(world.watching(watch))),
             rule => rule,
         }
     }
@@ -144,14 +161,16 @@ impl World {
         match self {
             Self::Rule(_) => None,
             Self::Learned(world) => Some(world.take_outlooks()),
+            Self::Relative(world) => Some(world.take_outlooks()),
         }
     }
 
-    /// Transformer passes made so far; rules make none.
+    /// Passes of the network made so far, whatever their batch; rules make none.
     pub(crate) fn passes(&self) -> u64 {
         match self {
             Self::Rule(_) => 0,
             Self::Learned(world) => world.passes(),
+            Self::Relative(world) => world.passes(),
         }
     }
 }

@@ -284,6 +284,99 @@ fn the_recorded_stages_of_the_shipped_weights_can_be_run() {
     assert!(fs::metadata(small).unwrap().len() < 12_000_000);
 }
 
+/// A very small network with relative attention, whose second stage drives.
+const RELATIVE: &str = "
+    model = 'relative'
+    [relative]
+    width = 32
+    layers = 1
+    heads = 2
+    edge_width = 16
+    edge_hidden = 24
+    [train]
+    batch = 2
+    mixed_precision = true
+    [[stage]]
+    data = ['first=3', 'more']
+    [stage.train]
+    steps = 4
+    [[stage]]
+    [stage.train]
+    steps = 4
+    [stage.train.closed_loop]
+    share = 1.0
+    refresh = 2
+    ";
+
+#[test]
+fn a_relative_network_trains_in_stages_and_goes_on_where_it_stopped() {
+    let place = Workplace::new();
+    fs::write(place.path("r.toml"), RELATIVE).unwrap();
+    let whole = place.results("r.toml --validation held-out", "whole");
+    assert_eq!(whole["steps"], 4);
+    assert!(whole["validation_realism"].is_f64());
+    let weights = |out: &str| fs::read(place.path(&format!("{out}/weights.safetensors"))).unwrap();
+
+    // The first stage alone, in two parts; then the rest.
+    let first = RELATIVE.replace(
+        "['first=3', 'more']\n",
+        "['first=3', 'more']\nstop_at = 2\n",
+    );
+    fs::write(
+        place.path("part.toml"),
+        &first[..first.rfind("[[stage]]").unwrap()],
+    )
+    .unwrap();
+    place.results("part.toml", "parts");
+    let parts = place.results("r.toml --resume", "parts");
+    assert_eq!(parts["resumed"], true);
+    assert!(weights("parts") == weights("whole"));
+    assert_eq!(
+        losses(&place.path("parts/stage-1")),
+        losses(&place.path("whole/stage-1"))
+    );
+
+    let on = "r.toml --from whole/weights.safetensors";
+    assert!(place.results(on, "on")["loss_last"].is_f64());
+    let world = "simulate --world model:whole/weights.safetensors --futures 2 --seconds 1 --out w \
+                 --scenario held-out/scene.tfrecord";
+    let mut command = place.command(env!("CARGO_BIN_EXE_xtask"));
+    let output = command.args(world.split_whitespace()).output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+    for (from, to, words, parts) in [
+        (
+            "width = 32",
+            "width = 64",
+            on,
+            ["holds another model", "weights"],
+        ),
+        ("heads = 2", "heads = 3", "r.toml", ["width 32", "3 heads"]),
+        (
+            "share = 1.0",
+            "share = 1.5",
+            "r.toml",
+            ["closed_loop", "share"],
+        ),
+        (
+            "refresh = 2",
+            "refreshed = 2",
+            "r.toml",
+            ["refreshed", "refresh"],
+        ),
+        (
+            "batch = 2",
+            "batch = 3",
+            "r.toml --out whole --resume",
+            ["batch", "began with 2"],
+        ),
+    ] {
+        assert!(RELATIVE.contains(from), "{from}");
+        let changed = RELATIVE.replace(from, to);
+        fs::write(place.path("changed.toml"), changed).unwrap();
+        place.fails(&words.replace("r.toml", "changed.toml"), 2, &parts);
+    }
+}
+
 #[cfg(not(feature = "mpi"))]
 #[test]
 fn processes_that_know_nothing_of_each_other_are_refused() {

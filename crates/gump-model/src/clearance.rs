@@ -26,16 +26,16 @@ use crate::sampling::{Bins, Request, SamplingConfig};
 use crate::surroundings::{Edge, Survey, metres_across, metres_off};
 
 /// Poses of a chunk that must be clear: 1.5 s.
-const POSES: usize = 3;
+pub(crate) const POSES: usize = 3;
 /// Places that are looked at between two poses and at the second: every 0.1 s.
 const PLACES: usize = 5;
 /// A way, from 0.1 s on.
-type Way = [Pose; POSES * PLACES];
+pub(crate) type Way = [Pose; POSES * PLACES];
 /// What is over an edge by less than this is on the road, metres, and what is off it by so little more
 /// than before is not farther off: bins and maps are no finer.
 const SLACK_M: f64 = 0.05;
 /// How hard a vehicle without a clear way brakes, metres per second squared: firmly, on a dry road.
-const BRAKING: f64 = 5.0;
+pub(crate) const BRAKING: f64 = 5.0;
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
 
@@ -123,7 +123,7 @@ fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
 }
 
 /// The way through poses half a second apart; what comes from nowhere is at the first all along.
-fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
+pub(crate) fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
     std::array::from_fn(|i| {
         let (to, step) = (i / PLACES, i % PLACES + 1);
         let from = match to {
@@ -134,13 +134,14 @@ fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
     })
 }
 
-/// The objects of a window.
+/// Objects of a frame, with where they are going.
 #[derive(Default)]
-struct Crowd {
+pub(crate) struct Crowd {
     members: Vec<Member>,
 }
 
-struct Member {
+/// An object with where it is going.
+pub(crate) struct Member {
     length: f64,
     width: f64,
     before: Option<Pose>,
@@ -157,6 +158,28 @@ struct Member {
 }
 
 impl Member {
+    /// What is of this length and width, metres, moves at `speed`, metres per second, and goes `ahead`;
+    /// driven objects are where they are.
+    pub(crate) fn new(
+        [length, width]: [f64; 2],
+        before: Option<Pose>,
+        speed: f64,
+        ahead: Way,
+        is_driven: bool,
+    ) -> Self {
+        Self {
+            length,
+            width,
+            before,
+            speed,
+            ahead,
+            edges: Vec::new(),
+            off: 0.0,
+            is_driven,
+            reach: length.hypot(width) / 2.0,
+        }
+    }
+
     fn at(&self, pose: Pose) -> OrientedBox {
         OrientedBox {
             pose,
@@ -223,7 +246,7 @@ impl Member {
     }
 
     /// Takes in the edges of the road that it might cross on its way, and how far it is off the road.
-    fn look_for_edges(&mut self, survey: &Survey) {
+    pub(crate) fn look_for_edges(&mut self, survey: &Survey) {
         let Some(before) = self.before else {
             return;
         };
@@ -242,6 +265,11 @@ impl Member {
 }
 
 impl Crowd {
+    /// These objects.
+    pub(crate) fn new(members: Vec<Member>) -> Self {
+        Self { members }
+    }
+
     /// Takes in the objects that `decoded` has more.
     fn admit(&mut self, window: &Window, decoded: &[Bins], config: &SamplingConfig) {
         let last = window.history.last();
@@ -261,17 +289,13 @@ impl Crowd {
                 let size = |field: Field| field.dequantize(agent.state.get(field));
                 let (length, width) = (size(Field::Length), size(Field::Width));
                 let last = of_last(agent.key.id);
-                let mut member = Member {
-                    length,
-                    width,
-                    before: request.from().or(last.map(QuantizedState::pose)),
-                    speed: last.map_or(0.0, |state| state.velocity().length()),
-                    ahead: foreseen(request, bins, config),
-                    edges: Vec::new(),
-                    off: 0.0,
-                    is_driven: request.forced[4].is_some(),
-                    reach: length.hypot(width) / 2.0,
-                };
+                let mut member = Member::new(
+                    [length, width],
+                    request.from().or(last.map(QuantizedState::pose)),
+                    last.map_or(0.0, |state| state.velocity().length()),
+                    foreseen(request, bins, config),
+                    request.forced[4].is_some(),
+                );
                 if agent.key.kind == AgentKind::Vehicle && !member.is_driven {
                     member.look_for_edges(&window.survey);
                 }
@@ -283,7 +307,7 @@ impl Crowd {
 
     /// Who of those from `first` on should be drawn again: who leaves the road, and of two that get
     /// into each other's way the one that moves more, unless only the other may be.
-    fn unclear(&self, first: usize) -> Vec<usize> {
+    pub(crate) fn unclear(&self, first: usize) -> Vec<usize> {
         let leaves = |member: &Member| member.places_on_road(&member.ahead) < member.ahead.len();
         let mut unclear: Vec<bool> = self.members.iter().map(leaves).collect();
         for (i, a) in self.members.iter().enumerate() {
@@ -304,7 +328,7 @@ impl Crowd {
 
     /// Takes a draw of an object if it stays clear of all others, and on the road, longer than what
     /// it has.
-    fn improve(&mut self, i: usize, ahead: &Way) -> bool {
+    pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
         let member = &self.members[i];
         let clear = |ahead: &Way| {
             let others = self.members.iter().enumerate().filter(|(j, _)| *j != i);

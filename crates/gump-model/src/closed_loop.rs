@@ -90,7 +90,7 @@ pub(crate) fn drive(
     seed: Seed,
 ) -> Result<Vec<Drive>, ModelError> {
     let sampling = SamplingConfig {
-        temperature: config.temperature,
+        temperature: Some(config.temperature),
         ..SamplingConfig::default()
     };
     let world = TransformerWorld::new(network, sampling);

@@ -32,7 +32,7 @@ pub(crate) fn draw_field(
     let field = STEPS[step];
     debug_assert_eq!(logits.len(), field.n_bins());
     let sharpness = Sharpness {
-        temperature: config.temperature,
+        temperature: config.temperature.unwrap_or(TEMPERATURE),
         top_k: config.top_k,
     };
     if let Some(guide) = &request.guide {
@@ -50,6 +50,10 @@ pub(crate) fn draw_field(
     let found = draw(&logits[allowed.clone()], uniform, sharpness, room);
     (allowed.start + found) as u16
 }
+
+/// What the logits of a sequence network are divided by unless told otherwise: its targets were
+/// smoothed over neighbouring bins, so that it is less sure than it could be.
+const TEMPERATURE: f64 = 0.5;
 
 /// How far a draw keeps to what is likely.
 #[derive(Clone, Copy, Debug)]
@@ -235,7 +239,7 @@ mod tests {
             ..SamplingConfig::default()
         };
         let cold = SamplingConfig {
-            temperature: 0.0,
+            temperature: Some(0.0),
             ..SamplingConfig::default()
         };
         for seed in 0..50 {
@@ -251,7 +255,7 @@ mod tests {
         let mut logits = [f32::NEG_INFINITY; 14];
         (logits[2], logits[9]) = (0.0, (3.0f32).ln());
         let config = SamplingConfig {
-            temperature: 1.0,
+            temperature: Some(1.0),
             ..SamplingConfig::default()
         };
         let n = 4000;
@@ -301,7 +305,7 @@ mod tests {
     fn guides_weigh_bins_whatever_the_temperature() {
         let guide: std::sync::Arc<dyn Guide> = std::sync::Arc::new(Prefers);
         let config = SamplingConfig {
-            temperature: 0.5,
+            temperature: Some(0.5),
             top_k: 1000,
             ..SamplingConfig::default()
         };

@@ -98,7 +98,7 @@ mod tests {
         for mode in [Mode::PartialAr, Mode::FullAr] {
             let sampling = SamplingConfig {
                 mode,
-                temperature: 1.0,
+                temperature: Some(1.0),
                 ..SamplingConfig::default()
             };
             let watch = Watch {

@@ -26,8 +26,10 @@ pub struct SamplingConfig {
     pub mode: Mode,
     /// What is kept between passes.
     pub cache: CacheMode,
-    /// Divides the logits (paper, simulation: 1.1); above 1 is bolder.
-    pub temperature: f64,
+    /// Divides the logits (paper, simulation: 1.1); above 1 is bolder. Without one draws are as the
+    /// network was made for: at 0.5 by the sequence network, whose targets were smoothed, and at 1 by
+    /// the relative one.
+    pub temperature: Option<f64>,
     /// Bins that may be drawn per field (paper, simulation: 40).
     pub top_k: usize,
     /// Weight of a prediction made `i` frames ago is `decay^i` (paper: 1.2); 0 switches aggregation
@@ -56,7 +58,7 @@ impl Default for SamplingConfig {
         Self {
             mode: Mode::PartialAr,
             cache: CacheMode::Window,
-            temperature: 0.5,
+            temperature: None,
             top_k: 40,
             decay: 0.3,
             history: 3,
@@ -85,7 +87,7 @@ impl SamplingConfig {
     /// decay 1.2, three frames of history.
     pub fn paper() -> Self {
         Self {
-            temperature: 1.1,
+            temperature: Some(1.1),
             top_k: 40,
             decay: 1.2,
             history: 3,
@@ -288,7 +290,7 @@ mod tests {
         let raw = SamplingConfig {
             mode: Mode::PartialAr,
             cache: CacheMode::Window,
-            temperature: 0.5,
+            temperature: None,
             top_k: 40,
             decay: 0.3,
             history: 3,
@@ -304,7 +306,7 @@ mod tests {
         };
         assert_eq!(SamplingConfig::raw(), raw);
         let paper = SamplingConfig {
-            temperature: 1.1,
+            temperature: Some(1.1),
             decay: 1.2,
             ..raw.clone()
         };

@@ -555,7 +555,7 @@ fn surrogates_that_are_right_give_full_autoregression() {
     let run = |mode, window: &Window| {
         let sampling = SamplingConfig {
             mode,
-            temperature: 0.0,
+            temperature: Some(0.0),
             decay: 0.0,
             redraws: 0,
             ..SamplingConfig::default()

@@ -62,6 +62,20 @@ impl Recording {
         self.n_frames
     }
 
+    /// Number of snapshots.
+    pub(crate) fn n_snapshots(&self) -> usize {
+        self.n_frames + 2
+    }
+
+    /// Lets a body that stood move through these poses, one per snapshot.
+    pub(crate) fn move_along(&mut self, id: i64, poses: Vec<Pose>) {
+        debug_assert_eq!(poses.len(), self.n_snapshots());
+        if let Some(track) = self.tracks.get_mut(&id) {
+            track.body.is_mobile = true;
+            track.poses = poses.into_iter().map(Some).collect();
+        }
+    }
+
     /// All tracks in the order of their ids.
     pub(crate) fn tracks(&self) -> impl Iterator<Item = &Track> {
         self.tracks.values()
@@ -142,6 +156,11 @@ impl Track {
     /// Where the box is in a frame.
     pub(crate) fn pose(&self, frame: usize) -> Option<Pose> {
         self.poses[frame + 1]
+    }
+
+    /// Where the box is in a snapshot.
+    pub(crate) fn pose_at_snapshot(&self, snapshot: usize) -> Option<Pose> {
+        self.poses[snapshot]
     }
 
     /// Present in every snapshot.

@@ -27,7 +27,7 @@ pub(crate) struct Draw {
     /// In which form the weights are multiplied
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
-    /// Divides the logits; above 1 is bolder [default: 0.5]
+    /// Divides the logits; above 1 is bolder [default: 0.5, and 1 of a relative network]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
     /// Bins that may be drawn per field [default: 40]
@@ -154,18 +154,16 @@ impl Draw {
             },
             precision: self.precision.resolve(),
             life: self.life,
-            temperature: self.temperature.unwrap_or(base.temperature),
+            temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             decay: self.decay.unwrap_or(base.decay),
             redraws: self.redraws.unwrap_or(base.redraws),
             limits: base.limits && !self.no_limits,
             ..base
         };
-        let wrong = if !(config.temperature > 0.0 && config.temperature.is_finite()) {
-            format!(
-                "--temperature: expected a number above 0, found {}",
-                config.temperature
-            )
+        let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
+        let wrong = if let Some(t) = config.temperature.filter(absurd) {
+            format!("--temperature: expected a number above 0, found {t}")
         } else if config.top_k == 0 {
             "--top-k: expected at least 1, found 0".into()
         } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
@@ -318,6 +316,6 @@ mod tests {
             ..draw()
         };
         let raw = check(Draw { raw: true, ..warm }, &["raw"]);
-        assert_eq!(raw[0].sampling.temperature, 0.9);
+        assert_eq!(raw[0].sampling.temperature, Some(0.9));
     }
 }

@@ -48,7 +48,7 @@ fn training_and_driving_see_the_same() {
 fn velocities_agree_with_displacements() {
     let scenario = scenario();
     let sampling = SamplingConfig {
-        temperature: 1.5,
+        temperature: Some(1.5),
         ..SamplingConfig::default()
     };
     let (steps, _) = imagine(sampling, &scenario, 4, 6, None);

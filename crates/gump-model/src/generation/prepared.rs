@@ -80,7 +80,7 @@ impl<'a> Prepared<'a> {
             grounds,
             lanes,
             sampling: SamplingConfig {
-                temperature: config.temperature,
+                temperature: Some(config.temperature),
                 top_k: config.top_k,
                 ..world.sampling().clone()
             },

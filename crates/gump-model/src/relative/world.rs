@@ -5,9 +5,10 @@
 //! constant velocity, and lights hold.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use gump_geometry::DVec2;
+use gump_geometry::{DVec2, Pose};
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, LightState, SceneState, Seed};
 use rayon::prelude::*;
@@ -18,12 +19,20 @@ use super::graph::{Body, Lights, PAST, Shown, look, past_edge};
 use super::grid::dequantize;
 use super::map::{Hidden, VectorMap};
 use super::net::RelativeNetwork;
+use super::rules::{held_back, settle};
 use crate::ModelError;
 use crate::ops::panels::Precision;
+use crate::outlook::{Outlook, Watch};
 use crate::sample::TOKEN_DT;
+use crate::surroundings::Survey;
 
 /// How far around the ego the map is laid out, metres.
 const MAP_M: f64 = 300.0;
+
+/// Separates the streams of redraws from those of fields.
+const REDRAW: u64 = 1 << 20;
+/// Separates the streams of those who watch.
+const WATCH: u64 = 1 << 40;
 
 /// How futures are drawn.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,6 +42,11 @@ pub struct RelativeSampling {
     pub temperature: f64,
     /// Draws are among the likeliest bins that together have this probability.
     pub top_p: f64,
+    /// How often an agent that would run into another or off the road within 1.5 s is drawn again at
+    /// most.
+    pub redraws: usize,
+    /// Whether vehicles and bicycles are held back from turning on the spot and slipping sideways.
+    pub limits: bool,
     /// In which form the weights are multiplied.
     pub precision: Precision,
 }
@@ -42,7 +56,18 @@ impl Default for RelativeSampling {
         Self {
             temperature: 1.0,
             top_p: 1.0,
+            redraws: 0,
+            limits: false,
             precision: Precision::F32,
+        }
+    }
+}
+
+impl RelativeSampling {
+    fn draw(&self) -> Draw {
+        Draw {
+            temperature: self.temperature,
+            top_p: self.top_p,
         }
     }
 }
@@ -52,6 +77,11 @@ impl Default for RelativeSampling {
 pub struct RelativeWorld {
     engine: Engine,
     sampling: RelativeSampling,
+    /// Steps made so far, of all sessions.
+    passes: AtomicU64,
+    /// What is kept of the distributions, and what was.
+    watch: Watch,
+    outlooks: Mutex<Vec<Outlook>>,
 }
 
 impl RelativeWorld {
@@ -63,12 +93,32 @@ impl RelativeWorld {
         Ok(Self {
             engine: Engine::new(network, sampling.precision)?,
             sampling,
+            passes: AtomicU64::new(0),
+            watch: Watch::default(),
+            outlooks: Mutex::default(),
         })
+    }
+
+    /// The same world, which keeps what its agents might have done.
+    pub fn watching(self, watch: Watch) -> Self {
+        Self { watch, ..self }
+    }
+
+    /// Takes what was watched since it was last taken: step by step, futures in their order, and
+    /// agents in that of their ids.
+    pub fn take_outlooks(&self) -> Vec<Outlook> {
+        let mut kept = self.outlooks.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::take(&mut *kept)
+    }
+
+    /// Steps made so far, whatever the number of futures.
+    pub fn passes(&self) -> u64 {
+        self.passes.load(Ordering::Relaxed)
     }
 
     /// The futures of a start, with the scene they share.
     fn begin(&self, start: &Start<'_>) -> Result<(Arc<Scene>, Vec<Future>), ModelError> {
-        let scene = Arc::new(Scene::new(&self.engine, start.scene));
+        let scene = Arc::new(Scene::new(&self.engine, start.scene, &self.sampling));
         let first = Future::begin(&self.engine, &scene, start.scene)?;
         let futures = (0..start.n_futures).map(|k| Future {
             seed: start.seed.fork(k as u64),
@@ -85,7 +135,7 @@ impl RelativeWorld {
         &self,
         scene: SceneState<'_>,
     ) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
-        let shared = Arc::new(Scene::new(&self.engine, scene));
+        let shared = Arc::new(Scene::new(&self.engine, scene, &self.sampling));
         let future = Future::begin(&self.engine, &shared, scene)?;
         let numbers = future
             .members
@@ -106,6 +156,7 @@ impl WorldModel for RelativeWorld {
         Ok(Box::new(RelativeSession {
             world: self,
             futures: begun.into_iter().flat_map(|(_, futures)| futures).collect(),
+            step: 0,
         }))
     }
 }
@@ -115,16 +166,22 @@ impl WorldModel for RelativeWorld {
 struct Scene {
     map: VectorMap,
     memory: MapMemory,
+    /// The edges of the road, where rules look at them.
+    survey: Survey,
     ego: AgentId,
 }
 
 impl Scene {
-    fn new(engine: &Engine, scene: SceneState<'_>) -> Self {
+    fn new(engine: &Engine, scene: SceneState<'_>, sampling: &RelativeSampling) -> Self {
         let centre = scene.ego_now().state.pose.position;
         let map = VectorMap::new(scene.map, centre, MAP_M, Hidden::default());
         Self {
             memory: engine.remember(&map),
             map,
+            survey: match sampling.redraws {
+                0 => Survey::default(),
+                _ => Survey::of_edges(scene.map, centre, MAP_M),
+            },
             ego: scene.ego,
         }
     }
@@ -238,16 +295,22 @@ impl Future {
     }
 
     /// Goes on by half a second.
-    fn step(&mut self, engine: &Engine, draw: Draw, ego: Option<AgentState>, room: &mut Workspace) {
+    fn step(
+        &mut self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) {
         let seed = self.seed.fork(self.frames as u64);
         let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
         let streams: Vec<Seed> = self.members.iter().map(stream).collect();
-        let moves = engine.decide(&self.hidden, &streams, draw, room);
         let id = self.scene.ego;
-        for (member, bins) in self.members.iter_mut().zip(moves) {
+        let moves = self.moves(engine, sampling, &streams, ego, room);
+        for (member, step) in self.members.iter_mut().zip(moves) {
             let driven = ego.filter(|_| member.agent.id == id);
             let state = driven.unwrap_or_else(|| AgentState {
-                pose: member.now().pose * dequantize(bins),
+                pose: member.now().pose * step,
                 velocity: DVec2::ZERO,
             });
             member.push(state);
@@ -262,6 +325,87 @@ impl Future {
             light.2 = light.2.map(|elapsed| elapsed + TOKEN_DT);
         }
         self.read(engine, room);
+    }
+
+    /// The next moves of all agents, each in its own frame, after the rules.
+    fn moves(
+        &self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        streams: &[Seed],
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) -> Vec<Pose> {
+        let draw = sampling.draw();
+        let agents: Vec<Shown> = self.members.iter().map(Member::now).collect();
+        let kept = |i: usize, bins| match sampling.limits {
+            true => held_back(&agents[i], dequantize(bins)),
+            false => dequantize(bins),
+        };
+        let drawn = engine.decide(&self.hidden, streams, draw, room);
+        let mut moves: Vec<Pose> = (0..agents.len()).map(|i| kept(i, drawn[i])).collect();
+        if sampling.redraws == 0 {
+            return moves;
+        }
+        let is_ego = |member: &Member| member.agent.id == self.scene.ego;
+        let driven = ego.and_then(|ego| Some((self.members.iter().position(is_ego)?, ego)));
+        if let Some((i, ego)) = driven {
+            moves[i] = agents[i].pose.inverse() * ego.pose;
+        }
+        let c = self.hidden.len() / agents.len().max(1);
+        let mut again = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let rows = who.iter().flat_map(|&i| &self.hidden[i * c..][..c]);
+            let rows: Vec<f32> = rows.copied().collect();
+            let fresh = |&i: &usize| streams[i].fork(REDRAW + attempt as u64);
+            let streams: Vec<Seed> = who.iter().map(fresh).collect();
+            let drawn = engine.decide(&rows, &streams, draw, room);
+            who.iter()
+                .zip(drawn)
+                .map(|(&i, bins)| kept(i, bins))
+                .collect()
+        };
+        let (survey, redraws) = (&self.scene.survey, sampling.redraws);
+        let driven = driven.map(|(i, _)| i);
+        settle(&agents, driven, survey, redraws, &mut moves, &mut again);
+        moves
+    }
+
+    /// What agents might do next, from streams of their own.
+    fn outlooks(
+        &self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        (watch, future, step): (Watch, usize, usize),
+        driven: Option<AgentId>,
+    ) -> Vec<Outlook> {
+        let draw = sampling.draw();
+        let mut room = Workspace::default();
+        let seed = self.seed.fork(self.frames as u64);
+        let draws: Vec<_> = (0..watch.draws as u64)
+            .map(|k| {
+                let stream = |member: &Member| seed.fork(member.agent.id.0 as u64).fork(WATCH + k);
+                let streams: Vec<Seed> = self.members.iter().map(stream).collect();
+                engine.decide(&self.hidden, &streams, draw, &mut room)
+            })
+            .collect();
+        let members = self.members.iter().enumerate();
+        let told = members.filter(|(_, member)| driven != Some(member.agent.id));
+        let outlook = |(i, member): (usize, &Member)| Outlook {
+            future,
+            step,
+            agent: member.agent.id,
+            draws: draws
+                .iter()
+                .map(|bins| {
+                    let next = member.now().then(member.now().pose * dequantize(bins[i]));
+                    AgentState {
+                        pose: next.pose,
+                        velocity: next.velocity(),
+                    }
+                })
+                .collect(),
+        };
+        told.map(outlook).collect()
     }
 
     fn frame(&self) -> Frame {
@@ -323,6 +467,8 @@ fn lights_at(history: &[Frame], dt: f64) -> Lights {
 struct RelativeSession<'a> {
     world: &'a RelativeWorld,
     futures: Vec<Future>,
+    /// Steps made so far.
+    step: usize,
 }
 
 impl Session for RelativeSession<'_> {
@@ -331,15 +477,26 @@ impl Session for RelativeSession<'_> {
     }
 
     fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
-        let engine = &self.world.engine;
-        let draw = Draw {
-            temperature: self.world.sampling.temperature,
-            top_p: self.world.sampling.top_p,
-        };
+        let (engine, sampling) = (&self.world.engine, &self.world.sampling);
+        let watch = self.world.watch;
+        if watch.futures > 0 && watch.draws > 0 {
+            let watched = self.futures.iter().take(watch.futures).enumerate();
+            let seen = watched.flat_map(|(i, future)| {
+                let driven = ego.is_some().then_some(future.scene.ego);
+                future.outlooks(engine, sampling, (watch, i, self.step), driven)
+            });
+            let mut kept = self.world.outlooks.lock();
+            let kept = kept
+                .as_mut()
+                .map_err(|_| "a thread panicked while watching")?;
+            kept.extend(seen);
+        }
+        self.step += 1;
+        self.world.passes.fetch_add(1, Ordering::Relaxed);
         let frames = self.futures.par_iter_mut().enumerate().map_init(
             Workspace::default,
             |room, (i, future)| {
-                future.step(engine, draw, ego.map(|ego| ego[i]), room);
+                future.step(engine, sampling, ego.map(|ego| ego[i]), room);
                 future.frame()
             },
         );

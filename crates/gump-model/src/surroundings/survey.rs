@@ -119,6 +119,20 @@ impl Survey {
         survey
     }
 
+    /// The road edges within `reach` metres of a place, in the frame of the map; no lanes.
+    pub(crate) fn of_edges(map: &MapGraph, centre: DVec2, reach: f64) -> Self {
+        let edges = map.road_edges().iter();
+        let stretches = edges.flat_map(|edge| Edge::of(&edge.line, Pose::IDENTITY));
+        let edges: Vec<Edge> = stretches
+            .filter(|edge| edge.from.distance_squared(centre) < reach * reach)
+            .collect();
+        Self {
+            edge_cells: Cells::new(edges.iter().map(|edge| edge.from)),
+            edges,
+            ..Self::default()
+        }
+    }
+
     pub(super) fn point(&self, index: u32) -> LanePoint {
         self.points[index as usize]
     }

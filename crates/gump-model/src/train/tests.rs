@@ -588,7 +588,7 @@ fn a_network_reproduces_the_scene_it_learned() {
     for mode in [Mode::PartialAr, Mode::FullAr] {
         let sampling = SamplingConfig {
             mode,
-            temperature: 0.0,
+            temperature: Some(0.0),
             redraws: 0,
             ..SamplingConfig::default()
         };

@@ -28,7 +28,7 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     add_some(plan, extent, n_parks, add_car_park, rng);
     allow_parking(plan, rng);
     // Traffic is faster on wide roads than their plain plans have it.
-    let haste = rng.random_range(1.1..1.45);
+    let haste = rng.random_range(1.2..1.75);
     for road in plan.roads.iter_mut().filter(|road| road.forward > 1) {
         road.speed_limit *= haste;
     }

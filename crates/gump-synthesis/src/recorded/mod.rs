@@ -6,6 +6,7 @@
 
 mod dress;
 mod driveways;
+mod manoeuvres;
 mod scenery;
 
 use std::ops::RangeInclusive;
@@ -98,6 +99,8 @@ pub(crate) fn draw_scenario(
     if !recording.part_bodies() {
         return None;
     }
+    let mut parking_rng = seed.fork(attempt).fork(2).rng();
+    manoeuvres::add(&mut recording, &network, config.dt, &mut parking_rng);
     let ego = choose_ego(&recording, config.now(), &mut rng)?;
     let placement = draw_placement(&mut rng);
     let mut route = route(&network, ego, &traffic, &placement);
@@ -193,7 +196,9 @@ fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option
     let suits = |track: &&Track| {
         let body = track.body;
         let near = |pose: gump_geometry::Pose| pose.position.length() < EGO_REACH;
-        body.is_mobile
+        // Who leaves a parking place has no lane.
+        !track.places().is_empty()
+            && body.is_mobile
             && body.kind == AgentKind::Vehicle
             && body.size[0] < 6.0
             && track.is_complete()

@@ -93,7 +93,7 @@ impl Knob {
         };
         match self {
             Self::Temperature => [0.3, 0.5, 0.7, 0.9, 1.1, 1.3]
-                .map(|t| with(t, &|config| config.temperature = t))
+                .map(|t| with(t, &|config| config.temperature = Some(t)))
                 .into(),
             Self::Decay => [0.0, 0.3, 0.6, 0.9, 1.2, 1.5]
                 .map(|decay| with(decay, &|config| config.decay = decay))
@@ -280,7 +280,7 @@ mod tests {
         let settings = Knob::Temperature.settings(&base);
         assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
         for (_, at, decoding) in settings {
-            assert_eq!(decoding.sampling.temperature, at);
+            assert_eq!(decoding.sampling.temperature, Some(at));
             let back = decoding.turned(|turned| turned.temperature = config.temperature);
             assert_eq!(back, base);
         }

@@ -81,7 +81,7 @@ impl Args {
         let mut demo = Demo {
             scenario: find(&name)?,
             sampling: SamplingConfig {
-                temperature: TEMPERATURE,
+                temperature: Some(TEMPERATURE),
                 ..SamplingConfig::default()
             },
             page: Page::new("gump: one scene, many futures"),

@@ -1,0 +1,166 @@
+//! Vehicles that leave a car park or a driveway, or come in: slowly, often backwards, on no lane.
+//!
+//! Traffic follows lanes, so these are laid into what was recorded of it: a parked vehicle gets a
+//! path out of its place, or the same path backwards in time, if that stays clear of everybody all
+//! the while. Nobody reacts to them, and they keep off the roads.
+
+use gump_geometry::{DVec2, OrientedBox, Pose, wrap_angle};
+use gump_scene::{AgentKind, Rng};
+use rand::Rng as _;
+
+use crate::network::Network;
+use crate::record::Recording;
+use crate::traffic::Body;
+
+/// Vehicles that move so in a scene, at most.
+const MOST: usize = 5;
+/// Parked vehicles that are tried, and paths for each.
+const TRIED: usize = 40;
+const PATHS: usize = 5;
+/// Only vehicles this near to the centre of the scene are tried, metres.
+const REACH_M: f64 = 70.0;
+/// From the centre of a lane of a road, metres; those of car parks may be driven on.
+const OFF_ROAD_M: f64 = 3.4;
+/// Lanes with a lower limit are those of car parks, m/s.
+const CAR_PARK_SPEED: f64 = 6.0;
+/// Room that is kept to what stands and to what moves, metres.
+const ROOM_M: [f64; 2] = [0.15, 0.8];
+/// From the middle of a vehicle to its rear axle, as a share of its length.
+const REAR_AXLE: f64 = 0.28;
+/// Tightest turn, 1/m.
+const CURVATURE: f64 = 0.2;
+
+/// Lets some parked vehicles leave or arrive.
+pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &mut Rng) {
+    let wanted = (rng.random_range(0.0_f64..1.0).powi(2) * (MOST as f64 + 0.99)) as usize;
+    if wanted == 0 {
+        return;
+    }
+    let parked = recording.tracks().filter(|track| {
+        let near = |pose: Pose| pose.position.length() < REACH_M;
+        let body = &track.body;
+        body.kind == AgentKind::Vehicle && !body.is_mobile && track.pose(0).is_some_and(near)
+    });
+    let mut parked: Vec<Body> = parked.map(|track| track.body).collect();
+    let mut left = wanted;
+    for _ in 0..TRIED.min(parked.len()) {
+        let body = parked.swap_remove(rng.random_range(0..parked.len()));
+        let (id, size) = (body.id, [body.size[0], body.size[1]]);
+        for _ in 0..PATHS {
+            let poses = path(body.pose, size[0], recording.n_snapshots(), dt, rng);
+            let stays_off = poses
+                .iter()
+                .step_by(5)
+                .all(|pose| is_off_road(network, *pose));
+            if stays_off && is_clear(recording, id, size, &poses) {
+                recording.move_along(id, poses);
+                left -= 1;
+                break;
+            }
+        }
+        if left == 0 {
+            return;
+        }
+    }
+}
+
+/// Poses of a vehicle that leaves `parked`, or comes to stand there, one per snapshot.
+fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose> {
+    let axle = REAR_AXLE * length;
+    let mut rear = parked * Pose::new(-axle, 0.0, 0.0);
+    let centre = |rear: Pose| rear * Pose::new(axle, 0.0, 0.0);
+    let backs_out = rng.random_bool(0.65);
+    let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+    // First out of the place, then on its way.
+    let first_gear = if backs_out { -1.0 } else { 1.0 };
+    let first_metres = rng.random_range(4.0..8.5);
+    let first_speed: f64 = rng.random_range(0.8..2.2);
+    let straight = rng.random_range(0.5..3.0);
+    let first_turn = side * rng.random_range(0.08..CURVATURE);
+    let mut second_turn = -side * first_gear * rng.random_range(-0.05..CURVATURE);
+    let second_speed = rng.random_range(2.0..5.5);
+    let pause = rng.random_range(0.3..1.6);
+    let haste = rng.random_range(0.5..1.3);
+    let starts = rng.random_range(-0.6..0.85) * n as f64 * dt;
+    let (mut driven, mut speed, mut paused, mut turn) = (0.0_f64, 0.0_f64, 0.0, 0.0_f64);
+    let mut poses = Vec::with_capacity(n);
+    let before = ((-starts).max(0.0) / dt) as usize;
+    for step in 0..n + before {
+        if step >= before {
+            poses.push(centre(rear));
+        }
+        if (step as f64 - before as f64) * dt < starts {
+            continue;
+        }
+        let leaving = driven < first_metres;
+        let (gear, wanted, aim) = if leaving {
+            let left = first_metres - driven;
+            // It stops at the end of the first part if it has to change gear.
+            let stops = if backs_out {
+                (1.6 * left).sqrt() + 0.05
+            } else {
+                f64::INFINITY
+            };
+            let aim = if driven < straight { 0.0 } else { first_turn };
+            (first_gear, first_speed.min(stops), aim)
+        } else {
+            if backs_out && paused < pause {
+                (paused, speed) = (paused + dt, 0.0);
+                continue;
+            }
+            second_turn *= 1.0 - 0.25 * dt;
+            second_turn += rng.random_range(-0.06..0.06) * dt.sqrt();
+            second_turn = second_turn.clamp(-CURVATURE, CURVATURE);
+            (1.0, second_speed, second_turn)
+        };
+        speed += (wanted - speed).clamp(-2.0 * dt, haste * dt);
+        turn += (aim - turn).clamp(-0.15 * dt, 0.15 * dt);
+        let metres = speed * dt;
+        driven += metres;
+        let bent = turn * gear * metres;
+        let middle = rear.heading + bent / 2.0;
+        rear = Pose {
+            position: rear.position + DVec2::from_angle(middle) * (gear * metres),
+            heading: wrap_angle(rear.heading + bent),
+        };
+    }
+    if rng.random_bool(0.45) {
+        poses.reverse();
+    }
+    poses
+}
+
+fn is_off_road(network: &Network, pose: Pose) -> bool {
+    network.lanes.iter().all(|lane| {
+        let is_road = lane.speed_limit >= CAR_PARK_SPEED;
+        let foot = |p: DVec2| lane.track.pose_at(lane.track.project(p)).position;
+        !is_road || foot(pose.position).distance(pose.position) > OFF_ROAD_M
+    })
+}
+
+/// True if a vehicle on this path touches nobody.
+fn is_clear(recording: &Recording, id: i64, [length, width]: [f64; 2], poses: &[Pose]) -> bool {
+    let others = recording.tracks().filter(|track| track.body.id != id);
+    others.into_iter().all(|other| {
+        let [l, w, _] = other.body.size;
+        let room = ROOM_M[usize::from(other.body.is_mobile)];
+        let own = |pose: Pose| OrientedBox {
+            pose,
+            length: length + 2.0 * room,
+            width: width + 2.0 * room,
+        };
+        let near = length.hypot(width) / 2.0 + 2.0 * room + l.hypot(w) / 2.0;
+        poses.iter().enumerate().all(|(i, &pose)| {
+            let at = other.pose_at_snapshot(i);
+            at.filter(|at| at.position.distance(pose.position) < near)
+                .is_none_or(|at| {
+                    let theirs = OrientedBox {
+                        pose: at,
+                        length: l,
+                        width: w,
+                    };
+                    !own(pose).overlaps(&theirs)
+                })
+        })
+    })
+}
