@@ -139,6 +139,22 @@ pub fn read_rollouts(path: &Path) -> Result<Vec<ScenarioRollouts>, DataError> {
     Ok(vec![one])
 }
 
+/// Decodes the bytes of a `ScenarioRollouts` message.
+///
+/// # Errors
+/// [`Problem::Message`].
+pub fn decode_rollouts(bytes: &[u8]) -> Result<ScenarioRollouts, Problem> {
+    ScenarioRollouts::decode(bytes).map_err(|source| Problem::Message {
+        message: "waymo.open_dataset.ScenarioRollouts",
+        source,
+    })
+}
+
+/// Encodes a `ScenarioRollouts` message; the inverse of [`decode_rollouts`].
+pub fn encode_rollouts(message: &ScenarioRollouts) -> Vec<u8> {
+    message.encode_to_vec()
+}
+
 /// Turns a message into rollouts of `scenario`: its history, then one frame per step.
 ///
 /// Sizes and kinds are those at the present, velocities are differences of positions, headings
