@@ -36,10 +36,6 @@ pub(crate) fn runtime(error: impl Display) -> PyErr {
 }
 
 /// A message that is none.
-#[allow(
-    clippy::needless_pass_by_value,
-    reason = "the form that map_err passes errors in"
-)]
 pub(crate) fn data_problem(problem: gump_data::Problem) -> PyErr {
     DataError::new_err(problem.to_string())
 }

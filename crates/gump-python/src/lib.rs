@@ -6,6 +6,11 @@
 //!
 //! Start with `scenario`, then `wosac`. What users read is in `python/gump`.
 
+#![allow(
+    clippy::needless_pass_by_value,
+    reason = "PyO3 hands arguments over by value, and map_err errors"
+)]
+
 mod arrays;
 mod env;
 mod errors;

@@ -1,13 +1,14 @@
 //! A recorded scenario as Python sees it.
 
+use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
 
 use gump_metrics::wosac::{Log, WosacError};
-use gump_scene::AgentId;
-use numpy::PyArray1;
+use gump_scene::{AgentId, Frame};
+use numpy::{PyArray1, PyArrayDyn};
 use pyo3::prelude::*;
 
-use crate::arrays::array;
+use crate::arrays::{Numbers, array};
 use crate::errors;
 use crate::scenario_arrays as convert;
 
@@ -161,6 +162,44 @@ impl Scenario {
             }
         }
         Ok(array(py, [ids.len(), frames.len(), 4], numbers)?.into_any())
+    }
+
+    /// The same scenario with these agents and nobody else, int64 `[A]`; others are no targets
+    /// either.
+    fn only(&self, agent_id: &Bound<'_, PyArrayDyn<i64>>) -> PyResult<Self> {
+        let ids = Numbers::new("agent_id", agent_id, &["A"])?;
+        let kept: BTreeSet<AgentId> = ids.slice()?.iter().map(|&id| AgentId(id)).collect();
+        let inner = self.inner();
+        if !kept.contains(&inner.ego) {
+            let (id, ego) = (&inner.id, inner.ego);
+            return Err(errors::value(format!(
+                "scenario {id}: expected agent_id to name the ego, {ego}, found it left out"
+            )));
+        }
+        let frame = |frame: &Frame| {
+            let agents = frame
+                .agents()
+                .iter()
+                .filter(|agent| kept.contains(&agent.id));
+            Frame::new(agents.copied().collect(), frame.lights().to_vec())
+        };
+        let is_kept = |id: &AgentId| kept.contains(id);
+        let scenario = gump_scene::Scenario {
+            log: inner.log.iter().map(frame).collect(),
+            targets: inner.targets.iter().copied().filter(is_kept).collect(),
+            ..inner.clone()
+        };
+        let log = self.scene.log().ok().map(|log| Log {
+            tracks: log
+                .tracks
+                .iter()
+                .filter(|t| is_kept(&t.id))
+                .cloned()
+                .collect(),
+            targets: log.targets.iter().copied().filter(is_kept).collect(),
+            ..log.clone()
+        });
+        Ok(Self::new(Scene::with_log(scenario, log)))
     }
 
     /// Writes it as a Waymo record (`.tfrecord`), which every reader of that format reads.

@@ -270,10 +270,6 @@ fn start(scene: &Scene, n_futures: usize, seed: Seed) -> Start<'_> {
 }
 
 /// Arguments that a world refuses.
-#[allow(
-    clippy::needless_pass_by_value,
-    reason = "the form that map_err passes errors in"
-)]
 fn refusal(error: gump_rollout::BoxError) -> PyErr {
     errors::value(error)
 }

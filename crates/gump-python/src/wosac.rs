@@ -19,11 +19,21 @@ use crate::scenario::{Scenario, Scene};
 use crate::threads;
 use crate::waymo;
 
-/// The settings of a year, read once.
-fn config(year: &str) -> PyResult<&'static Config> {
-    static CONFIGS: [OnceLock<Config>; Year::ALL.len()] = [const { OnceLock::new() }; 5];
+/// The settings of a year, read once, or settings of one's own: TOML, which has more than one line.
+fn config(year: &str) -> PyResult<Arc<Config>> {
+    static CONFIGS: [OnceLock<Arc<Config>>; Year::ALL.len()] = [const { OnceLock::new() }; 5];
+    if year.contains('\n') {
+        let config = Config::parse(year).map_err(|why| {
+            let why = why.trim().replace('\n', " ");
+            errors::value(format!("settings: {why}"))
+        })?;
+        return Ok(Arc::new(config));
+    }
     match Year::ALL.iter().position(|y| y.name() == year) {
-        Some(i) => Ok(CONFIGS[i].get_or_init(|| Config::of(Year::ALL[i]))),
+        Some(i) => {
+            let config = CONFIGS[i].get_or_init(|| Arc::new(Config::of(Year::ALL[i])));
+            Ok(Arc::clone(config))
+        }
         None => {
             let names = Year::ALL.map(Year::name).join(", ");
             Err(errors::value(format!(
@@ -323,7 +333,7 @@ pub(crate) fn wosac_score<'py>(
     let scene = &scenario.scene;
     let found = threads::work(py, || {
         let rollouts = arrays.rollouts(&scene.scenario.id, n_steps(config.mode).0);
-        evaluate(scene.log()?, &rollouts, config, wanted)
+        evaluate(scene.log()?, &rollouts, &config, wanted)
     })?;
     found.map_err(errors::value)?.tell(py, &scene.scenario.id)
 }
@@ -356,7 +366,7 @@ pub(crate) fn wosac_score_many<'py>(
         let pairs = scenes.par_iter().zip(&arrays);
         let each = pairs.map(|(scene, arrays)| {
             let rollouts = arrays.rollouts(&scene.scenario.id, n_steps(config.mode).0);
-            evaluate(scene.log()?, &rollouts, config, SCORES_ALONE)
+            evaluate(scene.log()?, &rollouts, &config, SCORES_ALONE)
         });
         each.collect::<Vec<Result<Found, WosacError>>>()
     })?;
@@ -437,7 +447,7 @@ pub(crate) fn wosac_score_catk<'py>(
             let future = |rollout| agents.iter().map(|&a| drive(a, rollout)).collect();
             let futures = (0..n_rollouts).into_par_iter().map(future);
             let rollouts = Rollouts::new(scene.scenario.id.clone(), futures.collect());
-            evaluate(scene.log()?, &rollouts, config, SCORES_ALONE)
+            evaluate(scene.log()?, &rollouts, &config, SCORES_ALONE)
         });
         each.collect::<Vec<_>>()
     })?;
@@ -468,7 +478,7 @@ pub(crate) fn wosac_score_message<'py>(
     };
     let found = threads::work(py, || {
         let rollouts = waymo::rollouts(&message, config.mode);
-        evaluate(scene.log()?, &rollouts, config, wanted)
+        evaluate(scene.log()?, &rollouts, &config, wanted)
     })?;
     found.map_err(errors::value)?.tell(py, &scene.scenario.id)
 }

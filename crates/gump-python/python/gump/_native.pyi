@@ -63,6 +63,9 @@ class Scenario:
         the frames after the present, NaN where an agent is absent."""
     def __len__(self) -> int:
         """Frames, past and future."""
+    def only(self, agent_id: NDArray[np.int64]) -> "Scenario":
+        """The same scenario with these agents and nobody else, int64 [A]; others are no targets
+        either. Raises `ValueError` if the ego is left out."""
     def save(self, path: Union[str, PathLike[str]]) -> None:
         """Writes it as a Waymo record (`.tfrecord`)."""
 

@@ -15,7 +15,15 @@ import numpy as np
 
 from . import _arrays, _native
 
-Year = Union[int, str]
+
+class Settings(NamedTuple):
+    """Settings of one's own in place of a year's."""
+
+    toml: str
+    """In the form of the files in `crates/gump-metrics/src/wosac/configs`."""
+
+
+Year = Union[int, str, Settings]
 
 YEARS = ("2023-v0", "2023", "2024", "2025", "2025-generation")
 
@@ -164,7 +172,7 @@ def score(
         _scenario(scenario),
         _arrays.ids(agent_id),
         _arrays.numbers(states, "states"),
-        str(year),
+        _year(year),
         leave_one_out,
         per_agent,
         explain,
@@ -186,7 +194,7 @@ def score_many(
         [_scenario(scenario) for scenario in scenarios],
         [_arrays.ids(one) for one in agent_id],
         [_arrays.numbers(one, "states") for one in states],
-        str(year),
+        _year(year),
     )
     return [_scores(one) for one in told]
 
@@ -213,7 +221,7 @@ def score_batch(
         _arrays.numbers(position, "position"),
         _arrays.numbers(z, "z"),
         _arrays.numbers(heading, "heading"),
-        str(year),
+        _year(year),
     )
     return [_scores(one) for one in told]
 
@@ -229,7 +237,7 @@ def score_message(
     """Scores a serialized `waymo.open_dataset.ScenarioRollouts` message. Raises as `score`, and
     `DataError` for bytes that are no such message."""
     told = _native.wosac_score_message(
-        _scenario(scenario), bytes(message), str(year), leave_one_out, per_agent, explain
+        _scenario(scenario), bytes(message), _year(year), leave_one_out, per_agent, explain
     )
     return _scores(told)
 
@@ -280,7 +288,11 @@ def mean(scores: Sequence[Scores]) -> Scores:
 
 def weights(year: Year = 2025) -> Dict[str, float]:
     """What each likelihood weighs in a year's meta metric, by the names of `Scores`."""
-    return _native.wosac_weights(str(year))
+    return _native.wosac_weights(_year(year))
+
+
+def _year(year: Year) -> str:
+    return year.toml + "\n" if isinstance(year, Settings) else str(year)
 
 
 def _scenario(value: Any) -> _native.Scenario:
