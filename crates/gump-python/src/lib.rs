@@ -40,7 +40,7 @@ mod native {
     #[pymodule_export]
     use super::generate::generate;
     #[pymodule_export]
-    use super::messages::{rollouts_from_message, rollouts_to_message};
+    use super::messages::{rollouts_from_file, rollouts_from_message, rollouts_to_message};
     #[pymodule_export]
     use super::motion::Tally;
     #[pymodule_export]

@@ -1,6 +1,8 @@
 //! Waymo's `ScenarioRollouts` as arrays and back.
 
-use gump_data::submission::{decode_rollouts, encode_rollouts};
+use std::path::PathBuf;
+
+use gump_data::submission::{decode_rollouts, encode_rollouts, read_rollouts};
 use gump_data::womd::proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
@@ -9,14 +11,35 @@ use pyo3::types::PyBytes;
 use crate::arrays::{Numbers, array};
 use crate::errors;
 
-/// The scenario's id, int64 `[A]` and float32 `[R, A, T, 4]` of a serialized message; agents in the
-/// order of the first rollout.
+/// A scenario's id, int64 `[A]` and float32 `[R, A, T, 4]`.
+type RolloutArrays<'py> = (String, Bound<'py, PyAny>, Bound<'py, PyAny>);
+
+/// The arrays of a serialized message; agents in the order of the first rollout.
 #[pyfunction]
 pub(crate) fn rollouts_from_message<'py>(
     py: Python<'py>,
     message: &[u8],
-) -> PyResult<(String, Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+) -> PyResult<RolloutArrays<'py>> {
     let message = decode_rollouts(message).map_err(errors::data_problem)?;
+    arrays_of(py, &message)
+}
+
+/// The arrays of every scenario in a file of messages, of a submission or of arrays.
+#[pyfunction]
+pub(crate) fn rollouts_from_file<'py>(
+    py: Python<'py>,
+    path: PathBuf,
+) -> PyResult<Vec<RolloutArrays<'py>>> {
+    let messages = py.detach(|| read_rollouts(&path));
+    let messages = messages.map_err(|error| errors::data(&error))?;
+    messages
+        .iter()
+        .map(|message| arrays_of(py, message))
+        .collect()
+}
+
+/// Heights that are not stated are NaN.
+fn arrays_of<'py>(py: Python<'py>, message: &ScenarioRollouts) -> PyResult<RolloutArrays<'py>> {
     let first = message.joint_scenes.first();
     let first = first.map_or(&[][..], |scene| &scene.simulated_trajectories);
     let ids: Vec<i32> = first.iter().map(SimulatedTrajectory::object_id).collect();
@@ -42,13 +65,21 @@ pub(crate) fn rollouts_from_message<'py>(
                 &agent.center_z,
                 &agent.heading,
             ];
-            if let Some(column) = columns.iter().find(|column| column.len() != steps) {
+            let is_short = |column: &&&Vec<f32>| {
+                let is_open = std::ptr::eq(**column, &agent.center_z) && column.is_empty();
+                column.len() != steps && !is_open
+            };
+            if let Some(column) = columns.iter().find(is_short) {
                 let found = column.len();
                 return Err(errors::DataError::new_err(format!(
                     "rollout {r}: expected {steps} steps of agent {id}, found {found}"
                 )));
             }
-            states.extend((0..steps).flat_map(|step| columns.map(|column| column[step])));
+            let at = |column: &Vec<f32>, step: usize| column.get(step).copied();
+            states.extend(
+                (0..steps)
+                    .flat_map(|step| columns.map(|column| at(column, step).unwrap_or(f32::NAN))),
+            );
         }
     }
     let shape = [message.joint_scenes.len(), ids.len(), steps, 4];

@@ -9,6 +9,7 @@ rollouts; `score` takes any number of them.
 from __future__ import annotations
 
 import dataclasses
+import os
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Union
 
 import numpy as np
@@ -257,6 +258,22 @@ def read_rollouts(message: bytes) -> RolloutArrays:
     its first rollout. Raises `DataError` for bytes that are no such message, and for rollouts whose
     agents or steps differ."""
     return RolloutArrays(*_native.rollouts_from_message(bytes(message)))
+
+
+def open_rollouts(path: Union[str, "os.PathLike[str]"]) -> List[RolloutArrays]:
+    """The rollouts of every scenario in a file: a `ScenarioRollouts` message, a shard of a submission, or
+    arrays, as `evaluate wosac --rollouts` takes them:
+
+    - `.npz` with `scenario_id`, `agent_id` [A] and `states` [R, A, T, 4], as `numpy.savez` and
+      `numpy.savez_compressed` write it;
+    - `.npy` with the JSON beside it that says what its axes are (`futures.npy` of `simulate`);
+    - `.parquet`, the table `futures.parquet` of `simulate`.
+
+    An agent that is missing from some step on stays where it was last; one that is missing at first is left
+    out. Heights that are not stated are NaN. Raises `FileNotFoundError`, and `DataError` for what is none
+    of these.
+    """
+    return [RolloutArrays(*one) for one in _native.rollouts_from_file(os.fspath(path))]
 
 
 def write_rollouts(scenario_id: str, agent_id: Any, states: Any) -> bytes:
