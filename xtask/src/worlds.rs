@@ -113,14 +113,7 @@ impl World {
                     return Err(WrongArguments(wrong).into());
                 }
                 let network = relative::load(path, device)?;
-                let usual = RelativeSampling::default();
-                let sampling = RelativeSampling {
-                    temperature: sampling.temperature.unwrap_or(usual.temperature),
-                    redraws: sampling.redraws,
-                    limits: sampling.limits,
-                    precision: sampling.precision,
-                    ..usual
-                };
+                let sampling = RelativeSampling::from(sampling);
                 Self::Relative(Box::new(RelativeWorld::new(&network, sampling)?))
             }
             WorldName::Model(path) => {

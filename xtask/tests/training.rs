@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gump_model::checkpoint::{self, Precision};
+use gump_model::relative;
 use gump_model::train::ModelChoice;
 use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
 use gump_scene::Seed;
@@ -315,7 +316,13 @@ fn a_relative_network_trains_in_stages_and_goes_on_where_it_stopped() {
     let whole = place.results("r.toml --validation held-out", "whole");
     assert_eq!(whole["steps"], 4);
     assert!(whole["validation_realism"].is_f64());
-    let weights = |out: &str| fs::read(place.path(&format!("{out}/weights.safetensors"))).unwrap();
+    let weights = |out: &str| {
+        let path = place.path(&format!("{out}/weights.safetensors"));
+        let network = relative::load(&path, &Device::Cpu).unwrap();
+        let all = network.parameters().all();
+        all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+            .collect::<Vec<_>>()
+    };
 
     // The first stage alone, in two parts; then the rest.
     let first = RELATIVE.replace(

@@ -260,6 +260,14 @@ pub(crate) const MAX_COORDINATE: f64 = 1e8;
 /// Why a decoded record is not a usable scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Problem {
+    /// Bytes are not the message they should be.
+    #[error("expected a {message} message, found bytes that are none: {source}")]
+    Message {
+        /// The message's name.
+        message: &'static str,
+        /// What the decoder says.
+        source: prost::DecodeError,
+    },
     /// It has no map.
     #[error("expected a map, found no map feature")]
     NoMap,

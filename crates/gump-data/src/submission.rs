@@ -5,6 +5,7 @@
 //! Start with [`write_rollouts`] and [`read_rollouts`]; [`submission_problems`] knows the rules.
 
 mod archive;
+mod arrays;
 mod motion;
 mod shard;
 
@@ -111,12 +112,20 @@ fn trajectory(rollout: &Rollout, id: AgentId, object_id: i32) -> (SimulatedTraje
     (trajectory, n_held)
 }
 
-/// Reads a file of rollouts, plain or gzip: one `ScenarioRollouts` message or one shard of a
-/// submission.
+/// Reads a file of rollouts, plain or gzip: one `ScenarioRollouts` message, one shard of a
+/// submission, or arrays (`.npz`, `.npy` with the JSON beside it that says what its axes are,
+/// `.parquet` as [`crate::write_rollouts`] writes it). What a file is shows in its content.
+///
+/// In arrays an agent that is missing from some step on stays where it was last. Where they state no
+/// heights, the columns of heights are empty.
 ///
 /// # Errors
-/// [`DataError::Missing`], [`DataError::Empty`], [`DataError::Io`], [`DataError::Proto`].
+/// [`DataError::Missing`], [`DataError::Empty`], [`DataError::Io`], [`DataError::Proto`], and
+/// [`DataError::Table`] for other arrays.
 pub fn read_rollouts(path: &Path) -> Result<Vec<ScenarioRollouts>, DataError> {
+    if let Some(rollouts) = arrays::read(path)? {
+        return Ok(rollouts);
+    }
     let mut bytes = Vec::new();
     let mut content = stream::open(path)?;
     content
@@ -137,6 +146,22 @@ pub fn read_rollouts(path: &Path) -> Result<Vec<ScenarioRollouts>, DataError> {
         },
     })?;
     Ok(vec![one])
+}
+
+/// Decodes the bytes of a `ScenarioRollouts` message.
+///
+/// # Errors
+/// [`Problem::Message`].
+pub fn decode_rollouts(bytes: &[u8]) -> Result<ScenarioRollouts, Problem> {
+    ScenarioRollouts::decode(bytes).map_err(|source| Problem::Message {
+        message: "waymo.open_dataset.ScenarioRollouts",
+        source,
+    })
+}
+
+/// Encodes a `ScenarioRollouts` message; the inverse of [`decode_rollouts`].
+pub fn encode_rollouts(message: &ScenarioRollouts) -> Vec<u8> {
+    message.encode_to_vec()
 }
 
 /// Turns a message into rollouts of `scenario`: its history, then one frame per step.

@@ -9,7 +9,7 @@
 mod forecasting;
 mod map;
 mod sensor_log;
-mod table;
+pub(crate) mod table;
 
 use std::path::{Path, PathBuf};
 

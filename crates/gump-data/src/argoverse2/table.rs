@@ -20,18 +20,18 @@ const MAX_ROWS: usize = 5_000_000;
 const MAX_BYTES: u64 = 256 << 20;
 
 /// A whole table.
-pub(super) struct Table {
+pub(crate) struct Table {
     batches: Vec<RecordBatch>,
-    pub(super) n_rows: usize,
+    pub(crate) n_rows: usize,
 }
 
 /// Reads a Parquet file.
-pub(super) fn parquet(path: &Path) -> Result<Table, DataError> {
+pub(crate) fn parquet(path: &Path) -> Result<Table, DataError> {
     guarded(path, read_parquet)
 }
 
 /// Reads a Feather file (version 2, which is Arrow IPC).
-pub(super) fn feather(path: &Path) -> Result<Table, DataError> {
+pub(crate) fn feather(path: &Path) -> Result<Table, DataError> {
     guarded(path, read_feather)
 }
 
@@ -123,7 +123,7 @@ fn open(path: &Path) -> Result<File, DataError> {
         .len();
     if length > MAX_BYTES {
         return Err(DataError::TooLarge {
-            what: "an Argoverse 2 table",
+            what: "a table",
             limit: MAX_BYTES,
             path: path.into(),
         });
@@ -165,7 +165,7 @@ fn too_long(rows: i64, path: &Path) -> DataError {
 
 impl Table {
     /// A column of numbers; NaN where a value is missing.
-    pub(super) fn numbers(&self, name: &str, path: &Path) -> Result<Vec<f64>, DataError> {
+    pub(crate) fn numbers(&self, name: &str, path: &Path) -> Result<Vec<f64>, DataError> {
         self.column(name, "numbers", path, |column, values| {
             macro_rules! extend {
                 ($($variant:ident => $kind:ty),*) => {
@@ -187,7 +187,7 @@ impl Table {
     }
 
     /// A column of whole numbers; -1 where a value is missing.
-    pub(super) fn integers(&self, name: &str, path: &Path) -> Result<Vec<i64>, DataError> {
+    pub(crate) fn integers(&self, name: &str, path: &Path) -> Result<Vec<i64>, DataError> {
         self.column(name, "whole numbers", path, |column, values| {
             match column.data_type() {
                 DataType::Int64 => {
@@ -213,7 +213,7 @@ impl Table {
     }
 
     /// A column of yes and no; no where a value is missing.
-    pub(super) fn flags(&self, name: &str, path: &Path) -> Result<Vec<bool>, DataError> {
+    pub(crate) fn flags(&self, name: &str, path: &Path) -> Result<Vec<bool>, DataError> {
         self.column(name, "truth values", path, |column, values| {
             let flags = column.as_boolean_opt();
             values.extend(flags.into_iter().flatten().map(|v| v == Some(true)));
@@ -222,7 +222,7 @@ impl Table {
     }
 
     /// A column of text; empty where a value is missing.
-    pub(super) fn texts(&self, name: &str, path: &Path) -> Result<Vec<String>, DataError> {
+    pub(crate) fn texts(&self, name: &str, path: &Path) -> Result<Vec<String>, DataError> {
         self.column(name, "text", path, |column, values: &mut Vec<String>| {
             let owned = |text: Option<&str>| text.unwrap_or_default().to_owned();
             match column.data_type() {

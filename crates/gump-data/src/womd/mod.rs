@@ -14,7 +14,7 @@ use prost::Message;
 use crate::files::Format;
 use crate::open::{BoxedSource, Source};
 use crate::tfrecord::{self, TfRecordReader};
-use crate::{DataError, ReadOptions, ScenarioRecord};
+use crate::{DataError, Problem, ReadOptions, ScenarioRecord};
 
 pub use read::scenario_from_proto;
 pub use write::{scenario_to_proto, write_scenarios};
@@ -32,6 +32,18 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
         options,
         path: Arc::new(path.to_path_buf()),
     }))
+}
+
+/// Decodes the bytes of a `Scenario` message, for those who read more of it than
+/// [`scenario_from_proto`] keeps.
+///
+/// # Errors
+/// [`Problem::Message`].
+pub fn decode_scenario(bytes: &[u8]) -> Result<proto::Scenario, Problem> {
+    proto::Scenario::decode(bytes).map_err(|source| Problem::Message {
+        message: "waymo.open_dataset.Scenario",
+        source,
+    })
 }
 
 struct Scenarios {

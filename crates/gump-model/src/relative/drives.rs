@@ -33,6 +33,10 @@ pub struct RelativeDrives {
     pub share: f64,
     /// Draws per agent and step, of which the nearest to the log is taken.
     pub candidates: usize,
+    /// Where even the nearest draw is farther than this from the way back to the log, metres, an
+    /// agent moves along that way instead: a driver who stays at a light that has turned green says
+    /// nothing of how to catch up.
+    pub tolerance_m: f64,
     /// Divides the logits of the draws.
     pub temperature: f64,
     /// Steps after which the network drives as it is then.
@@ -44,6 +48,7 @@ impl Default for RelativeDrives {
         Self {
             share: 0.5,
             candidates: 4,
+            tolerance_m: 0.6,
             temperature: 1.0,
             refresh: 50,
         }
@@ -59,6 +64,9 @@ impl RelativeDrives {
         }
         if self.candidates == 0 || self.refresh == 0 {
             return fail("candidates and refresh must be at least 1");
+        }
+        if !self.tolerance_m.is_finite() || self.tolerance_m < 0.0 {
+            return fail("tolerance_m must be 0 or more");
         }
         if !self.temperature.is_finite() || self.temperature <= 0.0 {
             return fail("temperature must be above 0");
@@ -140,13 +148,18 @@ impl Driver {
                 .collect();
             let moves = self.draws(&hidden, here.len(), seed.fork(t as u64), &mut room);
             for (i, &a) in here.iter().enumerate() {
-                let Some(next) = tracks[a].states[t + 1] else {
+                let (Some(now), Some(next)) = (tracks[a].states[t], tracks[a].states[t + 1]) else {
                     continue;
                 };
                 let candidates = moves.iter().map(|of_draw| agents[i].pose * of_draw[i]);
                 let nearest =
                     candidates.min_by(|a, b| far(*a, next.logged).total_cmp(&far(*b, next.logged)));
-                let shown = nearest.expect("there is at least one candidate");
+                let nearest = nearest.expect("there is at least one candidate");
+                let wanted = now.way_back(&next);
+                let shown = match far(nearest, wanted) < self.config.tolerance_m {
+                    true => nearest,
+                    false => wanted,
+                };
                 tracks[a].states[t + 1] = Some(next.driven_to(shown));
             }
         }

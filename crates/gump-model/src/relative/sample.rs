@@ -138,6 +138,11 @@ pub(super) struct State {
 }
 
 impl State {
+    /// Where it should be half a second later, given where the log has it then.
+    pub(super) fn way_back(&self, next: &Self) -> Pose {
+        pushed(next.logged, self.off.then())
+    }
+
     /// The same, shown where it was driven to.
     pub(super) fn driven_to(self, shown: Pose) -> Self {
         let off = self.logged.inverse() * shown;
@@ -431,16 +436,16 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
 /// What agent `a` should say at frame `t`, if it is there at the next.
 fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     let states = &tracks[a].states;
-    let State { logged, off, .. } = states[t]?;
-    let next = (*states.get(t + 1)?)?.logged;
-    let moved = logged.inverse() * next;
+    let state = states[t]?;
+    let next = (*states.get(t + 1)?)?;
+    let moved = state.logged.inverse() * next.logged;
     let stops = moved.position.length() < STILL_M;
     let step = if stops {
         // Who is behind goes on to where the log stands, if that is on the way.
-        let left = (-off.ahead_m).clamp(0.0, BRAKING * own.step.position.x.max(0.0));
+        let left = (-state.off.ahead_m).clamp(0.0, BRAKING * own.step.position.x.max(0.0));
         Pose::new(left, 0.0, 0.0)
     } else {
-        own.pose.inverse() * pushed(next, off.then())
+        own.pose.inverse() * state.way_back(&next)
     };
     Some(Target {
         node: 0,

@@ -24,6 +24,7 @@ use crate::ModelError;
 use crate::ops::panels::Precision;
 use crate::outlook::{Outlook, Watch};
 use crate::sample::TOKEN_DT;
+use crate::sampling::SamplingConfig;
 use crate::surroundings::Survey;
 
 /// How far around the ego the map is laid out, metres.
@@ -59,6 +60,20 @@ impl Default for RelativeSampling {
             redraws: 0,
             limits: false,
             precision: Precision::F32,
+        }
+    }
+}
+
+impl From<&SamplingConfig> for RelativeSampling {
+    /// What of the settings this network knows.
+    fn from(config: &SamplingConfig) -> Self {
+        let usual = Self::default();
+        Self {
+            temperature: config.temperature.unwrap_or(usual.temperature),
+            redraws: config.redraws,
+            limits: config.limits,
+            precision: config.precision,
+            ..usual
         }
     }
 }

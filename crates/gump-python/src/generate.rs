@@ -1,0 +1,135 @@
+//! Scenes out of nothing, on the map of any scenario.
+
+use std::sync::Arc;
+
+use gump_model::generation::constraint::parse_constraints;
+use gump_model::generation::factory::{Made, Order, make_many};
+use gump_model::generation::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_scene::{ScenarioTag, Seed};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+
+use crate::errors;
+use crate::scenario::{Scenario, Scene};
+use crate::threads;
+use crate::world::{Kind, World};
+
+/// Scenes made together.
+const BATCH: u64 = 32;
+
+/// What is to be made; see `gump.generate`.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Wish {
+    prompts: Vec<String>,
+    vehicles: Option<usize>,
+    pedestrians: Option<usize>,
+    bicycles: Option<usize>,
+    objects: Option<String>,
+    count: u64,
+    seconds: f64,
+    anywhere: bool,
+    guided: bool,
+    attempts: usize,
+    seed: u64,
+}
+
+impl Wish {
+    fn order(&self, recorded: &gump_scene::Scenario) -> PyResult<Order> {
+        let tag = |name: &String| {
+            let tag = name.parse::<ScenarioTag>();
+            tag.map_err(|why| errors::value(format!("prompt: {why}")))
+        };
+        if !(0.0..=3600.0).contains(&self.seconds) {
+            let found = self.seconds;
+            return Err(errors::value(format!(
+                "seconds: expected a number from 0 to 3600, found {found}"
+            )));
+        }
+        let objects = match &self.objects {
+            Some(text) => parse_constraints(text)
+                .map_err(|error| errors::value(format!("objects: {error}")))?,
+            None => Vec::new(),
+        };
+        let counts = [self.vehicles, self.pedestrians, self.bicycles];
+        let present = recorded.present();
+        let ego = present.ego_now();
+        let agents = present.now().agents().iter();
+        Ok(Order {
+            request: GenerateRequest {
+                map: Arc::clone(&recorded.map),
+                ego: EgoStart {
+                    pose: ego.state.pose,
+                    length: ego.length,
+                    width: ego.width,
+                    velocity: None,
+                },
+                lights: present.now().lights().to_vec(),
+                fixtures: agents
+                    .filter(|agent| !agent.kind.is_moving())
+                    .copied()
+                    .collect(),
+                prompts: self.prompts.iter().map(tag).collect::<PyResult<_>>()?,
+                counts: counts.iter().any(Option::is_some).then(|| Counts {
+                    vehicles: self.vehicles.unwrap_or(0),
+                    pedestrians: self.pedestrians.unwrap_or(0),
+                    bicycles: self.bicycles.unwrap_or(0),
+                }),
+                objects,
+                config: GenerateConfig {
+                    placement: if self.guided {
+                        Placement::Guided
+                    } else {
+                        Placement::Free
+                    },
+                    ..GenerateConfig::default()
+                },
+            },
+            roams: self.anywhere,
+            seconds: self.seconds,
+            attempts: self.attempts,
+        })
+    }
+}
+
+/// Makes scenes; a list of dictionaries.
+#[pyfunction]
+pub(crate) fn generate<'py>(
+    py: Python<'py>,
+    world: &World,
+    scenario: &Scenario,
+    wish: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyList>> {
+    let wish: Wish = wish.extract()?;
+    let Kind::Transformer(model) = &world.kind else {
+        return Err(errors::value(
+            "world: expected a network that generates scenes, found one that does not",
+        ));
+    };
+    let order = wish.order(&scenario.scene.scenario)?;
+    let list = PyList::empty(py);
+    for first in (0..wish.count).step_by(BATCH as usize) {
+        py.check_signals()?;
+        let numbers = first..(first + BATCH).min(wish.count);
+        let made = threads::work(py, || make_many(model, &order, numbers, Seed(wish.seed)))?;
+        for made in made.map_err(errors::value)? {
+            list.append(told(py, made.map_err(errors::runtime)?)?)?;
+        }
+    }
+    Ok(list)
+}
+
+fn told(py: Python<'_>, made: Made) -> PyResult<Bound<'_, PyDict>> {
+    let told = PyDict::new(py);
+    told.set_item("holds", made.holds())?;
+    told.set_item("attempts", made.attempts)?;
+    told.set_item("is_steered", made.is_steered)?;
+    let clauses = made
+        .clauses
+        .iter()
+        .map(|clause| (&clause.clause, clause.holds));
+    told.set_item("clauses", clauses.collect::<Vec<_>>())?;
+    let scenario = Scenario::new(Scene::of(made.scenario));
+    told.set_item("scenario", Bound::new(py, scenario)?)?;
+    Ok(told)
+}

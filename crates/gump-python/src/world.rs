@@ -1,0 +1,446 @@
+//! Worlds by name, what they imagine, and sessions that go on step by step.
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gump_geometry::{Pose, dvec2};
+use gump_model::relative::{self, RelativeSampling, RelativeWorld};
+use gump_model::world::TransformerWorld;
+use gump_model::{Device, Mode, Precision, SamplingConfig, checkpoint};
+use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
+use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
+use gump_scene::{AgentId, AgentState, Frame, Rollout, Seed};
+use numpy::PyArrayDyn;
+use pyo3::prelude::*;
+
+use crate::arrays::{Numbers, array};
+use crate::errors;
+use crate::scenario::{Scenario, Scene};
+use crate::scenario_arrays::state;
+use crate::threads;
+
+/// What imagines.
+#[derive(Clone)]
+pub(crate) enum Kind {
+    /// What really happened: another world in every scenario.
+    Log,
+    /// Rules that look at no log.
+    Rules(Arc<dyn WorldModel>),
+    /// A network of the paper's kind, which also generates scenes.
+    Transformer(Arc<TransformerWorld>),
+    /// A network of another kind.
+    Network(Arc<dyn WorldModel>),
+}
+
+/// A world: imagines how traffic goes on.
+#[pyclass(frozen, module = "gump._native")]
+pub(crate) struct World {
+    name: String,
+    pub(crate) kind: Kind,
+    /// How its frames become those of the scene.
+    frames: SimulateConfig,
+}
+
+/// How a network draws, as far as it is not the default; see `gump.World`.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Sampling {
+    mode: String,
+    temperature: Option<f64>,
+    top_k: Option<usize>,
+    decay: Option<f64>,
+    redraws: Option<usize>,
+    limits: bool,
+    raw: bool,
+    paper: bool,
+    life: bool,
+    precision: String,
+}
+
+impl Sampling {
+    /// Error: a number out of its range, or ways of decoding that contradict each other.
+    fn resolve(&self) -> PyResult<SamplingConfig> {
+        let base = match (self.raw, self.paper) {
+            (true, true) => {
+                return Err(errors::value("expected raw or paper, found both"));
+            }
+            (_, true) => SamplingConfig::paper(),
+            (true, _) => SamplingConfig::raw(),
+            _ => SamplingConfig::default(),
+        };
+        let config = SamplingConfig {
+            mode: match self.mode.as_str() {
+                "partial-ar" => Mode::PartialAr,
+                "full-ar" => Mode::FullAr,
+                found => return Err(unknown("mode", "partial-ar or full-ar", found)),
+            },
+            precision: match self.precision.as_str() {
+                "f32" => Precision::F32,
+                "bf16" => Precision::Bf16,
+                "int8" => Precision::Int8,
+                found => return Err(unknown("precision", "f32, bf16 or int8", found)),
+            },
+            life: self.life,
+            temperature: self.temperature.or(base.temperature),
+            top_k: self.top_k.unwrap_or(base.top_k),
+            decay: self.decay.unwrap_or(base.decay),
+            redraws: self.redraws.unwrap_or(base.redraws),
+            limits: base.limits && self.limits,
+            ..base
+        };
+        let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
+        let wrong = if let Some(t) = config.temperature.filter(absurd) {
+            ("temperature", "a number above 0", t)
+        } else if config.top_k == 0 {
+            ("top_k", "at least 1", 0.0)
+        } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
+            ("decay", "0 or more", config.decay)
+        } else {
+            return Ok(config);
+        };
+        let (name, expected, found) = wrong;
+        Err(errors::value(format!(
+            "{name}: expected {expected}, found {found}"
+        )))
+    }
+}
+
+fn unknown(name: &str, expected: &str, found: &str) -> PyErr {
+    errors::value(format!("{name}: expected {expected}, found {found}"))
+}
+
+#[pymethods]
+impl World {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        name: &str,
+        weights: Option<PathBuf>,
+        sampling: &Bound<'_, PyAny>,
+    ) -> PyResult<Self> {
+        let sampling: Sampling = sampling.extract()?;
+        let config = sampling.resolve()?;
+        let kind = match (name, &weights) {
+            ("log", _) => Kind::Log,
+            ("idm", _) => Kind::Rules(Arc::new(Idm::default())),
+            ("constant-velocity", _) => Kind::Rules(Arc::new(ConstantVelocity)),
+            (_, Some(path)) => threads::work(py, || load(path, config))??,
+            (found, None) => {
+                let expected = "log, idm, constant-velocity, model or model:WEIGHTS";
+                return Err(unknown("world", expected, found));
+            }
+        };
+        let is_learned = matches!(kind, Kind::Transformer(_) | Kind::Network(_));
+        Ok(Self {
+            name: name.into(),
+            kind,
+            frames: if sampling.paper && is_learned {
+                SimulateConfig::compat()
+            } else {
+                SimulateConfig::default()
+            },
+        })
+    }
+
+    /// Its name, as it was asked for.
+    #[getter]
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Imagines `futures` of what comes after the present; float64 `[R, A, T, 4]`.
+    fn simulate<'py>(
+        &self,
+        py: Python<'py>,
+        scenario: &Scenario,
+        futures: usize,
+        seconds: f64,
+        seed: u64,
+        hold: bool,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let scene = &scenario.scene;
+        let config = SimulateConfig {
+            seconds,
+            ..self.frames.clone()
+        };
+        check_futures(futures)?;
+        let world = self.model(scene)?;
+        let ids: Vec<AgentId> = scene.present().collect();
+        let imagined = threads::work(py, || {
+            let starts = [start(scene, futures, Seed(seed))];
+            let rollouts = simulate(&*world, &starts, None, &config)?;
+            let steps = rollouts.first().map_or(0, Rollout::steps);
+            Ok::<_, gump_rollout::BoxError>((steps, numbers(&rollouts, &ids, hold)))
+        })?;
+        let (steps, numbers) = imagined.map_err(refusal)?;
+        Ok(array(py, [futures, ids.len(), steps, 4], numbers)?.into_any())
+    }
+
+    /// Opens a session that goes on step by step.
+    fn start(
+        &self,
+        py: Python<'_>,
+        scenario: &Scenario,
+        futures: usize,
+        seed: u64,
+    ) -> PyResult<Session> {
+        check_futures(futures)?;
+        let world = self.model(&scenario.scene)?;
+        Session::open(py, world, Arc::clone(&scenario.scene), futures, Seed(seed))
+    }
+}
+
+impl World {
+    /// Whether it was asked for by this name.
+    pub(crate) fn name_is(&self, name: &str) -> bool {
+        self.name == name
+    }
+
+    /// The world of a scenario.
+    ///
+    /// Error: a map without lanes for a world that follows them.
+    pub(crate) fn model(&self, scene: &Scene) -> PyResult<Arc<dyn WorldModel>> {
+        let scenario = &scene.scenario;
+        let follows_lanes =
+            self.name == "idm" || matches!(self.kind, Kind::Transformer(_) | Kind::Network(_));
+        if follows_lanes && scenario.map.lanes().is_empty() {
+            return Err(errors::value(format!(
+                "scenario {}: expected a map with lanes to drive on, found none",
+                scenario.id
+            )));
+        }
+        Ok(match &self.kind {
+            Kind::Log => Arc::new(LogReplay::new(scenario)),
+            kind => kind
+                .model()
+                .expect("every world but the log is one for all scenarios"),
+        })
+    }
+}
+
+impl Kind {
+    /// What imagines in every scenario; `None` of the log.
+    pub(crate) fn model(&self) -> Option<Arc<dyn WorldModel>> {
+        match self {
+            Self::Log => None,
+            Self::Rules(world) | Self::Network(world) => Some(Arc::clone(world)),
+            Self::Transformer(world) => Some(Arc::<TransformerWorld>::clone(world)),
+        }
+    }
+}
+
+/// Reads weights, whatever network they are of.
+fn load(path: &Path, config: SamplingConfig) -> PyResult<Kind> {
+    if !path.exists() {
+        return Err(pyo3::exceptions::PyFileNotFoundError::new_err(format!(
+            "expected weights, found no file: {}",
+            path.display()
+        )));
+    }
+    let damaged = |error: gump_model::ModelError| errors::DataError::new_err(error.to_string());
+    if relative::is_relative(path).map_err(damaged)? {
+        let network = relative::load(path, &Device::Cpu).map_err(damaged)?;
+        let world =
+            RelativeWorld::new(&network, RelativeSampling::from(&config)).map_err(damaged)?;
+        return Ok(Kind::Network(Arc::new(world)));
+    }
+    let network = checkpoint::load(path, &Device::Cpu).map_err(damaged)?;
+    let world = TransformerWorld::new(network, config);
+    Ok(Kind::Transformer(Arc::new(world)))
+}
+
+fn check_futures(futures: usize) -> PyResult<()> {
+    if futures == 0 {
+        return Err(errors::value("futures: expected at least 1, found 0"));
+    }
+    Ok(())
+}
+
+/// The present without the route, which comes from what is to be imagined.
+fn start(scene: &Scene, n_futures: usize, seed: Seed) -> Start<'_> {
+    Start {
+        scene: scene.scenario.present().unguided(),
+        n_futures,
+        seed,
+    }
+}
+
+/// Arguments that a world refuses.
+fn refusal(error: gump_rollout::BoxError) -> PyErr {
+    errors::value(error)
+}
+
+/// States `[R, A, T, 4]`; an agent that a world removes stays where it was last, or is NaN.
+fn numbers(rollouts: &[Rollout], ids: &[AgentId], hold: bool) -> Vec<f64> {
+    let mut numbers = Vec::new();
+    for rollout in rollouts {
+        for &id in ids {
+            let mut last = rollout.start().agent(id).map_or([f64::NAN; 4], state);
+            for frame in rollout.imagined() {
+                let now = frame.agent(id).map(state);
+                match now {
+                    Some(now) => last = now,
+                    None if hold => {}
+                    None => last = [f64::NAN; 4],
+                }
+                numbers.extend(last);
+            }
+        }
+    }
+    numbers
+}
+
+/// Asks a session to go on; the ego's next states, if it is driven.
+struct Ask {
+    ego: Option<Vec<AgentState>>,
+    answer: Sender<Result<Vec<Frame>, String>>,
+}
+
+/// Futures in progress, a step of the world at a time.
+#[pyclass(frozen, module = "gump._native")]
+pub(crate) struct Session {
+    asks: Mutex<Option<Sender<Ask>>>,
+    process: u32,
+    ids: Vec<AgentId>,
+    futures: usize,
+    dt: f64,
+}
+
+impl Session {
+    fn open(
+        py: Python<'_>,
+        world: Arc<dyn WorldModel>,
+        scene: Arc<Scene>,
+        futures: usize,
+        seed: Seed,
+    ) -> PyResult<Self> {
+        let ids = scene.present().collect();
+        let (tell, told) = channel();
+        let (asks, asked) = channel();
+        threads::alone(move || serve(&*world, &scene, futures, seed, &tell, &asked))?;
+        let dt = py.detach(move || told.recv()).map_err(|_| gone())?;
+        Ok(Self {
+            asks: Mutex::new(Some(asks)),
+            process: std::process::id(),
+            ids,
+            futures,
+            dt: dt.map_err(errors::value)?,
+        })
+    }
+}
+
+/// Opens a session, tells its time step, and goes on whenever asked.
+fn serve(
+    world: &dyn WorldModel,
+    scene: &Scene,
+    futures: usize,
+    seed: Seed,
+    tell: &Sender<Result<f64, String>>,
+    asked: &Receiver<Ask>,
+) {
+    let mut session = match world.open(&[start(scene, futures, seed)]) {
+        Ok(session) => session,
+        Err(error) => {
+            // Nobody is left to be told if this fails.
+            drop(tell.send(Err(error.to_string())));
+            return;
+        }
+    };
+    if tell.send(Ok(session.dt())).is_err() {
+        return;
+    }
+    while let Ok(ask) = asked.recv() {
+        let frames = session.step(ask.ego.as_deref());
+        if ask
+            .answer
+            .send(frames.map_err(|error| error.to_string()))
+            .is_err()
+        {
+            return;
+        }
+    }
+}
+
+fn gone() -> PyErr {
+    errors::runtime("expected a session in progress, found that it has failed")
+}
+
+#[pymethods]
+impl Session {
+    /// Seconds that a step takes.
+    #[getter]
+    fn dt(&self) -> f64 {
+        self.dt
+    }
+
+    /// Ids of the agents in the order of the states, int64 `[A]`.
+    #[getter]
+    fn agent_id<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let ids: Vec<i64> = self.ids.iter().map(|id| id.0).collect();
+        Ok(array(py, ids.len(), ids)?.into_any())
+    }
+
+    /// Imagines the next frame; float64 `[R, A, 6]`: x, y, z, heading and velocity, NaN where an
+    /// agent is absent. `ego` is float64 `[R, 5]`: its next x, y, heading and velocity.
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        ego: Option<&Bound<'py, PyArrayDyn<f64>>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let ego = ego.map(|ego| self.ego(ego)).transpose()?;
+        if self.process != std::process::id() {
+            let sentence =
+                "expected the process that started the session, found one forked from it";
+            return Err(errors::runtime(sentence));
+        }
+        let asks = {
+            let asks = self.asks.lock().unwrap_or_else(PoisonError::into_inner);
+            asks.clone()
+        };
+        let asks = asks.ok_or_else(|| {
+            errors::value("expected a session that is open, found one that was closed")
+        })?;
+        let frames = py.detach(|| {
+            let (answer, answered) = channel();
+            asks.send(Ask { ego, answer }).ok()?;
+            answered.recv().ok()
+        });
+        let frames = frames.ok_or_else(gone)?.map_err(errors::value)?;
+        let mut numbers = Vec::with_capacity(frames.len() * self.ids.len() * 6);
+        for frame in &frames {
+            for &id in &self.ids {
+                let agent = frame.agent(id);
+                numbers.extend(agent.map_or([f64::NAN; 4], state));
+                numbers.extend(agent.map_or([f64::NAN; 2], |a| a.state.velocity.to_array()));
+            }
+        }
+        Ok(array(py, [frames.len(), self.ids.len(), 6], numbers)?.into_any())
+    }
+
+    /// Lets the session go; `step` raises `ValueError` from then on.
+    fn close(&self) {
+        let mut asks = self.asks.lock().unwrap_or_else(PoisonError::into_inner);
+        *asks = None;
+    }
+}
+
+impl Session {
+    fn ego(&self, ego: &Bound<'_, PyArrayDyn<f64>>) -> PyResult<Vec<AgentState>> {
+        let ego = Numbers::new("ego", ego, &["R", "5"])?;
+        ego.expect(0, self.futures, "one per future")?;
+        ego.expect(1, 5, "x, y, heading and velocity")?;
+        let states = ego.slice()?.as_chunks::<5>().0.iter();
+        let state = |&[x, y, heading, vx, vy]: &[f64; 5]| AgentState {
+            pose: Pose::new(x, y, heading),
+            velocity: dvec2(vx, vy),
+        };
+        let states: Vec<AgentState> = states.map(state).collect();
+        match states.iter().position(|state| !state.is_finite()) {
+            Some(row) => Err(errors::value(format!(
+                "ego: expected numbers, found one that is none in row {row}"
+            ))),
+            None => Ok(states),
+        }
+    }
+}
