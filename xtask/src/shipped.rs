@@ -18,13 +18,24 @@ pub(crate) fn scenario() -> String {
     format!("{}#20", data().join("procedural.tfrecord.gz").display())
 }
 
-/// The shipped weights.
+/// The shipped weights of the sequence network, which generates scenes and says who comes and leaves.
 pub(crate) fn weights() -> PathBuf {
     from_here(&repository().join("datasets/weights/gump-tiny.safetensors"))
 }
 
+/// The shipped weights of the relative network, which drives whoever is there.
+pub(crate) fn traffic() -> PathBuf {
+    from_here(&repository().join("datasets/weights/gump-relative.safetensors"))
+}
+
 /// The shipped learned world.
 pub(crate) fn world() -> WorldName {
+    WorldName::Model(traffic())
+}
+
+/// The shipped learned world of the sequence network, in which everything about decoding can be
+/// turned.
+pub(crate) fn sequence_world() -> WorldName {
     WorldName::Model(weights())
 }
 
@@ -32,14 +43,16 @@ pub(crate) fn world() -> WorldName {
 ///
 /// Error: they are not.
 pub(crate) fn check_weights() -> anyhow::Result<()> {
-    let path = weights();
-    std::fs::metadata(&path).map(drop).with_context(|| {
-        format!(
-            "expected the shipped weights at {}; \
-             `cargo xtask train --data datasets/mini` makes others",
-            path.display()
-        )
-    })
+    for path in [weights(), traffic()] {
+        std::fs::metadata(&path).map(drop).with_context(|| {
+            format!(
+                "expected the shipped weights at {}; \
+                 `cargo xtask train --data datasets/mini` makes others",
+                path.display()
+            )
+        })?;
+    }
+    Ok(())
 }
 
 /// The path as seen from the working directory where that is shorter: reports stay the same

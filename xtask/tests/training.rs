@@ -334,8 +334,8 @@ fn a_relative_network_trains_in_stages_and_goes_on_where_it_stopped() {
         &first[..first.rfind("[[stage]]").unwrap()],
     )
     .unwrap();
-    place.results("part.toml", "parts");
-    let parts = place.results("r.toml --resume", "parts");
+    place.results("part.toml --validation held-out", "parts");
+    let parts = place.results("r.toml --resume --validation held-out", "parts");
     assert_eq!(parts["resumed"], true);
     assert!(weights("parts") == weights("whole"));
     assert_eq!(

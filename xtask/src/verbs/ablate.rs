@@ -76,7 +76,7 @@ impl Args {
         };
         let scenario = run.phase("read", |_| Ok(find(&name)?))?;
         run.setting("scenario", &name)?;
-        let world = self.world.clone().unwrap_or_else(shipped::world);
+        let world = self.world.clone().unwrap_or_else(shipped::sequence_world);
         if !matches!(world, WorldName::Model(_)) {
             let wrong = format!(
                 "--world: expected model:WEIGHTS, since rules decode nothing, found {world}"

@@ -136,7 +136,7 @@ impl Knob {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run, knob: Knob) -> anyhow::Result<()> {
-        let world = self.world.clone().unwrap_or_else(shipped::world);
+        let world = self.world.clone().unwrap_or_else(shipped::sequence_world);
         if !matches!(world, WorldName::Model(_)) {
             let wrong = format!("--world: expected model:WEIGHTS, found {world}");
             return Err(WrongArguments(wrong).into());

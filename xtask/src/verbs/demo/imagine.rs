@@ -1,7 +1,6 @@
 //! What comes of it: futures in every world, their metrics, and a plan.
 
 use gump_metrics::summarize;
-use gump_model::{checkpoint, world::TransformerWorld};
 use gump_planner::{Interactive, InteractiveConfig, Plan, Planner as _};
 use gump_scene::{Rollout, SceneState};
 use gump_viz::{Camera, CandidatePath, FilmSpec, overlay_film};
@@ -121,14 +120,13 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
 }
 
 pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
-    let network = checkpoint::load(&shipped::weights(), run.device())?;
-    let world = TransformerWorld::new(network, demo.sampling.clone());
+    let world = World::without_log(run.device(), &shipped::world(), &demo.sampling)?;
     let config = InteractiveConfig {
         n_futures: PLANNED,
         seed: run.seed(),
         ..InteractiveConfig::default()
     };
-    let plan = Interactive::new(&world, config)?.plan(&demo.scenario.present())?;
+    let plan = Interactive::new(world.model(), config)?.plan(&demo.scenario.present())?;
     demo.candidates = candidates(&plan, &demo.scenario.present());
     let table: Vec<_> = ranked(&plan)
         .into_iter()

@@ -32,10 +32,6 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// The shipped weights learned for an hour and are less sure than the paper's; at its temperature of
-/// 1.1 they collide more (docs/results/0001-tiny-weights.md).
-const TEMPERATURE: f64 = 0.7;
-
 /// What the stages share.
 struct Demo {
     scenario: Scenario,
@@ -80,10 +76,7 @@ impl Args {
         run.setting("scenario", &name)?;
         let mut demo = Demo {
             scenario: find(&name)?,
-            sampling: SamplingConfig {
-                temperature: Some(TEMPERATURE),
-                ..SamplingConfig::default()
-            },
+            sampling: SamplingConfig::default(),
             page: Page::new("gump: one scene, many futures"),
             futures: Vec::new(),
             candidates: Vec::new(),
