@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use gump_metrics::wosac::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
+use gump_model::relative::{self, RelativeWorld};
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
@@ -60,14 +61,47 @@ const FLOORS: [Floor; 2] = [
     },
 ];
 
+/// The same of the relative network: raw 0.859, 0.698, 0.838, 0.979 and 1.97 m, ruled 0.873, 0.699, 0.869,
+/// 0.979 and 1.97 m.
+const RELATIVE_FLOORS: [Floor; 2] = [
+    Floor {
+        name: "raw",
+        redraws: 0,
+        limits: false,
+        realism: 0.84,
+        kinematic: 0.675,
+        interactive: 0.815,
+        map_based: 0.96,
+        min_ade: 2.35,
+    },
+    Floor {
+        name: "ruled",
+        redraws: 12,
+        limits: true,
+        realism: 0.853,
+        kinematic: 0.675,
+        interactive: 0.845,
+        map_based: 0.96,
+        min_ade: 2.35,
+    },
+];
+
 fn datasets() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets")
 }
 
-/// The shipped weights with a way of drawing.
-fn shipped(sampling: SamplingConfig) -> TransformerWorld {
+/// The shipped sequence network with a way of drawing.
+fn sequence(sampling: &SamplingConfig) -> Box<dyn WorldModel> {
     let weights = datasets().join("weights/gump-tiny.safetensors");
-    TransformerWorld::new(checkpoint::load(&weights, &Device::Cpu).unwrap(), sampling)
+    let network = checkpoint::load(&weights, &Device::Cpu).unwrap();
+    Box::new(TransformerWorld::new(network, sampling.clone()))
+}
+
+/// The shipped relative network with a way of drawing.
+fn relative(sampling: &SamplingConfig) -> Box<dyn WorldModel> {
+    let weights = datasets().join("weights/gump-relative.safetensors");
+    let network = relative::load(&weights, &Device::Cpu).unwrap();
+    Box::new(RelativeWorld::new(&network, sampling.into()).unwrap())
 }
 
 /// Mean scores of a world.
@@ -89,20 +123,29 @@ fn scores(scenarios: &[Scenario], world: &dyn WorldModel) -> Scores {
 }
 
 #[test]
-fn shipped_weights_are_as_realistic_as_they_were() {
+fn the_sequence_network_is_as_realistic_as_it_was() {
+    holds(&FLOORS, sequence);
+}
+
+#[test]
+fn the_relative_network_is_as_realistic_as_it_was() {
+    holds(&RELATIVE_FLOORS, relative);
+}
+
+fn holds(floors: &[Floor], shipped: fn(&SamplingConfig) -> Box<dyn WorldModel>) {
     let scenarios = SCENES.map(|name| {
         let path = datasets().join("mini").join(name);
         gump_data::find(&path.display().to_string()).unwrap()
     });
     let straight_on = scores(&scenarios, &ConstantVelocity);
     let mut short = Vec::new();
-    for floor in FLOORS {
-        let world = shipped(SamplingConfig {
+    for floor in floors {
+        let world = shipped(&SamplingConfig {
             redraws: floor.redraws,
             limits: floor.limits,
             ..SamplingConfig::default()
         });
-        let found = scores(&scenarios, &world);
+        let found = scores(&scenarios, &*world);
         let name = floor.name;
         assert!(
             straight_on.metametric < floor.realism && straight_on.min_ade > floor.min_ade,
