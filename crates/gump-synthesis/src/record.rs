@@ -68,12 +68,31 @@ impl Recording {
     }
 
     /// Lets a body that stood move through these poses, one per snapshot.
-    pub(crate) fn move_along(&mut self, id: i64, poses: Vec<Pose>) {
+    pub(crate) fn move_along(&mut self, id: i64, poses: Vec<Option<Pose>>) {
         debug_assert_eq!(poses.len(), self.n_snapshots());
         if let Some(track) = self.tracks.get_mut(&id) {
             track.body.is_mobile = true;
-            track.poses = poses.into_iter().map(Some).collect();
+            track.poses = poses;
         }
+    }
+
+    /// An id that nobody has.
+    pub(crate) fn new_id(&self) -> i64 {
+        self.tracks.keys().next_back().map_or(0, |last| last + 1)
+    }
+
+    /// Adds a body with its poses, one per snapshot while it is there.
+    pub(crate) fn add(&mut self, body: Body, poses: Vec<Option<Pose>>) {
+        debug_assert_eq!(poses.len(), self.n_snapshots());
+        let places = Vec::new();
+        self.tracks.insert(
+            body.id,
+            Track {
+                body,
+                poses,
+                places,
+            },
+        );
     }
 
     /// All tracks in the order of their ids.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_2;
 
-use gump_geometry::{Pose, wrap_angle};
+use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_scene::Rng;
 use rand::Rng as _;
 
@@ -17,20 +17,33 @@ const SHORTEST: f64 = 34.0;
 const CLEARANCE: f64 = 9.0;
 /// Metres of a new road beside its own junction, where it is near the road it leaves.
 const OWN_JUNCTION: f64 = 26.0;
-/// Length of a driveway between the road and the first bay, metres.
-const DRIVEWAY: f64 = 16.0;
+/// Length of a driveway between the road and the first bay, metres: of one aisle alone, and of
+/// several side by side.
+const DRIVEWAY: [f64; 2] = [16.0, 11.0];
+/// Share of scenes with a car park of several aisles, as in front of shops.
+const WIDE_CAR_PARKS: f64 = 0.4;
+/// Aisles leave their road within this of a right angle, radians.
+const SLANT: f64 = 0.3;
 
 /// Adds side roads and car parks, then decides along which roads vehicles park.
 pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
+    // First what needs most room.
+    if rng.random_bool(WIDE_CAR_PARKS) {
+        add_some(plan, extent, 1, add_wide_car_park, rng);
+    }
     let n_side = rng.random_range(1..=6);
     add_some(plan, extent, n_side, add_side_road, rng);
     let n_parks = rng.random_range(1..=6);
     add_some(plan, extent, n_parks, add_car_park, rng);
     allow_parking(plan, rng);
-    // Traffic is faster on wide roads than their plain plans have it.
-    let haste = rng.random_range(1.2..1.75);
-    for road in plan.roads.iter_mut().filter(|road| road.forward > 1) {
-        road.speed_limit *= haste;
+    // Traffic is faster than plain plans have it, on wide roads above all.
+    let haste: f64 = rng.random_range(1.2..1.75);
+    for road in plan.roads.iter_mut().filter(|road| road.speed_limit > 7.0) {
+        road.speed_limit *= if road.forward > 1 {
+            haste
+        } else {
+            haste.sqrt()
+        };
     }
 }
 
@@ -76,7 +89,8 @@ fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut
     } else {
         Control::MinorYield
     };
-    let node = split(plan, at, control, rng.random_bool(0.15), rng);
+    let corners = (rng.random_bool(0.15), rng.random_range(3.5..7.0));
+    let node = split(plan, at, control, corners);
     plan.roads.push(RoadPlan {
         reference,
         ends: [Some(node), None],
@@ -87,7 +101,71 @@ fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut
 
 /// A driveway and, behind it, an aisle between two rows of bays.
 fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
-    let aisle = RoadPlan {
+    let style = aisle(rng);
+    let start = start(plan, at, rng.random_range(-0.06..0.06));
+    let driveway = plan.roads[at.0].half_width(!at.2) + DRIVEWAY[0];
+    let length = rng
+        .random_range(45.0..85.0_f64)
+        .min(1.4 * extent - start.position.length());
+    if length < 35.0 {
+        return false;
+    }
+    let whole = Track::through(&bend(start, driveway + length, &[]));
+    if !is_clear(plan, at.0, &whole, style.half_width(true)) {
+        return false;
+    }
+    let radius = rng.random_range(3.5..7.0);
+    let node = split(plan, at, Control::MinorYield, (false, radius));
+    add_aisle(plan, node, &whole, driveway, style);
+    true
+}
+
+/// Several aisles side by side off one road, whose rows of bays stand back to back.
+fn add_wide_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
+    let (road, first, left) = at;
+    let style = aisle(rng);
+    let pitch = style.half_width(true) + style.half_width(false) + rng.random_range(0.0..1.5);
+    let wanted = rng.random_range(3..=7);
+    let slant = rng.random_range(-SLANT..SLANT);
+    let driveway = plan.roads[road].half_width(!left) + DRIVEWAY[1];
+    let length = rng.random_range(45.0..100.0_f64);
+    let reference = &plan.roads[road].reference;
+    let heading = start(plan, (road, first, left), slant).heading;
+    // Places along the road whose aisles lie a pitch apart.
+    let mut starts: Vec<(f64, Pose)> = Vec::new();
+    let mut s = first;
+    while s < reference.length() - SHORTEST && starts.len() < wanted {
+        let along = start(plan, (road, s, left), 0.0);
+        let pose = Pose { heading, ..along };
+        let is_apart = |(_, last): &(f64, Pose)| (last.inverse() * pose.position).y.abs() >= pitch;
+        if starts.last().is_none_or(is_apart) {
+            let is_square = angle_difference(along.heading, heading).abs() <= SLANT;
+            let whole = Track::through(&bend(pose, driveway + length, &[]));
+            let is_in = pose.position.length() + length < 1.6 * extent;
+            if !is_square || !is_in || !is_clear(plan, road, &whole, style.half_width(true)) {
+                break;
+            }
+            starts.push((s, pose));
+        }
+        s += 0.5;
+    }
+    if starts.len() < 2 {
+        return false;
+    }
+    // The farthest first: what is left of the road keeps its place in the plan.
+    for (s, pose) in starts.into_iter().rev() {
+        let radius = rng.random_range(1.5..3.0);
+        let node = split(plan, (road, s, left), Control::MinorYield, (false, radius));
+        let length = length * rng.random_range(0.85..1.0);
+        let whole = Track::through(&bend(pose, driveway + length, &[]));
+        add_aisle(plan, node, &whole, driveway, style.clone());
+    }
+    true
+}
+
+/// The cross-section of an aisle between two rows of bays.
+fn aisle(rng: &mut Rng) -> RoadPlan {
+    RoadPlan {
         lane_width: rng.random_range(2.9..3.2),
         median: 0.0,
         bike_lanes: false,
@@ -96,21 +174,11 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
         sidewalks: false,
         speed_limit: rng.random_range(3.5..5.5),
         ..street(1, false, rng)
-    };
-    let start = start(plan, at, rng.random_range(-0.06..0.06));
-    let road = &plan.roads[at.0];
-    let driveway = road.half_width(!at.2) + DRIVEWAY;
-    let length = rng
-        .random_range(45.0..85.0_f64)
-        .min(1.4 * extent - start.position.length());
-    if length < 35.0 {
-        return false;
     }
-    let whole = Track::through(&bend(start, driveway + length, &[]));
-    if !is_clear(plan, at.0, &whole, aisle.half_width(true)) {
-        return false;
-    }
-    let node = split(plan, at, Control::MinorYield, false, rng);
+}
+
+/// Adds a driveway and its aisle, which begins after `driveway` metres of `whole`.
+fn add_aisle(plan: &mut Plan, node: usize, whole: &Track, driveway: f64, style: RoadPlan) {
     let inner = plan.nodes.len();
     plan.nodes.push(NodePlan {
         control: Control::Free,
@@ -123,14 +191,13 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
         ends: [Some(node), Some(inner)],
         parking: false,
         bays: false,
-        ..aisle.clone()
+        ..style.clone()
     });
     plan.roads.push(RoadPlan {
         reference: whole.slice(driveway, whole.length()),
         ends: [Some(inner), None],
-        ..aisle
+        ..style
     });
-    true
 }
 
 /// The pose on the reference of a road from which a new one sets out, to its left or right.
@@ -143,19 +210,19 @@ fn start(plan: &Plan, (road, s, left): (usize, f64, bool), skew: f64) -> Pose {
     }
 }
 
-/// Cuts a road in two at a new junction, of which it gives the index.
+/// Cuts a road in two at a new junction, of which it gives the index; with crosswalks or not, and
+/// curbs of this radius.
 fn split(
     plan: &mut Plan,
     (road, s, _): (usize, f64, bool),
     control: Control,
-    crosswalks: bool,
-    rng: &mut Rng,
+    (crosswalks, corner_radius): (bool, f64),
 ) -> usize {
     let node = plan.nodes.len();
     plan.nodes.push(NodePlan {
         control,
         crosswalks,
-        corner_radius: rng.random_range(3.5..7.0),
+        corner_radius,
         min_setback: 5.0,
     });
     let whole = plan.roads[road].clone();

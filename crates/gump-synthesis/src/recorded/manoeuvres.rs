@@ -51,8 +51,9 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
             let stays_off = poses
                 .iter()
                 .step_by(5)
-                .all(|pose| is_off_road(network, *pose));
-            if stays_off && is_clear(recording, id, size, &poses) {
+                .all(|pose| is_off_road(network, *pose, OFF_ROAD_M));
+            let poses: Vec<Option<Pose>> = poses.into_iter().map(Some).collect();
+            if stays_off && is_clear(recording, id, size, ROOM_M, &poses) {
                 recording.move_along(id, poses);
                 left -= 1;
                 break;
@@ -130,37 +131,44 @@ fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose
     poses
 }
 
-fn is_off_road(network: &Network, pose: Pose) -> bool {
+/// True if a pose is this far from the centres of all lanes of roads, metres.
+pub(super) fn is_off_road(network: &Network, pose: Pose, far: f64) -> bool {
     network.lanes.iter().all(|lane| {
         let is_road = lane.speed_limit >= CAR_PARK_SPEED;
         let foot = |p: DVec2| lane.track.pose_at(lane.track.project(p)).position;
-        !is_road || foot(pose.position).distance(pose.position) > OFF_ROAD_M
+        !is_road || foot(pose.position).distance(pose.position) > far
     })
 }
 
-/// True if a vehicle on this path touches nobody.
-fn is_clear(recording: &Recording, id: i64, [length, width]: [f64; 2], poses: &[Pose]) -> bool {
-    let others = recording.tracks().filter(|track| track.body.id != id);
-    others.into_iter().all(|other| {
+/// True if a body of this length and width on this path, one pose per snapshot, keeps room to
+/// everybody else: to what stands, and to what moves.
+pub(super) fn is_clear(
+    recording: &Recording,
+    id: i64,
+    [length, width]: [f64; 2],
+    rooms: [f64; 2],
+    poses: &[Option<Pose>],
+) -> bool {
+    let mut others = recording.tracks().filter(|track| track.body.id != id);
+    others.all(|other| {
         let [l, w, _] = other.body.size;
-        let room = ROOM_M[usize::from(other.body.is_mobile)];
+        let room = rooms[usize::from(other.body.is_mobile)];
         let own = |pose: Pose| OrientedBox {
             pose,
             length: length + 2.0 * room,
             width: width + 2.0 * room,
         };
         let near = length.hypot(width) / 2.0 + 2.0 * room + l.hypot(w) / 2.0;
-        poses.iter().enumerate().all(|(i, &pose)| {
-            let at = other.pose_at_snapshot(i);
-            at.filter(|at| at.position.distance(pose.position) < near)
-                .is_none_or(|at| {
-                    let theirs = OrientedBox {
-                        pose: at,
-                        length: l,
-                        width: w,
-                    };
-                    !own(pose).overlaps(&theirs)
-                })
+        poses.iter().enumerate().all(|(i, pose)| {
+            let (Some(pose), Some(at)) = (*pose, other.pose_at_snapshot(i)) else {
+                return true;
+            };
+            let theirs = OrientedBox {
+                pose: at,
+                length: l,
+                width: w,
+            };
+            at.position.distance(pose.position) >= near || !own(pose).overlaps(&theirs)
         })
     })
 }

@@ -1,13 +1,14 @@
 //! Scenes like recorded ones: the plain families of roads, dressed with what recordings show.
 //!
 //! `dress` adds side roads, car parks and parking to a plan; `scenery` puts parked vehicles,
-//! people who stand and people who cross anywhere on the network; here all is put together. How
-//! many of what there are is fitted to `configs/targets/waymo-like.toml`.
+//! people who stand and people who cross anywhere on the network; `manoeuvres` and `walkers` are what
+//! goes on in car parks; here all is put together. How many of what there are is fitted to `configs/targets/waymo-like.toml`.
 
 mod dress;
 mod driveways;
 mod manoeuvres;
 mod scenery;
+mod walkers;
 
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -26,15 +27,15 @@ use crate::{RoadFamily, SynthesisConfig};
 
 /// How often a family is drawn: recordings are made in towns, rarely on motorways.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 25),
+    (RoadFamily::SignalizedCrossing, 17),
     (RoadFamily::StopCrossing, 13),
-    (RoadFamily::TeeJunction, 10),
+    (RoadFamily::TeeJunction, 12),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 20),
-    (RoadFamily::CurvedRoad, 4),
+    (RoadFamily::Arterial, 24),
+    (RoadFamily::CurvedRoad, 8),
     (RoadFamily::OnRamp, 14),
-    (RoadFamily::MidBlockCrosswalk, 4),
-    (RoadFamily::Grid, 16),
+    (RoadFamily::MidBlockCrosswalk, 6),
+    (RoadFamily::Grid, 14),
 ];
 /// Share of scenes whose map states no speed limits.
 const NO_LIMITS: f64 = 0.5;
@@ -55,7 +56,7 @@ const EGO_REACH: f64 = 60.0;
 pub(crate) fn config() -> SynthesisConfig {
     SynthesisConfig {
         extent_m: 150.0,
-        vehicles: 10..=60,
+        vehicles: 8..=44,
         pedestrians: 0..=34,
         bicycles: 0..=3,
         ..SynthesisConfig::standard()
@@ -101,6 +102,7 @@ pub(crate) fn draw_scenario(
     }
     let mut parking_rng = seed.fork(attempt).fork(2).rng();
     manoeuvres::add(&mut recording, &network, config.dt, &mut parking_rng);
+    walkers::add(&mut recording, &network, config.dt, &mut parking_rng);
     let ego = choose_ego(&recording, config.now(), &mut rng)?;
     let placement = draw_placement(&mut rng);
     let mut route = route(&network, ego, &traffic, &placement);

@@ -25,7 +25,7 @@ const BESIDE_WALK: std::ops::Range<f64> = 2.2..3.3;
 /// Share of scenes in which a vehicle has stopped in its lane.
 const HELD: f64 = 0.12;
 /// Parked vehicles of a scene, at most, before density.
-const MOST_PARKED: f64 = 170.0;
+const MOST_PARKED: f64 = 190.0;
 
 /// Draws what stands about; `bustle` of 0 to 1 says how lively the place is.
 pub(crate) fn draw(
@@ -101,9 +101,9 @@ fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
     all
 }
 
-/// The share of places that are taken; rows are mostly nearly full or nearly empty.
+/// The share of places that are taken; rows are mostly nearly full, or nearly empty.
 fn draw_fill(rng: &mut Rng) -> f64 {
-    let part: f64 = rng.random_range(0.0..1.0);
+    let part: f64 = rng.random_range(0.0_f64..1.0).powf(0.6);
     0.1 + 0.88 * (0.55 - (std::f64::consts::PI * part).cos() / 2.0).clamp(0.0, 1.0)
 }
 

@@ -59,6 +59,9 @@ pub(crate) struct Standing {
     pub(crate) pose: Pose,
 }
 
+/// From this limit on a lane of a scene like a recorded one is fully used, m/s.
+const FAST_LANE: f64 = 16.0;
+
 impl Traffic<'_> {
     /// Fills the network once, before the first step.
     pub(super) fn populate(&mut self) {
@@ -77,11 +80,15 @@ impl Traffic<'_> {
         if lanes.is_empty() {
             return;
         }
-        for _ in 0..4 * self.demand.moving {
+        let tries = if self.demand.scenery.is_real { 10 } else { 4 };
+        for _ in 0..tries * self.demand.moving {
             if self.count(AgentKind::Vehicle) >= self.demand.moving {
                 break;
             }
             let lane = lanes[self.rng.random_range(0..lanes.len())];
+            if !self.is_used(lane) {
+                continue;
+            }
             let length = self.network.lanes[lane].length();
             let s = self.rng.random_range(6.0..length - 6.0);
             self.try_add(AgentKind::Vehicle, lane, s);
@@ -146,7 +153,7 @@ impl Traffic<'_> {
             let arrives = self
                 .rng
                 .random_bool((self.demand.arrivals * self.dt).min(1.0));
-            if !arrives {
+            if !arrives || !self.is_used(lane) {
                 continue;
             }
             let bicycles = self.count(AgentKind::Bicycle) < self.demand.bicycles;
@@ -159,6 +166,12 @@ impl Traffic<'_> {
         if self.people.len() < self.demand.people && self.rng.random_bool(0.5 * self.dt) {
             self.add_person(Some(()));
         }
+    }
+
+    /// Drawn: the faster a lane, the more use it; everywhere alike in plain scenes.
+    fn is_used(&mut self, lane: LaneIdx) -> bool {
+        let share = self.network.lanes[lane].speed_limit / FAST_LANE;
+        !self.demand.scenery.is_real || self.rng.random_bool(share.powi(2).clamp(0.06, 1.0))
     }
 
     fn count(&self, kind: AgentKind) -> usize {
@@ -230,7 +243,7 @@ impl Traffic<'_> {
         }
         if self.demand.scenery.is_real && kind == AgentKind::Vehicle {
             // Hardly anybody drives in the very middle of the lane.
-            let room = (l.width / 2.0 - vehicle.width() / 2.0 - 0.15).clamp(0.0, 0.65);
+            let room = (l.width / 2.0 - vehicle.width() / 2.0 - 0.1).clamp(0.0, 0.8);
             let part: f64 = self.rng.random_range(-1.0..1.0);
             vehicle.settle(part * room);
         }
@@ -354,7 +367,7 @@ impl Traffic<'_> {
             let progress = self.rng.random_range(0.0..length);
             if self.demand.scenery.is_real {
                 // More people are near the corners, where they cross.
-                let left = self.rng.random_range(0.0..60.0_f64).min(length);
+                let left = self.rng.random_range(0.0..35.0_f64).min(length);
                 (walk, forward, progress.max(length - left))
             } else {
                 (walk, forward, progress)
@@ -364,8 +377,8 @@ impl Traffic<'_> {
         self.next_id += 1;
         let mut person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
         if self.demand.scenery.is_real {
-            // Half of those who walk are with somebody.
-            let n = [0, 0, 0, 0, 1, 1, 1, 2, 3, 4][self.rng.random_range(0..10)];
+            // Most of those who walk are with somebody.
+            let n = [0, 0, 0, 1, 1, 1, 2, 2, 3, 5][self.rng.random_range(0..10)];
             person.accompany(self.next_id, n, &mut self.rng);
             self.next_id += n as i64;
         }

@@ -1,5 +1,7 @@
 //! People on foot: along sidewalks, around corners, and across the road when it is safe.
 
+use std::f64::consts::TAU;
+
 use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
@@ -47,9 +49,11 @@ pub(crate) struct Person {
     activity: Option<Activity>,
     gone: bool,
     companions: Vec<Companion>,
+    /// How far they sway to the sides, metres, and where in its period that began.
+    sway: (f64, f64),
 }
 
-/// Somebody who walks with a person, always at the same place beside or behind.
+/// Somebody who walks with a person, about at the same place beside or behind.
 #[derive(Clone, Copy, Debug)]
 struct Companion {
     id: i64,
@@ -99,12 +103,14 @@ impl Person {
             activity: None,
             gone: false,
             companions: Vec::new(),
+            sway: (0.0, 0.0),
         }
     }
 
     /// Lets others walk with the person: ids follow each other from `first_id` on.
     pub(crate) fn accompany(&mut self, first_id: i64, n: usize, rng: &mut Rng) {
         self.size = draw_person_size(rng);
+        self.sway = (rng.random_range(0.0..0.14), rng.random_range(0.0..TAU));
         if n > 0 {
             // Leaves room on the right, so that nobody walks off the sidewalk.
             let shift = self.aside - rng.random_range(0.25..0.45);
@@ -127,15 +133,27 @@ impl Person {
 
     /// The boxes of those who walk with the person.
     pub(crate) fn companions(&self) -> impl Iterator<Item = Body> + '_ {
-        self.companions.iter().map(|companion| Body {
-            id: companion.id,
-            size: companion.size,
-            pose: Pose {
-                position: self.pose * companion.place,
-                ..self.pose
-            },
-            ..self.body()
-        })
+        // Each drifts a little about its place as they walk.
+        let drift = |k: usize| {
+            let at = self.sway.1 + 1.7 * k as f64;
+            self.sway.0
+                * DVec2::new(
+                    (self.progress / 1.9 + at).sin(),
+                    (self.progress / 2.6 - at).sin(),
+                )
+        };
+        self.companions
+            .iter()
+            .enumerate()
+            .map(move |(k, companion)| Body {
+                id: companion.id,
+                size: companion.size,
+                pose: Pose {
+                    position: self.pose * (companion.place + drift(k)),
+                    ..self.pose
+                },
+                ..self.body()
+            })
     }
 
     /// The crosswalk the person is at, where along its walk, and what the person does there.
@@ -181,7 +199,8 @@ impl Person {
             (track.length() - ahead, -1.0)
         };
         let pose = track.pose_at(s);
-        pose.position - pose.direction().perp() * (self.aside * sign)
+        let aside = self.aside + self.sway.0 * (self.progress / 2.2 + self.sway.1).sin();
+        pose.position - pose.direction().perp() * (aside * sign)
     }
 
     /// Walks on for `dt` seconds towards the carrot, moved by `push`, at up to `limit` metres per
@@ -316,7 +335,7 @@ impl Traffic<'_> {
         let crossing = choices
             .iter()
             .position(|(walk, _)| self.network.walks[*walk].crosswalk.is_some());
-        let crosses = self.demand.scenery.is_real && self.rng.random_bool(0.65);
+        let crosses = self.demand.scenery.is_real && self.rng.random_bool(0.85);
         let (walk, forward) = match crossing.filter(|_| crosses) {
             Some(crossing) => choices[crossing],
             None => choices[self.rng.random_range(0..choices.len())],

@@ -1,0 +1,182 @@
+//! People who walk where vehicles are parked: between them, along aisles, to one or away from one.
+//!
+//! Like manoeuvres of parking they are laid into what was recorded of traffic, and only if they stay
+//! clear of everybody all the while.
+
+use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, wrap_angle};
+use gump_scene::{AgentKind, Rng};
+use rand::Rng as _;
+
+use super::manoeuvres::{is_clear, is_off_road};
+use crate::network::Network;
+use crate::record::Recording;
+use crate::traffic::{Body, draw_person_size};
+
+/// People who walk so in a scene, or pairs of them, at most.
+const MOST: f64 = 16.0;
+/// Ways that are tried for each.
+const TRIED: usize = 8;
+/// Scenes with fewer parked vehicles near the centre have none.
+const LEAST_PARKED: usize = 6;
+/// Only vehicles this near to the centre of the scene are walked to, metres.
+const REACH_M: f64 = 70.0;
+/// How far somebody walks, metres.
+const WAY_M: std::ops::Range<f64> = 6.0..45.0;
+/// From the centre of a lane of a road, metres.
+const OFF_ROAD_M: f64 = 2.4;
+/// Room that is kept to what stands and to what moves, metres.
+const ROOM_M: [f64; 2] = [0.05, 0.5];
+/// Within this of a vehicle people step aside, metres.
+const ASIDE_M: f64 = 1.0;
+/// Fastest turn, radians per second.
+const TURN_RATE: f64 = 1.8;
+/// Change of walking speed, m/s².
+const CHANGE: f64 = 1.2;
+
+/// Lets people walk between the parked vehicles of a scene.
+pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &mut Rng) {
+    let stands = |body: &Body| body.kind == AgentKind::Vehicle && !body.is_mobile;
+    let bodies = recording.tracks().map(|track| track.body);
+    let parked: Vec<OrientedBox> = bodies
+        .filter(|body| stands(body) && body.pose.position.length() < REACH_M)
+        .map(|body| OrientedBox {
+            pose: body.pose,
+            length: body.size[0],
+            width: body.size[1],
+        })
+        .collect();
+    if parked.len() < LEAST_PARKED {
+        return;
+    }
+    let wanted = rng.random_range(0.0_f64..1.0).powi(3) * MOST;
+    for _ in 0..wanted.round() as usize {
+        for _ in 0..TRIED {
+            let size = draw_person_size(rng);
+            let Some(poses) = way(&parked, recording.n_snapshots(), dt, rng) else {
+                continue;
+            };
+            let id = recording.new_id();
+            let shown: Vec<Pose> = poses.iter().flatten().copied().collect();
+            let off = |pose: &Pose| is_off_road(network, *pose, OFF_ROAD_M);
+            if !shown.iter().step_by(5).all(off)
+                || !is_clear(recording, id, [size[0], size[1]], ROOM_M, &poses)
+            {
+                continue;
+            }
+            recording.add(person(id, size, shown[0]), poses.clone());
+            if rng.random_bool(0.35) {
+                // Somebody beside, if there is room.
+                let beside = Pose::new(
+                    rng.random_range(-0.3..0.3),
+                    rng.random_range(0.85..1.15),
+                    0.0,
+                );
+                let poses: Vec<Option<Pose>> =
+                    poses.iter().map(|pose| pose.map(|p| p * beside)).collect();
+                let (id, size) = (recording.new_id(), draw_person_size(rng));
+                if is_clear(recording, id, [size[0], size[1]], [ROOM_M[0]; 2], &poses) {
+                    let first = *poses.iter().flatten().next().expect("somebody is shown");
+                    recording.add(person(id, size, first), poses);
+                }
+            }
+            break;
+        }
+    }
+}
+
+fn person(id: i64, size: [f64; 3], pose: Pose) -> Body {
+    Body {
+        id,
+        kind: AgentKind::Pedestrian,
+        size,
+        pose,
+        is_mobile: true,
+        place: None,
+    }
+}
+
+/// Poses of somebody who walks from or to the side of a parked vehicle, one per snapshot while he is
+/// there; `None` if he gets stuck.
+fn way(parked: &[OrientedBox], n: usize, dt: f64, rng: &mut Rng) -> Option<Vec<Option<Pose>>> {
+    let door = |rng: &mut Rng| {
+        let vehicle = &parked[rng.random_range(0..parked.len())];
+        let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+        let aside = side * (0.5 * vehicle.width + rng.random_range(0.5..0.75));
+        let along = rng.random_range(-0.3..0.3) * vehicle.length;
+        vehicle.pose * DVec2::new(along, aside)
+    };
+    let away = DVec2::from_angle(rng.random_range(-std::f64::consts::PI..std::f64::consts::PI))
+        * rng.random_range(WAY_M);
+    let from = door(rng);
+    let to = if rng.random_bool(0.3) {
+        door(rng)
+    } else {
+        from + away
+    };
+    if !(WAY_M.start..2.0 * WAY_M.end).contains(&from.distance(to)) {
+        return None;
+    }
+    // To the vehicle as often as from it.
+    let (from, to, ends_inside) = match rng.random_bool(0.5) {
+        true => (from, to, false),
+        false => (to, from, rng.random_bool(0.5)),
+    };
+    let near: Vec<&OrientedBox> = parked
+        .iter()
+        .filter(|vehicle| {
+            let (a, b) = (vehicle.pose.position - from, to - from);
+            let foot = b * (a.dot(b) / b.length_squared()).clamp(0.0, 1.0);
+            a.distance(foot) < 12.0
+        })
+        .collect();
+    let pace: f64 = rng.random_range(0.8..1.8);
+    let starts: f64 = rng.random_range(-20.0..8.0);
+    let mut pose = Pose {
+        position: from,
+        heading: wrap_angle((to - from).to_angle() + rng.random_range(-0.4..0.4)),
+    };
+    let (mut speed, mut turning) = (0.0_f64, 0.0_f64);
+    let before = ((-starts).max(0.0) / dt) as usize;
+    let mut poses = Vec::with_capacity(n);
+    let (mut stuck, mut is_there) = (0.0, false);
+    for step in 0..n + before {
+        if step >= before {
+            poses.push((!is_there || !ends_inside).then_some(pose));
+        }
+        if (step as f64 - before as f64) * dt < starts || is_there {
+            continue;
+        }
+        let left = to - pose.position;
+        is_there = left.length() < 0.4;
+        let mut wish = left.normalize();
+        for vehicle in &near {
+            let local = vehicle.pose.inverse() * pose.position;
+            let half = 0.5 * DVec2::new(vehicle.length, vehicle.width);
+            let nearest = local.clamp(-half, half);
+            let gap = vehicle.pose.rotate(local - nearest);
+            let distance = gap.length();
+            if distance < 1e-6 {
+                return None;
+            }
+            // Past the vehicle rather than back.
+            let push = 1.8 * (1.0 - (distance - 0.3) / ASIDE_M).clamp(0.0, 1.5);
+            wish += gap / distance * push;
+        }
+        turning += rng.random_range(-1.0..1.0) * dt.sqrt() * 0.25 - turning * 0.5 * dt;
+        let turn = angle_difference(wish.to_angle() + turning, pose.heading);
+        let most = TURN_RATE * dt;
+        pose.heading = wrap_angle(pose.heading + (4.0 * dt * turn).clamp(-most, most));
+        let wanted = pace
+            .min((2.0 * CHANGE * left.length()).sqrt())
+            .min(pace * turn.cos().max(0.15));
+        speed += (wanted - speed).clamp(-2.0 * CHANGE * dt, CHANGE * dt);
+        let moved = pose.direction() * (speed * dt);
+        stuck += if moved.dot(left) > 0.0 { -dt } else { dt };
+        if stuck > 1.5 {
+            return None;
+        }
+        stuck = f64::max(stuck, 0.0);
+        pose.position += moved;
+    }
+    poses.iter().any(Option::is_some).then_some(poses)
+}
