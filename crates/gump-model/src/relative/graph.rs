@@ -15,7 +15,7 @@ use crate::sample::TOKEN_DT;
 /// Numbers of a node.
 pub(super) const NODE_NUMBERS: usize = 28;
 /// Numbers of an edge.
-pub(super) const EDGE_NUMBERS: usize = 44;
+pub(super) const EDGE_NUMBERS: usize = 46;
 
 /// Frames of its own past that a node sees beside itself.
 pub(super) const PAST: usize = 6;
@@ -180,6 +180,9 @@ const OF_PAST: usize = KINDS + RELATIVE;
 const OF_NEIGHBOUR: usize = OF_PAST + 1;
 const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
+const OF_GAP: usize = OF_LANE + 10;
+/// When the gap to a neighbour is looked at if both keep their velocities, seconds.
+const GAPS_S: [f64; 4] = [0.5, 1.0, 1.5, 2.0];
 
 /// A place and a direction, whose sine and cosine are taken once for many edges.
 #[derive(Clone, Copy, Debug)]
@@ -318,9 +321,26 @@ fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: 
             bend(nearest / 2.0),
             mark(other.tracked),
         ]);
+        let direction = from.turn(other.pose.direction());
+        let gap = |seconds: f64| gap(own.body, body, place + velocity * seconds, direction);
+        let soon = GAPS_S.map(gap).into_iter().fold(f64::INFINITY, f64::min);
+        Writer(&mut row[OF_GAP..]).put([bend(gap(0.0) / 0.5), bend(soon / 0.5)]);
         on_paths(map, other, paths, &mut row);
         view.neighbours.push((j, row));
     }
+}
+
+/// Metres between the boxes of an agent and of another one at `place`, which faces `direction`, both
+/// seen from the first: along the axis on which they are farthest apart; below 0 if they overlap.
+fn gap(own: Body, other: Body, place: DVec2, direction: DVec2) -> f64 {
+    let half = |body: Body| 0.5 * DVec2::new(body.length, body.width);
+    let (mine, theirs, turn) = (half(own), half(other), direction.abs());
+    // How far a box reaches along the axes of the other.
+    let reach = |half: DVec2| DVec2::new(half.dot(turn), half.y * turn.x + half.x * turn.y);
+    let seen = DVec2::new(direction.dot(place), direction.perp_dot(place));
+    let here = place.abs() - mine - reach(theirs);
+    let there = seen.abs() - theirs - reach(mine);
+    here.max(there).max_element()
 }
 
 /// Marks on which paths somebody is, and how far ahead.
@@ -494,6 +514,24 @@ mod tests {
         }
         // The car 30 m ahead in the lane is on the path.
         assert_eq!(here.neighbours[0].1[OF_PATH], 1.0);
+    }
+
+    #[test]
+    fn gaps_are_those_between_boxes() {
+        let beside = |x, y, turn: f64| gap(CAR, CAR, DVec2::new(x, y), DVec2::from_angle(turn));
+        assert!((beside(6.0, 0.3, 0.0) - 1.5).abs() < 1e-9);
+        assert!((beside(0.5, -3.0, std::f64::consts::PI) - 1.0).abs() < 1e-9);
+        // One that stands across is as wide as it is long.
+        assert!((beside(1.0, 4.0, std::f64::consts::FRAC_PI_2) - 0.75).abs() < 1e-9);
+        for (x, y, turn) in [(3.0, 1.0, 0.4), (4.6, 1.9, 0.8), (-4.0, 2.6, 2.3)] {
+            let shape = |pose| gump_geometry::OrientedBox {
+                pose,
+                length: CAR.length,
+                width: CAR.width,
+            };
+            let touch = shape(Pose::IDENTITY).overlaps(&shape(Pose::new(x, y, turn)));
+            assert_eq!(beside(x, y, turn) < 0.0, touch, "{x} {y} {turn}");
+        }
     }
 
     #[test]
