@@ -34,6 +34,7 @@ pub(crate) fn draw_field(
     let sharpness = Sharpness {
         temperature: config.temperature.unwrap_or(TEMPERATURE),
         top_k: config.top_k,
+        top_p: config.top_p.unwrap_or(1.0),
     };
     if let Some(guide) = &request.guide {
         return guided(
@@ -62,6 +63,8 @@ struct Sharpness {
     temperature: f64,
     /// Bins that may be drawn.
     top_k: usize,
+    /// Of those, the likeliest that together have this probability.
+    top_p: f64,
 }
 
 /// As [`draw_field`], as a guide says.
@@ -122,7 +125,11 @@ fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
 
 /// The index at which the tempered distribution over the `top_k` largest logits exceeds `uniform`.
 fn draw(logits: &[f32], uniform: f64, sharpness: Sharpness, room: &mut Candidates) -> usize {
-    let Sharpness { temperature, top_k } = sharpness;
+    let Sharpness {
+        temperature,
+        top_k,
+        top_p,
+    } = sharpness;
     let peak = crate::ops::wide(
         #[inline(always)]
         || crate::ops::max(logits),
@@ -146,6 +153,11 @@ fn draw(logits: &[f32], uniform: f64, sharpness: Sharpness, room: &mut Candidate
     for (_, logit) in room.iter_mut() {
         *logit = (f64::from(*logit - peak) * inverse).exp() as f32;
     }
+    if top_p < 1.0 {
+        let mut weights: Vec<f32> = room.iter().map(|(_, weight)| *weight).collect();
+        let least = least_kept(&mut weights, top_p);
+        room.retain(|(_, weight)| *weight >= least);
+    }
     let total: f64 = room.iter().map(|(_, weight)| f64::from(*weight)).sum();
     let mut left = uniform * total;
     for (i, weight) in room.iter() {
@@ -155,6 +167,20 @@ fn draw(logits: &[f32], uniform: f64, sharpness: Sharpness, room: &mut Candidate
         }
     }
     best()
+}
+
+/// The smallest of the largest weights that together have a share `top_p` of all; sorts them.
+pub(crate) fn least_kept(weights: &mut [f32], top_p: f64) -> f32 {
+    weights.sort_unstable_by(|a, b| b.total_cmp(a));
+    let total: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+    let mut left = top_p * total;
+    for weight in weights.iter() {
+        left -= f64::from(*weight);
+        if left <= 0.0 {
+            return *weight;
+        }
+    }
+    0.0
 }
 
 /// The `k`-th largest logit, and one more than how many logits equal to it belong to the `k`
@@ -351,6 +377,7 @@ mod tests {
             for k in [2, 40, 999, 1000] {
                 let sharpness = Sharpness {
                     top_k: k,
+                    top_p: 1.0,
                     temperature: 1e6,
                 };
                 let mut room = Vec::new();

@@ -32,6 +32,10 @@ pub struct SamplingConfig {
     pub temperature: Option<f64>,
     /// Bins that may be drawn per field (paper, simulation: 40).
     pub top_k: usize,
+    /// Draws are among the likeliest bins that together have this probability. Without one they are
+    /// as the network was made for: from all of `top_k` by the sequence network, without the least
+    /// likely tail by the relative one.
+    pub top_p: Option<f64>,
     /// Weight of a prediction made `i` frames ago is `decay^i` (paper: 1.2); 0 switches aggregation
     /// off.
     pub decay: f64,
@@ -60,6 +64,7 @@ impl Default for SamplingConfig {
             cache: CacheMode::Window,
             temperature: None,
             top_k: 40,
+            top_p: None,
             decay: 0.3,
             history: 3,
             surrogate: Surrogate::Chunk,
@@ -89,6 +94,7 @@ impl SamplingConfig {
         Self {
             temperature: Some(1.1),
             top_k: 40,
+            top_p: None,
             decay: 1.2,
             history: 3,
             surrogate: Surrogate::Chunk,
@@ -292,6 +298,7 @@ mod tests {
             cache: CacheMode::Window,
             temperature: None,
             top_k: 40,
+            top_p: None,
             decay: 0.3,
             history: 3,
             surrogate: Surrogate::Chunk,

@@ -49,6 +49,7 @@ struct Sampling {
     mode: String,
     temperature: Option<f64>,
     top_k: Option<usize>,
+    top_p: Option<f64>,
     decay: Option<f64>,
     redraws: Option<usize>,
     limits: bool,
@@ -84,6 +85,7 @@ impl Sampling {
             life: self.life,
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
+            top_p: self.top_p.or(base.top_p),
             decay: self.decay.unwrap_or(base.decay),
             redraws: self.redraws.unwrap_or(base.redraws),
             limits: base.limits && self.limits,
@@ -94,6 +96,8 @@ impl Sampling {
             ("temperature", "a number above 0", t)
         } else if config.top_k == 0 {
             ("top_k", "at least 1", 0.0)
+        } else if let Some(p) = config.top_p.filter(|p| !(*p > 0.0 && *p <= 1.0)) {
+            ("top_p", "a number above 0 and at most 1", p)
         } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
             ("decay", "0 or more", config.decay)
         } else {

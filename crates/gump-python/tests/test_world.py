@@ -149,6 +149,8 @@ def test_what_worlds_refuse(crossing, tmp_path):
         gump.World("model", temperature=0.0)
     with pytest.raises(ValueError, match="top_k: expected at least 1"):
         gump.World("model", top_k=0)
+    with pytest.raises(ValueError, match="top_p: expected a number above 0 and at most 1"):
+        gump.World("model", top_p=1.5)
     with pytest.raises(ValueError, match="precision: expected f32, bf16 or int8, found f64"):
         gump.World("model", precision="f64")
     with pytest.raises(ValueError, match="expected raw or paper, found both"):

@@ -33,6 +33,9 @@ pub(crate) struct Draw {
     /// Bins that may be drawn per field [default: 40]
     #[arg(long, value_name = "N")]
     top_k: Option<usize>,
+    /// Draws among the likeliest bins that together have this probability [default: 1, and 0.98 of a relative network]
+    #[arg(long, value_name = "X")]
+    top_p: Option<f64>,
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
     #[arg(long, value_name = "X")]
     decay: Option<f64>,
@@ -156,6 +159,7 @@ impl Draw {
             life: self.life,
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
+            top_p: self.top_p.or(base.top_p),
             decay: self.decay.unwrap_or(base.decay),
             redraws: self.redraws.unwrap_or(base.redraws),
             limits: base.limits && !self.no_limits,
@@ -166,6 +170,8 @@ impl Draw {
             format!("--temperature: expected a number above 0, found {t}")
         } else if config.top_k == 0 {
             "--top-k: expected at least 1, found 0".into()
+        } else if let Some(p) = config.top_p.filter(|p| !(*p > 0.0 && *p <= 1.0)) {
+            format!("--top-p: expected a number above 0 and at most 1, found {p}")
         } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
             format!("--decay: expected 0 or more, found {}", config.decay)
         } else if self.ruled && !config.has_rules() {
@@ -224,6 +230,7 @@ impl Draw {
         let given = [
             ("--temperature", self.temperature.map(|x| x.to_string())),
             ("--top-k", self.top_k.map(|n| n.to_string())),
+            ("--top-p", self.top_p.map(|x| x.to_string())),
             ("--decay", self.decay.map(|x| x.to_string())),
             ("--redraws", redraws),
         ];
@@ -247,6 +254,7 @@ mod tests {
             precision: PrecisionName::F32,
             temperature: None,
             top_k: None,
+            top_p: None,
             decay: None,
             redraws: None,
             no_limits: false,

@@ -11,12 +11,13 @@ use serde::{Deserialize, Serialize};
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::Seed;
 
-use super::engine::{AgentMemory, Draw, Engine, KEPT, Present, Workspace};
-use super::graph::{Lights, PAST, Shown, look, past_edge};
+use super::engine::{Draw, Engine, Workspace};
+use super::graph::{Lights, Shown};
 use super::grid::dequantize;
 use super::map::VectorMap;
 use super::net::RelativeNetwork;
 use super::sample::Track;
+use super::seen::{Seen, presents};
 use crate::ModelError;
 use crate::ops::panels::Precision;
 
@@ -81,13 +82,6 @@ pub(crate) struct Driver {
     config: RelativeDrives,
 }
 
-/// What is kept of an agent while it is driven.
-struct Member {
-    /// The last frames without a gap, the latest last; at most [`KEPT`].
-    shown: Vec<Shown>,
-    memory: AgentMemory,
-}
-
 impl Driver {
     pub(super) fn new(
         network: &RelativeNetwork,
@@ -112,32 +106,21 @@ impl Driver {
         seed: Seed,
     ) {
         let memory = self.engine.remember(map);
-        let mut members: Vec<Option<Member>> = tracks.iter().map(|_| None).collect();
+        let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
         for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
             for (track, member) in tracks.iter().zip(&mut members) {
-                *member = match (track.states[t], member.take()) {
-                    (None, _) => None,
-                    (Some(state), Some(member)) => Some(member.then(state.shown)),
-                    (Some(state), None) => Some(Member {
-                        shown: vec![Shown::first(track.body, state.shown, state.velocity)],
-                        memory: self.engine.blank(),
-                    }),
-                };
-            }
-            let mut present: Vec<&mut Member> = members.iter_mut().flatten().collect();
-            let agents: Vec<Shown> = present.iter().map(|member| member.now()).collect();
-            let read = present.iter_mut().enumerate().map(|(i, member)| {
-                let now = &agents[i];
-                let past = member.shown.iter().rev().take(PAST + 1).enumerate();
-                Present {
-                    numbers: now.numbers(),
-                    past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
-                    view: look(map, lights, &agents, i),
-                    memory: &mut member.memory,
+                match (track.states[t], &mut *member) {
+                    (None, _) => *member = None,
+                    (Some(state), Some(seen)) => seen.push(state.shown),
+                    (Some(state), None) => {
+                        let (pose, velocity) = (state.shown, state.velocity);
+                        *member = Some(Seen::first(&self.engine, track.body, pose, velocity));
+                    }
                 }
-            });
-            let mut read: Vec<Present<'_>> = read.collect();
+            }
+            let agents: Vec<Shown> = members.iter().flatten().map(Seen::now).collect();
+            let mut read = presents(map, lights, members.iter_mut().flatten());
             self.engine
                 .read(&mut read, t, &memory, &mut room, &mut hidden);
             if t + 1 < WARM_UP {
@@ -178,19 +161,6 @@ impl Driver {
             bins.into_iter().map(dequantize).collect()
         });
         candidates.collect()
-    }
-}
-
-impl Member {
-    fn now(&self) -> Shown {
-        *self.shown.last().expect("a member has been seen")
-    }
-
-    fn then(mut self, pose: Pose) -> Self {
-        self.shown.push(self.now().then(pose));
-        let n = self.shown.len();
-        self.shown.drain(..n.saturating_sub(KEPT));
-        self
     }
 }
 

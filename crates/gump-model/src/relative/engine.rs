@@ -11,7 +11,7 @@ use super::grid::{ALL_BINS, BINS, FIELDS, STANDS, first_bin};
 use super::map::{PIECE_NUMBERS, VectorMap};
 use super::net::RelativeNetwork;
 use crate::ModelError;
-use crate::draw::uniform;
+use crate::draw::{least_kept, uniform};
 use crate::mct::NORM_EPS;
 use crate::ops::panels::{Panels, Precision, Room};
 use crate::ops::{Heads, attend, gelu_row, gru_row, normalize_row, wide};
@@ -414,16 +414,7 @@ fn choose(logits: &[f32], uniform: f64, draw: Draw, weights: &mut Vec<f32>) -> u
     weights.extend(logits.iter().map(|logit| ((logit - peak) * inverse).exp()));
     let mut total: f64 = weights.iter().map(|w| f64::from(*w)).sum();
     if draw.top_p < 1.0 {
-        let mut sorted = weights.clone();
-        sorted.sort_unstable_by(|a, b| b.total_cmp(a));
-        let (mut kept, mut least) = (0.0, 0.0);
-        for weight in sorted {
-            kept += f64::from(weight);
-            least = weight;
-            if kept >= draw.top_p * total {
-                break;
-            }
-        }
+        let least = least_kept(&mut weights.clone(), draw.top_p);
         weights
             .iter_mut()
             .filter(|w| **w < least)

@@ -6,7 +6,7 @@
 //! kept. What a node ends with says the next half second of its agent, in the agent's own frame.
 //!
 //! `map` cuts the map into pieces, `graph` makes nodes and edges, `grid` has the bins of a move, `net`
-//! the network, `sample`, `drives` and `train` how it learns, `world` how it is rolled out and `rules` what then corrects it.
+//! the network, `sample`, `drives` and `train` how it learns, `seen` what is kept of an agent meanwhile, `world` how it is rolled out and `rules` what then corrects it.
 
 mod drives;
 mod engine;
@@ -16,6 +16,7 @@ mod map;
 mod net;
 mod rules;
 mod sample;
+mod seen;
 #[cfg(test)]
 mod tests;
 mod train;

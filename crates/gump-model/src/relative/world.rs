@@ -14,12 +14,13 @@ use gump_scene::{Agent, AgentId, AgentState, Frame, Light, LightState, SceneStat
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::engine::{AgentMemory, Draw, Engine, KEPT, MapMemory, Present, Workspace};
-use super::graph::{Body, Lights, PAST, Shown, look, past_edge};
+use super::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
+use super::graph::{Body, Lights, Shown};
 use super::grid::dequantize;
 use super::map::{Hidden, VectorMap};
 use super::net::RelativeNetwork;
 use super::rules::{held_back, settle};
+use super::seen::{Seen, presents};
 use crate::ModelError;
 use crate::ops::panels::Precision;
 use crate::outlook::{Outlook, Watch};
@@ -70,6 +71,7 @@ impl From<&SamplingConfig> for RelativeSampling {
         let usual = Self::default();
         Self {
             temperature: config.temperature.unwrap_or(usual.temperature),
+            top_p: config.top_p.unwrap_or(usual.top_p),
             redraws: config.redraws,
             limits: config.limits,
             precision: config.precision,
@@ -206,9 +208,7 @@ impl Scene {
 #[derive(Clone, Debug)]
 struct Member {
     agent: Agent,
-    /// The last frames it was seen in without a gap, the latest last; at most [`KEPT`].
-    shown: Vec<Shown>,
-    memory: AgentMemory,
+    seen: Seen,
 }
 
 /// One future in progress.
@@ -281,8 +281,7 @@ impl Future {
                 }
                 None => Member {
                     agent: *agent,
-                    shown: vec![Shown::first(body(agent), state.pose, state.velocity)],
-                    memory: engine.blank(),
+                    seen: Seen::first(engine, body(agent), state.pose, state.velocity),
                 },
             };
             self.members.push(member);
@@ -291,19 +290,9 @@ impl Future {
 
     /// Lets the network read the present.
     fn read(&mut self, engine: &Engine, room: &mut Workspace) {
-        let agents: Vec<Shown> = self.members.iter().map(Member::now).collect();
         let (map, lights) = (&self.scene.map, &self.shown_lights);
-        let present = self.members.iter_mut().enumerate().map(|(i, member)| {
-            let now = &agents[i];
-            let past = member.shown.iter().rev().take(PAST + 1).enumerate();
-            Present {
-                numbers: now.numbers(),
-                past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
-                view: look(map, lights, &agents, i),
-                memory: &mut member.memory,
-            }
-        });
-        let mut present: Vec<Present<'_>> = present.collect();
+        let seen = self.members.iter_mut().map(|member| &mut member.seen);
+        let mut present = presents(map, lights, seen);
         let t = self.frames;
         engine.read(&mut present, t, &self.scene.memory, room, &mut self.hidden);
         self.frames += 1;
@@ -432,19 +421,16 @@ impl Future {
 
 impl Member {
     fn now(&self) -> Shown {
-        *self.shown.last().expect("a member has been seen")
+        self.seen.now()
     }
 
     /// Half a second later it is here; its velocity is what it moved by.
     fn push(&mut self, state: AgentState) {
-        let next = self.now().then(state.pose);
+        self.seen.push(state.pose);
         self.agent.state = AgentState {
             pose: state.pose,
-            velocity: next.velocity(),
+            velocity: self.now().velocity(),
         };
-        self.shown.push(next);
-        let n = self.shown.len();
-        self.shown.drain(..n.saturating_sub(KEPT));
     }
 }
 

@@ -2,8 +2,7 @@
 
 `simulate` lets a planner drive: one of ours by name, or any object with nuPlan's two methods,
 `initialize(PlannerInitialization)` and `compute_planner_trajectory(PlannerInput)`. What it is given
-are the classes below, which bear nuPlan's names where they mean the same and hold arrays; for planners
-written against nuplan-devkit's own classes see `gump.compat.nuplan`.
+are the classes below, which bear nuPlan's names where they mean the same and hold arrays.
 
 Poses of the ego are those of its rear axle, as nuPlan's are; everybody else's are box centres.
 """

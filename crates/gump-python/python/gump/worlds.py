@@ -21,11 +21,12 @@ class World:
     happened: an oracle), "model" (the network that comes with the package) or "model:WEIGHTS", a
     file of weights of either architecture.
 
-    How a network draws: `temperature` divides the logits, `top_k` bins may be drawn per field,
-    `decay` weighs earlier predictions of a moment, `redraws` is how often what would run into
-    something or off the road is drawn again, `limits` hold back what cannot move so. `raw` is the
-    network alone, `paper` the paper's decoding, `life` lets agents come and leave and lights change.
-    `mode` is "partial-ar" or "full-ar", `precision` "f32", "bf16" or "int8".
+    How a network draws: `temperature` divides the logits, `top_k` bins may be drawn per field, and
+    among them the likeliest that together have the probability `top_p`; `decay` weighs earlier
+    predictions of a moment, `redraws` is how often what would run into something or off the road is
+    drawn again, `limits` hold back what cannot move so. `raw` is the network alone, `paper` the
+    paper's decoding, `life` lets agents come and leave and lights change. `mode` is "partial-ar" or
+    "full-ar", `precision` "f32", "bf16" or "int8".
 
     Raises `ValueError` for another name or a number out of its range, `FileNotFoundError` and
     `DataError` for weights.
@@ -37,6 +38,7 @@ class World:
         *,
         temperature: Optional[float] = None,
         top_k: Optional[int] = None,
+        top_p: Optional[float] = None,
         decay: Optional[float] = None,
         redraws: Optional[int] = None,
         limits: bool = True,
@@ -57,6 +59,7 @@ class World:
             "mode": mode,
             "temperature": temperature,
             "top_k": top_k,
+            "top_p": top_p,
             "decay": decay,
             "redraws": redraws,
             "limits": limits,
