@@ -194,6 +194,9 @@ fn what_readers_make_of_the_present_is_equal_and_of_the_future_is_not() {
 fn no_world_and_no_verb_sees_what_comes_after_the_present() {
     let place = Workplace::new();
     let model = format!("model:{}", place.weights());
+    let shipped = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../datasets/weights/gump-relative.safetensors");
+    let relative = format!("model:{}", shipped.display());
     let rollouts = "--rollouts-per-scenario 1";
     let maker =
         "--account me@example.org --method test --parameters 1K --complies-with-closed-loop";
@@ -208,7 +211,7 @@ fn no_world_and_no_verb_sees_what_comes_after_the_present() {
             assert_eq!(left.len(), n, "{}", words(&files[0]));
             assert_eq!(left, right, "{}", words(&files[0]));
         };
-        for world in ["idm", "constant-velocity", &model] {
+        for world in ["idm", "constant-velocity", &model, &relative] {
             let n = if world == model { 2 } else { 1 };
             check(1, &|f| {
                 format!("simulate --scenario {f} --world {world} --futures 2")

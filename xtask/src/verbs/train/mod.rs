@@ -89,7 +89,7 @@ enum Begin {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         if relative::is_asked(self)? {
-            return relative::execute(self, run);
+            return together(|processes| relative::execute(self, run, processes));
         }
         let stages = self.stages()?;
         together(|processes| {
@@ -194,16 +194,7 @@ impl Args {
         }
         trained?;
         run.result("parameters", trainer.network().parameters().count())?;
-        let tokens = losses.tokens_since(resumed_at);
-        run.result("steps", trainer.steps_done())?;
-        run.result(
-            "tokens_per_second",
-            tokens as f64 / began.elapsed().as_secs_f64(),
-        )?;
-        run.result("loss_first", losses.mean_of_first(WINDOW))?;
-        run.result("loss_last", losses.mean_of_last(WINDOW))?;
-        run.result("validation_loss", losses.last_validation())?;
-        run.result("validation_realism", losses.last_realism())?;
+        tell(run, &trainer, &losses, resumed_at, began)?;
         let judged = held_out.judge.as_ref().map_or(0, Judge::scenes);
         run.setting("realism_scenes", judged)?;
         if let Some(last) = losses.last() {
@@ -215,15 +206,7 @@ impl Args {
     /// A run keeps the configuration it began with; asking for another one is a mistake.
     fn check_resumed(&self, trainer: &Trainer, asked: &RunConfig) -> anyhow::Result<()> {
         let begun = trainer.config();
-        for (flag, asked, begun) in [
-            ("--steps", self.steps, begun.steps),
-            ("--batch", self.batch, begun.batch),
-        ] {
-            if let Some(asked) = asked.filter(|&asked| asked != begun) {
-                let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
-                return Err(WrongArguments(wrong).into());
-            }
-        }
+        self.check_flags(begun.steps, begun.batch)?;
         let Some(path) = &self.common.config else {
             return Ok(());
         };
@@ -236,6 +219,20 @@ impl Args {
             Some(wrong) => Err(WrongArguments(format!("{}: {wrong}", path.display())).into()),
             None => Ok(()),
         }
+    }
+
+    /// Error: [`WrongArguments`] if flags ask for other numbers than a run to resume began with.
+    fn check_flags(&self, steps: usize, batch: usize) -> anyhow::Result<()> {
+        for (flag, asked, begun) in [
+            ("--steps", self.steps, steps),
+            ("--batch", self.batch, batch),
+        ] {
+            if let Some(asked) = asked.filter(|&asked| asked != begun) {
+                let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
+                return Err(WrongArguments(wrong).into());
+            }
+        }
+        Ok(())
     }
 
     fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
@@ -426,6 +423,26 @@ fn write(run: &Run, files: &Files, trainer: &impl Learns, losses: &Losses) -> an
         chart.save(&path("realism"))?;
     }
     Ok(())
+}
+
+/// What came out of a run, or of this part of it.
+fn tell(
+    run: &mut Run,
+    trainer: &impl Learns,
+    losses: &Losses,
+    resumed_at: usize,
+    began: Instant,
+) -> anyhow::Result<()> {
+    let tokens = losses.tokens_since(resumed_at);
+    run.result("steps", trainer.steps_done())?;
+    run.result(
+        "tokens_per_second",
+        tokens as f64 / began.elapsed().as_secs_f64(),
+    )?;
+    run.result("loss_first", losses.mean_of_first(WINDOW))?;
+    run.result("loss_last", losses.mean_of_last(WINDOW))?;
+    run.result("validation_loss", losses.last_validation())?;
+    run.result("validation_realism", losses.last_realism())
 }
 
 /// Loss by part and by field of the state, nats.

@@ -8,7 +8,7 @@ use gump_model::relative::{
     self, RelativeConfig, RelativeNetwork, RelativeSampling, RelativeTrainConfig, RelativeTrainer,
     RelativeWorld,
 };
-use gump_model::train::StepReport;
+use gump_model::train::{Peers as _, StepReport};
 use gump_model::{Device, LossParts};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
@@ -18,9 +18,10 @@ use toml::Table;
 
 use super::realism::Judge;
 use super::stages::{self, Stage};
-use super::{Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, WINDOW, learn, write};
+use super::{Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, tell, write};
 use crate::cli::WrongArguments;
 use crate::losses::Losses;
+use crate::peers::Processes;
 use crate::run::Run;
 
 /// The name of the architecture in `--model`.
@@ -52,7 +53,14 @@ pub(super) fn is_asked(args: &Args) -> anyhow::Result<bool> {
 /// Trains, in one stage or several.
 ///
 /// Error: bad input, or a step that failed; what was learned before it is kept.
-pub(super) fn execute(args: &Args, run: &mut Run) -> anyhow::Result<()> {
+pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyhow::Result<()> {
+    if processes.size() > 1 {
+        let wrong = format!(
+            "--model relative: trains in one process, found {}",
+            processes.size()
+        );
+        return Err(WrongArguments(wrong).into());
+    }
     let stages = args.stages_of(&known_keys()?, |table| config(args, table))?;
     let was_begun = |stage: &Stage<Config>| run.path(&stage.files.path(CHECKPOINT)).is_file();
     let mut resume = args.resume;
@@ -143,17 +151,8 @@ fn train(
     });
     run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?;
     trained?;
-    let tokens = losses.tokens_since(resumed_at);
     run.result("parameters", trainer.network().parameters().count())?;
-    run.result("steps", trainer.steps_done())?;
-    run.result(
-        "tokens_per_second",
-        tokens as f64 / began.elapsed().as_secs_f64(),
-    )?;
-    run.result("loss_first", losses.mean_of_first(WINDOW))?;
-    run.result("loss_last", losses.mean_of_last(WINDOW))?;
-    run.result("validation_loss", losses.last_validation())?;
-    run.result("validation_realism", losses.last_realism())?;
+    tell(run, &trainer, &losses, resumed_at, began)?;
     if let Some(last) = losses.last() {
         let names = ["stands", "ahead", "left", "turn"];
         let fields = names.iter().zip(&last.loss.fields);
@@ -172,15 +171,7 @@ fn check_resumed(
     trainer: &RelativeTrainer,
 ) -> anyhow::Result<()> {
     let begun = trainer.config();
-    for (flag, asked, begun) in [
-        ("--steps", args.steps, begun.steps),
-        ("--batch", args.batch, begun.batch),
-    ] {
-        if let Some(asked) = asked.filter(|&asked| asked != begun) {
-            let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
-            return Err(WrongArguments(wrong).into());
-        }
-    }
+    args.check_flags(begun.steps, begun.batch)?;
     let Some(path) = &args.common.config else {
         return Ok(());
     };
