@@ -4,10 +4,10 @@
 
 use std::path::PathBuf;
 
-use gump_metrics::wosac::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::Seed;
+use gump_wosac::realism::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),

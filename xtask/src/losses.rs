@@ -5,9 +5,9 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_metrics::wosac::Scores;
 use gump_model::train::StepReport;
 use gump_viz::{Chart, Series};
+use gump_wosac::realism::Scores;
 
 /// Points of a drawn curve; more cannot be told apart.
 const DRAWN: usize = 300;

@@ -2,8 +2,8 @@
 //! column is.
 
 use gump_data::Table;
-use gump_metrics::nuplan::{MetricScores, Row, ScenarioScores, Scoring};
 use gump_metrics::{ALL, average_displacement, over_rollout};
+use gump_nuplan::metrics::{MetricScores, Row, ScenarioScores, Scoring};
 use gump_scene::{Agent, AgentId, Rollout, Scenario};
 use rayon::prelude::*;
 use serde_json::Value;

@@ -3,11 +3,11 @@
 
 use anyhow::Context as _;
 use gump_metrics::behaviour::{Behaviour, Judged, judge};
-use gump_metrics::wosac::{Component, Config, Features, Log, Reference, Rollouts, Year};
 use gump_model::{Outlook, Watch};
 use gump_rollout::SimulateConfig;
 use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
+use gump_wosac::realism::{Component, Config, Features, Log, Reference, Rollouts, Year};
 
 use crate::imagine::imagine;
 use crate::run::Run;
@@ -52,7 +52,7 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
     };
     let realism = evaluation.realism();
     let conduct = Behaviour::new(scenario, HORIZON_S).conduct(futures);
-    for judged in judge(&realism, conduct) {
+    for judged in judge(realism.iter().map(|one| (one.agent, one.realism)), conduct) {
         if judged.realism.is_some() {
             viewer.realism(judged.conduct.agent, judged.plausibility);
             viewer.deeds(judged.conduct.agent, deeds(&judged));

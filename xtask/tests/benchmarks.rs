@@ -13,11 +13,11 @@ use gump_data::submission::{
     write_rollouts,
 };
 use gump_data::tfrecord::{TfRecordReader, write_record};
-use gump_data::womd::proto::motion::{MotionChallengeSubmission, PredictionKind};
-use gump_data::womd::proto::{
-    self, FeatureData, MapFeature, RequiredPrediction, SimAgentsChallengeSubmission,
-};
 use gump_metrics::logged;
+use gump_proto::motion::{MotionChallengeSubmission, PredictionKind};
+use gump_proto::{
+    self as proto, FeatureData, MapFeature, RequiredPrediction, SimAgentsChallengeSubmission,
+};
 use gump_scene::{PredictedMode, Prediction, Scenario};
 use prost::Message;
 use serde_json::Value;

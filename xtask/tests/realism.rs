@@ -4,12 +4,12 @@
 
 use std::path::{Path, PathBuf};
 
-use gump_metrics::wosac::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 use gump_model::relative::{self, RelativeWorld};
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Scenario, Seed};
+use gump_wosac::realism::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 
 /// Scenes of the tuning split of the mini set: a crossing with lights, a roundabout and a street with
 /// parked cars among them.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use gump_data::tfrecord::TfRecordReader;
-use gump_data::womd::{proto, write_scenarios};
+use gump_data::womd::write_scenarios;
 use gump_data::{ReadOptions, open_with};
 use prost::Message;
 
@@ -46,7 +46,7 @@ fn read(c: &mut Criterion) {
         b.iter(|| {
             for payload in payloads() {
                 let bytes = payload.expect("sound").bytes;
-                let message = proto::Scenario::decode(bytes.as_slice());
+                let message = gump_proto::Scenario::decode(bytes.as_slice());
                 black_box(message.expect("sound"));
             }
         });

@@ -18,10 +18,8 @@ use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario};
 use prost::Message;
 
 use crate::stream::{self, io_error};
-use crate::womd::proto::{
-    JointScene, ScenarioRollouts, SimAgentsChallengeSubmission, SimulatedTrajectory,
-};
 use crate::{DataError, Place, Problem, write_atomically};
+use gump_proto::{JointScene, ScenarioRollouts, SimAgentsChallengeSubmission, SimulatedTrajectory};
 
 pub use archive::{
     ArchiveWriter, ExpectedScenarios, SubmissionCheck, check_archive, metadata_problems,

@@ -11,7 +11,7 @@ use gump_data::submission::{
     ArchiveWriter, ExpectedScenarios, N_FUTURES, SubmissionCheck, check_archive, metadata_problems,
     rollouts_to_proto,
 };
-use gump_data::womd::proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
+use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use gump_scene::{Rollout, Scenario};
 use prost::Message;
 

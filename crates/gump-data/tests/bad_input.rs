@@ -7,9 +7,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use gump_data::tfrecord::{MAX_RECORD_BYTES, masked_crc, write_record};
-use gump_data::womd::proto::{self, FeatureData};
 use gump_data::womd::{scenario_from_proto, scenario_to_proto};
 use gump_data::{DataError, Problem, ReadOptions, open};
+use gump_proto::{self as proto, FeatureData};
 use prost::Message;
 use tempfile::TempDir;
 

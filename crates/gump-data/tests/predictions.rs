@@ -10,11 +10,9 @@ use gump_data::submission::{
     N_POSITIONS, prediction_problems, predictions_from_proto, predictions_to_proto,
     read_predictions, write_predictions,
 };
-use gump_data::womd::proto::motion::{
-    ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind,
-};
 use gump_data::{DataError, Problem};
 use gump_geometry::{DVec2, dvec2};
+use gump_proto::motion::{ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind};
 use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
 
 fn golden(name: &str) -> PathBuf {
@@ -154,7 +152,7 @@ fn inconsistent_messages_are_refused() {
     };
     let damaged =
         |m: &mut ChallengeScenarioPredictions,
-         damage: &dyn Fn(&mut gump_data::womd::proto::motion::ScoredJointTrajectory)| {
+         damage: &dyn Fn(&mut gump_proto::motion::ScoredJointTrajectory)| {
             let mut joint = modes(m);
             damage(&mut joint.joint_trajectories[1]);
             m.prediction_set = Some(PredictionKind::JointPrediction(joint));

@@ -75,7 +75,7 @@ fn every_broken_rule_is_named() {
     let scenario = common::crossing();
     let rollouts: Vec<_> = (0..N_FUTURES).map(|k| future(&scenario, k)).collect();
     let (message, _) = rollouts_to_proto(&scenario.id, &rollouts).unwrap();
-    let check = |damage: &dyn Fn(&mut gump_data::womd::proto::ScenarioRollouts), expected: &str| {
+    let check = |damage: &dyn Fn(&mut gump_proto::ScenarioRollouts), expected: &str| {
         let mut message = message.clone();
         damage(&mut message);
         let problems = submission_problems(&message, &scenario);

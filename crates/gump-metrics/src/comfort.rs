@@ -8,7 +8,7 @@ use crate::{Metric, Reduce, kinematics};
 ///
 /// Bounds that cannot be computed yet do not count; `None` if not even an acceleration can.
 /// Differences are taken frame by frame, so frames from noisy tracks break bounds that the same
-/// drive keeps when it is smoothed; [`crate::nuplan::ComfortSeries`] does that for finished drives.
+/// drive keeps when it is smoothed; `ComfortSeries` of `gump-nuplan` does that for finished drives.
 ///
 /// Source: the bounds of nuPlan's comfort metric, see [`ComfortBounds`].
 #[derive(Clone, Copy, Debug)]

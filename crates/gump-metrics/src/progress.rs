@@ -35,7 +35,7 @@ impl Metric for Progress {
 
 /// Metres gained along a path by moving from one point to another, at most the distance moved, so
 /// that a path which crosses itself adds nothing.
-pub(crate) fn gained(path: &Polyline, before: DVec2, now: DVec2) -> f64 {
+pub fn gained(path: &Polyline, before: DVec2, now: DVec2) -> f64 {
     let gained = path.project(now).arc_length - path.project(before).arc_length;
     let moved = before.distance(now);
     gained.clamp(-moved, moved)

@@ -1,7 +1,7 @@
 //! What can keep a planner from planning.
 
 use gump_geometry::DVec2;
-use gump_metrics::nuplan::NuPlanError;
+use gump_nuplan::metrics::NuPlanError;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::{AgentId, RoadblockId};
 

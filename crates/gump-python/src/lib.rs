@@ -22,7 +22,6 @@ mod reader;
 mod scenario;
 mod scenario_arrays;
 mod threads;
-mod waymo;
 mod world;
 mod wosac;
 

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use gump_data::submission::{decode_rollouts, encode_rollouts, read_rollouts};
-use gump_data::womd::proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
+use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;

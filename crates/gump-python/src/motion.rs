@@ -3,8 +3,8 @@
 use std::sync::{Mutex, PoisonError};
 
 use gump_geometry::dvec2;
-use gump_metrics::motion::{MotionConfig, MotionTally, PredictionScore, evaluate_predictions};
 use gump_scene::{AgentId, PredictedMode, Prediction};
+use gump_wosac::motion::{MotionConfig, MotionTally, PredictionScore, evaluate_predictions};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -49,7 +49,7 @@ impl Tally {
             let scores = evaluate_predictions(scenario, &predictions, &self.config)?;
             let mut tally = self.tally.lock().unwrap_or_else(PoisonError::into_inner);
             scores.iter().for_each(|score| tally.add(score));
-            Ok::<_, gump_metrics::motion::MotionError>(scores)
+            Ok::<_, gump_wosac::motion::MotionError>(scores)
         });
         let told = PyList::empty(py);
         for score in &scores.map_err(errors::value)? {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gump_geometry::{Pose, dvec2};
-use gump_metrics::nuplan::{ClosedLoop, Drive, Sample, Scoring, score};
+use gump_nuplan::metrics::{ClosedLoop, Drive, Sample, Scoring, score};
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{
     ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver, NuplanIdmDriver,

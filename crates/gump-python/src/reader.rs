@@ -7,6 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use gump_data::tfrecord::TfRecordReader;
 use gump_data::womd::{decode_scenario, scenario_from_proto};
 use gump_data::{DataError, Problem, ReadOptions, list_files, open_files};
+use gump_wosac::realism::{Log, N_HISTORY, N_STEPS};
 use pyo3::prelude::*;
 
 use crate::errors;
@@ -136,7 +137,13 @@ fn waymo(bytes: &[u8]) -> Result<Scene, (String, Problem)> {
     let message = decode_scenario(bytes).map_err(|problem| (String::new(), problem))?;
     let (scenario, _) = scenario_from_proto(&message, ReadOptions::ALL)
         .map_err(|problem| (message.scenario_id().to_owned(), problem))?;
-    let log = crate::waymo::log(&message, &scenario);
+    // The metric is defined on Waymo's own clock.
+    let is_waymos = (scenario.now + 1, scenario.log.len()) == (N_HISTORY, N_STEPS);
+    let log = is_waymos.then(|| Log {
+        ego: Some(scenario.ego),
+        targets: scenario.targets.clone(),
+        ..Log::of_message(&message)
+    });
     Ok(Scene::with_log(scenario, log))
 }
 

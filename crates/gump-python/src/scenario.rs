@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
 
-use gump_metrics::wosac::{Log, WosacError};
 use gump_scene::{AgentId, Frame};
+use gump_wosac::realism::{Log, WosacError};
 use numpy::{PyArray1, PyArrayDyn};
 use pyo3::prelude::*;
 

@@ -3,11 +3,11 @@
 use std::sync::{Arc, OnceLock};
 
 use gump_data::submission::decode_rollouts;
-use gump_metrics::wosac::{
+use gump_scene::{AgentId, AgentKind};
+use gump_wosac::realism::{
     AgentRealism, Blame, Component, Config, Log, Mode, N_FUTURE, N_STEPS, Reference, Rollouts,
     Scores, Trajectory, WosacError, Year,
 };
-use gump_scene::{AgentId, AgentKind};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -17,7 +17,6 @@ use crate::arrays::{Numbers, array};
 use crate::errors;
 use crate::scenario::{Scenario, Scene};
 use crate::threads;
-use crate::waymo;
 
 /// The settings of a year, read once, or settings of one's own: TOML, which has more than one line.
 fn config(year: &str) -> PyResult<Arc<Config>> {
@@ -477,7 +476,7 @@ pub(crate) fn wosac_score_message<'py>(
         explain,
     };
     let found = threads::work(py, || {
-        let rollouts = waymo::rollouts(&message, config.mode);
+        let rollouts = Rollouts::of_message(&message, config.mode);
         evaluate(scene.log()?, &rollouts, &config, wanted)
     })?;
     found.map_err(errors::value)?.tell(py, &scene.scenario.id)

@@ -3,7 +3,7 @@
 //! Taken of the stored message, before a reader infers anything, and of numbers rounded so far
 //! that the last bits of another machine's sine do not count.
 
-use gump_data::womd::proto::{FeatureData, MapPoint, Scenario};
+use gump_proto::{FeatureData, MapPoint, Scenario};
 use sha2::{Digest, Sha256};
 
 /// Parts of a metre, a radian and a metre per second that count.

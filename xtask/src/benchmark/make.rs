@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_data::tfrecord::TfRecordReader;
-use gump_data::womd::proto;
+use gump_proto as proto;
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{SumoDemand, SynthesisConfig, synthesize};
 use prost::Message as _;

@@ -19,8 +19,8 @@ const CONFINED: [(&str, &[&str], &str); 4] = [
     ),
     (
         "prost",
-        &["gump-data", "xtask"],
-        "only gump-data and the driver know a file layout",
+        &["gump-proto", "gump-data", "xtask"],
+        "only messages, gump-data and the driver know a file layout",
     ),
     ("clap", &["xtask"], "only the driver reads a command line"),
     (

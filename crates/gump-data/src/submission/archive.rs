@@ -16,8 +16,8 @@ use prost::Message;
 use super::rollouts_problems;
 use super::shard::{ShardReader, write_scenario};
 use crate::stream::{self, io_error};
-use crate::womd::proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use crate::{DataError, write_atomically};
+use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 
 /// A shard is closed once it holds this much; protobuf ends at 2 GB.
 const SHARD_BYTES: u64 = 1 << 30;

@@ -23,7 +23,7 @@ use serde::Deserialize;
 use crate::DataError;
 use crate::argoverse2::table;
 use crate::stream;
-use crate::womd::proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
+use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 
 /// The largest file that is read, and the most that a member of it may unpack to, bytes.
 const MAX_BYTES: u64 = 4 << 30;

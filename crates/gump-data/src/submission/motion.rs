@@ -12,12 +12,12 @@ use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
 use prost::Message;
 
 use crate::stream::{self, io_error};
-use crate::womd::proto::motion::{
+use crate::{DataError, Place, Problem, write_atomically};
+use gump_proto::motion::{
     ChallengeScenarioPredictions, JointPrediction, MotionChallengeSubmission, ObjectTrajectory,
     PredictionKind, PredictionSet, ScoredJointTrajectory, ScoredTrajectory, SingleObjectPrediction,
     Trajectory,
 };
-use crate::{DataError, Place, Problem, write_atomically};
 
 /// Positions the challenge asks for, per path: 8 s at 2 Hz.
 pub const N_POSITIONS: usize = 16;

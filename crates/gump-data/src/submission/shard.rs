@@ -10,8 +10,8 @@ use prost::Message;
 
 use crate::stream::io_error;
 use crate::tfrecord::MAX_RECORD_BYTES;
-use crate::womd::proto::{ScenarioRollouts, SimAgentsChallengeSubmission};
 use crate::{DataError, Place};
+use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission};
 
 /// Field number of the scenarios in `SimAgentsChallengeSubmission`.
 const SCENARIO_ROLLOUTS: u64 = 1;

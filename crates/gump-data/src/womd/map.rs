@@ -8,9 +8,9 @@ use gump_scene::{
     RoadLineKind, StopSign,
 };
 
-use super::proto::{self, FeatureData, LaneType, RoadEdgeType, RoadLineType};
 use crate::error::MAX_COORDINATE;
 use crate::{Problem, ReadReport, infer};
+use gump_proto::{self as proto, FeatureData, LaneType, RoadEdgeType, RoadLineType};
 
 /// Metres per second in one mile per hour (international mile, exact).
 pub(crate) const METERS_PER_SECOND_IN_MPH: f64 = 0.447_04;

@@ -1,7 +1,6 @@
 //! Waymo Open Motion Dataset: `Scenario` messages in TFRecord files.
 
 mod map;
-pub mod proto;
 mod read;
 mod write;
 mod write_map;
@@ -39,8 +38,8 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
 ///
 /// # Errors
 /// [`Problem::Message`].
-pub fn decode_scenario(bytes: &[u8]) -> Result<proto::Scenario, Problem> {
-    proto::Scenario::decode(bytes).map_err(|source| Problem::Message {
+pub fn decode_scenario(bytes: &[u8]) -> Result<gump_proto::Scenario, Problem> {
+    gump_proto::Scenario::decode(bytes).map_err(|source| Problem::Message {
         message: "waymo.open_dataset.Scenario",
         source,
     })
@@ -67,7 +66,7 @@ impl Source for Scenarios {
                 Err(error) => return Some(Err(error)),
             };
             let place = payload.place;
-            let proto = match proto::Scenario::decode(payload.bytes.as_slice()) {
+            let proto = match gump_proto::Scenario::decode(payload.bytes.as_slice()) {
                 Ok(proto) => proto,
                 Err(source) => {
                     let message = "waymo.open_dataset.Scenario";

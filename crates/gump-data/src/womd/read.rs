@@ -11,9 +11,9 @@ use gump_scene::{
 };
 
 use super::map;
-use super::proto::{self, ObjectType, SignalState};
 use crate::error::MAX_COORDINATE;
 use crate::{Problem, ReadOptions, ReadReport, infer};
+use gump_proto::{self as proto, ObjectType, SignalState};
 
 /// Time stamps may stray from the nominal step by this fraction: Waymo's clocks drift by up to
 /// 0.5 %, and a lost step would be 100 %.

@@ -13,11 +13,11 @@ use flate2::write::GzEncoder;
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Light, LightState, Scenario};
 use prost::Message;
 
-use super::proto::{self, ObjectType, SignalState};
 use super::write_map;
 use crate::stream::io_error;
 use crate::tfrecord::write_record;
 use crate::{DataError, ReadReport, write_atomically};
+use gump_proto::{self as proto, ObjectType, SignalState};
 
 /// Writes scenarios as TFRecord, gzip if the name ends in `.gz`, and says what Waymo's messages
 /// have no room for.

@@ -6,8 +6,8 @@ use gump_scene::{
 };
 
 use super::map::METERS_PER_SECOND_IN_MPH;
-use super::proto::{self, FeatureData, LaneType, MapPoint, RoadEdgeType, RoadLineType};
 use crate::ReadReport;
+use gump_proto::{self as proto, FeatureData, LaneType, MapPoint, RoadEdgeType, RoadLineType};
 
 /// All features of the map, each kind in its order; areas Waymo does not know are dropped.
 pub(super) fn features_from_map(map: &MapGraph, report: &mut ReadReport) -> Vec<proto::MapFeature> {

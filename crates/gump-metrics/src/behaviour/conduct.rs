@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use super::{Behaviour, Measure, Seen};
 use crate::logged;
 use crate::summary::{is_on_road, leaves_road};
-use crate::wosac::AgentRealism;
 
 /// Something that a driver would not do, and that the log of the agent does not show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -122,13 +121,17 @@ pub struct Judged {
     pub plausibility: f64,
 }
 
-/// Sets realism and conduct side by side, the least plausible agent first; ties by id.
+/// Sets realism, as far as agents have one, and conduct side by side, the least plausible agent
+/// first; ties by id.
 ///
 /// The official score is not touched: this ranks whom to look at.
-pub fn judge(realism: &[AgentRealism], conduct: Vec<Conduct>) -> Vec<Judged> {
-    let of = |id: AgentId| realism.iter().find(|agent| agent.agent == id);
+pub fn judge(
+    realism: impl IntoIterator<Item = (AgentId, f64)>,
+    conduct: Vec<Conduct>,
+) -> Vec<Judged> {
+    let realism: BTreeMap<AgentId, f64> = realism.into_iter().collect();
     let judged = conduct.into_iter().map(|conduct| {
-        let realism = of(conduct.agent).map(|agent| agent.realism);
+        let realism = realism.get(&conduct.agent).copied();
         Judged {
             realism,
             plausibility: realism.unwrap_or(1.0) * (1.0 - conduct.any),

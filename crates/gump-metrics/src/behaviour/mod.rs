@@ -49,7 +49,6 @@ mod lane_change;
 mod lights;
 mod measure;
 mod overlap;
-mod paths;
 mod reach;
 mod standing;
 #[cfg(test)]
@@ -63,7 +62,6 @@ use rayon::prelude::*;
 
 pub use conduct::{Conduct, Deed, Judged, judge};
 pub use measure::{Class, Count, Incident, Key, Measure, Seen, Tally};
-pub use paths::of_paths;
 use track::{Take, Track};
 
 /// Moments at which it is counted who stands, seconds after the present.

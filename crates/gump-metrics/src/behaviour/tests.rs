@@ -6,7 +6,7 @@ use gump_geometry::{Pose, dvec2};
 use gump_scene::{Agent, AgentId, Frame, Light, LightState, Rollout, Scenario, fixture};
 
 use super::*;
-use crate::{logged, wosac};
+use crate::logged;
 
 /// A future of 8 s in which every agent is where `drive` says that it is after so many seconds.
 fn future(scenario: &Scenario, drive: impl Fn(&Agent, f64) -> Pose) -> Rollout {
@@ -426,51 +426,6 @@ fn newcomers_count_only_where_that_is_asked_for() {
     };
     assert_eq!(count(new()), (0.0, 1.0));
     assert_eq!(count(new().with_newcomers()), (1.0, 2.0));
-}
-
-#[test]
-fn the_parked_car_that_pulls_out_in_every_future_is_the_worst() {
-    let text = format!(
-        "{ROAD}edge: -150,-9 600,-9
-         agent vehicle 1: 30,-5
-         agent vehicle 2: 60,0 velocity 10,0
-         agent pedestrian 3: 40,8 velocity 1,0
-         history 1 future 8 dt 0.1"
-    );
-    let scenario = scenario(&text);
-    // Agent 2 slows down a little, never as logged; agent 1 pulls out, each time elsewhere.
-    let futures: Vec<Rollout> = (0..8)
-        .map(|i| {
-            future(&scenario, |agent, t| {
-                let (pose, speed) = (agent.state.pose, agent.state.velocity.length());
-                match agent.id.0 {
-                    1 => ahead(pose, 0.4 * (t - 0.5 * f64::from(i)).max(0.0).powi(2)),
-                    2 => ahead(pose, (speed - 2.0 - 0.1 * f64::from(i)) * t),
-                    _ => ahead(pose, speed * t),
-                }
-            })
-        })
-        .collect();
-    let config = wosac::Config::of(wosac::Year::Y2025);
-    let log = wosac::Log::of(&scenario).unwrap();
-    let reference = wosac::Reference::new(&log, &config).unwrap();
-    let imagined = wosac::Rollouts::of(&scenario.id, &futures, config.mode).unwrap();
-    let realism = reference.evaluate(&imagined).unwrap().realism();
-    let own = |id| realism.iter().find(|agent| agent.agent == AgentId(id));
-    let (parked, slow) = (own(1).unwrap().realism, own(2).unwrap().realism);
-    // What this is about: the log alone finds the parked car fine.
-    assert!(parked > 0.5 && parked > slow - 0.2, "{parked} {slow}");
-    let conduct = Behaviour::new(&scenario, 8).conduct(&futures);
-    let judged = judge(&realism, conduct);
-    assert_eq!(judged[0].conduct.agent, AgentId(1), "{judged:?}");
-    let worst = &judged[0];
-    assert_eq!((worst.plausibility, worst.conduct.any), (0.0, 1.0));
-    let deed = Deed::Measured(Measure::ParkedMove);
-    assert_eq!(worst.conduct.deeds[0], (deed, 1.0));
-    assert!(
-        judged[1..].iter().all(|agent| agent.plausibility > 0.3),
-        "{judged:?}"
-    );
 }
 
 #[test]

@@ -3,8 +3,8 @@
 //! The bounds are those of the metric; the windows are PDM's: a proposal is as short as a window.
 
 use gump_geometry::angle_difference;
-use gump_metrics::nuplan::SavitzkyGolay;
 use gump_metrics::{ComfortBounds, Felt};
+use gump_nuplan::metrics::SavitzkyGolay;
 use gump_scene::EgoState;
 
 /// Filters for drives of one length, as matrices.

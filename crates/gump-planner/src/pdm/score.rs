@@ -1,12 +1,12 @@
 //! How good the tracked proposals are.
 //!
 //! Definitions shared with nuPlan's metrics (whose fault a collision is, what is ahead, comfort)
-//! come from `gump_metrics::nuplan`; what is PDM's own is here.
+//! come from `gump_nuplan::metrics`; what is PDM's own is here.
 
 use std::collections::BTreeSet;
 
 use gump_geometry::{DVec2, OrientedBox, Quad};
-use gump_metrics::nuplan::{classify, is_ahead, is_behind};
+use gump_nuplan::metrics::{classify, is_ahead, is_behind};
 use gump_scene::{EgoState, VehicleParameters};
 
 use super::comfort::ComfortFilters;

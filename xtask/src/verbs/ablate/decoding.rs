@@ -10,10 +10,10 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_metrics::interval;
-use gump_metrics::wosac::{Config, Reference, Scores, Year};
 use gump_model::{Mode, Precision, SamplingConfig, Surrogate};
 use gump_scene::Seed;
 use gump_viz::{Chart, Series};
+use gump_wosac::realism::{Config, Reference, Scores, Year};
 use serde::Serialize;
 use serde_json::{Value, json};
 

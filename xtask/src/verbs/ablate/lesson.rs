@@ -7,10 +7,10 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_metrics::interval;
-use gump_metrics::wosac::Scores;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::{Mode, ModelConfig, RunConfig, TrainConfig, Trainer};
 use gump_scene::{Scenario, Seed};
+use gump_wosac::realism::Scores;
 use serde::Serialize;
 use serde_json::{Value, json};
 

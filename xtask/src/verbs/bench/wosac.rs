@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
-use gump_metrics::wosac::{Config, Log, Mode, Rollouts, Year, score};
 use gump_scene::Seed;
+use gump_wosac::realism::{Config, Log, Mode, Rollouts, Year, score};
 use rand::Rng as _;
 use serde::Serialize;
 use serde_json::json;

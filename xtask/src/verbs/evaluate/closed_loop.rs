@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use gump_metrics::interval;
-use gump_metrics::nuplan::MetricScores;
+use gump_nuplan::metrics::MetricScores;
 use gump_planner::closed_loop::{Scored, drive_and_score, evaluate};
 use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
 use gump_rollout::WorldModel;

@@ -6,8 +6,8 @@ use gump_data::submission::{
     ArchiveWriter, ExpectedScenarios, N_FUTURES, N_STEPS, SubmissionCheck, check_archive,
     metadata_problems, read_rollouts, rollouts_to_proto,
 };
-use gump_data::womd::proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use gump_data::{ReadOptions, open_with};
+use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use serde::Serialize;
 
 use crate::cli::WrongArguments;

@@ -1,9 +1,9 @@
 //! Realism while training: the network as it is imagines held-out scenes, which are scored as in
 //! the Waymo Sim Agents Challenge of 2025.
 
-use gump_metrics::wosac::{Config, Log, Reference, Rollouts, Scores, Year};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Scenario, Seed};
+use gump_wosac::realism::{Config, Log, Reference, Rollouts, Scores, Year};
 
 use crate::run::stop_if_interrupted;
 

@@ -10,12 +10,12 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use gump_data::ReadOptions;
-use gump_metrics::motion::{
+use gump_model::Device;
+use gump_scene::{Prediction, Scenario};
+use gump_wosac::motion::{
     MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
     forecast,
 };
-use gump_model::Device;
-use gump_scene::{Prediction, Scenario};
 use serde::{Deserialize, Serialize};
 
 use self::scores::Scores;

@@ -1,7 +1,7 @@
 //! Scores of the predictions of one scenario as they are kept in a ledger.
 
-use gump_metrics::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
 use gump_scene::{AgentId, AgentKind};
+use gump_wosac::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
 use serde::{Deserialize, Serialize};
 
 /// What one scenario got.

@@ -7,12 +7,10 @@ use anyhow::Context as _;
 use gump_data::submission::{
     predictions_from_proto, read_predictions, read_rollouts, rollouts_from_proto,
 };
-use gump_data::womd::proto::ScenarioRollouts;
-use gump_data::womd::proto::motion::{
-    ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind,
-};
-use gump_metrics::motion::{MotionConfig, forecast};
+use gump_proto::ScenarioRollouts;
+use gump_proto::motion::{ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind};
 use gump_scene::{Prediction, Scenario};
+use gump_wosac::motion::{MotionConfig, forecast};
 
 use crate::rollout_files;
 

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use gump_metrics::motion::{MotionConfig, MotionRow, MotionTally};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
 use gump_viz::Bars;
+use gump_wosac::motion::{MotionConfig, MotionRow, MotionTally};
 use serde::Deserialize as _;
 use serde_json::{Map, Value, json};
 

@@ -16,9 +16,9 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
-use gump_metrics::wosac::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_wosac::realism::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
 use serde::{Deserialize, Serialize};
 
 use super::ledger::{Entry, Header, Ledger};
@@ -325,7 +325,7 @@ impl Args {
 fn constant_velocity(
     recorded: &Recorded,
     mode: Mode,
-) -> anyhow::Result<gump_metrics::wosac::Rollouts> {
+) -> anyhow::Result<gump_wosac::realism::Rollouts> {
     let start = Start {
         scene: recorded.scenario.present().unguided(),
         n_futures: 1,
@@ -339,7 +339,7 @@ fn constant_velocity(
     )
     .map_err(|error| anyhow::anyhow!(error))?;
     let id = &recorded.log.scenario;
-    Ok(gump_metrics::wosac::Rollouts::of(id, &rollouts, mode)?)
+    Ok(gump_wosac::realism::Rollouts::of(id, &rollouts, mode)?)
 }
 
 /// Writes what a scenario's score lacks, and keeps the dearest of all scenarios.

@@ -11,10 +11,9 @@ use std::rc::Rc;
 use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::tfrecord::TfRecordReader;
-use gump_data::womd::proto::{self, FeatureData, LaneType, ObjectType, SignalState};
 use gump_data::womd::scenario_from_proto;
-use gump_metrics::wosac::{Log, N_HISTORY, N_STEPS, Signal, SignalLane, State, Track};
-use gump_scene::{AgentId, AgentKind, Scenario};
+use gump_scene::Scenario;
+use gump_wosac::realism::{Log, N_HISTORY, N_STEPS};
 use prost::Message as _;
 
 /// A recorded scenario.
@@ -127,13 +126,17 @@ fn waymo_files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
 }
 
 fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> anyhow::Result<Recorded> {
-    let message = proto::Scenario::decode(bytes).context("expected a Scenario message")?;
+    let message = gump_proto::Scenario::decode(bytes).context("expected a Scenario message")?;
     let id = message.scenario_id();
     let (scenario, _) =
         scenario_from_proto(&message, options).with_context(|| format!("scenario {id}"))?;
     // Waymo's own messages all have this clock; others are scored as scenarios.
     let log = match (scenario.now + 1, scenario.log.len()) {
-        (N_HISTORY, N_STEPS) => log(&message, &scenario),
+        (N_HISTORY, N_STEPS) => Log {
+            ego: Some(scenario.ego),
+            targets: scenario.targets.clone(),
+            ..Log::of_message(&message)
+        },
         _ => Log::of(&scenario)?,
     };
     Ok(Recorded {
@@ -141,72 +144,4 @@ fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> anyhow::Result<
         scenario,
         log,
     })
-}
-
-/// What the metric reads of a message that is a scenario.
-fn log(message: &proto::Scenario, scenario: &Scenario) -> Log {
-    let tracks = message.tracks.iter().map(|track| {
-        let id = AgentId(track.id().into());
-        Track::new(
-            id,
-            kind(track.object_type()),
-            track.states.iter().map(state).collect(),
-        )
-    });
-    let mut log = Log::new(message.scenario_id(), tracks.collect());
-    log.ego = Some(scenario.ego);
-    log.targets.clone_from(&scenario.targets);
-    for feature in &message.map_features {
-        match &feature.feature_data {
-            Some(FeatureData::RoadEdge(edge)) => {
-                log.road_edges
-                    .push(edge.polyline.iter().map(point).collect());
-            }
-            Some(FeatureData::Lane(lane)) if lane.r#type() == LaneType::SurfaceStreet => {
-                let points = lane.polyline.iter().map(point);
-                log.lanes.push(SignalLane {
-                    id: feature.id(),
-                    points: points.map(|[x, y, _]| [x, y]).collect(),
-                });
-            }
-            _ => {}
-        }
-    }
-    let steps = message.dynamic_map_states.iter();
-    log.signals = steps
-        .map(|step| step.lane_states.iter().map(signal).collect())
-        .collect();
-    log
-}
-
-/// What an object is.
-pub(super) fn kind(object_type: ObjectType) -> AgentKind {
-    match object_type {
-        ObjectType::Vehicle => AgentKind::Vehicle,
-        ObjectType::Pedestrian => AgentKind::Pedestrian,
-        ObjectType::Cyclist => AgentKind::Bicycle,
-        ObjectType::Other | ObjectType::Unset => AgentKind::Other,
-    }
-}
-
-fn state(state: &proto::ObjectState) -> State {
-    State {
-        position: [state.center_x(), state.center_y(), state.center_z()].map(|v| v as f32),
-        heading: state.heading(),
-        size: [state.length(), state.width(), state.height()],
-        valid: state.valid(),
-    }
-}
-
-fn point(point: &proto::MapPoint) -> [f32; 3] {
-    [point.x(), point.y(), point.z()].map(|v| v as f32)
-}
-
-fn signal(signal: &proto::TrafficSignalLaneState) -> Signal {
-    let [x, y, _] = signal.stop_point.as_ref().map_or([0.0; 3], point);
-    Signal {
-        lane: signal.lane(),
-        stop: matches!(signal.state(), SignalState::Stop | SignalState::ArrowStop),
-        stop_point: [x, y],
-    }
 }

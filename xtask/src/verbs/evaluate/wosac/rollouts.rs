@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::submission::read_rollouts;
-use gump_data::womd::proto::{ScenarioRollouts, SimulatedTrajectory};
-use gump_metrics::wosac::{Mode, Rollouts, Trajectory};
-use gump_scene::{AgentId, Seed};
+use gump_proto::ScenarioRollouts;
+use gump_scene::Seed;
+use gump_wosac::realism::{Mode, Rollouts};
 
 use super::Recorded;
-use super::recording::kind;
 use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::imagine;
@@ -178,37 +177,10 @@ impl Source {
                     .find(|message| message.scenario_id() == scenario.id)
                     .with_context(|| format!("the file has changed: {}", file.display()))?;
                 Ok(Found {
-                    rollouts: rollouts(message, mode),
+                    rollouts: Rollouts::of_message(message, mode),
                     digest: None,
                 })
             }
         }
     }
-}
-
-/// A message as what is scored.
-fn rollouts(message: &ScenarioRollouts, mode: Mode) -> Rollouts {
-    let trajectory = |t: &SimulatedTrajectory| {
-        let drive = Trajectory::new(
-            AgentId(t.object_id().into()),
-            t.center_x.clone(),
-            t.center_y.clone(),
-            t.center_z.clone(),
-            t.heading.clone(),
-        );
-        if mode == Mode::SimAgents {
-            return drive;
-        }
-        let sizes = t.length.iter().zip(&t.width).zip(&t.height);
-        drive.with_box(
-            kind(t.object_type()),
-            sizes.map(|((&l, &w), &h)| [l, w, h]).collect(),
-        )
-    };
-    let scenes = message.joint_scenes.iter();
-    let futures = scenes.map(|scene| {
-        let trajectories = scene.simulated_trajectories.iter();
-        trajectories.map(trajectory).collect()
-    });
-    Rollouts::new(message.scenario_id(), futures.collect())
 }

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use gump_data::Table;
 use gump_metrics::interval;
-use gump_metrics::wosac::{Component, Scores};
 use gump_scene::Seed;
 use gump_viz::Bars;
+use gump_wosac::realism::{Component, Scores};
 use serde_json::{Map, Value, json};
 
 use super::{Scored, Settings};

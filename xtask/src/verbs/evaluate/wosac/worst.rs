@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use gump_metrics::behaviour::{Behaviour, Judged, judge, of_paths};
-use gump_metrics::wosac::{Blame, Evaluation, Rollouts};
+use gump_metrics::behaviour::{Behaviour, Judged, judge};
 use gump_scene::{AgentId, Scenario};
+use gump_wosac::realism::{Blame, Evaluation, Rollouts};
 use serde_json::{Value, json};
 
 use crate::run::Run;
@@ -41,8 +41,10 @@ impl Worst {
         for blame in blames {
             *costs.entry(blame.agent).or_default() += blame.cost;
         }
-        let conduct = Behaviour::new(scenario, HORIZON_S).conduct(&of_paths(scenario, rollouts));
-        for judged in judge(&evaluation.realism(), conduct) {
+        let conduct = Behaviour::new(scenario, HORIZON_S).conduct(&rollouts.in_scene(scenario));
+        let realism = evaluation.realism();
+        let realism = realism.iter().map(|one| (one.agent, one.realism));
+        for judged in judge(realism, conduct) {
             if judged.realism.is_none() && judged.conduct.any == 0.0 {
                 continue;
             }
