@@ -6,8 +6,9 @@
 
 use gump_geometry::Pose;
 use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
+use gump_nuplan::{closed_loop::*, reactive_agents::NuplanIdm, tracking::Trajectory};
 use gump_planner::closed_loop::drive_scenario;
-use gump_rollout::{BoxError, closed_loop::*, dynamics::Trajectory, worlds::NuplanIdm};
+use gump_rollout::BoxError;
 use gump_scene::{EgoState, Seed};
 
 const DATASETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../datasets");

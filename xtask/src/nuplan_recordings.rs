@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::nuplan::{Extraction, Log, Maps, NuplanScenario, ScenarioFilter, Selected};
-use gump_rollout::closed_loop::Recording;
+use gump_nuplan::closed_loop::Recording;
 use gump_scene::VehicleParameters;
 
 use crate::recordings::{Case, Named};

@@ -4,13 +4,14 @@
 use std::time::{Duration, Instant};
 
 use gump_model::Device;
+use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::{
     Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
     NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
 };
-use gump_rollout::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
-use gump_rollout::dynamics::Trajectory;
-use gump_rollout::worlds::{Idm, NuplanIdm};
+use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
 use serde::Serialize;

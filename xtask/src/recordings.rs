@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use gump_rollout::closed_loop::{Recording, derive_roadblocks};
+use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
 use gump_scene::{EgoState, MapGraph, Scenario};
 
 use crate::nuplan_recordings;

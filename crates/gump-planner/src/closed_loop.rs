@@ -3,11 +3,11 @@
 //! [`drive_scenario`] does one scenario, [`drive_and_score`] one recording, [`evaluate`] many at once. What fails is an error of its
 //! recording; nothing here averages.
 
-use gump_nuplan::metrics::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
-use gump_nuplan::metrics::{open_loop, score};
-use gump_rollout::closed_loop::{
+use gump_nuplan::closed_loop::{
     DriveConfig, Driven, Driver, Recording, Tracking, Traffic, derive_roadblocks, drive,
 };
+use gump_nuplan::metrics::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
+use gump_nuplan::metrics::{open_loop, score};
 use gump_scene::{EgoState, MapGraph, Scenario};
 use rayon::prelude::*;
 

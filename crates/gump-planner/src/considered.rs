@@ -1,7 +1,7 @@
 //! What a driver considered before it decided.
 
 use gump_geometry::Pose;
-use gump_rollout::closed_loop::Driver;
+use gump_nuplan::closed_loop::Driver;
 
 use crate::Decision;
 

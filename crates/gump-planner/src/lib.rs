@@ -5,7 +5,7 @@
 //! [`PlannerPolicy`] lets one drive in a simulation. How traffic moves is a world's business, what
 //! is good a reward's; nothing here reads a file or steps a world by itself.
 //!
-//! nuPlan's closed loop is driven by a [`gump_rollout::closed_loop::Driver`]: [`PdmClosed`], the
+//! nuPlan's closed loop is driven by a [`gump_nuplan::closed_loop::Driver`]: [`PdmClosed`], the
 //! paper's [`InteractiveDriver`], which is PDM with imagination in place of a forecast,
 //! [`ImitationDriver`], [`NuplanIdmDriver`], [`SimpleDriver`], the oracle [`LogDriver`], or any
 //! [`Planner`] as [`Planned`]. [`closed_loop`] lets one drive and scores it; [`Comparison`] says who
@@ -40,7 +40,8 @@
 //! `examples/score_a_planner.rs` judges this one in three worlds.
 //! ```
 //! use gump_planner::closed_loop::drive_scenario;
-//! use gump_rollout::{BoxError, closed_loop::*, dynamics::Trajectory, worlds::NuplanIdm};
+//! use gump_nuplan::{closed_loop::*, reactive_agents::NuplanIdm, tracking::Trajectory};
+//! use gump_rollout::BoxError;
 //! use gump_scene::EgoState;
 //!
 //! /// Goes on straight at the speed it has.

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::f64::consts::FRAC_PI_4;
 
 use gump_geometry::{DVec2, Polygon, Pose, angle_difference, dvec2};
-use gump_rollout::baseline;
+use gump_nuplan::path::baseline;
 use gump_scene::{Lane, LaneId, MapGraph, Roadblock, RoadblockId};
 
 /// Half the square around the rear axle in which its roadblock is looked for, metres.

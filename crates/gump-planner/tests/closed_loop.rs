@@ -5,17 +5,18 @@
 use std::sync::Arc;
 
 use gump_geometry::Pose;
+use gump_nuplan::closed_loop::{
+    DriveConfig, Driver, Mission, Moment, Recording, Replayed, derive_roadblocks,
+};
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{drive_and_score, evaluate};
 use gump_planner::{
     Explain, ImitationDriver, Interactive, InteractiveConfig, InteractiveDriver,
     InteractiveDriverConfig, LogDriver, NuplanIdmDriver, PdmClosed, Planned, SimpleDriver,
 };
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{
-    DriveConfig, Driver, Mission, Moment, Recording, Replayed, derive_roadblocks,
-};
-use gump_rollout::dynamics::Trajectory;
-use gump_rollout::worlds::{Idm, NuplanIdm};
+use gump_rollout::worlds::Idm;
 use gump_scene::{EgoState, MapGraph, Seed, fixture};
 
 const STREET: &str = "

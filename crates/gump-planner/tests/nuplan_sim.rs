@@ -11,10 +11,10 @@ use std::sync::Arc;
 use gump_data::ReadOptions;
 use gump_data::nuplan::{Extraction, Log, NuplanScenario, Token, read_map};
 use gump_geometry::angle_difference;
+use gump_nuplan::closed_loop::{DriveConfig, Driver, Recording, Replayed, Tracking, Traffic};
+use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_planner::closed_loop::{drive_and_score, plan_and_compare};
 use gump_planner::{LogDriver, NuplanIdmDriver, PdmClosed, SimpleDriver};
-use gump_rollout::closed_loop::{DriveConfig, Driver, Recording, Replayed, Tracking, Traffic};
-use gump_rollout::worlds::NuplanIdm;
 use gump_scene::{AgentId, EgoState, VehicleParameters};
 use serde_json::Value;
 
@@ -100,7 +100,7 @@ fn check_ego(name: &str, states: &[EgoState], golden: &Value) {
 fn check_agents(
     name: &str,
     synthetic: &Synthetic,
-    driven: &gump_rollout::closed_loop::Driven,
+    driven: &gump_nuplan::closed_loop::Driven,
     golden: &Value,
 ) {
     let Some(tokens) = golden["idm_agent_tokens"].as_array() else {

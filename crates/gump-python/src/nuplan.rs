@@ -4,18 +4,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gump_geometry::{Pose, dvec2};
+use gump_nuplan::closed_loop::{
+    DriveConfig, Driver, Imagined, Mission, Moment, Others, Recording, Replayed, Step, Tracking,
+    Traffic, derive_roadblocks,
+};
 use gump_nuplan::metrics::{ClosedLoop, Drive, Sample, Scoring, score};
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{
     ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver, NuplanIdmDriver,
     PdmClosed, SimpleDriver,
 };
-use gump_rollout::closed_loop::{
-    DriveConfig, Driver, Imagined, Mission, Moment, Others, Recording, Replayed, Step, Tracking,
-    Traffic, derive_roadblocks,
-};
-use gump_rollout::dynamics::Trajectory;
-use gump_rollout::worlds::{Idm, NuplanIdm};
+use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Frame, Scenario as Recorded, Seed, VehicleParameters};
 use numpy::PyArrayDyn;

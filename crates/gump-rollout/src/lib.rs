@@ -23,10 +23,8 @@
 //! assert!((ego.x - 64.0).abs() < 1e-9);
 //! ```
 
-pub mod closed_loop;
 pub mod dynamics;
 mod error;
-mod path;
 mod policy;
 mod resample;
 mod simulate;
@@ -34,7 +32,6 @@ mod world;
 pub mod worlds;
 
 pub use error::RolloutError;
-pub use path::{Path, baseline, curvature_at_start, nearest_on_baseline};
 pub use policy::{Command, Policy};
 pub use simulate::{Interpolation, SimulateConfig, simulate};
 pub use world::{BoxError, Session, Start, WorldModel};

@@ -1,10 +1,10 @@
 //! `plan`: one planner through one scenario, with everything it considered.
 
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{Considered, Decision, Explain};
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
 use gump_scene::{Frame, Scenario};
 use serde::Serialize;
 use serde_json::{Value, json};

@@ -1,8 +1,8 @@
 //! The world's own ego as a driver.
 
 use gump_geometry::{DVec2, Pose};
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError, Start, WorldModel};
 use gump_scene::{Seed, VehicleParameters};
 

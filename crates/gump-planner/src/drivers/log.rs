@@ -1,7 +1,7 @@
 //! The recorded driver, an oracle.
 
-use gump_rollout::closed_loop::{Driver, Moment, Recording};
-use gump_rollout::dynamics::Trajectory;
+use gump_nuplan::closed_loop::{Driver, Moment, Recording};
+use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::EgoState;
 

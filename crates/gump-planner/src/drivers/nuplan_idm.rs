@@ -4,10 +4,11 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::{OrientedBox, Polygon, Pose, Quad, widen};
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::path::{Path, baseline};
+use gump_nuplan::tracking::Trajectory;
+use gump_rollout::BoxError;
 use gump_rollout::worlds::{IdmConfig, idm_euler_step};
-use gump_rollout::{BoxError, Path, baseline};
 use gump_scene::{
     Agent, EgoState, Lane, LaneId, LightState, MapGraph, RoadblockId, VehicleParameters,
 };

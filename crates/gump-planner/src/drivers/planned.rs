@@ -1,9 +1,9 @@
 //! Any planner as a driver.
 
 use gump_geometry::dvec2;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
 use gump_scene::{EgoState, VehicleParameters};
 
 use crate::considered::{Considered, Explain};

@@ -1,9 +1,9 @@
 //! A car that rolls on straight.
 
 use gump_geometry::DVec2;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::{Controls, Trajectory, propagate_by};
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::{Controls, Trajectory, propagate_by};
 use gump_scene::{EgoState, VehicleParameters};
 
 use crate::PlanError;

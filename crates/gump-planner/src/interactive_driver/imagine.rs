@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use gump_geometry::Pose;
-use gump_rollout::closed_loop::Moment;
+use gump_nuplan::closed_loop::Moment;
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState};
 use rayon::prelude::*;

@@ -15,8 +15,8 @@ mod tests;
 
 use std::time::Duration;
 
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Rollout, Seed};
 

@@ -4,7 +4,7 @@ use std::cell::Cell;
 
 use approx::assert_abs_diff_eq;
 use gump_geometry::DVec2;
-use gump_rollout::closed_loop::{Recording, derive_roadblocks};
+use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_rollout::{RolloutError, Session, Start};
 use gump_scene::{Agent, AgentId, AgentState, Frame, fixture};

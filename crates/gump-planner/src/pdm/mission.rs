@@ -4,10 +4,11 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::{Polygon, Pose, Quad, angle_difference};
-use gump_rollout::closed_loop::{Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
+use gump_nuplan::closed_loop::{Mission, Moment};
+use gump_nuplan::path::{Path, baseline};
+use gump_nuplan::tracking::Trajectory;
+use gump_rollout::RolloutError;
 use gump_rollout::worlds::IdmConfig;
-use gump_rollout::{Path, RolloutError, baseline};
 use gump_scene::{
     EgoState, Lane, LaneId, LightState, MapGraph, RoadblockId, SceneState, VehicleParameters,
 };

@@ -21,9 +21,9 @@ pub(crate) mod track;
 
 pub use score::PdmScore;
 
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{Driver, Mission, Moment};
-use gump_rollout::dynamics::Trajectory;
 use gump_rollout::worlds::IdmConfig;
 use gump_scene::EgoState;
 

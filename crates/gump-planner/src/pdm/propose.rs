@@ -2,7 +2,7 @@
 //! through the forecast.
 
 use gump_geometry::{DVec2, LineIndex, Polygon, Pose, Quad, widen};
-use gump_rollout::Path;
+use gump_nuplan::path::Path;
 use gump_rollout::worlds::{IdmConfig, idm_euler_step};
 use gump_scene::VehicleParameters;
 

@@ -1,7 +1,7 @@
 //! How the ego would really drive the proposals: tracker and vehicle in the loop.
 
 use gump_geometry::Pose;
-use gump_rollout::dynamics::{
+use gump_nuplan::tracking::{
     Profile, ProfileFit, Smoothness, TRACKING_DT, TRACKING_HORIZON, Target, propagate_by,
     track_target,
 };

@@ -1,23 +1,14 @@
 //! How a command becomes the next state of a vehicle.
 //!
-//! [`advance`] works on box-centre states: a command and what it does at once. The ego of a closed
-//! loop is a vehicle with a rear axle and lagging actuators instead: a [`Trajectory`] is what it is
-//! asked to drive, [`LqrTracker`] turns that into [`Controls`], [`propagate`] into the next state.
-//! What to command is a [`crate::Policy`]'s business.
+//! [`advance`] works on box-centre states: a command and what it does at once. The ego of nuPlan's
+//! closed loop, a vehicle with a rear axle and lagging actuators, is `gump-nuplan`'s business, what to
+//! command a [`crate::Policy`]'s.
 
 mod bicycle;
-mod lqr;
 mod perfect;
-mod profile;
-mod rear_axle;
-mod trajectory;
 
 pub use bicycle::drive;
-pub use lqr::{LqrTracker, TRACKING_DT, TRACKING_HORIZON, Target, track_target};
 pub use perfect::track;
-pub use profile::{Profile, ProfileFit, Smoothness};
-pub use rear_axle::{Controls, propagate, propagate_by};
-pub use trajectory::Trajectory;
 
 use gump_scene::AgentState;
 

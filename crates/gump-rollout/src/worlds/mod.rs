@@ -5,10 +5,8 @@
 mod constant_velocity;
 mod idm;
 mod independent;
-mod nuplan_idm;
 mod replay;
 
 pub use constant_velocity::ConstantVelocity;
 pub use idm::{Idm, IdmConfig, idm_acceleration, idm_euler_step};
-pub use nuplan_idm::{NuplanIdm, NuplanIdmConfig};
 pub use replay::LogReplay;

@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use gump_model::{Precision, SamplingConfig};
+use gump_nuplan::closed_loop::{DriveConfig, Driver, Mission, Moment, Replayed, drive};
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig, Phases};
 use gump_rollout::BoxError;
-use gump_rollout::closed_loop::{DriveConfig, Driver, Mission, Moment, Replayed, drive};
-use gump_rollout::dynamics::Trajectory;
 use serde_json::{Value, json};
 
 use crate::planners::Surroundings;

@@ -5,10 +5,10 @@ use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_nuplan::closed_loop::{DriveConfig, Recording, Replayed, derive_roadblocks, drive};
+use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_planner::PdmClosed;
 use gump_planner::closed_loop::drive_and_score;
-use gump_rollout::closed_loop::{DriveConfig, Recording, Replayed, derive_roadblocks, drive};
-use gump_rollout::worlds::NuplanIdm;
 use serde::Serialize;
 use serde_json::{Value, json};
 

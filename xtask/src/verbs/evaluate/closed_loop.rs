@@ -5,11 +5,11 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use gump_metrics::interval;
+use gump_nuplan::closed_loop::{DriveConfig, Tracking};
 use gump_nuplan::metrics::MetricScores;
 use gump_planner::closed_loop::{Scored, drive_and_score, evaluate};
 use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
 use gump_rollout::WorldModel;
-use gump_rollout::closed_loop::{DriveConfig, Tracking};
 use gump_scene::Seed;
 use gump_viz::Bars;
 use serde::Serialize;

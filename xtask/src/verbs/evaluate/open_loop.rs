@@ -3,9 +3,9 @@
 use std::num::NonZeroUsize;
 
 use gump_metrics::interval;
+use gump_nuplan::closed_loop::Replayed;
 use gump_nuplan::metrics::{OpenLoop, Scoring};
 use gump_planner::closed_loop::{evaluate, plan_and_compare};
-use gump_rollout::closed_loop::Replayed;
 use serde::Serialize;
 use serde_json::{Value, json};
 

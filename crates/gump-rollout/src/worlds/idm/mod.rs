@@ -68,7 +68,11 @@ impl Default for IdmConfig {
 }
 
 impl IdmConfig {
-    pub(super) fn check(&self) -> Result<(), RolloutError> {
+    /// Whether every parameter is a positive number.
+    ///
+    /// # Errors
+    /// [`RolloutError::Parameter`] with the first that is not.
+    pub fn check(&self) -> Result<(), RolloutError> {
         let fields = [
             ("target_velocity", self.target_velocity),
             ("min_gap", self.min_gap),

@@ -20,8 +20,8 @@ pub use traffic::{Imagined, Others, Replayed, Step, Traffic};
 
 use gump_scene::{EgoState, Frame, Rollout, SceneState};
 
-use crate::RolloutError;
-use crate::dynamics::Trajectory;
+use crate::tracking::Trajectory;
+use gump_rollout::RolloutError;
 
 /// What a closed loop leaves behind: one entry per executed iteration.
 #[derive(Clone, Debug)]
@@ -77,7 +77,7 @@ pub fn drive(
     let n = recording.n_iterations(config.seconds)?;
     let failed = |iteration: usize, who: &str| {
         let who = who.to_owned();
-        move |error: crate::BoxError| RolloutError::Loop {
+        move |error: gump_rollout::BoxError| RolloutError::Loop {
             iteration,
             who,
             what: error.to_string(),

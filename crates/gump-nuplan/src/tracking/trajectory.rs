@@ -3,7 +3,7 @@
 use gump_geometry::Pose;
 use gump_scene::EgoState;
 
-use crate::RolloutError;
+use gump_rollout::RolloutError;
 
 /// States of the rear axle at increasing times.
 #[derive(Clone, Debug, PartialEq)]

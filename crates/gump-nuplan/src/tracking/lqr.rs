@@ -10,7 +10,7 @@ use gump_scene::EgoState;
 
 use super::profile::{Profile, ProfileFit, Smoothness};
 use super::{Controls, Trajectory};
-use crate::RolloutError;
+use gump_rollout::RolloutError;
 
 /// Seconds between the steps that the tracker looks ahead, and between poses of its reference.
 pub const TRACKING_DT: f64 = 0.1;

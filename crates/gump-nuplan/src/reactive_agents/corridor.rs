@@ -2,7 +2,7 @@
 
 use gump_geometry::{DVec2, Polygon, Quad, joint};
 
-use crate::Path;
+use crate::path::Path;
 
 /// Segments that share bounds.
 const CHUNK: usize = 16;

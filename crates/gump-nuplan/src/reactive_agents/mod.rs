@@ -20,11 +20,11 @@ use std::sync::Arc;
 use gump_geometry::{OrientedBox, Polygon, Quad};
 use gump_scene::{Agent, AgentKind, AreaKind, Frame, LightState, MapGraph};
 
-use super::IdmConfig;
 use crate::closed_loop::{Others, Recording, Step, Traffic};
-use crate::{BoxError, RolloutError};
 use agent::{Encounters, Vehicle};
 use corridor::Footprint;
+use gump_rollout::worlds::IdmConfig;
+use gump_rollout::{BoxError, RolloutError};
 
 /// Parameters of nuPlan's reactive agents.
 #[derive(Clone, Debug, PartialEq)]

@@ -3,8 +3,8 @@
 use gump_scene::{Agent, AgentState, EgoState, Frame, Light, SceneState, Seed};
 
 use super::Recording;
-use crate::dynamics::Trajectory;
-use crate::{BoxError, Session, Start, WorldModel};
+use crate::tracking::Trajectory;
+use gump_rollout::{BoxError, Session, Start, WorldModel};
 
 /// Everyone but the ego, one iteration after another.
 pub trait Traffic {
@@ -159,7 +159,7 @@ fn advance(mut session: Box<dyn Session + '_>, ego: &AgentState) -> Result<Frame
     let found = frames.len();
     frames.into_iter().next().ok_or_else(|| {
         let (who, expected) = ("the world", 1);
-        crate::RolloutError::Count {
+        gump_rollout::RolloutError::Count {
             who,
             expected,
             found,

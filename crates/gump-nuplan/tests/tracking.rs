@@ -4,7 +4,7 @@
 
 use approx::assert_abs_diff_eq;
 use gump_geometry::{Pose, angle_difference, dvec2, wrap_angle};
-use gump_rollout::dynamics::{LqrTracker, Trajectory, propagate};
+use gump_nuplan::tracking::{LqrTracker, Trajectory, propagate};
 use gump_scene::EgoState;
 use serde_json::Value;
 

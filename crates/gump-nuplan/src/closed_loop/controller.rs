@@ -3,8 +3,8 @@
 use gump_scene::EgoState;
 
 use super::Recording;
-use crate::RolloutError;
-use crate::dynamics::{LqrTracker, Trajectory, propagate};
+use crate::tracking::{LqrTracker, Trajectory, propagate};
+use gump_rollout::RolloutError;
 
 /// A tracked speed beyond which a plan is nonsense, metres per second.
 const IMPOSSIBLE_SPEED: f64 = 50.0;

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use gump_geometry::Pose;
 use gump_scene::{EgoState, MapGraph, Route, SceneState, VehicleParameters};
 
-use crate::BoxError;
-use crate::dynamics::Trajectory;
+use crate::tracking::Trajectory;
+use gump_rollout::BoxError;
 
 /// Told once where to go, then asked for a trajectory at every step.
 ///

@@ -4,7 +4,7 @@ use gump_geometry::{Pose, angle_difference};
 use gump_scene::{Agent, EgoState, Scenario, VehicleParameters};
 
 use super::Mission;
-use crate::RolloutError;
+use gump_rollout::RolloutError;
 
 /// A recorded drive: traffic, and the ego at its rear axle in every frame.
 #[derive(Clone, Debug)]

@@ -5,9 +5,10 @@ use std::fmt::Write as _;
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use gump_rollout::closed_loop::{Recording, Step, Traffic};
-use gump_rollout::dynamics::Trajectory;
-use gump_rollout::worlds::{Idm, IdmConfig, NuplanIdm};
+use gump_nuplan::closed_loop::{Recording, Step, Traffic};
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
+use gump_rollout::worlds::{Idm, IdmConfig};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::Seed;
 use rayon::prelude::*;

@@ -8,7 +8,7 @@ use gump_scene::{Agent, AgentState, Lane, LaneId, LightState, MapGraph};
 use super::corridor::{Corridor, Footprint};
 use super::{Scene, in_intersection};
 use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
-use crate::worlds::idm_euler_step;
+use gump_rollout::worlds::idm_euler_step;
 
 /// Lanes of the way that a vehicle remembers.
 const REMEMBERED_LANES: usize = 5;
