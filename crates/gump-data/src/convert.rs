@@ -16,6 +16,7 @@ use serde::Serialize;
 
 use crate::cache::ShardWriter;
 use crate::stream::io_error;
+#[cfg(feature = "parquet")]
 use crate::tracks::TrackTable;
 use crate::{
     DataError, ReadOptions, ReadReport, Reader, open_files, scenario_json, tfrecord, womd,
@@ -33,6 +34,7 @@ pub enum OutputFormat {
     /// JSON for people's own programs, packed, a file per scenario.
     ScenarioJson,
     /// Tables of tracks, without maps.
+    #[cfg(feature = "parquet")]
     Parquet,
 }
 
@@ -105,6 +107,7 @@ pub fn convert<E: From<DataError>>(
     match format {
         OutputFormat::Cache => conversion.write_file(&with_ending(stem, ".cache"), new_shard),
         OutputFormat::Waymo => conversion.write_file(&with_ending(stem, ".tfrecord"), new_messages),
+        #[cfg(feature = "parquet")]
         OutputFormat::Parquet => conversion.write_file(&with_ending(stem, ".parquet"), new_table),
         OutputFormat::ScenarioJson => conversion.write_documents(stem),
     }?;
@@ -145,6 +148,7 @@ fn new_messages<'f>(file: &'f mut BufWriter<File>, path: &'f Path) -> Begun<'f> 
     Ok(Box::new(Messages { file, path }))
 }
 
+#[cfg(feature = "parquet")]
 fn new_table<'f>(file: &'f mut BufWriter<File>, path: &'f Path) -> Begun<'f> {
     Ok(Box::new(TrackTable::begin(file, path)?))
 }
@@ -159,6 +163,7 @@ impl<W: Write> Sink for ShardWriter<'_, W> {
     }
 }
 
+#[cfg(feature = "parquet")]
 impl<W: Write + Send> Sink for TrackTable<'_, W> {
     fn add(&mut self, scenario: &Scenario) -> Result<ReadReport, DataError> {
         self.write(scenario).map(|()| ReadReport::default())

@@ -121,6 +121,7 @@ pub enum DataError {
         path: PathBuf,
     },
     /// A database cannot be read, or holds a value of another type.
+    #[cfg(feature = "nuplan")]
     #[error("could not {doing}: {source}: {}", path.display())]
     Sqlite {
         /// What was tried.

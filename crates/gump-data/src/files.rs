@@ -8,12 +8,19 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "argoverse2")]
+use crate::argoverse2;
+#[cfg(feature = "commonroad")]
+use crate::commonroad;
+#[cfg(feature = "nuplan")]
+use crate::nuplan;
 use crate::open::BoxedSource;
 use crate::stream::{self, io_error};
-use crate::{
-    DataError, ReadOptions, argoverse2, cache, commonroad, gpudrive, nuplan, scenario_json, sumo,
-    taf_bw, womd,
-};
+#[cfg(feature = "sumo")]
+use crate::sumo;
+#[cfg(feature = "taf-bw")]
+use crate::taf_bw;
+use crate::{DataError, ReadOptions, cache, gpudrive, scenario_json, womd};
 
 // ANCHOR: format
 /// A format that content can be recognised as.
@@ -29,16 +36,22 @@ pub(crate) struct Format {
 // ANCHOR_END: format
 
 /// The formats that hold scenarios; the first that recognises a file has it.
-static FORMATS: [Format; 10] = [
+static FORMATS: &[Format] = &[
     cache::FORMAT,
     womd::FORMAT,
     gpudrive::FORMAT,
+    #[cfg(feature = "argoverse2")]
     argoverse2::FORECASTING,
+    #[cfg(feature = "argoverse2")]
     argoverse2::SENSOR_LOG,
+    #[cfg(feature = "commonroad")]
     commonroad::FORMAT,
     scenario_json::FORMAT,
+    #[cfg(feature = "sumo")]
     sumo::FORMAT,
+    #[cfg(feature = "nuplan")]
     nuplan::FORMAT,
+    #[cfg(feature = "taf-bw")]
     taf_bw::FORMAT,
 ];
 
@@ -51,25 +64,32 @@ pub(crate) struct Companion {
 }
 
 /// Files that belong to some format but hold no scenarios.
-static COMPANIONS: [Companion; 7] = [
+static COMPANIONS: &[Companion] = &[
+    #[cfg(feature = "argoverse2")]
     Companion {
         what: "Argoverse 2 map",
         recognises: argoverse2::is_map,
     },
+    #[cfg(feature = "argoverse2")]
     Companion {
         what: "Feather table beside an Argoverse 2 log",
         recognises: argoverse2::is_feather,
     },
+    #[cfg(feature = "sumo")]
     Companion {
         what: "SUMO network",
         recognises: sumo::is_network,
     },
+    #[cfg(feature = "sumo")]
     Companion {
         what: "other SUMO file",
         recognises: sumo::is_other,
     },
+    #[cfg(feature = "nuplan")]
     nuplan::MAP,
+    #[cfg(feature = "nuplan")]
     nuplan::OTHER,
+    #[cfg(feature = "taf-bw")]
     taf_bw::MAP,
 ];
 

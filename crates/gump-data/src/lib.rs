@@ -30,9 +30,29 @@
 //!   leaves out because [`Scenario`](gump_scene::Scenario) has no room for it or it is unusable.
 //!
 //! A new format is one file beside `womd` and one line in the table of `files`.
+//!
+//! # Features
+//! All are on by default. Without any, Waymo's and GPUDrive's files, Scenario-JSON and the cache are
+//! read, and neither SQLite nor Parquet nor an XML reader is compiled. `argoverse2`, `commonroad`,
+//! `nuplan`, `sumo` and `taf-bw` are the formats of these names; `parquet` writes tables and reads
+//! rollouts from them.
+#![cfg_attr(
+    not(all(
+        feature = "argoverse2",
+        feature = "commonroad",
+        feature = "nuplan",
+        feature = "sumo",
+        feature = "taf-bw"
+    )),
+    allow(dead_code, reason = "what formats share is not used by each")
+)]
 
+#[cfg(feature = "argoverse2")]
 mod argoverse2;
 pub mod cache;
+#[cfg(feature = "parquet")]
+mod columns;
+#[cfg(feature = "commonroad")]
 mod commonroad;
 mod convert;
 mod document;
@@ -43,24 +63,32 @@ mod gpudrive;
 mod infer;
 mod inspect;
 mod json;
+#[cfg(any(feature = "commonroad", feature = "taf-bw"))]
 mod lanelet;
 mod motion;
+#[cfg(feature = "nuplan")]
 pub mod nuplan;
 mod open;
 mod record;
 mod recording;
+#[cfg(feature = "parquet")]
 mod rollouts;
 pub mod scenario_json;
 mod stream;
 pub mod submission;
+#[cfg(feature = "sumo")]
 pub mod sumo;
+#[cfg(feature = "parquet")]
 mod table;
+#[cfg(feature = "taf-bw")]
 mod taf_bw;
 pub mod tfrecord;
+#[cfg(feature = "parquet")]
 mod tracks;
 mod verify;
 pub mod womd;
 mod write_atomically;
+#[cfg(any(feature = "commonroad", feature = "taf-bw"))]
 mod xml;
 
 pub use convert::{Converted, OutputFormat, convert, groups};
@@ -69,8 +97,11 @@ pub use files::list as list_files;
 pub use inspect::{Summary, inspect, inspect_with};
 pub use open::{Reader, find, find_record, open, open_files, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
+#[cfg(feature = "parquet")]
 pub use rollouts::write_rollouts;
+#[cfg(feature = "parquet")]
 pub use table::Table;
+#[cfg(feature = "parquet")]
 pub use tracks::write_tracks;
 pub use verify::{
     Finding, FormatCounts, MAX_FINDINGS, Severity, Verification, verify, verify_one_of_many,

@@ -7,7 +7,8 @@ use gump_geometry::{dvec2, dvec3};
 use gump_scene::{AgentKind, Scenario};
 
 use super::map::{self, Map};
-use super::{DT, beside, table};
+use super::{DT, beside};
+use crate::columns as table;
 use crate::document::{self, Document};
 use crate::files::Format;
 use crate::recording::{Recording, State, Track, UNSTATED, assemble};

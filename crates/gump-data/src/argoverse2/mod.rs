@@ -2,14 +2,13 @@
 //! (Feather with ego poses and a map beside).
 //!
 //! Neither states traffic lights or speed limits; forecasting scenarios have no sizes either.
-//! `map` reads the road, `forecasting` and `sensor_log` the traffic, `table` columns of both.
+//! `map` reads the road, `forecasting` and `sensor_log` the traffic, `columns` of the crate the tables of both.
 //!
 //! Source: the formats' descriptions in the Argoverse 2 API documentation, checked on its samples.
 
 mod forecasting;
 mod map;
 mod sensor_log;
-pub(crate) mod table;
 
 use std::path::{Path, PathBuf};
 

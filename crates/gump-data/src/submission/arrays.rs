@@ -21,7 +21,8 @@ use flate2::read::DeflateDecoder;
 use serde::Deserialize;
 
 use crate::DataError;
-use crate::argoverse2::table;
+#[cfg(feature = "parquet")]
+use crate::columns as table;
 use crate::stream;
 use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 
@@ -32,6 +33,7 @@ const NPY: &[u8] = b"\x93NUMPY";
 /// What a ZIP file starts with.
 const ZIP: &[u8] = b"PK\x03\x04";
 /// What a Parquet file starts with.
+#[cfg(feature = "parquet")]
 const PARQUET: &[u8] = b"PAR1";
 
 /// The rollouts of a file of arrays; `None` for content of another kind.
@@ -40,6 +42,7 @@ const PARQUET: &[u8] = b"PAR1";
 /// reading.
 pub(crate) fn read(path: &Path) -> Result<Option<Vec<ScenarioRollouts>>, DataError> {
     let head = stream::head(path, 8)?;
+    #[cfg(feature = "parquet")]
     if head.starts_with(PARQUET) {
         return parquet(path).map(Some);
     }
@@ -413,6 +416,7 @@ fn trajectory(
 }
 
 /// The rollouts of a table of futures, which is sorted by scenario, rollout, track and step.
+#[cfg(feature = "parquet")]
 fn parquet(path: &Path) -> Result<Vec<ScenarioRollouts>, DataError> {
     let table = table::parquet(path)?;
     let scenarios = table.texts("scenario_id", path)?;
