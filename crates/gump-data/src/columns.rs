@@ -279,11 +279,11 @@ mod tests {
 
     #[test]
     fn a_block_beyond_the_file_is_refused_before_memory_is_taken_for_it() {
-        let sound = include_bytes!("../../tests/hostile/argoverse2_log/seed.feather");
+        let sound = include_bytes!("../tests/hostile/argoverse2_log/seed.feather");
         assert!(unpacked_bytes(sound).is_some_and(|bytes| bytes < 1 << 20));
         // Found by the fuzzer: two gigabytes for a file of four kilobytes.
         let damaged =
-            include_bytes!("../../tests/hostile/argoverse2_log/block_beyond_the_file.feather");
+            include_bytes!("../tests/hostile/argoverse2_log/block_beyond_the_file.feather");
         assert_eq!(unpacked_bytes(damaged), None);
     }
 }

@@ -33,7 +33,7 @@ pub(crate) struct Draw {
     /// Bins that may be drawn per field [default: 40]
     #[arg(long, value_name = "N")]
     top_k: Option<usize>,
-    /// Draws among the likeliest bins that together have this probability [default: 1, and 0.98 of a relative network]
+    /// Draws among the likeliest bins that together have this probability [default: 1, and 0.95 of a relative network]
     #[arg(long, value_name = "X")]
     top_p: Option<f64>,
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]

@@ -5,26 +5,38 @@
 //! rolled out. Here it draws several next moves of every agent and takes the one nearest to the log
 //! (as CAT-K does, Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models",
 //! 2024), so that agents stay near enough to the log for its next states to be their targets.
+//!
+//! In a share of drives agents go their own ways instead, under the rules of `rules`: what would run
+//! into somebody or off the road is drawn again. What they then did is what the network should say,
+//! so that it comes to keep the rules by itself.
 
 use serde::{Deserialize, Serialize};
 
-use gump_geometry::{Pose, angle_difference};
-use gump_scene::Seed;
+use gump_geometry::{DVec2, Pose, angle_difference};
+use gump_scene::{MapGraph, Seed};
+use rand::Rng as _;
 
 use super::engine::{Draw, Engine, Workspace};
 use super::graph::{Lights, Shown};
 use super::grid::dequantize;
 use super::map::VectorMap;
 use super::net::RelativeNetwork;
+use super::rules::settle;
 use super::sample::Track;
 use super::seen::{Seen, presents};
 use crate::ModelError;
 use crate::ops::panels::Precision;
+use crate::surroundings::Survey;
 
 /// Frames that are shown as logged before the network drives.
 const WARM_UP: usize = 2;
 /// Metres that a radian counts for in choosing the move nearest to the log.
 const METRES_PER_RADIAN: f64 = 2.0;
+
+/// How far around a sample edges of the road are looked at, metres.
+const EDGES_M: f64 = 150.0;
+/// Separates the choice of how a sample is driven from its draws.
+const RULED: u64 = 1 << 32;
 
 /// How agents are driven by the network that learns.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -42,6 +54,13 @@ pub struct RelativeDrives {
     pub temperature: f64,
     /// Steps after which the network drives as it is then.
     pub refresh: usize,
+    /// Share of the driven samples whose agents go their own ways under the rules.
+    pub ruled: f64,
+    /// Of those, how often a move is drawn again at most.
+    pub redraws: usize,
+    /// Of those, draws are among the likeliest bins that together have this probability: targets are
+    /// smoothed, and without the tail cut off draws would spread a little more with each refresh.
+    pub top_p: f64,
 }
 
 impl Default for RelativeDrives {
@@ -52,6 +71,9 @@ impl Default for RelativeDrives {
             tolerance_m: 0.6,
             temperature: 1.0,
             refresh: 50,
+            ruled: 0.0,
+            redraws: 8,
+            top_p: 0.95,
         }
     }
 }
@@ -60,8 +82,13 @@ impl RelativeDrives {
     /// Error: [`ModelError::Config`] naming the first number out of its range.
     pub(super) fn validate(&self) -> Result<(), ModelError> {
         let fail = |what: &str| Err(ModelError::Config(format!("closed_loop: {what}")));
-        if !(0.0..=1.0).contains(&self.share) {
-            return fail("share must be between 0 and 1");
+        for (name, share) in [("share", self.share), ("ruled", self.ruled)] {
+            if !(0.0..=1.0).contains(&share) {
+                return fail(&format!("{name} must be between 0 and 1"));
+            }
+        }
+        if !(self.top_p > 0.0 && self.top_p <= 1.0) {
+            return fail("top_p must be above 0 and at most 1");
         }
         if self.candidates == 0 || self.refresh == 0 {
             return fail("candidates and refresh must be at least 1");
@@ -97,14 +124,17 @@ impl Driver {
         &self.config
     }
 
-    /// Moves the agents of a sample to where the network drives them.
+    /// Moves the agents of a sample, which lies around `centre`, to where the network drives them.
     pub(super) fn drive(
         &self,
+        (streets, centre): (&MapGraph, DVec2),
         map: &VectorMap,
         lights: &[Lights],
         tracks: &mut [Track],
         seed: Seed,
     ) {
+        let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
+        let survey = ruled.then(|| Survey::of_edges(streets, centre, EDGES_M));
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
@@ -129,7 +159,17 @@ impl Driver {
             let here: Vec<usize> = (0..tracks.len())
                 .filter(|&a| members[a].is_some())
                 .collect();
-            let moves = self.draws(&hidden, here.len(), seed.fork(t as u64), &mut room);
+            let seed = seed.fork(t as u64);
+            if let Some(survey) = &survey {
+                let moves = self.moves_by_the_rules(&agents, survey, &hidden, seed, &mut room);
+                for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
+                    if let Some(next) = &mut tracks[a].states[t + 1] {
+                        *next = next.led_to(now.pose * step);
+                    }
+                }
+                continue;
+            }
+            let moves = self.draws(&hidden, here.len(), seed, &mut room);
             for (i, &a) in here.iter().enumerate() {
                 let (Some(now), Some(next)) = (tracks[a].states[t], tracks[a].states[t + 1]) else {
                     continue;
@@ -146,6 +186,39 @@ impl Driver {
                 tracks[a].states[t + 1] = Some(next.driven_to(shown));
             }
         }
+    }
+
+    /// A move of every agent in its own frame, drawn again where the rules forbid it.
+    fn moves_by_the_rules(
+        &self,
+        agents: &[Shown],
+        survey: &Survey,
+        hidden: &[f32],
+        seed: Seed,
+        room: &mut Workspace,
+    ) -> Vec<Pose> {
+        let draw = Draw {
+            temperature: self.config.temperature,
+            top_p: self.config.top_p,
+        };
+        let c = hidden.len() / agents.len().max(1);
+        let mut drawn = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let rows: Vec<f32> = who
+                .iter()
+                .flat_map(|&i| &hidden[i * c..][..c])
+                .copied()
+                .collect();
+            let of_draw = seed.fork(attempt as u64);
+            let streams: Vec<Seed> = who.iter().map(|&i| of_draw.fork(i as u64)).collect();
+            let bins = self.engine.decide(&rows, &streams, draw, room);
+            bins.into_iter().map(dequantize).collect()
+        };
+        let all: Vec<usize> = (0..agents.len()).collect();
+        let mut moves = drawn(&all, 0);
+        let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
+        let redraws = self.config.redraws;
+        settle(agents, None, survey, redraws, &mut moves, &mut again);
+        moves
     }
 
     /// The candidates' moves of all agents, in the agents' frames.

@@ -359,6 +359,11 @@ impl Engine {
             }
             room.queries.resize(n * BINS[field], 0.0);
             self.heads[field].apply(states, &mut room.queries, &mut room.panels);
+            // Whether to stand is no tail of anything: who sets off rarely must still do so.
+            let draw = match field {
+                0 => Draw { top_p: 1.0, ..draw },
+                _ => draw,
+            };
             for (i, logits) in room.queries.chunks_exact(BINS[field]).enumerate() {
                 let stands = field > 0 && moves[i][0] == STANDS;
                 moves[i][field] = match stands {

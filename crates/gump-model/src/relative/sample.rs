@@ -143,6 +143,16 @@ impl State {
         pushed(next.logged, self.off.then())
     }
 
+    /// The same, where it was led to instead of where the log has it.
+    pub(super) fn led_to(self, pose: Pose) -> Self {
+        Self {
+            logged: pose,
+            shown: pose,
+            off: Off::default(),
+            ..self
+        }
+    }
+
     /// The same, shown where it was driven to.
     pub(super) fn driven_to(self, shown: Pose) -> Self {
         let off = self.logged.inverse() * shown;
@@ -208,7 +218,8 @@ pub(crate) fn draw(
         false => lights(scenario, start, stride, n_frames),
     };
     if let Some(driver) = driver {
-        driver.drive(&map, &lights, &mut tracks, seed.fork(0));
+        let place = (&*scenario.map, centre);
+        driver.drive(place, &map, &lights, &mut tracks, seed.fork(0));
     }
     Some(assemble(&map, &tracks, &lights))
 }

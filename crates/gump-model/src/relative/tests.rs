@@ -172,10 +172,44 @@ fn driven_agents_leave_the_log_and_learn_the_way_back() {
     assert!(many.0 > 0, "{many:?}");
 }
 
+/// Under the rules agents go their own ways, and what they then did is what they learn.
+#[test]
+fn agents_that_go_their_own_ways_learn_what_they_did() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 8,0";
+    let alone = gump_scene::fixture::scenario(text).unwrap();
+    let drawn = |ruled| {
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::Driver::new(&network, &config).unwrap();
+        draw(&alone, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap()
+    };
+    // Metres ahead in the step that led to a node, and those that the node before should say; the
+    // first target is of the warm-up.
+    let differences = |sample: &sample::Sample| -> Vec<f64> {
+        let targets = sample.targets.iter().skip(1);
+        let difference = |target: &sample::Target| {
+            let node = target.node as usize + 1;
+            let done = 5.0 * f64::from(sample.nodes[node * graph::NODE_NUMBERS + 8]);
+            (done - grid::dequantize(target.bins).position.x).abs()
+        };
+        targets.map(difference).collect()
+    };
+    let worst = |sample: &sample::Sample| differences(sample).into_iter().fold(0.0, f64::max);
+    let (ruled, led_back) = (drawn(1.0), drawn(0.0));
+    assert!(worst(&ruled) < 1e-4, "{:?}", differences(&ruled));
+    assert!(worst(&led_back) > 0.1, "{:?}", differences(&led_back));
+    assert_eq!(drawn(1.0).nodes, ruled.nodes);
+}
+
 #[test]
 fn a_resumed_run_ends_in_the_same_weights() {
     let closed_loop = RelativeDrives {
         refresh: 2,
+        ruled: 0.5,
         ..RelativeDrives::default()
     };
     for closed_loop in [None, Some(closed_loop)] {

@@ -31,6 +31,11 @@ use crate::surroundings::Survey;
 /// How far around the ego the map is laid out, metres.
 const MAP_M: f64 = 300.0;
 
+/// Draws are among the likeliest bins that together have this probability, unless told otherwise.
+/// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1
+/// somebody on foot now and then shoots off. Chosen on the tuning set (result 19).
+const TOP_P: f64 = 0.95;
+
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
 /// Separates the streams of those who watch.
@@ -42,7 +47,8 @@ const WATCH: u64 = 1 << 40;
 pub struct RelativeSampling {
     /// Divides the logits; above 1 is bolder.
     pub temperature: f64,
-    /// Draws are among the likeliest bins that together have this probability.
+    /// Draws are among the likeliest bins that together have this probability; whether to stand is
+    /// drawn from both.
     pub top_p: f64,
     /// How often an agent that would run into another or off the road within 1.5 s is drawn again at
     /// most.
@@ -57,7 +63,7 @@ impl Default for RelativeSampling {
     fn default() -> Self {
         Self {
             temperature: 1.0,
-            top_p: 1.0,
+            top_p: TOP_P,
             redraws: 0,
             limits: false,
             precision: Precision::F32,
