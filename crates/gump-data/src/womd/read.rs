@@ -13,6 +13,7 @@ use gump_scene::{
 use super::map;
 use super::proto::{self, ObjectType, SignalState};
 use crate::error::MAX_COORDINATE;
+use crate::recording::{Recording, assemble};
 use crate::{Problem, ReadOptions, ReadReport, infer};
 
 /// Time stamps may stray from the nominal step by this fraction: Waymo's clocks drift by up to
@@ -32,6 +33,9 @@ pub fn scenario_from_proto(
     options: ReadOptions,
 ) -> Result<(Scenario, ReadReport), Problem> {
     let mut report = ReadReport::default();
+    if options.park_an_ego && proto.tracks.is_empty() && !proto.map_features.is_empty() {
+        return map_alone(proto, options, report);
+    }
     check_tracks(proto)?;
     let dt = time_step(&proto.timestamps_seconds)?;
     let ego = ego(proto)?;
@@ -74,6 +78,30 @@ pub fn scenario_from_proto(
     };
     scenario.validate()?;
     infer::route(&mut scenario, options, &mut report);
+    Ok((scenario, report))
+}
+
+/// A message that holds a map and nobody on it.
+fn map_alone(
+    proto: &proto::Scenario,
+    options: ReadOptions,
+    mut report: ReadReport,
+) -> Result<(Scenario, ReadReport), Problem> {
+    let parts = map::parts_from_proto(&proto.map_features, &mut report)?;
+    let nobody = Recording {
+        id: proto.scenario_id().into(),
+        dt: 0.1,
+        steps: 0,
+        now: 0,
+        ego: None,
+        tracks: Vec::new(),
+        lights: Vec::new(),
+        targets: None,
+        objects_of_interest: Vec::new(),
+        tags: Vec::new(),
+        route: None,
+    };
+    let scenario = assemble(nobody, parts, options, &mut report)?;
     Ok((scenario, report))
 }
 
