@@ -75,8 +75,8 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     demo.page
         .section("How good they are")
         .prose(
-            "Collisions and off-road driving as shares of agents; displacement from what really \
-             happened in metres, of the average and of the best future. The log is what happened; \
+            "Collisions and off-road driving as shares of agents; displacement from what was recorded, \
+             in metres, of the average and of the best future. The log is the recording; \
              raw is the network alone, without the rules that hold its draws back.",
         )
         .table(
@@ -110,7 +110,10 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
         .section("Futures")
         .prose("From the present on, the shipped network drives everyone, the ego too.")
         .link("viewer.html", "Play them all in the viewer")
-        .film(&film, "What really happened, and three of the futures.")
+        .film(
+            &film,
+            "What was recorded, and three of the simulated futures.",
+        )
         .film(
             &overlay,
             "All futures over one another: what they agree on is solid.",

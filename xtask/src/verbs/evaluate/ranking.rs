@@ -22,7 +22,7 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value]) -> String {
         shown
     });
     let shown: Vec<Value> = shown.collect();
-    table::text(&json!({ format!("among {world}, %"): shown }))
+    table::text(&json!({ format!("among {world}, %"): shown }), usize::MAX)
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places.
