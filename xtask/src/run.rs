@@ -194,6 +194,11 @@ impl Run {
         }
     }
 
+    /// Columns that tables may take on the terminal.
+    pub(crate) fn width(&self) -> usize {
+        self.width
+    }
+
     /// Adds a result; keys keep the order in which they come.
     pub(crate) fn result(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
         let value = serde_json::to_value(value)

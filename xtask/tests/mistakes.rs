@@ -3,7 +3,7 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
@@ -172,6 +172,11 @@ fn a_map_is_all_that_generation_needs() {
         ego.pose.position,
         lane.pose_at(lane.length() / 2.0).position
     );
+    let network =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/networks/lankershim.net.xml.gz");
+    let network = network.display().to_string();
+    assert!(gump_data::find_map(&network).unwrap().map.lanes().len() > 20);
+    place.check(&format!("data inspect {network}"), 1, &["SUMO network"]);
     // What is missing to the driver is what the test withholds: the weights, not agents.
     let generate = "generate --map map.tfrecord --vehicles 1 --weights none.safetensors";
     place.check(generate, 1, &["none.safetensors"]);

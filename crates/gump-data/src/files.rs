@@ -61,7 +61,7 @@ static COMPANIONS: [Companion; 7] = [
         recognises: argoverse2::is_feather,
     },
     Companion {
-        what: "SUMO network",
+        what: sumo::NETWORK,
         recognises: sumo::is_network,
     },
     Companion {

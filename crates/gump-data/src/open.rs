@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use gump_scene::Scenario;
 
 use crate::files::{self, Role};
-use crate::{DataError, ReadOptions, ScenarioRecord};
+use crate::{DataError, ReadOptions, ScenarioRecord, sumo};
 
 /// How a format hands over its scenarios.
 pub(crate) type BoxedSource = Box<dyn Source>;
@@ -198,8 +198,8 @@ pub fn find_record(source: &str) -> Result<ScenarioRecord, DataError> {
     find_with(source, ReadOptions::ALL)
 }
 
-/// As [`find`], for who needs the map alone: a recording without agents has a parked ego on the
-/// longest of its lanes.
+/// As [`find`], for who needs the map alone: a recording without agents, and a SUMO network, has a
+/// parked ego on the longest of its lanes.
 ///
 /// # Errors
 /// As [`find`].
@@ -208,6 +208,10 @@ pub fn find_map(source: &str) -> Result<Scenario, DataError> {
         park_an_ego: true,
         ..ReadOptions::ALL
     };
+    let path = Path::new(source);
+    if path.is_file() && matches!(files::role(path)?, Role::Companion(sumo::NETWORK)) {
+        return sumo::map_alone(path, options);
+    }
     find_with(source, options).map(|record| record.scenario)
 }
 

@@ -41,6 +41,25 @@ pub(crate) struct Recording {
     pub(crate) route: Option<Route>,
 }
 
+impl Recording {
+    /// A recording of nobody: what a map alone is.
+    pub(crate) fn of_nobody(id: String) -> Self {
+        Self {
+            id,
+            dt: 0.1,
+            steps: 0,
+            now: 0,
+            ego: None,
+            tracks: Vec::new(),
+            lights: Vec::new(),
+            targets: None,
+            objects_of_interest: Vec::new(),
+            tags: Vec::new(),
+            route: None,
+        }
+    }
+}
+
 /// One agent over time.
 pub(crate) struct Track {
     pub(crate) id: i64,

@@ -30,8 +30,8 @@ const BATCH: u64 = 32;
 /// Arguments of `generate`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// The scenario whose map and lights are taken, or a map without agents: PATH, PATH#INDEX or
-    /// PATH#SCENARIO_ID
+    /// The scenario whose map and lights are taken, or a map without agents (a SUMO network too):
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     map: String,
     /// What kind of situation it is to be: one of nuPlan's 73 scenario tags, at most four times

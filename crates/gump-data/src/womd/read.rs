@@ -88,19 +88,7 @@ fn map_alone(
     mut report: ReadReport,
 ) -> Result<(Scenario, ReadReport), Problem> {
     let parts = map::parts_from_proto(&proto.map_features, &mut report)?;
-    let nobody = Recording {
-        id: proto.scenario_id().into(),
-        dt: 0.1,
-        steps: 0,
-        now: 0,
-        ego: None,
-        tracks: Vec::new(),
-        lights: Vec::new(),
-        targets: None,
-        objects_of_interest: Vec::new(),
-        tags: Vec::new(),
-        route: None,
-    };
+    let nobody = Recording::of_nobody(proto.scenario_id().into());
     let scenario = assemble(nobody, parts, options, &mut report)?;
     Ok((scenario, report))
 }

@@ -40,7 +40,7 @@ function begin(unpacked) {
 }
 
 // The address says what is shown: viewer.html#t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north.
-function remember() {
+function address() {
   const said = new URLSearchParams();
   if (Math.abs(ui.t) > 0.049) said.set('t', ui.t.toFixed(1));
   said.set('shown', ui.shown);
@@ -49,8 +49,13 @@ function remember() {
   if (ui.selected >= 0) said.set('agent', facts.agents[ui.selected].id);
   if (ui.follow >= 0) said.set('follow', 1);
   if (ui.up !== 'ego') said.set('up', ui.up);
-  if (remembered === String(said) || location.hash === '#check') return;
-  remembered = String(said);
+  return String(said);
+}
+
+function remember() {
+  const said = address();
+  if (remembered === said || location.hash === '#check') return;
+  remembered = said;
   // Browsers refuse pages that write their address too often.
   try { history.replaceState(null, '', `#${remembered}`); } catch { remembered = ''; }
 }
@@ -99,8 +104,16 @@ function buildCandidates() {
     words.textContent = name + (chosen ? ' (chosen)' : '');
     number.textContent = score === null ? '-' : score.toFixed(3);
     b.append(words, number);
+    const made = document.createElement('dl');
+    made.hidden = true;
+    made.dataset.parts = i;
+    for (const [part, value] of facts.candidates[i].parts) {
+      const dt = document.createElement('dt'), dd = document.createElement('dd');
+      dt.textContent = part.replace(/_/g, ' '); dd.textContent = value === null ? '-' : value.toFixed(3);
+      made.append(dt, dd);
+    }
     b.dataset.candidate = i;
-    item.append(b);
+    item.append(b, made);
     $('candidates').querySelector('ol').append(item);
   }
 }
@@ -175,6 +188,7 @@ function dress() {
   for (const b of document.querySelectorAll('[data-shown]')) press(b, b.dataset.shown === String(ui.shown));
   for (const b of document.querySelectorAll('[data-colour]')) press(b, b.dataset.colour === ui.colour);
   for (const b of document.querySelectorAll('[data-candidate]')) press(b, b.dataset.candidate === String(ui.candidate));
+  for (const made of document.querySelectorAll('[data-parts]')) made.hidden = made.dataset.parts !== String(ui.candidate) || !made.children.length;
   for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails], ['up', ui.up === 'ego'], ['beside', ui.left !== null]]) press(document.querySelector(`[data-do=${name}]`), on);
   const named = ui.shown > 0 && isLong(world.takes[ui.shown].name);
   $('futures-title').textContent = named ? `Futures: ${world.takes[ui.shown].name}` : 'Futures';

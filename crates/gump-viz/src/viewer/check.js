@@ -42,6 +42,13 @@ if (location.hash === '#check') {
     $('candidates').querySelector('button').click();
     report.candidate_shows = [ui.candidate, ui.shown, $('futures-title').textContent];
     report.candidates = $('candidates').querySelectorAll('li').length;
+    report.parts = [...document.querySelectorAll('[data-parts]:not([hidden]) dt')].map(dt => `${dt.textContent} ${dt.nextSibling.textContent}`);
+    report.marks = $('marks').querySelectorAll('li').length;
+    seek(1.5); choose(facts.ego); paint();
+    report.tip = $('tip').hidden ? '' : $('tip').textContent;
+    report.address = address();
+    // Where the chosen agent is told of can be seen without scrolling, on a phone too.
+    report.panel_in_sight = $('agent').getBoundingClientRect().top < window.innerHeight - 40;
     report.wide = document.documentElement.scrollWidth > window.innerWidth;
     return report;
   };

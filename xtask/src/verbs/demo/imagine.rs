@@ -13,6 +13,7 @@ use crate::imagine::imagine;
 use crate::run::Run;
 use crate::shipped;
 use crate::table::decimal;
+use crate::verbs::explain::named;
 use crate::worlds::{World, WorldName};
 
 /// Futures per world.
@@ -173,6 +174,10 @@ fn candidates(plan: &Plan, scene: &SceneState<'_>) -> Vec<CandidatePath> {
             CandidatePath {
                 name: candidate.proposal.kind.to_string(),
                 score: candidate.score.as_ref().map(|score| score.mean),
+                parts: candidate
+                    .score
+                    .as_ref()
+                    .map_or_else(Vec::new, |score| named(&score.parts())),
                 is_chosen: i == plan.chosen,
                 path: std::iter::once(start)
                     .chain(states.iter().map(|state| state.pose.position))
