@@ -308,7 +308,7 @@ function drawHeatPanel() {
 function drawAgentPanel() {
   if (ui.selected < 0) return;
   drawHeatPanel();
-  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
+  const take = heatTake(ui, world), s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
   const degrees = h => ((h * 180 / Math.PI) % 360 + 540) % 360 - 180;
   const rows = s ? [
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
