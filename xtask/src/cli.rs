@@ -38,9 +38,9 @@ enum Verb {
     Data(data::Verb),
     /// Train a world model.
     Train(train::Args),
-    /// Imagine how a recorded scene goes on, many times over.
+    /// Simulate how a recorded scene goes on: joint rollouts of all agents.
     Simulate(simulate::Args),
-    /// Make traffic out of nothing on a map, as a prompt and your wishes say.
+    /// Generate a scene on a map from a prompt and constraints.
     Generate(generate::Args),
     /// Let a planner drive through a scene and see everything it considered.
     Plan(plan::Args),

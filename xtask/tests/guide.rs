@@ -1,6 +1,6 @@
 //! The guide is true: its commands run, what it shows of their output is there, the code it quotes
-//! exists, its links lead somewhere in the book, and commands that cannot run here at least have
-//! flags that exist.
+//! is what its source says, its links lead somewhere in the book, and commands that cannot run here
+//! at least have flags that exist.
 //!
 //! What the fences of a chapter mean:
 //!
