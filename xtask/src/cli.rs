@@ -5,14 +5,17 @@
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
+use gump_data::DataError;
 
 use crate::config;
-use crate::run::Run;
+use crate::run::{self, Run};
 use crate::verbs::ablate::Knob;
 use crate::verbs::{
-    ablate, bench, ci, data, demo, evaluate, generate, plan, rl, simulate, submit, tidy, train,
+    ablate, bench, ci, data, demo, evaluate, generate, manual, plan, rl, simulate, submit, tidy,
+    train,
 };
+use crate::words;
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -35,9 +38,9 @@ enum Verb {
     Data(data::Verb),
     /// Train a world model.
     Train(train::Args),
-    /// Imagine how a recorded scene goes on, many times over.
+    /// Simulate how a recorded scene goes on: joint rollouts of all agents.
     Simulate(simulate::Args),
-    /// Make traffic out of nothing on a map, as a prompt and your wishes say.
+    /// Generate a scene on a map from a prompt and constraints.
     Generate(generate::Args),
     /// Let a planner drive through a scene and see everything it considered.
     Plan(plan::Args),
@@ -60,6 +63,10 @@ enum Verb {
     Ci(ci::Args),
     /// Check the house rules of the repository.
     Tidy(tidy::Args),
+    /// Print what a shell needs to complete the words of a command.
+    Completions(manual::Completions),
+    /// Write the pages of the manual for `man`.
+    Manual(manual::Manual),
 }
 
 /// The arguments are wrong: exit status 2.
@@ -71,8 +78,17 @@ pub(crate) struct WrongArguments(pub(crate) String);
 ///
 /// Error: clap's own, or [`WrongArguments`] for a config file that does not fit the verb.
 pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Cli> {
-    let arguments = config::splice(&Cli::command(), arguments)?;
-    Ok(Cli::try_parse_from(arguments)?)
+    let mut command = command();
+    let arguments = config::splice(&command, arguments)?;
+    let matches = command.try_get_matches_from_mut(arguments);
+    let matches = matches.map_err(words::plainer)?;
+    words::check_device(&matches)?;
+    Ok(Cli::from_arg_matches(&matches)?)
+}
+
+/// The command line as it is offered.
+fn command() -> Command {
+    words::dressed(Cli::command())
 }
 
 impl Cli {
@@ -195,6 +211,8 @@ impl Cli {
             Verb::Tidy(args) => {
                 Run::of("tidy", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Completions(args) => args.execute(command()),
+            Verb::Manual(args) => args.execute(command()),
         }
     }
 }
@@ -211,7 +229,23 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
         };
     }
     eprintln!("error: {error:#}");
-    ExitCode::from(if error.is::<WrongArguments>() { 2 } else { 1 })
+    ExitCode::from(match error {
+        // As shells tell of a program that a signal ended: 128 and the signal's number.
+        _ if run::interrupted() => 130,
+        error if error.is::<WrongArguments>() || names_nothing(error) => 2,
+        _ => 1,
+    })
+}
+
+/// True if what was read is sound and the name of a scenario in it is not.
+fn names_nothing(error: &anyhow::Error) -> bool {
+    let mut causes = error.chain().filter_map(|cause| cause.downcast_ref());
+    causes.any(|cause: &DataError| {
+        matches!(
+            cause,
+            DataError::NoSuchScenario { .. } | DataError::SeveralFiles { .. }
+        )
+    })
 }
 
 #[cfg(test)]
@@ -220,7 +254,7 @@ mod tests {
 
     #[test]
     fn the_command_line_is_consistent() {
-        Cli::command().debug_assert();
+        command().debug_assert();
     }
 
     #[test]

@@ -109,7 +109,9 @@ fn read(path: &Path) -> anyhow::Result<Table> {
 fn flags(path: &Path, table: &Table, verb: &Command) -> anyhow::Result<Vec<OsString>> {
     let known: Vec<&str> = verb
         .get_arguments()
-        .filter_map(|argument| argument.get_long())
+        .filter(|argument| !argument.is_hide_set())
+        .filter_map(|argument| argument.get_long_and_visible_aliases())
+        .flatten()
         .filter(|name| !["config", "help", "version"].contains(name))
         .collect();
     let mut flags = Vec::new();

@@ -3,7 +3,7 @@
 //! One file per verb under `verbs/`, each a thin layer over the crates: it reads its arguments,
 //! shows progress, calls crates and fills a report. What every verb shares is in [`run`] (output
 //! folder, seed, threads, phases), [`report`] (`report.json` and the table on the terminal),
-//! [`config`] (TOML files as flags) and [`progress`]. Start with [`cli`].
+//! [`config`] (TOML files as flags), [`words`] (other names of flags) and [`progress`]. Start with [`cli`].
 #![allow(
     clippy::disallowed_methods,
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
@@ -36,6 +36,7 @@ mod tables;
 mod targets;
 mod told;
 mod verbs;
+mod words;
 mod worlds;
 
 use std::process::ExitCode;

@@ -89,6 +89,14 @@ pub(crate) fn find(source: &str) -> anyhow::Result<Case> {
     let (path, wanted) = source.split_once('#').unwrap_or((source, "0"));
     let logs = nuplan_recordings::logs_of(Path::new(path));
     if !logs.is_empty() {
+        if logs.len() > 1 && !source.contains('#') {
+            let several = gump_data::DataError::SeveralFiles {
+                files: logs.len(),
+                first: logs[0].clone(),
+                path: path.into(),
+            };
+            return Err(several.into());
+        }
         let mut all = nuplan_recordings::open(&logs)?.enumerate();
         let found = all.find(|(i, named)| named.id == wanted || i.to_string() == wanted);
         let (_, named) = found.with_context(|| format!("no scenario {wanted} in {path}"))?;

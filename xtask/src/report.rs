@@ -92,11 +92,16 @@ impl Report {
         Ok(())
     }
 
-    /// The results and times as the terminal shows them.
-    pub(crate) fn text(&self) -> String {
+    /// True if there is a result that the terminal shows.
+    pub(crate) fn has_something_to_tell(&self) -> bool {
+        self.results.keys().any(|key| !self.untold.contains(key))
+    }
+
+    /// The results and times as a terminal of so many columns shows them.
+    pub(crate) fn text(&self, width: usize) -> String {
         let mut told = self.results.clone();
         told.retain(|key, _| !self.untold.contains(key));
-        let results = table::text(&Value::Object(told));
+        let results = table::text(&Value::Object(told), width);
         let seconds = self.seconds.iter().map(|(phase, seconds)| {
             let seconds = seconds.as_f64().unwrap_or_default();
             format!("{phase} {seconds:.2}")

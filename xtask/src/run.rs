@@ -41,6 +41,10 @@ pub(crate) struct Common {
     /// No progress and no table, errors only
     #[arg(long)]
     quiet: bool,
+    /// Whole tables on the terminal, however wide; report.json has them anyway
+    #[arg(long)]
+    #[serde(skip)]
+    wide: bool,
 }
 
 /// Where tensors live.
@@ -79,11 +83,16 @@ impl Device {
     }
 }
 
+/// Columns of a terminal that tables fit into.
+const WIDTH: usize = 120;
+
 /// A run in progress.
 pub(crate) struct Run {
     out: PathBuf,
     seed: Seed,
     quiet: bool,
+    /// Columns that tables may take on the terminal.
+    width: usize,
     threads: usize,
     device: gump_model::Device,
     /// False for a process that helps another one, which tells and writes for both.
@@ -117,6 +126,7 @@ impl Run {
         Ok(Self {
             seed: Seed(seed),
             quiet: common.quiet,
+            width: if common.wide { usize::MAX } else { WIDTH },
             threads: common
                 .threads
                 .map_or_else(machine::cores, NonZeroUsize::get),
@@ -149,9 +159,13 @@ impl Run {
         self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
         let path = self.out.join("report.json");
         let written = self.report.write(&path);
-        let has_something_to_tell = done.is_ok() || !self.report.results.is_empty();
+        let has_something_to_tell = done.is_ok() || self.report.has_something_to_tell();
         if !self.quiet && has_something_to_tell {
-            print_line(&format!("{}report: {}", self.report.text(), path.display()));
+            print_line(&format!(
+                "{}report: {}",
+                self.report.text(self.width),
+                path.display()
+            ));
         }
         done.and(written)
     }
@@ -178,6 +192,11 @@ impl Run {
         if !self.quiet {
             print_line(line);
         }
+    }
+
+    /// Columns that tables may take on the terminal.
+    pub(crate) fn width(&self) -> usize {
+        self.width
     }
 
     /// Adds a result; keys keep the order in which they come.

@@ -2,12 +2,13 @@
 //!
 //! Objects become `name  value` lines with dotted names; a list of objects becomes a table with
 //! one row each, its columns in order of first appearance; of long tables only the start is shown,
-//! `report.json` has all.
+//! `report.json` has all. A table that is too wide lies on its side if that fits; what does not fit
+//! then is left out and said so.
 
 use serde_json::Value;
 
-/// The text of `results`, every line ended.
-pub(crate) fn text(results: &Value) -> String {
+/// The text of `results`, every line ended, in tables of at most `width` columns.
+pub(crate) fn text(results: &Value, width: usize) -> String {
     let mut pairs = Vec::new();
     let mut tables = Vec::new();
     walk("", results, &mut pairs, &mut tables);
@@ -18,9 +19,15 @@ pub(crate) fn text(results: &Value) -> String {
     let mut text = aligned(&pairs);
     for (name, rows) in tables {
         let shown = rows.len().min(MAX_ROWS + 1);
-        text.push_str(&format!("\n{name}\n{}", aligned(&rows[..shown])));
+        let (fitted, n_hidden) = fitted(rows[..shown].to_vec(), width);
+        text.push_str(&format!("\n{name}\n{}", aligned(&fitted)));
         if rows.len() > shown {
             text.push_str(&format!("... and {} more\n", rows.len() - shown));
+        }
+        if n_hidden > 0 {
+            text.push_str(&format!(
+                "... and {n_hidden} more columns: in report.json, and here with --wide\n"
+            ));
         }
     }
     text
@@ -118,6 +125,93 @@ pub(crate) fn decimal(x: f64) -> String {
     }
 }
 
+/// The table in a form that fits, and how many of its columns or rows had to go for that.
+fn fitted(rows: Rows, width: usize) -> (Rows, usize) {
+    if width_of(&rows) <= width {
+        return (rows, 0);
+    }
+    let joined = with_intervals(rows);
+    if width_of(&joined) <= width {
+        return (joined, 0);
+    }
+    let turned = transposed(&joined);
+    // A table with more worlds than numbers is no better on its side.
+    let mut best = match width_of(&turned) < width_of(&joined) {
+        true => turned,
+        false => joined,
+    };
+    for name in best.iter_mut().take(1).flatten() {
+        *name = shortened(name);
+    }
+    let n_columns = best.first().map_or(0, Vec::len);
+    let mut kept = n_columns;
+    while kept > 2 && width_of(&best) > width {
+        kept -= 1;
+        for row in &mut best {
+            row.truncate(kept);
+        }
+    }
+    (best, n_columns - kept)
+}
+
+/// Columns `X`, `X low` and `X high` as one.
+fn with_intervals(rows: Rows) -> Rows {
+    let Some(names) = rows.first().cloned() else {
+        return rows;
+    };
+    let find = |name: String| names.iter().position(|other| *other == name);
+    let ends: Vec<Option<(usize, usize)>> = names
+        .iter()
+        .map(|name| find(format!("{name} low")).zip(find(format!("{name} high"))))
+        .collect();
+    let mut gone = vec![false; names.len()];
+    for (low, high) in ends.iter().flatten() {
+        (gone[*low], gone[*high]) = (true, true);
+    }
+    let row = |(i, row): (usize, &Vec<String>)| {
+        let kept = (0..row.len()).filter(|column| !gone[*column]);
+        let cells = kept.map(|column| match ends[column] {
+            Some((low, high)) if i > 0 && row[low] != "-" => {
+                format!("{} [{}, {}]", row[column], row[low], row[high])
+            }
+            _ => row[column].clone(),
+        });
+        cells.collect()
+    };
+    rows.iter().enumerate().map(row).collect()
+}
+
+/// Rows as columns.
+fn transposed(rows: &Rows) -> Rows {
+    let n_columns = rows.first().map_or(0, Vec::len);
+    let column = |i: usize| rows.iter().map(|row| row[i].clone()).collect();
+    (0..n_columns).map(column).collect()
+}
+
+/// The end of a long name, which tells files of one folder apart.
+fn shortened(name: &str) -> String {
+    let n = name.chars().count();
+    match n > LONGEST_NAME {
+        true => format!(
+            "\u{2026}{}",
+            name.chars().skip(n - LONGEST_NAME + 1).collect::<String>()
+        ),
+        false => name.into(),
+    }
+}
+
+/// Characters of a column's name where there is little room.
+const LONGEST_NAME: usize = 24;
+
+fn width_of(rows: &Rows) -> usize {
+    let lines = aligned(rows);
+    lines
+        .lines()
+        .map(|line| line.chars().count())
+        .max()
+        .unwrap_or(0)
+}
+
 /// First column to the left, numbers to the right.
 fn aligned(rows: &[Vec<String>]) -> String {
     let n_columns = rows.iter().map(Vec::len).max().unwrap_or(0);
@@ -170,7 +264,56 @@ world    ade    note
 idm    1.500       -
 log        0  oracle
 ";
-        assert_eq!(text(&results), expected);
+        assert_eq!(text(&results, 120), expected);
+    }
+
+    #[test]
+    fn a_wide_table_lies_on_its_side() {
+        let row = |world: &str| {
+            let components = (0..12).map(|i| (format!("component_{i}"), json!(0.5)));
+            let components: serde_json::Map<_, _> = components.collect();
+            json!({"world": world, "metametric": 0.7, "components": components})
+        };
+        let results = json!({"rows": [row("log"), row("idm")]});
+        let told = text(&results, 120);
+        assert!(
+            told.lines().all(|line| line.chars().count() <= 120),
+            "{told}"
+        );
+        assert!(
+            told.contains("\nmetametric               0.7000  0.7000\n"),
+            "{told}"
+        );
+        assert!(told.contains("components.component_11"), "{told}");
+        let wide = text(&results, usize::MAX);
+        assert!(
+            wide.lines().any(|line| line.chars().count() > 120),
+            "{wide}"
+        );
+    }
+
+    #[test]
+    fn intervals_are_one_column_where_room_is_scarce() {
+        let line = |score: &str| json!({"score": score, "my world": 0.7, "my world low": 0.65, "my world high": 0.75});
+        let results = json!({"intervals": [line("a"), line("b")]});
+        let told = text(&results, 36);
+        let expected = "\nintervals\nscore  my world\na      0.7000 [0.6500, 0.7500]\n\
+                        b      0.7000 [0.6500, 0.7500]\n";
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn columns_that_fit_in_no_way_are_counted() {
+        let rows: Vec<Value> = (0..9)
+            .map(|i| json!({"name": format!("a world {i}"), "x": i, "y": i}))
+            .collect();
+        let told = text(&json!({"rows": rows}), 12);
+        assert!(
+            told.lines()
+                .all(|line| line.starts_with("...") || line.chars().count() <= 14),
+            "{told}"
+        );
+        assert!(told.contains("more columns"), "{told}");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 mod flags;
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use gump_model::relative::{self, RelativeSampling, RelativeWorld};
@@ -21,7 +21,7 @@ pub(crate) use flags::{Draw, PrecisionName, Sampling};
 /// Which world imagines.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum WorldName {
-    /// What really happened: an oracle.
+    /// What was recorded: an oracle.
     Log,
     /// Rule-driven traffic that reacts.
     Idm,
@@ -41,9 +41,37 @@ impl FromStr for WorldName {
             "constant-velocity" => Ok(Self::ConstantVelocity),
             _ => match name.strip_prefix("model:") {
                 Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
-                _ => Err("expected log, idm, constant-velocity or model:WEIGHTS".into()),
+                // Nothing else is named like that: what is meant is clear.
+                None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
+                _ => Err(no_world(name)),
             },
         }
+    }
+}
+
+/// How files of weights end.
+const WEIGHTS: &str = ".safetensors";
+
+/// A file of weights, by its path or as a world is named.
+///
+/// Error: a world without weights.
+pub(crate) fn weights(name: &str) -> Result<PathBuf, String> {
+    match name.parse() {
+        Ok(WorldName::Model(path)) => Ok(path),
+        Ok(world) => Err(format!(
+            "expected a file of weights, found the world {world}"
+        )),
+        Err(_) => Ok(name.into()),
+    }
+}
+
+/// Why a name is no world, and what may be meant.
+fn no_world(name: &str) -> String {
+    let expected = "expected log, idm, constant-velocity or model:WEIGHTS";
+    let is_path = name.contains(['/', '\\', '.']) || Path::new(name).exists();
+    match is_path && !name.starts_with("model:") {
+        true => format!("{expected}; for weights in a file: model:{name}"),
+        false => expected.into(),
     }
 }
 
@@ -212,5 +240,12 @@ mod tests {
         for name in ["", "model:", "model", "IDM"] {
             assert!(name.parse::<WorldName>().is_err(), "{name}");
         }
+        let bare: WorldName = "a/b.safetensors".parse().unwrap();
+        assert_eq!(bare.to_string(), "model:a/b.safetensors");
+        let other = "a/b.bin".parse::<WorldName>().unwrap_err();
+        assert!(
+            other.ends_with("for weights in a file: model:a/b.bin"),
+            "{other}"
+        );
     }
 }

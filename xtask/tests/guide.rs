@@ -1,6 +1,6 @@
 //! The guide is true: its commands run, what it shows of their output is there, the code it quotes
-//! exists, its links lead somewhere in the book, and commands that cannot run here at least have
-//! flags that exist.
+//! is what its source says, its links lead somewhere in the book, and commands that cannot run here
+//! at least have flags that exist.
 //!
 //! What the fences of a chapter mean:
 //!
@@ -162,33 +162,71 @@ fn flags_of(verb: &str) -> BTreeSet<String> {
         .collect()
 }
 
+/// Chapters are read as plain Markdown on the web, too: what they quote stands in them, and is what
+/// stands in its source now. `UPDATE_GUIDE=1` writes it anew.
 #[test]
-fn quoted_code_exists() {
-    let mut n_quotes = 0;
+fn quotes_are_what_their_sources_say() {
+    let (mut n_quotes, mut stale) = (0, Vec::new());
     for chapter in chapters() {
-        for block in blocks(&chapter) {
-            for quote in block
-                .lines
-                .iter()
-                .filter_map(|line| line.strip_prefix("{{#include "))
-            {
-                let quote = quote.strip_suffix("}}").unwrap();
-                let (file, anchor) = quote.split_once(':').unwrap_or((quote, ""));
-                let path = chapter.with_file_name(file);
-                let text = fs::read_to_string(&path).unwrap_or_default();
-                let at = format!("{}:{}: {quote}", chapter.display(), block.line);
-                assert!(!text.is_empty(), "{at}: expected such a file");
-                let marks = ["ANCHOR: ", "ANCHOR_END: "].map(|mark| format!("// {mark}{anchor}\n"));
-                let marked = marks.iter().all(|mark| text.matches(&**mark).count() == 1);
-                assert!(
-                    anchor.is_empty() || marked,
-                    "{at}: expected it to be marked there"
-                );
-                n_quotes += 1;
+        let text = fs::read_to_string(&chapter).unwrap();
+        assert!(!text.contains("{{#"), "{}: an include", chapter.display());
+        let mut written = String::new();
+        let mut lines = text.lines();
+        while let Some(line) = lines.next() {
+            written += &format!("{line}\n");
+            let quote = line.strip_prefix("<!-- from ");
+            let Some(quote) = quote.and_then(|rest| rest.strip_suffix(" -->")) else {
+                continue;
+            };
+            let fence = lines.next().unwrap_or_default();
+            assert!(
+                fence.starts_with("```"),
+                "{quote}: expected a block, found {fence}"
+            );
+            assert!(
+                lines.any(|line| line == "```"),
+                "{quote}: the block does not end"
+            );
+            written += &format!("{fence}\n{}\n```\n", quoted(&chapter, quote));
+            n_quotes += 1;
+        }
+        if written != text {
+            stale.push(chapter.display().to_string());
+            if std::env::var_os("UPDATE_GUIDE").is_some() {
+                fs::write(&chapter, written).unwrap();
             }
         }
     }
-    assert!(n_quotes >= 5, "only {n_quotes} quotes found");
+    assert!(
+        stale.is_empty(),
+        "stale quotes, UPDATE_GUIDE=1 mends them: {stale:?}"
+    );
+    assert!(n_quotes >= 12, "only {n_quotes} quotes found");
+}
+
+/// `FILE` or what stands in `FILE` between the marks of an `ANCHOR`, less the indent of all lines.
+fn quoted(chapter: &Path, quote: &str) -> String {
+    let (file, anchor) = quote.split_once(':').unwrap_or((quote, ""));
+    let path = chapter.with_file_name(file);
+    let text = fs::read_to_string(&path).unwrap_or_else(|_| panic!("{quote}: no such file"));
+    let part = match anchor {
+        "" => text.as_str(),
+        anchor => {
+            let (_, from) = text
+                .split_once(&format!("// ANCHOR: {anchor}\n"))
+                .unwrap_or_else(|| panic!("{quote}: no such mark"));
+            let (part, _) = from
+                .split_once(&format!("// ANCHOR_END: {anchor}\n"))
+                .unwrap_or_else(|| panic!("{quote}: no end mark"));
+            part.trim_end_matches(' ')
+        }
+    };
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let filled = part.lines().filter(|line| !line.trim().is_empty());
+    let least = filled.map(indent).min().unwrap_or(0);
+    let lines = part.lines().map(|line| line.get(least..).unwrap_or(""));
+    let lines: Vec<&str> = lines.collect();
+    lines.join("\n").trim_matches('\n').to_owned()
 }
 
 #[test]

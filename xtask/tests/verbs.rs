@@ -224,7 +224,6 @@ fn bad_input_is_one_sentence_and_exit_1() {
     fs::write(place.path("text"), "once upon a time there was a car").unwrap();
     check("data inspect text", &["text", "once"]);
     let scene = place.scene();
-    check(&format!("data inspect {scene}#other"), &[scene, "other"]);
     let words = format!("simulate --scenario {scene} --world model:text");
     check(&words, &["text"]);
     check("train --data empty", &["empty"]);

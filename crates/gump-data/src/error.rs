@@ -242,7 +242,7 @@ pub enum DataError {
         problem: String,
     },
     /// A name like `FILE#ID` names nothing.
-    #[error("expected a scenario \"{wanted}\", found {found} others: {}", path.display())]
+    #[error("{}: {}", no_such_scenario(wanted, *found), path.display())]
     NoSuchScenario {
         /// The index or id asked for.
         wanted: String,
@@ -251,6 +251,54 @@ pub enum DataError {
         /// The file or directory.
         path: PathBuf,
     },
+    /// A folder of several files stands where one scenario is meant.
+    #[error(
+        "expected one scenario, found a folder with {files} files of scenarios: name a file such \
+         as {}, or a scenario by its number or id as in {}#0",
+        first.display(),
+        path.display()
+    )]
+    SeveralFiles {
+        /// How many of its files hold scenarios.
+        files: usize,
+        /// The first of them.
+        first: PathBuf,
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A folder whose making was cut short.
+    #[error(
+        "expected a finished data set, found {} in {}: the conversion that made it was stopped; \
+         the same command finishes it",
+        crate::INCOMPLETE,
+        path.display()
+    )]
+    Incomplete {
+        /// The folder.
+        path: PathBuf,
+    },
+}
+
+/// What was asked for after `#`, and what there is instead.
+fn no_such_scenario(wanted: &str, found: usize) -> String {
+    let is_number = wanted.parse::<usize>().is_ok();
+    match found {
+        1 if is_number => format!("expected #0, the only scenario there is, found #{wanted}"),
+        n if is_number && n > 1 => {
+            format!(
+                "expected one of its {n} scenarios, #0 to #{}, found #{wanted}",
+                n - 1
+            )
+        }
+        n => format!(
+            "expected a scenario \"{wanted}\", found {n} {}",
+            if n == 1 {
+                "of another id"
+            } else {
+                "of other ids"
+            }
+        ),
+    }
 }
 
 /// The largest number accepted in a state or a map, in SI units.
@@ -273,7 +321,7 @@ pub enum Problem {
     #[error("expected a map, found no map feature")]
     NoMap,
     /// It has no agents.
-    #[error("expected at least one track, found none")]
+    #[error("expected at least one track, found a map alone or nothing")]
     NoAgents,
     /// It does not say who the ego is.
     #[error("expected the index of the ego's track, found none")]

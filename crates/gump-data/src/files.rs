@@ -77,7 +77,7 @@ static COMPANIONS: &[Companion] = &[
     },
     #[cfg(feature = "sumo")]
     Companion {
-        what: "SUMO network",
+        what: sumo::NETWORK,
         recognises: sumo::is_network,
     },
     #[cfg(feature = "sumo")]
@@ -100,6 +100,10 @@ const HEAD_BYTES: u64 = 64 << 10;
 /// is not recognised is damaged rather than something else.
 const BINARY_NAMES: [&str; 4] = [".tfrecord", ".parquet", ".feather", ".db"];
 
+/// Name of the file that marks a folder whose making was begun and not finished: what is there is
+/// sound, but it is not all. No reader takes such a folder.
+pub const INCOMPLETE: &str = "CACHE-INCOMPLETE";
+
 /// What a file is.
 pub(crate) enum Role {
     /// It holds scenarios.
@@ -115,8 +119,29 @@ pub(crate) enum Role {
 /// left out; links are followed, but into no directory twice.
 ///
 /// # Errors
-/// [`DataError::Missing`], and [`DataError::Io`] for a directory that cannot be listed.
+/// [`DataError::Missing`], [`DataError::Incomplete`] for a directory with a file [`INCOMPLETE`] in
+/// it, and [`DataError::Io`] for one that cannot be listed.
 pub fn list(path: &Path) -> Result<Vec<PathBuf>, DataError> {
+    let files = list_unfinished(path)?;
+    let mark = files.iter().find(|file| is_mark(file));
+    match mark.and_then(|mark| mark.parent()) {
+        Some(folder) if path.is_dir() => Err(DataError::Incomplete {
+            path: folder.into(),
+        }),
+        _ => Ok(files),
+    }
+}
+
+fn is_mark(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| name == INCOMPLETE)
+}
+
+/// As [`list`], in folders that are being made too: for who makes them. The mark is among the
+/// files.
+///
+/// # Errors
+/// [`DataError::Missing`], and [`DataError::Io`] for a directory that cannot be listed.
+pub fn list_unfinished(path: &Path) -> Result<Vec<PathBuf>, DataError> {
     if !path.exists() {
         return Err(DataError::Missing { path: path.into() });
     }

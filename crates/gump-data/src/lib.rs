@@ -93,9 +93,9 @@ mod xml;
 
 pub use convert::{Converted, OutputFormat, convert, groups};
 pub use error::{DataError, Place, Problem};
-pub use files::list as list_files;
+pub use files::{INCOMPLETE, list as list_files, list_unfinished};
 pub use inspect::{Summary, inspect, inspect_with};
-pub use open::{Reader, find, find_record, open, open_files, open_with};
+pub use open::{Reader, find, find_map, find_record, open, open_files, open_with};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
 #[cfg(feature = "parquet")]
 pub use rollouts::write_rollouts;

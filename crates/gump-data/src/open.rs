@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use gump_scene::Scenario;
 
 use crate::files::{self, Role};
-use crate::{DataError, ReadOptions, ScenarioRecord};
+use crate::{DataError, ReadOptions, ScenarioRecord, sumo};
 
 /// How a format hands over its scenarios.
 pub(crate) type BoxedSource = Box<dyn Source>;
@@ -177,13 +177,15 @@ impl Source for NoRecords {
     }
 }
 
-/// Reads one scenario by name: `PATH` (the first), `PATH#INDEX` (from 0) or `PATH#SCENARIO_ID`.
+/// Reads one scenario by name: `PATH` (the first of a file, the one file of a folder),
+/// `PATH#INDEX` (from 0) or `PATH#SCENARIO_ID`.
 ///
 /// An index wins over an id of the same digits. A path that itself contains `#` is taken whole if
 /// it exists.
 ///
 /// # Errors
-/// [`DataError::NoSuchScenario`], those of [`open`], and those of the record asked for.
+/// [`DataError::NoSuchScenario`], [`DataError::SeveralFiles`] for a folder of several files of
+/// scenarios without an index, those of [`open`], and those of the record asked for.
 pub fn find(source: &str) -> Result<Scenario, DataError> {
     find_record(source).map(|record| record.scenario)
 }
@@ -193,21 +195,67 @@ pub fn find(source: &str) -> Result<Scenario, DataError> {
 /// # Errors
 /// As [`find`].
 pub fn find_record(source: &str) -> Result<ScenarioRecord, DataError> {
+    find_with(source, ReadOptions::ALL)
+}
+
+/// As [`find`], for who needs the map alone: a recording without agents, and a SUMO network, has a
+/// parked ego on the longest of its lanes.
+///
+/// # Errors
+/// As [`find`].
+pub fn find_map(source: &str) -> Result<Scenario, DataError> {
+    let options = ReadOptions {
+        park_an_ego: true,
+        ..ReadOptions::ALL
+    };
+    let path = Path::new(source);
+    if path.is_file() && matches!(files::role(path)?, Role::Companion(sumo::NETWORK)) {
+        return sumo::map_alone(path, options);
+    }
+    find_with(source, options).map(|record| record.scenario)
+}
+
+fn find_with(source: &str, options: ReadOptions) -> Result<ScenarioRecord, DataError> {
     let (path, wanted) = match source.rsplit_once('#') {
         Some((path, wanted)) if !Path::new(source).exists() => (Path::new(path), wanted),
-        _ => (Path::new(source), "0"),
+        _ => {
+            let path = Path::new(source);
+            refuse_several(path)?;
+            (path, "0")
+        }
     };
     if let Ok(index) = wanted.parse()
-        && let Some(record) = find_index(path, index)?
+        && let Some(record) = find_index(path, index, options)?
     {
         return Ok(record);
     }
-    find_id(path, wanted)
+    find_id(path, wanted, options)
+}
+
+/// Refuses a folder of which it is not clear which file is meant.
+fn refuse_several(path: &Path) -> Result<(), DataError> {
+    if !path.is_dir() {
+        return Ok(());
+    }
+    let mut files = files::list(path)?;
+    files.retain(|file| matches!(files::role(file), Ok(Role::Scenarios(_))));
+    if files.len() < 2 {
+        return Ok(());
+    }
+    Err(DataError::SeveralFiles {
+        files: files.len(),
+        first: files.swap_remove(0),
+        path: path.into(),
+    })
 }
 
 /// Records too broken to read count, so that a record keeps its index.
-fn find_index(path: &Path, index: usize) -> Result<Option<ScenarioRecord>, DataError> {
-    let mut reader = open(path)?;
+fn find_index(
+    path: &Path,
+    index: usize,
+    options: ReadOptions,
+) -> Result<Option<ScenarioRecord>, DataError> {
+    let mut reader = open_with(path, options)?;
     for _ in 0..index {
         if reader.first_of(|source| source.skip()).is_none() {
             return Ok(None);
@@ -216,8 +264,8 @@ fn find_index(path: &Path, index: usize) -> Result<Option<ScenarioRecord>, DataE
     reader.next().transpose()
 }
 
-fn find_id(path: &Path, wanted: &str) -> Result<ScenarioRecord, DataError> {
-    let mut reader = open(path)?;
+fn find_id(path: &Path, wanted: &str, options: ReadOptions) -> Result<ScenarioRecord, DataError> {
+    let mut reader = open_with(path, options)?;
     let (mut found, mut hit, mut first_error) = (0, false, None);
     while let Some(next) = reader.first_of(|source| {
         source.next_wanted(&mut |id| {

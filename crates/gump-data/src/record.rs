@@ -139,6 +139,9 @@ pub struct ReadOptions {
     /// recordings such as NGSIM. Looks 0.3 s to both sides, **at the present too**. Never on by
     /// default.
     pub smooth: bool,
+    /// Gives a recording without agents, a map alone, one parked vehicle on its longest lane as
+    /// the ego; otherwise it is refused. Never on by default.
+    pub park_an_ego: bool,
 }
 
 impl ReadOptions {
@@ -160,6 +163,7 @@ impl ReadOptions {
         infer_motion: false,
         infer_elevation: false,
         smooth: false,
+        park_an_ego: false,
     };
     /// Fills every gap that can be filled; smooths nothing.
     pub const ALL: Self = Self {
@@ -179,6 +183,7 @@ impl ReadOptions {
         infer_motion: true,
         infer_elevation: true,
         smooth: false,
+        park_an_ego: false,
     };
 }
 

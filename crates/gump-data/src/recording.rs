@@ -41,6 +41,25 @@ pub(crate) struct Recording {
     pub(crate) route: Option<Route>,
 }
 
+impl Recording {
+    /// A recording of nobody: what a map alone is.
+    pub(crate) fn of_nobody(id: String) -> Self {
+        Self {
+            id,
+            dt: 0.1,
+            steps: 0,
+            now: 0,
+            ego: None,
+            tracks: Vec::new(),
+            lights: Vec::new(),
+            targets: None,
+            objects_of_interest: Vec::new(),
+            tags: Vec::new(),
+            route: None,
+        }
+    }
+}
+
 /// One agent over time.
 pub(crate) struct Track {
     pub(crate) id: i64,
@@ -132,7 +151,13 @@ pub(crate) fn assemble(
     }
     recording.tracks.retain(|track| !track.states.is_empty());
     if recording.tracks.is_empty() {
-        return Err(Problem::NoAgents);
+        let parked = options.park_an_ego.then(|| parked(&map)).flatten();
+        let parked = parked.ok_or(Problem::NoAgents)?;
+        report.infer("ego: parked on the longest lane", 1);
+        (recording.steps, recording.now, recording.ego) = (1, 0, Some(parked.id));
+        recording.lights.retain(|(step, _)| *step == 0);
+        recording.targets = None;
+        recording.tracks.push(parked);
     }
     let ego = recording.ego.or_else(|| {
         let best = options
@@ -167,6 +192,33 @@ pub(crate) fn assemble(
     }
     infer::route(&mut scenario, options, report);
     Ok(scenario)
+}
+
+/// A vehicle that stands in the middle of the longest lane; `None` without lanes.
+fn parked(map: &MapGraph) -> Option<Track> {
+    let longest = map
+        .lanes()
+        .iter()
+        .max_by(|a, b| a.centerline.length().total_cmp(&b.centerline.length()))?;
+    let pose = longest
+        .centerline
+        .pose_at(longest.centerline.length() / 2.0);
+    let kind = AgentKind::Vehicle;
+    let [length, width, height] = kind.usual_size();
+    let ground = map.elevation_at(pose.position).unwrap_or(0.0);
+    let state = State {
+        step: 0,
+        position: pose.position.extend(ground + height / 2.0),
+        heading: pose.heading,
+        velocity: DVec2::ZERO,
+        size: [length, width, height],
+    };
+    Some(Track {
+        id: 0,
+        kind,
+        usual_size: kind.usual_size(),
+        states: vec![state],
+    })
 }
 
 /// Leaves out tracks and states that cannot be used; sorts states by step.

@@ -214,6 +214,7 @@ impl<'a> Viewer<'a> {
             "candidates": self.candidates.iter().map(|c| json!({
                 "name": c.name,
                 "score": c.score,
+                "parts": c.parts,
                 "chosen": c.is_chosen,
                 "path": c.path.iter().map(|&p| local(p)).collect::<Vec<_>>(),
             })).collect::<Vec<_>>(),

@@ -147,6 +147,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         viewer.candidate(CandidatePath {
             name: name.into(),
             score,
+            parts: vec![("progress".into(), 0.25), ("comfort".into(), 1.0)],
             is_chosen: score.is_some(),
             path: vec![dvec2(10.0, 0.0), dvec2(30.0, 1.0)],
         });
@@ -173,7 +174,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         assert!((0.499..0.9).contains(&played), "{played}");
         let changes = report["changes"].as_object().expect("a table of keys");
         assert!(
-            changes.len() == 8 && changes.values().all(|changed| *changed == true),
+            changes.len() == 11 && changes.values().all(|changed| *changed == true),
             "{report}"
         );
         let heat = report["heat"].as_array().expect("a number per canvas");
@@ -193,6 +194,27 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         // A candidate brings its future along.
         let shown = serde_json::json!([0, 4, "Futures: slow ahead"]);
         assert_eq!(report["candidate_shows"], shown);
+        // What its score is made of, and what is drawn, stand in the panel; so does what the tip
+        // says of an agent beside it.
+        assert_eq!(
+            report["parts"],
+            serde_json::json!(["progress 0.250", "comfort 1.000"])
+        );
+        assert!(
+            report["marks"].as_u64().is_some_and(|n| n >= 10),
+            "{report}"
+        );
+        let tip = report["tip"].as_str().expect("a text");
+        assert!(
+            tip.contains("ego, vehicle 0") && tip.contains("m/s"),
+            "{tip}"
+        );
+        let address = report["address"].as_str().expect("a text");
+        assert!(
+            address.contains("t=1.5") && address.contains("agent=0"),
+            "{address}"
+        );
+        assert_eq!(report["panel_in_sight"], true, "{report}");
         assert_eq!(report["wide"], false, "the page is wider than its window");
         let ends = report["ends"].as_array().expect("one state per take");
         let last = std::iter::once(&scenario.log[scenario.log.len() - 1])

@@ -206,6 +206,7 @@ fn viewer<'a>(
         viewer.candidate(CandidatePath {
             name: prospect.kind.to_string(),
             score: Some(prospect.value),
+            parts: named(&prospect.score.parts()),
             is_chosen: i == decision.chosen && !decision.brakes,
             path: path
                 .map(|state| vehicle.center_of(state.rear_axle).position)
@@ -213,6 +214,14 @@ fn viewer<'a>(
         });
     }
     viewer
+}
+
+/// Parts of a score as the viewer takes them.
+pub(crate) fn named(parts: &[(&'static str, f64)]) -> Vec<(String, f64)> {
+    let parts = parts.iter();
+    parts
+        .map(|(name, value)| ((*name).into(), *value))
+        .collect()
 }
 
 /// What `report.json` says of the decision.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use gump_data::find;
+use gump_data::find_map;
 use gump_model::generation::constraint::{ObjectSpec, parse_constraints};
 use gump_model::generation::factory::{Made, Order, make_many};
 use gump_model::generation::verdict::{off_road, overlaps};
@@ -22,6 +22,7 @@ use crate::cli::WrongArguments;
 use crate::futures;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
+use crate::worlds;
 
 /// Scenes made together.
 const BATCH: u64 = 32;
@@ -29,7 +30,8 @@ const BATCH: u64 = 32;
 /// Arguments of `generate`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// The scenario whose map and lights are taken: PATH, PATH#INDEX or PATH#SCENARIO_ID
+    /// The scenario whose map and lights are taken, or a map without agents (a SUMO network too):
+    /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     map: String,
     /// What kind of situation it is to be: one of nuPlan's 73 scenario tags, at most four times
@@ -63,7 +65,7 @@ pub(crate) struct Args {
     #[arg(long, value_enum, default_value_t = PlacementName::Guided)]
     placement: PlacementName,
     /// Weights of the model [default: the shipped ones]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
     weights: Option<PathBuf>,
     /// Divides the logits; above 1 is bolder [default: 1, with --paper 1.25]
     #[arg(long, value_name = "X")]
@@ -115,7 +117,7 @@ impl Args {
         let prompts = tags(&self.prompt)?;
         self.check_numbers()?;
         let objects = self.objects()?;
-        let recorded = run.phase("read", |_| Ok(find(&self.map)?))?;
+        let recorded = run.phase("read", |_| Ok(find_map(&self.map)?))?;
         let world = run.phase("load", |run| {
             world(run.device(), self.weights.as_ref(), self.life)
         })?;

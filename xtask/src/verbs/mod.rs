@@ -8,6 +8,7 @@ pub(crate) mod demo;
 pub(crate) mod evaluate;
 mod explain;
 pub(crate) mod generate;
+pub(crate) mod manual;
 pub(crate) mod plan;
 pub(crate) mod rl;
 pub(crate) mod simulate;

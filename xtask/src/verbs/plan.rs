@@ -81,7 +81,9 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
         let sampling = self.sampling.resolve()?;
+        self.check_explain(None)?;
         let case = run.phase("read", |_| recordings::find(&self.scenario))?;
+        self.check_explain(Some(case.recording.scenario()))?;
         let surroundings = run.phase("load", |run| {
             Surroundings::load(run.device(), &self.world, &sampling)
         })?;
@@ -136,6 +138,36 @@ impl Args {
 }
 
 impl Args {
+    /// Refuses to explain what there will be no decision of, before anything is driven.
+    ///
+    /// Error: [`WrongArguments`] for a planner that imagines nothing, and for a step beyond the
+    /// drive through a scenario.
+    fn check_explain(&self, scenario: Option<&Scenario>) -> anyhow::Result<()> {
+        let Some(step) = self.explain else {
+            return Ok(());
+        };
+        let wrong = if self.planner != PlannerName::Interactive {
+            format!(
+                "--explain {step}: expected a planner that imagines before it decides, \
+                 interactive, found {}",
+                self.planner.name()
+            )
+        } else if let Some(scenario) = scenario {
+            let recorded = scenario.log.len() - scenario.now - 1;
+            let steps = recorded.min((self.driving.seconds / scenario.dt).round() as usize);
+            if step < steps {
+                return Ok(());
+            }
+            format!(
+                "--explain {step}: expected a step of the drive, 0 to {}, found {step}",
+                steps.saturating_sub(1)
+            )
+        } else {
+            return Ok(());
+        };
+        Err(WrongArguments(wrong).into())
+    }
+
     /// Writes the page of the decision that was asked for.
     ///
     /// Error: a planner that imagines nothing, a step that is no decision's.

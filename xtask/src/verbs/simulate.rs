@@ -140,8 +140,9 @@ impl Args {
         }
         viewer
             .note(format!(
-                "{} futures in the world {}",
+                "{} simulated future{} in the world {}",
                 rollouts.len(),
+                if rollouts.len() == 1 { "" } else { "s" },
                 self.world
             ))
             .futures(rollouts);

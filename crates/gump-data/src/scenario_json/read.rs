@@ -196,6 +196,9 @@ impl File {
         names: &mut Names,
         report: &mut ReadReport,
     ) -> Result<Recording, Problem> {
+        if self.tracks.is_empty() {
+            return Ok(Recording::of_nobody(id));
+        }
         let longest = self
             .tracks
             .values()

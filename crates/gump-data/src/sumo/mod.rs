@@ -25,9 +25,11 @@ use std::sync::Arc;
 
 use crate::files::Format;
 use crate::open::BoxedSource;
+use crate::recording::{Recording, assemble};
 use crate::stream::{self, io_error};
-use crate::{DataError, ReadOptions};
+use crate::{DataError, Place, ReadOptions};
 use floating_cars::FloatingCars;
+use gump_scene::Scenario;
 use signals::Signals;
 use vehicle_types::VehicleTypes;
 
@@ -41,6 +43,9 @@ pub(crate) const FORMAT: Format = Format {
     recognises: is_floating_cars,
     open,
 };
+
+/// What a network is called among the files without scenarios.
+pub(crate) const NETWORK: &str = "SUMO network";
 
 /// How much of a file must be seen to tell what it is; SUMO writes its options in front.
 const HEAD_BYTES: u64 = 16 * 1024;
@@ -108,6 +113,27 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
 
 fn is_floating_cars(head: &[u8]) -> bool {
     root(head).is_some_and(|root| root == "fcd-export")
+}
+
+/// A network as a scenario of nobody, if `options` park an ego there.
+///
+/// Error: those of reading a network, and of one without lanes for vehicles.
+pub(crate) fn map_alone(path: &Path, options: ReadOptions) -> Result<Scenario, DataError> {
+    let roads = Roads::new(&Network::read(path)?);
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let id = name.split('.').next().unwrap_or_default().to_owned();
+    let mut report = roads.report().clone();
+    let nobody = Recording::of_nobody(id.clone());
+    let scenario = assemble(nobody, roads.parts().clone(), options, &mut report);
+    scenario.map_err(|problem| DataError::Scenario {
+        id,
+        problem,
+        place: Place {
+            record: 0,
+            offset: 0,
+            path: path.into(),
+        },
+    })
 }
 
 /// True for a network, which scenarios need beside them.

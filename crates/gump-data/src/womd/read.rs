@@ -12,6 +12,7 @@ use gump_scene::{
 
 use super::map;
 use crate::error::MAX_COORDINATE;
+use crate::recording::{Recording, assemble};
 use crate::{Problem, ReadOptions, ReadReport, infer};
 use gump_proto::{self as proto, ObjectType, SignalState};
 
@@ -32,6 +33,9 @@ pub fn scenario_from_proto(
     options: ReadOptions,
 ) -> Result<(Scenario, ReadReport), Problem> {
     let mut report = ReadReport::default();
+    if options.park_an_ego && proto.tracks.is_empty() && !proto.map_features.is_empty() {
+        return map_alone(proto, options, report);
+    }
     check_tracks(proto)?;
     let dt = time_step(&proto.timestamps_seconds)?;
     let ego = ego(proto)?;
@@ -74,6 +78,18 @@ pub fn scenario_from_proto(
     };
     scenario.validate()?;
     infer::route(&mut scenario, options, &mut report);
+    Ok((scenario, report))
+}
+
+/// A message that holds a map and nobody on it.
+fn map_alone(
+    proto: &proto::Scenario,
+    options: ReadOptions,
+    mut report: ReadReport,
+) -> Result<(Scenario, ReadReport), Problem> {
+    let parts = map::parts_from_proto(&proto.map_features, &mut report)?;
+    let nobody = Recording::of_nobody(proto.scenario_id().into());
+    let scenario = assemble(nobody, parts, options, &mut report)?;
     Ok((scenario, report))
 }
 

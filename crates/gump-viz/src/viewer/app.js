@@ -6,7 +6,7 @@ window.addEventListener('error', event => errors.push(String(event.message)));
 window.addEventListener('unhandledrejection', event => errors.push(String(event.reason)));
 
 const dark = window.matchMedia('(prefers-color-scheme: dark)');
-const ui = { t: 0, playing: false, speed: 1, shown: 0, colour: 'class', follow: -1, heading: false, trails: true, selected: -1, candidate: -1, dark: dark.matches };
+const ui = { t: 0, playing: false, speed: 1, shown: 0, colour: 'class', follow: -1, heading: false, trails: true, selected: -1, hovered: -1, pane: 0, left: null, up: 'ego', candidate: -1, dark: dark.matches };
 let world, scene, span, stale = true, charted = '';
 
 // Ways of colouring that this page has numbers for.
@@ -24,25 +24,52 @@ function begin(unpacked) {
   Object.assign($('time'), { min: span[0], max: span[1], step: 'any', value: 0 });
   $('present').style.left = `${100 * (0 - span[0]) / Math.max(span[1] - span[0], 1e-9)}%`;
   const n = world.takes.length - 1;
-  $('note').textContent = facts.note || `${plural(facts.agents.length, 'agent')}, ${n ? plural(n, 'future') : 'the log'}`;
+  $('note').textContent = facts.note || `${plural(facts.agents.length, 'agent')}, ${n ? plural(n, 'simulated future') : 'recorded'}`;
   buildTakes(n);
   buildCandidates();
   for (const b of document.querySelectorAll('[data-colour]')) b.hidden = !COLOURS.includes(b.dataset.colour);
+  $('pair').hidden = !n;
+  buildMarks();
   listen();
   if (n) ui.shown = 1;
   fit();
   restore();
   dress();
+  window.addEventListener('hashchange', () => { if (location.hash.slice(1) !== remembered) { restore(); dress(); } });
   requestAnimationFrame(tick);
 }
 
-// A link may say what to show: viewer.html#t=4&shown=all&colour=speed&agent=3&follow=1.
+// The address says what is shown: viewer.html#t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north.
+function address() {
+  const said = new URLSearchParams();
+  if (Math.abs(ui.t) > 0.049) said.set('t', ui.t.toFixed(1));
+  said.set('shown', ui.shown);
+  if (ui.left !== null) said.set('beside', ui.left);
+  if (ui.colour !== 'class') said.set('colour', ui.colour);
+  if (ui.selected >= 0) said.set('agent', facts.agents[ui.selected].id);
+  if (ui.follow >= 0) said.set('follow', 1);
+  if (ui.up !== 'ego') said.set('up', ui.up);
+  return String(said);
+}
+
+function remember() {
+  const said = address();
+  if (remembered === said || location.hash === '#check') return;
+  remembered = said;
+  // Browsers refuse pages that write their address too often.
+  try { history.replaceState(null, '', `#${remembered}`); } catch { remembered = ''; }
+}
+let remembered = '', rememberAt = 0;
+
 function restore() {
   const said = new URLSearchParams(location.hash.slice(1)), n = world.takes.length;
   if (Number.isFinite(Number(said.get('t')))) seek(Number(said.get('t')));
   if (said.get('shown') === 'all' && n > 2) ui.shown = 'all';
   else if (said.has('shown') && world.takes[Number(said.get('shown'))]) ui.shown = Number(said.get('shown'));
   if (COLOURS.includes(said.get('colour'))) ui.colour = said.get('colour');
+  const beside = said.get('beside');
+  if (beside === 'all' ? n > 2 : said.has('beside') && world.takes[Number(beside)]) ui.left = beside === 'all' ? 'all' : Number(beside);
+  if (said.has('up')) { ui.up = said.get('up') === 'north' ? 'north' : 'ego'; scene.camera.angle = upright(); }
   if (said.has('agent')) ui.selected = facts.agents.findIndex(agent => agent.id === said.get('agent'));
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
@@ -61,8 +88,8 @@ function buildTakes(n) {
     b.dataset.shown = shown;
     $(where).append(b);
   };
-  add('shown', 'log', 'What was recorded (L)', 0);
-  if (n) add('shown', n > 1 ? `all ${n} futures` : 'the future', 'All over one another (A)', n > 1 ? 'all' : 1);
+  add('shown', 'recorded', 'The recording (L)', 0);
+  if (n) add('shown', n > 1 ? `all ${n} simulated` : 'simulated', n > 1 ? 'All over one another (A)' : 'The future (A)', n > 1 ? 'all' : 1);
   $('futures-title').hidden = $('futures').hidden = n < 2;
   // A long name is told of when it is shown; its button has its number.
   if (n > 1) for (let i = 1; i <= n; i++) add('futures', isLong(world.takes[i].name) ? i : world.takes[i].name, `Future ${world.takes[i].name}`, i);
@@ -77,8 +104,16 @@ function buildCandidates() {
     words.textContent = name + (chosen ? ' (chosen)' : '');
     number.textContent = score === null ? '-' : score.toFixed(3);
     b.append(words, number);
+    const made = document.createElement('dl');
+    made.hidden = true;
+    made.dataset.parts = i;
+    for (const [part, value] of facts.candidates[i].parts) {
+      const dt = document.createElement('dt'), dd = document.createElement('dd');
+      dt.textContent = part.replace(/_/g, ' '); dd.textContent = value === null ? '-' : value.toFixed(3);
+      made.append(dt, dd);
+    }
     b.dataset.candidate = i;
-    item.append(b);
+    item.append(b, made);
     $('candidates').querySelector('ol').append(item);
   }
 }
@@ -95,11 +130,17 @@ function show(shown) { ui.shown = shown; dress(); }
 
 function choose(agent) { ui.selected = agent; dress(); }
 
+// The angle of the camera that has the ego of the present, or north, point up.
+function upright() {
+  const s = stateAt(world, 0, facts.ego, 0);
+  return ui.up === 'ego' && s ? s.heading - Math.PI / 2 : 0;
+}
+
 // The view of someone who has just opened the page.
 function fit() {
   scene.resize();
   const s = stateAt(world, 0, facts.ego, 0) || { x: 0, y: 0 };
-  Object.assign(scene.camera, { x: s.x, y: s.y, angle: 0, scale: Math.max(Math.min(scene.width, scene.height), 200) / 100 });
+  Object.assign(scene.camera, { x: s.x, y: s.y, angle: upright(), scale: Math.max(Math.min(scene.width, scene.height), 200) / 100 });
   ui.heading = false; ui.follow = -1;
   redraw();
 }
@@ -129,7 +170,14 @@ const actions = {
   heading: () => {
     ui.heading = !ui.heading;
     if (ui.heading && ui.follow < 0) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
-    if (!ui.heading) scene.camera.angle = 0;
+    if (!ui.heading) scene.camera.angle = upright();
+    dress();
+  },
+  up: () => { ui.up = ui.up === 'ego' ? 'north' : 'ego'; ui.heading = false; scene.camera.angle = upright(); dress(); },
+  beside: () => {
+    const n = world.takes.length;
+    // Beside the recording comes a future, beside a future the recording, until another is chosen.
+    if (ui.left === null) { ui.left = ui.shown; ui.shown = ui.shown === 0 ? Math.min(1, n - 1) : 0; } else ui.left = null;
     dress();
   },
   trails: () => { ui.trails = !ui.trails; dress(); },
@@ -140,9 +188,14 @@ function dress() {
   for (const b of document.querySelectorAll('[data-shown]')) press(b, b.dataset.shown === String(ui.shown));
   for (const b of document.querySelectorAll('[data-colour]')) press(b, b.dataset.colour === ui.colour);
   for (const b of document.querySelectorAll('[data-candidate]')) press(b, b.dataset.candidate === String(ui.candidate));
-  for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails]]) press(document.querySelector(`[data-do=${name}]`), on);
+  for (const made of document.querySelectorAll('[data-parts]')) made.hidden = made.dataset.parts !== String(ui.candidate) || !made.children.length;
+  for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails], ['up', ui.up === 'ego'], ['beside', ui.left !== null]]) press(document.querySelector(`[data-do=${name}]`), on);
   const named = ui.shown > 0 && isLong(world.takes[ui.shown].name);
   $('futures-title').textContent = named ? `Futures: ${world.takes[ui.shown].name}` : 'Futures';
+  $('panes').classList.toggle('two', ui.left !== null);
+  const [one, other] = $('panes').children;
+  one.textContent = ui.left === null ? '' : takeName(world, ui.left);
+  other.textContent = takeName(world, ui.shown);
   $('play').classList.toggle('on', ui.playing);
   $('play').setAttribute('aria-label', ui.playing ? 'Pause' : 'Play');
   $('speed').value = String(ui.speed);
@@ -164,7 +217,10 @@ function dressLegend() {
     bar.className = 'ramp';
     bar.style.background = `linear-gradient(90deg, ${RAMP[ui.dark ? 'dark' : 'light'].join(',')})`;
     const [low, high] = ui.colour === 'speed' ? ['0', `${FAST} m/s`] : [`realism \u2264 ${UNLIKE}`, '1'];
-    legend.append(low, bar, high);
+    const ego = document.createElement('span'), rim = document.createElement('i');
+    rim.style.cssText = `background: none; border: 3px solid ${colours().ego}`;
+    ego.append(rim, 'ego');
+    legend.append(low, bar, high, ego);
     return;
   }
   for (const kind of items) {
@@ -178,12 +234,13 @@ function dressLegend() {
 function dressAgent() {
   const box = $('agent');
   box.replaceChildren();
+  box.classList.toggle('chosen', ui.selected >= 0);
   const heading = document.createElement('h2');
   box.append(heading);
   if (ui.selected < 0) {
     heading.textContent = 'Agent';
     const hint = document.createElement('p');
-    hint.textContent = 'Click an agent to see its state over time.';
+    hint.textContent = 'Click or tap an agent to see its state over time.';
     box.append(hint);
     return;
   }
@@ -193,9 +250,18 @@ function dressAgent() {
   state.id = 'state';
   box.append(state);
   if (world.heat.some(map => map.agent === ui.selected)) buildHeat(box);
-  for (const { name } of quantities(world, ui.selected)) {
+  const all = quantities(world, ui.selected);
+  if (world.takes.length > 1) {
+    const key = document.createElement('p');
+    key.textContent = ui.shown === 0 ? 'Solid: recorded. The upright line is now.' : 'Dashed: recorded. Solid: simulated. The upright line is now.';
+    box.append(key);
+  }
+  for (const { name, of } of all) {
+    // The recording is nowhere away from itself: no empty chart of that.
+    if (ui.shown === 0 && !of(0).length) continue;
     const figure = document.createElement('figure'), caption = document.createElement('figcaption'), canvas = document.createElement('canvas');
     caption.textContent = name;
+    canvas.dataset.name = name;
     canvas.onpointerdown = canvas.onpointermove = event => {
       if (!event.buttons) return;
       const x = (event.offsetX - 38) / (canvas.clientWidth - 42);
@@ -227,7 +293,7 @@ function drawHeatPanel() {
   if (!map) {
     const kept = world.heat.filter(map => map.agent === ui.selected), takes = [...new Set(kept.map(map => world.takes[map.take].name))];
     $('heat-title').textContent = 'What it might do next';
-    $('heat-none').textContent = `Kept for future ${takes.join(', ')} from the present on.`;
+    $('heat-none').textContent = `Kept for simulated future ${takes.join(', ')} from the present on.`;
     return;
   }
   const where = ui.shown === 'all' ? `future ${world.takes[take].name}, ` : '';
@@ -242,7 +308,7 @@ function drawHeatPanel() {
 function drawAgentPanel() {
   if (ui.selected < 0) return;
   drawHeatPanel();
-  const take = ui.shown === 'all' ? 0 : ui.shown, s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
+  const take = heatTake(ui, world), s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
   const degrees = h => ((h * 180 / Math.PI) % 360 + 540) % 360 - 180;
   const rows = s ? [
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
@@ -256,11 +322,13 @@ function drawAgentPanel() {
     return [dt, dd];
   }));
   const ink = kindColour(ui.selected, colours()), takes = ui.shown === 'all' ? world.takes.map((_, i) => i).slice(1) : [ui.shown];
-  const canvases = $('agent').querySelectorAll(':scope > figure canvas');
-  quantities(world, ui.selected).forEach(({ digits, of }, i) => {
+  const canvases = [...$('agent').querySelectorAll(':scope > figure canvas')];
+  quantities(world, ui.selected).forEach(quantity => {
+    const { name, of } = quantity, canvas = canvases.find(canvas => canvas.dataset.name === name);
+    if (!canvas) return;
     const curves = [{ points: of(0), colour: colours().text, width: 1.5, alpha: takes[0] === 0 ? 0.9 : 0.5, dash: takes[0] === 0 ? [] : [4, 3] }];
     for (const k of takes) if (k > 0) curves.push({ points: of(k), colour: ink, width: takes.length > 1 ? 1 : 2, alpha: takes.length > 1 ? Math.max(0.15, 1 / Math.sqrt(takes.length)) : 1 });
-    drawChart(canvases[i], curves, span, ui.t, colours(), digits);
+    drawChart(canvas, curves, span, ui.t, colours(), quantity);
   });
 }
 
@@ -290,7 +358,7 @@ const KEYS = {
   ' ': actions.play, ArrowLeft: e => step(e.shiftKey ? -1 / world.takes[0].dt : -1), ArrowRight: e => step(e.shiftKey ? 1 / world.takes[0].dt : 1),
   Home: () => seek(span[0]), End: () => seek(span[1]), ArrowUp: () => nextFuture(-1), ArrowDown: () => nextFuture(1),
   l: () => show(0), a: () => show(world.takes.length > 2 ? 'all' : world.takes.length - 1), c: () => { ui.colour = COLOURS[(COLOURS.indexOf(ui.colour) + 1) % COLOURS.length]; dress(); },
-  n: () => nextAgent(1), p: () => nextAgent(-1), e: () => choose(facts.ego), f: actions.follow, h: actions.heading, t: actions.trails,
+  n: () => nextAgent(1), p: () => nextAgent(-1), e: () => choose(facts.ego), f: actions.follow, h: actions.heading, t: actions.trails, u: actions.up, b: () => { if (world.takes.length > 1) actions.beside(); },
   '+': actions.nearer, '=': actions.nearer, '-': actions.farther, 0: actions.fit, ',': () => faster(-1), '.': () => faster(1),
   Escape: () => choose(-1), '?': () => { $('keys').open = !$('keys').open; },
 };
@@ -314,7 +382,7 @@ function listen() {
   });
   $('time').oninput = event => seek(Number(event.target.value));
   $('speed').onchange = event => { ui.speed = Number(event.target.value); };
-  dark.addEventListener('change', () => { ui.dark = dark.matches; dress(); });
+  dark.addEventListener('change', () => { ui.dark = dark.matches; buildMarks(); dress(); });
   new ResizeObserver(() => { charted = ''; redraw(); }).observe($('stage'));
   listenToPointers($('view'));
 }
@@ -323,12 +391,15 @@ function listen() {
 function listenToPointers(canvas) {
   const held = new Map();
   let moved = 0;
-  const at = event => [event.offsetX, event.offsetY];
+  // Both panes show the same ground: a point of the right one is as far from its own left edge.
+  const at = event => { scene.resize(panes()); ui.pane = panes() > 1 && event.offsetX > scene.width ? 1 : 0; return [event.offsetX - ui.pane * scene.width, event.offsetY]; };
   const apart = () => { const [a, b] = [...held.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
   canvas.onpointerdown = event => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, at(event)); if (held.size === 1) moved = 0; };
   canvas.onpointermove = event => {
     const before = held.get(event.pointerId);
-    canvas.style.cursor = held.size ? 'grabbing' : scene.pick(ui, ...at(event)) < 0 ? 'grab' : 'pointer';
+    const under = held.size ? -1 : pickAt(...at(event));
+    if (event.pointerType === 'mouse' && under !== ui.hovered) { ui.hovered = under; redraw(); }
+    canvas.style.cursor = held.size ? 'grabbing' : under < 0 ? 'grab' : 'pointer';
     if (!before) return;
     const now = at(event), old = held.size === 2 ? apart() : 0;
     held.set(event.pointerId, now);
@@ -342,15 +413,80 @@ function listenToPointers(canvas) {
   };
   canvas.onpointerup = canvas.onpointercancel = event => {
     held.delete(event.pointerId);
-    if (event.type === 'pointerup' && !held.size && moved < 5) choose(scene.pick(ui, ...at(event)));
+    if (event.type === 'pointerup' && !held.size && moved < 5) choose(pickAt(...at(event)));
   };
+  canvas.onpointerleave = () => { ui.hovered = -1; redraw(); };
   canvas.addEventListener('wheel', event => { event.preventDefault(); zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at(event)); }, { passive: false });
+}
+
+const panes = () => (ui.left === null ? 1 : 2);
+
+// The agent at a point of the pane that was touched.
+function pickAt(px, py) { return scene.pick({ ...ui, shown: ui.pane || ui.left === null ? ui.shown : ui.left }, px, py); }
+
+// What an agent is, beside it: of the one under the mouse, or else of the chosen one.
+function drawTip() {
+  const tip = $('tip'), a = ui.hovered >= 0 ? ui.hovered : ui.selected;
+  const right = panes() > 1 && ui.pane === 1, shown = right || ui.left === null ? ui.shown : ui.left, take = shown === 'all' ? Math.min(1, world.takes.length - 1) : shown;
+  const s = a < 0 ? null : stateAt(world, take, a, ui.t);
+  tip.hidden = !s;
+  if (!s) return;
+  const { id, kind, realism } = facts.agents[a], title = document.createElement('b');
+  title.textContent = `${a === facts.ego ? 'ego, ' : ''}${kind.replace('_', ' ')} ${id}`;
+  const lines = [`${s.speed.toFixed(1)} m/s, ${ui.t < 0 || take === 0 ? 'recorded' : takeName(world, take)}`, ...(realism === null ? [] : [`realism ${realism.toFixed(2)}`])];
+  tip.replaceChildren(title, lines.join(', '));
+  if (a === ui.selected && matchMedia('(max-width: 46rem)').matches) {
+    const link = document.createElement('a');
+    Object.assign(link, { href: '#agent', textContent: ' charts', onclick: event => { event.preventDefault(); $('agent').scrollIntoView({ behavior: 'smooth' }); } });
+    tip.append(link);
+  }
+  scene.left = right ? scene.width : 0;
+  const [x, y] = scene.onCanvas(s.x, s.y), w = tip.offsetWidth, h = tip.offsetHeight;
+  scene.left = 0;
+  const whole = scene.width * panes();
+  tip.style.transform = `translate(${Math.round(Math.min(Math.max(x + 14, 4), whole - w - 4))}px, ${Math.round(Math.min(Math.max(y - h - 12, 4), scene.height - h - 4))}px)`;
+}
+
+// A row for everything that this page draws.
+function buildMarks() {
+  const list = $('marks').querySelector('ul'), has = kind => world.features.some(feature => feature.kind === kind), c = colours();
+  const line = (colour, more = '') => `<path d="M1 7h22" stroke="${colour}" stroke-width="2" fill="none" ${more}/>`;
+  const spot = colour => `<circle cx="12" cy="7" r="4.5" fill="${colour}"/>`;
+  const box = (fill, more = '') => `<rect x="3" y="3" width="18" height="8" rx="1" fill="${fill}" ${more}/>`;
+  const n = world.takes.length - 1;
+  const rows = [
+    [true, 'road', box(c.road)],
+    [has(KIND.route), "the ego's route", box(c.route)],
+    [has(KIND.lane), 'way of travel', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
+    [has(KIND.edge), 'road edge', line(c.edge)],
+    [[6, 7, 8, 9].some(has), 'lane marking', box(c.road) + line(c.whiteLine, 'stroke-dasharray="5 3"')],
+    [has(KIND.crosswalk), 'crosswalk', [3, 9, 15].map(x => `<rect x="${x}" y="2" width="4" height="10" fill="${c.crosswalk}"/>`).join('')],
+    [has(KIND.bump), 'speed bump', box(c.yellowLine, 'opacity="0.5"')],
+    [has(KIND.stopLine), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
+    [has(KIND.stopSign), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
+    [facts.lights.length, 'traffic light', spot(c.red)],
+    [true, 'the ego has a rim', box('none', `stroke="${c.ego}" stroke-width="3"`)],
+    [true, 'front', `<path d="M8 3l10 4-10 4z" fill="${c.text}" opacity="0.7"/>`],
+    [true, 'chosen agent', box('none', `stroke="${c.text}" stroke-width="1.6"`)],
+    [true, 'fading: last 2 s', line(c.vehicle, 'stroke-width="4" opacity="0.6"')],
+    [true, 'thin: way to come', line(c.vehicle, 'opacity="0.6"')],
+    [n > 1, 'pale boxes: one per future', box(c.vehicle, 'opacity="0.3"')],
+    [facts.candidates.length, "planner's candidate; bold: chosen", line(c.text)],
+    [world.heat.length, 'where it may be next', spot(scaled(0.7, ui.dark))],
+  ];
+  list.replaceChildren(...rows.filter(([is]) => is).map(([, name, drawn]) => {
+    const item = document.createElement('li');
+    item.innerHTML = `<svg viewBox="0 0 24 14" width="24" height="14" aria-hidden="true">${drawn}</svg>`;
+    item.append(name);
+    return item;
+  }));
 }
 
 let last = 0;
 function tick(time) {
   advance(Math.min((time - last) / 1000, 0.1));
   last = time;
+  if (time > rememberAt && !ui.playing) { rememberAt = time + 400; remember(); }
   requestAnimationFrame(tick);
 }
 
@@ -365,12 +501,13 @@ function advance(elapsed) {
 
 function paint() {
   stale = false;
-  scene.resize();
+  scene.resize(panes());
   if (ui.follow >= 0) {
     const s = stateAt(world, ui.shown === 'all' ? 0 : ui.shown, ui.follow, ui.t);
     if (s) Object.assign(scene.camera, { x: s.x, y: s.y }, ui.heading ? { angle: s.heading - Math.PI / 2 } : {});
   }
   scene.draw(ui, colours());
+  drawTip();
   $('time').value = ui.t;
   $('clock').textContent = `${ui.t < -0.0001 ? '\u2212' : '+'}${Math.abs(ui.t).toFixed(1)} s`;
   const key = `${ui.t.toFixed(3)},${$('agent').clientWidth}`;

@@ -1,15 +1,19 @@
 // Small charts of one agent over time.
 
 // Curves: [{points: [[t, y]...], colour, width, alpha, dash}]. Times and values share one scale.
-function drawChart(canvas, curves, [from, to], now, colours, digits) {
+function drawChart(canvas, curves, [from, to], now, colours, { digits, range, base, unit }) {
   const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext('2d');
   Object.assign(canvas, { width: Math.round(w * ratio), height: Math.round(h * ratio) });
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
   let low = Infinity, high = -Infinity;
   for (const { points } of curves) for (const [, y] of points) if (Number.isFinite(y)) { low = Math.min(low, y); high = Math.max(high, y); }
-  if (!(low <= high)) [low, high] = [0, 1];
-  const least = 2 / 10 ** digits;
-  if (high - low < least) { const middle = (low + high) / 2; [low, high] = [middle - least / 2, middle + least / 2]; }
+  if (!(low <= high)) [low, high] = [0, range];
+  // Noise is not to fill the chart: it shows so many units at least, and from zero where that is near.
+  if (base === 0 && low >= 0 && low < 2 * range) low = 0;
+  if (high - low < range) {
+    const middle = (low + high) / 2;
+    [low, high] = base === 0 && low >= 0 && middle < range / 2 ? [0, range] : [middle - range / 2, middle + range / 2];
+  }
   const left = 38, right = 4, top = 6, bottom = 16;
   const px = t => left + (t - from) / Math.max(to - from, 1e-9) * (w - left - right);
   const py = y => top + (high - y) / (high - low) * (h - top - bottom);
@@ -17,8 +21,14 @@ function drawChart(canvas, curves, [from, to], now, colours, digits) {
   c.fillStyle = c.strokeStyle = colours.text;
   c.globalAlpha = 0.75; c.textAlign = 'right'; c.textBaseline = 'middle';
   c.fillText(high.toFixed(digits), left - 5, top + 3);
+  // Zero has a line of its own where the curve crosses it.
+  if (low < 0 && high > 0) {
+    if (Math.min(py(0) - top, h - bottom - py(0)) > 12) c.fillText('0', left - 5, py(0));
+    c.globalAlpha = 0.35; c.fillRect(left, py(0), w - left - right, 1); c.globalAlpha = 0.75;
+  }
   c.fillText(low.toFixed(digits), left - 5, h - bottom - 2);
   c.textBaseline = 'alphabetic'; c.textAlign = 'left'; c.fillText(`${from.toFixed(0)} s`, left, h - 3);
+  if (unit) c.fillText(unit, left + 3, top + 7);
   c.textAlign = 'right'; c.fillText(`${to.toFixed(0)} s`, w - right, h - 3);
   c.globalAlpha = 0.2; c.lineWidth = 1;
   for (const y of [top, h - bottom]) { c.beginPath(); c.moveTo(left, y + 0.5); c.lineTo(w - right, y + 0.5); c.stroke(); }
@@ -48,11 +58,11 @@ function quantities(world, agent) {
     return take > 0 && logged && !Number.isNaN(start) ? 360 * Math.round((logged.heading - start) / (2 * Math.PI)) : 0;
   };
   const list = [
-    { name: 'speed, m/s', digits: 1, of: take => points(world.takes[take], (k, i) => k.speed[i]) },
-    { name: 'heading, degrees', digits: 0, of: take => { const more = turns(take); return points(world.takes[take], (k, i) => k.heading[i] * 180 / Math.PI + more); } },
+    { name: 'speed', unit: 'm/s', digits: 1, range: 5, base: 0, of: take => points(world.takes[take], (k, i) => k.speed[i]) },
+    { name: 'heading', unit: '\u00b0', digits: 0, range: 20, of: take => { const more = turns(take); return points(world.takes[take], (k, i) => k.heading[i] * 180 / Math.PI + more); } },
   ];
   if (world.takes.length > 1) list.push({
-    name: 'distance from the log, m', digits: 1, of: take => {
+    name: 'distance from the recording', unit: 'm', digits: 1, range: 2, base: 0, of: take => {
       if (take === 0) return [];
       const { first, dt, frames } = world.takes[0];
       return points(world.takes[take], (k, i, t) => {
@@ -64,7 +74,7 @@ function quantities(world, agent) {
   });
   const own = world.metrics.filter(track => track.agent === agent);
   for (const name of facts.metrics.filter(name => own.some(track => track.name === name))) list.push({
-    name, digits: 2, of: take => {
+    name: name.split(', ')[0], unit: name.split(', ')[1] || '', digits: 1, range: 2, of: take => {
       const track = own.find(track => track.name === name && track.take === take), { first, dt } = world.takes[take];
       return track ? track.values.map((v, i) => [first + (track.first + i) * dt, v]) : [];
     },

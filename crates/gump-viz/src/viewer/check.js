@@ -26,7 +26,7 @@ if (location.hash === '#check') {
     report.different_takes = pictures.size;
     report.ends = world.takes.map((take, k) => state(k, facts.ego, take.first + (take.frames - 1) * take.dt));
     const changes = keys => { const before = picture(); keys.forEach(press); return picture() !== before; };
-    report.changes = { all: changes(['a']), colour: changes(['c']), ego: changes(['e']), follow: changes(['f', 'Home']), heading: changes(['h']), trails: changes(['l', 't']), zoom: changes(['+']), fit: changes(['0']) };
+    report.changes = { all: changes(['a']), colour: changes(['c']), ego: changes(['e']), follow: changes(['f', 'Home']), up: changes(['u']), heading: changes(['h']), trails: changes(['l', 't']), beside: changes(['b']), alone: changes(['b', 'l']), zoom: changes(['+']), fit: changes(['0']) };
     seek(0); show(1); choose(facts.ego); paint();
     // Heat in the panel and on the road; none of another future.
     const inked = canvas => { const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height); let n = 0; for (let i = 3; i < data.length; i += 4) n += data[i] > 0; return n; };
@@ -42,6 +42,13 @@ if (location.hash === '#check') {
     $('candidates').querySelector('button').click();
     report.candidate_shows = [ui.candidate, ui.shown, $('futures-title').textContent];
     report.candidates = $('candidates').querySelectorAll('li').length;
+    report.parts = [...document.querySelectorAll('[data-parts]:not([hidden]) dt')].map(dt => `${dt.textContent} ${dt.nextSibling.textContent}`);
+    report.marks = $('marks').querySelectorAll('li').length;
+    seek(1.5); choose(facts.ego); paint();
+    report.tip = $('tip').hidden ? '' : $('tip').textContent;
+    report.address = address();
+    // Where the chosen agent is told of can be seen without scrolling, on a phone too.
+    report.panel_in_sight = $('agent').getBoundingClientRect().top < window.innerHeight - 40;
     report.wide = document.documentElement.scrollWidth > window.innerWidth;
     return report;
   };

@@ -29,6 +29,9 @@ function agentColour(ui, agent, speed, colours) {
   return kindColour(agent, colours);
 }
 
+// What a take is called.
+const takeName = (world, take) => (take === 0 ? 'recorded' : take === 'all' ? `simulated, all ${world.takes.length - 1}` : `simulated ${world.takes[take].name}`);
+
 function kindColour(agent, colours) {
   if (agent === facts.ego) return colours.ego;
   return colours[facts.agents[agent].kind] || colours.other;
@@ -131,9 +134,10 @@ class Scene {
     this.overlay = { key: '', canvas: document.createElement('canvas') };
   }
 
-  resize() {
+  resize(panes = 1) {
     const ratio = window.devicePixelRatio || 1, { clientWidth: w, clientHeight: h } = this.canvas;
-    Object.assign(this, { ratio, width: w, height: h });
+    // Of several panes this is the first; `at` goes from one to the next.
+    Object.assign(this, { ratio, width: w / panes, height: h, left: 0 });
     const [pw, ph] = [Math.round(w * ratio), Math.round(h * ratio)];
     if (this.canvas.width !== pw || this.canvas.height !== ph) Object.assign(this.canvas, { width: pw, height: ph });
   }
@@ -141,7 +145,7 @@ class Scene {
   // World metres, y up, to device pixels; angle is the heading that points up, less a quarter turn.
   aim(context) {
     const { x, y, scale, angle } = this.camera, k = scale * this.ratio, c = Math.cos(angle) * k, s = Math.sin(angle) * k;
-    context.setTransform(c, s, s, -c, this.width * this.ratio / 2 - c * x - s * y, this.height * this.ratio / 2 - s * x + c * y);
+    context.setTransform(c, s, s, -c, (this.left + this.width / 2) * this.ratio - c * x - s * y, this.height * this.ratio / 2 - s * x + c * y);
   }
 
   worldAt(px, py) {
@@ -154,11 +158,35 @@ class Scene {
 
   sees(x, y) { return Math.hypot(x - this.camera.x, y - this.camera.y) < Math.hypot(this.width, this.height) / 2 / this.camera.scale + 12; }
 
+  // Where a point of the world is on the canvas, in CSS pixels.
+  onCanvas(x, y) {
+    const { scale, angle } = this.camera, dx = x - this.camera.x, dy = y - this.camera.y, c = Math.cos(angle), s = Math.sin(angle);
+    return [this.left + this.width / 2 + scale * (c * dx + s * dy), this.height / 2 + scale * (s * dx - c * dy)];
+  }
+
+  // One take, or two beside each other.
   draw(ui, colours) {
     const c = this.context;
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.fillStyle = colours.ground;
     c.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    const panes = ui.left === null ? [ui.shown] : [ui.left, ui.shown];
+    panes.forEach((shown, i) => {
+      this.left = i * this.width;
+      c.save();
+      c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+      c.beginPath(); c.rect(this.left, 0, this.width, this.height); c.clip();
+      this.drawPane({ ...ui, shown }, colours);
+      c.restore();
+    });
+    this.left = 0;
+    if (panes.length < 2) return;
+    c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    c.fillStyle = colours.text; c.globalAlpha = 0.5; c.fillRect(this.width - 1, 0, 2, this.height); c.globalAlpha = 1;
+  }
+
+  drawPane(ui, colours) {
+    const c = this.context;
     this.aim(c);
     c.lineJoin = c.lineCap = 'round';
     this.drawRoad(c, colours);
@@ -243,7 +271,7 @@ class Scene {
   // All futures over one another, kept until camera or theme change.
   drawOverlay(ui, colours) {
     const { overlay, canvas } = this, { x, y, scale, angle } = this.camera;
-    const key = [x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected, ui.colour].join();
+    const key = [this.left, x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected, ui.colour].join();
     if (overlay.key !== key) {
       overlay.key = key;
       Object.assign(overlay.canvas, { width: canvas.width, height: canvas.height });
@@ -279,6 +307,12 @@ class Scene {
     c.globalAlpha = 1;
   }
 
+  // The ego is told by its rim, whatever its colour says.
+  rim(c, agent, s, colours) {
+    this.box(c, facts.agents[agent], s, 1.5 / this.camera.scale);
+    c.strokeStyle = colours.ego; c.lineWidth = this.px(0.35, 2.5); c.stroke();
+  }
+
   drawLights(c, ui, takeIndex, colours) {
     const r = Math.min(this.px(0.55, 2), 9 / this.camera.scale);
     facts.lights.forEach((at, l) => {
@@ -299,6 +333,7 @@ class Scene {
       c.fill();
       c.strokeStyle = colours.outline; c.lineWidth = this.px(0.08, 0.8); c.stroke();
       this.wedge(c, agent, s, colours);
+      if (a === facts.ego) this.rim(c, a, s, colours);
       if (a === ui.selected) { this.box(c, agent, s, 5 / this.camera.scale); c.strokeStyle = colours.text; c.lineWidth = 2 / this.camera.scale; c.stroke(); }
     });
   }
@@ -314,7 +349,8 @@ class Scene {
         c.globalAlpha = fade;
         c.fillStyle = agentColour(ui, a, s.speed, colours);
         c.fill();
-        if (a === ui.selected) { c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
+        if (a === facts.ego && ui.colour !== 'class') { c.globalAlpha = Math.min(1, 2 * fade); this.rim(c, a, s, colours); }
+        if (a === ui.selected) { this.box(c, agent, s, 0); c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
       }
     });
     c.globalAlpha = 1;

@@ -187,6 +187,7 @@ fn no_text_breaks_out_of_its_place() {
     viewer.note(attack).candidate(CandidatePath {
         name: attack.into(),
         score: Some(f64::NAN),
+        parts: vec![(attack.into(), 1.0)],
         is_chosen: true,
         path: vec![dvec2(10.0, 0.0), dvec2(20.0, 0.0)],
     });

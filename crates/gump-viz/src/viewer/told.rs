@@ -30,6 +30,8 @@ pub struct CandidatePath {
     pub name: String,
     /// How it was judged, higher is better; `None` if it was not.
     pub score: Option<f64>,
+    /// What the score is made of: names and numbers, which the page shows of the candidate chosen.
+    pub parts: Vec<(String, f64)>,
     /// Whether it was the choice.
     pub is_chosen: bool,
     /// Box centres of the ego, world frame, metres.

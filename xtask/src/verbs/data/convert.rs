@@ -6,7 +6,9 @@ use std::sync::Mutex;
 use std::time::Instant;
 
 use anyhow::Context as _;
-use gump_data::{Converted, OutputFormat, ReadOptions, convert, groups, list_files};
+use gump_data::{
+    Converted, INCOMPLETE, OutputFormat, ReadOptions, convert, groups, list_files, list_unfinished,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -94,6 +96,7 @@ impl Args {
         let files = list_files(&self.from)?;
         let groups = groups(&files);
         let ledger = self.ledger(&files)?;
+        let mark = self.mark()?;
         let resumed = ledger.groups.len();
         let before: usize = ledger.groups.values().map(|group| group.scenarios).sum();
         if resumed > 0 {
@@ -145,7 +148,15 @@ impl Args {
         run.result("dropped", &all.dropped)?;
         run.result("inferred", &all.inferred)?;
         run.result("problems", &all.refused)?;
+        if run::interrupted() && converted.is_err() {
+            anyhow::bail!(
+                "stopped by Ctrl-C; the same command goes on, and until it is done {} says that \
+                 the data set is not whole",
+                mark.display()
+            );
+        }
         converted?;
+        std::fs::remove_file(&mark).with_context(|| format!("cannot remove {}", mark.display()))?;
         for problem in all.refused.iter().take(TOLD) {
             run.say(&format!("refused: {problem}"));
         }
@@ -179,7 +190,11 @@ impl Args {
             .with_context(|| format!("cannot create the folder {}", self.to.display()))?;
         let source = self.fingerprint(files)?;
         let Ok(text) = std::fs::read_to_string(self.to.join(LEDGER)) else {
-            let others = list_files(&self.to)?.len();
+            let others = list_unfinished(&self.to)?;
+            let others = others
+                .iter()
+                .filter(|file| !file.ends_with(INCOMPLETE))
+                .count();
             if others > 0 {
                 return Err(wrong(format!(
                     "--to {} holds {others} files of something else",
@@ -218,6 +233,14 @@ impl Args {
         }
         let digest = hash.finalize();
         Ok(digest.iter().map(|byte| format!("{byte:02x}")).collect())
+    }
+
+    /// Marks the folder as unfinished, which readers refuse.
+    fn mark(&self) -> anyhow::Result<PathBuf> {
+        let mark = self.to.join(INCOMPLETE);
+        let text = "A conversion into this folder was begun and is not done: start it again.\n";
+        std::fs::write(&mark, text).with_context(|| format!("cannot write {}", mark.display()))?;
+        Ok(mark)
     }
 
     fn save(&self, ledger: &Ledger) -> anyhow::Result<()> {

@@ -40,21 +40,27 @@ impl Args {
         })?;
         let n_unreadable = summary.unreadable.len();
         let first_problem = summary.unreadable.first().cloned();
+        if summary.scenarios == 0
+            && let Some(problem) = first_problem
+        {
+            // Counts of nothing would only stand before the reason.
+            run.result_untold("unreadable", &summary.unreadable)?;
+            anyhow::bail!(match n_unreadable {
+                1 => format!("the only record cannot be read: {problem}"),
+                n => format!("none of {n} records can be read, the first because: {problem}"),
+            });
+        }
         if let serde_json::Value::Object(fields) = serde_json::to_value(&summary)? {
             for (key, value) in fields {
                 run.result(&key, value)?;
             }
         }
-        if summary.scenarios == 0
-            && let Some(problem) = first_problem
-        {
-            anyhow::bail!(
-                "none of {n_unreadable} records can be read, the first because: {problem}"
-            );
-        }
         if self.picture {
             run.phase("picture", |run| {
-                let scenario = shown.map_or_else(|| find(&self.scenario), Ok)?;
+                let scenario = match shown {
+                    Some(scenario) => scenario,
+                    None => find(&format!("{}#0", self.scenario))?,
+                };
                 let path = run.path("picture.png");
                 picture(&scenario)
                     .save_png(&path)

@@ -13,6 +13,7 @@ use crate::imagine::imagine;
 use crate::run::Run;
 use crate::shipped;
 use crate::table::decimal;
+use crate::verbs::explain::named;
 use crate::worlds::{World, WorldName};
 
 /// Futures per world.
@@ -75,8 +76,8 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     demo.page
         .section("How good they are")
         .prose(
-            "Collisions and off-road driving as shares of agents; displacement from what really \
-             happened in metres, of the average and of the best future. The log is what happened; \
+            "Collisions and off-road driving as shares of agents; displacement from what was recorded, \
+             in metres, of the average and of the best future. The log is the recording; \
              raw is the network alone, without the rules that hold its draws back.",
         )
         .table(
@@ -110,7 +111,10 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
         .section("Futures")
         .prose("From the present on, the shipped network drives everyone, the ego too.")
         .link("viewer.html", "Play them all in the viewer")
-        .film(&film, "What really happened, and three of the futures.")
+        .film(
+            &film,
+            "What was recorded, and three of the simulated futures.",
+        )
         .film(
             &overlay,
             "All futures over one another: what they agree on is solid.",
@@ -170,6 +174,10 @@ fn candidates(plan: &Plan, scene: &SceneState<'_>) -> Vec<CandidatePath> {
             CandidatePath {
                 name: candidate.proposal.kind.to_string(),
                 score: candidate.score.as_ref().map(|score| score.mean),
+                parts: candidate
+                    .score
+                    .as_ref()
+                    .map_or_else(Vec::new, |score| named(&score.parts())),
                 is_chosen: i == plan.chosen,
                 path: std::iter::once(start)
                     .chain(states.iter().map(|state| state.pose.position))

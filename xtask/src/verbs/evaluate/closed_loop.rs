@@ -199,7 +199,7 @@ impl Args {
             let told = drives.iter().map(|drives| row(drives, world, run.seed()));
             let told: Vec<Value> = told.collect();
             if self.world.len() > 1 {
-                run.say(&ranking::table_of(world, &told));
+                run.say(&ranking::table_of(world, &told, run.width()));
             }
             rows.extend(told);
             let entries = drives

@@ -27,6 +27,7 @@ use crate::dataset::{self, Split};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
 use crate::verbs::generate;
+use crate::worlds;
 
 /// Arguments of `evaluate generation`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -57,7 +58,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 8)]
     long_scenes: usize,
     /// Weights of the model [default: the shipped ones]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
     weights: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]

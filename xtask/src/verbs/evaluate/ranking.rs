@@ -9,8 +9,8 @@ use crate::run::Run;
 use crate::table;
 use crate::worlds::WorldName;
 
-/// The table of one world as text: percent, without what is the same in every row.
-pub(super) fn table_of(world: &WorldName, rows: &[Value]) -> String {
+/// The table of one world as text of so many columns: percent, without what is the same in every row.
+pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> String {
     let percent = |value: &Value| value.as_f64().map(|x| (x * 1e4).round() / 100.0);
     let shown = rows.iter().map(|row| {
         let mut shown = json!({ "planner": row["planner"], "failed": row["failed"] });
@@ -22,7 +22,7 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value]) -> String {
         shown
     });
     let shown: Vec<Value> = shown.collect();
-    table::text(&json!({ format!("among {world}, %"): shown }))
+    table::text(&json!({ format!("among {world}, %"): shown }), width)
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places.

@@ -149,6 +149,7 @@ pub(super) fn tell(
     let columns: Vec<&Column> = std::iter::once(&log).chain(others).collect();
     run.say(&table::text(
         &json!({ "behaviour": lines(&columns, &keys) }),
+        run.width(),
     ));
     for (stem, label, shows) in CHARTS {
         charts::save(run, stem, &chart(label, &columns, &keys, shows))?;

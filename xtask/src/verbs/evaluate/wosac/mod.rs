@@ -160,6 +160,9 @@ pub(crate) struct Explained {
     imagined: f64,
 }
 
+/// Rollouts of every scenario that the challenge asks for.
+const CHALLENGE: usize = 32;
+
 /// Explanations shown in the report.
 const N_EXPLAINED: usize = 20;
 
@@ -179,6 +182,7 @@ impl Args {
         let mut ledger = Ledger::open(run.out(), &header)?;
         let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
         let mut worst = self.explain.then(Worst::default);
+        let mut fewest = usize::MAX;
         run.phase("evaluate", |run| {
             let mut log = match self.explain {
                 true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
@@ -189,8 +193,8 @@ impl Args {
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
             for recorded in recordings(&scenarios.paths, options, wanted)? {
                 let scored = recorded.and_then(|recorded| {
-                    let scored =
-                        self.evaluate(run, &config, &recorded, &mut sources, worst.as_mut())?;
+                    let seen = (worst.as_mut(), &mut fewest);
+                    let scored = self.evaluate(run, &config, &recorded, &mut sources, seen)?;
                     Ok((recorded, scored))
                 });
                 let scored = left_out.sift(scored, is_of_another_length)?;
@@ -224,6 +228,18 @@ impl Args {
             self.scenarios
         );
         tell::tell(run, &settings, &entries)?;
+        if self.world.is_some() {
+            // Scenarios of an earlier run of the same evaluation had as many.
+            fewest = fewest.min(self.rollouts_per_scenario.get());
+        }
+        if fewest < CHALLENGE {
+            let note = format!(
+                "note: expected {CHALLENGE} rollouts per scenario, as the challenge asks for, \
+                 found {fewest}: scores of other numbers of rollouts do not compare"
+            );
+            run.say(&note);
+            run.result_untold("note", note)?;
+        }
         if self.explain {
             run.result("explain", &explained)?;
             tabulate(run)?;
@@ -274,7 +290,7 @@ impl Args {
         config: &Config,
         recorded: &Recorded,
         sources: &mut [Source],
-        mut worst: Option<&mut Worst>,
+        (mut worst, fewest): (Option<&mut Worst>, &mut usize),
     ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
@@ -292,6 +308,7 @@ impl Args {
         let (mut evaluated, mut blames) = (Vec::new(), None);
         for (decoding, found) in found {
             let evaluation = reference.evaluate(&found.rollouts)?;
+            *fewest = found.rollouts.count().min(*fewest);
             if blames.is_none() {
                 let of_first = evaluation.explain();
                 if let Some(worst) = worst.take().filter(|_| config.mode == Mode::SimAgents) {

@@ -1,0 +1,305 @@
+//! The words of the command line that verbs share: one flag for one thing, whatever the verb calls
+//! it first.
+//!
+//! Verbs declare their flags by themselves; here, over all of them at once, other names, short
+//! ones and headings are added, and what clap says about wrong numbers is put plainly. A flag's
+//! first name is a contract with scripts and never changes here. Start with [`dressed`].
+
+use std::error::Error as _;
+use std::num::{IntErrorKind, ParseFloatError, ParseIntError};
+use std::sync::OnceLock;
+
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{Arg, ArgMatches, Command};
+
+use crate::cli::WrongArguments;
+use crate::machine;
+
+/// Other names of a flag. The first one of a list that the verb does not use otherwise is shown in
+/// its help, if the list is of a flag that has another word for the same thing.
+const ALIASES: [(&str, &[&str]); 9] = [
+    ("scenario", &["scenarios"]),
+    ("scenarios", &["scenario"]),
+    ("map", &["scenario", "scenarios"]),
+    ("futures", &["rollouts-per-scenario"]),
+    ("rollouts_per_scenario", &["futures"]),
+    ("count", &["scenes"]),
+    ("scenes", &["count"]),
+    ("world", &["weights"]),
+    ("weights", &["world"]),
+];
+
+/// Short names; a verb's first flag with a letter has it.
+const SHORT: [(char, &[&str]); 7] = [
+    ('o', &["out"]),
+    ('j', &["threads"]),
+    ('q', &["quiet"]),
+    ('s', &["scenario", "scenarios", "map"]),
+    ('w', &["world", "weights"]),
+    ('p', &["planner"]),
+    (
+        'n',
+        &["rollouts_per_scenario", "count", "scenes", "futures"],
+    ),
+];
+
+/// Flags of every verb.
+const OF_THE_RUN: [&str; 8] = [
+    "out", "seed", "config", "threads", "device", "kernel", "quiet", "wide",
+];
+
+/// How a network decodes.
+const DECODING: [&str; 13] = [
+    "mode",
+    "cache",
+    "precision",
+    "temperature",
+    "top_k",
+    "top_p",
+    "decay",
+    "redraws",
+    "no_limits",
+    "raw",
+    "paper",
+    "ruled",
+    "life",
+];
+
+/// How planners that imagine do it.
+const THINKING: [&str; 6] = [
+    "futures",
+    "nearest",
+    "horizon",
+    "think_ms",
+    "replan_every",
+    "discount",
+];
+
+/// How a drive goes.
+const DRIVING: [&str; 3] = ["seconds", "controller", "budget_ms"];
+
+/// Verbs without tensors: there is no device to choose.
+const NOTHING_COMPUTES: [&str; 10] = [
+    "data inspect",
+    "data verify",
+    "data stats",
+    "data convert",
+    "data synthesize",
+    "data benchmark",
+    "evaluate merge",
+    "bench wosac",
+    "ci",
+    "tidy",
+];
+
+/// The command line with everything that verbs share.
+pub(crate) fn dressed(root: Command) -> Command {
+    let root = root.version(version()).after_help(
+        "A scenario is PATH, PATH#INDEX or PATH#SCENARIO_ID; the format is detected from content.\n\
+         Exit status: 0 done, 1 the work failed, 2 the arguments are wrong, 130 stopped by Ctrl-C.",
+    );
+    dress(root, "")
+}
+
+/// The version, and the commit where somebody asks for it.
+fn version() -> &'static str {
+    static VERSION: OnceLock<String> = OnceLock::new();
+    VERSION.get_or_init(|| {
+        let version = env!("CARGO_PKG_VERSION");
+        // Asking git takes milliseconds, which only those who want to know should wait.
+        match std::env::args().any(|word| word == "--version" || word == "-V") {
+            true => format!("{version} ({})", machine::commit()),
+            false => version.into(),
+        }
+    })
+}
+
+fn dress(mut command: Command, verb: &str) -> Command {
+    let names: Vec<String> = command
+        .get_subcommands()
+        .map(|sub| sub.get_name().to_owned())
+        .collect();
+    for name in names {
+        let verb = format!("{verb} {name}").trim().to_owned();
+        command = command.mut_subcommand(name, |sub| dress(sub, &verb));
+    }
+    let ids: Vec<String> = command
+        .get_arguments()
+        .map(|arg| arg.get_id().to_string())
+        .collect();
+    let has = |id: &str| ids.iter().any(|other| other == id);
+    let longs: Vec<String> = command
+        .get_arguments()
+        .filter_map(|arg| arg.get_long().map(str::to_owned))
+        .collect();
+    let plans = has("replan_every");
+    let mut taken = longs.clone();
+    for (id, aliases) in ALIASES {
+        // Futures that a planner imagines are not those of a scenario.
+        if !has(id) || (id == "futures" && plans) {
+            continue;
+        }
+        for &alias in aliases {
+            if !taken.iter().any(|name| name == alias) {
+                taken.push(alias.into());
+                let is_plural = alias.trim_end_matches('s') == id.trim_end_matches('s');
+                command = command.mut_arg(id, |arg| match is_plural {
+                    true => arg.alias(alias),
+                    false => arg.visible_alias(alias),
+                });
+            }
+        }
+    }
+    for (letter, of) in SHORT {
+        let id = of.iter().find(|id| longs.contains(&id.replace('_', "-")));
+        if let Some(id) = id.filter(|id| !(**id == "futures" && plans)) {
+            command = command.mut_arg(*id, |arg| arg.short(letter));
+        }
+    }
+    let computes = !NOTHING_COMPUTES.contains(&verb);
+    let (decodes, drives) = (has("top_k"), has("controller"));
+    command.mut_args(|arg| {
+        let id = arg.get_id().to_string();
+        let is = |ids: &[&str]| ids.contains(&id.as_str());
+        let arg = signed(arg);
+        if is(&["device", "kernel"]) && !computes {
+            arg.hide(true)
+        } else if is(&OF_THE_RUN) {
+            arg.help_heading("Of every run")
+        } else if decodes && is(&DECODING) {
+            arg.help_heading("How a learned world decodes")
+        } else if plans && is(&THINKING) {
+            arg.help_heading("How planners that imagine do it")
+        } else if drives && is(&DRIVING) {
+            arg.help_heading("The drive")
+        } else {
+            arg
+        }
+    })
+}
+
+/// Takes `-3` for a number rather than a flag: then whoever wants another number says so.
+fn signed(arg: Arg) -> Arg {
+    match arg.get_action().takes_values() {
+        true => arg.allow_negative_numbers(true),
+        false => arg,
+    }
+}
+
+/// Refuses a device where nothing computes.
+///
+/// Error: [`WrongArguments`].
+pub(crate) fn check_device(matches: &ArgMatches) -> Result<(), WrongArguments> {
+    let (mut matches, mut verb) = (matches, String::new());
+    while let Some((name, of)) = matches.subcommand() {
+        verb = format!("{verb} {name}").trim().to_owned();
+        matches = of;
+    }
+    if !NOTHING_COMPUTES.contains(&verb.as_str()) {
+        return Ok(());
+    }
+    let given = ["device", "kernel"].into_iter().find(|id| {
+        let source = matches
+            .try_contains_id(id)
+            .is_ok()
+            .then(|| matches.value_source(id));
+        source.flatten() == Some(clap::parser::ValueSource::CommandLine)
+    });
+    match given {
+        Some(id) => Err(WrongArguments(format!(
+            "--{id}: expected no such flag, since {verb} computes nothing on a device"
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// A sentence in place of what clap says about a number that is none or out of range.
+pub(crate) fn plainer(error: clap::Error) -> anyhow::Error {
+    let said = |kind| match error.get(kind) {
+        Some(ContextValue::String(text)) => Some(text.as_str()),
+        _ => None,
+    };
+    let (argument, value) = (
+        said(ContextKind::InvalidArg),
+        said(ContextKind::InvalidValue),
+    );
+    let (ErrorKind::ValueValidation, Some(argument), Some(value)) = (error.kind(), argument, value)
+    else {
+        return error.into();
+    };
+    let Some(source) = error.source() else {
+        return error.into();
+    };
+    let expected = if let Some(wrong) = source.downcast_ref::<ParseIntError>() {
+        match wrong.kind() {
+            IntErrorKind::Zero => "at least 1",
+            IntErrorKind::PosOverflow => "a smaller whole number",
+            _ if value.starts_with('-') => "a whole number, not below 0",
+            _ => "a whole number",
+        }
+    } else if source.is::<ParseFloatError>() {
+        "a number"
+    } else {
+        return error.into();
+    };
+    let flag = argument.split(' ').next().unwrap_or(argument);
+    WrongArguments(format!("{flag}: expected {expected}, found {value}")).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn command() -> Command {
+        let number = |name: &'static str| {
+            Arg::new(name)
+                .long(name)
+                .value_parser(clap::value_parser!(std::num::NonZeroUsize))
+        };
+        let device = Arg::new("device").long("device").default_value("cpu");
+        let inspect = Command::new("inspect").arg(device.clone());
+        let simulate = Command::new("simulate")
+            .arg(number("futures"))
+            .arg(Arg::new("scenario").long("scenario"))
+            .arg(device);
+        let data = Command::new("data").subcommand(inspect);
+        dressed(Command::new("xtask").subcommand(simulate).subcommand(data))
+    }
+
+    fn parse(words: &str) -> Result<ArgMatches, String> {
+        let matches = command().try_get_matches_from(words.split(' '));
+        let matches = matches.map_err(|error| plainer(error).to_string())?;
+        check_device(&matches).map_err(|wrong| wrong.to_string())?;
+        Ok(matches)
+    }
+
+    #[test]
+    fn numbers_out_of_range_are_told_plainly() {
+        let told = |words: &str| parse(words).unwrap_err();
+        let zero = "--futures: expected at least 1, found 0";
+        assert_eq!(told("xtask simulate --futures 0"), zero);
+        assert_eq!(told("xtask simulate -n 0"), zero);
+        let below = "--futures: expected a whole number, not below 0, found -3";
+        assert_eq!(told("xtask simulate --futures -3"), below);
+        let word = "--futures: expected a whole number, found many";
+        assert_eq!(told("xtask simulate --futures many"), word);
+    }
+
+    #[test]
+    fn one_thing_goes_by_any_of_its_names() {
+        for flag in ["--scenario", "--scenarios", "-s"] {
+            let matches = parse(&format!("xtask simulate {flag} a")).unwrap();
+            let (_, of) = matches.subcommand().unwrap();
+            assert_eq!(of.get_one::<String>("scenario").unwrap(), "a");
+        }
+        assert!(parse("xtask simulate --rollouts-per-scenario 3").is_ok());
+    }
+
+    #[test]
+    fn a_device_is_refused_where_nothing_computes() {
+        assert!(parse("xtask simulate --device cpu").is_ok());
+        assert!(parse("xtask data inspect").is_ok());
+        let error = parse("xtask data inspect --device cpu").unwrap_err();
+        assert!(error.contains("data inspect computes nothing"), "{error}");
+    }
+}
