@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
 use gump_data::tfrecord::{TfRecordReader, write_record};
-use gump_data::womd::proto;
+use gump_proto as proto;
 use prost::Message as _;
 
 /// A folder for one test, and the driver in it.

@@ -129,7 +129,7 @@ fn scenarios_are_found_by_index_and_by_id() {
     assert!(
         error
             .to_string()
-            .starts_with("expected a scenario \"nobody\", found 4 others")
+            .starts_with("expected a scenario \"nobody\", found 4 of other ids")
     );
 }
 

@@ -15,7 +15,7 @@ use super::road_edge::RoadEdges;
 use super::*;
 
 fn golden(name: &str) -> Value {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wosac");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/realism");
     let file = std::fs::File::open(format!("{folder}/{name}.json.gz")).unwrap();
     let mut text = String::new();
     let mut unpacked = flate2::read::GzDecoder::new(file);
