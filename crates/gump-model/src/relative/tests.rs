@@ -177,7 +177,7 @@ fn driven_agents_leave_the_log_and_learn_the_way_back() {
 fn agents_that_go_their_own_ways_learn_what_they_did() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
     let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 8,0";
-    let alone = gump_scene::fixture::scenario(text).unwrap();
+    let alone = fixture::scenario(text).unwrap();
     let drawn = |ruled| {
         let config = RelativeDrives {
             share: 1.0,
@@ -193,7 +193,7 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
         let targets = sample.targets.iter().skip(1);
         let difference = |target: &sample::Target| {
             let node = target.node as usize + 1;
-            let done = 5.0 * f64::from(sample.nodes[node * graph::NODE_NUMBERS + 8]);
+            let done = 5.0 * f64::from(sample.nodes[node * NODE_NUMBERS + 8]);
             (done - grid::dequantize(target.bins).position.x).abs()
         };
         targets.map(difference).collect()

@@ -81,7 +81,6 @@ impl From<&SamplingConfig> for RelativeSampling {
             redraws: config.redraws,
             limits: config.limits,
             precision: config.precision,
-            ..usual
         }
     }
 }

@@ -116,7 +116,7 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     }
     let radius = rng.random_range(3.5..7.0);
     let node = split(plan, at, Control::MinorYield, (false, radius));
-    add_aisle(plan, node, &whole, driveway, style);
+    add_aisle(plan, node, &whole, driveway, &style);
     true
 }
 
@@ -158,7 +158,7 @@ fn add_wide_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: 
         let node = split(plan, (road, s, left), Control::MinorYield, (false, radius));
         let length = length * rng.random_range(0.85..1.0);
         let whole = Track::through(&bend(pose, driveway + length, &[]));
-        add_aisle(plan, node, &whole, driveway, style.clone());
+        add_aisle(plan, node, &whole, driveway, &style);
     }
     true
 }
@@ -178,7 +178,7 @@ fn aisle(rng: &mut Rng) -> RoadPlan {
 }
 
 /// Adds a driveway and its aisle, which begins after `driveway` metres of `whole`.
-fn add_aisle(plan: &mut Plan, node: usize, whole: &Track, driveway: f64, style: RoadPlan) {
+fn add_aisle(plan: &mut Plan, node: usize, whole: &Track, driveway: f64, style: &RoadPlan) {
     let inner = plan.nodes.len();
     plan.nodes.push(NodePlan {
         control: Control::Free,
@@ -196,7 +196,7 @@ fn add_aisle(plan: &mut Plan, node: usize, whole: &Track, driveway: f64, style: 
     plan.roads.push(RoadPlan {
         reference: whole.slice(driveway, whole.length()),
         ends: [Some(inner), None],
-        ..style
+        ..style.clone()
     });
 }
 

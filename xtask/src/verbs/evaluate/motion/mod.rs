@@ -162,7 +162,7 @@ impl Args {
             (None, Some(name)) => {
                 let decoding = self.sampling.decoding(name)?;
                 Forecaster::World {
-                    worlds: Worlds::new(device, name, decoding.sampling.clone()),
+                    worlds: Box::new(Worlds::new(device, name, decoding.sampling.clone())),
                     n_futures: self.futures.get(),
                     decoding,
                 }
@@ -210,7 +210,7 @@ enum Forecaster<'a> {
     File(Predictions, &'a Path),
     /// Futures of a world.
     World {
-        worlds: Worlds<'a>,
+        worlds: Box<Worlds<'a>>,
         n_futures: usize,
         decoding: Decoding,
     },
