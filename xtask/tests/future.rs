@@ -240,7 +240,7 @@ fn no_world_and_no_verb_sees_what_comes_after_the_present() {
         });
         assert_ne!(left, right);
     }
-    assert_eq!(checked, 24);
+    assert_eq!(checked, 32);
 }
 
 #[test]

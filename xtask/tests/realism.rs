@@ -61,16 +61,16 @@ const FLOORS: [Floor; 2] = [
     },
 ];
 
-/// The same of the relative network: raw 0.859, 0.698, 0.838, 0.979 and 1.97 m, ruled 0.873, 0.699, 0.869,
-/// 0.979 and 1.97 m.
+/// The same of the relative network: raw 0.884, 0.739, 0.875, 0.978 and 1.95 m, ruled 0.887, 0.739, 0.881,
+/// 0.978 and 1.95 m.
 const RELATIVE_FLOORS: [Floor; 2] = [
     Floor {
         name: "raw",
         redraws: 0,
         limits: false,
-        realism: 0.84,
-        kinematic: 0.675,
-        interactive: 0.815,
+        realism: 0.865,
+        kinematic: 0.718,
+        interactive: 0.85,
         map_based: 0.96,
         min_ade: 2.35,
     },
@@ -78,9 +78,9 @@ const RELATIVE_FLOORS: [Floor; 2] = [
         name: "ruled",
         redraws: 12,
         limits: true,
-        realism: 0.853,
-        kinematic: 0.675,
-        interactive: 0.845,
+        realism: 0.867,
+        kinematic: 0.718,
+        interactive: 0.858,
         map_based: 0.96,
         min_ade: 2.35,
     },

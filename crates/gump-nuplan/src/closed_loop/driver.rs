@@ -10,7 +10,7 @@ use gump_rollout::BoxError;
 
 /// Told once where to go, then asked for a trajectory at every step.
 ///
-/// Unlike a [`crate::Policy`] it drives a car with a rear axle in one future, may remember what it
+/// Unlike a [`gump_rollout::Policy`] it drives a car with a rear axle in one future, may remember what it
 /// saw, and answers with seconds of trajectory of which a tenth of a second is driven.
 pub trait Driver {
     /// A short name for tables and reports.

@@ -3,7 +3,7 @@
 //! [`drive`] is the loop, over a [`Recording`]. A [`Driver`] is what is tested, [`Traffic`] whom it
 //! meets, a [`Controller`] what turns its plan into motion. Nothing here scores.
 //!
-//! [`crate::simulate`] is the other loop: many futures of a scene at once, box centres, no vehicle.
+//! [`gump_rollout::simulate`] is the other loop: many futures of a scene at once, box centres, no vehicle.
 //! This one follows nuPlan's: one future, the ego a car with a rear axle, clocks as recorded.
 
 mod controller;

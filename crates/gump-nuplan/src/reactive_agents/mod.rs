@@ -2,8 +2,8 @@
 //! recorded.
 //!
 //! Here are the parameters and the traffic as a whole; `agent` is one vehicle, `corridor` the strip
-//! it sweeps. [`super::Idm`] is the other world with the same car-following law
-//! ([`super::idm_acceleration`]): it sees no log, lets pedestrians move on and everyone decides at
+//! it sweeps. [`gump_rollout::worlds::Idm`] is the other world with the same car-following law
+//! ([`gump_rollout::worlds::idm_acceleration`]): it sees no log, lets pedestrians move on and everyone decides at
 //! once. This one is nuPlan's environment with all its particulars, for scores that compare:
 //!
 //! * Vehicles are snapped to the centre of their lane; those on no lane, and those that would then
