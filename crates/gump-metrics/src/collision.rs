@@ -8,7 +8,7 @@ use crate::{Metric, Reduce};
 ///
 /// Boxes that only touch do not overlap. Whose fault it is does not matter, nor how long it has
 /// lasted; [`crate::summarize`] leaves out overlaps that were there at the start and
-/// [`crate::nuplan`] tells collisions apart (and counts touching, as its reference does).
+/// `gump-nuplan` tells collisions apart (and counts touching, as its reference does).
 #[derive(Clone, Copy, Debug)]
 pub struct Collision;
 
