@@ -63,7 +63,7 @@ mod gpudrive;
 mod infer;
 mod inspect;
 mod json;
-#[cfg(any(feature = "commonroad", feature = "taf-bw"))]
+#[cfg(any(feature = "argoverse2", feature = "commonroad", feature = "taf-bw"))]
 mod lanelet;
 mod motion;
 #[cfg(feature = "nuplan")]

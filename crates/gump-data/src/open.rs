@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use gump_scene::Scenario;
 
 use crate::files::{self, Role};
-use crate::{DataError, ReadOptions, ScenarioRecord, sumo};
+#[cfg(feature = "sumo")]
+use crate::sumo;
+use crate::{DataError, ReadOptions, ScenarioRecord};
 
 /// How a format hands over its scenarios.
 pub(crate) type BoxedSource = Box<dyn Source>;
@@ -208,9 +210,12 @@ pub fn find_map(source: &str) -> Result<Scenario, DataError> {
         park_an_ego: true,
         ..ReadOptions::ALL
     };
-    let path = Path::new(source);
-    if path.is_file() && matches!(files::role(path)?, Role::Companion(sumo::NETWORK)) {
-        return sumo::map_alone(path, options);
+    #[cfg(feature = "sumo")]
+    {
+        let path = Path::new(source);
+        if path.is_file() && matches!(files::role(path)?, Role::Companion(sumo::NETWORK)) {
+            return sumo::map_alone(path, options);
+        }
     }
     find_with(source, options).map(|record| record.scenario)
 }
