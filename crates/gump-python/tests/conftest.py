@@ -11,7 +11,7 @@ import gump
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 MINI = REPOSITORY / "datasets" / "mini"
-GOLDEN = REPOSITORY / "crates" / "gump-metrics" / "tests" / "golden" / "wosac"
+GOLDEN = REPOSITORY / "crates" / "gump-wosac" / "tests" / "golden" / "realism"
 
 
 def shared(name):

@@ -1,7 +1,7 @@
 //! Predictions as the Waymo motion prediction challenge exchanges them.
 //!
 //! Start with [`read_predictions`] and [`predictions_from_proto`]; measuring them is the business
-//! of `gump-metrics`.
+//! of `gump_wosac::motion`.
 
 use std::collections::BTreeSet;
 use std::io::{Read, Write};

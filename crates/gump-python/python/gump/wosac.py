@@ -21,7 +21,7 @@ class Settings(NamedTuple):
     """Settings of one's own in place of a year's."""
 
     toml: str
-    """In the form of the files in `crates/gump-metrics/src/wosac/configs`."""
+    """In the form of the files in `crates/gump-wosac/src/realism/configs`."""
 
 
 Year = Union[int, str, Settings]
