@@ -37,7 +37,7 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     add_some(plan, extent, n_parks, add_car_park, rng);
     allow_parking(plan, rng);
     // Traffic is faster than plain plans have it, on wide roads above all.
-    let haste: f64 = rng.random_range(1.2..1.75);
+    let haste: f64 = rng.random_range(1.3..2.0);
     for road in plan.roads.iter_mut().filter(|road| road.speed_limit > 7.0) {
         road.speed_limit *= if road.forward > 1 {
             haste

@@ -27,15 +27,15 @@ use crate::{RoadFamily, SynthesisConfig};
 
 /// How often a family is drawn: recordings are made in towns, rarely on motorways.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 17),
-    (RoadFamily::StopCrossing, 13),
-    (RoadFamily::TeeJunction, 12),
+    (RoadFamily::SignalizedCrossing, 16),
+    (RoadFamily::StopCrossing, 8),
+    (RoadFamily::TeeJunction, 8),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 24),
+    (RoadFamily::Arterial, 38),
     (RoadFamily::CurvedRoad, 8),
-    (RoadFamily::OnRamp, 14),
-    (RoadFamily::MidBlockCrosswalk, 6),
-    (RoadFamily::Grid, 14),
+    (RoadFamily::OnRamp, 18),
+    (RoadFamily::MidBlockCrosswalk, 8),
+    (RoadFamily::Grid, 12),
 ];
 /// Share of scenes whose map states no speed limits.
 const NO_LIMITS: f64 = 0.5;
@@ -159,7 +159,7 @@ fn draw_demand(
     let bustle = rng.random_range(0.0_f64..1.0);
     let people = draw_skewed(
         &config.pedestrians,
-        3.0,
+        4.5,
         config.density * (0.4 + bustle),
         rng,
     );

@@ -266,7 +266,11 @@ fn draw_jaywalks(network: &Network, rng: &mut Rng) -> Vec<Jaywalk> {
     if lanes.is_empty() {
         return ways;
     }
-    for _ in 0..rng.random_range(0..=12) {
+    let wanted = rng.random_range(0..=9);
+    for _ in 0..6 * wanted {
+        if ways.len() == wanted {
+            break;
+        }
         let lane = lanes[rng.random_range(0..lanes.len())];
         let s = rng.random_range(15.0..network.lanes[lane].length() - 15.0);
         let mirrored = rng.random_bool(0.5);

@@ -1,4 +1,5 @@
-//! People who walk where vehicles are parked: between them, along aisles, to one or away from one.
+//! People who walk where vehicles are parked: between them, along aisles and the road, to one or
+//! away from one.
 //!
 //! Like manoeuvres of parking they are laid into what was recorded of traffic, and only if they stay
 //! clear of everybody all the while.
@@ -22,10 +23,13 @@ const LEAST_PARKED: usize = 6;
 const REACH_M: f64 = 70.0;
 /// How far somebody walks, metres.
 const WAY_M: std::ops::Range<f64> = 6.0..45.0;
-/// From the centre of a lane of a road, metres.
+/// From the centre of a lane of a road, metres: where people are off it, and where they may stand,
+/// as at the door of a vehicle beside the lane.
 const OFF_ROAD_M: f64 = 2.4;
-/// Room that is kept to what stands and to what moves, metres.
-const ROOM_M: [f64; 2] = [0.05, 0.5];
+const ASIDE_ROAD_M: f64 = 1.3;
+/// Room that is kept to what stands and to what moves, metres: off the road, and on it, where
+/// nobody makes way for them.
+const ROOM_M: [[f64; 2]; 2] = [[0.05, 0.5], [0.05, 2.5]];
 /// Within this of a vehicle people step aside, metres.
 const ASIDE_M: f64 = 1.0;
 /// Fastest turn, radians per second.
@@ -58,9 +62,12 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
             let id = recording.new_id();
             let shown: Vec<Pose> = poses.iter().flatten().copied().collect();
             let off = |pose: &Pose| is_off_road(network, *pose, OFF_ROAD_M);
-            if !shown.iter().step_by(5).all(off)
-                || !is_clear(recording, id, [size[0], size[1]], ROOM_M, &poses)
-            {
+            let aside = |pose: &Pose| is_off_road(network, *pose, ASIDE_ROAD_M);
+            if !aside(&shown[0]) || !shown.last().is_some_and(aside) {
+                continue;
+            }
+            let room = ROOM_M[usize::from(!shown.iter().step_by(5).all(off))];
+            if !is_clear(recording, id, [size[0], size[1]], room, &poses) {
                 continue;
             }
             recording.add(person(id, size, shown[0]), poses.clone());
@@ -74,7 +81,7 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
                 let poses: Vec<Option<Pose>> =
                     poses.iter().map(|pose| pose.map(|p| p * beside)).collect();
                 let (id, size) = (recording.new_id(), draw_person_size(rng));
-                if is_clear(recording, id, [size[0], size[1]], [ROOM_M[0]; 2], &poses) {
+                if is_clear(recording, id, [size[0], size[1]], [room[0]; 2], &poses) {
                     let first = *poses.iter().flatten().next().expect("somebody is shown");
                     recording.add(person(id, size, first), poses);
                 }

@@ -3,7 +3,7 @@
 //! Nobody has to let them, so they start only when everybody who comes is far enough away; once
 //! they are on the road, vehicles stop for them like for anything that stands in the way.
 
-use gump_geometry::{Pose, wrap_angle};
+use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::AgentKind;
 
 use super::vehicle::Vehicle;
@@ -53,6 +53,8 @@ pub(crate) struct Crosser {
     pub(crate) pace: f64,
     /// Seconds of the simulation before which the person does not want to cross.
     pub(crate) starts: f64,
+    /// Metres to the left of the way's middle.
+    aside: f64,
     progress: f64,
     speed: f64,
     goes: bool,
@@ -74,10 +76,21 @@ impl Crosser {
             jaywalk,
             pace,
             starts,
+            aside: 0.0,
             progress: 0.0,
             speed: 0.0,
             goes: false,
             pose: way.track.pose_at(0.0),
+        }
+    }
+
+    /// Somebody who goes along, this far to the left.
+    pub(crate) fn companion(&self, id: i64, size: [f64; 3], aside: f64) -> Self {
+        Self {
+            id,
+            size,
+            aside,
+            ..self.clone()
         }
     }
 
@@ -87,8 +100,8 @@ impl Crosser {
             kind: AgentKind::Pedestrian,
             size: self.size,
             pose: Pose {
+                position: self.pose * DVec2::new(0.0, self.aside),
                 heading: wrap_angle(self.pose.heading),
-                ..self.pose
             },
             is_mobile: true,
             place: None,

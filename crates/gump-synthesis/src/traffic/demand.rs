@@ -136,8 +136,14 @@ impl Traffic<'_> {
             let size = draw_person_size(&mut self.rng);
             let pace = self.rng.random_range(1.1..2.2);
             let way = (jaywalk, &self.demand.scenery.jaywalks[jaywalk]);
-            self.crossers
-                .push(Crosser::new(id, size, way, pace, starts));
+            let first = Crosser::new(id, size, way, pace, starts);
+            let aside = self.rng.random_range(0.9..1.2);
+            if self.rng.random_bool(0.4) {
+                let id = self.new_id();
+                let size = draw_person_size(&mut self.rng);
+                self.crossers.push(first.companion(id, size, aside));
+            }
+            self.crossers.push(first);
         }
     }
 
@@ -171,7 +177,7 @@ impl Traffic<'_> {
     /// Drawn: the faster a lane, the more use it; everywhere alike in plain scenes.
     fn is_used(&mut self, lane: LaneIdx) -> bool {
         let share = self.network.lanes[lane].speed_limit / FAST_LANE;
-        !self.demand.scenery.is_real || self.rng.random_bool(share.powi(2).clamp(0.06, 1.0))
+        !self.demand.scenery.is_real || self.rng.random_bool(share.powi(3).clamp(0.04, 1.0))
     }
 
     fn count(&self, kind: AgentKind) -> usize {
@@ -353,21 +359,23 @@ impl Traffic<'_> {
             (walk, forward, 0.0)
         } else {
             let mut walk = walks[self.rng.random_range(0..walks.len())];
-            for _ in 0..3 {
-                // Those far from the centre are seen by nobody.
+            let mut forward = self.rng.random_bool(0.5);
+            for _ in 0..4 {
+                // Those far from the centre are seen by nobody, and most are where roads are crossed.
                 let track = &self.network.walks[walk].track;
                 let near = track.pose_at(track.length() / 2.0).position.length() < 75.0;
-                if near || !self.demand.scenery.is_real {
+                let suits = near && self.leads_across(walk, forward);
+                if suits || !self.demand.scenery.is_real {
                     break;
                 }
                 walk = walks[self.rng.random_range(0..walks.len())];
+                forward = self.rng.random_bool(0.5);
             }
             let length = self.network.walks[walk].track.length();
-            let forward = self.rng.random_bool(0.5);
             let progress = self.rng.random_range(0.0..length);
             if self.demand.scenery.is_real {
-                // More people are near the corners, where they cross.
-                let left = self.rng.random_range(0.0..35.0_f64).min(length);
+                // More people are near the corners: they come there when the scene is warm.
+                let left = self.rng.random_range(0.0..50.0_f64).min(length);
                 (walk, forward, progress.max(length - left))
             } else {
                 (walk, forward, progress)
@@ -378,11 +386,18 @@ impl Traffic<'_> {
         let mut person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
         if self.demand.scenery.is_real {
             // Most of those who walk are with somebody.
-            let n = [0, 0, 0, 1, 1, 1, 2, 2, 3, 5][self.rng.random_range(0..10)];
+            let n = [0, 0, 0, 1, 1, 2, 2, 3, 4, 6][self.rng.random_range(0..10)];
             person.accompany(self.next_id, n, &mut self.rng);
             self.next_id += n as i64;
         }
         self.people.push(person);
+    }
+
+    /// True if a walk leads to a crosswalk.
+    fn leads_across(&self, walk: usize, forward: bool) -> bool {
+        let end = self.network.walks[walk].ends[usize::from(forward)];
+        let mut walks = self.network.walks.iter();
+        walks.any(|other| other.crosswalk.is_some() && other.ends.contains(&end))
     }
 
     /// Walks with an end that no other walk has, entered there.

@@ -12,8 +12,10 @@ use crate::network::LaneIdx;
 const ROOM_AFTER: f64 = 15.0;
 /// Deceleration that a change may impose on the vehicle behind, m/s².
 const IMPOSED_BRAKING: f64 = 2.0;
-/// Acceleration that a change must gain, m/s².
-const GAIN: f64 = 0.25;
+/// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones.
+const GAIN: [f64; 2] = [0.25, 0.05];
+/// How often a vehicle changes lanes for reasons of its own when it thinks of it.
+const WHIM: [f64; 2] = [0.04, 0.7];
 
 impl Traffic<'_> {
     /// Starts lane changes and moves over for bicycles.
@@ -30,7 +32,7 @@ impl Traffic<'_> {
             if !must && lane.left.is_none() && lane.right.is_none() {
                 continue;
             }
-            let whim = !must && self.rng.random_bool(0.04);
+            let whim = !must && self.rng.random_bool(WHIM[self.is_real()]);
             let patience = self.rng.random_range(1.0..3.0);
             let vehicle = &self.vehicles[i];
             let sides = [lane.left, lane.right];
@@ -94,7 +96,13 @@ impl Traffic<'_> {
             return false;
         }
         let now = self.occupancy.leader(self.network, vehicle);
-        must || whim || then > driver.acceleration(vehicle.speed, speed, now, None) + GAIN
+        must || whim
+            || then > driver.acceleration(vehicle.speed, speed, now, None) + GAIN[self.is_real()]
+    }
+
+    /// 1 in scenes like recorded ones, 0 in plain ones.
+    fn is_real(&self) -> usize {
+        usize::from(self.demand.scenery.is_real)
     }
 
     fn change_length(&self, vehicle: &Vehicle, must: bool) -> f64 {
