@@ -24,6 +24,8 @@ struct Row {
     learning_rate: f64,
     gradient_norm: f64,
     tokens: usize,
+    /// Realism of the rollouts that were learned from.
+    rollouts: Option<f64>,
     validation: Option<Validation>,
 }
 
@@ -44,7 +46,7 @@ pub(crate) struct Losses {
 }
 
 const HEADER: &str = "step,total,state,control,trajectory,reconstruction,learning_rate,\
-                      gradient_norm,tokens,validation,realism,min_ade";
+                      gradient_norm,tokens,rollouts,validation,realism,min_ade";
 
 impl Losses {
     /// Reads the rows up to `steps` of an earlier part of the run.
@@ -76,6 +78,7 @@ impl Losses {
             learning_rate: report.learning_rate,
             gradient_norm: report.gradient_norm,
             tokens: report.tokens,
+            rollouts: report.rollouts,
             validation: None,
         });
         self.last = Some(report);
@@ -156,17 +159,33 @@ impl Losses {
         })
     }
 
-    /// Realism over the run; `None` where nothing was imagined.
+    /// Realism over the run: of held-out scenes, and of the rollouts that were learned from; `None`
+    /// where nothing was imagined.
     pub(crate) fn realism_chart(&self) -> Option<Chart> {
-        let points = self.validations(|validation| Some(validation.imagined?.0));
-        (!points.is_empty()).then(|| Chart {
-            x_label: "step".into(),
-            y_label: "realism (2025) of held-out scenes".into(),
-            series: vec![Series {
-                name: "realism".into(),
+        let held_out = self.validations(|validation| Some(validation.imagined?.0));
+        let chunk = self.rows.len().div_ceil(DRAWN).max(20);
+        let learned = self.rows.chunks(chunk).filter_map(|rows| {
+            let scores: Vec<f64> = rows.iter().filter_map(|row| row.rollouts).collect();
+            let mean = scores.iter().sum::<f64>() / scores.len() as f64;
+            (!scores.is_empty()).then(|| (rows[rows.len() / 2].step as f64, mean))
+        });
+        let curves = [
+            ("held-out scenes", held_out),
+            ("rollouts learned from", learned.collect()),
+        ];
+        let series: Vec<Series> = curves
+            .into_iter()
+            .filter(|(_, points)| !points.is_empty())
+            .map(|(name, points)| Series {
+                name: name.into(),
                 points,
                 ..Series::default()
-            }],
+            })
+            .collect();
+        (!series.is_empty()).then(|| Chart {
+            x_label: "step".into(),
+            y_label: "realism (2025)".into(),
+            series,
             ..Chart::default()
         })
     }
@@ -206,6 +225,7 @@ impl Row {
             rate,
             norm,
             tokens,
+            rollouts,
             validation,
             realism,
             min_ade,
@@ -223,6 +243,10 @@ impl Row {
             learning_rate: rate.parse().ok()?,
             gradient_norm: norm.parse().ok()?,
             tokens: tokens.parse().ok()?,
+            rollouts: match *rollouts {
+                "" => None,
+                realism => Some(realism.parse().ok()?),
+            },
             validation: match (*validation, *realism, *min_ade) {
                 ("", "", "") => None,
                 (loss, realism, min_ade) => Some(Validation {
@@ -247,16 +271,18 @@ impl Row {
             learning_rate,
             gradient_norm,
             tokens,
+            rollouts,
             validation,
         } = self;
         let (realism, min_ade) = validation.and_then(|said| said.imagined).unzip();
         let told = |number: Option<f64>| number.map_or(String::new(), |number| number.to_string());
-        let [validation, realism, min_ade] =
-            [validation.map(|said| said.loss), realism, min_ade].map(told);
+        let validation = validation.map(|said| said.loss);
+        let [rollouts, validation, realism, min_ade] =
+            [*rollouts, validation, realism, min_ade].map(told);
         writeln!(
             text,
             "{step},{total},{state},{control},{trajectory},{reconstruction},{learning_rate},\
-             {gradient_norm},{tokens},{validation},{realism},{min_ade}"
+             {gradient_norm},{tokens},{rollouts},{validation},{realism},{min_ade}"
         )
         .expect("writing to a string cannot fail");
     }
@@ -296,6 +322,7 @@ mod tests {
                 learning_rate: 1e-3,
                 gradient_norm: 0.1,
                 tokens: 10,
+                rollouts: (step % 2 == 0).then_some(0.5),
             });
         }
         losses.push_validation(n, 0.25, None);
@@ -319,7 +346,8 @@ mod tests {
         assert_eq!(written.last_validation(), Some(0.25));
         assert_eq!(written.last_realism(), Some(IMAGINED.0));
         assert_eq!(written.realism_chart().unwrap().series[0].points.len(), 1);
-        assert!(cut.realism_chart().is_none());
+        let learned = Losses::read(&path, 1).unwrap();
+        assert!(learned.realism_chart().is_none());
     }
 
     #[test]

@@ -72,18 +72,9 @@ fn evaluate(
 ) -> Result<Found, WosacError> {
     let reference = Reference::new(log, config)?;
     let evaluation = reference.evaluate(rollouts)?;
-    let without = |i: usize| {
-        let mut futures = rollouts.futures.clone();
-        futures.remove(i);
-        let others = Rollouts::new(rollouts.scenario.clone(), futures);
-        Ok(reference.evaluate(&others)?.scores.metametric)
-    };
-    let leave_one_out = wanted.leave_one_out.then(|| {
-        let each = (0..rollouts.futures.len()).into_par_iter().map(without);
-        each.collect::<Result<Vec<f64>, WosacError>>()
-    });
+    let leave_one_out = wanted.leave_one_out.then(|| evaluation.leave_one_out());
     Ok(Found {
-        leave_one_out: leave_one_out.transpose()?,
+        leave_one_out: leave_one_out.flatten().map(|worth| worth.metametric),
         per_agent: wanted.per_agent.then(|| evaluation.realism()),
         blames: wanted.explain.then(|| evaluation.explain()),
         scores: evaluation.scores,

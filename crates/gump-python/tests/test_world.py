@@ -62,9 +62,9 @@ def test_more_real_than_going_straight_on(crossing, network):
 
 
 def test_the_shipped_weights_are_found(network):
-    path = gump.worlds.SHIPPED_WEIGHTS
-    assert path.is_file()
-    assert gump.World(f"model:{path}").name == f"model:{path}"
+    for path in (gump.worlds.SHIPPED_WEIGHTS, gump.worlds.GENERATOR_WEIGHTS):
+        assert path.is_file()
+        assert gump.World(f"model:{path}").name == f"model:{path}"
 
 
 def test_steps_are_what_simulate_does(crossing):
@@ -177,8 +177,9 @@ def test_scenes_from_nothing(crossing):
     assert len(moving.scenario) - moving.scenario.now - 1 == 20
     with pytest.raises(ValueError, match='prompt: "behnd_bike" is not one of the 73 scenario tags'):
         gump.generate(crossing, "behnd_bike")
-    with pytest.raises(ValueError, match="world: expected a network that generates scenes"):
-        gump.generate(crossing, world=gump.World("idm"))
+    for other in ("idm", "model"):
+        with pytest.raises(ValueError, match="world: expected a network that generates scenes"):
+            gump.generate(crossing, world=gump.World(other))
     with pytest.raises(ValueError, match="seconds: expected a number from 0 to 3600, found -1"):
         gump.generate(crossing, seconds=-1.0)
     with pytest.raises(ValueError, match="objects: "):

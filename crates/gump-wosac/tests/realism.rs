@@ -328,3 +328,38 @@ fn an_agent_never_valid_again_is_not_scored_and_nothing_at_all_is_nan() {
     assert!(scores.metametric.is_nan());
     assert!(scores.components[&Component::LinearSpeed].is_nan());
 }
+
+#[test]
+fn what_a_rollout_is_worth_is_the_score_less_that_of_the_others() {
+    let log = log();
+    for y in Year::ALL {
+        if y == Year::Y2025Generation {
+            continue;
+        }
+        let config = year(y);
+        let reference = Reference::new(&log, &config).unwrap();
+        let speeds = [0.9, 1.0, 1.1, 0.2, 1.0];
+        let all = reference.evaluate(&rollouts(&speeds)).unwrap();
+        let worth = all.leave_one_out().unwrap();
+        for i in 0..speeds.len() {
+            let mut others = speeds.to_vec();
+            others.remove(i);
+            let plain = reference.evaluate(&rollouts(&others)).unwrap();
+            let (plain, found) = (plain.scores.metametric, worth.metametric[i]);
+            assert!((found - plain).abs() < 1e-9, "{y:?} {i}: {found} {plain}");
+            // The parts are worth about the whole.
+            let parts: f64 = worth.credit[i].iter().sum();
+            let whole = all.scores.metametric - plain;
+            assert!(
+                (parts - whole).abs() < 0.3 * whole.abs() + 1e-3,
+                "{y:?} {i}: {parts} of {whole}"
+            );
+        }
+        assert_eq!(worth.agents, [AgentId(3), AgentId(9)]);
+        // What keeps to the log is worth more than what stands nearly still.
+        let total = |i: usize| worth.credit[i].iter().sum::<f64>();
+        assert!(total(1) > total(3), "{y:?}");
+        let one = reference.evaluate(&rollouts(&[1.0])).unwrap();
+        assert!(one.leave_one_out().is_none());
+    }
+}

@@ -6,7 +6,7 @@
 //! kept. What a node ends with says the next half second of its agent, in the agent's own frame.
 //!
 //! `map` cuts the map into pieces, `graph` makes nodes and edges, `grid` has the bins of a move, `net`
-//! the network, `sample`, `drives` and `train` how it learns, `seen` what is kept of an agent meanwhile, `world` how it is rolled out and `rules` what then corrects it.
+//! the network, `sample`, `drives`, `rewards` and `train` how it learns, `seen` what is kept of an agent meanwhile, `world` how it is rolled out and `rules` what then corrects it.
 
 mod drives;
 mod engine;
@@ -14,6 +14,7 @@ mod graph;
 mod grid;
 mod map;
 mod net;
+mod rewards;
 mod rules;
 mod sample;
 mod seen;
@@ -29,6 +30,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::drives::RelativeDrives;
 pub use self::net::RelativeNetwork;
+pub use self::rewards::RelativeRewards;
 pub use self::sample::SampleConfig as RelativeSampleConfig;
 pub use self::train::{RelativeStep, RelativeTrainConfig, RelativeTrainer};
 pub use self::world::{RelativeSampling, RelativeWorld};

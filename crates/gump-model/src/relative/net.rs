@@ -239,9 +239,31 @@ impl RelativeNetwork {
         total: f64,
         smoothing_bins: f64,
     ) -> Result<(Tensor, [f64; FIELDS])> {
+        let outputs = self.forced(sample)?;
+        self.cross_entropy(sample, &outputs, total, smoothing_bins, |weight| weight)
+    }
+
+    /// As [`Self::loss`] with weights of either sign, nothing smoothed: moves of positive weight
+    /// become likelier, those of negative weight less likely.
+    pub(super) fn preference(
+        &self,
+        sample: &Sample,
+        total: f64,
+    ) -> Result<(Tensor, [f64; FIELDS])> {
+        let outputs = self.forced(sample)?;
+        let part = |sign: f32| {
+            let weight = move |weight: f32| (sign * weight).max(0.0);
+            self.cross_entropy(sample, &outputs, total, 0.0, weight)
+        };
+        let ((liked, gains), (disliked, losses)) = (part(1.0)?, part(-1.0)?);
+        let sums = std::array::from_fn(|field| gains[field] - losses[field]);
+        Ok(((liked - disliked)?, sums))
+    }
+
+    /// What the decoder reads the fields of the moves from, each field knowing those before it.
+    fn forced(&self, sample: &Sample) -> Result<Tensor> {
         let device = self.parameters.device();
         let targets = &sample.targets;
-        let k = targets.len();
         let nodes: Vec<u32> = targets.iter().map(|target| target.node).collect();
         let hidden = self
             .hidden(sample)?
@@ -252,11 +274,25 @@ impl RelativeNetwork {
                 .iter()
                 .map(move |t| first + u32::from(t.bins[field]))
         });
-        let rows = Tensor::from_vec(rows.collect::<Vec<u32>>(), (FIELDS - 1, k), device)?;
-        let outputs = self.decoder.forced(&hidden, &rows)?;
+        let shape = (FIELDS - 1, targets.len());
+        let rows = Tensor::from_vec(rows.collect::<Vec<u32>>(), shape, device)?;
+        self.decoder.forced(&hidden, &rows)
+    }
+
+    /// Cross-entropies of the moves, each with the weight that `weigh` makes of its own.
+    fn cross_entropy(
+        &self,
+        sample: &Sample,
+        outputs: &Tensor,
+        total: f64,
+        smoothing_bins: f64,
+        weigh: impl Fn(f32) -> f32,
+    ) -> Result<(Tensor, [f64; FIELDS])> {
+        let device = self.parameters.device();
+        let targets = &sample.targets;
         let weight = |field: usize, target: &super::sample::Target| {
             let counts = field == 0 || target.bins[0] != super::grid::STANDS;
-            if counts { target.weight } else { 0.0 }
+            if counts { weigh(target.weight) } else { 0.0 }
         };
         let asked = (0..FIELDS).map(|field| {
             let asked = Targets {
@@ -272,7 +308,7 @@ impl RelativeNetwork {
             (first..first + BINS[field], asked)
         });
         let matrix = self.decoder.head.weight();
-        let means = ops::linear_cross_entropy(&outputs, matrix, asked.collect())?; // [FIELDS]
+        let means = ops::linear_cross_entropy(outputs, matrix, asked.collect())?; // [FIELDS]
         let shares: Vec<f64> = (0..FIELDS)
             .map(|field| targets.iter().map(|t| f64::from(weight(field, t))).sum())
             .collect();

@@ -93,10 +93,24 @@ impl Sample {
     }
 }
 
+impl Sample {
+    /// Gives every move the weight that `weight` says of its agent and frame, by index; moves that
+    /// weigh nothing are left out.
+    pub(super) fn weigh(&mut self, weight: impl Fn(usize, usize) -> f32) {
+        for target in &mut self.targets {
+            target.weight = weight(target.agent as usize, target.frame as usize);
+        }
+        self.targets.retain(|target| target.weight != 0.0);
+    }
+}
+
 /// What a node should say.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Target {
     pub(super) node: u32,
+    /// Index of the agent among those of the sample, and of the frame.
+    pub(super) agent: u32,
+    pub(super) frame: u32,
     pub(super) bins: [u16; FIELDS],
     pub(super) weight: f32,
 }
@@ -222,6 +236,27 @@ pub(crate) fn draw(
         driver.drive(place, &map, &lights, &mut tracks, seed.fork(0));
     }
     Some(assemble(&map, &tracks, &lights))
+}
+
+/// The sample of all frames of a scenario from `start` on, everything shown as it is, and the agents
+/// `ids` in their order.
+pub(super) fn whole(
+    scenario: &Scenario,
+    start: usize,
+    ids: &[AgentId],
+    map: &VectorMap,
+) -> Option<Sample> {
+    let stride = stride_of(scenario.dt);
+    let n_frames = (scenario.log.len().checked_sub(start + 1)?) / stride + 1;
+    let frames: Vec<&Frame> = (0..n_frames)
+        .map(|i| &scenario.log[start + i * stride])
+        .collect();
+    let plain = SampleConfig::plain();
+    let mut nothing = Seed(0).rng();
+    let track = |id: &AgentId| track(&frames, *id, &plain, 0.0, &mut nothing);
+    let tracks: Vec<Track> = ids.iter().map(track).collect();
+    let lights = lights(scenario, start, stride, n_frames);
+    Some(assemble(map, &tracks, &lights))
 }
 
 /// The agents of a sample, and the place it is about.
@@ -460,6 +495,8 @@ fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     };
     Some(Target {
         node: 0,
+        agent: a as u32,
+        frame: t as u32,
         bins: quantize(step),
         weight: if own.tracked { 1.0 } else { UNTRACKED },
     })

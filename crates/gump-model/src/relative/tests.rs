@@ -212,12 +212,63 @@ fn a_resumed_run_ends_in_the_same_weights() {
         ruled: 0.5,
         ..RelativeDrives::default()
     };
-    for closed_loop in [None, Some(closed_loop)] {
+    let realism = RelativeRewards {
+        rollouts: 3,
+        refresh: 2,
+        ..RelativeRewards::default()
+    };
+    let closed_loop = Some(closed_loop);
+    for (closed_loop, realism) in [
+        (None, None),
+        (closed_loop.clone(), None),
+        (closed_loop, Some(realism)),
+    ] {
         resumes(&RelativeTrainConfig {
             closed_loop,
+            realism,
             ..train_config(6)
         });
     }
+}
+
+/// What futures did is what is judged: every move of theirs, and no other.
+#[test]
+fn rollouts_are_judged_by_the_moves_they_made() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let config = RelativeRewards {
+        rollouts: 4,
+        ..RelativeRewards::default()
+    };
+    let judged = rewards::Judged::new(&network, &config).unwrap();
+    let group = judged.group(&scenario(), Seed(2)).unwrap().unwrap();
+    assert_eq!(group.samples.len(), 4);
+    assert!(group.realism > 0.0 && group.realism < 1.0);
+    let (mut sum, mut n) = (0.0, 0);
+    for sample in &group.samples {
+        for target in &sample.targets {
+            // Five agents are there at every frame; the present is the third.
+            assert_eq!(target.node, 5 * target.frame + target.agent);
+            assert!((2..18).contains(&target.frame));
+            let next = target.node as usize + 5;
+            let done = 5.0 * f64::from(sample.nodes[next * NODE_NUMBERS + 8]);
+            let said = grid::dequantize(target.bins).position.x;
+            assert!((done - said).abs() < 1e-4, "{done} {said}");
+            sum += f64::from(target.weight);
+            n += 1;
+        }
+    }
+    // Each move is compared with those of the other futures.
+    assert!(n > 100 && (sum / f64::from(n)).abs() < 0.1, "{sum} of {n}");
+    let too_short = fixture::scenario(
+        "lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0\nhistory 1.0 future 2.0 dt 0.1",
+    );
+    assert!(judged.group(&too_short.unwrap(), Seed(2)).unwrap().is_none());
+    let alone = RelativeRewards {
+        rollouts: 1,
+        ..RelativeRewards::default()
+    };
+    let told = alone.validate().unwrap_err().to_string();
+    assert!(told.contains("rollouts must be at least 2"), "{told}");
 }
 
 fn resumes(config: &RelativeTrainConfig) {

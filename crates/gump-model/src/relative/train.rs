@@ -15,6 +15,7 @@ use super::RelativeConfig;
 use super::drives::{Driver, RelativeDrives};
 use super::grid::FIELDS;
 use super::net::RelativeNetwork;
+use super::rewards::{Group, Judged, RelativeRewards};
 use super::sample::{Sample, SampleConfig, draw};
 use crate::ModelError;
 use crate::checkpoint::{self, Precision};
@@ -23,6 +24,11 @@ use crate::optimizer::{AdamW, OptimizerConfig, move_average};
 use crate::parameters::Parameters;
 use crate::scenes::Scenes;
 use crate::train::Gradients;
+
+/// How many scenes are tried for a sample.
+const ATTEMPTS: u64 = 64;
+/// Separates the scenes that are rolled out from those of the samples.
+const GROUP: u64 = 1 << 40;
 
 /// What names of the tensors that drive begin with in a checkpoint.
 pub(super) const DRIVER: &str = "driver.";
@@ -47,6 +53,9 @@ pub struct RelativeTrainConfig {
     /// Whether agents are driven by the network that learns, and how; without it samples show logs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub closed_loop: Option<RelativeDrives>,
+    /// Whether the network learns from what its own rollouts add to realism beside that, and how.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub realism: Option<RelativeRewards>,
     /// How samples are drawn.
     pub sample: SampleConfig,
     /// How steps are taken.
@@ -63,6 +72,7 @@ impl Default for RelativeTrainConfig {
             smoothing_bins: 0.7,
             mixed_precision: false,
             closed_loop: None,
+            realism: None,
             sample: SampleConfig::default(),
             optimizer: OptimizerConfig {
                 learning_rate: 1e-3,
@@ -74,6 +84,13 @@ impl Default for RelativeTrainConfig {
 }
 
 impl RelativeTrainConfig {
+    /// Steps after which the network that drives is brought up to date, if one drives.
+    fn refresh(&self) -> Option<usize> {
+        let drives = self.closed_loop.as_ref().map(|drives| drives.refresh);
+        let rewards = self.realism.as_ref().map(|rewards| rewards.refresh);
+        drives.into_iter().chain(rewards).min()
+    }
+
     /// Checks that the numbers are in their ranges.
     ///
     /// # Errors
@@ -86,6 +103,9 @@ impl RelativeTrainConfig {
         self.closed_loop
             .as_ref()
             .map_or(Ok(()), RelativeDrives::validate)?;
+        self.realism
+            .as_ref()
+            .map_or(Ok(()), RelativeRewards::validate)?;
         self.optimizer.validate()
     }
 }
@@ -105,6 +125,9 @@ pub struct RelativeStep {
     pub learning_rate: f64,
     /// Agents at frames that were presented.
     pub nodes: usize,
+    /// Realism of the rollouts that were learned from, if any were.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rollouts: Option<f64>,
 }
 
 /// A training run.
@@ -117,7 +140,20 @@ pub struct RelativeTrainer {
     source: Arc<Source>,
     /// The network that drives the agents of samples, as it was at the last refresh.
     driving: Option<RelativeNetwork>,
-    next: Receiver<Result<Vec<Sample>, ModelError>>,
+    next: Receiver<Result<Batch, ModelError>>,
+}
+
+/// What a step learns from.
+struct Batch {
+    samples: Vec<Sample>,
+    group: Option<Group>,
+}
+
+/// The network that drives, in both of its roles.
+#[derive(Default)]
+struct Drivers {
+    driver: Option<Driver>,
+    judged: Option<Judged>,
 }
 
 struct Source {
@@ -128,8 +164,33 @@ struct Source {
 }
 
 impl Source {
+    fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, ModelError> {
+        let group = drivers.judged.as_ref();
+        let group = group.map(|judged| self.group(step, judged));
+        Ok(Batch {
+            samples: self.samples(step, drivers.driver.as_ref())?,
+            group: group.transpose()?,
+        })
+    }
+
+    fn group(&self, step: usize, judged: &Judged) -> Result<Group, ModelError> {
+        let seed = self.seed.fork(step as u64).fork(GROUP);
+        for attempt in 0..ATTEMPTS {
+            let seed = seed.fork(attempt);
+            let scenario = self.scenarios.pick(step, seed.fork(0).0);
+            let scenario = self.scenarios.get(scenario)?;
+            if let Some(group) = judged.group(&scenario, seed.fork(1))? {
+                return Ok(group);
+            }
+        }
+        Err(ModelError::Config(
+            "realism: no scene has the second of past and the eight seconds of future at 10 Hz, \
+             the road edges and the agents that its rollouts are compared with"
+                .to_owned(),
+        ))
+    }
+
     fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, ModelError> {
-        const ATTEMPTS: u64 = 64;
         let seed = self.seed.fork(step as u64);
         let drawn = (0..self.batch).map(|i| {
             let seed = seed.fork(i as u64);
@@ -151,12 +212,12 @@ impl Source {
 fn prefetch(
     source: &Arc<Source>,
     step: usize,
-    driver: Option<Driver>,
-) -> Receiver<Result<Vec<Sample>, ModelError>> {
+    drivers: Drivers,
+) -> Receiver<Result<Batch, ModelError>> {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.
-    std::thread::spawn(move || drop(sender.send(source.samples(step, driver.as_ref()))));
+    std::thread::spawn(move || drop(sender.send(source.batch(step, &drivers))));
     receiver
 }
 
@@ -244,7 +305,7 @@ impl RelativeTrainer {
             seed: Seed(config.seed).fork(1),
             batch: config.batch,
         });
-        let next = prefetch(&source, step, driver(driving.as_ref(), &config)?);
+        let next = prefetch(&source, step, drivers(driving.as_ref(), &config)?);
         Ok(Self {
             trained: network,
             average,
@@ -263,22 +324,32 @@ impl RelativeTrainer {
     /// [`ModelError::LossNotFinite`] before anything is changed, or what drawing samples reports.
     pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
         let drawn = self.next.recv();
-        let samples = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
-        let drives = self.config.closed_loop.as_ref();
-        if drives.is_some_and(|drives| self.step.is_multiple_of(drives.refresh)) {
+        let Batch { samples, group } = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
+        let refresh = self.config.refresh();
+        if refresh.is_some_and(|refresh| self.step.is_multiple_of(refresh)) {
             self.driving = driving(&self.average, &self.config)?;
         }
-        let driver = driver(self.driving.as_ref(), &self.config)?;
-        self.next = prefetch(&self.source, self.step + 1, driver);
+        let drivers = drivers(self.driving.as_ref(), &self.config)?;
+        self.next = prefetch(&self.source, self.step + 1, drivers);
         let total = weight(&samples);
         let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
         let operands = match self.config.mixed_precision {
             true => Operands::Bf16,
             false => Operands::F32,
         };
-        let parts = samples.par_iter().map(|sample| {
+        let judged = group.as_ref().map_or(&[][..], |group| &group.samples);
+        let n_judged: usize = judged.iter().map(|sample| sample.targets.len()).sum();
+        let rewards = self.config.realism.as_ref();
+        let judged_total = rewards.map_or(1.0, |rewards| n_judged as f64 / rewards.weight);
+        let imitated = samples.par_iter().map(|sample| (sample, true));
+        let preferred = judged.par_iter().filter(|sample| !sample.targets.is_empty());
+        let all = imitated.chain(preferred.map(|sample| (sample, false)));
+        let parts = all.map(|(sample, imitates)| {
             let deferred = Deferred::default();
-            let build = || network.loss(sample, total, smoothing);
+            let build = || match imitates {
+                true => network.loss(sample, total, smoothing),
+                false => network.preference(sample, judged_total),
+            };
             let (loss, sums) = operands.during(|| deferred.during(build))?;
             Ok(Part {
                 gradients: loss.backward()?,
@@ -287,7 +358,8 @@ impl RelativeTrainer {
             })
         });
         let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
-        let fields = mean_fields(parts.iter().map(|part| &part.sums), total);
+        let imitated = parts[..samples.len()].iter();
+        let fields = mean_fields(imitated.map(|part| &part.sums), total);
         let loss: f64 = fields.iter().sum();
         if !loss.is_finite() {
             let field = "move".to_owned();
@@ -326,7 +398,8 @@ impl RelativeTrainer {
             fields,
             gradient_norm,
             learning_rate: rate,
-            nodes: samples.iter().map(Sample::n_nodes).sum(),
+            nodes: samples.iter().chain(judged).map(Sample::n_nodes).sum(),
+            rollouts: group.as_ref().map(|group| group.realism),
         })
     }
 
@@ -416,18 +489,23 @@ fn driving(
     average: &RelativeNetwork,
     config: &RelativeTrainConfig,
 ) -> Result<Option<RelativeNetwork>, ModelError> {
-    let drives = config.closed_loop.as_ref();
-    let copied = drives.map(|_| build_like(average, copies(average)?));
+    let copied = config.refresh();
+    let copied = copied.map(|_| build_like(average, copies(average)?));
     copied.transpose()
 }
 
-fn driver(
+fn drivers(
     driving: Option<&RelativeNetwork>,
     config: &RelativeTrainConfig,
-) -> Result<Option<Driver>, ModelError> {
-    let both = driving.zip(config.closed_loop.as_ref());
-    both.map(|(network, drives)| Driver::new(network, drives))
-        .transpose()
+) -> Result<Drivers, ModelError> {
+    let driver = driving.zip(config.closed_loop.as_ref());
+    let driver = driver.map(|(network, drives)| Driver::new(network, drives));
+    let judged = driving.zip(config.realism.as_ref());
+    let judged = judged.map(|(network, rewards)| Judged::new(network, rewards));
+    Ok(Drivers {
+        driver: driver.transpose()?,
+        judged: judged.transpose()?,
+    })
 }
 
 /// What one sample of a step found.

@@ -29,7 +29,7 @@ use crate::sampling::SamplingConfig;
 use crate::surroundings::Survey;
 
 /// How far around the ego the map is laid out, metres.
-const MAP_M: f64 = 300.0;
+pub(super) const MAP_M: f64 = 300.0;
 
 /// Draws are among the likeliest bins that together have this probability, unless told otherwise.
 /// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1

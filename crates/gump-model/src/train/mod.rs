@@ -53,6 +53,8 @@ pub struct StepReport {
     pub gradient_norm: f64,
     /// Tokens presented.
     pub tokens: usize,
+    /// Realism of the rollouts that were learned from, if any were.
+    pub rollouts: Option<f64>,
 }
 
 /// A training run.
@@ -187,6 +189,7 @@ impl Trainer {
             learning_rate: self.config.optimizer.rate(step, self.config.steps),
             gradient_norm,
             tokens: found.tokens,
+            rollouts: None,
         })
     }
 

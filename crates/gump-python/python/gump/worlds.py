@@ -10,8 +10,11 @@ import numpy as np
 
 from . import _arrays, _native
 
-SHIPPED_WEIGHTS = Path(__file__).with_name("weights") / "gump-tiny.safetensors"
-"""The weights that come with the package."""
+_WEIGHTS = Path(__file__).with_name("weights")
+SHIPPED_WEIGHTS = _WEIGHTS / "gump-relative.safetensors"
+"""The weights of traffic that come with the package: the network with relative attention."""
+GENERATOR_WEIGHTS = _WEIGHTS / "gump-tiny.safetensors"
+"""The weights that make scenes from nothing: the sequence network."""
 
 
 class World:
@@ -195,6 +198,9 @@ def generate(
 
     Raises `ValueError` for an unknown tag, contradicting wishes and numbers out of range,
     `RuntimeError` if a scene cannot be made.
+
+    `world` is a sequence network, the only one that makes scenes; by default the one that comes with
+    the package.
     """
     wish = {
         "prompts": [prompt] if isinstance(prompt, str) else list(prompt),
@@ -209,7 +215,7 @@ def generate(
         "attempts": attempts,
         "seed": seed,
     }
-    world = World() if world is None else world
+    world = World(f"model:{GENERATOR_WEIGHTS}") if world is None else world
     made = _native.generate(world._world, _scenario(scenario), wish)
     return [Generated(**one) for one in made]
 

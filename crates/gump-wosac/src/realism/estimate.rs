@@ -69,6 +69,67 @@ pub fn log_likelihoods(
     }
 }
 
+/// As [`log_likelihoods`] without one rollout each, by rollout; at least two must be counted.
+pub(crate) fn leave_one_out(
+    config: &FeatureConfig,
+    log: &[f32],
+    simulated: &[&[f32]],
+    copies: usize,
+    shape: Shape,
+) -> Vec<Vec<f32>> {
+    let histogram = match config.estimator {
+        Estimator::Histogram {
+            min,
+            max,
+            bins,
+            pseudocount,
+        } => Histogram::new(min, max, bins, pseudocount),
+        Estimator::Bernoulli { pseudocount } => Histogram::new(-0.5, 1.5, 2, pseudocount),
+        Estimator::KernelDensity { .. } => {
+            let others = |i: usize| -> Vec<&[f32]> {
+                let each = simulated.iter().enumerate();
+                let kept = each.flat_map(|(k, rollout)| {
+                    std::iter::repeat_n(*rollout, copies - usize::from(k == i))
+                });
+                kept.collect()
+            };
+            let without = |i| log_likelihoods(config, log, &others(i), 1, shape);
+            return (0..simulated.len()).map(without).collect();
+        }
+    };
+    let (groups, n_groups) = shape.groups(config);
+    let n_bins = histogram.edges.len() - 1;
+    let count = |rollout: &[f32], one: usize, counts: &mut [usize]| {
+        for (&value, &group) in rollout.iter().zip(&groups) {
+            counts[group * n_bins + histogram.bin(value)] += one;
+        }
+    };
+    let mut all = vec![0; n_groups * n_bins];
+    for rollout in simulated {
+        count(rollout, copies, &mut all);
+    }
+    let mut n_of_group = vec![0; n_groups];
+    for &group in &groups {
+        n_of_group[group] += 1;
+    }
+    let wanted: Vec<usize> = log
+        .iter()
+        .zip(&groups)
+        .map(|(&value, &group)| group * n_bins + histogram.bin(value))
+        .collect();
+    let without = |rollout: &&[f32]| {
+        let mut own = vec![0; n_groups * n_bins];
+        count(rollout, 1, &mut own);
+        let left = (simulated.len() * copies - 1) as f32;
+        let likelihood = |&at: &usize| {
+            let values = left * n_of_group[at / n_bins] as f32;
+            histogram.log_likelihood(all[at] - own[at], values)
+        };
+        wanted.iter().map(likelihood).collect()
+    };
+    simulated.iter().map(without).collect()
+}
+
 /// Equal bins over a range.
 pub(crate) struct Histogram {
     pub(crate) edges: Vec<f32>,
@@ -100,6 +161,12 @@ impl Histogram {
         inner.iter().take_while(|&&edge| edge <= value).count()
     }
 
+    /// Of a bin with `n` of a group's `all` values.
+    fn log_likelihood(&self, n: usize, all: f32) -> f32 {
+        let n_bins = (self.edges.len() - 1) as f32;
+        ((n as f32 + self.pseudocount) / (all + n_bins * self.pseudocount)).ln()
+    }
+
     fn log_likelihoods(
         &self,
         log: &[f32],
@@ -119,10 +186,8 @@ impl Histogram {
         let likelihoods: Vec<f32> = counts
             .chunks(n_bins)
             .flat_map(|counts| {
-                let all = counts.iter().sum::<usize>() as f32 + n_bins as f32 * self.pseudocount;
-                counts
-                    .iter()
-                    .map(move |&n| ((n as f32 + self.pseudocount) / all).ln())
+                let all = counts.iter().sum::<usize>() as f32;
+                counts.iter().map(move |&n| self.log_likelihood(n, all))
             })
             .collect();
         let pairs = log.iter().zip(groups);

@@ -9,7 +9,8 @@
 //! Waymo's messages, or with [`Log::of`] and [`Rollouts::of`] on scenes.
 //! [`Reference`] keeps what rollouts are compared with, [`Evaluation`] what the comparison found,
 //! [`Evaluation::explain`] says what lowered the score and when, [`Evaluation::realism`] whose futures
-//! are like the log; [`Scores::mean`] averages over
+//! are like the log, [`Evaluation::leave_one_out`] what each rollout adds, as a reward to learn
+//! from; [`Scores::mean`] averages over
 //! scenarios; `gump_metrics::interval` says how sure an average is. A year is a [`Config`], which is a TOML file.
 //! Reading files is the business of `gump-data`, checking a submission too.
 //!
@@ -33,6 +34,7 @@ mod following;
 mod from_scene;
 mod input;
 mod kinematics;
+mod leave_one_out;
 mod lights;
 mod reference;
 mod road_edge;
@@ -46,6 +48,7 @@ pub use features::Features;
 pub use input::{
     Log, N_FUTURE, N_HISTORY, N_STEPS, Rollouts, Signal, SignalLane, State, Track, Trajectory,
 };
+pub use leave_one_out::LeaveOneOut;
 pub use reference::{Evaluation, Reference, score};
 pub use scores::Scores;
 

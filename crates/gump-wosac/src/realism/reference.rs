@@ -1,5 +1,6 @@
 //! Comparing rollouts with the log.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use gump_scene::{AgentId, AgentKind};
@@ -176,6 +177,24 @@ impl<'a> Reference<'a> {
         holds
     }
 
+    /// What is compared of a component: how many steps it has, and its values `[agent, step]` of the
+    /// log and then of each rollout.
+    pub(crate) fn values<'f>(
+        &'f self,
+        component: Component,
+        imagined: &'f [Features],
+    ) -> (usize, Vec<Cow<'f, [f32]>>) {
+        let all = std::iter::once(&self.features).chain(imagined);
+        if component.is_indication() {
+            let vehicles_only = component == Component::TrafficLightViolation;
+            let ever = |features| Cow::Owned(self.ever(features, component, vehicles_only));
+            (1, all.map(ever).collect())
+        } else {
+            let values = |features: &'f Features| Cow::Borrowed(features.values(component));
+            (self.features.n_steps, all.map(values).collect())
+        }
+    }
+
     /// Whether each scored agent ever has an indication, as 0 or 1.
     pub(crate) fn ever(
         &self,
@@ -209,6 +228,8 @@ pub struct Evaluation<'a> {
     /// [`Scores::ade`].
     pub displacements: Vec<Vec<f32>>,
     pub(crate) reference: &'a Reference<'a>,
+    /// How many equal rollouts each of `imagined` stands for.
+    pub(crate) copies: usize,
     pub(crate) log_likelihoods: BTreeMap<Component, Vec<f32>>,
 }
 
@@ -223,21 +244,14 @@ impl<'a> Evaluation<'a> {
         let log = &reference.features;
         let mut likelihoods = BTreeMap::new();
         for (component, feature) in config.components() {
-            let shape = |steps| Shape {
+            let (steps, values) = reference.values(component, &imagined);
+            let (own, imagined) = values.split_first().expect("the log comes first");
+            let imagined: Vec<&[f32]> = imagined.iter().map(AsRef::as_ref).collect();
+            let shape = Shape {
                 agents: log.agents.len(),
                 steps,
             };
-            let found = if component.is_indication() {
-                let vehicles_only = component == Component::TrafficLightViolation;
-                let ever = |f: &Features| reference.ever(f, component, vehicles_only);
-                let imagined: Vec<_> = imagined.iter().map(ever).collect();
-                let imagined: Vec<_> = imagined.iter().map(Vec::as_slice).collect();
-                log_likelihoods(feature, &ever(log), &imagined, copies, shape(1))
-            } else {
-                let imagined: Vec<_> = imagined.iter().map(|f| f.values(component)).collect();
-                let values = log.values(component);
-                log_likelihoods(feature, values, &imagined, copies, shape(log.n_steps))
-            };
+            let found = log_likelihoods(feature, own, &imagined, copies, shape);
             likelihoods.insert(component, found);
         }
         let components = likelihoods.iter().map(|(&component, found)| {
@@ -264,8 +278,14 @@ impl<'a> Evaluation<'a> {
             imagined,
             displacements,
             reference,
+            copies,
             log_likelihoods: likelihoods,
         }
+    }
+
+    /// As [`Reference::values`] of the rollouts.
+    pub(crate) fn values(&self, component: Component) -> (usize, Vec<Cow<'_, [f32]>>) {
+        self.reference.values(component, &self.imagined)
     }
 
     /// Log-likelihood of every logged value of a component before validity is looked at, `[agent,
@@ -288,7 +308,7 @@ impl<'a> Evaluation<'a> {
 }
 
 /// Exponential of the mean of the values that count; NaN if none does.
-fn geometric_mean(log_likelihoods: &[f32], mask: Option<&[bool]>) -> f64 {
+pub(crate) fn geometric_mean(log_likelihoods: &[f32], mask: Option<&[bool]>) -> f64 {
     let counts = |i: usize| mask.is_none_or(|mask| mask[i]);
     let values = log_likelihoods.iter().enumerate();
     let values = values.filter(|(i, _)| counts(*i));

@@ -209,6 +209,7 @@ fn known_keys() -> anyhow::Result<Table> {
     known.insert("relative".into(), shape.into());
     let train = RelativeTrainConfig {
         closed_loop: Some(relative::RelativeDrives::default()),
+        realism: Some(relative::RelativeRewards::default()),
         ..RelativeTrainConfig::default()
     };
     known.insert("train".into(), Table::try_from(train)?.into());
@@ -238,6 +239,7 @@ impl Learns for RelativeTrainer {
             learning_rate: step.learning_rate,
             gradient_norm: step.gradient_norm,
             tokens: step.nodes,
+            rollouts: step.rollouts,
         })
     }
 

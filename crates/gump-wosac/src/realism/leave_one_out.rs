@@ -1,0 +1,101 @@
+//! What each rollout is worth to the score of all: a reward to learn from.
+//!
+//! Realism is a property of a set of rollouts. What one of them adds is the score of all less the
+//! score of the others (its leave-one-out value). Features are measured once; leaving a rollout out
+//! takes its counts from the histograms.
+
+use std::collections::BTreeMap;
+
+use gump_scene::AgentId;
+
+use super::config::Component;
+use super::estimate::leave_one_out;
+use super::features::Features;
+use super::reference::{Evaluation, geometric_mean};
+use super::scores::{Scores, rounded};
+
+/// Scores without each rollout, and who earned the difference when.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LeaveOneOut {
+    /// Meta metric of all rollouts but this one, by rollout.
+    pub metametric: Vec<f64>,
+    /// The scored agents.
+    pub agents: Vec<AgentId>,
+    /// Scored steps.
+    pub n_steps: usize,
+    /// What each rollout adds to the meta metric, split by agent and step: `[rollout][agent, step]`.
+    ///
+    /// With components `c` of weight `w` and likelihood `L` over `n` values that count, the part of
+    /// a value is `w L / n` times the difference of its log-likelihood with and without the rollout;
+    /// to first order the parts of a rollout sum to its leave-one-out value. What an indication (a
+    /// collision, say) adds counts at the step where it first holds in the rollout, and at the last
+    /// one if it never does.
+    pub credit: Vec<Vec<f64>>,
+}
+
+impl Evaluation<'_> {
+    /// What each rollout is worth; `None` for a single one, without which nothing is left.
+    ///
+    /// The values equal those of evaluating the others anew.
+    pub fn leave_one_out(&self) -> Option<LeaveOneOut> {
+        let n = self.imagined.len();
+        if n * self.copies < 2 {
+            return None;
+        }
+        let reference = self.reference;
+        let log = reference.features();
+        let (n_agents, n_steps) = (log.agents.len(), log.n_steps);
+        let mut components = vec![BTreeMap::new(); n];
+        let mut credit = vec![vec![0.0; n_agents * n_steps]; n];
+        for (component, feature) in reference.config.components() {
+            let (steps, values) = self.values(component);
+            let (own, imagined) = values.split_first().expect("the log comes first");
+            let imagined: Vec<&[f32]> = imagined.iter().map(AsRef::as_ref).collect();
+            let shape = super::Shape {
+                agents: n_agents,
+                steps,
+            };
+            let without = leave_one_out(feature, own, &imagined, self.copies, shape);
+            let mask = (!component.is_indication()).then(|| reference.mask(component));
+            let mask = mask.as_deref();
+            let with = &self.log_likelihoods[&component];
+            let counted = mask.map_or(with.len(), |m| m.iter().filter(|&&m| m).count());
+            let likelihood = geometric_mean(with, mask);
+            let share = f64::from(feature.weight) * likelihood / counted.max(1) as f64;
+            for (i, without) in without.iter().enumerate() {
+                let held = (component.is_indication())
+                    .then(|| self.first_held(&self.imagined[i], component));
+                components[i].insert(component, rounded(geometric_mean(without, mask)));
+                let gains = with.iter().zip(without).enumerate();
+                for (at, (with, without)) in gains {
+                    if mask.is_some_and(|mask| !mask[at]) {
+                        continue;
+                    }
+                    let place = held.as_ref().map_or(at, |held| at * n_steps + held[at]);
+                    credit[i][place] += share * f64::from(with - without);
+                }
+            }
+        }
+        let config = reference.config;
+        let scores = components.into_iter();
+        Some(LeaveOneOut {
+            metametric: scores
+                .map(|found| Scores::of_components(config, found).metametric)
+                .collect(),
+            agents: log.agents.clone(),
+            n_steps,
+            credit,
+        })
+    }
+
+    /// The step at which an indication first holds, by agent; the last if it never does.
+    fn first_held(&self, features: &Features, component: Component) -> Vec<usize> {
+        let vehicles_only = component == Component::TrafficLightViolation;
+        let holds = self.reference.indicated(features, component, vehicles_only);
+        let last = features.n_steps - 1;
+        let agents = holds.chunks(features.n_steps);
+        agents
+            .map(|own| own.iter().position(|&holds| holds).unwrap_or(last))
+            .collect()
+    }
+}
