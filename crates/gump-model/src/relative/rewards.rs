@@ -1,10 +1,11 @@
 //! Learning from one's own rollouts: what a rollout adds to the realism of a group of them.
 //!
 //! Futures of a scene are drawn by the network alone and compared with the log by the metric of
-//! Waymo's Sim Agents Challenge. What each of them adds (its leave-one-out value, split by agent and
-//! step) is the reward of the moves up to that step, as in RLFTSim (Ahmadi et al., "Fine-tuning
-//! Generative Traffic Simulation via Reinforcement Learning", 2025), who take whole scenes. Moves that
-//! earned more than those of the other futures become likelier, the others less likely.
+//! Waymo's Sim Agents Challenge. What each of them adds (its leave-one-out value) is the reward, as in
+//! RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent Traffic Simulation via
+//! Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and step: a move earns what
+//! came after it. Moves that earned more than those of the other futures become likelier, the others
+//! less likely.
 
 use serde::{Deserialize, Serialize};
 
@@ -158,50 +159,23 @@ fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     }
 }
 
-/// Each future as a sample whose moves weigh what they earned, in standard deviations of the group.
+/// Each future as a sample whose moves weigh what they earned; `None` if all earned the same.
 fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Option<Vec<Sample>> {
+    let per_move = (TOKEN_DT / scenario.dt).round() as usize;
+    let n_moves = worth.n_steps / per_move;
+    let earnings = standardized(&worth.credit, |credit| {
+        let agents = credit.chunks(worth.n_steps);
+        agents.flat_map(|own| to_go(own, per_move)).collect()
+    })?;
     let stride = stride_of(scenario.dt);
-    let start = scenario.now % stride;
-    let first_move = scenario.now / stride;
+    let (start, first_move) = (scenario.now % stride, scenario.now / stride);
     let now = &scenario.log[scenario.now];
     let ids: Vec<AgentId> = now.agents().iter().map(|agent| agent.id).collect();
-    let scored: Vec<Option<usize>> = ids
-        .iter()
-        .map(|id| worth.agents.iter().position(|agent| agent == id))
-        .collect();
-    let per_move = (TOKEN_DT / scenario.dt).round() as usize;
-    // What a move earned: all that came of it, from its own step on.
-    let n_moves = worth.n_steps / per_move;
-    let mut earned = vec![vec![0.0; worth.agents.len() * n_moves]; futures.len()];
-    for (earned, credit) in earned.iter_mut().zip(&worth.credit) {
-        let agents = earned
-            .chunks_mut(n_moves)
-            .zip(credit.chunks(worth.n_steps));
-        for (earned, credit) in agents {
-            let mut sum = 0.0;
-            for k in (0..n_moves).rev() {
-                sum += credit[k * per_move..][..per_move].iter().sum::<f64>();
-                earned[k] = sum;
-            }
-        }
-    }
-    let n = futures.len() as f64;
-    let mut squares = 0.0;
-    for at in 0..worth.agents.len() * n_moves {
-        let mean = earned.iter().map(|earned| earned[at]).sum::<f64>() / n;
-        for earned in &mut earned {
-            earned[at] -= mean;
-            squares += earned[at] * earned[at];
-        }
-    }
-    let spread = (squares / (n * (worth.agents.len() * n_moves) as f64)).sqrt();
-    // NaN must not pass.
-    if !(spread > LEAST) {
-        return None;
-    }
+    let scored = |id: &AgentId| worth.agents.iter().position(|agent| agent == id);
+    let scored: Vec<Option<usize>> = ids.iter().map(scored).collect();
     let centre = now.agent(scenario.ego)?.state.pose.position;
     let map = VectorMap::new(&scenario.map, centre, MAP_M, Hidden::default());
-    let samples = futures.iter().zip(&earned).map(|(future, earned)| {
+    let samples = futures.iter().zip(&earnings).map(|(future, earned)| {
         let mut log = scenario.log[..=scenario.now].to_vec();
         log.extend(future.imagined().iter().cloned());
         let driven = Scenario {
@@ -211,11 +185,45 @@ fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Opti
         let mut sample = whole(&driven, start, &ids, &map)?;
         sample.weigh(|agent, frame| {
             let own = scored[agent].zip(frame.checked_sub(first_move));
-            own.map_or(0.0, |(agent, k)| {
-                (earned[agent * n_moves + k] / spread).clamp(-MOST, MOST) as f32
-            })
+            own.map_or(0.0, |(agent, k)| earned[agent * n_moves + k] as f32)
         });
         Some(sample)
     });
     samples.collect()
+}
+
+/// What is earned from each move on, given what is earned at each step.
+fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
+    let mut earned: Vec<f64> = credit
+        .chunks_exact(per_move)
+        .map(|steps| steps.iter().sum())
+        .collect();
+    for k in (1..earned.len()).rev() {
+        earned[k - 1] += earned[k];
+    }
+    earned
+}
+
+/// What each future earned beyond the mean of all, in standard deviations of the group; `None` if
+/// that says nothing.
+fn standardized(credit: &[Vec<f64>], earned: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Vec<f64>>> {
+    let mut all: Vec<Vec<f64>> = credit.iter().map(|credit| earned(credit)).collect();
+    let n = all.len() as f64;
+    let n_moves = all.first()?.len();
+    let mut squares = 0.0;
+    for at in 0..n_moves {
+        let mean = all.iter().map(|earned| earned[at]).sum::<f64>() / n;
+        for earned in &mut all {
+            earned[at] -= mean;
+            squares += earned[at] * earned[at];
+        }
+    }
+    let spread = (squares / (n * n_moves as f64)).sqrt();
+    if spread.is_nan() || spread <= LEAST {
+        return None;
+    }
+    for earned in all.iter_mut().flatten() {
+        *earned = (*earned / spread).clamp(-MOST, MOST);
+    }
+    Some(all)
 }

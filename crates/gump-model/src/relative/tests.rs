@@ -262,7 +262,12 @@ fn rollouts_are_judged_by_the_moves_they_made() {
     let too_short = fixture::scenario(
         "lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0\nhistory 1.0 future 2.0 dt 0.1",
     );
-    assert!(judged.group(&too_short.unwrap(), Seed(2)).unwrap().is_none());
+    assert!(
+        judged
+            .group(&too_short.unwrap(), Seed(2))
+            .unwrap()
+            .is_none()
+    );
     let alone = RelativeRewards {
         rollouts: 1,
         ..RelativeRewards::default()

@@ -342,7 +342,9 @@ impl RelativeTrainer {
         let rewards = self.config.realism.as_ref();
         let judged_total = rewards.map_or(1.0, |rewards| n_judged as f64 / rewards.weight);
         let imitated = samples.par_iter().map(|sample| (sample, true));
-        let preferred = judged.par_iter().filter(|sample| !sample.targets.is_empty());
+        let preferred = judged
+            .par_iter()
+            .filter(|sample| !sample.targets.is_empty());
         let all = imitated.chain(preferred.map(|sample| (sample, false)));
         let parts = all.map(|(sample, imitates)| {
             let deferred = Deferred::default();
