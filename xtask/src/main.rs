@@ -26,6 +26,8 @@ mod peers;
 mod planners;
 mod progress;
 mod recordings;
+#[cfg(feature = "grpc")]
+mod remote;
 mod report;
 mod rollout_files;
 mod run;

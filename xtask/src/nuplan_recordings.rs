@@ -81,5 +81,6 @@ fn case(log: &Log, selected: &Selected, maps: &mut Maps) -> anyhow::Result<Case>
         recording: Recording::new(scenario, ego, VehicleParameters::PACIFICA, read.goal)?,
         map,
         after: read.ego_after,
+        map_name: log.map_name().into(),
     })
 }

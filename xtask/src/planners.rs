@@ -1,8 +1,12 @@
 //! Planners by name, with a clock: `log`, `idm`, `simple`, `pdm-closed`, `imitation` and
-//! `interactive`.
+//! `interactive`; and `grpc:HOST:PORT`, one in another process.
 
+use std::ffi::OsStr;
+use std::fmt;
 use std::time::{Duration, Instant};
 
+use clap::builder::{EnumValueParser, PossibleValue, TypedValueParser};
+use clap::{Arg, Command};
 use gump_model::Device;
 use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
 use gump_nuplan::reactive_agents::NuplanIdm;
@@ -14,7 +18,7 @@ use gump_planner::{
 use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use crate::cli::WrongArguments;
 use crate::recordings::Case;
@@ -78,6 +82,91 @@ impl PlannerName {
                 return Err(WrongArguments(wrong.into()).into());
             }
         })
+    }
+}
+
+/// Who plans: one of ours, or whoever serves nuPlan's planner protocol.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Chosen {
+    /// One of ours.
+    Ours(PlannerName),
+    /// The one at `HOST:PORT`.
+    Remote(String),
+}
+
+impl Chosen {
+    /// Refuses what this build cannot call.
+    ///
+    /// Error: [`WrongArguments`] for a planner in another process, in a build without `grpc`.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        if matches!(self, Self::Remote(_)) && !cfg!(feature = "grpc") {
+            let wrong = format!(
+                "--planner {self}: expected a build with the feature grpc, found one without; \
+                 use cargo run -p xtask --features grpc -- evaluate closed-loop"
+            );
+            return Err(WrongArguments(wrong).into());
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Chosen {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Ours(planner) => f.write_str(planner.name()),
+            Self::Remote(address) => write!(f, "{REMOTE}{address}"),
+        }
+    }
+}
+
+impl Serialize for Chosen {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// How planners in other processes begin.
+const REMOTE: &str = "grpc:";
+
+/// Reads a [`Chosen`], and lists ours in the help.
+#[derive(Clone)]
+pub(crate) struct ChosenParser;
+
+impl TypedValueParser for ChosenParser {
+    type Value = Chosen;
+
+    fn parse_ref(
+        &self,
+        command: &Command,
+        arg: Option<&Arg>,
+        value: &OsStr,
+    ) -> Result<Chosen, clap::Error> {
+        let told = value.to_str().unwrap_or_default();
+        if told.starts_with(REMOTE) {
+            return remote.parse_ref(command, arg, value);
+        }
+        let ours = EnumValueParser::<PlannerName>::new();
+        ours.parse_ref(command, arg, value).map(Chosen::Ours)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let elsewhere = "The planner that serves nuPlan's planner protocol there, any language";
+        let elsewhere = PossibleValue::new("grpc:HOST:PORT").help(elsewhere);
+        let ours = EnumValueParser::<PlannerName>::new();
+        let ours: Vec<_> = ours.possible_values().into_iter().flatten().collect();
+        Some(Box::new(ours.into_iter().chain([elsewhere])))
+    }
+}
+
+/// `grpc:HOST:PORT`.
+fn remote(told: &str) -> Result<Chosen, String> {
+    let address = told.strip_prefix(REMOTE).unwrap_or(told);
+    let port = address
+        .rsplit_once(':')
+        .filter(|(host, _)| !host.is_empty());
+    match port.and_then(|(_, port)| port.parse().ok()) {
+        Some(1u16..) => Ok(Chosen::Remote(address.into())),
+        _ => Err("expected grpc:HOST:PORT with a port from 1 to 65535".into()),
     }
 }
 

@@ -17,6 +17,12 @@ pub(crate) struct Case {
     pub(crate) map: Arc<MapGraph>,
     /// What was driven after the recording's end, if that is known.
     pub(crate) after: Vec<EgoState>,
+    /// nuPlan's name of the map; empty for other formats.
+    #[cfg_attr(
+        not(feature = "grpc"),
+        expect(dead_code, reason = "planners in other processes are told it")
+    )]
+    pub(crate) map_name: String,
 }
 
 /// A case or why there is none, by the name of its scenario.
@@ -120,5 +126,6 @@ fn of_boxes(mut scenario: Scenario) -> anyhow::Result<Case> {
         recording: Recording::of_boxes(scenario)?,
         map,
         after: Vec::new(),
+        map_name: String::new(),
     })
 }

@@ -82,6 +82,25 @@ fn text(bytes: &[u8]) -> String {
 }
 
 #[test]
+fn planners_in_other_processes_have_an_address() {
+    let place = Workplace::new();
+    let words = "evaluate closed-loop --scenarios scene.tfrecord --world log --planner";
+    for wrong in [
+        "grpc:",
+        "grpc:nowhere",
+        "grpc:localhost:0",
+        "grpc:localhost:70000",
+    ] {
+        let expected = "expected grpc:HOST:PORT with a port from 1 to 65535";
+        place.check(&format!("{words} {wrong}"), 2, &[wrong, expected]);
+    }
+    if !cfg!(feature = "grpc") {
+        let expected = "expected a build with the feature grpc, found one without";
+        place.check(&format!("{words} grpc:localhost:50051"), 2, &[expected]);
+    }
+}
+
+#[test]
 fn numbers_that_cannot_be_meant_are_told_plainly() {
     let place = Workplace::new();
     let simulate = "simulate --scenario scene.tfrecord --world idm";

@@ -1,10 +1,12 @@
 //! Messages of the Waymo Open Dataset, written by hand from their published field numbers
 //! (package `waymo.open_dataset`, proto2). Lidar and camera fields are not listed and so skipped.
+//! Those of nuPlan's planner protocol are in [`nuplan`].
 //!
 //! Fields are named as in the schema. Optional fields keep proto2's meaning: absent is `None`.
 //! Repeated numbers are read packed and unpacked alike; each is written as the schema says.
 
 pub mod motion;
+pub mod nuplan;
 
 /// A recorded scenario of the motion dataset.
 #[derive(Clone, PartialEq, prost::Message)]

@@ -8,7 +8,7 @@ import pytest
 
 import gump
 from conftest import GOLDEN, content, document
-from gump.compat import catk, trajtok, waymo
+from gump.compat import catk, pufferdrive, trajtok, waymo
 
 TOLERANCE = 1e-6
 CONFIGS = [
@@ -190,3 +190,86 @@ def test_trajtok(record, noise, golden):
         metric.update(None, [record], rollouts.agent_id, np.zeros(n, int), twice)
     with pytest.raises(KeyError, match="agent_id"):
         trajtok.compute_scenario_metrics_for_bundle(None, record, {"simulated_states": rollouts.states})
+
+
+@pytest.fixture(scope="module")
+def puffer(scenes):
+    """Two scenes as PufferDrive hands them over, their rollouts, and the scores of the scenes as they are."""
+    rng, rollouts = np.random.default_rng(0), 6
+    truth, simulated, state, edges, expected = {}, {}, {}, {}, {}
+
+    def add(into, **columns):
+        for name, column in columns.items():
+            into.setdefault(name, []).append(np.asarray(column))
+
+    for scene in (scenes[0], scenes[2]):
+        tracks, agents = scene.tracks, scene.simulated
+        rows = np.searchsorted(tracks.agent_id, agents)
+        log, heading = np.nan_to_num(tracks.position[rows]), np.nan_to_num(tracks.heading[rows])
+        states = np.zeros((rollouts, len(rows), 80, 4), np.float32)
+        states[..., :2] = log[:, scene.now, None, :2] + np.cumsum(rng.normal(0, 0.3, (*states.shape[:3], 2)), axis=2)
+        states[..., 2], states[..., 3] = log[:, scene.now, 2, None], heading[:, scene.now, None]
+        ids = np.where(np.isin(agents, [*scene.targets, scene.ego]), agents, -1)
+        told = np.concatenate([np.zeros((len(rows), rollouts, 11, 4)), states.transpose(1, 0, 2, 3)], axis=2)
+        names = np.full((len(rows), 1), scene.id)
+        valid = tracks.valid[rows][:, None]
+        add(truth, x=log[:, None, :, 0], y=log[:, None, :, 1], heading=heading[:, None], valid=valid)
+        add(truth, id=ids[:, None], scenario_id=names)
+        add(simulated, x=told[..., 0], y=told[..., 1], heading=told[..., 3])
+        add(simulated, id=np.broadcast_to(ids[:, None, None], told.shape[:3]))
+        size = tracks.size[rows, scene.now]
+        add(state, length=size[:, 0], width=size[:, 1], kind=[tracks.kind[row] for row in rows])
+        lines = scene.map.road_edges
+        add(edges, x=np.concatenate(lines)[:, 0], y=np.concatenate(lines)[:, 1])
+        add(edges, lengths=[len(line) for line in lines], scenario_id=[scene.id] * len(lines))
+        expected[scene.id] = gump.wosac.score(scene, agents, states, 2024)
+    given = [{name: np.concatenate(column) for name, column in one.items()} for one in (truth, simulated, state, edges)]
+    return given, expected
+
+
+def rows_of(table):
+    return table.to_dict("index") if hasattr(table, "to_dict") else table
+
+
+def test_pufferdrive(puffer):
+    given, expected = puffer
+    found = rows_of(pufferdrive.WOSACEvaluator({}).compute_metrics(*given))
+    assert list(found) == list(expected)
+    # What heights do not enter is the same.
+    same = ("angular_speed", "angular_acceleration", "distance_to_nearest_object", "time_to_collision", "collision_indication")
+    for name, scores in expected.items():
+        for part in same:
+            assert found[name][f"likelihood_{part}"] == getattr(scores, f"{part}_likelihood"), part
+        assert found[name]["realism_meta_score"] == pytest.approx(scores.metametric, abs=0.01)
+        assert found[name]["num_collisions_sim"] == pytest.approx(6 * scores.simulated_collision_rate)
+    means = pufferdrive.WOSACEvaluator().compute_metrics(*given, aggregate_results=True)
+    assert means["realism_meta_score"] == pytest.approx(np.mean([row["realism_meta_score"] for row in found.values()]))
+    assert means["total_num_agents"] == sum(row["num_agents"] for row in found.values())
+
+
+def test_pufferdrive_from_the_present_on(puffer):
+    given, expected = puffer
+    later = [{name: a[..., 10:] if a.ndim == 3 else a for name, a in one.items()} for one in given]
+    found = rows_of(pufferdrive.WOSACEvaluator().compute_metrics(*later))
+    for name, scores in expected.items():
+        assert found[name]["realism_meta_score"] == pytest.approx(scores.metametric, abs=0.02)
+
+
+def test_what_pufferdrives_function_refuses(puffer):
+    (truth, simulated, state, edges), _ = puffer
+    compute = pufferdrive.WOSACEvaluator().compute_metrics
+    with pytest.raises(ValueError, match=r"x: expected an array of shape \[A, R, 81\] or \[A, R, 91\], found"):
+        compute(truth, {**simulated, "x": simulated["x"][..., :50]}, state, edges)
+    with pytest.raises(ValueError, match="y: expected a log of shape"):
+        compute({**truth, "y": truth["y"][:, 0]}, simulated, state, edges)
+    with pytest.raises(ValueError, match="id: expected .* for agent 0 as in the log, found"):
+        compute(truth, {**simulated, "id": simulated["id"] + 1}, state, edges)
+    with pytest.raises(ValueError, match="road_edge_polylines: expected"):
+        compute(truth, simulated, state, {**edges, "x": edges["x"][1:]})
+    with pytest.raises(ValueError, match="expected an agent with an id of 0 or more at the present, found none"):
+        nobody = {"id": np.full_like(truth["id"], -1)}
+        compute({**truth, **nobody}, {**simulated, "id": np.full_like(simulated["id"], -1)}, state, edges)
+    with pytest.raises(ValueError, match="kind: expected vehicle, pedestrian, bicycle or other, found tram"):
+        compute(truth, simulated, {**state, "kind": ["tram"] * len(state["length"])}, edges)
+    with pytest.raises(KeyError, match="lengths"):
+        compute(truth, simulated, state, {})

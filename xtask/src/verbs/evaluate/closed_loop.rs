@@ -20,7 +20,7 @@ use crate::benchmark::{Found, Scenes};
 use crate::charts;
 use crate::cli::WrongArguments;
 use crate::futures;
-use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
+use crate::planners::{Chosen, ChosenParser, PlannerName, Surroundings, Thinking, Timed};
 use crate::recordings::{self, Case, Named};
 use crate::run::{Common, Run, interrupted};
 use crate::tables;
@@ -45,8 +45,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
     /// Who plans; several, apart by commas, for several rows
-    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
-    planner: Vec<PlannerName>,
+    #[arg(long, value_parser = ChosenParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
+    planner: Vec<Chosen>,
     /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, for several tables
     #[arg(long, value_name = "W", default_value = "idm", num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
@@ -167,6 +167,7 @@ impl Drives {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
+        self.planner.iter().try_for_each(Chosen::check)?;
         let sampling = self.sampling.resolve()?;
         let found = run.phase("find", |_| self.scenarios.find())?;
         run.result("set", &found.set)?;
@@ -186,7 +187,7 @@ impl Args {
                 Surroundings::load(run.device(), world, &sampling)
             })?;
             let mut drives = Vec::new();
-            for &planner in &self.planner {
+            for planner in &self.planner {
                 let drive = Drive {
                     args: self,
                     found: &found,
@@ -240,17 +241,39 @@ struct Drive<'a> {
 
 impl Drive<'_> {
     /// The rows of a planner; nearly all have one.
-    fn all(&self, run: &Run, planner: PlannerName) -> anyhow::Result<Vec<Drives>> {
-        if planner != PlannerName::Proposals {
-            let thinking = &self.args.thinking;
-            let entries = self.through(run, planner.name(), &|case, seed| {
-                planner.build(case, self.imagination, seed, thinking)
-            })?;
-            return Ok(vec![Drives {
-                planner: planner.name().into(),
-                entries,
-            }]);
-        }
+    fn all(&self, run: &Run, planner: &Chosen) -> anyhow::Result<Vec<Drives>> {
+        let name = planner.to_string();
+        let entries = match planner {
+            Chosen::Ours(PlannerName::Proposals) => return self.proposals(run),
+            Chosen::Ours(planner) => self.through(run, &name, &|case, seed| {
+                planner.build(case, self.imagination, seed, &self.args.thinking)
+            })?,
+            Chosen::Remote(address) => self.remote(run, &name, address)?,
+        };
+        Ok(vec![Drives {
+            planner: name,
+            entries,
+        }])
+    }
+
+    /// Drives by a planner in another process, one after another as it plans for one at a time.
+    #[cfg(feature = "grpc")]
+    fn remote(&self, run: &Run, name: &str, address: &str) -> anyhow::Result<Vec<Entry>> {
+        let limit = self.args.driving.budget();
+        self.turns(run, name, false, &|case, _| {
+            let driver = crate::remote::RemoteDriver::new(address, &case.map_name, limit);
+            Ok(Box::new(driver))
+        })
+    }
+
+    #[cfg(not(feature = "grpc"))]
+    fn remote(&self, _: &Run, _: &str, address: &str) -> anyhow::Result<Vec<Entry>> {
+        Chosen::Remote(address.into()).check()?;
+        Ok(Vec::new())
+    }
+
+    /// Every proposal alone, as two rows.
+    fn proposals(&self, run: &Run) -> anyhow::Result<Vec<Drives>> {
         let all = PdmConfig::default();
         let mut alone = Vec::new();
         for &lateral_offset in &all.lateral_offsets {
@@ -277,11 +300,22 @@ impl Drive<'_> {
         Ok(best_and_oracle(alone))
     }
 
-    /// Drives every scenario; those that fail say why.
+    /// Drives every scenario, several side by side; those that fail say why.
     fn through<'d>(
         &self,
         run: &Run,
         name: &str,
+        build: Build<'_, 'd>,
+    ) -> anyhow::Result<Vec<Entry>> {
+        self.turns(run, name, true, build)
+    }
+
+    /// As [`Drive::through`], side by side or one after another.
+    fn turns<'d>(
+        &self,
+        run: &Run,
+        name: &str,
+        side_by_side: bool,
         build: Build<'_, 'd>,
     ) -> anyhow::Result<Vec<Entry>> {
         let args = self.args;
@@ -291,7 +325,7 @@ impl Drive<'_> {
         let total = args.limit.map_or(0, NonZeroUsize::get) as u64;
         let progress = run.progress(&label, total, "scenarios");
         let film_error = Mutex::new(None);
-        let entries = evaluate(cases, |i, named: Named| {
+        let work = |i: usize, named: Named| {
             let seed = run.seed().fork(i as u64);
             let finished = named.case.and_then(|case| {
                 let mut driver = build(&case, seed)?;
@@ -314,7 +348,11 @@ impl Drive<'_> {
                     Err(error) => Err(format!("{error:#}")),
                 },
             }
-        });
+        };
+        let entries = match side_by_side {
+            true => evaluate(cases, work),
+            false => cases.enumerate().map(|(i, named)| work(i, named)).collect(),
+        };
         let failed = film_error
             .into_inner()
             .expect("nobody panics while holding it");

@@ -1,0 +1,247 @@
+//! A planner in another process, by nuPlan's planner protocol: `grpc:HOST:PORT`.
+//!
+//! The protocol is the one that nuPlan's challenges called planners by (service
+//! `DetectionTracksChallenge`): where to go is told once per drive, and at every step a trajectory
+//! is asked for. A server plans for one drive at a time, so whoever uses [`RemoteDriver`] lets one
+//! drive end before the next begins. The bytes of the history are in `pickle.rs`, the connection in
+//! `client.rs`.
+
+mod client;
+mod pickle;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use gump_geometry::{Pose, dvec2};
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
+use gump_planner::{Considered, Explain};
+use gump_proto::nuplan as proto;
+use gump_rollout::BoxError;
+use gump_scene::{EgoState, LightState, VehicleParameters};
+
+use client::Client;
+
+/// How long a planner may load maps and weights before it drives.
+const TO_INITIALIZE: Duration = Duration::from_secs(60);
+/// How long it may think about a step where no budget is set; the challenges allowed one second.
+const TO_PLAN: Duration = Duration::from_secs(30);
+/// Moments that nuPlan's planners see: the present and 2.1 s before it, at 10 Hz.
+const BUFFER: usize = 22;
+
+/// Why a planner elsewhere has no plan.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RemoteError {
+    /// Nobody is there.
+    #[error("expected a planner at {address}, found none: {what}")]
+    Unreachable {
+        /// Where it was looked for.
+        address: String,
+        /// What the network says.
+        what: String,
+    },
+    /// It thinks for too long.
+    #[error("expected an answer to {call} within {seconds} s, found none")]
+    Late {
+        /// What was asked.
+        call: &'static str,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// It says why there is no answer.
+    #[error("expected an answer to {call}, found the error {code}: {message}")]
+    Refused {
+        /// What was asked.
+        call: &'static str,
+        /// gRPC's name of the error.
+        code: String,
+        /// What the planner says.
+        message: String,
+    },
+    /// A state without a pose.
+    #[error("state {state} of the trajectory: expected a rear_axle_pose, found none")]
+    NoPose {
+        /// Which one.
+        state: usize,
+    },
+    /// A trajectory of another time.
+    #[error(
+        "expected a trajectory over {now_us} to {next_us} µs, found one over {from_us} to {to_us}"
+    )]
+    OtherTime {
+        /// The present.
+        now_us: i64,
+        /// The next step.
+        next_us: i64,
+        /// Time of its first state.
+        from_us: i64,
+        /// Time of its last state.
+        to_us: i64,
+    },
+    /// A light whose lane the protocol has no number for.
+    #[error(
+        "the light of lane {0}: expected a lane below 2147483648, as the protocol has 32 bits for it"
+    )]
+    Lane(i64),
+    /// Asked to drive before it was told where to go.
+    #[error("the planner was asked to drive before it was given a mission")]
+    NoMission,
+}
+
+/// Drives as a planner in another process says.
+pub(crate) struct RemoteDriver {
+    name: String,
+    address: String,
+    map_name: String,
+    to_plan: Duration,
+    begun: Option<(Client, VehicleParameters)>,
+}
+
+impl RemoteDriver {
+    /// The planner at `HOST:PORT`, for a drive on nuPlan's map of that name (empty for maps that are
+    /// not nuPlan's); a step may take `limit`, 30 s without one.
+    pub(crate) fn new(address: &str, map_name: &str, limit: Option<Duration>) -> Self {
+        Self {
+            name: format!("grpc:{address}"),
+            address: address.into(),
+            map_name: map_name.into(),
+            to_plan: limit.unwrap_or(TO_PLAN),
+            begun: None,
+        }
+    }
+}
+
+impl Driver for RemoteDriver {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        let mut client = Client::connect(&self.address)?;
+        let message = initialization(mission, &self.map_name);
+        let proto::Empty {} = client.call("InitializePlanner", message, TO_INITIALIZE)?;
+        self.begun = Some((client, mission.vehicle));
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let (client, vehicle) = self.begun.as_mut().ok_or(RemoteError::NoMission)?;
+        let message = input(moment, vehicle)?;
+        let told: proto::Trajectory = client.call("ComputeTrajectory", message, self.to_plan)?;
+        trajectory(&told, moment)
+    }
+}
+
+impl Explain for RemoteDriver {
+    fn considered(&self) -> Vec<Considered> {
+        vec![Considered::alone("what the planner said", Vec::new())]
+    }
+}
+
+fn initialization(mission: &Mission<'_>, map_name: &str) -> proto::PlannerInitializationLight {
+    let blocks = mission.route.map(|route| route.roadblocks.as_slice());
+    let blocks = blocks.unwrap_or_default().iter();
+    proto::PlannerInitializationLight {
+        route_roadblock_ids: blocks.map(|block| block.0.to_string()).collect(),
+        mission_goal: mission.goal.map(|goal| proto::StateSe2 {
+            x: goal.position.x as f32,
+            y: goal.position.y as f32,
+            heading: goal.heading as f32,
+        }),
+        map_name: map_name.into(),
+    }
+}
+
+/// What is new: at first the past too, then the present alone.
+fn input(
+    moment: &Moment<'_>,
+    vehicle: &VehicleParameters,
+) -> Result<proto::PlannerInput, RemoteError> {
+    let first = moment.iteration == 0;
+    let n = match first {
+        true => BUFFER
+            .min(moment.past.len() + 1)
+            .min(moment.scene.history.len()),
+        false => 1,
+    };
+    let past = &moment.past[moment.past.len() + 1 - n..];
+    let frames = &moment.scene.history[moment.scene.history.len() - n..];
+    let egos = past.iter().chain([moment.ego]);
+    let observed = frames.iter().zip(egos.clone());
+    let history = proto::SimulationHistoryBuffer {
+        ego_states: egos.map(|ego| pickle::ego_state(ego, vehicle)).collect(),
+        observations: observed
+            .map(|(frame, ego)| pickle::detections(frame, moment.scene.ego, ego.time_us))
+            .collect(),
+        sample_interval: first.then_some(moment.scene.dt as f32),
+    };
+    Ok(proto::PlannerInput {
+        simulation_iteration: Some(proto::SimulationIteration {
+            time_us: moment.ego.time_us,
+            index: moment.iteration as i32,
+        }),
+        simulation_history_buffer: Some(history),
+        traffic_light_data: lights(moment)?,
+    })
+}
+
+fn lights(moment: &Moment<'_>) -> Result<Vec<proto::TrafficLightStatusData>, RemoteError> {
+    let lights = moment.scene.now().lights().iter();
+    let lights = lights.map(|light| {
+        let name = match light.state {
+            LightState::Green => "GREEN",
+            LightState::Yellow => "YELLOW",
+            LightState::Red => "RED",
+            LightState::Unknown => "UNKNOWN",
+        };
+        let lane = light.lane.0;
+        Ok(proto::TrafficLightStatusData {
+            status: Some(proto::TrafficLightStatusType {
+                status_name: name.into(),
+            }),
+            lane_connector_id: i32::try_from(lane).map_err(|_| RemoteError::Lane(lane))?,
+            timestamp: moment.ego.time_us,
+        })
+    });
+    lights.collect()
+}
+
+/// A trajectory that can be driven from now on.
+fn trajectory(told: &proto::Trajectory, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    let states = told.ego_states.iter().enumerate();
+    let states = states.map(|(i, state)| ego_state(i, state));
+    let trajectory = Trajectory::new(states.collect::<Result<_, _>>()?)?;
+    let now_us = moment.ego.time_us;
+    let next_us = now_us + (moment.scene.dt * 1e6).round() as i64;
+    if trajectory.start_us() > now_us || trajectory.end_us() < next_us {
+        let other = RemoteError::OtherTime {
+            now_us,
+            next_us,
+            from_us: trajectory.start_us(),
+            to_us: trajectory.end_us(),
+        };
+        return Err(other.into());
+    }
+    Ok(trajectory)
+}
+
+fn ego_state(i: usize, told: &proto::EgoState) -> Result<EgoState, RemoteError> {
+    let pose = told
+        .rear_axle_pose
+        .ok_or(RemoteError::NoPose { state: i })?;
+    let vector = |vector: Option<proto::StateVector2D>| {
+        let vector = vector.unwrap_or_default();
+        dvec2(vector.x.into(), vector.y.into())
+    };
+    Ok(EgoState {
+        time_us: told.time_us,
+        rear_axle: Pose::new(pose.x.into(), pose.y.into(), pose.heading.into()),
+        velocity: vector(told.rear_axle_velocity_2d),
+        acceleration: vector(told.rear_axle_acceleration_2d),
+        steering_angle: told.tire_steering_angle.into(),
+        steering_rate: 0.0,
+        yaw_rate: told.angular_vel.into(),
+        yaw_acceleration: told.angular_accel.into(),
+    })
+}
