@@ -85,7 +85,12 @@ fn text(bytes: &[u8]) -> String {
 fn planners_in_other_processes_have_an_address() {
     let place = Workplace::new();
     let words = "evaluate closed-loop --scenarios scene.tfrecord --world log --planner";
-    for wrong in ["grpc:", "grpc:nowhere", "grpc:localhost:0", "grpc:localhost:70000"] {
+    for wrong in [
+        "grpc:",
+        "grpc:nowhere",
+        "grpc:localhost:0",
+        "grpc:localhost:70000",
+    ] {
         let output = place.run(&format!("{words} {wrong}"));
         let error = text(&output.stderr);
         let expected = "expected grpc:HOST:PORT with a port from 1 to 65535";
