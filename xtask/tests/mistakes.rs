@@ -91,8 +91,11 @@ fn planners_in_other_processes_have_an_address() {
         "grpc:localhost:0",
         "grpc:localhost:70000",
     ] {
+        let output = place.run(&format!("{words} {wrong}"));
+        let error = text(&output.stderr);
         let expected = "expected grpc:HOST:PORT with a port from 1 to 65535";
-        place.check(&format!("{words} {wrong}"), 2, &[wrong, expected]);
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(wrong) && error.contains(expected), "{error}");
     }
     if !cfg!(feature = "grpc") {
         let expected = "expected a build with the feature grpc, found one without";
