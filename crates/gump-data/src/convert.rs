@@ -14,14 +14,13 @@ use gump_scene::Scenario;
 use prost::Message as _;
 use serde::Serialize;
 
-use crate::cache::ShardWriter;
-use crate::stream::io_error;
+use crate::formats::cache::ShardWriter;
+use crate::formats::{scenario_json, womd};
+use crate::io::stream::io_error;
+use crate::io::tfrecord;
 #[cfg(feature = "parquet")]
 use crate::tracks::TrackTable;
-use crate::{
-    DataError, ReadOptions, ReadReport, Reader, open_files, scenario_json, tfrecord, womd,
-    write_atomically,
-};
+use crate::{DataError, ReadOptions, ReadReport, Reader, open_files, write_atomically};
 
 /// What is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -28,6 +28,10 @@ impl fmt::Display for Place {
     }
 }
 
+/// Name of the file that marks a folder whose making was begun and not finished: what is there is
+/// sound, but it is not all. No reader takes such a folder.
+pub const INCOMPLETE: &str = "CACHE-INCOMPLETE";
+
 /// Why data could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
@@ -270,7 +274,7 @@ pub enum DataError {
     #[error(
         "expected a finished data set, found {} in {}: the conversion that made it was stopped; \
          the same command finishes it",
-        crate::INCOMPLETE,
+        INCOMPLETE,
         path.display()
     )]
     Incomplete {

@@ -29,7 +29,8 @@
 //! * **stated** is what a format says, **inferred** what a reader adds, **dropped** what a reader
 //!   leaves out because [`Scenario`](gump_scene::Scenario) has no room for it or it is unusable.
 //!
-//! A new format is one file beside `womd` and one line in the table of `files`.
+//! A new format is one file beside `womd` in `formats` and one line in the table of
+//! `formats/registry.rs`.
 //!
 //! # Features
 //! All are on by default. Without any, Waymo's and GPUDrive's files, Scenario-JSON and the cache are
@@ -47,63 +48,43 @@
     allow(dead_code, reason = "what formats share is not used by each")
 )]
 
-#[cfg(feature = "argoverse2")]
-mod argoverse2;
-pub mod cache;
-#[cfg(feature = "parquet")]
-mod columns;
-#[cfg(feature = "commonroad")]
-mod commonroad;
+mod complete;
 mod convert;
-mod document;
 mod error;
-mod features;
-mod files;
-mod gpudrive;
-mod infer;
+mod formats;
 mod inspect;
-mod json;
-#[cfg(any(feature = "argoverse2", feature = "commonroad", feature = "taf-bw"))]
-mod lanelet;
-mod motion;
-#[cfg(feature = "nuplan")]
-pub mod nuplan;
+mod io;
 mod open;
+mod parse;
 mod record;
-mod recording;
 #[cfg(feature = "parquet")]
 mod rollouts;
-pub mod scenario_json;
-mod stream;
+mod source;
 pub mod submission;
-#[cfg(feature = "sumo")]
-pub mod sumo;
-#[cfg(feature = "parquet")]
-mod table;
-#[cfg(feature = "taf-bw")]
-mod taf_bw;
-pub mod tfrecord;
 #[cfg(feature = "parquet")]
 mod tracks;
 mod verify;
-pub mod womd;
-mod write_atomically;
-#[cfg(any(feature = "commonroad", feature = "taf-bw"))]
-mod xml;
 
 pub use convert::{Converted, OutputFormat, convert, groups};
-pub use error::{DataError, Place, Problem};
-pub use files::{INCOMPLETE, list as list_files, list_unfinished};
+pub use error::{DataError, INCOMPLETE, Place, Problem};
+#[cfg(feature = "nuplan")]
+pub use formats::nuplan;
+#[cfg(feature = "sumo")]
+pub use formats::sumo;
+pub use formats::{cache, scenario_json, womd};
 pub use inspect::{Summary, inspect, inspect_with};
+pub use io::files::{list as list_files, list_unfinished};
+#[cfg(feature = "parquet")]
+pub use io::table::Table;
+pub use io::tfrecord;
+pub use io::write_atomically::write_atomically;
 pub use open::{Reader, find, find_map, find_record, open, open_files, open_with};
+pub use parse::{parse, parse_json};
 pub use record::{MAX_NOTES, Note, ReadOptions, ReadReport, ScenarioRecord};
 #[cfg(feature = "parquet")]
 pub use rollouts::write_rollouts;
-#[cfg(feature = "parquet")]
-pub use table::Table;
 #[cfg(feature = "parquet")]
 pub use tracks::write_tracks;
 pub use verify::{
     Finding, FormatCounts, MAX_FINDINGS, Severity, Verification, verify, verify_one_of_many,
 };
-pub use write_atomically::write_atomically;

@@ -5,32 +5,13 @@ use std::path::{Path, PathBuf};
 
 use gump_scene::Scenario;
 
-use crate::files::{self, Role};
+use crate::formats::cache::{Cache, is_shard};
+use crate::formats::registry::{self, Role};
 #[cfg(feature = "sumo")]
-use crate::sumo;
+use crate::formats::sumo;
+use crate::io::files;
+use crate::source::{BoxedSource, Source};
 use crate::{DataError, ReadOptions, ScenarioRecord};
-
-/// How a format hands over its scenarios.
-pub(crate) type BoxedSource = Box<dyn Source>;
-
-// ANCHOR: source
-/// The scenarios of one file, in order.
-pub(crate) trait Source: Send {
-    /// The next scenario whose id is `wanted`; the others are skipped at less cost. `wanted` is
-    /// asked exactly once per record whose id can be read. After an error the next call goes on
-    /// with the next record where that is possible; `None` is the end.
-    fn next_wanted(
-        &mut self,
-        wanted: &mut dyn FnMut(&str) -> bool,
-    ) -> Option<Result<ScenarioRecord, DataError>>;
-
-    /// Passes over the next record, at less cost than reading it where that is possible.
-    fn skip(&mut self) -> Option<Result<(), DataError>> {
-        let record = self.next_wanted(&mut |_| true)?;
-        Some(record.map(drop))
-    }
-}
-// ANCHOR_END: source
 
 /// Opens a file, or every file of a directory that holds scenarios, in order of their paths and
 /// whatever their formats, filling gaps with [`ReadOptions::ALL`].
@@ -140,7 +121,7 @@ impl Reader {
     fn start_next(&mut self) -> Option<Result<(), DataError>> {
         loop {
             let file = self.files.pop_front()?;
-            let format = match files::role(&file) {
+            let format = match registry::role(&file) {
                 Ok(Role::Scenarios(format)) => format,
                 Ok(Role::Companion(what) | Role::Unknown(what, _)) if self.is_folder => {
                     *self.skipped.entry(what).or_default() += 1;
@@ -213,7 +194,7 @@ pub fn find_map(source: &str) -> Result<Scenario, DataError> {
     #[cfg(feature = "sumo")]
     {
         let path = Path::new(source);
-        if path.is_file() && matches!(files::role(path)?, Role::Companion(sumo::NETWORK)) {
+        if path.is_file() && matches!(registry::role(path)?, Role::Companion(sumo::NETWORK)) {
             return sumo::map_alone(path, options);
         }
     }
@@ -243,7 +224,7 @@ fn refuse_several(path: &Path) -> Result<(), DataError> {
         return Ok(());
     }
     let mut files = files::list(path)?;
-    files.retain(|file| matches!(files::role(file), Ok(Role::Scenarios(_))));
+    files.retain(|file| matches!(registry::role(file), Ok(Role::Scenarios(_))));
     if files.len() < 2 {
         return Ok(());
     }
@@ -290,4 +271,18 @@ fn find_id(path: &Path, wanted: &str, options: ReadOptions) -> Result<ScenarioRe
         found,
         path: path.into(),
     }))
+}
+
+// Here rather than beside the cache: what else a directory holds takes every format to tell.
+impl Cache {
+    /// True for a shard, and for a directory with shards and no scenarios in other formats.
+    ///
+    /// # Errors
+    /// [`DataError::Missing`], [`DataError::Io`].
+    pub fn is_at(path: &Path) -> Result<bool, DataError> {
+        let files = files::list(path)?;
+        let (shards, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_shard(file));
+        let is_other = |file: &&PathBuf| matches!(registry::role(file), Ok(Role::Scenarios(_)));
+        Ok(!shards.is_empty() && !others.iter().any(is_other))
+    }
 }

@@ -20,6 +20,9 @@ pub struct ScenarioRecord {
     pub path: Arc<PathBuf>,
 }
 
+/// Boxes may interpenetrate this much before it counts, metres: the precision of annotation.
+pub(crate) const OVERLAP_TOLERANCE: f64 = 0.1;
+
 /// What a reader left out and what it added, by reason, with counts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ReadReport {

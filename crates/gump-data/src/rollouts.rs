@@ -27,7 +27,7 @@ use std::path::Path;
 use gump_scene::{Agent, AgentId, Frame, Rollout};
 
 use crate::DataError;
-use crate::table::{Table, write_tables};
+use crate::io::table::{Table, write_tables};
 
 /// Writes the rollouts of scenarios, each by its id, as one table; the file appears when it is
 /// complete.

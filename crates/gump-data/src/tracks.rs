@@ -23,7 +23,7 @@ use std::path::Path;
 use gump_scene::{Agent, AgentId, Scenario};
 
 use crate::DataError;
-use crate::table::{Sheet, Table, write_tables};
+use crate::io::table::{Sheet, Table, write_tables};
 
 /// Writes the tracks of scenarios as one table; the file appears when it is complete.
 ///

@@ -10,7 +10,9 @@ use gump_geometry::DVec2;
 use gump_scene::{Agent, AgentKind, Frame, Scenario};
 use serde::Serialize;
 
-use crate::files::{self, Role};
+use crate::formats::registry::{self, Role};
+use crate::io::files;
+use crate::record::OVERLAP_TOLERANCE;
 use crate::{DataError, ReadOptions, ReadReport, ScenarioRecord, open_with};
 
 /// How bad a finding is.
@@ -179,7 +181,7 @@ pub fn verify(path: &Path) -> Result<Verification, DataError> {
 /// counted.
 pub fn verify_one_of_many(file: &Path) -> Verification {
     let mut result = Verification::default();
-    match files::role(file) {
+    match registry::role(file) {
         Ok(Role::Companion(what) | Role::Unknown(what, _)) => {
             result.skipped.insert(what, 1);
             return result;
@@ -293,9 +295,6 @@ const DEAD_LINKS: [&str; 2] = [
     "link to a lane that is not in the map",
     "neighbour that is not in the map",
 ];
-
-/// Boxes may interpenetrate this much before it counts, metres: the precision of annotation.
-pub(crate) const OVERLAP_TOLERANCE: f64 = 0.1;
 
 fn overlapping_starts(scenario: &Scenario, suspect: &mut impl FnMut(&'static str, String)) {
     let agents = scenario.present().now().agents();

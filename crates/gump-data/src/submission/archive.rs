@@ -15,7 +15,7 @@ use prost::Message;
 
 use super::rollouts_problems;
 use super::shard::{ShardReader, write_scenario};
-use crate::stream::{self, io_error};
+use crate::io::stream::{self, io_error};
 use crate::{DataError, write_atomically};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 

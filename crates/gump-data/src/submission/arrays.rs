@@ -22,8 +22,8 @@ use serde::Deserialize;
 
 use crate::DataError;
 #[cfg(feature = "parquet")]
-use crate::columns as table;
-use crate::stream;
+use crate::io::columns as table;
+use crate::io::stream;
 use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 
 /// The largest file that is read, and the most that a member of it may unpack to, bytes.

@@ -11,7 +11,7 @@ use gump_geometry::{DVec2, dvec2};
 use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
 use prost::Message;
 
-use crate::stream::{self, io_error};
+use crate::io::stream::{self, io_error};
 use crate::{DataError, Place, Problem, write_atomically};
 use gump_proto::motion::{
     ChallengeScenarioPredictions, JointPrediction, MotionChallengeSubmission, ObjectTrajectory,

@@ -8,8 +8,8 @@ use std::path::PathBuf;
 
 use prost::Message;
 
-use crate::stream::io_error;
-use crate::tfrecord::MAX_RECORD_BYTES;
+use crate::io::stream::io_error;
+use crate::io::tfrecord::MAX_RECORD_BYTES;
 use crate::{DataError, Place};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission};
 
