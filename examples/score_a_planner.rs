@@ -4,9 +4,13 @@
 //! `gump_planner::PdmClosed::default()`, or for `InteractiveDriver::new(&learned, ...)?`, which
 //! imagines before it drives.
 
+use gump_engine::SamplingConfig;
+use gump_engine::TransformerWorld;
 use gump_geometry::Pose;
-use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
-use gump_nuplan::{closed_loop::*, reactive_agents::NuplanIdm, tracking::Trajectory};
+use gump_model::{Device, checkpoint};
+use gump_nuplan::closed_loop::*;
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::drive_scenario;
 use gump_rollout::BoxError;
 use gump_scene::{EgoState, Seed};

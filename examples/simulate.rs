@@ -5,7 +5,8 @@
 
 use std::path::Path;
 
-use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
+use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_model::{Device, checkpoint};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::Seed;
 use gump_viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};

@@ -5,8 +5,9 @@
 
 use std::path::PathBuf;
 
-use gump_model::relative::{RelativeConfig, RelativeTrainConfig, RelativeTrainer};
+use gump_model::relative::RelativeConfig;
 use gump_scene::Scenario;
+use gump_train::relative::{RelativeTrainConfig, RelativeTrainer};
 
 fn main() -> anyhow::Result<()> {
     let args: Vec<String> = std::env::args().skip(1).collect();

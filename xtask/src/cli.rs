@@ -7,15 +7,15 @@ use std::process::ExitCode;
 
 use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use gump_data::DataError;
+use gump_eval::EvalError;
 
-use crate::config;
 use crate::run::{self, Run};
 use crate::verbs::ablate::Knob;
 use crate::verbs::{
     ablate, bench, ci, data, demo, evaluate, generate, manual, plan, rl, simulate, submit, tidy,
-    train,
+    train, web,
 };
-use crate::words;
+use crate::{config, words};
 
 /// The generative world model for driving: every pipeline as a verb.
 #[derive(Debug, Parser)]
@@ -59,6 +59,8 @@ enum Verb {
     /// Measure speed, side by side.
     #[command(subcommand)]
     Bench(bench::Verb),
+    /// Build the page that lets one drive inside the learned world.
+    Web(web::Args),
     /// Everything CI runs: format, lints, tests, docs, layers, house rules.
     Ci(ci::Args),
     /// Check the house rules of the repository.
@@ -207,6 +209,9 @@ impl Cli {
             Verb::Bench(bench::Verb::Planning(args)) => {
                 Run::of("bench planning", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Web(args) => {
+                Run::of("web", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
             Verb::Tidy(args) => {
                 Run::of("tidy", &args.common, &args)?.execute(|run| args.execute(run))
@@ -233,6 +238,7 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
         // As shells tell of a program that a signal ended: 128 and the signal's number.
         _ if run::interrupted() => 130,
         error if error.is::<WrongArguments>() || names_nothing(error) => 2,
+        error if error.downcast_ref().is_some_and(EvalError::is_argument) => 2,
         _ => 1,
     })
 }

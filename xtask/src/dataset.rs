@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_data::cache::Cache;
-use gump_model::{ModelError, Scenes};
+use gump_model::ModelError;
 use gump_scene::{Scenario, Seed};
+use gump_train::ScenarioSource;
 use serde::{Deserialize, Serialize};
 
 use crate::fresh::{Fresh, Stream};
@@ -264,7 +265,7 @@ impl Training {
     }
 }
 
-impl Scenes for Training {
+impl ScenarioSource for Training {
     fn len(&self) -> usize {
         let held = self.sources.last().map_or(0, |(end, _)| *end);
         let own = self.fresh.as_ref().map_or(held, Fresh::len);
@@ -330,11 +331,12 @@ pub(crate) fn with_share(named: &Path) -> (PathBuf, f64) {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use std::collections::BTreeSet;
 
-    use crate::machine::repository;
     use sha2::{Digest, Sha256};
+
+    use super::*;
+    use crate::machine::repository;
 
     #[test]
     fn the_mini_set_is_as_its_manifest_says() {

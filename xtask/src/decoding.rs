@@ -3,10 +3,9 @@
 //! Realism is told of the network alone beside what rules make of it, for rules that look at the
 //! same edges and boxes as a score raise the score by themselves. The flags are in `worlds`.
 
-use gump_model::SamplingConfig;
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::WorldName;
 use gump_rollout::SimulateConfig;
-
-use crate::worlds::WorldName;
 
 /// How the futures of a world are made.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,8 +83,9 @@ impl Decoding {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use gump_rollout::Interpolation;
+
+    use super::*;
 
     #[test]
     fn what_each_decoding_sets_is_pinned() {

@@ -5,12 +5,12 @@
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use gump_eval::worlds::World;
 use gump_rollout::{BoxError, Session, SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentState, Frame, Rollout, Scenario, Seed};
 
 use crate::progress::Progress;
 use crate::run::{Run, stop_if_interrupted};
-use crate::worlds::World;
 
 /// Futures of one scene, and what they cost.
 pub(crate) struct Imagined {

@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_model::train::StepReport;
+use gump_train::StepReport;
 use gump_viz::{Chart, Series};
 use gump_wosac::realism::Scores;
 
@@ -303,8 +303,9 @@ fn mean<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use gump_train::LossParts;
+
     use super::*;
-    use gump_model::LossParts;
 
     const IMAGINED: (f64, f64) = (0.8, 2.5);
 

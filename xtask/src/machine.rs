@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gump_model::ops::Choice;
+use gump_kernels::Choice;
 use serde::Serialize;
 
 /// The machine as a report names it.

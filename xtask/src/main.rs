@@ -21,16 +21,14 @@ mod futures;
 mod imagine;
 mod losses;
 mod machine;
-mod nuplan_recordings;
 mod peers;
 mod planners;
 mod progress;
-mod recordings;
 #[cfg(feature = "grpc")]
 mod remote;
 mod report;
-mod rollout_files;
 mod run;
+mod sampling;
 mod shipped;
 mod sumo;
 mod table;
@@ -39,7 +37,6 @@ mod targets;
 mod told;
 mod verbs;
 mod words;
-mod worlds;
 
 use std::process::ExitCode;
 

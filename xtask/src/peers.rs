@@ -1,9 +1,9 @@
 //! The processes that train together: those that `mpirun` started, or this one alone.
 
-#[cfg(not(feature = "mpi"))]
-pub(crate) use gump_model::train::Alone as Processes;
 #[cfg(feature = "mpi")]
-pub(crate) use gump_model::train::Mpi as Processes;
+pub(crate) use gump_train::Mpi as Processes;
+#[cfg(not(feature = "mpi"))]
+pub(crate) use gump_train::SingleProcess as Processes;
 
 /// Joins the other processes and works with them; one that fails makes `mpirun` stop the others.
 ///

@@ -1,87 +1,49 @@
-//! Planners by name, with a clock: `log`, `idm`, `simple`, `pdm-closed`, `imitation` and
-//! `interactive`; and `grpc:HOST:PORT`, one in another process.
+//! Planners on the command line: ours by name, those in other processes by `grpc:HOST:PORT`, and how
+//! those imagine who do.
 
 use std::ffi::OsStr;
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use clap::builder::{EnumValueParser, PossibleValue, TypedValueParser};
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, Command};
-use gump_model::Device;
-use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
-use gump_nuplan::reactive_agents::NuplanIdm;
-use gump_nuplan::tracking::Trajectory;
-use gump_planner::{
-    Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
-    NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
-};
-use gump_rollout::worlds::Idm;
-use gump_rollout::{BoxError, WorldModel};
-use gump_scene::Seed;
+use gump_eval::planners::{PlannerConfig, PlannerName};
 use serde::{Serialize, Serializer};
 
 use crate::cli::WrongArguments;
-use crate::recordings::Case;
-use crate::worlds::{World, WorldName};
 
-/// Who plans.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum PlannerName {
-    /// The recorded driver: an oracle
-    Log,
-    /// nuPlan's IDM planner: the route, at the limit, behind whoever is ahead
-    Idm,
-    /// Straight on
-    Simple,
-    /// PDM-Closed: 15 proposals against a constant-velocity forecast
-    PdmClosed,
-    /// What the imagined world has the ego do: the mean of several futures
-    #[value(alias = "model")]
-    Imitation,
-    /// 15 policies and imitation, each imagined among others who react
-    Interactive,
-    /// PDM's 15 proposals, each alone to the end: two rows, the best of them and the best in each
-    /// scenario, an oracle
-    Proposals,
+/// Our planners as the help lists them.
+fn ours() -> Vec<PossibleValue> {
+    let value = |planner: PlannerName| {
+        let value = PossibleValue::new(planner.name()).help(planner.description());
+        match planner {
+            PlannerName::Imitation => value.alias("model"),
+            _ => value,
+        }
+    };
+    PlannerName::ALL.map(value).into()
 }
 
-impl PlannerName {
-    /// The name on the command line.
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::Log => "log",
-            Self::Idm => "idm",
-            Self::Simple => "simple",
-            Self::PdmClosed => "pdm-closed",
-            Self::Imitation => "imitation",
-            Self::Interactive => "interactive",
-            Self::Proposals => "proposals",
-        }
+/// Reads the name of one of our planners.
+#[derive(Clone)]
+pub(crate) struct PlannerParser;
+
+impl TypedValueParser for PlannerParser {
+    type Value = PlannerName;
+
+    fn parse_ref(
+        &self,
+        command: &Command,
+        arg: Option<&Arg>,
+        value: &OsStr,
+    ) -> Result<PlannerName, clap::Error> {
+        let known = PossibleValuesParser::new(ours());
+        let name = known.parse_ref(command, arg, value)?;
+        Ok(name.parse().expect("clap lets known names pass"))
     }
 
-    /// The planner for one case; `imagination` is the world that those think in who do.
-    ///
-    /// Error: `proposals`, who are many.
-    pub(crate) fn build<'w>(
-        self,
-        case: &Case,
-        imagination: &'w dyn WorldModel,
-        seed: Seed,
-        thinking: &Thinking,
-    ) -> anyhow::Result<Box<dyn Explain + 'w>> {
-        Ok(match self {
-            Self::Log => Box::new(LogDriver::new(&case.recording, &case.after)),
-            Self::Idm => Box::new(NuplanIdmDriver::default()),
-            Self::Simple => Box::new(SimpleDriver::default()),
-            Self::PdmClosed => Box::new(PdmClosed::default()),
-            Self::Imitation => Box::new(thinking.imitation(imagination, seed)?),
-            Self::Interactive => Box::new(thinking.interactive(imagination, seed)?),
-            Self::Proposals => {
-                let wrong = "proposals are fifteen planners, only evaluate closed-loop takes them";
-                return Err(WrongArguments(wrong.into()).into());
-            }
-        })
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(ours().into_iter()))
     }
 }
 
@@ -145,16 +107,14 @@ impl TypedValueParser for ChosenParser {
         if told.starts_with(REMOTE) {
             return remote.parse_ref(command, arg, value);
         }
-        let ours = EnumValueParser::<PlannerName>::new();
-        ours.parse_ref(command, arg, value).map(Chosen::Ours)
+        let ours = PlannerParser.parse_ref(command, arg, value);
+        ours.map(Chosen::Ours)
     }
 
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
         let elsewhere = "The planner that serves nuPlan's planner protocol there, any language";
         let elsewhere = PossibleValue::new("grpc:HOST:PORT").help(elsewhere);
-        let ours = EnumValueParser::<PlannerName>::new();
-        let ours: Vec<_> = ours.possible_values().into_iter().flatten().collect();
-        Some(Box::new(ours.into_iter().chain([elsewhere])))
+        Some(Box::new(ours().into_iter().chain([elsewhere])))
     }
 }
 
@@ -172,7 +132,7 @@ fn remote(told: &str) -> Result<Chosen, String> {
 
 /// How planners that imagine do it.
 #[derive(Clone, Debug, Serialize, clap::Args)]
-pub(crate) struct Thinking {
+pub(crate) struct ImaginationArgs {
     /// Futures that imagining planners see
     #[arg(long, value_name = "N", default_value_t = 4)]
     futures: usize,
@@ -193,15 +153,11 @@ pub(crate) struct Thinking {
     discount: Option<f64>,
 }
 
-impl Thinking {
-    /// The interactive planner with a clock.
+impl ImaginationArgs {
+    /// The same for a library.
     ///
-    /// Error: a number out of its range.
-    pub(crate) fn interactive<'w>(
-        &self,
-        world: &'w dyn WorldModel,
-        seed: Seed,
-    ) -> anyhow::Result<InteractiveDriver<'w>> {
+    /// Error: a limit that is no time.
+    pub(crate) fn config(&self) -> anyhow::Result<PlannerConfig> {
         let wall = match self.think_ms {
             Some(ms) if !(ms > 0.0 && ms.is_finite()) => {
                 let wrong = format!("--think-ms: expected a number above 0, found {ms}");
@@ -209,151 +165,13 @@ impl Thinking {
             }
             ms => ms.map(|ms| Duration::from_secs_f64(ms * 1e-3)),
         };
-        let config = InteractiveDriverConfig {
-            n_futures: self.futures,
-            seed,
+        Ok(PlannerConfig {
+            futures: self.futures,
+            nearest: self.nearest,
+            horizon: self.horizon,
+            wall,
             replan_every: self.replan_every,
-            worth: self
-                .discount
-                .map_or(Worth::Rollout, |gamma| Worth::DiscountedStep { gamma }),
-            budget: PlanBudget {
-                nearest: self.nearest,
-                horizon: self.horizon,
-                wall,
-            },
-            ..InteractiveDriverConfig::default()
-        };
-        let began = Instant::now();
-        Ok(InteractiveDriver::new(world, config)?.with_clock(move || began.elapsed()))
-    }
-
-    /// The imitating planner.
-    ///
-    /// Error: a number out of its range.
-    fn imitation<'w>(
-        &self,
-        world: &'w dyn WorldModel,
-        seed: Seed,
-    ) -> anyhow::Result<ImitationDriver<'w>> {
-        Ok(ImitationDriver::new(
-            world,
-            self.futures,
-            self.replan_every,
-            seed,
-        )?)
-    }
-}
-
-/// What the ego meets and what planners imagine, by the name of the world.
-pub(crate) struct Surroundings {
-    name: WorldName,
-    learned: Option<World>,
-    rules: Idm,
-}
-
-impl Surroundings {
-    /// Loads what the world needs, once for all scenarios.
-    ///
-    /// Error: weights that cannot be read.
-    pub(crate) fn load(
-        device: &Device,
-        name: &WorldName,
-        sampling: &gump_model::SamplingConfig,
-    ) -> anyhow::Result<Self> {
-        let learned = match name {
-            WorldName::Model(_) => Some(World::without_log(device, name, sampling)?),
-            _ => None,
-        };
-        Ok(Self {
-            name: name.clone(),
-            learned,
-            rules: Idm::default(),
+            discount: self.discount,
         })
-    }
-
-    /// As [`Surroundings::load`], to imagine in: what planners look ahead fits a window that grows,
-    /// in which nothing is read twice.
-    ///
-    /// Error: weights that cannot be read.
-    pub(crate) fn load_imagination(
-        device: &Device,
-        name: &WorldName,
-        sampling: &gump_model::SamplingConfig,
-    ) -> anyhow::Result<Self> {
-        let growing = gump_model::SamplingConfig {
-            cache: gump_model::CacheMode::Growing,
-            ..sampling.clone()
-        };
-        Self::load(device, name, &growing)
-    }
-
-    /// A world to imagine in: the network where there is one, else reactive rules.
-    pub(crate) fn imagination(&self) -> &dyn WorldModel {
-        match &self.learned {
-            Some(world) => world.model(),
-            None => &self.rules,
-        }
-    }
-
-    /// The traffic of one drive.
-    pub(crate) fn traffic(&self, seed: Seed) -> Box<dyn Traffic + '_> {
-        match (&self.name, &self.learned) {
-            (WorldName::Log, _) => Box::new(Replayed),
-            (WorldName::Idm, _) => Box::new(NuplanIdm::default()),
-            (_, Some(world)) => Box::new(Imagined::new(world.model(), seed)),
-            (_, None) => Box::new(Imagined::new(&gump_rollout::worlds::ConstantVelocity, seed)),
-        }
-    }
-}
-
-/// A driver with a stopwatch and, perhaps, a limit.
-pub(crate) struct Timed<'a> {
-    inner: &'a mut dyn Driver,
-    limit: Option<Duration>,
-    spent: Duration,
-    steps: u32,
-}
-
-impl<'a> Timed<'a> {
-    /// Watches a driver; a step longer than `limit` is a failure.
-    pub(crate) fn new(inner: &'a mut dyn Driver, limit: Option<Duration>) -> Self {
-        Self {
-            inner,
-            limit,
-            spent: Duration::ZERO,
-            steps: 0,
-        }
-    }
-
-    /// Mean milliseconds per step so far; 0 before the first.
-    pub(crate) fn milliseconds_per_step(&self) -> f64 {
-        self.spent.as_secs_f64() * 1e3 / f64::from(self.steps.max(1))
-    }
-}
-
-impl Driver for Timed<'_> {
-    fn name(&self) -> &str {
-        self.inner.name()
-    }
-
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
-    }
-
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let began = Instant::now();
-        let plan = self.inner.drive(moment);
-        let took = began.elapsed();
-        self.spent += took;
-        self.steps += 1;
-        match self.limit {
-            Some(limit) if took > limit => Err(format!(
-                "took {:.1} ms for a plan, expected at most {:.1}",
-                took.as_secs_f64() * 1e3,
-                limit.as_secs_f64() * 1e3
-            )
-            .into()),
-            _ => plan,
-        }
     }
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::Context as _;
-use gump_model::ops::{Choice, Kernel};
+use gump_kernels::{Choice, Kernel};
 use gump_scene::Seed;
 use serde::Serialize;
 

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
+use gump_eval::worlds::WorldName;
 
 use crate::machine::repository;
-use crate::worlds::WorldName;
 
 /// The folder of the shipped data set.
 pub(crate) fn data() -> PathBuf {

@@ -2,8 +2,9 @@
 //! over time, what a learned world drew from.
 
 use anyhow::Context as _;
+use gump_engine::{PredictiveSamples, ProbeConfig};
+use gump_eval::worlds::World;
 use gump_metrics::behaviour::{Behaviour, Judged, judge};
-use gump_model::{Outlook, Watch};
 use gump_rollout::SimulateConfig;
 use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
@@ -11,7 +12,6 @@ use gump_wosac::realism::{Component, Config, Features, Log, Reference, Rollouts,
 
 use crate::imagine::imagine;
 use crate::run::Run;
-use crate::worlds::World;
 
 /// Agents told of, those nearest to the ego: more would make the page larger than it needs to be.
 const AGENTS: usize = 32;
@@ -122,21 +122,21 @@ pub(crate) fn heat(
     n_futures: usize,
     config: &SimulateConfig,
 ) -> anyhow::Result<()> {
-    let watch = Watch {
+    let watch = ProbeConfig {
         futures: n_futures,
         draws: DRAWS,
     };
     let world = world.watching(watch);
     imagine(run, &world, scenario, n_futures, config, run.seed())?;
     let outlooks = world
-        .take_outlooks()
+        .take_predictive_samples()
         .context("a world that follows rules draws nothing")?;
     for outlook in outlooks {
         viewer.heat(HeatMap {
             agent: outlook.agent,
             future: outlook.future,
             from_s: outlook.from_s(),
-            ahead_s: Outlook::AHEAD_S,
+            ahead_s: PredictiveSamples::AHEAD_S,
             draws: outlook.draws,
         });
     }

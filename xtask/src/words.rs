@@ -79,7 +79,7 @@ const THINKING: [&str; 6] = [
 const DRIVING: [&str; 3] = ["seconds", "controller", "budget_ms"];
 
 /// Verbs without tensors: there is no device to choose.
-const NOTHING_COMPUTES: [&str; 10] = [
+const NOTHING_COMPUTES: [&str; 11] = [
     "data inspect",
     "data verify",
     "data stats",
@@ -90,6 +90,7 @@ const NOTHING_COMPUTES: [&str; 10] = [
     "bench wosac",
     "ci",
     "tidy",
+    "web",
 ];
 
 /// The command line with everything that verbs share.

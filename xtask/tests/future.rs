@@ -7,8 +7,8 @@ use std::process::{Command, Output};
 
 use gump_data::{cache, find, womd};
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_model::checkpoint::{self, Precision};
-use gump_model::{Device, ModelConfig, Network};
+use gump_model::checkpoint::Precision;
+use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_scene::{
     Agent, AgentId, AgentState, Frame, LaneId, Light, LightState, Scenario, Seed, fixture,
 };

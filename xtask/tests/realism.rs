@@ -4,8 +4,10 @@
 
 use std::path::{Path, PathBuf};
 
-use gump_model::relative::{self, RelativeWorld};
-use gump_model::{Device, SamplingConfig, checkpoint, world::TransformerWorld};
+use gump_engine::SamplingConfig;
+use gump_engine::TransformerWorld;
+use gump_engine::relative::RelativeWorld;
+use gump_model::{Device, checkpoint, relative};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Scenario, Seed};

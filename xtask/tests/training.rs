@@ -6,11 +6,10 @@ use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gump_model::checkpoint::{self, Precision};
-use gump_model::relative;
-use gump_model::train::ModelChoice;
-use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
+use gump_model::checkpoint::Precision;
+use gump_model::{Device, ModelConfig, Network, checkpoint, relative};
 use gump_scene::Seed;
+use gump_train::{ModelChoice, RunConfig, TrainConfig};
 use serde_json::Value;
 
 /// Folders of scenes, and the configuration of a very small model.

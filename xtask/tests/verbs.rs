@@ -8,11 +8,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gump_model::checkpoint::{self, Precision};
-use gump_model::ops::Kernel;
-use gump_model::train::ModelChoice;
-use gump_model::{Device, ModelConfig, Network, RunConfig, TrainConfig};
+use gump_kernels::Kernel;
+use gump_model::checkpoint::Precision;
+use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_scene::Seed;
+use gump_train::{ModelChoice, RunConfig, TrainConfig};
 use serde_json::Value;
 use shared_data::shared;
 

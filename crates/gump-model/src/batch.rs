@@ -1,96 +1,21 @@
 //! Token sequences as tensors: here padding is born, and nowhere else.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use gump_geometry::{DVec2, Pose};
-use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
+use gump_geometry::DVec2;
+use gump_tokenizer::Slot;
 use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::embedding::{ROWS_PER_TOKEN, SineKey, SineTables, Tables};
-use crate::exact::Exact;
+use crate::local_context::{LocalContext, Survey, encode_local_context, n_numbers};
 use crate::mct::{PLACES, TokenBatch};
-use crate::surroundings::{Surroundings, Survey, look_around, n_numbers};
-
-/// A slot and where it stands in the presented window.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct PlacedSlot {
-    pub(crate) slot: Slot,
-    /// Index of the token, from 0 at the start of the window.
-    pub(crate) position: usize,
-    /// Index of its frame, from 0 at the oldest.
-    pub(crate) frame: usize,
-    /// The key before it, if it is a value.
-    pub(crate) key: Option<Key>,
-    /// What its object was last seen as in the window, if it is a key.
-    pub(crate) last: Option<QuantizedState>,
-    /// The same, or what its object is, if it is a value, before it was rounded; `None` where only
-    /// the token is known.
-    pub(crate) exact: Option<Exact>,
-}
-
-impl PlacedSlot {
-    /// Where the object of a key was last seen in the window: where it sees from, and in whose frame
-    /// its chunk is said.
-    pub(crate) fn last_pose(&self) -> Option<Pose> {
-        let last = self.last?;
-        Some(self.exact.map_or(last.pose(), |exact| exact.pose()))
-    }
-}
-
-/// The slots of a sequence of which only the tokens are known.
-pub(crate) fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
-    place_exactly(sequence, |_, _| None)
-}
-
-/// The slots of a sequence with their places; prompts belong to frame 0. `exact` tells what an object
-/// was in a frame, by the index of the frame and the id.
-pub(crate) fn place_exactly(
-    sequence: &TokenSequence,
-    exact: impl Fn(usize, u16) -> Option<Exact>,
-) -> Vec<PlacedSlot> {
-    let mut frame = None;
-    let mut key: Option<Key> = None;
-    let mut seen: BTreeMap<u16, (QuantizedState, Option<Exact>)> = BTreeMap::new();
-    let slots = sequence.slots().into_iter().enumerate();
-    slots
-        .map(|(position, slot)| {
-            if matches!(slot, Slot::Begin) {
-                frame = Some(frame.map_or(0, |frame: usize| frame + 1));
-            }
-            let before = key.take();
-            let (mut last, mut is) = (None, None);
-            match (slot, before) {
-                (Slot::Key(found), _) => {
-                    key = Some(found);
-                    (last, is) = match seen.get(&found.id) {
-                        Some((state, exact)) => (Some(*state), *exact),
-                        None => (None, None),
-                    };
-                }
-                (Slot::Value(state), Some(key)) => {
-                    is = exact(frame.unwrap_or(0), key.id);
-                    seen.insert(key.id, (state, is));
-                }
-                _ => {}
-            }
-            PlacedSlot {
-                slot,
-                position,
-                frame: frame.unwrap_or(0),
-                key: before,
-                last,
-                exact: is,
-            }
-        })
-        .collect()
-}
+use crate::placed_slot::PlacedSlot;
 
 /// How tokens become the rows of a batch, for one network.
 #[derive(Debug)]
-pub(crate) struct Packer {
+pub struct Packer {
     tables: Tables,
     sines: SineTables,
     width: usize,
@@ -102,7 +27,8 @@ pub(crate) struct Packer {
 }
 
 impl Packer {
-    pub(crate) fn new(config: &ModelConfig) -> Self {
+    /// For a network of this shape.
+    pub fn new(config: &ModelConfig) -> Self {
         Self {
             tables: Tables::new(config),
             sines: SineTables::new(config),
@@ -132,12 +58,12 @@ impl Packer {
             if !self.surroundings {
                 return Vec::new();
             }
-            let mut seen = look_around(&surveys[row / sharing], slots, from);
+            let mut seen = encode_local_context(&surveys[row / sharing], slots, from);
             seen.iter_mut()
                 .for_each(|(at, _)| *at = *at + row * t - from);
             seen
         };
-        let seen: Vec<(usize, Surroundings)> = sequences
+        let seen: Vec<(usize, LocalContext)> = sequences
             .par_iter()
             .enumerate()
             .flat_map_iter(look)
@@ -190,22 +116,22 @@ impl Packer {
     }
 
     /// The table rows that a token sums, `u32::MAX` where there is none.
-    pub(crate) fn rows(&self, placed: &PlacedSlot) -> [u32; ROWS_PER_TOKEN] {
+    pub fn rows(&self, placed: &PlacedSlot) -> [u32; ROWS_PER_TOKEN] {
         self.tables.rows(placed)
     }
 
     /// Which sine features a token has.
-    pub(crate) fn sine_key(&self, placed: &PlacedSlot) -> Option<SineKey> {
+    pub fn sine_key(&self, placed: &PlacedSlot) -> Option<SineKey> {
         self.sines.key(placed)
     }
 
     /// Appends the sine features of a token to `out` if it has any.
-    pub(crate) fn sine(&self, placed: &PlacedSlot, out: &mut Vec<f32>) -> bool {
+    pub fn sine(&self, placed: &PlacedSlot, out: &mut Vec<f32>) -> bool {
         self.sines.append(placed, out)
     }
 
     /// The visual tokens at the places that a token's object looks at, if it looks.
-    pub(crate) fn cells(&self, placed: &PlacedSlot) -> Option<[u32; PLACES.len()]> {
+    pub fn cells(&self, placed: &PlacedSlot) -> Option<[u32; PLACES.len()]> {
         let last = placed.last.filter(|_| self.local_map)?;
         let (from, velocity) = match placed.exact {
             Some(exact) => (exact.pose(), exact.velocity()),
@@ -240,8 +166,9 @@ fn padding(position: usize) -> PlacedSlot {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use gump_geometry::dvec2;
+
+    use super::*;
 
     #[test]
     fn cells_are_numbered_as_visual_tokens_are() {

@@ -12,15 +12,16 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use candle_core::{DType, Device, Tensor};
+use gump_nn::parameters::Parameters;
 use gump_tokenizer::VOCABULARY_SIZE;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
+use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
 use crate::config::ModelConfig;
+use crate::local_context::n_numbers;
 use crate::network::Network;
-use crate::parameters::Parameters;
-use crate::surroundings::n_numbers;
 
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";
@@ -38,18 +39,19 @@ pub enum Precision {
 }
 
 /// Before the names of the optimiser's moments.
-pub(crate) const OPTIMIZER: &str = "optimizer.";
+pub const OPTIMIZER: &str = "optimizer.";
 /// Before the names of the weights that drove the scenes of closed-loop training.
-pub(crate) const DRIVER: &str = "driver.";
+pub const DRIVER: &str = "driver.";
 /// Before the names of the weights being trained, where their moving average is what is shipped.
-pub(crate) const TRAINED: &str = "trained.";
+pub const TRAINED: &str = "trained.";
 /// What a run's checkpoint holds beside the weights.
 const PREFIXES: [&str; 3] = [OPTIMIZER, DRIVER, TRAINED];
 
 /// Tensors and header entries of a file.
 #[derive(Debug)]
-pub(crate) struct Archive {
-    pub(crate) tensors: BTreeMap<String, Tensor>,
+pub struct Archive {
+    /// By name.
+    pub tensors: BTreeMap<String, Tensor>,
     pub(crate) metadata: BTreeMap<String, String>,
     pub(crate) path: PathBuf,
 }
@@ -137,7 +139,7 @@ fn widened(matrix: &Tensor, columns: usize) -> Result<Tensor, ModelError> {
 
 impl Archive {
     /// Takes out the tensors whose names start with `prefix`, without it.
-    pub(crate) fn take(&mut self, prefix: &str) -> BTreeMap<String, Tensor> {
+    pub fn take(&mut self, prefix: &str) -> BTreeMap<String, Tensor> {
         let all = std::mem::take(&mut self.tensors);
         let (taken, rest) = all
             .into_iter()
@@ -149,21 +151,22 @@ impl Archive {
     }
 
     /// The configuration in the header.
-    pub(crate) fn config(&self) -> Result<ModelConfig, ModelError> {
+    pub fn config(&self) -> Result<ModelConfig, ModelError> {
         let text = self.entry("config")?;
         serde_json::from_str(text)
             .map_err(|error| self.error(format!("its configuration is not valid ({error})")))
     }
 
     /// A header entry.
-    pub(crate) fn entry(&self, key: &str) -> Result<&str, ModelError> {
+    pub fn entry(&self, key: &str) -> Result<&str, ModelError> {
         let value = self.metadata.get(key);
         value
             .map(String::as_str)
             .ok_or_else(|| self.error(format!("its header has no \"{key}\"")))
     }
 
-    pub(crate) fn error(&self, what: String) -> ModelError {
+    /// An error that names the file.
+    pub fn error(&self, what: String) -> ModelError {
         ModelError::Checkpoint {
             what,
             path: self.path.clone(),
@@ -172,7 +175,7 @@ impl Archive {
 }
 
 /// Header entries every file of this crate has.
-pub(crate) fn header(config: &ModelConfig) -> Result<BTreeMap<String, String>, ModelError> {
+pub fn header(config: &ModelConfig) -> Result<BTreeMap<String, String>, ModelError> {
     let config =
         serde_json::to_string(config).map_err(|error| ModelError::Config(error.to_string()))?;
     Ok(BTreeMap::from([
@@ -183,7 +186,7 @@ pub(crate) fn header(config: &ModelConfig) -> Result<BTreeMap<String, String>, M
 }
 
 /// Writes named tensors and a header, atomically.
-pub(crate) fn write(
+pub fn write(
     path: &Path,
     tensors: BTreeMap<String, Tensor>,
     metadata: BTreeMap<String, String>,
@@ -228,11 +231,48 @@ pub(crate) fn write(
             what: error.to_string(),
             path: path.to_owned(),
         })?;
-    write_beside(path, &encoded)
+    let sorted = with_sorted_header(&encoded).map_err(|error| ModelError::Checkpoint {
+        what: error.to_string(),
+        path: path.to_owned(),
+    })?;
+    write_beside(path, &sorted)
+}
+
+/// A tensor in the header of a file.
+#[derive(Serialize, Deserialize)]
+struct Entry {
+    dtype: String,
+    shape: Vec<usize>,
+    data_offsets: [usize; 2],
+}
+
+/// The header of a file: its own entries before the tensors.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    #[serde(rename = "__metadata__")]
+    metadata: BTreeMap<String, String>,
+    #[serde(flatten)]
+    tensors: BTreeMap<String, Entry>,
+}
+
+/// The same file with its header in order: the library writes entries as a hash map gives them, and
+/// equal weights are to be equal bytes.
+fn with_sorted_header(encoded: &[u8]) -> serde_json::Result<Vec<u8>> {
+    let length = encoded.as_chunks::<8>().0.first().copied();
+    let length = u64::from_le_bytes(length.unwrap_or_default()) as usize;
+    let (header, data) = encoded[8..].split_at(length);
+    let header: Header = serde_json::from_slice(header)?;
+    let mut text = serde_json::to_string(&header)?;
+    let padded = text.len().next_multiple_of(8);
+    text.extend(std::iter::repeat_n(' ', padded - text.len()));
+    let mut sorted = (padded as u64).to_le_bytes().to_vec();
+    sorted.extend_from_slice(text.as_bytes());
+    sorted.extend_from_slice(data);
+    Ok(sorted)
 }
 
 /// Reads named tensors and the header, and checks format and vocabulary.
-pub(crate) fn read(path: &Path) -> Result<Archive, ModelError> {
+pub fn read(path: &Path) -> Result<Archive, ModelError> {
     let fail = |what: String| ModelError::Checkpoint {
         what,
         path: path.to_owned(),

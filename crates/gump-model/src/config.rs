@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
 
+/// An agent whose surrogate leaves this range gets no tokens any more (released code), metres.
+pub const KEEP_RANGE_M: f64 = 96.0;
+
 /// The shape of a network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -8,22 +8,22 @@
 use std::ops::Range;
 
 use candle_core::{Device, Result, Tensor};
+use gump_nn::layers::{Linear, TABLE_DEVIATION};
+use gump_nn::ops;
+use gump_nn::parameters::{Init, Scope};
 use gump_tokenizer::Field;
 
 use crate::ModelError;
 use crate::config::ModelConfig;
-use crate::mct::{Linear, TABLE_DEVIATION};
-use crate::ops;
-use crate::parameters::{Init, Scope};
 
 /// Poses in a chunk: the frame itself and three more, half a second apart.
-pub(crate) const CHUNK: usize = 4;
+pub const CHUNK: usize = 4;
 
 /// Steps that make the first state; poses of later moments follow.
-pub(crate) const STATE_STEPS: usize = 7;
+pub const STATE_STEPS: usize = 7;
 
 /// What each step of the decoder yields.
-pub(crate) const STEPS: [Field; 4 + 3 * CHUNK] = [
+pub const STEPS: [Field; 4 + 3 * CHUNK] = [
     Field::Width,
     Field::Length,
     Field::VelocityX,
@@ -42,9 +42,12 @@ pub(crate) const STEPS: [Field; 4 + 3 * CHUNK] = [
     Field::Heading,
 ];
 
+/// What the decoder says of one object: a bin per step, to be read through the object's local frame.
+pub type Bins = [u16; STEPS.len()];
+
 /// A stacked GRU with one slot embedding per step and one output matrix for all fields.
 #[derive(Debug)]
-pub(crate) struct StateDecoder {
+pub struct StateDecoder {
     layers: Vec<GruLayer>,
     slots: Tensor,
     head: Linear,
@@ -217,7 +220,7 @@ impl StateDecoder {
 
     /// The rows by which tokens enter the decoder, [TABLE_ROWS, C], from those of the transformer
     /// unless it has its own.
-    pub(crate) fn input_table(&self, table: &Tensor) -> Result<Tensor> {
+    pub fn input_table(&self, table: &Tensor) -> Result<Tensor> {
         let table = self.table.as_ref().unwrap_or(table);
         match &self.smooth {
             Some(smooth) => smooth.raise(table),
@@ -229,7 +232,7 @@ impl StateDecoder {
     ///
     /// `hidden` [K, C]; `tokens` [STEPS, K], the token of each step (PAD where missing).
     /// Returns [STEPS, K, C].
-    pub(crate) fn teacher_forced(
+    pub fn teacher_forced(
         &self,
         table: &Tensor,
         hidden: &Tensor,
@@ -238,8 +241,7 @@ impl StateDecoder {
         let (k, c) = hidden.dims2()?;
         let n = STEPS.len();
         let previous = tokens.narrow(0, 0, n - 1)?.contiguous()?; // [STEPS - 1, K]
-        let embedded =
-            crate::embedding::embedding_sum(table, &previous.reshape(((n - 1) * k, 1))?)?;
+        let embedded = ops::embedding_sum(table, &previous.reshape(((n - 1) * k, 1))?)?;
         let embedded = embedded.reshape((n - 1, k, c))?.pad_with_zeros(0, 1, 0)?; // [STEPS, K, C]
         let mut inputs = embedded.broadcast_add(&self.slots.reshape((n, 1, c))?)?;
         for layer in &self.layers {
@@ -251,13 +253,13 @@ impl StateDecoder {
     }
 
     /// The state before the first step: the hidden vector in every layer.
-    pub(crate) fn begin(&self, hidden: &Tensor) -> Vec<Tensor> {
+    pub fn begin(&self, hidden: &Tensor) -> Vec<Tensor> {
         vec![hidden.clone(); self.layers.len()]
     }
 
-    /// One step: `previous` [K] are the tokens of the step before, none at step 0. Returns the
+    /// One step: `previous` `[K]` are the tokens of the step before, none at step 0. Returns the
     /// output, [K, C], for [`StateDecoder::logits`].
-    pub(crate) fn step(
+    pub fn step(
         &self,
         table: &Tensor,
         states: &mut [Tensor],
@@ -280,13 +282,13 @@ impl StateDecoder {
 
     /// Logits over the bins of one field: only its rows of the shared output matrix are multiplied,
     /// which is exact because nothing outside the field may be sampled.
-    pub(crate) fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
+    pub fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
         ops::linear(output, &self.output_rows(field)?, None)
     }
 
     /// Rows of the output matrix for the bins of all fields, [all bins, C]; see
     /// [`StateDecoder::rows_of`].
-    pub(crate) fn all_output_rows(&self) -> Result<Tensor> {
+    pub fn all_output_rows(&self) -> Result<Tensor> {
         let fields = field_rows();
         let rows = ops::table_rows(self.head.weight(), fields.start, fields.len())?;
         match &self.smooth {
@@ -296,13 +298,13 @@ impl StateDecoder {
     }
 
     /// Which of [`StateDecoder::all_output_rows`] are the bins of a field.
-    pub(crate) fn rows_of(field: Field) -> Range<usize> {
+    pub fn rows_of(field: Field) -> Range<usize> {
         let first = field.first_token() as usize - field_rows().start;
         first..first + field.n_bins()
     }
 
     /// Rows of the output matrix for the bins of a field, [bins, C].
-    pub(crate) fn output_rows(&self, field: Field) -> Result<Tensor> {
+    pub fn output_rows(&self, field: Field) -> Result<Tensor> {
         let rows = self
             .head
             .weight()
@@ -315,7 +317,7 @@ impl StateDecoder {
 
     /// Logits over what may follow a control or value token: the 321 keys, then BEGIN, NEWBORN and
     /// LIGHTS_END; [N, 324].
-    pub(crate) fn control_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+    pub fn control_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let weight = self.head.weight();
         let keys = ops::table_rows(weight, 0, CONTROL_KEYS)?;
         let specials = ops::table_rows(weight, gump_tokenizer::BEGIN as usize, 3)?;
@@ -324,7 +326,7 @@ impl StateDecoder {
 
     /// Logits over the state of the light that follows a BEGIN or a light, in the order of their
     /// tokens; [N, 4].
-    pub(crate) fn light_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+    pub fn light_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let first = gump_tokenizer::FIRST_LIGHT as usize;
         ops::linear(
             hidden,
@@ -335,7 +337,7 @@ impl StateDecoder {
 }
 
 /// States of a light: green, yellow, red, unknown.
-pub(crate) const N_LIGHT_STATES: usize = 4;
+pub const N_LIGHT_STATES: usize = 4;
 
 /// Keys in the control alphabet: the ego's and 320 agents'.
-pub(crate) const CONTROL_KEYS: usize = 321;
+pub const CONTROL_KEYS: usize = 321;

@@ -4,9 +4,8 @@
 //! are stacked into one, so that every token of every kind is the sum of a few of its rows; the
 //! gather and its backward pass are one operation, in `ops`.
 
-use crate::batch::PlacedSlot;
 use crate::config::ModelConfig;
-pub(crate) use crate::ops::embedding_sum;
+use crate::placed_slot::PlacedSlot;
 use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TABLE_ROWS};
 
 /// Rows of the frame table; frames beyond share the last row.
@@ -18,13 +17,14 @@ pub(crate) const ROWS_PER_TOKEN: usize = 12;
 
 /// Where each table starts in the stack of tables.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Tables {
+pub struct Tables {
     block_size: usize,
     pairs_share: bool,
 }
 
 impl Tables {
-    pub(crate) const CLASS: usize = TABLE_ROWS as usize;
+    /// First row of the classes.
+    pub const CLASS: usize = TABLE_ROWS as usize;
     pub(crate) const LIGHT_INDEX: usize = Self::CLASS + N_CLASSES;
     pub(crate) const PROMPT: usize = Self::LIGHT_INDEX + N_LIGHT_INDICES;
     pub(crate) const FRAME: usize = Self::PROMPT + N_PROMPTS;
@@ -91,7 +91,7 @@ impl Tables {
 
 /// What distinguishes the sine features of one token from another's: the bins, and whether only the
 /// first three count, as for a light.
-pub(crate) type SineKey = (QuantizedState, bool);
+pub type SineKey = (QuantizedState, bool);
 
 /// Sine features of every bin of every field, computed once.
 ///

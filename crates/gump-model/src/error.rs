@@ -6,6 +6,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// The tensor library failed.
+    #[cfg(feature = "tensors")]
     #[error("tensor operation failed: {0}")]
     Tensor(#[from] candle_core::Error),
     /// A configuration contradicts itself.
@@ -28,8 +29,11 @@ pub enum ModelError {
         found: Vec<usize>,
     },
     /// A kernel that this processor does not have, or that multiplies wrongly.
-    #[error("{0}")]
-    Kernel(String),
+    #[error(transparent)]
+    Kernel(#[from] gump_kernels::KernelError),
+    /// Bytes that hold no weights, or those of another network.
+    #[error("weights: {0}")]
+    Weights(String),
     /// A weight cannot be written in the form that is asked for.
     #[error("tensor \"{name}\" holds {number}, which {form} cannot express")]
     WeightNotFinite {
@@ -80,4 +84,25 @@ pub enum ModelError {
     /// A scene cannot be imagined by this model.
     #[error("scene: {0}")]
     Scene(String),
+}
+
+#[cfg(feature = "tensors")]
+impl From<gump_nn::NnError> for ModelError {
+    fn from(error: gump_nn::NnError) -> Self {
+        use gump_nn::NnError;
+        match error {
+            NnError::Tensor(error) => Self::Tensor(error),
+            NnError::Config(what) => Self::Config(what),
+            NnError::MissingTensor { name } => Self::MissingTensor { name },
+            NnError::TensorShape {
+                name,
+                expected,
+                found,
+            } => Self::TensorShape {
+                name,
+                expected,
+                found,
+            },
+        }
+    }
 }

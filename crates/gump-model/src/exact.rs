@@ -4,9 +4,6 @@
 //! its exact pose (`anchor`), so what it sees around itself must be seen from there, too: the slots
 //! of a window carry both.
 
-#[cfg(test)]
-mod tests;
-
 use std::collections::BTreeMap;
 
 use gump_geometry::{DVec2, Pose, dvec2};
@@ -18,12 +15,12 @@ use gump_tokenizer::Identities;
 /// 32 bits tell micrometres within a scene, and hold the same numbers whether a state went through
 /// the world frame or not, so that caches know a slot again.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Exact {
+pub struct Exact {
     place: [f32; 3],
     velocity: [f32; 2],
     size: [f32; 2],
     /// False for one whose size its source does not state.
-    pub(crate) has_size: bool,
+    pub has_size: bool,
 }
 
 impl Exact {
@@ -39,7 +36,7 @@ impl Exact {
     }
 
     /// The same object in another state.
-    pub(crate) fn with_state(self, state: AgentState) -> Self {
+    pub fn with_state(self, state: AgentState) -> Self {
         let Pose { position, heading } = state.pose;
         Self {
             place: [position.x as f32, position.y as f32, heading as f32],
@@ -66,12 +63,12 @@ impl Exact {
 
 /// The objects of consecutive frames by the ids of their keys.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct ExactFrames(Vec<BTreeMap<u16, Exact>>);
+pub struct ExactFrames(Vec<BTreeMap<u16, Exact>>);
 
 impl ExactFrames {
     /// The last `n` of these frames of the world; where there are fewer, nothing is known of the
     /// first.
-    pub(crate) fn last(
+    pub fn last(
         n: usize,
         frames: &[Frame],
         identities: &Identities,
@@ -96,7 +93,7 @@ impl ExactFrames {
     }
 
     /// What the object with this id was in a frame.
-    pub(crate) fn of(&self, frame: usize, id: u16) -> Option<Exact> {
+    pub fn of(&self, frame: usize, id: u16) -> Option<Exact> {
         self.0.get(frame)?.get(&id).copied()
     }
 }

@@ -11,155 +11,17 @@
 
 use std::sync::Arc;
 
-use candle_core::{DType, Result, Tensor};
-use gump_scene::Seed;
+use candle_core::{Result, Tensor};
+use gump_nn::layers::{Dropout, LayerNorm, Linear, TABLE_DEVIATION, drop_out};
+use gump_nn::ops;
+use gump_nn::ops::embedding_sum;
+use gump_nn::parameters::{Init, Scope};
 use gump_tokenizer::N_CLASSES;
 
 use crate::ModelError;
 use crate::config::{Gate, ModelConfig};
-use crate::embedding::{Tables, embedding_sum};
-use crate::ops;
-use crate::parameters::{Init, Scope};
-use crate::surroundings::{Survey, n_numbers};
-
-/// Every table starts from this deviation, as GPT-2's do.
-pub(crate) const TABLE_DEVIATION: f64 = 0.02;
-pub(crate) const NORM_EPS: f64 = 1e-5;
-
-/// Layer normalisation with scale and shift.
-#[derive(Debug)]
-pub(crate) struct LayerNorm {
-    weight: Tensor,
-    bias: Tensor,
-}
-
-impl LayerNorm {
-    pub(crate) fn new(
-        scope: &mut Scope<'_>,
-        name: &str,
-        width: usize,
-    ) -> std::result::Result<Self, ModelError> {
-        let mut scope = scope.part(name);
-        let weight = scope.get("weight", width, Init::Constant(1.0))?;
-        Ok(Self {
-            weight,
-            bias: scope.get("bias", width, Init::Constant(0.0))?,
-        })
-    }
-
-    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        ops::layer_norm(x, &self.weight, &self.bias, NORM_EPS as f32)
-    }
-}
-
-/// A matrix, with or without bias.
-#[derive(Debug)]
-pub(crate) struct Linear {
-    weight: Tensor,
-    bias: Option<Tensor>,
-    /// In what the product is computed.
-    product: DType,
-}
-
-impl Linear {
-    /// A layer that PyTorch would build: uniform start.
-    pub(crate) fn new(
-        scope: &mut Scope<'_>,
-        name: &str,
-        inputs: usize,
-        outputs: usize,
-    ) -> std::result::Result<Self, ModelError> {
-        Self::with(
-            scope,
-            name,
-            inputs,
-            outputs,
-            Init::FanIn(inputs),
-            Some(Init::FanIn(inputs)),
-        )
-    }
-
-    pub(crate) fn with(
-        scope: &mut Scope<'_>,
-        name: &str,
-        inputs: usize,
-        outputs: usize,
-        weight: Init,
-        bias: Option<Init>,
-    ) -> std::result::Result<Self, ModelError> {
-        let mut scope = scope.part(name);
-        let weight = scope.get("weight", (outputs, inputs), weight)?;
-        Ok(Self {
-            weight,
-            product: scope.products(),
-            bias: bias
-                .map(|init| scope.get("bias", outputs, init))
-                .transpose()?,
-        })
-    }
-
-    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        if self.product != DType::F32 {
-            return ops::reduced_linear(x, &self.weight, self.bias.as_ref(), self.product);
-        }
-        ops::linear(x, &self.weight, self.bias.as_ref())
-    }
-
-    /// The matrix, `[out, in]`.
-    pub(crate) fn weight(&self) -> &Tensor {
-        &self.weight
-    }
-
-    /// What is added, `[out]`, if anything is.
-    pub(crate) fn bias(&self) -> Option<&Tensor> {
-        self.bias.as_ref()
-    }
-}
-
-/// Seeded dropout: absent at inference.
-#[derive(Clone, Debug)]
-pub(crate) struct Dropout {
-    probability: f64,
-    seed: Seed,
-    calls: std::cell::Cell<u64>,
-}
-
-impl Dropout {
-    pub(crate) fn new(probability: f64, seed: Seed) -> Option<Self> {
-        (probability > 0.0).then(|| Self {
-            probability,
-            seed,
-            calls: 0.into(),
-        })
-    }
-}
-
-/// Drops entries of `x` and scales the rest up, if training asks for it.
-fn drop_out(x: Tensor, dropout: Option<&Dropout>) -> Result<Tensor> {
-    let Some(Dropout {
-        probability,
-        seed,
-        calls,
-    }) = dropout
-    else {
-        return Ok(x);
-    };
-    let seed = seed.fork(calls.get());
-    calls.set(calls.get() + 1);
-    let mut rng = seed.rng();
-    let keep = 1.0 / (1.0 - probability) as f32;
-    let threshold = (probability * f64::from(u32::MAX)) as u32;
-    let mask: Vec<f32> = (0..x.elem_count())
-        .map(|_| {
-            if rand::RngCore::next_u32(&mut rng) < threshold {
-                0.0
-            } else {
-                keep
-            }
-        })
-        .collect();
-    &x * Tensor::from_vec(mask, x.shape(), x.device())?
-}
+use crate::embedding::Tables;
+use crate::local_context::{Survey, n_numbers};
 
 /// Self-attention and MLP, pre-norm.
 #[derive(Debug)]
@@ -303,17 +165,18 @@ impl CrossBlock {
 /// What the transformer keeps of a scene's map: keys and values per cross-attention block,
 /// `[S, M, C]`; computed once and shared by all futures of the scene.
 #[derive(Clone, Debug)]
-pub(crate) struct VisualMemory {
+pub struct VisualMemory {
     /// Per scene, its map laid out for looking around.
-    pub(crate) surveys: Vec<Arc<Survey>>,
+    pub surveys: Vec<Arc<Survey>>,
     /// The visual tokens themselves, for looking up what lies under an object.
-    pub(crate) visual: Tensor,
-    pub(crate) key_values: Vec<(Tensor, Tensor)>,
+    pub visual: Tensor,
+    /// By layer of cross-attention.
+    pub key_values: Vec<(Tensor, Tensor)>,
 }
 
 impl VisualMemory {
     /// The memories of several scenes as one batch, in the given order.
-    pub(crate) fn join(parts: &[&Self]) -> Result<Self> {
+    pub fn join(parts: &[&Self]) -> Result<Self> {
         if let [only] = parts {
             return Ok((*only).clone());
         }
@@ -338,35 +201,41 @@ impl VisualMemory {
 
 /// Keys and values of the tokens seen so far, per self-attention block, `[B, T, C]`.
 #[derive(Clone, Debug)]
-pub(crate) struct Cache {
+pub struct Cache {
     layers: Vec<Option<(Tensor, Tensor)>>,
 }
 
 impl Cache {
-    pub(crate) fn new(layers: usize) -> Self {
+    /// Nothing is kept yet.
+    pub fn new(layers: usize) -> Self {
         Self {
             layers: vec![None; layers],
         }
     }
 
+    /// Whether no token is remembered.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// Tokens remembered.
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.layers[0].as_ref().map_or(0, |(k, _)| k.dims()[1])
     }
 }
 
 /// What a forward pass leaves.
 #[derive(Debug)]
-pub(crate) struct Features {
+pub struct Features {
     /// After the final normalisation, [B, T, C].
-    pub(crate) hidden: Tensor,
+    pub hidden: Tensor,
     /// After each block a trajectory head reads, [B, T, C] each.
-    pub(crate) levels: Vec<Tensor>,
+    pub levels: Vec<Tensor>,
 }
 
 /// Token embeddings and the transformer.
 #[derive(Debug)]
-pub(crate) struct Mct {
+pub struct Mct {
     table: Tensor,
     sine_in: Linear,
     sine_norm: LayerNorm,
@@ -383,7 +252,7 @@ pub(crate) struct Mct {
 
 /// Tokens ready to embed: `B` sequences of `T` tokens each.
 #[derive(Debug)]
-pub(crate) struct TokenBatch {
+pub struct TokenBatch {
     /// Table rows per token, [B * T, ROWS_PER_TOKEN].
     pub(crate) rows: Tensor,
     /// Flat indices of the tokens that have coordinates, [N].
@@ -401,11 +270,11 @@ pub(crate) struct TokenBatch {
     /// What they see, [K', n] with n the numbers that this network is shown.
     pub(crate) surroundings: Tensor,
     /// (B, T)
-    pub(crate) shape: (usize, usize),
+    pub shape: (usize, usize),
 }
 
 /// Where an object looks: seconds ahead on its present course.
-pub(crate) const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
+pub const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
 
 impl Mct {
     pub(crate) fn new(
@@ -463,13 +332,13 @@ impl Mct {
     }
 
     /// The rows of the token table, [TABLE_ROWS, C], which the decoder reads too.
-    pub(crate) fn token_table(&self) -> Result<Tensor> {
+    pub fn token_table(&self) -> Result<Tensor> {
         self.table.narrow(0, 0, Tables::CLASS)
     }
 
     /// Logits over the class of an agent not seen before, from the slot before its key; the rows by
     /// which classes enter are also those by which they are told; [N, 3].
-    pub(crate) fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
+    pub fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let rows = ops::table_rows(&self.table, Tables::CLASS, N_CLASSES)?;
         ops::linear(hidden, &rows, None)
     }
@@ -484,11 +353,7 @@ impl Mct {
     }
 
     /// Reads the visual tokens of scenes once, [S, M, C].
-    pub(crate) fn remember(
-        &self,
-        visual: &Tensor,
-        surveys: Vec<Arc<Survey>>,
-    ) -> Result<VisualMemory> {
+    pub fn remember(&self, visual: &Tensor, surveys: Vec<Arc<Survey>>) -> Result<VisualMemory> {
         let key_values = self.cross.iter().map(|cross| cross.remember(visual));
         Ok(VisualMemory {
             surveys,
@@ -498,7 +363,7 @@ impl Mct {
     }
 
     /// What lies under and ahead of every object that looks, [K, C].
-    fn look_around(&self, batch: &TokenBatch, memory: &VisualMemory) -> Result<Tensor> {
+    fn encode_local_context(&self, batch: &TokenBatch, memory: &VisualMemory) -> Result<Tensor> {
         let (scenes, m, c) = memory.visual.dims3()?;
         let flat = memory.visual.reshape((scenes * m, c))?;
         let sharing = (batch.shape.0 / scenes) as u32;
@@ -519,7 +384,7 @@ impl Mct {
 
     /// One pass over `batch`, after the tokens in `cache` if there is one; the cache then holds
     /// the new tokens too.
-    pub(crate) fn forward(
+    pub fn forward(
         &self,
         batch: &TokenBatch,
         visual: &VisualMemory,
@@ -532,7 +397,11 @@ impl Mct {
             x = x.index_add(&batch.sine_positions, &self.embed_sine(&batch.sines)?, 0)?;
         }
         if !batch.looker_rows.is_empty() {
-            x = x.index_add(&batch.lookers, &self.look_around(batch, visual)?, 0)?;
+            x = x.index_add(
+                &batch.lookers,
+                &self.encode_local_context(batch, visual)?,
+                0,
+            )?;
         }
         if let Some((first, second)) = &self.surroundings
             && batch.surroundings.dim(0)? > 0

@@ -3,17 +3,18 @@
 use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor};
+use gump_nn::parameters::Parameters;
 use gump_raster::{Raster, RasterSpec};
 use gump_scene::Seed;
 
 use crate::ModelError;
-use crate::batch::{Packer, PlacedSlot};
+use crate::batch::Packer;
 use crate::config::ModelConfig;
 use crate::decoder::StateDecoder;
+use crate::local_context::Survey;
 use crate::mct::{Mct, TokenBatch, VisualMemory};
-use crate::parameters::Parameters;
-use crate::surroundings::Survey;
-use crate::trajectory::TrajectoryHead;
+use crate::placed_slot::PlacedSlot;
+use crate::trajectory_head::TrajectoryHead;
 use crate::visual::Visual;
 
 /// A GUMP network.
@@ -23,10 +24,14 @@ pub struct Network {
     raster_spec: RasterSpec,
     parameters: Parameters,
     packer: Packer,
-    pub(crate) mct: Mct,
-    pub(crate) decoder: StateDecoder,
-    pub(crate) visual: Visual,
-    pub(crate) trajectory_heads: Vec<TrajectoryHead>,
+    /// The transformer.
+    pub mct: Mct,
+    /// From hidden vectors to states.
+    pub decoder: StateDecoder,
+    /// The encoder of rasters.
+    pub visual: Visual,
+    /// Heads that say whole trajectories, for an auxiliary loss.
+    pub trajectory_heads: Vec<TrajectoryHead>,
 }
 
 impl Network {
@@ -73,7 +78,7 @@ impl Network {
 
     /// The same network, whose matrices are multiplied in another type; its parameters and all else
     /// keep theirs.
-    pub(crate) fn multiplying_in(self, products: DType) -> Result<Self, ModelError> {
+    pub fn multiplying_in(self, products: DType) -> Result<Self, ModelError> {
         let all = self.parameters.all();
         let tensors = all.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
         let parameters = Parameters::loaded(tensors.collect(), self.device());
@@ -97,7 +102,7 @@ impl Network {
 
     /// How many of `n` samples are best differentiated as one batch: a processor's threads share
     /// them out one by one, which a device's do not, and batch statistics need all.
-    pub(crate) fn samples_together(&self, n: usize) -> usize {
+    pub fn samples_together(&self, n: usize) -> usize {
         let is_free = self.parameters.statistics().next().is_none();
         if is_free && self.device().is_cpu() {
             1
@@ -112,7 +117,7 @@ impl Network {
     }
 
     /// Sequences of slots as a batch, without their first `from`.
-    pub(crate) fn pack(
+    pub fn pack(
         &self,
         sequences: &[&[PlacedSlot]],
         from: usize,
@@ -123,7 +128,7 @@ impl Network {
     }
 
     /// Rasters of several scenes as one tensor, [S, P, side, side].
-    pub(crate) fn raster_tensor(&self, rasters: &[Raster]) -> Result<Tensor, ModelError> {
+    pub fn raster_tensor(&self, rasters: &[Raster]) -> Result<Tensor, ModelError> {
         let side = self.raster_spec.side_px;
         let data: Vec<f32> = rasters
             .iter()
@@ -134,13 +139,13 @@ impl Network {
     }
 
     /// Visual features with their positions added, [S, M, C].
-    pub(crate) fn place(&self, features: &Tensor) -> candle_core::Result<Tensor> {
+    pub fn place(&self, features: &Tensor) -> candle_core::Result<Tensor> {
         let positions = self.mct.embed_sine(self.visual.positions())?; // [M, C]
         features.broadcast_add(&positions.unsqueeze(0)?)
     }
 
     /// Looks at the maps once, for any number of passes.
-    pub(crate) fn look(
+    pub fn look(
         &self,
         rasters: &[Raster],
         surveys: Vec<Arc<Survey>>,

@@ -5,13 +5,13 @@
 //! centre agent.
 
 use candle_core::{Result, Tensor, Var};
+use gump_nn::layers::Linear;
+use gump_nn::ops;
+use gump_nn::parameters::{Init, Scope};
 
 use crate::ModelError;
 use crate::config::{Encoder, ModelConfig};
 use crate::embedding::sine_of_point;
-use crate::mct::Linear;
-use crate::ops;
-use crate::parameters::{Init, Scope};
 
 type Built<T> = std::result::Result<T, ModelError>;
 
@@ -292,7 +292,7 @@ enum Backbone {
 
 /// Encoder, adaptor and position of the visual tokens.
 #[derive(Debug)]
-pub(crate) struct Visual {
+pub struct Visual {
     backbone: Backbone,
     adaptor: (Conv, Option<BatchNorm>),
     /// Sine features of the cell centres, [M, C].
@@ -345,7 +345,7 @@ impl Visual {
     }
 
     /// `raster` [S, P, side, side] to features [S, M, C], without positions.
-    pub(crate) fn features(&self, raster: &Tensor, training: bool) -> Result<Tensor> {
+    pub fn features(&self, raster: &Tensor, training: bool) -> Result<Tensor> {
         let map = match &self.backbone {
             Backbone::Compact(net) => net.forward(raster)?,
             Backbone::ResNet(net) => net.forward(raster, training)?,
@@ -367,7 +367,7 @@ impl Visual {
     }
 
     /// The decoder of the auxiliary loss, if the configuration asks for one.
-    pub(crate) fn reconstruction(&self) -> Option<&Reconstruction> {
+    pub fn reconstruction(&self) -> Option<&Reconstruction> {
         self.reconstruction.as_ref()
     }
 }
@@ -386,7 +386,7 @@ fn cell_positions(config: &ModelConfig, device: &candle_core::Device) -> Result<
 /// Every visual token redraws the pixels it covers: a transposed convolution whose kernel is its
 /// stride.
 #[derive(Debug)]
-pub(crate) struct Reconstruction {
+pub struct Reconstruction {
     hidden: Linear,
     pixels: Linear,
     planes: usize,
@@ -408,7 +408,7 @@ impl Reconstruction {
     /// Mean absolute difference between the redrawn raster and the raster itself.
     ///
     /// `features` [S, M, C], `raster` [S, P, side, side].
-    pub(crate) fn loss(&self, features: &Tensor, raster: &Tensor) -> Result<Tensor> {
+    pub fn loss(&self, features: &Tensor, raster: &Tensor) -> Result<Tensor> {
         let (scenes, planes, side, _) = raster.dims4()?;
         let n = side / self.stride;
         let drawn = self
@@ -424,8 +424,9 @@ impl Reconstruction {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use candle_core::Device;
+
+    use super::*;
 
     #[test]
     fn two_halves_of_pooling_are_pooling() {

@@ -1,10 +1,11 @@
-//! Everything a planner considered in one scene, and why it chose what it chose.
+//! Every candidate of a planner in one scene, and why it chose what it chose.
 //!
 //! `cargo run -p gump-planner --example explain_a_choice [FILE#INDEX]`
 
-use std::error::Error;
-
-use gump_planner::{Interactive, InteractiveConfig, Planner};
+use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
+use gump_planner::closed_loop::plan_once;
+use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig};
+use gump_rollout::BoxError;
 use gump_rollout::worlds::Idm;
 
 const SHIPPED: &str = concat!(
@@ -12,40 +13,47 @@ const SHIPPED: &str = concat!(
     "/../../datasets/mini/procedural.tfrecord.gz#17"
 );
 
-fn main() -> Result<(), Box<dyn Error>> {
+const GATES: [&str; 3] = [
+    "no_at_fault_collisions",
+    "drivable_area",
+    "driving_direction",
+];
+
+fn main() -> Result<(), BoxError> {
     let name = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
-    let scenario = gump_data::find(&name)?;
-    let scene = scenario.present();
+    let mut scenario = gump_data::find(&name)?;
+    derive_roadblocks(&mut scenario);
+    let recording = Recording::of_boxes(scenario)?;
 
-    // Any world will do; a learned one takes the same place.
+    // Any world will do.
     let world = Idm::default();
-    let mut planner = Interactive::new(&world, InteractiveConfig::default())?;
-    let plan = planner.plan(&scene)?;
+    let mut planner = InteractiveDriver::new(&world, InteractiveDriverConfig::default())?;
+    plan_once(&recording, &mut planner)?;
+    let Some(decision) = planner.decision() else {
+        return Err("a planner that planned has decided".into());
+    };
 
-    let speed = scene.ego_now().state.speed();
-    println!("{}: the ego drives {speed:.1} m/s", scenario.id);
-    println!("  reward  progress, m  comfort  proposal");
-    for (i, candidate) in plan.candidates.iter().enumerate() {
-        let Some(score) = &candidate.score else {
-            continue; // The emergency brake is chosen without being imagined.
-        };
-        let parts = score.parts();
-        let part = |wanted| parts.iter().find(|(name, _)| *name == wanted);
-        let value = |wanted| part(wanted).map_or(f64::NAN, |(_, value)| *value);
+    let speed = recording.ego_at(0).speed();
+    println!("{}: the ego drives {speed:.1} m/s", recording.scenario().id);
+    println!("   score  progress, m  comfort  candidate");
+    for (i, candidate) in decision.prospects.iter().enumerate() {
+        let parts = candidate.score.parts();
+        let comfort = parts.iter().find(|(name, _)| *name == "comfort");
         // A gate is a factor: 0 where something happened in all imagined futures.
-        let closed = parts.iter().find(|(name, factor)| {
-            ["collision", "off_road", "red_light"].contains(name) && *factor < 1.0
-        });
+        let closed = parts
+            .iter()
+            .find(|(name, factor)| GATES.contains(name) && *factor < 1.0);
         println!(
             "{} {:6.3} {:12.1} {:8.2}  {}{}",
-            if i == plan.chosen { '>' } else { ' ' },
-            score.mean,
-            value("progress_m"),
-            value("comfort"),
-            candidate.proposal.kind,
+            if i == decision.chosen { '>' } else { ' ' },
+            candidate.value,
+            candidate.progress_m,
+            comfort.map_or(f64::NAN, |(_, value)| *value),
+            candidate.kind,
             closed.map_or(String::new(), |(name, _)| format!(" ({name})")),
         );
     }
-    println!("chosen: {}", plan.choice().proposal.kind);
+    // It may brake all the same.
+    println!("chosen: {}", decision.prospects[decision.chosen].kind);
     Ok(())
 }

@@ -1,13 +1,16 @@
 //! Closed-loop evaluation: drive, score, over and over.
 //!
-//! [`drive_scenario`] does one scenario, [`drive_and_score`] one recording, [`evaluate`] many at once. What fails is an error of its
-//! recording; nothing here averages.
+//! [`drive_scenario`] does one scenario, [`drive_and_score`] one recording, [`evaluate`] many at
+//! once; [`plan_once`] asks for a plan alone. What fails is an error of its recording; nothing here
+//! averages.
 
 use gump_nuplan::closed_loop::{
-    DriveConfig, Driven, Driver, Recording, Tracking, Traffic, derive_roadblocks, drive,
+    DriveConfig, Driven, Driver, Moment, Recording, Tracking, Traffic, derive_roadblocks, drive,
 };
 use gump_nuplan::metrics::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
 use gump_nuplan::metrics::{open_loop, score};
+use gump_nuplan::tracking::Trajectory;
+use gump_rollout::BoxError;
 use gump_scene::{EgoState, MapGraph, Scenario};
 use rayon::prelude::*;
 
@@ -67,6 +70,20 @@ pub fn drive_scenario(
     derive_roadblocks(&mut driven);
     let recording = Recording::of_boxes(driven)?;
     drive_and_score(&recording, &scenario.map, traffic, driver, config)
+}
+
+/// What a driver plans in the present of a recording; nothing is driven.
+///
+/// # Errors
+/// Whatever the driver reports.
+pub fn plan_once(recording: &Recording, driver: &mut dyn Driver) -> Result<Trajectory, BoxError> {
+    driver.start(&recording.mission())?;
+    driver.drive(&Moment {
+        iteration: 0,
+        scene: recording.scenario().present(),
+        ego: recording.ego_at(0),
+        past: recording.past(),
+    })
 }
 
 /// Lets a driver plan along the log without being followed, and compares its plans with what was

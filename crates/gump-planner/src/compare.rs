@@ -176,11 +176,11 @@ fn variance(values: &[f64]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{IdmPlanner, PlannerPolicy, ProposalConfig, planning_reward};
     use approx::assert_abs_diff_eq;
+    use gump_metrics::{Collision, Discomfort, Metric, OffRoad, Progress, RedLight, Reduce};
     use gump_rollout::Command;
-    use gump_rollout::worlds::ConstantVelocity;
-    use gump_scene::fixture;
+    use gump_rollout::worlds::{ConstantVelocity, IdmConfig, idm_acceleration};
+    use gump_scene::{Agent, fixture};
 
     /// Holds an acceleration whatever happens.
     struct Holds(&'static str, f64);
@@ -199,6 +199,47 @@ mod tests {
         }
     }
 
+    /// Keeps the law's distance to the only other, who is ahead on a road along the x-axis.
+    struct Careful;
+
+    impl Policy for Careful {
+        fn name(&self) -> &str {
+            "careful"
+        }
+
+        fn act(&mut self, scenes: &[SceneState<'_>]) -> Result<Vec<Command>, BoxError> {
+            let config = IdmConfig::default();
+            let commands = scenes.iter().map(|scene| {
+                let (ego, other) = (scene.ego_now(), scene.now().agents()[1]);
+                let apart = other.state.pose.position.x - ego.state.pose.position.x;
+                let gap = apart - (ego.length + other.length) / 2.0;
+                let (speed, lead) = (ego.state.speed(), other.state.speed());
+                Command::Drive {
+                    acceleration: idm_acceleration(&config, speed, 12.0, gap, lead),
+                    curvature: 0.0,
+                }
+            });
+            Ok(commands.collect())
+        }
+    }
+
+    /// The share of frames that keep all comfort bounds.
+    struct Comfort;
+
+    impl Metric for Comfort {
+        fn name(&self) -> &'static str {
+            "comfort"
+        }
+
+        fn at(&self, scene: &SceneState<'_>, agent: &Agent) -> Option<f64> {
+            Discomfort.at(scene, agent).map(|broken| 1.0 - broken)
+        }
+
+        fn reduce(&self) -> Reduce {
+            Reduce::Mean
+        }
+    }
+
     #[test]
     fn policies_are_ranked_by_what_they_come_to() {
         let street = |x: u32| {
@@ -210,14 +251,19 @@ mod tests {
         };
         let scenarios = [street(40), street(45), street(300)];
         let scenes: Vec<_> = scenarios.iter().map(|s| s.present()).collect();
-        let mut careful = PlannerPolicy::new(IdmPlanner::new(ProposalConfig::default()).unwrap());
         let (mut blind, mut lazy) = (Holds("blind", 0.0), Holds("lazy", -4.0));
-        let mut policies: [&mut dyn Policy; 3] = [&mut blind, &mut lazy, &mut careful];
-        let (reward, config) = (planning_reward(), ValueConfig::default());
+        let mut policies: [&mut dyn Policy; 3] = [&mut blind, &mut lazy, &mut Careful];
+        let reward = Reward::new()
+            .gate(Collision)
+            .gate(OffRoad)
+            .gate(RedLight)
+            .term(5.0 / 7.0 / 60.0, Progress)
+            .term(2.0 / 7.0, Comfort);
+        let config = ValueConfig::default();
         let ranked =
             value_policies(&ConstantVelocity, &scenes, &mut policies, &reward, &config).unwrap();
         let names: Vec<&str> = ranked.iter().map(|value| value.name.as_str()).collect();
-        assert_eq!(names, ["idm", "lazy", "blind"]);
+        assert_eq!(names, ["careful", "lazy", "blind"]);
         // The blind one hits the car in two scenes of three.
         let blind: Vec<bool> = ranked[2].scores.iter().map(|s| s[0] > 0.0).collect();
         assert_eq!(blind, [false, false, true]);

@@ -1,6 +1,5 @@
 //! What can keep a planner from planning.
 
-use gump_geometry::DVec2;
 use gump_nuplan::metrics::NuPlanError;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::{AgentId, RoadblockId};
@@ -8,16 +7,6 @@ use gump_scene::{AgentId, RoadblockId};
 /// Why there is no plan.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
-    /// Neither the route nor a lane passes near the ego in its direction.
-    #[error(
-        "the ego stands at ({:.1}, {:.1}) m, where neither the route nor a lane leads ahead",
-        position.x,
-        position.y
-    )]
-    NoLaneAhead {
-        /// Where the ego is, world frame, metres.
-        position: DVec2,
-    },
     /// A planner of the closed loop was asked before it was told where to go.
     #[error("the planner was asked to drive before it was given a mission")]
     NoMission,

@@ -1,38 +1,45 @@
 //! Proposals, imagining them in any world, choosing one.
 //!
-//! Start with [`Interactive`]: it proposes what the ego might do, imagines how others answer and
-//! keeps every candidate with its score. [`Planner`] is what plans from a scene alone;
-//! [`PlannerPolicy`] lets one drive in a simulation. How traffic moves is a world's business, what
-//! is good a reward's; nothing here reads a file or steps a world by itself.
+//! Start with [`InteractiveDriver`], the paper's planner: it proposes what the ego might do,
+//! imagines how others answer and keeps every candidate with its score. How traffic moves is a
+//! world's business; nothing here reads a file or steps a world by itself.
 //!
-//! nuPlan's closed loop is driven by a [`gump_nuplan::closed_loop::Driver`]: [`PdmClosed`], the
-//! paper's [`InteractiveDriver`], which is PDM with imagination in place of a forecast,
-//! [`ImitationDriver`], [`NuplanIdmDriver`], [`SimpleDriver`], the oracle [`LogDriver`], or any
-//! [`Planner`] as [`Planned`]. [`closed_loop`] lets one drive and scores it; [`Comparison`] says who
-//! is better and how sure that is, [`value_policies`] does it for any policy in any world.
+//! All planners are a [`gump_nuplan::closed_loop::Driver`]: [`PdmClosed`], of which
+//! [`InteractiveDriver`] differs by imagining instead of a forecast, [`ImitationDriver`],
+//! [`NuplanIdmDriver`], [`SimpleDriver`] and the oracle [`LogDriver`]. [`closed_loop`] lets one
+//! drive and scores it; [`Comparison`] says who is better and how sure that is,
+//! [`value_policies`] does it for any policy in any world.
 //!
 //! # Terms
-//! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with what became of it.
-//! * **plan**: all candidates and which one was chosen.
-//! * **way**: the line a proposal follows, the route or the lanes ahead.
+//! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with what was found of it.
+//! * **way**: the line a proposal follows, taken from the route.
 //! * **prospect**: a policy with all that was imagined of it. **Decision**: all prospects and which
 //!   one drives on.
 //!
 //! ```
-//! use gump_planner::{Interactive, InteractiveConfig, Planner};
+//! use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
+//! use gump_planner::closed_loop::plan_once;
+//! use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig};
 //! use gump_rollout::worlds::Idm;
 //!
-//! let scenario = gump_scene::fixture::scenario(
+//! let mut scenario = gump_scene::fixture::scenario(
 //!     "lane 1: 0,0 300,0 speed 15
+//!      drivable: 0,-3 300,-3 300,3 0,3
+//!      route 1
 //!      ego vehicle 0: 10,0 velocity 8,0
 //!      agent vehicle 1: 60,0 velocity 6,0",
 //! ).unwrap();
+//! derive_roadblocks(&mut scenario);
+//! let recording = Recording::of_boxes(scenario).unwrap();
 //! let world = Idm::default();
-//! let mut planner = Interactive::new(&world, InteractiveConfig::default()).unwrap();
-//! let plan = planner.plan(&scenario.present()).unwrap();
-//! assert_eq!(plan.candidates.len(), 15);
-//! let score = plan.choice().score.as_ref().unwrap();
-//! assert!(plan.candidates.iter().all(|c| c.score.as_ref().unwrap().mean <= score.mean + 1e-6));
+//! let config = InteractiveDriverConfig::default();
+//! let mut planner = InteractiveDriver::new(&world, config).unwrap();
+//! plan_once(&recording, &mut planner).unwrap();
+//! let decision = planner.decision().unwrap();
+//! // Five speeds on three lines, and what the world has the ego do.
+//! assert_eq!(decision.prospects.len(), 16);
+//! let best = decision.prospects[decision.chosen].value;
+//! assert!(decision.prospects.iter().all(|prospect| prospect.value <= best + 1e-6));
 //! ```
 //!
 //! # Scoring a planner
@@ -72,33 +79,23 @@
 //! assert!(scored.score > 0.5);
 //! ```
 
+mod candidates;
 pub mod closed_loop;
 mod compare;
-mod considered;
-mod driver;
 mod drivers;
 mod error;
-mod idm;
 mod interactive;
-mod interactive_driver;
-mod obstacle;
-mod path_ahead;
 mod pdm;
-mod planner;
 mod proposal;
-mod propose;
 pub mod route_search;
 
+pub use candidates::{Candidate, Explain};
 pub use compare::{Comparison, PolicyValue, ValueConfig, value_policies};
-pub use considered::{Considered, Explain};
-pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, Planned, SimpleDriver};
+pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, SimpleDriver};
 pub use error::PlanError;
-pub use idm::IdmPlanner;
-pub use interactive::{Interactive, InteractiveConfig, planning_reward};
-pub use interactive_driver::{
-    Decision, InteractiveDriver, InteractiveDriverConfig, Phases, PlanBudget, Prospect, Worth,
+pub use interactive::{
+    CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig, Phases, PlanBudget,
+    Prospect, Worth,
 };
 pub use pdm::{PdmClosed, PdmConfig, PdmScore};
-pub use planner::{Candidate, CandidateScore, Plan, Planner, PlannerPolicy};
 pub use proposal::{Proposal, ProposalKind};
-pub use propose::{ProposalConfig, Proposals, emergency_brake, propose};

@@ -1,7 +1,7 @@
 //! Proposals: trajectories the ego might drive.
 //!
-//! Here is the trajectory and its interpolation; `propose` makes them, [`crate::Interactive`]
-//! judges them.
+//! Here is the trajectory and its interpolation; worlds that drive the ego and rules make them,
+//! [`crate::InteractiveDriver`] judges them.
 
 use std::fmt;
 

@@ -7,12 +7,12 @@ mod shared_data;
 
 use std::ops::Range;
 
-use gump_planner::{
-    IdmPlanner, Interactive, InteractiveConfig, Planner, PlannerPolicy, ProposalConfig,
-};
+use gump_nuplan::closed_loop::{DriveConfig, Recording, Replayed, derive_roadblocks};
+use gump_planner::closed_loop::{drive_scenario, plan_once};
+use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig, NuplanIdmDriver};
+use gump_rollout::WorldModel;
 use gump_rollout::worlds::{Idm, LogReplay};
-use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{Scenario, Seed};
+use gump_scene::{EgoState, Scenario};
 
 fn shared(name: &str) -> Option<Scenario> {
     let path = shared_data::shared(&format!("data/waymo/{name}"))?;
@@ -22,24 +22,26 @@ fn shared(name: &str) -> Option<Scenario> {
 /// Plans interactively among reactive and among replayed traffic; metres the choice drives.
 fn check(scenario: &Scenario, expected: Range<f64>) {
     let replay = LogReplay::new(scenario);
+    let mut driven = scenario.clone();
+    derive_roadblocks(&mut driven);
+    let recording = Recording::of_boxes(driven).unwrap();
     for world in [&Idm::default() as &dyn WorldModel, &replay] {
-        let mut planner = Interactive::new(world, InteractiveConfig::default()).unwrap();
-        let plan = planner.plan(&scenario.present()).unwrap();
-        assert_eq!(plan.candidates.len(), 15, "the emergency brake was needed");
-        let now = scenario.present().ego_now().state;
-        for candidate in &plan.candidates {
-            let mut before = now;
-            for state in candidate.proposal.resampled(&now, 0.1) {
-                let moved = (state.pose.position - before.pose.position) / 0.1;
-                let middle = (state.velocity + before.velocity) / 2.0;
+        let config = InteractiveDriverConfig::default();
+        let mut planner = InteractiveDriver::new(world, config).unwrap();
+        plan_once(&recording, &mut planner).unwrap();
+        let decision = planner.decision().unwrap();
+        assert_eq!(decision.prospects.len(), 16);
+        assert!(!decision.brakes, "the emergency brake was needed");
+        for prospect in &decision.prospects {
+            for pair in prospect.drives[0].windows(2) {
+                let moved = (pair[1].rear_axle.position - pair[0].rear_axle.position) / 0.1;
+                let velocity = |state: &EgoState| state.rear_axle.direction() * state.velocity.x;
+                let middle = (velocity(&pair[0]) + velocity(&pair[1])) / 2.0;
                 assert!((moved - middle).length() < 0.3, "{moved} but {middle}");
-                before = state;
             }
         }
-        let progress = plan.choice().score.as_ref().unwrap().futures[0].terms[0];
-        assert_eq!(progress.name, "progress_m");
-        let driven = progress.value.unwrap();
-        assert!(expected.contains(&driven), "{driven} m in {}", world.name());
+        let metres = decision.prospects[decision.chosen].progress_m;
+        assert!(expected.contains(&metres), "{metres} m in {}", world.name());
     }
 }
 
@@ -56,17 +58,13 @@ fn the_ego_turns_right_where_it_turned_right() {
         return;
     };
     check(&scenario, 10.0..25.0);
-    let world = LogReplay::new(&scenario);
-    let start = Start {
-        scene: scenario.present(),
-        n_futures: 1,
-        seed: Seed(0),
+    let config = DriveConfig {
+        seconds: 8.0,
+        ..DriveConfig::default()
     };
-    let planner = IdmPlanner::new(ProposalConfig::default()).unwrap();
-    let mut policy = PlannerPolicy::new(planner);
-    let config = SimulateConfig::default();
-    let rollouts = simulate(&world, &[start], Some(&mut policy), &config).unwrap();
-    let ego = rollouts[0].last().ego_now().state;
+    let mut driver = NuplanIdmDriver::default();
+    let scored = drive_scenario(&scenario, &mut Replayed, &mut driver, &config).unwrap();
+    let ego = scored.driven.rollout.last().ego_now().state;
     let foot = scenario
         .route
         .as_ref()

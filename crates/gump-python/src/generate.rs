@@ -2,17 +2,16 @@
 
 use std::sync::Arc;
 
-use gump_model::generation::constraint::parse_constraints;
-use gump_model::generation::factory::{Made, Order, make_many};
-use gump_model::generation::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_generate::constraint::parse_constraints;
+use gump_generate::factory::{GenerationJob, Made, make_many};
+use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
 use gump_scene::{ScenarioTag, Seed};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
-use crate::errors;
 use crate::scenario::{Scenario, Scene};
-use crate::threads;
 use crate::world::{Kind, World};
+use crate::{errors, threads};
 
 /// Scenes made together.
 const BATCH: u64 = 32;
@@ -35,7 +34,7 @@ struct Wish {
 }
 
 impl Wish {
-    fn order(&self, recorded: &gump_scene::Scenario) -> PyResult<Order> {
+    fn order(&self, recorded: &gump_scene::Scenario) -> PyResult<GenerationJob> {
         let tag = |name: &String| {
             let tag = name.parse::<ScenarioTag>();
             tag.map_err(|why| errors::value(format!("prompt: {why}")))
@@ -55,7 +54,7 @@ impl Wish {
         let present = recorded.present();
         let ego = present.ego_now();
         let agents = present.now().agents().iter();
-        Ok(Order {
+        Ok(GenerationJob {
             request: GenerateRequest {
                 map: Arc::clone(&recorded.map),
                 ego: EgoStart {

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use gump_engine::relative::{RelativeSampling, RelativeWorld};
+use gump_engine::{Mode, Precision, SamplingConfig, TransformerWorld};
 use gump_geometry::{Pose, dvec2};
-use gump_model::relative::{self, RelativeSampling, RelativeWorld};
-use gump_model::world::TransformerWorld;
-use gump_model::{Device, Mode, Precision, SamplingConfig, checkpoint};
+use gump_model::{Device, checkpoint, relative};
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentId, AgentState, Frame, Rollout, Seed};
@@ -15,10 +15,9 @@ use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 
 use crate::arrays::{Numbers, array};
-use crate::errors;
 use crate::scenario::{Scenario, Scene};
 use crate::scenario_arrays::state;
-use crate::threads;
+use crate::{errors, threads};
 
 /// What imagines.
 #[derive(Clone)]

@@ -259,7 +259,8 @@ proptest! {
             place(0.0, 0.0),
         )).unwrap();
         let raster_pose = world * Pose::new(shift_x, shift_y, turn);
-        let raster = rasterize(&all_layers(104, 0.5), &scenario.present(), raster_pose);
+        // Wide enough for a bend in the far corner, seen across.
+        let raster = rasterize(&all_layers(120, 0.5), &scenario.present(), raster_pose);
 
         let meeting = scenario.present().now().agent(AgentId(1)).unwrap().state.pose.position;
         for layer in [
@@ -270,7 +271,7 @@ proptest! {
         }
         prop_assert_eq!(raster.get(Layer::Agents).unwrap().iter().sum::<f32>(), 1.0);
         // The public transform leads to the same pixel, up to rounding at its border.
-        let local = (dvec2(26.0, 26.0) - (raster.raster_from_world * meeting)) / 0.5;
+        let local = (dvec2(30.0, 30.0) - (raster.raster_from_world * meeting)) / 0.5;
         let (row, column) = raster.pixel_of(meeting).unwrap();
         prop_assert!((local - dvec2(row as f64 + 0.5, column as f64 + 0.5)).abs().max_element() < 0.5001);
     }

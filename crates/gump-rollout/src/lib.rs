@@ -33,5 +33,5 @@ pub mod worlds;
 
 pub use error::RolloutError;
 pub use policy::{Command, Policy};
-pub use simulate::{Interpolation, SimulateConfig, simulate};
+pub use simulate::{Interpolation, SimulateConfig, fill, simulate};
 pub use world::{BoxError, Session, Start, WorldModel};

@@ -110,6 +110,25 @@ pub fn simulate(
         .collect())
 }
 
+/// The frames from the present of a scene, excluded, to the world's next one, included, at the
+/// scene's rate: what [`simulate`] puts between two frames of a world, for whoever steps one by hand.
+///
+/// The curve bends as the frame `dt` before the present asks; what comes after `next` is not known
+/// yet, so it ends straight.
+///
+/// # Errors
+/// [`RolloutError::TimeStep`] if `dt`, seconds, is no multiple of the scene's.
+pub fn fill(
+    scene: SceneState<'_>,
+    next: &Frame,
+    dt: f64,
+    config: &SimulateConfig,
+) -> Result<Vec<Frame>, RolloutError> {
+    let stride = stride(dt, scene.dt)?;
+    let knots = std::slice::from_ref(next);
+    Ok(resample(scene, knots, stride, stride, config))
+}
+
 /// One future in the making, at the time step of the world.
 struct Future<'a> {
     scene: SceneState<'a>,

@@ -38,12 +38,12 @@ mod rollout;
 mod route;
 mod scenario;
 mod scene_state;
-mod seed;
 mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
+pub use gump_seed::{Rng, Seed};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
@@ -55,5 +55,4 @@ pub use rollout::Rollout;
 pub use route::Route;
 pub use scenario::{Scenario, ScenarioError};
 pub use scene_state::SceneState;
-pub use seed::{Rng, Seed};
 pub use tag::ScenarioTag;

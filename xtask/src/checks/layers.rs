@@ -11,11 +11,11 @@ use anyhow::Context as _;
 use serde::Deserialize;
 
 /// Outside crates (by the start of their names) that only some packages may use, and why.
-const CONFINED: [(&str, &[&str], &str); 4] = [
+const CONFINED: [(&str, &[&str], &str); 5] = [
     (
         "candle",
-        &["gump-model", "gump-rl"],
-        "tensors live in the network and the learners only",
+        &["gump-nn", "gump-model", "gump-engine", "gump-train"],
+        "tensors live in the networks and the learners only",
     ),
     (
         "prost",
@@ -23,6 +23,11 @@ const CONFINED: [(&str, &[&str], &str); 4] = [
         "only messages, gump-data and the driver know a file layout",
     ),
     ("clap", &["xtask"], "only the driver reads a command line"),
+    (
+        "wasm-bindgen",
+        &["gump-web"],
+        "only the page's bindings know JavaScript",
+    ),
     (
         "anyhow",
         &["xtask", "examples"],
@@ -45,7 +50,64 @@ pub(crate) fn problems(repository: &Path) -> anyhow::Result<Vec<String>> {
         "cargo metadata failed: {}",
         String::from_utf8_lossy(&output.stderr).trim()
     );
-    Ok(problems_in(&serde_json::from_slice(&output.stdout)?))
+    let workspace: Metadata = serde_json::from_slice(&output.stdout)?;
+    let path = repository.join("ARCHITECTURE.md");
+    let page = std::fs::read_to_string(&path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    let mut problems = problems_in(&workspace);
+    problems.extend(problems_of_the_page(&workspace, &page));
+    // What is compiled differs by platform; the page tells of one.
+    if cfg!(all(target_os = "linux", target_arch = "x86_64")) {
+        problems.extend(problems_of_counts(repository, &workspace, &page)?);
+    }
+    Ok(problems)
+}
+
+/// Where the table of ARCHITECTURE.md says another number of crates to compile than there are.
+fn problems_of_counts(
+    repository: &Path,
+    workspace: &Metadata,
+    page: &str,
+) -> anyhow::Result<Vec<String>> {
+    let mut problems = Vec::new();
+    for package in &workspace.packages {
+        let name = package.name.as_str();
+        let row = page
+            .lines()
+            .find(|line| line.starts_with(&format!("| `{name}` |")));
+        let told = row.and_then(|row| row.trim_end_matches(" |").rsplit(' ').next());
+        let counted = n_compiled(repository, name)?;
+        if told.and_then(|told| told.parse().ok()) != Some(counted) {
+            problems.push(format!(
+                "ARCHITECTURE.md says that {name} compiles {} crates, cargo tree says {counted}",
+                told.unwrap_or("no")
+            ));
+        }
+    }
+    Ok(problems)
+}
+
+/// How many crates building a package takes, itself included.
+fn n_compiled(repository: &Path, package: &str) -> anyhow::Result<usize> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let words = "tree --quiet --offline --locked --edges normal,build --prefix none --format {p}";
+    let output = Command::new(cargo)
+        .args(words.split(' '))
+        .args(["--package", package])
+        .current_dir(repository)
+        .output()
+        .context("cannot run cargo tree")?;
+    anyhow::ensure!(
+        output.status.success(),
+        "cargo tree failed: {}",
+        String::from_utf8_lossy(&output.stderr).trim()
+    );
+    let text = String::from_utf8_lossy(&output.stdout);
+    let names = text
+        .lines()
+        .map(|line| line.trim_end_matches(" (*)").trim());
+    let names: std::collections::BTreeSet<&str> = names.filter(|line| !line.is_empty()).collect();
+    Ok(names.len())
 }
 
 #[derive(Deserialize)]
@@ -58,6 +120,8 @@ struct Package {
     name: String,
     metadata: Option<PackageMetadata>,
     dependencies: Vec<Dependency>,
+    #[serde(default)]
+    features: std::collections::BTreeMap<String, Vec<String>>,
 }
 
 #[derive(Deserialize)]
@@ -109,6 +173,46 @@ fn problems_in(workspace: &Metadata) -> Vec<String> {
     problems
 }
 
+/// Where ARCHITECTURE.md says otherwise than the manifests: its picture of the layers, and the
+/// outside crates in its table.
+fn problems_of_the_page(workspace: &Metadata, page: &str) -> Vec<String> {
+    let mut problems = Vec::new();
+    let layers = page.lines().filter_map(|line| {
+        let (layer, names) = line.trim().split_once(' ')?;
+        Some((layer.parse::<u32>().ok()?, names))
+    });
+    let layers: Vec<(u32, &str)> = layers.collect();
+    for package in &workspace.packages {
+        let name = package.name.as_str();
+        let says = |names: &str| names.split_whitespace().any(|word| word == name);
+        let drawn = layers.iter().find(|(_, names)| says(names));
+        if drawn.map(|(layer, _)| *layer) != package.layer() {
+            let (own, drawn) = (package.layer(), drawn.map(|(layer, _)| *layer));
+            problems.push(format!(
+                "ARCHITECTURE.md draws {name} on layer {drawn:?}, its Cargo.toml states {own:?}"
+            ));
+        }
+        let row = page
+            .lines()
+            .find(|line| line.starts_with(&format!("| `{name}` |")));
+        let Some(row) = row else {
+            problems.push(format!("ARCHITECTURE.md has no row for {name}"));
+            continue;
+        };
+        let outside = row.split(" | ").nth(2).unwrap_or_default();
+        for word in outside.split('`').skip(1).step_by(2) {
+            let is_known = package.dependencies.iter().any(|d| d.name == word);
+            // A word may also name a feature.
+            if !is_known && !package.features.contains_key(word) {
+                problems.push(format!(
+                    "ARCHITECTURE.md gives {name} the crate {word}, on which it does not depend"
+                ));
+            }
+        }
+    }
+    problems
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -138,9 +242,28 @@ mod tests {
             found,
             [
                 "gump-raster (layer 2) depends on gump-data (layer 2), expected a lower layer",
-                "gump-raster depends on candle-core, but tensors live in the network and the \
+                "gump-raster depends on candle-core, but tensors live in the networks and the \
                  learners only",
                 "gump-new states no layer in its Cargo.toml",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_page_that_says_otherwise_is_found() {
+        let workspace = json!({"packages": [
+            {"name": "gump-scene", "metadata": {"layer": 1}, "dependencies": [{"name": "glam"}]},
+            {"name": "gump-data", "metadata": {"layer": 2}, "dependencies": []},
+        ]});
+        let page = " 2   gump-scene\n| `gump-scene` | Words. | `glam`, `prost` | 9 |\n";
+        let found = problems_of_the_page(&serde_json::from_value(workspace).unwrap(), page);
+        assert_eq!(
+            found,
+            [
+                "ARCHITECTURE.md draws gump-scene on layer Some(2), its Cargo.toml states Some(1)",
+                "ARCHITECTURE.md gives gump-scene the crate prost, on which it does not depend",
+                "ARCHITECTURE.md draws gump-data on layer None, its Cargo.toml states Some(2)",
+                "ARCHITECTURE.md has no row for gump-data",
             ]
         );
     }

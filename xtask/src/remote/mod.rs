@@ -16,7 +16,7 @@ use std::time::Duration;
 use gump_geometry::{Pose, dvec2};
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
 use gump_nuplan::tracking::Trajectory;
-use gump_planner::{Considered, Explain};
+use gump_planner::{Candidate, Explain};
 use gump_proto::nuplan as proto;
 use gump_rollout::BoxError;
 use gump_scene::{EgoState, LightState, VehicleParameters};
@@ -134,8 +134,8 @@ impl Driver for RemoteDriver {
 }
 
 impl Explain for RemoteDriver {
-    fn considered(&self) -> Vec<Considered> {
-        vec![Considered::alone("what the planner said", Vec::new())]
+    fn candidates(&self) -> Vec<Candidate> {
+        vec![Candidate::alone("what the planner said", Vec::new())]
     }
 }
 

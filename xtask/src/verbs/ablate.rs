@@ -8,21 +8,22 @@ mod switches;
 use std::num::NonZeroUsize;
 
 use gump_data::find;
+use gump_engine::Mode;
 use gump_metrics::{Part, summarize};
-use gump_model::Mode;
 use gump_scene::{Rollout, Scenario};
 use gump_viz::Picture;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 pub(crate) use self::decoding::Knob;
+use gump_eval::worlds::{World, WorldName};
+
 use crate::cli::WrongArguments;
 use crate::decoding::Decoding;
-use crate::futures;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
-use crate::shipped;
-use crate::worlds::{Draw, World, WorldName};
+use crate::sampling::Draw;
+use crate::{futures, shipped};
 
 /// Which ablation.
 #[derive(Debug, clap::Subcommand)]

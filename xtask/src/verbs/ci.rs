@@ -17,18 +17,18 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// A check that cargo does: its name and the words after `cargo`.
-const STEPS: [(&str, &str); 5] = [
-    ("fmt", "fmt --all --check"),
-    (
-        "clippy",
-        "clippy --workspace --all-targets --locked -- -D warnings",
-    ),
-    // What reads one format alone must build without the others.
-    ("slim", "check -p gump-data --no-default-features --locked"),
-    ("doc", "doc --workspace --no-deps --locked"),
-    ("test", "test --workspace --locked"),
-];
+/// The list that `.ci/run` reads too: a name and the words after `cargo` a line.
+const CHECKS: &str = include_str!("../../../.ci/checks");
+
+/// A target that checks named `wasm...` build for.
+const WASM: &str = "wasm32-unknown-unknown";
+
+/// The checks: names and words after `cargo`.
+fn checks() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let is_check = |line: &&str| !line.is_empty() && !line.starts_with('#');
+    let lines = CHECKS.lines().filter(is_check);
+    lines.filter_map(|line| line.split_once(": "))
+}
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
@@ -36,11 +36,20 @@ impl Args {
             common: self.common.clone(),
         }
         .execute(run)?;
-        for (name, words) in STEPS {
+        let has_wasm = has_target(WASM);
+        let mut done = Vec::new();
+        for (name, words) in checks() {
+            if name.starts_with("wasm") && !has_wasm {
+                run.say(&format!(
+                    "skipped: {name} (run `rustup target add {WASM}` for it)"
+                ));
+                continue;
+            }
             run.say(&format!("cargo {words}"));
             run.phase(name, |_| cargo(words))?;
+            done.push(name);
         }
-        run.result("steps", STEPS.map(|(name, _)| name))?;
+        run.result("steps", done)?;
         Ok(())
     }
 }
@@ -59,4 +68,32 @@ fn cargo(words: &str) -> anyhow::Result<()> {
     let status = command.status().context("cannot run cargo")?;
     anyhow::ensure!(status.success(), "cargo {words} failed: {status}");
     Ok(())
+}
+
+/// Whether the compiler has the standard library of a target.
+fn has_target(target: &str) -> bool {
+    let sysroot = Command::new("rustc").args(["--print", "sysroot"]).output();
+    sysroot.is_ok_and(|output| {
+        let sysroot = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+        std::path::Path::new(&sysroot)
+            .join("lib/rustlib")
+            .join(target)
+            .is_dir()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_of_checks_is_read_whole() {
+        let names: Vec<_> = checks().map(|(name, _)| name).collect();
+        assert_eq!(names.first(), Some(&"fmt"));
+        assert_eq!(names.last(), Some(&"test"));
+        let written = CHECKS
+            .lines()
+            .filter(|l| !l.is_empty() && !l.starts_with('#'));
+        assert_eq!(names.len(), written.count());
+    }
 }

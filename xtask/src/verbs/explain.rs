@@ -56,7 +56,7 @@ pub(crate) fn write(
 }
 
 /// The chosen one, then the others, best first.
-fn ranked(decision: &Decision) -> Vec<usize> {
+pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
     let mut order: Vec<usize> = (0..decision.prospects.len()).collect();
     order.sort_by(|&a, &b| {
         let value = |i: usize| decision.prospects[i].value;
@@ -202,26 +202,27 @@ fn viewer<'a>(
     for &i in order {
         let prospect = &decision.prospects[i];
         viewer.future(prospect.kind.to_string(), &prospect.futures[0]);
-        let path = prospect.drives[0].iter();
-        viewer.candidate(CandidatePath {
-            name: prospect.kind.to_string(),
-            score: Some(prospect.value),
-            parts: named(&prospect.score.parts()),
-            is_chosen: i == decision.chosen && !decision.brakes,
-            path: path
-                .map(|state| vehicle.center_of(state.rear_axle).position)
-                .collect(),
-        });
+        viewer.candidate(path(vehicle, decision, i));
     }
     viewer
 }
 
-/// Parts of a score as the viewer takes them.
-pub(crate) fn named(parts: &[(&'static str, f64)]) -> Vec<(String, f64)> {
-    let parts = parts.iter();
-    parts
-        .map(|(name, value)| ((*name).into(), *value))
-        .collect()
+/// A candidate with its line in the first of its futures, as the viewer takes it.
+pub(crate) fn path(vehicle: &VehicleParameters, decision: &Decision, i: usize) -> CandidatePath {
+    let prospect = &decision.prospects[i];
+    let (parts, states) = (prospect.score.parts(), prospect.drives[0].iter());
+    CandidatePath {
+        name: prospect.kind.to_string(),
+        score: Some(prospect.value),
+        parts: parts
+            .into_iter()
+            .map(|(name, value)| (name.to_owned(), value))
+            .collect(),
+        is_chosen: i == decision.chosen && !decision.brakes,
+        path: states
+            .map(|state| vehicle.center_of(state.rear_axle).position)
+            .collect(),
+    }
 }
 
 /// What `report.json` says of the decision.

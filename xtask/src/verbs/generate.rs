@@ -7,22 +7,22 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use gump_data::find_map;
-use gump_model::generation::constraint::{ObjectSpec, parse_constraints};
-use gump_model::generation::factory::{Made, Order, make_many};
-use gump_model::generation::verdict::{off_road, overlaps};
-use gump_model::generation::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
-use gump_model::world::TransformerWorld;
-use gump_model::{Device, SamplingConfig, checkpoint};
+use gump_engine::placement::object_spec::ObjectSpec;
+use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_eval::worlds;
+use gump_generate::constraint::parse_constraints;
+use gump_generate::factory::{GenerationJob, Made, make_many};
+use gump_generate::verdict::{off_road, overlaps};
+use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_model::{Device, checkpoint};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
 use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
-use crate::futures;
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::shipped;
-use crate::worlds;
+use crate::{futures, shipped};
 
 /// Scenes made together.
 const BATCH: u64 = 32;
@@ -121,7 +121,7 @@ impl Args {
         let world = run.phase("load", |run| {
             world(run.device(), self.weights.as_ref(), self.life)
         })?;
-        let order = Order {
+        let order = GenerationJob {
             request: GenerateRequest {
                 prompts,
                 counts: self.counts(),
@@ -189,7 +189,7 @@ impl Args {
         &self,
         run: &Run,
         world: &TransformerWorld,
-        order: &Order,
+        order: &GenerationJob,
     ) -> anyhow::Result<(Vec<Made>, Duration)> {
         let n = self.count.get() as u64;
         let progress = run.progress("generating", n, "scenes");
@@ -344,7 +344,7 @@ fn count(made: &Made, wanted: impl Fn(AgentKind) -> bool) -> usize {
 /// Per clause whether it holds; of several scenes, in all of them, with the share in which it does.
 fn clauses(made: &[Made]) -> Vec<Value> {
     let first = made.first().map_or(&[][..], |made| &made.clauses);
-    let row = |(i, clause): (usize, &gump_model::generation::verdict::Clause)| {
+    let row = |(i, clause): (usize, &gump_generate::verdict::Clause)| {
         let verdicts: Vec<Option<bool>> = made.iter().map(|made| made.clauses[i].holds).collect();
         let holding = verdicts
             .iter()

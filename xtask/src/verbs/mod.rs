@@ -15,3 +15,4 @@ pub(crate) mod simulate;
 pub(crate) mod submit;
 pub(crate) mod tidy;
 pub(crate) mod train;
+pub(crate) mod web;

@@ -1,9 +1,13 @@
 //! `plan`: one planner through one scenario, with everything it considered.
 
+use gump_eval::planners::{PlannerName, PlanningWorld, TimedDriver};
+use gump_eval::recordings;
+use gump_eval::recordings::Case;
+use gump_eval::worlds::WorldName;
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
-use gump_planner::{Considered, Decision, Explain};
+use gump_planner::{Candidate, Decision, Explain};
 use gump_rollout::BoxError;
 use gump_scene::{Frame, Scenario};
 use serde::Serialize;
@@ -13,10 +17,9 @@ use super::evaluate::Driving;
 use super::explain;
 use crate::cli::WrongArguments;
 use crate::futures;
-use crate::planners::{PlannerName, Surroundings, Thinking, Timed};
-use crate::recordings::{self, Case};
+use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// Arguments of `plan`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -25,7 +28,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S")]
     scenario: String,
     /// Who plans
-    #[arg(long, value_enum, value_name = "P", default_value_t = PlannerName::Interactive)]
+    #[arg(long, value_parser = PlannerParser, value_name = "P", default_value_t = PlannerName::Interactive)]
     planner: PlannerName,
     /// Whom it meets, and what it imagines in: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
@@ -38,7 +41,7 @@ pub(crate) struct Args {
     driving: Driving,
     #[command(flatten)]
     #[serde(flatten)]
-    thinking: Thinking,
+    thinking: ImaginationArgs,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -50,7 +53,7 @@ pub(crate) struct Args {
 /// A driver that notes what it considered.
 struct Noted<'a> {
     inner: Box<dyn Explain + 'a>,
-    steps: Vec<Vec<Considered>>,
+    steps: Vec<Vec<Candidate>>,
     /// The step to explain, and then its past with the decision.
     explain: Option<usize>,
     explained: Option<(Vec<Frame>, Decision)>,
@@ -67,7 +70,7 @@ impl Driver for Noted<'_> {
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let plan = self.inner.drive(moment)?;
-        self.steps.push(self.inner.considered());
+        self.steps.push(self.inner.candidates());
         if self.explain == Some(moment.iteration) {
             let past = moment.scene.history.to_vec();
             let decision = self.inner.decision().cloned();
@@ -82,26 +85,30 @@ impl Args {
         self.driving.check()?;
         let sampling = self.sampling.resolve()?;
         self.check_explain(None)?;
-        let case = run.phase("read", |_| recordings::find(&self.scenario))?;
+        let case = run.phase("read", |_| Ok(recordings::find(&self.scenario)?))?;
         self.check_explain(Some(case.recording.scenario()))?;
         let surroundings = run.phase("load", |run| {
-            Surroundings::load(run.device(), &self.world, &sampling)
+            Ok(PlanningWorld::load(run.device(), &self.world, &sampling)?)
         })?;
         let seed = run.seed();
         let imagined = run.phase("load", |run| {
-            Surroundings::load_imagination(run.device(), &self.world, &sampling)
+            Ok(PlanningWorld::load_imagination(
+                run.device(),
+                &self.world,
+                &sampling,
+            )?)
         })?;
         let imagination = imagined.imagination();
         let inner = self
             .planner
-            .build(&case, imagination, seed, &self.thinking)?;
+            .build(&case, imagination, seed, &self.thinking.config()?)?;
         let mut noted = Noted {
             inner,
             steps: Vec::new(),
             explain: self.explain,
             explained: None,
         };
-        let mut timed = Timed::new(&mut noted, self.driving.budget());
+        let mut timed = TimedDriver::new(&mut noted, self.driving.budget());
         let mut traffic = surroundings.traffic(seed);
         let config = self.driving.config();
         let scored = run.phase("drive", |_| {
@@ -130,10 +137,7 @@ impl Args {
         run.result("milliseconds_per_step", milliseconds)?;
         tell(run, &scored)?;
         let first = noted.steps.first().map_or(&[][..], |step| step);
-        run.result(
-            "candidates",
-            first.iter().map(candidate).collect::<Vec<_>>(),
-        )
+        run.result("candidates", first.iter().map(row).collect::<Vec<_>>())
     }
 }
 
@@ -203,27 +207,27 @@ fn tell(run: &mut Run, scored: &Scored) -> anyhow::Result<()> {
 }
 
 /// A candidate as a row of the table: the first step's are shown, the file has all.
-fn candidate(considered: &Considered) -> Value {
+fn row(candidate: &Candidate) -> Value {
     let mut row = json!({
-        "candidate": considered.name,
-        "chosen": if considered.chosen { "yes" } else { "" },
-        "score": considered.score,
+        "candidate": candidate.name,
+        "chosen": if candidate.chosen { "yes" } else { "" },
+        "score": candidate.score,
     });
-    for &(name, value) in &considered.parts {
+    for &(name, value) in &candidate.parts {
         row[name] = json!(value);
     }
     row
 }
 
 /// `candidates.json`: per step every candidate, with its poses to the centimetre.
-fn write_candidates(run: &Run, steps: &[Vec<Considered>]) -> anyhow::Result<()> {
+fn write_candidates(run: &Run, steps: &[Vec<Candidate>]) -> anyhow::Result<()> {
     let rounded = |x: f64, unit: f64| (x / unit).round() * unit;
     let all: Vec<Vec<Value>> = steps
         .iter()
         .map(|step| {
-            let full = step.iter().map(|considered| {
-                let mut told = candidate(considered);
-                let poses = considered.poses.iter().map(|pose| {
+            let full = step.iter().map(|candidate| {
+                let mut told = row(candidate);
+                let poses = candidate.poses.iter().map(|pose| {
                     let p = pose.position;
                     [
                         rounded(p.x, 0.01),

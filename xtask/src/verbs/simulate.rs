@@ -4,6 +4,7 @@ use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use gump_data::{find, submission};
+use gump_eval::worlds::{World, WorldName};
 use gump_metrics::{Part, Summary, summarize};
 use gump_scene::{Rollout, Scenario};
 use gump_viz::Viewer;
@@ -11,12 +12,10 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
-use crate::futures;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
-use crate::tables;
-use crate::told;
-use crate::worlds::{Sampling, World, WorldName};
+use crate::sampling::Sampling;
+use crate::{futures, tables, told};
 
 /// Arguments of `simulate`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -84,7 +83,12 @@ impl Args {
         let config = decoding.frames(self.seconds);
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
         let world = run.phase("load", |run| {
-            World::build(run.device(), &self.world, &scenario, &decoding.sampling)
+            Ok(World::build(
+                run.device(),
+                &self.world,
+                &scenario,
+                &decoding.sampling,
+            )?)
         })?;
         let imagined = run.phase("imagine", |run| {
             let (n, seed) = (self.futures.get(), run.seed());

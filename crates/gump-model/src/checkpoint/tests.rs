@@ -1,8 +1,9 @@
 //! What is written comes back, what does not fit is refused in one sentence.
 
+use gump_scene::Seed;
+
 use super::*;
 use crate::config::VisualConfig;
-use gump_scene::Seed;
 
 fn small() -> ModelConfig {
     let visual = VisualConfig {
@@ -52,6 +53,21 @@ fn check_refused(path: &Path, expected: &str) {
 }
 
 #[test]
+fn equal_weights_are_equal_bytes() {
+    with_file(|path| {
+        let bytes = || {
+            write_tensors(path, |_, metadata| {
+                metadata.extend((0..9).map(|i| (format!("note {i}"), i.to_string())));
+            });
+            fs::read(path).unwrap()
+        };
+        let first = bytes();
+        assert!((0..4).all(|_| bytes() == first));
+        load(path, &Device::Cpu).unwrap();
+    });
+}
+
+#[test]
 fn weights_come_back() {
     with_file(|path| {
         let network = Network::random(small(), Seed(1), &Device::Cpu).unwrap();
@@ -87,10 +103,10 @@ fn weights_without_marks_grow_them_and_say_the_same() {
              agent vehicle 1: 20,0 velocity 5,0",
         )
         .unwrap();
-        let slots = crate::tests::slots(&scenario);
+        let slots = crate::testing::slots(&scenario);
         let said = |network: &Network| {
-            let memory = crate::tests::memory(network, &scenario);
-            crate::tests::hidden(network, &[&slots], &memory)
+            let memory = crate::testing::memory(network, &scenario);
+            crate::testing::hidden(network, &[&slots], &memory)
                 .concat()
                 .concat()
         };

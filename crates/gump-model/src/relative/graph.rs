@@ -8,17 +8,17 @@ use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentKind, LightState};
 use gump_tokenizer::class_index;
 
-use super::grid::STILL_M;
-use super::map::{PATHS, PieceKind, VectorMap};
-use crate::sample::TOKEN_DT;
+use crate::relative::grid::STILL_M;
+use crate::relative::map::{PATHS, PieceKind, VectorMap};
+use crate::steps::TOKEN_DT;
 
 /// Numbers of a node.
-pub(super) const NODE_NUMBERS: usize = 28;
+pub const NODE_NUMBERS: usize = 28;
 /// Numbers of an edge.
-pub(super) const EDGE_NUMBERS: usize = 46;
+pub const EDGE_NUMBERS: usize = 46;
 
 /// Frames of its own past that a node sees beside itself.
-pub(super) const PAST: usize = 6;
+pub const PAST: usize = 6;
 /// Neighbours that a node sees: those who are nearest now and soon.
 const NEIGHBOURS: usize = 16;
 /// How soon, seconds.
@@ -36,20 +36,24 @@ const MAP_REACH_M: f64 = 40.0;
 
 /// What an agent is.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Body {
-    pub(super) kind: AgentKind,
+pub struct Body {
+    /// What it is.
+    pub kind: AgentKind,
     /// Metres.
-    pub(super) length: f64,
-    pub(super) width: f64,
+    pub length: f64,
+    /// Metres.
+    pub width: f64,
     /// False tells the network that the size is not known.
-    pub(super) sized: bool,
+    pub sized: bool,
 }
 
 /// An agent at a frame, as it is shown.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Shown {
-    pub(super) body: Body,
-    pub(super) pose: Pose,
+pub struct Shown {
+    /// Its class and size.
+    pub body: Body,
+    /// Where it is, world frame.
+    pub pose: Pose,
     /// The last half second: this pose in the frame of the one before; from the stated velocity for
     /// one not seen before.
     pub(super) step: Pose,
@@ -63,7 +67,7 @@ pub(super) struct Shown {
 
 impl Shown {
     /// An agent seen for the first time, with its stated velocity.
-    pub(super) fn first(body: Body, pose: Pose, velocity: DVec2) -> Self {
+    pub fn first(body: Body, pose: Pose, velocity: DVec2) -> Self {
         let local = pose.inverse().rotate(velocity) * TOKEN_DT;
         Self {
             body,
@@ -79,7 +83,7 @@ impl Shown {
     }
 
     /// The same agent half a second later.
-    pub(super) fn then(&self, pose: Pose) -> Self {
+    pub fn then(&self, pose: Pose) -> Self {
         let step = still_or(self.pose.inverse() * pose);
         let stands = step.position == DVec2::ZERO;
         Self {
@@ -93,7 +97,7 @@ impl Shown {
     }
 
     /// World frame, metres per second: the mean over the last half second.
-    pub(super) fn velocity(&self) -> DVec2 {
+    pub fn velocity(&self) -> DVec2 {
         // The step is told in the frame it began in, which is turned by as much as it turned.
         let began = self.pose.heading - self.step.heading;
         DVec2::from_angle(began).rotate(self.step.position) / TOKEN_DT
@@ -104,7 +108,7 @@ impl Shown {
     }
 
     /// The numbers of its node.
-    pub(super) fn numbers(&self) -> [f32; NODE_NUMBERS] {
+    pub fn numbers(&self) -> [f32; NODE_NUMBERS] {
         let mut out = [0.0; NODE_NUMBERS];
         let mut writer = Writer(&mut out);
         let body = self.body;
@@ -156,9 +160,9 @@ fn put_step(writer: &mut Writer<'_>, step: Pose) {
 
 /// The lights of a frame, by piece of the map, and for how long they have shown their colour.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Lights {
+pub struct Lights {
     /// Sorted by lane: the colour, and seconds since it changed where that was seen.
-    pub(super) by_lane: Vec<(gump_scene::LaneId, LightState, Option<f64>)>,
+    pub by_lane: Vec<(gump_scene::LaneId, LightState, Option<f64>)>,
 }
 
 impl Lights {
@@ -246,7 +250,7 @@ fn fast_exp(x: f64) -> f64 {
 }
 
 /// The edge to the node's own state `ago` frames before; 0 is itself.
-pub(super) fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
+pub fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
     let mut out = relative(0, Axes::of(now.pose), Axes::of(then.pose));
     out[OF_PAST] = ago as f32 / PAST as f32;
     out
@@ -254,14 +258,15 @@ pub(super) fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
 
 /// What a node sees beside its past.
 #[derive(Debug, Default)]
-pub(super) struct View {
+pub struct View {
     /// Index among the agents of the frame.
-    pub(super) neighbours: Vec<(usize, EdgeRow)>,
-    pub(super) pieces: Vec<(u32, EdgeRow)>,
+    pub neighbours: Vec<(usize, EdgeRow)>,
+    /// Pieces of the map that are seen, by index, with their edges.
+    pub pieces: Vec<(u32, EdgeRow)>,
 }
 
 /// What agent `i` of those of a frame sees.
-pub(super) fn look(map: &VectorMap, lights: &Lights, agents: &[Shown], i: usize) -> View {
+pub fn look(map: &VectorMap, lights: &Lights, agents: &[Shown], i: usize) -> View {
     let own = &agents[i];
     let mut view = View::default();
     let paths = match own.body.kind {

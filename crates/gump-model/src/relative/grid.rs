@@ -7,13 +7,13 @@
 use gump_geometry::{DVec2, Pose, angle_difference};
 
 /// Fields of a move, in the order in which they are drawn.
-pub(crate) const FIELDS: usize = 4;
+pub const FIELDS: usize = 4;
 /// Bins of each field.
-pub(crate) const BINS: [usize; FIELDS] = [2, AHEAD, SIDE, TURN];
+pub const BINS: [usize; FIELDS] = [2, AHEAD, SIDE, TURN];
 /// Bins of all fields.
-pub(crate) const ALL_BINS: usize = 2 + AHEAD + SIDE + TURN;
+pub const ALL_BINS: usize = 2 + AHEAD + SIDE + TURN;
 /// The bin of the first field that says that an agent stands.
-pub(crate) const STANDS: u16 = 1;
+pub const STANDS: u16 = 1;
 
 const AHEAD: usize = 512;
 const SIDE: usize = 255;
@@ -34,7 +34,7 @@ const TURN_FOCUS: f64 = 5.0;
 pub(crate) const STILL_M: f64 = 0.08;
 
 /// First bin of a field among the bins of all.
-pub(crate) fn first_bin(field: usize) -> usize {
+pub fn first_bin(field: usize) -> usize {
     BINS[..field].iter().sum()
 }
 
@@ -57,7 +57,7 @@ pub(crate) fn quantize(step: Pose) -> [u16; FIELDS] {
 }
 
 /// The next pose in the frame of the present one that bins say.
-pub(crate) fn dequantize(bins: [u16; FIELDS]) -> Pose {
+pub fn dequantize(bins: [u16; FIELDS]) -> Pose {
     if bins[0] == STANDS {
         return Pose::IDENTITY;
     }

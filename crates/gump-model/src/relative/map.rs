@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_scene::{AreaKind, LaneId, LaneKind, MapGraph, RoadEdgeKind};
 
-use super::graph::Axes;
+use crate::relative::graph::Axes;
 
 /// Longest piece of a lane, metres.
 const LANE_PIECE_M: f64 = 8.0;
@@ -34,7 +34,7 @@ pub(super) const PATHS: usize = 3;
 const MOST_PATHS: usize = 8;
 
 /// Numbers of a piece.
-pub(super) const PIECE_NUMBERS: usize = 2 * SHAPE + 4 + 3 + 6 + 11;
+pub const PIECE_NUMBERS: usize = 2 * SHAPE + 4 + 3 + 6 + 11;
 
 /// What a piece is a part of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,7 +46,7 @@ pub(super) enum PieceKind {
 
 /// A short part of the map.
 #[derive(Clone, Debug)]
-pub(super) struct Piece {
+pub struct Piece {
     /// The middle, along the direction of travel; of an area its centre, along its longer side.
     pub(super) pose: Pose,
     pub(super) kind: PieceKind,
@@ -86,23 +86,24 @@ impl Piece {
 
 /// What is not told of a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Hidden {
+pub struct Hidden {
     pub(super) limits: bool,
     pub(super) stop_signs: bool,
 }
 
 /// A map in pieces.
 #[derive(Debug, Default)]
-pub(crate) struct VectorMap {
-    pub(super) pieces: Vec<Piece>,
+pub struct VectorMap {
+    /// The pieces, by index.
+    pub pieces: Vec<Piece>,
     /// `[pieces, PIECE_NUMBERS]`
-    pub(super) numbers: Vec<f32>,
+    pub numbers: Vec<f32>,
     cells: BTreeMap<(i64, i64), Vec<u32>>,
 }
 
 impl VectorMap {
     /// The pieces of a map within `reach` metres of `centre`.
-    pub(super) fn new(map: &MapGraph, centre: DVec2, reach: f64, hidden: Hidden) -> Self {
+    pub fn new(map: &MapGraph, centre: DVec2, reach: f64, hidden: Hidden) -> Self {
         let mut this = Self::default();
         let near = |p: DVec2| p.distance_squared(centre) < reach * reach;
         this.add_lanes(map, near, hidden);

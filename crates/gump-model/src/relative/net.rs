@@ -6,16 +6,19 @@
 use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
+use gump_kernels::edge_attention::Edges;
+use gump_kernels::smoothing::OrdinalSmoothing;
+use gump_nn::layers::{LayerNorm, Linear, TABLE_DEVIATION};
+use gump_nn::ops;
+use gump_nn::ops::Targets;
+use gump_nn::parameters::{Init, Parameters, Scope};
 
-use super::RelativeConfig;
-use super::graph::{EDGE_NUMBERS, NODE_NUMBERS};
-use super::grid::{ALL_BINS, BINS, FIELDS, first_bin};
-use super::map::PIECE_NUMBERS;
-use super::sample::Sample;
 use crate::ModelError;
-use crate::mct::{LayerNorm, Linear, TABLE_DEVIATION};
-use crate::ops::{self, OrdinalSmoothing, Targets};
-use crate::parameters::{Init, Parameters, Scope};
+use crate::relative::RelativeConfig;
+use crate::relative::graph::{EDGE_NUMBERS, NODE_NUMBERS};
+use crate::relative::grid::{ALL_BINS, BINS, FIELDS, first_bin};
+use crate::relative::map::PIECE_NUMBERS;
+use crate::relative::sample::Sample;
 
 /// Two layers with a smooth bend between them.
 #[derive(Debug)]
@@ -79,7 +82,7 @@ impl Layer {
         x: &Tensor,
         pieces: &Tensor,
         features: &Tensor,
-        edges: &Arc<ops::Edges>,
+        edges: &Arc<Edges>,
         heads: usize,
     ) -> Result<Tensor> {
         let normed = self.norm.forward(x)?; // [N, C]
@@ -211,7 +214,7 @@ impl RelativeNetwork {
     }
 
     /// What every node of a sample ends with, [N, C].
-    pub(super) fn hidden(&self, sample: &Sample) -> Result<Tensor> {
+    pub fn hidden(&self, sample: &Sample) -> Result<Tensor> {
         let device = self.parameters.device();
         let tensor = |numbers: &[f32], width: usize| {
             Tensor::from_slice(numbers, (numbers.len() / width, width), device)
@@ -233,7 +236,7 @@ impl RelativeNetwork {
     /// differentiate, and the sums of the fields' cross-entropies as numbers, nats.
     ///
     /// `total` is the weight of all moves of the batch.
-    pub(super) fn loss(
+    pub fn loss(
         &self,
         sample: &Sample,
         total: f64,
@@ -245,11 +248,7 @@ impl RelativeNetwork {
 
     /// As [`Self::loss`] with weights of either sign, nothing smoothed: moves of positive weight
     /// become likelier, those of negative weight less likely.
-    pub(super) fn preference(
-        &self,
-        sample: &Sample,
-        total: f64,
-    ) -> Result<(Tensor, [f64; FIELDS])> {
+    pub fn preference(&self, sample: &Sample, total: f64) -> Result<(Tensor, [f64; FIELDS])> {
         let outputs = self.forced(sample)?;
         let part = |sign: f32| {
             let weight = move |weight: f32| (sign * weight).max(0.0);
@@ -290,8 +289,8 @@ impl RelativeNetwork {
     ) -> Result<(Tensor, [f64; FIELDS])> {
         let device = self.parameters.device();
         let targets = &sample.targets;
-        let weight = |field: usize, target: &super::sample::Target| {
-            let counts = field == 0 || target.bins[0] != super::grid::STANDS;
+        let weight = |field: usize, target: &crate::relative::sample::Target| {
+            let counts = field == 0 || target.bins[0] != crate::relative::grid::STANDS;
             if counts { weigh(target.weight) } else { 0.0 }
         };
         let asked = (0..FIELDS).map(|field| {

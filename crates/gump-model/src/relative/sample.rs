@@ -4,18 +4,17 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
-use gump_scene::{AgentId, AgentKind, Frame, LaneId, LightState, Rng, Scenario, Seed};
+use gump_kernels::edge_attention::Edges;
+use gump_scene::{AgentId, AgentKind, Frame, LaneId, LightState, MapGraph, Rng, Scenario, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
-use super::drives::Driver;
-use super::graph::{
+use crate::relative::graph::{
     Body, EDGE_NUMBERS, EdgeRow, Lights, NODE_NUMBERS, PAST, Shown, look, past_edge,
 };
-use super::grid::{FIELDS, STILL_M, quantize};
-use super::map::{Hidden, PIECE_NUMBERS, VectorMap};
-use crate::ops::Edges;
-use crate::sample::stride_of;
+use crate::relative::grid::{FIELDS, STILL_M, quantize};
+use crate::relative::map::{Hidden, PIECE_NUMBERS, VectorMap};
+use crate::steps::stride_of;
 
 /// How samples are drawn from scenarios.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -74,21 +73,22 @@ impl SampleConfig {
 
 /// A graph and what its nodes should say.
 #[derive(Debug, Default)]
-pub(crate) struct Sample {
+pub struct Sample {
     /// `[nodes, NODE_NUMBERS]`
-    pub(super) nodes: Vec<f32>,
+    pub nodes: Vec<f32>,
     /// `[edges, EDGE_NUMBERS]`
     pub(super) edge_numbers: Vec<f32>,
     /// Sources are nodes, then pieces.
     pub(super) edges: Arc<Edges>,
     /// `[pieces, PIECE_NUMBERS]`: those that somebody sees.
     pub(super) pieces: Vec<f32>,
-    pub(super) targets: Vec<Target>,
+    /// The moves that are asked for.
+    pub targets: Vec<Target>,
 }
 
 impl Sample {
     /// Number of nodes.
-    pub(crate) fn n_nodes(&self) -> usize {
+    pub fn n_nodes(&self) -> usize {
         self.nodes.len() / NODE_NUMBERS
     }
 }
@@ -96,7 +96,7 @@ impl Sample {
 impl Sample {
     /// Gives every move the weight that `weight` says of its agent and frame, by index; moves that
     /// weigh nothing are left out.
-    pub(super) fn weigh(&mut self, weight: impl Fn(usize, usize) -> f32) {
+    pub fn weigh(&mut self, weight: impl Fn(usize, usize) -> f32) {
         for target in &mut self.targets {
             target.weight = weight(target.agent as usize, target.frame as usize);
         }
@@ -106,13 +106,17 @@ impl Sample {
 
 /// What a node should say.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Target {
-    pub(super) node: u32,
+pub struct Target {
+    /// Index of the node.
+    pub node: u32,
     /// Index of the agent among those of the sample, and of the frame.
-    pub(super) agent: u32,
-    pub(super) frame: u32,
-    pub(super) bins: [u16; FIELDS],
-    pub(super) weight: f32,
+    pub agent: u32,
+    /// Index of the frame.
+    pub frame: u32,
+    /// The move, a bin per field.
+    pub bins: [u16; FIELDS],
+    /// Its weight in the loss.
+    pub weight: f32,
 }
 
 /// Weight of the first move of somebody of whom only one instant was seen.
@@ -133,32 +137,33 @@ const TURN: f64 = 0.1;
 const MAP_M: f64 = 180.0;
 
 /// An agent over the frames of a sample.
-pub(super) struct Track {
-    pub(super) body: Body,
+pub struct Track {
+    /// Its class and size.
+    pub body: Body,
     /// By frame, where it is there.
-    pub(super) states: Vec<Option<State>>,
+    pub states: Vec<Option<State>>,
 }
 
 /// An agent at a frame.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct State {
+pub struct State {
     /// Where the log has it.
-    pub(super) logged: Pose,
+    pub logged: Pose,
     /// Where it is shown.
-    pub(super) shown: Pose,
+    pub shown: Pose,
     /// As the log has it, world frame, metres per second.
-    pub(super) velocity: DVec2,
+    pub velocity: DVec2,
     off: Off,
 }
 
 impl State {
     /// Where it should be half a second later, given where the log has it then.
-    pub(super) fn way_back(&self, next: &Self) -> Pose {
+    pub fn way_back(&self, next: &Self) -> Pose {
         pushed(next.logged, self.off.then())
     }
 
     /// The same, where it was led to instead of where the log has it.
-    pub(super) fn led_to(self, pose: Pose) -> Self {
+    pub fn led_to(self, pose: Pose) -> Self {
         Self {
             logged: pose,
             shown: pose,
@@ -168,7 +173,7 @@ impl State {
     }
 
     /// The same, shown where it was driven to.
-    pub(super) fn driven_to(self, shown: Pose) -> Self {
+    pub fn driven_to(self, shown: Pose) -> Self {
         let off = self.logged.inverse() * shown;
         Self {
             shown,
@@ -190,12 +195,28 @@ struct Off {
     turn: f64,
 }
 
+/// What moves the agents of a sample away from their log.
+pub trait TrackDriver {
+    /// Share of samples that it drives.
+    fn share(&self) -> f64;
+
+    /// Moves the tracks of a sample, which lies around `centre`, to where it drives them.
+    fn drive(
+        &self,
+        place: (&MapGraph, DVec2),
+        map: &VectorMap,
+        lights: &[Lights],
+        tracks: &mut [Track],
+        seed: Seed,
+    );
+}
+
 /// Draws a sample; `None` for a scenario too short for one. With a driver, its agents leave the log
 /// for where that takes them.
-pub(crate) fn draw(
+pub fn draw(
     scenario: &Scenario,
     config: &SampleConfig,
-    driver: Option<&Driver>,
+    driver: Option<&dyn TrackDriver>,
     seed: Seed,
 ) -> Option<Sample> {
     let mut rng = seed.rng();
@@ -217,7 +238,7 @@ pub(crate) fn draw(
     };
     let hides_lights = rng.random_bool(config.hide_lights);
     let map = VectorMap::new(&scenario.map, centre, MAP_M, hidden);
-    let driver = driver.filter(|driver| rng.random_bool(driver.config().share));
+    let driver = driver.filter(|driver| rng.random_bool(driver.share()));
     let perturbed = if driver.is_some() {
         0.0
     } else {
@@ -240,7 +261,7 @@ pub(crate) fn draw(
 
 /// The sample of all frames of a scenario from `start` on, everything shown as it is, and the agents
 /// `ids` in their order.
-pub(super) fn whole(
+pub fn whole(
     scenario: &Scenario,
     start: usize,
     ids: &[AgentId],
@@ -504,8 +525,9 @@ fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use gump_scene::fixture;
+
+    use super::*;
 
     #[test]
     fn nodes_see_the_past_only() {
@@ -530,7 +552,7 @@ mod tests {
         }
         // Everybody but those of the last frame has a next move; the parked car stands.
         assert_eq!(sample.targets.len(), nodes - 3);
-        let stands = |target: &&Target| target.bins[0] == super::super::grid::STANDS;
+        let stands = |target: &&Target| target.bins[0] == crate::relative::grid::STANDS;
         let standing = sample.targets.iter().filter(stands).count();
         assert_eq!(
             standing,

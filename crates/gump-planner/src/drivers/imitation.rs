@@ -1,17 +1,18 @@
 //! The world's own ego as a driver.
 
-use gump_geometry::{DVec2, Pose};
+use gump_geometry::{DVec2, Pose, dvec2};
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError, Start, WorldModel};
-use gump_scene::{Seed, VehicleParameters};
+use gump_scene::{EgoState, Seed, VehicleParameters};
 
-use super::planned::follow;
-use crate::considered::{Considered, Explain};
+use crate::candidates::{Candidate, Explain};
 use crate::{PlanError, Proposal, ProposalKind};
 
 /// Seconds of a plan: what nuPlan's open loop compares.
 const SECONDS: f64 = 8.0;
+/// Seconds between the states that the vehicle is given.
+const DT: f64 = 0.1;
 
 /// Plans the mean of what the world has the ego do in several futures.
 ///
@@ -114,11 +115,30 @@ impl Driver for ImitationDriver<'_> {
 }
 
 impl Explain for ImitationDriver<'_> {
-    fn considered(&self) -> Vec<Considered> {
+    fn candidates(&self) -> Vec<Candidate> {
         let poses = |plan: &Trajectory| plan.states().iter().map(|s| s.rear_axle).collect();
         self.plan
             .iter()
-            .map(|plan| Considered::alone("the mean of what is imagined", poses(plan)))
+            .map(|plan| Candidate::alone("the mean of what is imagined", poses(plan)))
             .collect()
     }
+}
+
+/// A proposal as the trajectory that a vehicle follows from its present state on.
+fn follow(
+    proposal: &Proposal,
+    moment: &Moment<'_>,
+    vehicle: &VehicleParameters,
+) -> Result<Trajectory, BoxError> {
+    let now = moment.scene.ego_now().state;
+    let mut states = vec![*moment.ego];
+    for (i, state) in proposal.resampled(&now, DT).iter().enumerate() {
+        states.push(EgoState {
+            time_us: moment.ego.time_us + (i as i64 + 1) * (DT * 1e6) as i64,
+            rear_axle: vehicle.rear_axle_of(state.pose),
+            velocity: dvec2(state.velocity.dot(state.pose.direction()), 0.0),
+            ..EgoState::default()
+        });
+    }
+    Ok(Trajectory::new(states)?)
 }

@@ -5,7 +5,7 @@ use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::EgoState;
 
-use crate::considered::{Considered, Explain};
+use crate::candidates::{Candidate, Explain};
 
 /// Iterations between the states of a plan: half a second.
 const STRIDE: usize = 5;
@@ -59,7 +59,7 @@ impl Driver for LogDriver {
 }
 
 impl Explain for LogDriver {
-    fn considered(&self) -> Vec<Considered> {
-        vec![Considered::alone("what was driven", Vec::new())]
+    fn candidates(&self) -> Vec<Candidate> {
+        vec![Candidate::alone("what was driven", Vec::new())]
     }
 }

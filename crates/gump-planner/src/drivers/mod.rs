@@ -1,14 +1,12 @@
 //! Drivers of the closed loop that do not compare anything: the log, a car that just rolls, a
-//! follower of the route, the ego of a world; and any [`crate::Planner`] as a driver.
+//! follower of the route, the ego of a world.
 
 mod imitation;
 mod log;
 mod nuplan_idm;
-mod planned;
 mod simple;
 
 pub use imitation::ImitationDriver;
 pub use log::LogDriver;
 pub use nuplan_idm::NuplanIdmDriver;
-pub use planned::Planned;
 pub use simple::SimpleDriver;

@@ -14,7 +14,7 @@ use gump_scene::{
 };
 
 use crate::PlanError;
-use crate::considered::{Considered, Explain};
+use crate::candidates::{Candidate, Explain};
 use crate::pdm::mission::stated_route;
 use crate::route_search::{first_lanes, lanes_of_route};
 
@@ -248,7 +248,7 @@ impl Known {
 }
 
 impl Explain for NuplanIdmDriver {
-    fn considered(&self) -> Vec<Considered> {
-        vec![Considered::alone("along the route", self.plan.clone())]
+    fn candidates(&self) -> Vec<Candidate> {
+        vec![Candidate::alone("along the route", self.plan.clone())]
     }
 }

@@ -7,7 +7,7 @@ use gump_rollout::BoxError;
 use gump_scene::{EgoState, VehicleParameters};
 
 use crate::PlanError;
-use crate::considered::{Considered, Explain};
+use crate::candidates::{Candidate, Explain};
 
 /// Seconds between the states of a plan.
 const DT: f64 = 0.25;
@@ -69,7 +69,7 @@ impl Driver for SimpleDriver {
 }
 
 impl Explain for SimpleDriver {
-    fn considered(&self) -> Vec<Considered> {
-        vec![Considered::alone("straight on", Vec::new())]
+    fn candidates(&self) -> Vec<Candidate> {
+        vec![Candidate::alone("straight on", Vec::new())]
     }
 }

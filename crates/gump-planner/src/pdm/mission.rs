@@ -65,12 +65,17 @@ impl State {
     /// per second.
     ///
     /// # Errors
-    /// [`PlanError::NoRoute`] if there is no way from where the ego is.
+    /// [`PlanError::NoRoute`] if there is no way from where the ego is, [`PlanError::NotFinite`] for
+    /// an agent whose state is no number: in a forecast it would be nowhere and in nobody's way.
     pub(crate) fn prepare(
         &mut self,
         moment: &Moment<'_>,
         config: &PdmConfig,
     ) -> Result<Vec<f64>, PlanError> {
+        let mut agents = moment.scene.now().agents().iter();
+        if let Some(agent) = agents.find(|agent| !agent.state.is_finite()) {
+            return Err(PlanError::NotFinite { agent: agent.id });
+        }
         self.look(moment, config)?;
         let lane = self.starting_lane(moment.ego)?;
         self.lay_lines(lane, config)?;

@@ -14,6 +14,8 @@ pub(crate) mod forecast;
 pub(crate) mod ground;
 pub(crate) mod mission;
 pub(crate) mod propose;
+#[cfg(test)]
+mod scene_tests;
 pub(crate) mod score;
 #[cfg(test)]
 mod tests;
@@ -27,7 +29,7 @@ use gump_rollout::BoxError;
 use gump_rollout::worlds::IdmConfig;
 use gump_scene::EgoState;
 
-use crate::considered::{Considered, Explain};
+use crate::candidates::{Candidate, Explain};
 use crate::{PlanError, ProposalKind};
 use comfort::ComfortFilters;
 use mission::{State, brake, trajectory};
@@ -233,7 +235,7 @@ fn first_best(scores: &[PdmScore]) -> usize {
 }
 
 impl Explain for PdmClosed {
-    fn considered(&self) -> Vec<Considered> {
+    fn candidates(&self) -> Vec<Candidate> {
         let thought = &self.thought;
         let n = self.config.speed_fractions.len();
         let name = |i: usize| {
@@ -244,8 +246,8 @@ impl Explain for PdmClosed {
             .to_string()
         };
         let proposals = thought.proposals.iter().zip(&thought.scores).enumerate();
-        let mut all: Vec<Considered> = proposals
-            .map(|(i, (proposal, score))| Considered {
+        let mut all: Vec<Candidate> = proposals
+            .map(|(i, (proposal, score))| Candidate {
                 name: name(i),
                 chosen: i == thought.best && !thought.braked,
                 score: Some(score.total),
@@ -261,7 +263,7 @@ impl Explain for PdmClosed {
             })
             .collect();
         if thought.braked {
-            all.push(Considered::alone("emergency brake", Vec::new()));
+            all.push(Candidate::alone("emergency brake", Vec::new()));
         }
         all
     }

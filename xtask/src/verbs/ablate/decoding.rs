@@ -9,8 +9,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_engine::{Mode, Precision, SamplingConfig, Surrogate};
+use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
-use gump_model::{Mode, Precision, SamplingConfig, Surrogate};
 use gump_scene::Seed;
 use gump_viz::{Chart, Series};
 use gump_wosac::realism::{Config, Reference, Scores, Year};
@@ -19,12 +20,11 @@ use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
 use crate::decoding::Decoding;
-use crate::futures;
 use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::shipped;
+use crate::sampling::Draw;
 use crate::verbs::evaluate::wosac::{Source, recordings};
-use crate::worlds::{Draw, WorldName};
+use crate::{futures, shipped};
 
 /// Arguments of the ablations of decoding.
 #[derive(Debug, Serialize, clap::Args)]

@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_engine::Mode;
+use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
-use gump_model::checkpoint::{self, Precision};
-use gump_model::{Mode, ModelConfig, RunConfig, TrainConfig, Trainer};
+use gump_model::checkpoint::Precision;
+use gump_model::{ModelConfig, checkpoint};
 use gump_scene::{Scenario, Seed};
+use gump_train::{RunConfig, TrainConfig, Trainer};
 use gump_wosac::realism::Scores;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -18,8 +21,8 @@ use super::decoding;
 use crate::dataset::{self, Part, Split, Training};
 use crate::decoding::Decoding;
 use crate::run::{Run, stop_if_interrupted};
+use crate::sampling::Draw;
 use crate::shipped;
-use crate::worlds::{Draw, WorldName};
 
 /// How the laptop model is trained.
 pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");

@@ -1,7 +1,8 @@
 //! `ablate switches`: what each option of the network and of its training is worth, by leaving it
 //! out or putting it in.
 
-use gump_model::{ModelConfig, TrainConfig};
+use gump_model::ModelConfig;
+use gump_train::TrainConfig;
 use gump_viz::Bars;
 use serde::Serialize;
 use serde_json::{Value, json};

@@ -2,16 +2,17 @@
 
 use std::time::{Duration, Instant};
 
-use gump_model::{Precision, SamplingConfig};
+use gump_engine::{Precision, SamplingConfig};
+use gump_eval::planners::PlanningWorld;
+use gump_eval::recordings;
 use gump_nuplan::closed_loop::{DriveConfig, Driver, Mission, Moment, Replayed, drive};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig, Phases};
 use gump_rollout::BoxError;
 use serde_json::{Value, json};
 
-use crate::planners::Surroundings;
 use crate::run::Run;
-use crate::{recordings, shipped};
+use crate::shipped;
 
 /// Seconds between two looks at the recording.
 const DT: f64 = 0.1;
@@ -54,7 +55,7 @@ pub(crate) fn rows(run: &Run, n: usize, precision: Precision) -> anyhow::Result<
         precision,
         ..SamplingConfig::default()
     };
-    let world = Surroundings::load_imagination(run.device(), &shipped::world(), &sampling)?;
+    let world = PlanningWorld::load_imagination(run.device(), &shipped::world(), &sampling)?;
     let config = InteractiveDriverConfig {
         replan_every: 1,
         seed: run.seed(),

@@ -7,9 +7,9 @@
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_model::config::ModelConfig;
-use gump_model::world::TransformerWorld;
-use gump_model::{Device, Network, SamplingConfig};
+use gump_model::{Device, Network};
 use gump_rollout::{Start, WorldModel as _};
 use serde::Serialize;
 use serde_json::json;

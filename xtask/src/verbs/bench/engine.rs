@@ -7,9 +7,9 @@
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_engine::{CacheMode, Mode, SamplingConfig, TransformerWorld};
+use gump_model::Network;
 use gump_model::config::ModelConfig;
-use gump_model::world::TransformerWorld;
-use gump_model::{CacheMode, Mode, Network, SamplingConfig};
 use gump_rollout::{Start, WorldModel as _};
 use gump_scene::Scenario;
 use serde::Serialize;
@@ -17,7 +17,7 @@ use serde_json::json;
 
 use crate::machine::{cpu_seconds, peak_rss_mb};
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::worlds::PrecisionName;
+use crate::sampling::PrecisionName;
 
 /// Arguments of `bench engine`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -285,7 +285,7 @@ fn gemm_rate() -> f64 {
     for _ in 0..6 {
         let (cpu, began) = (cpu_seconds(), Instant::now());
         for _ in 0..REPEATS {
-            std::hint::black_box(gump_model::ops::square_product(&a, &a, n));
+            std::hint::black_box(gump_kernels::gemm::square_product(&a, &a, n));
         }
         let wall = began.elapsed().as_secs_f64();
         let cpu = cpu_seconds()

@@ -5,6 +5,7 @@ use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::planners::TimedDriver;
 use gump_nuplan::closed_loop::{DriveConfig, Recording, Replayed, derive_roadblocks, drive};
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_planner::PdmClosed;
@@ -13,9 +14,8 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::decision;
-use crate::planners::Timed;
 use crate::run::{Common, Run};
-use crate::worlds::PrecisionName;
+use crate::sampling::PrecisionName;
 
 /// Milliseconds of a PDM-Closed step in its authors' Python.
 ///
@@ -56,7 +56,7 @@ impl Args {
         let config = DriveConfig::default();
 
         let mut planner = PdmClosed::default();
-        let mut timed = Timed::new(&mut planner, None);
+        let mut timed = TimedDriver::new(&mut planner, None);
         let began = Instant::now();
         let mut traffic = NuplanIdm::default();
         let scored = drive_and_score(&recording, map, &mut traffic, &mut timed, &config)?;

@@ -1,6 +1,7 @@
 //! What the network is, and a few steps of learning.
 
-use gump_model::{Device, TrainConfig, Trainer, checkpoint};
+use gump_model::{Device, checkpoint};
+use gump_train::{TrainConfig, Trainer};
 use gump_viz::{Chart, Series};
 use serde_json::{Value, json};
 

@@ -8,18 +8,16 @@ mod learn;
 mod look;
 
 use gump_data::find;
-use gump_model::SamplingConfig;
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::World;
 use gump_scene::{Rollout, Scenario};
 use gump_viz::{CandidatePath, Page, Viewer};
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::decoding::Decoding;
-use crate::machine;
 use crate::run::{Common, Run};
-use crate::shipped;
-use crate::told;
-use crate::worlds::World;
+use crate::{machine, shipped, told};
 
 /// Arguments of `demo`.
 #[derive(Debug, Serialize, clap::Args)]

@@ -4,6 +4,10 @@ use std::num::NonZeroUsize;
 use std::sync::Mutex;
 use std::time::Duration;
 
+use gump_eval::planners::{PlannerName, PlanningWorld, TimedDriver};
+use gump_eval::recordings;
+use gump_eval::recordings::{Case, Named};
+use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_nuplan::closed_loop::{DriveConfig, Tracking};
 use gump_nuplan::metrics::MetricScores;
@@ -17,14 +21,11 @@ use serde_json::{Value, json};
 
 use super::ranking;
 use crate::benchmark::{Found, Scenes};
-use crate::charts;
 use crate::cli::WrongArguments;
-use crate::futures;
-use crate::planners::{Chosen, ChosenParser, PlannerName, Surroundings, Thinking, Timed};
-use crate::recordings::{self, Case, Named};
+use crate::planners::{Chosen, ChosenParser, ImaginationArgs};
 use crate::run::{Common, Run, interrupted};
-use crate::tables;
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
+use crate::{charts, futures, tables};
 
 /// Columns of the table, by nuPlan's names of the metrics.
 pub(super) const COLUMNS: [(&str, &str); 8] = [
@@ -58,7 +59,7 @@ pub(crate) struct Args {
     driving: Driving,
     #[command(flatten)]
     #[serde(flatten)]
-    thinking: Thinking,
+    thinking: ImaginationArgs,
     /// At most so many scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
@@ -178,13 +179,17 @@ impl Args {
             .or_else(|| self.world.iter().find(learned));
         let imagination = imagination.unwrap_or(&WorldName::Idm);
         let imagined = run.phase("load", |run| {
-            Surroundings::load_imagination(run.device(), imagination, &sampling)
+            Ok(PlanningWorld::load_imagination(
+                run.device(),
+                imagination,
+                &sampling,
+            )?)
         })?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         let mut worlds = Vec::new();
         for world in &self.world {
             let surroundings = run.phase("load", |run| {
-                Surroundings::load(run.device(), world, &sampling)
+                Ok(PlanningWorld::load(run.device(), world, &sampling)?)
             })?;
             let mut drives = Vec::new();
             for planner in &self.planner {
@@ -235,7 +240,7 @@ struct Drive<'a> {
     args: &'a Args,
     found: &'a Found,
     world: &'a WorldName,
-    surroundings: &'a Surroundings,
+    surroundings: &'a PlanningWorld,
     imagination: &'a dyn WorldModel,
 }
 
@@ -243,10 +248,13 @@ impl Drive<'_> {
     /// The rows of a planner; nearly all have one.
     fn all(&self, run: &Run, planner: &Chosen) -> anyhow::Result<Vec<Drives>> {
         let name = planner.to_string();
+        let thinking = self.args.thinking.config()?;
         let entries = match planner {
             Chosen::Ours(PlannerName::Proposals) => return self.proposals(run),
             Chosen::Ours(planner) => self.through(run, &name, &|case, seed| {
-                planner.build(case, self.imagination, seed, &self.args.thinking)
+                planner
+                    .build(case, self.imagination, seed, &thinking)
+                    .map_err(Into::into)
             })?,
             Chosen::Remote(address) => self.remote(run, &name, address)?,
         };
@@ -327,7 +335,7 @@ impl Drive<'_> {
         let film_error = Mutex::new(None);
         let work = |i: usize, named: Named| {
             let seed = run.seed().fork(i as u64);
-            let finished = named.case.and_then(|case| {
+            let finished = named.case.map_err(anyhow::Error::from).and_then(|case| {
                 let mut driver = build(&case, seed)?;
                 let finished = drive_one(&case, &mut *driver, self.surroundings, args, seed)?;
                 if i < args.films {
@@ -422,11 +430,11 @@ pub(crate) fn short(world: &WorldName) -> String {
 fn drive_one(
     case: &Case,
     driver: &mut dyn Explain,
-    surroundings: &Surroundings,
+    surroundings: &PlanningWorld,
     args: &Args,
     seed: Seed,
 ) -> anyhow::Result<Finished> {
-    let mut timed = Timed::new(driver, args.driving.budget());
+    let mut timed = TimedDriver::new(driver, args.driving.budget());
     let mut traffic = surroundings.traffic(seed);
     let config = args.driving.config();
     let scored = drive_and_score(

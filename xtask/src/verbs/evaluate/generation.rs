@@ -8,11 +8,12 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use gump_eval::worlds;
+use gump_generate::Placement;
+use gump_generate::baseline::{overlapping_vehicles, wrong_way};
+use gump_generate::verdict::off_road;
 use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
 use gump_metrics::{Interval, intervals};
-use gump_model::generation::Placement;
-use gump_model::generation::baseline::{overlapping_vehicles, wrong_way};
-use gump_model::generation::verdict::off_road;
 use gump_scene::{Frame, Scenario, Seed};
 use gump_viz::Bars;
 use rayon::prelude::*;
@@ -22,12 +23,10 @@ use serde_json::{Value, json};
 use super::sources::{Case, Makers, Source};
 use super::{long, prompts};
 use crate::benchmark::{Found, Scenes};
-use crate::charts;
 use crate::dataset::{self, Split};
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::shipped;
 use crate::verbs::generate;
-use crate::worlds;
+use crate::{charts, shipped};
 
 /// Arguments of `evaluate generation`.
 #[derive(Debug, Serialize, clap::Args)]

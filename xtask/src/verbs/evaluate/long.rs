@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use gump_model::world::TransformerWorld;
+use gump_engine::TransformerWorld;
 use gump_rollout::{BoxError, Start, WorldModel as _};
 use gump_scene::{AgentId, Frame, LaneId, LightState, Scenario, SceneState, Seed};
 use gump_synthesis::{SynthesisConfig, try_synthesize};
@@ -240,9 +240,10 @@ pub(super) fn chart(rows: &[Value]) -> Bars {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use gump_scene::{Light, fixture};
     use gump_viz::log_as_rollout;
+
+    use super::*;
 
     #[test]
     fn who_comes_and_goes_is_counted() {

@@ -2,9 +2,10 @@
 
 use std::path::PathBuf;
 
+use gump_eval::results;
 use serde::Serialize;
 
-use super::{behaviour, ledger, motion, wosac};
+use super::{behaviour, motion, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
@@ -30,7 +31,7 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let benchmark = ledger::header(&self.folders[0])?.benchmark;
+        let benchmark = results::header(&self.folders[0])?.benchmark;
         let Some((_, tell)) = BENCHMARKS.iter().find(|(name, _)| *name == benchmark) else {
             let known: Vec<_> = BENCHMARKS.iter().map(|(name, _)| *name).collect();
             anyhow::bail!(

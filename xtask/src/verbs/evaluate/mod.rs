@@ -1,13 +1,12 @@
 //! `evaluate`: the benchmarks, one file each.
 //!
-//! What they share: [`shard`] says which scenarios are this machine's, [`ledger`] keeps what each
+//! What they share: [`gump_eval::shard`] says which scenarios are this machine's, [`gump_eval::results`] keeps what each
 //! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of `BENCHMARKS` in [`merge`].
 
 pub(crate) mod behaviour;
 mod closed_loop;
 pub(crate) mod generation;
-mod ledger;
 mod left_out;
 mod long;
 mod merge;
@@ -15,7 +14,6 @@ pub(crate) mod motion;
 mod open_loop;
 mod prompts;
 mod ranking;
-mod shard;
 mod sources;
 pub(crate) mod wosac;
 

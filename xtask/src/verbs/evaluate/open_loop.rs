@@ -2,6 +2,10 @@
 
 use std::num::NonZeroUsize;
 
+use gump_eval::planners::{PlannerName, PlanningWorld};
+use gump_eval::recordings;
+use gump_eval::recordings::{Case, Named};
+use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_nuplan::closed_loop::Replayed;
 use gump_nuplan::metrics::{OpenLoop, Scoring};
@@ -12,10 +16,9 @@ use serde_json::{Value, json};
 use super::closed_loop::mean;
 use crate::benchmark::{Found, Scenes};
 use crate::charts;
-use crate::planners::{PlannerName, Surroundings, Thinking};
-use crate::recordings::{self, Case, Named};
+use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// Seconds that plans are compared over.
 const HORIZON: f64 = 8.0;
@@ -27,7 +30,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
     /// Who plans; several for several rows
-    #[arg(long, value_enum, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
+    #[arg(long, value_parser = PlannerParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
     /// What planners imagine in: idm or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
@@ -37,7 +40,7 @@ pub(crate) struct Args {
     limit: Option<NonZeroUsize>,
     #[command(flatten)]
     #[serde(flatten)]
-    thinking: Thinking,
+    thinking: ImaginationArgs,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -52,7 +55,11 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let sampling = self.sampling.resolve()?;
         let surroundings = run.phase("load", |run| {
-            Surroundings::load_imagination(run.device(), &self.world, &sampling)
+            Ok(PlanningWorld::load_imagination(
+                run.device(),
+                &self.world,
+                &sampling,
+            )?)
         })?;
         let found = run.phase("find", |_| self.scenarios.find())?;
         run.result("set", &found.set)?;
@@ -82,17 +89,18 @@ impl Args {
         run: &Run,
         found: &Found,
         planner: PlannerName,
-        surroundings: &Surroundings,
+        surroundings: &PlanningWorld,
     ) -> anyhow::Result<Vec<Outcome>> {
         let cases = recordings::open_all(&found.paths)?;
         let limit = self.limit.map(NonZeroUsize::get);
         let cases = cases.take(limit.unwrap_or(usize::MAX));
         let progress = run.progress(planner.name(), limit.unwrap_or(0) as u64, "scenarios");
+        let thinking = self.thinking.config()?;
         let outcomes = evaluate(cases, |i, named: Named| {
-            let outcome = named.case.and_then(|case| {
+            let outcome = named.case.map_err(anyhow::Error::from).and_then(|case| {
                 let seed = run.seed().fork(i as u64);
                 let imagination = surroundings.imagination();
-                let mut driver = planner.build(&case, imagination, seed, &self.thinking)?;
+                let mut driver = planner.build(&case, imagination, seed, &thinking)?;
                 let seconds = comparable_seconds(&case);
                 let (recording, after) = (&case.recording, &case.after);
                 let mut traffic = Replayed;

@@ -3,10 +3,10 @@
 //! A tag is asked for on maps that admit it, which is found out without the network; a tag that no
 //! map given admits (a car park, an all-way stop) is listed and does not count.
 
+use gump_engine::TransformerWorld;
+use gump_generate::factory::{GenerationJob, admits, make};
+use gump_generate::{Counts, GenerateRequest};
 use gump_metrics::tags::{self, rules};
-use gump_model::generation::factory::{Order, admits, make};
-use gump_model::generation::{Counts, GenerateRequest};
-use gump_model::world::TransformerWorld;
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rand::seq::SliceRandom as _;
 use rayon::prelude::*;
@@ -118,8 +118,8 @@ fn admitting<'a>(scenarios: &[&'a Scenario], tag: ScenarioTag, n: usize, seed: S
     places
 }
 
-fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Order {
-    Order {
+fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> GenerationJob {
+    GenerationJob {
         request: GenerateRequest {
             prompts: tag.into_iter().collect(),
             counts: Some(PROMPTED),
@@ -131,7 +131,13 @@ fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Orde
     }
 }
 
-fn ask(world: &TransformerWorld, order: &Order, tag: usize, number: u64, seed: Seed) -> Asked {
+fn ask(
+    world: &TransformerWorld,
+    order: &GenerationJob,
+    tag: usize,
+    number: u64,
+    seed: Seed,
+) -> Asked {
     let prompt = order.request.prompts[0];
     match make(world, order, number, seed) {
         Ok(made) => Asked {

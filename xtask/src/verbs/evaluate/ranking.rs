@@ -1,5 +1,6 @@
 //! Who is better in which world, how sure that is, and where worlds disagree.
 
+use gump_eval::worlds::WorldName;
 use gump_planner::Comparison;
 use gump_scene::Seed;
 use serde_json::{Value, json};
@@ -7,7 +8,6 @@ use serde_json::{Value, json};
 use super::closed_loop::{COLUMNS, Drives};
 use crate::run::Run;
 use crate::table;
-use crate::worlds::WorldName;
 
 /// The table of one world as text of so many columns: percent, without what is the same in every row.
 pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> String {

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use gump_engine::TransformerWorld;
+use gump_engine::placement::object_spec::{Bounds, ObjectSpec};
+use gump_generate::baseline::{random_along_lanes, retrieved};
+use gump_generate::{Counts, GenerateConfig, GenerateRequest, Placement};
 use gump_metrics::mmd::{MmdProtocol, scene_mmd};
-use gump_model::generation::baseline::{random_along_lanes, retrieved};
-use gump_model::generation::constraint::{Bounds, ObjectSpec};
-use gump_model::generation::{Counts, GenerateConfig, GenerateRequest, Placement};
-use gump_model::world::TransformerWorld;
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario, Seed};
 use rand::Rng as _;
 
@@ -240,7 +240,7 @@ impl Makers<'_> {
         let present = recorded.present();
         let ego = present.ego_now();
         request.ego.velocity = Some(ego.state.velocity);
-        let made = self.world.generate(&request, &[seed]).ok()?;
+        let made = gump_generate::generate(self.world, &request, &[seed]).ok()?;
         let scene = made.into_iter().next()?.ok()?;
         // The recorded ego has its own id, by which both scenes are seen.
         let agents = scene.frame.agents().iter().map(|agent| {
@@ -277,8 +277,9 @@ fn resampled(vehicles: &[Agent], ego: AgentId, n: usize, seed: Seed) -> Frame {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use gump_scene::fixture;
+
+    use super::*;
 
     fn protocol() -> MmdProtocol {
         MmdProtocol {

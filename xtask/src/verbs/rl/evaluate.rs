@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_rl::{
     Actor, Columns, Course, Drive, Driver, EnvConfig, evaluate, paired_difference,
@@ -19,7 +20,7 @@ use super::{Notes, RlWorld, Settings, courses, read, write};
 use crate::cli::WrongArguments;
 use crate::dataset::Split;
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// Arguments of `rl evaluate`.
 #[derive(Debug, Serialize, clap::Args)]

@@ -12,7 +12,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use gump_model::{Device, SamplingConfig};
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::{World, WorldName};
+use gump_model::Device;
 use gump_rl::networks::Architecture;
 use gump_rl::sac::SacConfig;
 use gump_rl::{Autoreset, Course, EnvConfig, Traffic};
@@ -23,7 +25,6 @@ use crate::cli::WrongArguments;
 use crate::config;
 use crate::dataset::{self, Part, Split};
 use crate::run::Run;
-use crate::worlds::{World, WorldName};
 
 /// Seconds that an action is held: a frame of the world model, as in the paper.
 const STEP: f64 = 0.5;

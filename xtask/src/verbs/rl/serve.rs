@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use gump_model::SamplingConfig;
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::WorldName;
 use gump_rl::server::{Event, Server};
 use gump_rl::{Course, EnvConfig, Sampling, Traffic};
 use serde::Serialize;
@@ -13,7 +14,6 @@ use serde::Serialize;
 use super::{RlWorld, courses};
 use crate::dataset::Split;
 use crate::run::{Common, Run, interrupted};
-use crate::worlds::WorldName;
 
 /// Arguments of `rl serve`.
 #[derive(Debug, Serialize, clap::Args)]

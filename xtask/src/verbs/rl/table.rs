@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gump_eval::worlds::WorldName;
 use gump_scene::Seed;
 use serde::Serialize;
 
@@ -11,7 +12,7 @@ use super::{RlWorld, Settings, courses};
 use crate::cli::WrongArguments;
 use crate::dataset::Split;
 use crate::run::{Common, Run};
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// Arguments of `rl table`.
 #[derive(Debug, Serialize, clap::Args)]

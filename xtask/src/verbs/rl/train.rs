@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use gump_eval::worlds::WorldName;
 use gump_rl::sac::{Algorithm, Training};
 use gump_rl::{Course, DrivingEnv, demonstrations};
 use gump_scene::Seed;
@@ -16,7 +17,7 @@ use super::{Notes, RlWorld, Settings, courses, read, write};
 use crate::cli::WrongArguments;
 use crate::dataset::Split;
 use crate::run::{self, Common, Run};
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);

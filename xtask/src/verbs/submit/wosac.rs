@@ -7,15 +7,16 @@ use gump_data::submission::{
     metadata_problems, read_rollouts, rollouts_to_proto,
 };
 use gump_data::{ReadOptions, open_with};
+use gump_eval::rollout_files;
+use gump_eval::worlds::{WorldName, Worlds};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
 use crate::futures;
 use crate::imagine::imagine;
-use crate::rollout_files;
 use crate::run::{self, Common, Run};
-use crate::worlds::{Sampling, WorldName, Worlds};
+use crate::sampling::Sampling;
 
 /// Name of the archive in the output folder.
 const ARCHIVE: &str = "submission.tar.gz";

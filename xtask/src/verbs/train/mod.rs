@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use gump_model::checkpoint::{self, Precision};
-use gump_model::train::{Peers as _, StepReport};
-use gump_model::world::TransformerWorld;
-use gump_model::{Device, LossParts, Network, RunConfig, SamplingConfig, Trainer};
+use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_model::checkpoint::Precision;
+use gump_model::{Device, Network, checkpoint};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
+use gump_train::{LossParts, ProcessGroup as _, RunConfig, StepReport, Trainer};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 

@@ -3,15 +3,14 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_model::checkpoint::Precision;
-use gump_model::relative::{
-    self, RelativeConfig, RelativeNetwork, RelativeSampling, RelativeTrainConfig, RelativeTrainer,
-    RelativeWorld,
-};
-use gump_model::train::{Peers as _, StepReport};
-use gump_model::{Device, LossParts};
+use gump_model::relative::{RelativeConfig, RelativeNetwork};
+use gump_model::{Device, relative};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
+use gump_train::relative::{RelativeTrainConfig, RelativeTrainer};
+use gump_train::{LossParts, ProcessGroup as _, StepReport};
 use serde::Deserialize;
 use serde_json::{Map, json};
 use toml::Table;
@@ -208,8 +207,8 @@ fn known_keys() -> anyhow::Result<Table> {
     let shape = Table::try_from(RelativeConfig::default())?;
     known.insert("relative".into(), shape.into());
     let train = RelativeTrainConfig {
-        closed_loop: Some(relative::RelativeDrives::default()),
-        realism: Some(relative::RelativeRewards::default()),
+        closed_loop: Some(gump_train::relative::RelativeDrives::default()),
+        realism: Some(gump_train::relative::RelativeRewards::default()),
         ..RelativeTrainConfig::default()
     };
     known.insert("train".into(), Table::try_from(train)?.into());

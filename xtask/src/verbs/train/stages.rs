@@ -6,7 +6,8 @@
 
 use std::path::{Path, PathBuf};
 
-use gump_model::{ClosedLoopConfig, ModelConfig, RunConfig, TrainConfig};
+use gump_model::ModelConfig;
+use gump_train::{ClosedLoopConfig, RunConfig, TrainConfig};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};

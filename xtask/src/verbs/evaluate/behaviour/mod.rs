@@ -11,15 +11,16 @@ use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
+use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::shard::Shard;
+use gump_eval::worlds::{WorldName, Worlds};
 use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
 use serde::{Deserialize, Serialize};
 
-use super::ledger::{Entry, Header, Ledger};
-use super::shard::Shard;
 use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine;
 use crate::run::{Common, Run, interrupted};
-use crate::worlds::{Sampling, WorldName, Worlds};
+use crate::sampling::Sampling;
 pub(crate) use tell::tell_merged;
 use ways::{Way, ways};
 
@@ -162,7 +163,7 @@ impl Args {
             .iter()
             .map(|way| Worlds::new(run.device(), &way.world, way.decoding.sampling.clone()))
             .collect();
-        let mut ledger = Ledger::open(run.out(), &header)?;
+        let mut ledger = ResultStore::open(run.out(), &header)?;
         let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
         run.phase("count", |run| {
             let progress = run.progress("counting", 0, "scenarios");
@@ -187,7 +188,7 @@ impl Args {
                     worlds: counted
                         .with_context(|| format!("cannot evaluate scenario {}", scenario.id))?,
                 };
-                ledger.enter(Entry {
+                ledger.add(Entry {
                     index,
                     id: scenario.id.clone(),
                     scores,

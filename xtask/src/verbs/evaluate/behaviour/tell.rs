@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use gump_eval::results::{self, Entry};
 use gump_metrics::behaviour::{Count, Key, Measure, Tally};
 use gump_metrics::{Interval, intervals};
 use gump_scene::Seed;
@@ -10,11 +11,9 @@ use gump_viz::Bars;
 use serde_json::{Map, Value, json};
 
 use super::{Counted, Named, Settings};
-use crate::charts;
 use crate::decoding::Decoding;
 use crate::run::Run;
-use crate::table;
-use crate::verbs::evaluate::ledger::{self, Entry};
+use crate::{charts, table};
 
 /// Draws of scenarios for an interval; its ends move by a few percent of its width with the seed.
 const DRAWS: usize = 1000;
@@ -42,7 +41,7 @@ const CHARTS: [Chart; 3] = [
 
 /// Puts shards together and tells the whole.
 pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = ledger::unite::<Counted>(folders)?;
+    let (header, entries) = results::merge::<Counted>(folders)?;
     tell(run, &header.settings.try_into()?, &entries)
 }
 

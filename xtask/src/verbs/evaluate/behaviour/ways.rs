@@ -1,8 +1,10 @@
 //! Worlds and how they decode: a learned one as it is used and without its rules.
 
+use gump_eval::worlds::WorldName;
+
 use super::Named;
 use crate::decoding::Decoding;
-use crate::worlds::{Sampling, WorldName};
+use crate::sampling::Sampling;
 
 /// One column of the table.
 pub(super) struct Way {

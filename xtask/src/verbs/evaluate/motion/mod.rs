@@ -10,6 +10,9 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use gump_data::ReadOptions;
+use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::shard::Shard;
+use gump_eval::worlds::{WorldName, Worlds};
 use gump_model::Device;
 use gump_scene::{Prediction, Scenario};
 use gump_wosac::motion::{
@@ -20,15 +23,13 @@ use serde::{Deserialize, Serialize};
 
 use self::scores::Scores;
 use self::source::Predictions;
-use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
-use super::shard::Shard;
 use crate::benchmark::{Found, Scenes};
 use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
-use crate::worlds::{Sampling, WorldName, Worlds};
+use crate::sampling::Sampling;
 
 pub(crate) use self::tell::tell_merged;
 
@@ -103,7 +104,7 @@ impl Args {
         let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
         let scenarios = run.phase("find", |_| self.scenarios.find())?;
         let header = self.header(run, &scenarios, forecaster.decoding())?;
-        let mut ledger = Ledger::open(run.out(), &header)?;
+        let mut ledger = ResultStore::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
         let mut records = self.open(&scenarios)?.enumerate();
@@ -131,7 +132,7 @@ impl Args {
             };
             let scores = Scores::new(&scores, absent, digest);
             let id = scenario.id;
-            ledger.enter(Entry { index, id, scores })?;
+            ledger.add(Entry { index, id, scores })?;
             progress.advance(1);
         }
         drop(progress);

@@ -7,12 +7,11 @@ use anyhow::Context as _;
 use gump_data::submission::{
     predictions_from_proto, read_predictions, read_rollouts, rollouts_from_proto,
 };
+use gump_eval::rollout_files;
 use gump_proto::ScenarioRollouts;
 use gump_proto::motion::{ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind};
 use gump_scene::{Prediction, Scenario};
 use gump_wosac::motion::{MotionConfig, forecast};
-
-use crate::rollout_files;
 
 /// What is predicted, by scenario.
 pub(super) struct Predictions(BTreeMap<String, Message>);

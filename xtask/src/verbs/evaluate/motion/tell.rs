@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
+use gump_eval::results::{self, Entry};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
 use gump_viz::Bars;
@@ -12,11 +13,9 @@ use serde_json::{Map, Value, json};
 
 use super::scores::Scores;
 use super::{NAME, Shapes};
-use crate::charts;
 use crate::decoding::Decoding;
-use crate::futures;
 use crate::run::Run;
-use crate::verbs::evaluate::ledger::{self, Entry};
+use crate::{charts, futures};
 
 /// Draws of scenarios for an interval; its ends move by a tenth of its width with the seed.
 const DRAWS: usize = 200;
@@ -71,7 +70,7 @@ pub(super) fn tell(
 
 /// Fills the report of shards put together.
 pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = ledger::unite::<Scores>(folders)?;
+    let (header, entries) = results::merge::<Scores>(folders)?;
     let shapes = header.settings.get("shapes").cloned();
     let shapes = shapes.context("expected the setting shapes in the ledger")?;
     let seed = header

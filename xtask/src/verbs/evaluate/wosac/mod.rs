@@ -16,19 +16,20 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
+use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::shard::Shard;
+use gump_eval::worlds::WorldName;
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_wosac::realism::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
 use serde::{Deserialize, Serialize};
 
-use super::ledger::{Entry, Header, Ledger};
 use super::left_out::LeftOut;
-use super::shard::Shard;
 use crate::benchmark::{Found, Scenes};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
+use crate::sampling::Sampling;
 use crate::tables;
-use crate::worlds::{Sampling, WorldName};
 pub(crate) use recording::{Recorded, recordings};
 pub(crate) use rollouts::Source;
 pub(crate) use tell::tell_merged;
@@ -179,7 +180,7 @@ impl Args {
         let config = Config::of(self.year.year());
         let mut sources = self.sources(run)?;
         let options = sources[0].read_options();
-        let mut ledger = Ledger::open(run.out(), &header)?;
+        let mut ledger = ResultStore::open(run.out(), &header)?;
         let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
         let mut worst = self.explain.then(Worst::default);
         let mut fewest = usize::MAX;
@@ -201,7 +202,7 @@ impl Args {
                 let Some((recorded, (entry, blames))) = scored else {
                     continue;
                 };
-                ledger.enter(entry)?;
+                ledger.add(entry)?;
                 if let Some(log) = &mut log {
                     note(
                         log,

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::submission::read_rollouts;
+use gump_eval::worlds::{World, WorldName};
 use gump_proto::ScenarioRollouts;
 use gump_scene::Seed;
 use gump_wosac::realism::{Mode, Rollouts};
@@ -15,7 +16,6 @@ use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::imagine;
 use crate::run::Run;
-use crate::worlds::{World, WorldName};
 
 /// Seconds that the challenge asks for.
 const HORIZON_S: f64 = 8.0;

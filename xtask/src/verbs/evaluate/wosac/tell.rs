@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use gump_data::Table;
+use gump_eval::results::{self, Entry};
 use gump_metrics::interval;
 use gump_scene::Seed;
 use gump_viz::Bars;
@@ -10,12 +11,9 @@ use gump_wosac::realism::{Component, Scores};
 use serde_json::{Map, Value, json};
 
 use super::{Scored, Settings};
-use crate::charts;
 use crate::decoding::Decoding;
-use crate::futures;
 use crate::run::Run;
-use crate::tables;
-use crate::verbs::evaluate::ledger::{self, Entry};
+use crate::{charts, futures, tables};
 
 /// The name of the log as a world.
 const ORACLE: &str = "logged-oracle";
@@ -24,7 +22,7 @@ const CONSTANT_VELOCITY: &str = "constant-velocity";
 
 /// Puts shards together and tells the whole.
 pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = ledger::unite::<Scored>(folders)?;
+    let (header, entries) = results::merge::<Scored>(folders)?;
     let settings: Settings = header.settings.try_into()?;
     tell(run, &settings, &entries)
 }

@@ -1,0 +1,118 @@
+//! Velocities that agree with displacements.
+//!
+//! An object says where it will be and how fast, each for itself; averaging with what it said before
+//! and the limits of its body then move the place alone. What it does next starts from both, and
+//! others see both, so the velocity follows the place:
+//!
+//! * what stays where it was stands: its velocity is zero;
+//! * what was turned or moved otherwise than it said drives the other way, too: the velocity turns
+//!   with it and grows or shrinks as the way does;
+//! * the speed at the end of the half second is one that the way made in it allows: nobody's speed
+//!   changes by more than twice `REACH_M_PER_S` within it, and nobody who started from rest is
+//!   faster than twice the mean.
+//!
+//! The paper has no such rule: there, as in the released code, places and velocities part.
+
+use gump_geometry::{DVec2, Pose, angle_difference};
+use gump_model::steps::TOKEN_DT;
+use gump_scene::AgentState;
+
+/// How much the speed at the end of half a second may differ from the mean, metres per second: 8 m/s²
+/// all along, the hardest braking on a dry road.
+const REACH_M_PER_S: f64 = 8.0 * TOKEN_DT / 2.0;
+/// Speeds nearer than this are equal, metres per second: a bin and a half of a token.
+const SLACK_M_PER_S: f64 = 0.3;
+/// Ways shorter than this have neither direction nor proportion, metres: two bins of the finest
+/// chunk.
+const SHORT_M: f64 = 0.1;
+
+/// The velocity of what was at `from`, said it would be in the state `said`, and is at `pose`;
+/// `steers` tells whether it goes where it faces.
+pub(crate) fn follow(from: Pose, said: AgentState, pose: Pose, steers: bool) -> DVec2 {
+    let (meant, made) = (
+        said.pose.position - from.position,
+        pose.position - from.position,
+    );
+    let long = meant.length() > SHORT_M && made.length() > SHORT_M;
+    let turn = match (steers, long) {
+        (true, _) => angle_difference(pose.heading, said.pose.heading),
+        (false, true) => meant.angle_to(made),
+        (false, false) => 0.0,
+    };
+    let stretch = match long {
+        true => made.length() / meant.length(),
+        false => 1.0,
+    };
+    DVec2::from_angle(turn).rotate(said.velocity) * stretch
+}
+
+/// The velocity nearest to `velocity` that half a second from `from` to `pose` allows; zero for what
+/// has not moved at all.
+pub(crate) fn allowed(from: Pose, pose: Pose, velocity: DVec2) -> DVec2 {
+    let made = pose.position - from.position;
+    if made == DVec2::ZERO {
+        return DVec2::ZERO;
+    }
+    let mean = made.length() / TOKEN_DT;
+    let most = (mean + REACH_M_PER_S).min(2.0 * mean) + SLACK_M_PER_S;
+    let least = (mean - REACH_M_PER_S - SLACK_M_PER_S).max(0.0);
+    let speed = velocity.length();
+    if speed > most {
+        velocity * (most / speed)
+    } else if speed >= least {
+        velocity
+    } else if speed > SLACK_M_PER_S {
+        velocity * (least / speed)
+    } else {
+        made.normalize() * least
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::dvec2;
+
+    use super::*;
+
+    fn said(x: f64, y: f64, heading: f64, velocity: DVec2) -> AgentState {
+        AgentState {
+            pose: Pose::new(x, y, heading),
+            velocity,
+        }
+    }
+
+    #[test]
+    fn what_goes_where_it_said_keeps_its_velocity() {
+        let state = said(4.0, 0.3, 0.1, dvec2(8.2, 0.9));
+        let velocity = follow(Pose::default(), state, state.pose, true);
+        assert!(velocity.distance(state.velocity) < 1e-12);
+        assert_eq!(allowed(Pose::default(), state.pose, velocity), velocity);
+    }
+
+    #[test]
+    fn a_shorter_way_is_a_lower_speed_and_a_turn_turns_it() {
+        let state = said(4.0, 0.0, 0.2, dvec2(8.0, 0.0));
+        let half = follow(Pose::default(), state, Pose::new(2.0, 0.0, 0.2), true);
+        assert!(half.distance(dvec2(4.0, 0.0)) < 1e-12);
+        // A car goes where it faces, a person where it goes.
+        let turned = follow(Pose::default(), state, Pose::new(4.0, 0.0, 0.7), true);
+        assert!(turned.distance(DVec2::from_angle(0.5) * 8.0) < 1e-12);
+        let walked = follow(Pose::default(), state, Pose::new(0.0, 4.0, 0.7), false);
+        assert!(walked.distance(dvec2(0.0, 8.0)) < 1e-9);
+    }
+
+    #[test]
+    fn no_speed_without_a_way_and_no_way_without_a_speed() {
+        let from = Pose::default();
+        assert_eq!(allowed(from, from, dvec2(3.0, 0.0)), DVec2::ZERO);
+        // From rest 0.2 m in half a second end at 0.8 m/s.
+        let crawling = allowed(from, Pose::new(0.2, 0.0, 0.0), dvec2(5.0, 0.0));
+        assert!((crawling.x - 1.1).abs() < 1e-9);
+        // 8 m in half a second do not end at rest.
+        let racing = allowed(from, Pose::new(8.0, 0.0, 0.0), DVec2::ZERO);
+        assert!((racing.x - 13.7).abs() < 1e-9);
+        // Braking hard is possible.
+        let braking = allowed(from, Pose::new(4.0, 0.0, 0.0), dvec2(6.0, 0.0));
+        assert_eq!(braking, dvec2(6.0, 0.0));
+    }
+}

@@ -1,0 +1,173 @@
+//! Keys and values of tokens seen, in pages that futures share until they part; and attention
+//! over them.
+//!
+//! What lives here: [`Pages`] (one attention layer), [`Context`] (all layers of one sequence, with
+//! the slots they were computed from) and [`attend`]. What does not: where keys and values come
+//! from. Start with [`Context::reuse`], which is what makes the cache exact: an entry is kept only
+//! as long as its token and all before it stand where they stood.
+
+use std::sync::Arc;
+
+use gump_kernels::panels::PANEL;
+use gump_kernels::rows::{exp_shifted_sum, max};
+use gump_kernels::{tile, wide};
+use gump_model::placed_slot::PlacedSlot;
+
+/// Tokens of a page.
+const PAGE: usize = PANEL;
+
+/// How channels are cut into heads.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Heads {
+    pub(crate) n: usize,
+    /// Channels of a head.
+    pub(crate) d: usize,
+}
+
+impl Heads {
+    /// Panels that the values of a head fill.
+    fn value_panels(self) -> usize {
+        self.d.div_ceil(PANEL)
+    }
+
+    /// Numbers of a page: keys `[H, d, PAGE]`, then values `[H, panels, PAGE, PANEL]`.
+    fn page_len(self) -> usize {
+        self.n * PAGE * (self.d + self.value_panels() * PANEL)
+    }
+
+    fn keys(self, page: &[f32], head: usize) -> &[f32] {
+        &page[head * self.d * PAGE..][..self.d * PAGE]
+    }
+
+    fn values(self, page: &[f32], head: usize, panel: usize) -> &[f32] {
+        let first = self.n * self.d * PAGE + (head * self.value_panels() + panel) * PAGE * PANEL;
+        &page[first..][..PAGE * PANEL]
+    }
+}
+
+/// Keys and values of one attention layer, page by page; clones share their pages until one of
+/// them writes.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Pages(Vec<Arc<Vec<f32>>>);
+
+impl Pages {
+    /// Writes the keys and values of tokens `first..`, one row `[2C]` each.
+    pub(super) fn write(&mut self, heads: Heads, first: usize, rows: &[f32]) {
+        let c = heads.n * heads.d;
+        let n = rows.len() / (2 * c);
+        while self.0.len() * PAGE < first + n {
+            self.0.push(Arc::new(vec![0.0; heads.page_len()]));
+        }
+        for (i, row) in rows.chunks_exact(2 * c).enumerate() {
+            let page = Arc::make_mut(&mut self.0[(first + i) / PAGE]);
+            let at = (first + i) % PAGE;
+            let (keys, values) = row.split_at(c);
+            for (k, key) in keys.iter().enumerate() {
+                page[k * PAGE + at] = *key;
+            }
+            let panels = heads.value_panels();
+            for (h, head) in values.chunks_exact(heads.d).enumerate() {
+                for (p, part) in head.chunks(PANEL).enumerate() {
+                    let first = c * PAGE + ((h * panels + p) * PAGE + at) * PANEL;
+                    page[first..first + part.len()].copy_from_slice(part);
+                }
+            }
+        }
+    }
+}
+
+/// What one sequence has left in every layer.
+#[derive(Clone, Debug, Default)]
+pub struct Context {
+    /// The slots whose keys and values are held.
+    pub(super) slots: Vec<PlacedSlot>,
+    pub(super) layers: Vec<Pages>,
+}
+
+impl Context {
+    /// Forgets everything but the memory it stood in.
+    pub(crate) fn clear(&mut self) {
+        self.slots.clear();
+    }
+
+    /// How many of the first tokens of `slots` are held already, in place, token by token.
+    pub(crate) fn common(&self, slots: &[PlacedSlot]) -> usize {
+        let pairs = self.slots.iter().zip(slots);
+        pairs.take_while(|(held, wanted)| held == wanted).count()
+    }
+
+    /// Keeps what is held of the first `limit` tokens of `slots`; returns how many that is.
+    pub(super) fn reuse(&mut self, slots: &[PlacedSlot], limit: usize) -> usize {
+        let n = self.common(&slots[..limit]);
+        self.slots.truncate(n);
+        n
+    }
+
+    /// Bytes held; of a page that several hold, each has its part.
+    pub(crate) fn bytes(&self) -> usize {
+        let pages = self.layers.iter().flat_map(|pages| &pages.0);
+        let part = |page: &Arc<Vec<f32>>| 4 * page.len() / Arc::strong_count(page);
+        pages.map(part).sum()
+    }
+}
+
+/// Attention of `q` `[rows, C]`, scaled already, over the first `visible[row]` tokens of `pages`;
+/// `out` is shaped like `q`.
+pub(super) fn attend<const N: usize>(
+    heads: Heads,
+    pages: &Pages,
+    q: &[f32],
+    visible: impl Fn(usize) -> usize,
+    out: &mut [f32],
+    scores: &mut Vec<f32>,
+) {
+    let c = heads.n * heads.d;
+    let rows = q.len() / c;
+    for head in 0..heads.n {
+        for first in (0..rows).step_by(N) {
+            // Rows beyond the last repeat it: they cost nothing else.
+            let row = |r: usize| (first + r).min(rows - 1);
+            let longest = (0..N).map(|r| visible(row(r))).fold(0, usize::max);
+            let pages = &pages.0[..longest.div_ceil(PAGE)];
+            let n = pages.len() * PAGE;
+            scores.resize(N * n, 0.0);
+            let queries: [&[f32]; N] =
+                std::array::from_fn(|r| &q[row(r) * c + head * heads.d..][..heads.d]);
+            for (p, page) in pages.iter().enumerate() {
+                let sums = tile::<N>(queries, std::iter::once(heads.keys(page, head)));
+                for (scores, sums) in scores.chunks_exact_mut(n).zip(sums) {
+                    scores[p * PAGE..(p + 1) * PAGE].copy_from_slice(&sums);
+                }
+            }
+            let mut reciprocals = [0.0; N];
+            for (r, scores) in scores.chunks_exact_mut(n).enumerate() {
+                let (seen, hidden) = scores.split_at_mut(visible(row(r)));
+                hidden.fill(0.0);
+                reciprocals[r] = 1.0 / softmax(seen);
+            }
+            let weights: [&[f32]; N] = std::array::from_fn(|r| &scores[r * n..][..n]);
+            for panel in 0..heads.value_panels() {
+                let blocks = pages.iter().map(|page| heads.values(page, head, panel));
+                let sums = tile::<N>(weights, blocks);
+                let width = PANEL.min(heads.d - panel * PANEL);
+                for r in 0..N.min(rows - first) {
+                    let at = (first + r) * c + head * heads.d + panel * PANEL;
+                    for (out, sum) in out[at..at + width].iter_mut().zip(sums[r]) {
+                        *out = sum * reciprocals[r];
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// `x[i] = e^(x[i] - max)`; returns the sum.
+fn softmax(x: &mut [f32]) -> f32 {
+    wide(
+        #[inline(always)]
+        || {
+            let peak = max(x);
+            exp_shifted_sum(x, peak)
+        },
+    )
+}

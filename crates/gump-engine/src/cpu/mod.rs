@@ -1,0 +1,479 @@
+//! The engine: the network's forward pass and decoder without gradients, for a CPU.
+//!
+//! What lives here: everything between slots and sampled bins, over weights that are packed once.
+//! Sequences of any lengths go through together, row by row, with nothing padded; the map's keys
+//! and values stand once per scene; each sequence may keep a [`Context`], whose tokens are then
+//! not computed again. What does not: the network in one sitting, which is `mct`; it is also the
+//! oracle in the tests and what other devices run. Start with [`Engine::run`].
+//!
+//! A row's arithmetic does not depend on the rows around it, so what a future becomes depends
+//! neither on its neighbours, nor on the number of threads, nor on what a context held.
+//!
+//! Shapes: `R` new tokens of all sequences one after another, `C` width.
+
+mod cache;
+mod decoder;
+mod embed;
+mod successor;
+#[cfg(test)]
+mod tests;
+mod weights;
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+pub use self::cache::Context;
+use self::cache::{Heads, Pages, attend};
+use self::decoder::Decoder;
+use self::embed::{Embedder, Ground};
+pub use self::successor::Successor;
+use gump_kernels::gelu::gelu_row;
+use gump_kernels::panels::{Panels, Precision, Scratch};
+use gump_kernels::wide;
+use gump_model::ModelError;
+use gump_model::Network;
+use gump_model::decoder::{Bins, STATE_STEPS, STEPS};
+use gump_model::local_context::{LocalContext, Survey};
+use gump_model::mct::VisualMemory;
+use gump_model::placed_slot::PlacedSlot;
+
+use self::successor::Successors;
+use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
+use crate::draw::Candidates;
+use crate::request::Request;
+use crate::sampling::SamplingConfig;
+
+/// New tokens that go through the layers together; bounds the memory of a pass.
+const WAVE: usize = 8 * 1024;
+
+/// A network ready to imagine on a CPU.
+#[derive(Debug)]
+pub struct Engine {
+    width: usize,
+    heads: Heads,
+    embedder: Embedder,
+    layers: Vec<Layer>,
+    norm: Norm,
+    decoder: Decoder,
+    successors: Successors,
+    rooms: Pool,
+    waves: Pool<Wave>,
+    products: AtomicU64,
+}
+
+/// What all futures of a scene share: the map's keys and values, and what lies under objects.
+#[derive(Debug, Default)]
+pub struct SceneMemory {
+    /// Visual tokens.
+    n: usize,
+    cross: Vec<Pages>,
+    ground: Ground,
+    survey: Arc<Survey>,
+}
+
+/// One sequence in a pass.
+#[derive(Debug)]
+pub struct Job<'a> {
+    /// The whole sequence, what the context holds included.
+    pub slots: &'a [PlacedSlot],
+    /// Where hidden vectors are asked for, ascending and not empty; everything after the last is
+    /// ignored.
+    pub wanted: Vec<usize>,
+    /// The map of its scene.
+    pub memory: &'a SceneMemory,
+    /// Tokens of the sequence that it holds are not computed again; the new ones are added if
+    /// `keep` says so, else it is left empty.
+    pub context: &'a mut Context,
+    /// Whether what is read stays in the context.
+    pub keep: bool,
+}
+
+/// Where a row stands: its job within the wave, its place in the job's sequence.
+type Row = (usize, usize);
+
+impl Engine {
+    /// Packs the numbers of a network.
+    ///
+    /// # Errors
+    /// What the tensor library reports.
+    pub(crate) fn new(network: &Network, precision: Precision) -> Result<Self, ModelError> {
+        let config = network.config();
+        let c = config.width;
+        let source = Source { network, precision };
+        Ok(Self {
+            width: c,
+            heads: Heads {
+                n: config.heads,
+                d: c / config.heads,
+            },
+            embedder: Embedder::new(&source)?,
+            layers: (0..config.layers)
+                .map(|i| Layer::new(&source, i, c))
+                .collect::<Result<_, _>>()?,
+            norm: source.norm("mct.norm")?,
+            decoder: Decoder::new(&source)?,
+            successors: Successors::new(&source)?,
+            rooms: Pool::default(),
+            waves: Pool::default(),
+            products: AtomicU64::new(0),
+        })
+    }
+
+    /// Numbers of a hidden vector.
+    pub(crate) fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Multiplications made so far.
+    pub(crate) fn products(&self) -> u64 {
+        self.products.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the packed matrices of transformer and decoder.
+    pub(crate) fn weight_bytes(&self) -> usize {
+        let matrices = self.layers.iter().flat_map(Layer::matrices);
+        let matrices = matrices.chain(self.decoder.matrices());
+        matrices.map(Panels::bytes).sum()
+    }
+
+    /// Puts the memory of one scene into the engine's form.
+    ///
+    /// # Errors
+    /// What the tensor library reports.
+    pub(crate) fn remember(&self, memory: &VisualMemory) -> Result<SceneMemory, ModelError> {
+        let c = self.width;
+        let pages = |(k, v): &(candle_core::Tensor, candle_core::Tensor)| {
+            let (k, v) = (numbers(k)?, numbers(v)?);
+            let mut pages = Pages::default();
+            for (i, (k, v)) in k.chunks_exact(c).zip(v.chunks_exact(c)).enumerate() {
+                pages.write(self.heads, i, &[k, v].concat());
+            }
+            Ok::<_, ModelError>(pages)
+        };
+        Ok(SceneMemory {
+            n: memory.visual.dim(1)?,
+            cross: memory
+                .key_values
+                .iter()
+                .map(pages)
+                .collect::<Result<_, _>>()?,
+            ground: self.embedder.ground(&memory.visual)?,
+            survey: memory.surveys.first().cloned().unwrap_or_default(),
+        })
+    }
+
+    /// The hidden vectors that all jobs ask for, one after another, `[wanted, C]`.
+    pub fn run(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
+        let mut hidden = Vec::new();
+        let mut rest = jobs;
+        while !rest.is_empty() {
+            let mut rows = 0;
+            let n = rest.iter().take_while(|job| {
+                let first = rows == 0;
+                rows += job.slots.len();
+                first || rows <= WAVE
+            });
+            let (wave, after) = rest.split_at_mut(n.count());
+            hidden.extend(self.waves.with(|room| self.run_wave(wave, room)));
+            rest = after;
+        }
+        hidden
+    }
+
+    /// One state per request; `hidden` `[K, C]` are the hidden vectors at the keys.
+    pub(crate) fn sample(
+        &self,
+        hidden: &[f32],
+        requests: &[&Request],
+        config: &SamplingConfig,
+    ) -> Vec<Bins> {
+        // Widths and lengths are always given.
+        let n_steps = STEPS.len();
+        self.count(self.decoder.products(requests.len(), 2, n_steps));
+        self.decoder
+            .sample(hidden, requests, config, n_steps, &self.rooms)
+    }
+
+    /// As `Engine::sample`, but no more than the first state, size included; the bins of what
+    /// would come next are 0.
+    pub fn sample_state(
+        &self,
+        hidden: &[f32],
+        requests: &[&Request],
+        config: &SamplingConfig,
+    ) -> Vec<Bins> {
+        self.count(self.decoder.products(requests.len(), 0, STATE_STEPS));
+        self.decoder
+            .sample(hidden, requests, config, STATE_STEPS, &self.rooms)
+    }
+
+    /// What may follow the tokens whose hidden vectors `[N, C]` are given.
+    pub fn say(&self, hidden: &[f32]) -> Vec<Successor> {
+        let rows = hidden.len() / self.width;
+        self.count(self.successors.products(rows));
+        hidden
+            .chunks_exact(self.width)
+            .map(|hidden| self.successors.say(hidden))
+            .collect()
+    }
+
+    fn count(&self, products: u64) {
+        self.products.fetch_add(products, Ordering::Relaxed);
+    }
+
+    fn run_wave(&self, jobs: &mut [Job<'_>], Wave { x, kv }: &mut Wave) -> Vec<f32> {
+        let c = self.width;
+        let mut rows: Vec<Row> = Vec::new();
+        let mut starts = Vec::with_capacity(jobs.len());
+        for (i, job) in jobs.iter_mut().enumerate() {
+            let end = job.wanted.last().map_or(0, |last| last + 1);
+            job.slots = &job.slots[..end];
+            let first = job.wanted.first().copied().unwrap_or(0);
+            let start = job.context.reuse(job.slots, first);
+            let n_layers = if job.keep || start > 0 {
+                self.layers.len()
+            } else {
+                1
+            };
+            // What is not kept needs room for one layer at a time.
+            job.context.layers.resize(n_layers, Pages::default());
+            rows.extend((start..end).map(|place| (i, place)));
+            starts.push(start);
+        }
+        let slots: Vec<&PlacedSlot> = rows.iter().map(|&(i, at)| &jobs[i].slots[at]).collect();
+        let ground = |row: usize| &jobs[rows[row].0].memory.ground;
+        self.count(self.embedder.embed(&slots, ground, &self.rooms, x)); // [R, C]
+        self.count(self.encode_local_context(jobs, &starts, x));
+        kv.resize(2 * x.len(), 0.0); // [R, 2C]
+        for (l, layer) in self.layers.iter().enumerate() {
+            self.keys_and_values(layer, x, kv);
+            write_pages(self.heads, l, jobs, &starts, kv);
+            if l + 1 == self.layers.len() {
+                // Nothing after this reads but what is asked for.
+                rows = self.keep_wanted(jobs, &starts, x);
+            }
+            self.layer(l, layer, jobs, &rows, x);
+        }
+        for (job, start) in jobs.iter_mut().zip(starts) {
+            if job.keep {
+                job.context.slots.extend_from_slice(&job.slots[start..]);
+            } else {
+                job.context.clear();
+            }
+        }
+        let mut hidden = vec![0.0; rows.len() * c];
+        self.norm.apply(x, &mut hidden);
+        hidden
+    }
+
+    /// Adds to the rows of keys what their objects see. Returns how many multiplications it took.
+    fn encode_local_context(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut [f32]) -> u64 {
+        let news = jobs
+            .iter()
+            .zip(starts)
+            .map(|(job, start)| job.slots.len() - start);
+        let firsts = news.scan(0, |next, n| Some(std::mem::replace(next, *next + n)));
+        let firsts: Vec<usize> = firsts.collect();
+        let seen = jobs
+            .par_iter()
+            .zip(starts)
+            .zip(firsts)
+            .map(|((job, &start), first)| {
+                let rows = |(place, numbers)| (first + place - start, numbers);
+                let seen = self
+                    .embedder
+                    .surroundings(&job.memory.survey, job.slots, start);
+                seen.into_iter().map(rows).collect::<Vec<_>>()
+            });
+        let seen: Vec<Vec<(usize, LocalContext)>> = seen.collect();
+        self.embedder
+            .add_surroundings(&seen.concat(), &self.rooms, x)
+    }
+
+    /// Leaves of `x` only the rows that are asked for.
+    fn keep_wanted(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut Vec<f32>) -> Vec<Row> {
+        let (mut rows, mut first) = (Vec::new(), 0);
+        for (i, (job, start)) in jobs.iter().zip(starts).enumerate() {
+            for &place in &job.wanted {
+                let row = (first + place - start) * self.width;
+                // Rows only move to the front, so none is overwritten before it has moved.
+                x.copy_within(row..row + self.width, rows.len() * self.width);
+                rows.push((i, place));
+            }
+            first += job.slots.len() - start;
+        }
+        x.truncate(rows.len() * self.width);
+        rows
+    }
+
+    fn keys_and_values(&self, layer: &Layer, x: &[f32], kv: &mut [f32]) {
+        let c = self.width;
+        let rows = x.len() / c;
+        self.count(layer.key_value.products(rows));
+        let step = chunk_rows(rows);
+        x.par_chunks(step * c)
+            .zip(kv.par_chunks_mut(2 * step * c))
+            .for_each(|(x, kv)| {
+                self.rooms.with(|room| {
+                    let [normal, ..] = &mut room.buffers;
+                    normal.resize(x.len(), 0.0);
+                    layer.attention.norm.apply(x, normal);
+                    layer.key_value.apply_to_few(normal, kv, &mut room.products);
+                });
+            });
+    }
+
+    /// Everything of a layer but its keys and values, in place; `x` holds `rows`.
+    fn layer(&self, l: usize, layer: &Layer, jobs: &[Job<'_>], rows: &[Row], x: &mut [f32]) {
+        let c = self.width;
+        self.count_layer(layer, jobs, rows);
+        let own = |row: &Row| {
+            let context = &*jobs[row.0].context;
+            let l = if context.layers.len() == 1 { 0 } else { l };
+            (&context.layers[l], row.1 + 1)
+        };
+        let map = |row: &Row| {
+            let memory = jobs[row.0].memory;
+            (&memory.cross[l / 3], memory.n)
+        };
+        let step = chunk_rows(rows.len());
+        x.par_chunks_mut(step * c)
+            .zip(rows.par_chunks(step))
+            .for_each(|(x, rows)| {
+                self.rooms.with(|room| {
+                    self.attend(&layer.attention, rows, own, x, room);
+                    mlp(&layer.mlp, c, x, room);
+                    if let Some((attention, feed_forward)) = &layer.cross {
+                        self.attend(attention, rows, map, x, room);
+                        mlp(feed_forward, c, x, room);
+                    }
+                });
+            });
+    }
+
+    fn count_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[Row]) {
+        let dense = layer.matrices().map(|panels| panels.products(rows.len()));
+        let dense = dense.sum::<u64>() - layer.key_value.products(rows.len());
+        let seen = |row: &Row| {
+            let map = layer.cross.as_ref().map_or(0, |_| jobs[row.0].memory.n);
+            (row.1 + 1 + map) as u64
+        };
+        let attended = rows.iter().map(seen).sum::<u64>() * 2 * self.width as u64;
+        self.count(dense + attended);
+    }
+
+    /// `x += gate * out(attention(query(norm(x))))`, where `keys` says what a row sees and how much.
+    fn attend<'a>(
+        &self,
+        attention: &Attention,
+        rows: &[Row],
+        keys: impl Fn(&Row) -> (&'a Pages, usize),
+        x: &mut [f32],
+        room: &mut Workspace,
+    ) {
+        let c = self.width;
+        let [normal, q, attended, scores] = &mut room.buffers;
+        normal.resize(x.len(), 0.0);
+        q.resize(x.len(), 0.0);
+        attended.resize(x.len(), 0.0);
+        attention.norm.apply(x, normal);
+        attention.query.apply_to_few(normal, q, &mut room.products);
+        let scale = 1.0 / (self.heads.d as f32).sqrt();
+        q.iter_mut().for_each(|q| *q *= scale);
+        let mut first = 0;
+        for group in rows.chunk_by(|a, b| a.0 == b.0) {
+            let (pages, _) = keys(&group[0]);
+            let at = first * c..(first + group.len()) * c;
+            let (q, out) = (&q[at.clone()], &mut attended[at]);
+            let visible = |i: usize| keys(&group[i]).1;
+            match group.len() {
+                1 => attend::<1>(self.heads, pages, q, visible, out, scores),
+                2..=4 => attend::<4>(self.heads, pages, q, visible, out, scores),
+                _ => attend::<8>(self.heads, pages, q, visible, out, scores),
+            }
+            first += group.len();
+        }
+        attention
+            .out
+            .apply_to_few(attended, normal, &mut room.products);
+        add_scaled(x, normal, attention.gate);
+    }
+}
+
+/// `x += gate * contract(gelu(expand(norm(x))))`
+fn mlp(mlp: &Mlp, c: usize, x: &mut [f32], room: &mut Workspace) {
+    let [normal, hidden, ..] = &mut room.buffers;
+    normal.resize(x.len(), 0.0);
+    mlp.norm.apply(x, normal);
+    hidden.resize(x.len() / c * mlp.expand.n_out(), 0.0);
+    mlp.expand.apply_to_few(normal, hidden, &mut room.products);
+    gelu_row(hidden);
+    mlp.contract
+        .apply_to_few(hidden, normal, &mut room.products);
+    add_scaled(x, normal, mlp.gate);
+}
+
+fn add_scaled(x: &mut [f32], y: &[f32], scale: f32) {
+    wide(
+        #[inline(always)]
+        || x.iter_mut().zip(y).for_each(|(x, y)| *x += scale * y),
+    );
+}
+
+/// Hands every job its new keys and values in layer `l`.
+fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], kv: &[f32]) {
+    let c = heads.n * heads.d;
+    let mut rest = kv;
+    let mut parts = Vec::with_capacity(jobs.len());
+    for (job, start) in jobs.iter_mut().zip(starts) {
+        let (own, after) = rest.split_at((job.slots.len() - start) * 2 * c);
+        rest = after;
+        parts.push((&mut *job.context, *start, own));
+    }
+    parts.into_par_iter().for_each(|(context, start, kv)| {
+        let l = if context.layers.len() == 1 { 0 } else { l };
+        context.layers[l].write(heads, start, kv);
+    });
+}
+
+/// Rows that one task takes through a layer: equal shares for all threads, as many as possible, for
+/// every task reads all weights, but so few that what lies between two products stays in the
+/// second-level cache.
+fn chunk_rows(rows: usize) -> usize {
+    const MOST: usize = 128;
+    let each = rows.div_ceil(rayon::current_num_threads());
+    let tasks = each.div_ceil(MOST).max(1);
+    each.div_ceil(tasks).next_multiple_of(8).max(8)
+}
+
+/// Memory that one task works in.
+#[derive(Debug, Default)]
+pub(crate) struct Workspace {
+    buffers: [Vec<f32>; 4],
+    products: Scratch,
+    /// Candidates of a draw.
+    draws: Candidates,
+}
+
+/// What a wave works in: its vectors, `[R, C]`, and their keys and values, `[R, 2C]`.
+#[derive(Debug, Default)]
+struct Wave {
+    x: Vec<f32>,
+    kv: Vec<f32>,
+}
+
+/// Rooms that are free; tasks return them, so that none is built twice.
+#[derive(Debug, Default)]
+struct Pool<R = Workspace>(Mutex<Vec<R>>);
+
+impl<R: Default> Pool<R> {
+    fn with<T>(&self, work: impl FnOnce(&mut R) -> T) -> T {
+        let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut room = free().pop().unwrap_or_default();
+        let done = work(&mut room);
+        free().push(room);
+        done
+    }
+}

@@ -1,0 +1,251 @@
+//! From windows to states: full and partial autoregression in the engine.
+//!
+//! What lives here: what a window is, how it is presented, and in which order its objects are
+//! decoded. What does not: the arithmetic (`engine`), the same for other devices (`plain`), and
+//! what becomes of the states (`future`).
+
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use gump_model::ModelError;
+use gump_model::decoder::Bins;
+use gump_model::exact::ExactFrames;
+use gump_model::local_context::Survey;
+use gump_model::placed_slot::{PlacedSlot, place_exactly};
+use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
+use rayon::prelude::*;
+
+use crate::cpu::{Context, Engine, Job, SceneMemory};
+use crate::predictive_samples::{ProbeConfig, Seen};
+use crate::redraw::Clearance;
+use crate::request::Request;
+use crate::sampling::{CacheMode, Mode, SamplingConfig};
+
+/// What is known of one future's next frame.
+#[derive(Debug)]
+pub(crate) struct Window {
+    /// Index of its scene's memory.
+    pub(crate) scene: usize,
+    /// Final states, oldest first.
+    pub(crate) history: Vec<TokenFrame>,
+    /// The same, not rounded.
+    pub(crate) exact: ExactFrames,
+    /// The frame to decode, with provisional states; the order of its tracked agents is the order
+    /// of decoding.
+    pub(crate) next: TokenFrame,
+    /// One per tracked agent of `next`.
+    pub(crate) requests: Vec<Request>,
+    /// The road of its scene.
+    pub(crate) survey: Arc<Survey>,
+}
+
+/// The slots of a window, up to the last provisional value. The oldest frames give way, whole, if
+/// all together would be longer than `block_size`.
+pub(crate) fn presented(window: &Window, block_size: usize) -> Result<Vec<PlacedSlot>, ModelError> {
+    let mut room = block_size.saturating_sub(window.next.len_slots());
+    let newest = window.history.iter().rev();
+    let n = newest
+        .take_while(|frame| {
+            let fits = frame.len_slots() <= room;
+            room = room.saturating_sub(frame.len_slots());
+            fits
+        })
+        .count();
+    let first = window.history.len() - n.max(1);
+    let mut frames = window.history[first..].to_vec();
+    frames[0] = std::mem::take(&mut frames[0]).into_first();
+    frames.push(window.next.clone());
+    let sequence = TokenSequence::new(Vec::new(), frames)
+        .map_err(|error| ModelError::Scene(error.to_string()))?;
+    let mut slots = place_exactly(&sequence, |frame, id| window.exact.of(first + frame, id));
+    // The last frame's NEWBORN decides nothing yet.
+    slots.truncate(
+        slots
+            .iter()
+            .rposition(|placed| matches!(placed.slot, Slot::Value(_)))
+            .map_or(0, |i| i + 1),
+    );
+    Ok(slots)
+}
+
+/// The windows of one step, in the engine.
+pub(crate) struct Step<'a> {
+    pub(crate) engine: &'a Engine,
+    pub(crate) sampling: &'a SamplingConfig,
+    /// By scene.
+    pub(crate) memories: &'a [&'a SceneMemory],
+    pub(crate) windows: &'a [Window],
+    /// Their slots, as [`presented`].
+    pub(crate) placed: Vec<Vec<PlacedSlot>>,
+    /// What is kept of the distributions.
+    pub(crate) watch: ProbeConfig,
+}
+
+/// The next frame of every window.
+pub(crate) struct Decoded {
+    /// One chunk of bins per tracked agent of every window.
+    pub(crate) bins: Vec<Vec<Bins>>,
+    /// Transformer passes that it took.
+    pub(crate) passes: u64,
+    /// Other draws from the same distributions, as far as they are watched.
+    pub(crate) seen: Vec<Seen>,
+}
+
+impl Step<'_> {
+    /// Decodes the next frame of every window; `contexts` are those of the windows.
+    pub(crate) fn decode(self, contexts: &mut [&mut Context]) -> Decoded {
+        match self.sampling.mode {
+            Mode::PartialAr => self.all_at_once(contexts),
+            Mode::FullAr => self.one_by_one(contexts),
+        }
+    }
+
+    /// Draws again from the distribution of an object, as often as is watched: `hidden` is that at
+    /// its key. The streams are others, so that nothing changes for the draws that count.
+    fn look(&self, window: usize, place: usize, hidden: &[f32]) -> Option<Seen> {
+        let request = &self.windows[window].requests[place];
+        if window >= self.watch.futures || request.is_driven() {
+            return None;
+        }
+        let requests: Vec<Request> = self.watch.requests(request).collect();
+        let requests: Vec<&Request> = requests.iter().collect();
+        let rows = hidden.repeat(requests.len());
+        Some(Seen {
+            window,
+            place,
+            bins: self.engine.sample(&rows, &requests, self.sampling),
+        })
+    }
+
+    /// Partial autoregression: one pass with surrogates in place, then every key is decoded.
+    fn all_at_once(&self, contexts: &mut [&mut Context]) -> Decoded {
+        let keep = self.sampling.cache == CacheMode::Growing;
+        let of_windows = self.windows.iter().zip(&self.placed).zip(contexts);
+        let mut jobs: Vec<Job<'_>> = of_windows
+            .map(|((window, slots), context)| {
+                if self.sampling.cache == CacheMode::None {
+                    context.clear();
+                }
+                let n = window.next.tracked.len();
+                let first = slots.len() - 2 * n;
+                Job {
+                    slots,
+                    wanted: (0..n).map(|i| first + 2 * i).collect(),
+                    memory: self.memories[window.scene],
+                    context,
+                    keep,
+                }
+            })
+            .collect();
+        let hidden = self.engine.run(&mut jobs);
+        let requests: Vec<&Request> = self.windows.iter().flat_map(|w| &w.requests).collect();
+        let bins = self.engine.sample(&hidden, &requests, self.sampling);
+        let mut bins = bins.into_iter();
+        let each = self.windows.iter().map(|w| w.next.tracked.len());
+        let mut decoded: Vec<Vec<Bins>> = each
+            .clone()
+            .map(|n| bins.by_ref().take(n).collect())
+            .collect();
+        let c = self.engine.width();
+        let firsts: Vec<usize> = each
+            .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
+            .collect();
+        let again = |who: &[(usize, usize)], requests: &[Request]| {
+            let rows = who
+                .iter()
+                .flat_map(|(w, i)| &hidden[(firsts[*w] + i) * c..][..c]);
+            let rows: Vec<f32> = rows.copied().collect();
+            let requests: Vec<&Request> = requests.iter().collect();
+            Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
+        };
+        let Ok(()) = Clearance::new(self.windows, self.sampling).settle(&mut decoded, again);
+        let watched = self.windows.iter().take(self.watch.futures).enumerate();
+        let watched =
+            watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
+        let seen =
+            watched.filter_map(|(w, i)| self.look(w, i, &hidden[(firsts[w] + i) * c..][..c]));
+        Decoded {
+            seen: seen.collect(),
+            bins: decoded,
+            passes: 1,
+        }
+    }
+
+    /// Full autoregression: each object sees the final states of those before it. The windows go
+    /// in step, object by object; those with fewer objects are done earlier.
+    fn one_by_one(mut self, contexts: &mut [&mut Context]) -> Decoded {
+        let n = |i: usize| self.windows[i].next.tracked.len();
+        let most = (0..self.windows.len()).map(n).max().unwrap_or(0);
+        let mut decoded: Vec<Vec<Bins>> = vec![Vec::new(); self.windows.len()];
+        let mut seen = Vec::new();
+        let mut clearance = Clearance::new(self.windows, self.sampling);
+        for i in 0..most {
+            let mut members = Vec::new();
+            let mut jobs: Vec<Job<'_>> = Vec::new();
+            let placed = self.placed.iter().zip(contexts.iter_mut()).enumerate();
+            for (w, (slots, context)) in placed {
+                let window = &self.windows[w];
+                let n = window.next.tracked.len();
+                if i >= n {
+                    continue;
+                }
+                if self.sampling.cache == CacheMode::None {
+                    context.clear();
+                }
+                members.push(w);
+                jobs.push(Job {
+                    slots,
+                    wanted: vec![slots.len() - 2 * (n - i)],
+                    memory: self.memories[window.scene],
+                    context,
+                    keep: self.sampling.cache != CacheMode::None,
+                });
+            }
+            let hidden = self.engine.run(&mut jobs);
+            let requests: Vec<&Request> = members
+                .iter()
+                .map(|w| &self.windows[*w].requests[i])
+                .collect();
+            let bins = self.engine.sample(&hidden, &requests, self.sampling);
+            let rows = members.iter().zip(hidden.chunks(self.engine.width()));
+            seen.extend(rows.filter_map(|(w, hidden)| self.look(*w, i, hidden)));
+            for (w, bins) in members.iter().zip(bins) {
+                decoded[*w].push(bins);
+            }
+            let again = |who: &[(usize, usize)], requests: &[Request]| {
+                let row = |(w, _): &(usize, usize)| members.partition_point(|member| member < w);
+                let c = self.engine.width();
+                let rows = who.iter().flat_map(|who| &hidden[row(who) * c..][..c]);
+                let rows: Vec<f32> = rows.copied().collect();
+                let requests: Vec<&Request> = requests.iter().collect();
+                Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
+            };
+            let Ok(()) = clearance.settle(&mut decoded, again);
+            for (&w, request) in members.iter().zip(requests) {
+                let bins = &decoded[w][i];
+                let settled = request.settle(bins, self.sampling);
+                let slots = &mut self.placed[w];
+                let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
+                slots[value].slot = Slot::Value(request.settled_state(bins, settled));
+                let like = slots[value - 1].exact;
+                slots[value].exact = like.map(|like| like.with_state(settled));
+            }
+        }
+        Decoded {
+            bins: decoded,
+            passes: most as u64,
+            seen,
+        }
+    }
+}
+
+/// All windows as [`presented`].
+pub(crate) fn present_all(
+    windows: &[Window],
+    block_size: usize,
+) -> Result<Vec<Vec<PlacedSlot>>, ModelError> {
+    windows
+        .par_iter()
+        .map(|window| presented(window, block_size))
+        .collect()
+}

@@ -1,0 +1,84 @@
+//! Rollouts of the learned world models in closed loop.
+//!
+//! What lives here: worlds ([`TransformerWorld`], [`relative::RelativeWorld`]) that a network drives;
+//! partial autoregression and its caches (`decode`, `session`); the networks' arithmetic on a
+//! processor without a tensor library (`cpu`, `relative`); drawing (`draw`, `nucleus`), redraws and
+//! limits that correct draws (`rejection`, `kinematic_limits`); agents that come and leave
+//! (`spawning`). What does not: the networks themselves, which are `gump-model`'s, and learning.
+//!
+//! Without the feature `tensors` (on by default in the workspace's drivers) there is the relative
+//! network from plain weights alone, and the crate builds for `wasm32-unknown-unknown`.
+//!
+//! # Terms
+//! * **surrogate**: a provisional state, from earlier chunks, that lets all objects of a frame be
+//!   decoded in one pass (partial autoregression).
+//! * **temporal ensemble**: averaging what several chunks say of the same instant.
+//! * **predictive samples**: what an agent might have done next, as draws from its distribution.
+//!
+//! ```
+//! # #[cfg(feature = "tensors")] {
+//! use gump_engine::{SamplingConfig, TransformerWorld};
+//! use gump_model::{Device, ModelConfig, Network};
+//! use gump_rollout::{SimulateConfig, Start, simulate};
+//! use gump_scene::Seed;
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: 0,0 200,0 speed 15
+//!      ego vehicle 0: 10,0 velocity 8,0",
+//! )?;
+//! // Untrained; `checkpoint::load` reads the shipped weights or one's own.
+//! let network = Network::random(ModelConfig::tiny(), Seed(0), &Device::Cpu)?;
+//! let world = TransformerWorld::new(network, SamplingConfig::default());
+//! let start = Start { scene: scenario.present(), n_futures: 2, seed: Seed(0) };
+//! let config = SimulateConfig { seconds: 1.0, ..SimulateConfig::default() };
+//! let futures = simulate(&world, &[start], None, &config)?;
+//! assert_eq!((futures.len(), futures[0].steps()), (2, 10));
+//! # }
+//! # Ok::<(), gump_rollout::BoxError>(())
+//! ```
+
+#[cfg(feature = "tensors")]
+pub mod agreement;
+#[cfg(feature = "tensors")]
+pub mod cpu;
+#[cfg(feature = "tensors")]
+pub mod decode;
+#[cfg(feature = "tensors")]
+mod deconvolution;
+#[cfg(feature = "tensors")]
+mod draw;
+pub mod kinematic_limits;
+pub mod nucleus;
+#[cfg(feature = "tensors")]
+pub mod placement;
+mod predictive_samples;
+#[cfg(feature = "tensors")]
+mod redraw;
+#[cfg(feature = "tensors")]
+pub mod reference;
+mod rejection;
+pub mod relative;
+#[cfg(feature = "tensors")]
+pub mod request;
+#[cfg(feature = "tensors")]
+mod rollout_state;
+mod sampling;
+#[cfg(feature = "tensors")]
+pub mod scene;
+#[cfg(feature = "tensors")]
+mod session;
+#[cfg(feature = "tensors")]
+pub mod spawning;
+#[cfg(feature = "tensors")]
+pub mod temporal_ensemble;
+#[cfg(test)]
+#[cfg(feature = "tensors")]
+mod tests;
+#[cfg(feature = "tensors")]
+pub mod world;
+
+pub use gump_kernels::panels::Precision;
+pub use predictive_samples::{PredictiveSamples, ProbeConfig};
+pub use sampling::{CacheMode, Mode, RateScale, SamplingConfig, Surrogate};
+#[cfg(feature = "tensors")]
+pub use world::TransformerWorld;

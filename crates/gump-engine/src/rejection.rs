@@ -1,0 +1,202 @@
+//! Drawing again where objects would run into each other or off the road.
+//!
+//! Objects of a frame are drawn independently, given surrogates of each other, so two of them may
+//! choose the same place. Who would overlap another within the next second and a half is drawn
+//! again, a few times at most, and the draw that stays clear longest is kept; so is a vehicle that
+//! would leave the road. What counts is the whole way, every tenth of a second, not the poses half a
+//! second apart: at 10 m/s these are a car's length from each other, and crossing cars pass through
+//! one another, thin borders between cars. Who is off the road may come back or stay as far off as it
+//! is. Who finds no clear way brakes, if that helps. In full
+//! autoregression, objects give way to those drawn before them. The paper does
+//! none of this; without it, chance alone makes collisions that no driver of the log would have had.
+
+#[cfg(test)]
+mod tests;
+
+use gump_geometry::{OrientedBox, Pose, angle_difference};
+use gump_model::local_context::{Edge, Survey, metres_across, metres_off};
+
+/// Poses of a chunk that must be clear: 1.5 s.
+pub(crate) const POSES: usize = 3;
+/// Places that are looked at between two poses and at the second: every 0.1 s.
+const PLACES: usize = 5;
+/// A way, from 0.1 s on.
+pub(crate) type Way = [Pose; POSES * PLACES];
+/// What is over an edge by less than this is on the road, metres, and what is off it by so little more
+/// than before is not farther off: bins and maps are no finer.
+const SLACK_M: f64 = 0.05;
+/// How hard a vehicle without a clear way brakes, metres per second squared: firmly, on a dry road.
+pub(crate) const BRAKING: f64 = 5.0;
+/// The way through poses half a second apart; what comes from nowhere is at the first all along.
+pub(crate) fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
+    std::array::from_fn(|i| {
+        let (to, step) = (i / PLACES, i % PLACES + 1);
+        let from = match to {
+            0 => from.unwrap_or(poses[0]),
+            to => poses[to - 1],
+        };
+        from.interpolate(poses[to], step as f64 / PLACES as f64)
+    })
+}
+
+/// Objects of a frame, with where they are going.
+#[derive(Default)]
+pub(crate) struct Footprints {
+    pub(crate) members: Vec<Member>,
+}
+
+/// An object with where it is going.
+pub(crate) struct Member {
+    length: f64,
+    width: f64,
+    pub(crate) before: Option<Pose>,
+    /// Metres per second, before.
+    pub(crate) speed: f64,
+    ahead: Way,
+    /// The edges of the road in reach, beyond which it must not go; none for what is no vehicle.
+    edges: Vec<Edge>,
+    /// How far it was off the road before, metres.
+    off: f64,
+    /// Driven objects are where they are.
+    pub(crate) is_driven: bool,
+    reach: f64,
+}
+
+impl Member {
+    /// What is of this length and width, metres, moves at `speed`, metres per second, and goes `ahead`;
+    /// driven objects are where they are.
+    pub(crate) fn new(
+        [length, width]: [f64; 2],
+        before: Option<Pose>,
+        speed: f64,
+        ahead: Way,
+        is_driven: bool,
+    ) -> Self {
+        Self {
+            length,
+            width,
+            before,
+            speed,
+            ahead,
+            edges: Vec::new(),
+            off: 0.0,
+            is_driven,
+            reach: length.hypot(width) / 2.0,
+        }
+    }
+
+    fn at(&self, pose: Pose) -> OrientedBox {
+        OrientedBox {
+            pose,
+            length: self.length,
+            width: self.width,
+        }
+    }
+
+    /// How many places pass before the object leaves the road, or is farther off it than it has been.
+    fn places_on_road(&self, ahead: &Way) -> usize {
+        if self.edges.is_empty() || self.stays(ahead) {
+            return ahead.len();
+        }
+        let mut most = self.off;
+        let leaves = |pose: &Pose| {
+            let body = self.at(*pose);
+            let off = match most > SLACK_M {
+                true => metres_off(&body, self.reach, &self.edges),
+                false => metres_across(&body, self.reach, &self.edges),
+            };
+            let leaves = off > most + SLACK_M;
+            most = most.min(off);
+            leaves
+        };
+        ahead.iter().position(leaves).unwrap_or(ahead.len())
+    }
+
+    /// True if a way leads nowhere.
+    fn stays(&self, ahead: &Way) -> bool {
+        let near = |pose: &Pose, before: Pose| {
+            pose.position.distance(before.position) < SLACK_M / 2.0
+                && angle_difference(pose.heading, before.heading).abs() < SLACK_M / 2.0
+        };
+        let stands = |before: Pose| ahead.iter().all(|pose| near(pose, before));
+        self.before.is_some_and(stands)
+    }
+
+    /// Takes in the edges of the road that it might cross on its way, and how far it is off the road.
+    pub(crate) fn look_for_edges(&mut self, survey: &Survey) {
+        let Some(before) = self.before else {
+            return;
+        };
+        let radius = self.reach + (self.moves() + 1.0).max(self.speed * 1.5);
+        let near = survey.edges_near(before.position, radius);
+        self.edges = near
+            .filter(|edge| edge.from.distance(before.position) <= radius)
+            .collect();
+        self.off = metres_off(&self.at(before), self.reach, &self.edges);
+    }
+
+    fn moves(&self) -> f64 {
+        let before = self.before.map_or(self.ahead[0].position, |p| p.position);
+        self.ahead[self.ahead.len() - 1].position.distance(before)
+    }
+}
+
+impl Footprints {
+    /// These objects.
+    pub(crate) fn new(members: Vec<Member>) -> Self {
+        Self { members }
+    }
+
+    /// Who of those from `first` on should be drawn again: who leaves the road, and of two that get
+    /// into each other's way the one that moves more, unless only the other may be.
+    pub(crate) fn unclear(&self, first: usize) -> Vec<usize> {
+        let leaves = |member: &Member| member.places_on_road(&member.ahead) < member.ahead.len();
+        let mut unclear: Vec<bool> = self.members.iter().map(leaves).collect();
+        for (i, a) in self.members.iter().enumerate() {
+            for (j, b) in self.members.iter().enumerate().skip(first.max(i + 1)) {
+                if clear_places(a, &a.ahead, b) == a.ahead.len() {
+                    continue;
+                }
+                let a_gives_way =
+                    i >= first && (b.is_driven || (!a.is_driven && a.moves() > b.moves()));
+                unclear[if a_gives_way { i } else { j }] = true;
+            }
+        }
+        let driven = |i: &usize| self.members[*i].is_driven;
+        (first..unclear.len())
+            .filter(|i| unclear[*i] && !driven(i))
+            .collect()
+    }
+
+    /// Takes a draw of an object if it stays clear of all others, and on the road, longer than what
+    /// it has.
+    pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
+        let member = &self.members[i];
+        let clear = |ahead: &Way| {
+            let others = self.members.iter().enumerate().filter(|(j, _)| *j != i);
+            let clear = others.map(|(_, other)| clear_places(member, ahead, other));
+            let on_road = member.places_on_road(ahead);
+            clear.fold(on_road, usize::min)
+        };
+        let better = clear(ahead) > clear(&member.ahead);
+        if better {
+            self.members[i].ahead = *ahead;
+        }
+        better
+    }
+}
+
+/// How many places pass before two objects, the first of them on its way `ahead`, overlap; all of
+/// them for a pair that overlaps already, since no draw can undo that.
+fn clear_places(a: &Member, ahead: &Way, b: &Member) -> usize {
+    let reach = a.reach + b.reach;
+    let meets = |(p, q): (&Pose, &Pose)| {
+        p.position.distance_squared(q.position) < reach * reach && a.at(*p).overlaps(&b.at(*q))
+    };
+    let first = ahead.iter().zip(&b.ahead).position(meets);
+    match (first, a.before.zip(b.before)) {
+        (None, _) => ahead.len(),
+        (Some(_), Some((p, q))) if a.at(p).overlaps(&b.at(q)) => ahead.len(),
+        (Some(first), _) => first,
+    }
+}

@@ -1,0 +1,58 @@
+//! What is kept of an agent while it is rolled out: its last frames and what the network made of them.
+
+use gump_geometry::{DVec2, Pose};
+use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
+use gump_model::relative::map::VectorMap;
+
+use crate::relative::engine::{AgentMemory, Engine, KEPT, Present};
+
+/// An agent as it has been seen.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    /// The last frames without a gap, the latest last; at least one, at most [`KEPT`].
+    shown: Vec<Shown>,
+    memory: AgentMemory,
+}
+
+impl Seen {
+    /// An agent seen for the first time, with its stated velocity, world frame, metres per second.
+    pub fn first(engine: &Engine, body: Body, pose: Pose, velocity: DVec2) -> Self {
+        Self {
+            shown: vec![Shown::first(body, pose, velocity)],
+            memory: engine.blank(),
+        }
+    }
+
+    /// As it was seen last.
+    pub fn now(&self) -> Shown {
+        *self.shown.last().expect("an agent has been seen")
+    }
+
+    /// Half a second later it is here.
+    pub fn push(&mut self, pose: Pose) {
+        self.shown.push(self.now().then(pose));
+        let n = self.shown.len();
+        self.shown.drain(..n.saturating_sub(KEPT));
+    }
+}
+
+/// What the network reads of the agents of a frame.
+pub fn presents<'a>(
+    map: &VectorMap,
+    lights: &Lights,
+    seen: impl Iterator<Item = &'a mut Seen>,
+) -> Vec<Present<'a>> {
+    let seen: Vec<&mut Seen> = seen.collect();
+    let agents: Vec<Shown> = seen.iter().map(|seen| seen.now()).collect();
+    let present = seen.into_iter().enumerate().map(|(i, seen)| {
+        let now = &agents[i];
+        let past = seen.shown.iter().rev().take(PAST + 1).enumerate();
+        Present {
+            numbers: now.numbers(),
+            past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
+            view: look(map, lights, &agents, i),
+            memory: &mut seen.memory,
+        }
+    });
+    present.collect()
+}

@@ -1,0 +1,574 @@
+//! The relative network as a world: scenes in, futures out.
+//!
+//! A future keeps its agents with what the network remembers of them; the map is laid out and
+//! computed once for all futures of a scene. Agents of kinds that are not predicted go on with
+//! constant velocity, and lights hold.
+
+mod live;
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use gump_geometry::{DVec2, Pose};
+use gump_kernels::panels::Precision;
+use gump_model::ModelError;
+use gump_model::local_context::Survey;
+use gump_model::relative::RelativeWeights;
+use gump_model::relative::graph::{Body, Lights, Shown};
+use gump_model::relative::grid::dequantize;
+use gump_model::relative::map::{Hidden, VectorMap};
+use gump_model::steps::TOKEN_DT;
+use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light, LightState, SceneState, Seed};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
+use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
+use crate::relative::rules::{held_back, settle};
+use crate::relative::seen::{Seen, presents};
+use crate::sampling::SamplingConfig;
+
+pub use live::LiveFuture;
+
+/// How far around the ego the map is laid out, metres.
+pub const MAP_M: f64 = 300.0;
+
+/// Draws are among the likeliest bins that together have this probability, unless told otherwise.
+/// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1
+/// somebody on foot now and then shoots off. Chosen on the tuning set (result 19).
+const TOP_P: f64 = 0.95;
+
+/// Separates the streams of redraws from those of fields.
+const REDRAW: u64 = 1 << 20;
+/// Separates the streams of those who watch.
+const WATCH: u64 = 1 << 40;
+
+/// How futures are drawn.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeSampling {
+    /// Divides the logits; above 1 is bolder.
+    pub temperature: f64,
+    /// Draws are among the likeliest bins that together have this probability; whether to stand is
+    /// drawn from both.
+    pub top_p: f64,
+    /// How often an agent that would run into another or off the road within 1.5 s is drawn again at
+    /// most.
+    pub redraws: usize,
+    /// Whether vehicles and bicycles are held back from turning on the spot and slipping sideways.
+    pub limits: bool,
+    /// In which form the weights are multiplied.
+    pub precision: Precision,
+}
+
+impl Default for RelativeSampling {
+    fn default() -> Self {
+        Self {
+            temperature: 1.0,
+            top_p: TOP_P,
+            redraws: 0,
+            limits: false,
+            precision: Precision::F32,
+        }
+    }
+}
+
+impl From<&SamplingConfig> for RelativeSampling {
+    /// What of the settings this network knows.
+    fn from(config: &SamplingConfig) -> Self {
+        let usual = Self::default();
+        Self {
+            temperature: config.temperature.unwrap_or(usual.temperature),
+            top_p: config.top_p.unwrap_or(usual.top_p),
+            redraws: config.redraws,
+            limits: config.limits,
+            precision: config.precision,
+        }
+    }
+}
+
+impl RelativeSampling {
+    fn draw(&self) -> Draw {
+        Draw {
+            temperature: self.temperature,
+            top_p: self.top_p,
+        }
+    }
+}
+
+/// A trained relative network that rolls traffic out.
+#[derive(Debug)]
+pub struct RelativeWorld {
+    engine: Engine,
+    sampling: RelativeSampling,
+    /// Steps made so far, of all sessions.
+    passes: AtomicU64,
+    /// What is kept of the distributions, and what was.
+    watch: ProbeConfig,
+    outlooks: Mutex<Vec<PredictiveSamples>>,
+}
+
+impl RelativeWorld {
+    /// A world that draws as `sampling` says.
+    ///
+    /// # Errors
+    /// A network that is not in main memory as f32.
+    #[cfg(feature = "tensors")]
+    pub fn new(
+        network: &gump_model::relative::RelativeNetwork,
+        sampling: RelativeSampling,
+    ) -> Result<Self, ModelError> {
+        Self::of_weights(&RelativeWeights::of(network)?, sampling)
+    }
+
+    /// As [`Self::new`], from plain weights.
+    ///
+    /// # Errors
+    /// Weights that lack a parameter.
+    pub fn of_weights(
+        weights: &RelativeWeights,
+        sampling: RelativeSampling,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            engine: Engine::new(weights, sampling.precision)?,
+            sampling,
+            passes: AtomicU64::new(0),
+            watch: ProbeConfig::default(),
+            outlooks: Mutex::default(),
+        })
+    }
+
+    /// The same world, which keeps what its agents might have done.
+    pub fn watching(self, watch: ProbeConfig) -> Self {
+        Self { watch, ..self }
+    }
+
+    /// Divides the logits by this from now on; above 1 is bolder.
+    pub fn set_temperature(&mut self, temperature: f64) {
+        self.sampling.temperature = temperature;
+    }
+
+    /// Takes what was watched since it was last taken: step by step, futures in their order, and
+    /// agents in that of their ids.
+    pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
+        let mut kept = self.outlooks.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::take(&mut *kept)
+    }
+
+    /// Steps made so far, whatever the number of futures.
+    pub fn passes(&self) -> u64 {
+        self.passes.load(Ordering::Relaxed)
+    }
+
+    /// The futures of a start, with the scene they share.
+    fn begin(&self, start: &Start<'_>) -> Result<(Arc<Scene>, Vec<Future>), ModelError> {
+        let scene = Arc::new(Scene::new(&self.engine, start.scene, &self.sampling));
+        let first = Future::begin(&self.engine, &scene, start.scene)?;
+        let futures = (0..start.n_futures).map(|k| Future {
+            seed: start.seed.fork(k as u64),
+            ..first.clone()
+        });
+        Ok((Arc::clone(&scene), futures.collect()))
+    }
+}
+
+impl RelativeWorld {
+    /// The numbers of the present's nodes and what they end with, agents in the order of their ids:
+    /// what training computes of the same frames, up to rounding.
+    ///
+    /// # Errors
+    /// A scene that cannot be rolled out.
+    pub fn read_present(&self, scene: SceneState<'_>) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
+        let shared = Arc::new(Scene::new(&self.engine, scene, &self.sampling));
+        let future = Future::begin(&self.engine, &shared, scene)?;
+        let numbers = future
+            .members
+            .iter()
+            .flat_map(|member| member.now().numbers());
+        Ok((numbers.collect(), future.hidden))
+    }
+}
+
+impl WorldModel for RelativeWorld {
+    fn name(&self) -> &str {
+        "model"
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        let begun = starts.par_iter().map(|start| self.begin(start));
+        let begun: Vec<_> = begun.collect::<Result<_, _>>()?;
+        Ok(Box::new(RelativeSession {
+            world: self,
+            futures: begun.into_iter().flat_map(|(_, futures)| futures).collect(),
+            step: 0,
+        }))
+    }
+}
+
+/// What all futures of a start share.
+#[derive(Debug)]
+pub(super) struct Scene {
+    map: VectorMap,
+    pub memory: MapMemory,
+    /// The edges of the road, where rules look at them.
+    pub survey: Survey,
+    ego: AgentId,
+}
+
+impl Scene {
+    fn new(engine: &Engine, scene: SceneState<'_>, sampling: &RelativeSampling) -> Self {
+        let centre = scene.ego_now().state.pose.position;
+        let map = VectorMap::new(scene.map, centre, MAP_M, Hidden::default());
+        Self {
+            memory: engine.remember(&map),
+            map,
+            survey: match sampling.redraws {
+                0 => Survey::default(),
+                _ => Survey::of_edges(scene.map, centre, MAP_M),
+            },
+            ego: scene.ego,
+        }
+    }
+}
+
+/// An agent of a future.
+#[derive(Clone, Debug)]
+struct Member {
+    agent: Agent,
+    seen: Seen,
+}
+
+/// One future in progress.
+#[derive(Clone, Debug)]
+struct Future {
+    scene: Arc<Scene>,
+    seed: Seed,
+    /// Frames read so far.
+    frames: usize,
+    members: Vec<Member>,
+    /// Those who are not predicted.
+    others: Vec<Agent>,
+    lights: Vec<Light>,
+    shown_lights: Lights,
+    /// What the present's nodes ended with, `[members, C]`.
+    hidden: Vec<f32>,
+}
+
+impl Future {
+    /// The present of a scene, its history read.
+    fn begin(
+        engine: &Engine,
+        scene: &Arc<Scene>,
+        state: SceneState<'_>,
+    ) -> Result<Self, ModelError> {
+        let stride = (TOKEN_DT / state.dt).round().max(1.0) as usize;
+        if (stride as f64 * state.dt - TOKEN_DT).abs() > 1e-3 {
+            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", state.dt);
+            return Err(ModelError::Scene(what));
+        }
+        let frames = state.strided_history(stride, KEPT);
+        let (predicted, others): (Vec<Agent>, Vec<Agent>) = state
+            .now()
+            .agents()
+            .iter()
+            .partition(|agent| agent.kind.is_moving());
+        let mut future = Self {
+            scene: Arc::clone(scene),
+            seed: Seed(0),
+            frames: 0,
+            members: Vec::new(),
+            others,
+            lights: state.now().lights().to_vec(),
+            shown_lights: Lights::default(),
+            hidden: Vec::new(),
+        };
+        let now = state.history.len() - 1;
+        let mut room = Workspace::default();
+        for (i, frame) in frames.iter().enumerate() {
+            let index = now - (frames.len() - 1 - i) * stride;
+            future.shown_lights = lights_at(&state.history[..=index], state.dt);
+            future.see(engine, frame, &predicted);
+            future.read(engine, &mut room);
+        }
+        Ok(future)
+    }
+
+    /// Takes in a frame of history: of those who are there now, whoever is in it.
+    fn see(&mut self, engine: &Engine, frame: &Frame, predicted: &[Agent]) {
+        let mut before: BTreeMap<AgentId, Member> = std::mem::take(&mut self.members)
+            .into_iter()
+            .map(|member| (member.agent.id, member))
+            .collect();
+        for agent in predicted.iter().filter_map(|a| frame.agent(a.id)) {
+            let state = agent.state;
+            let member = match before.remove(&agent.id) {
+                Some(mut member) => {
+                    member.push(state);
+                    member
+                }
+                None => Member {
+                    agent: *agent,
+                    seen: Seen::first(engine, body(agent), state.pose, state.velocity),
+                },
+            };
+            self.members.push(member);
+        }
+    }
+
+    /// Lets the network read the present.
+    fn read(&mut self, engine: &Engine, room: &mut Workspace) {
+        let (map, lights) = (&self.scene.map, &self.shown_lights);
+        let seen = self.members.iter_mut().map(|member| &mut member.seen);
+        let mut present = presents(map, lights, seen);
+        let t = self.frames;
+        engine.read(&mut present, t, &self.scene.memory, room, &mut self.hidden);
+        self.frames += 1;
+    }
+
+    /// Goes on by half a second.
+    fn step(
+        &mut self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) {
+        let moves = self.decide(engine, sampling, ego, room);
+        self.go(engine, &moves, ego, room);
+    }
+
+    /// What everyone will do in the next half second, if the ego does what is given.
+    fn decide(
+        &self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) -> Vec<Pose> {
+        let seed = self.seed.fork(self.frames as u64);
+        let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
+        let streams: Vec<Seed> = self.members.iter().map(stream).collect();
+        self.moves(engine, sampling, &streams, ego, room)
+    }
+
+    /// Goes on by these moves; an ego that is given is where it is said to be.
+    fn go(
+        &mut self,
+        engine: &Engine,
+        moves: &[Pose],
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) {
+        let id = self.scene.ego;
+        for (member, &step) in self.members.iter_mut().zip(moves) {
+            let driven = ego.filter(|_| member.agent.id == id);
+            let state = driven.unwrap_or_else(|| AgentState {
+                pose: member.now().pose * step,
+                velocity: DVec2::ZERO,
+            });
+            member.push(state);
+            if let Some(driven) = driven {
+                member.agent.state = driven;
+            }
+        }
+        for other in &mut self.others {
+            other.state.pose.position += other.state.velocity * TOKEN_DT;
+        }
+        for light in &mut self.shown_lights.by_lane {
+            light.2 = light.2.map(|elapsed| elapsed + TOKEN_DT);
+        }
+        self.read(engine, room);
+    }
+
+    /// The next moves of all agents, each in its own frame, after the rules.
+    fn moves(
+        &self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        streams: &[Seed],
+        ego: Option<AgentState>,
+        room: &mut Workspace,
+    ) -> Vec<Pose> {
+        let draw = sampling.draw();
+        let agents: Vec<Shown> = self.members.iter().map(Member::now).collect();
+        let kept = |i: usize, bins| match sampling.limits {
+            true => held_back(&agents[i], dequantize(bins)),
+            false => dequantize(bins),
+        };
+        let drawn = engine.decide(&self.hidden, streams, draw, room);
+        let mut moves: Vec<Pose> = (0..agents.len()).map(|i| kept(i, drawn[i])).collect();
+        if sampling.redraws == 0 {
+            return moves;
+        }
+        let is_ego = |member: &Member| member.agent.id == self.scene.ego;
+        let driven = ego.and_then(|ego| Some((self.members.iter().position(is_ego)?, ego)));
+        if let Some((i, ego)) = driven {
+            moves[i] = agents[i].pose.inverse() * ego.pose;
+        }
+        let c = self.hidden.len() / agents.len().max(1);
+        let mut again = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let rows = who.iter().flat_map(|&i| &self.hidden[i * c..][..c]);
+            let rows: Vec<f32> = rows.copied().collect();
+            let fresh = |&i: &usize| streams[i].fork(REDRAW + attempt as u64);
+            let streams: Vec<Seed> = who.iter().map(fresh).collect();
+            let drawn = engine.decide(&rows, &streams, draw, room);
+            who.iter()
+                .zip(drawn)
+                .map(|(&i, bins)| kept(i, bins))
+                .collect()
+        };
+        let (survey, redraws) = (&self.scene.survey, sampling.redraws);
+        let driven = driven.map(|(i, _)| i);
+        settle(&agents, driven, survey, redraws, &mut moves, &mut again);
+        moves
+    }
+
+    /// What agents might do next, from streams of their own.
+    fn outlooks(
+        &self,
+        engine: &Engine,
+        sampling: &RelativeSampling,
+        (draws, future, step): (Range<u64>, usize, usize),
+        driven: Option<AgentId>,
+    ) -> Vec<PredictiveSamples> {
+        let draw = sampling.draw();
+        let mut room = Workspace::default();
+        let seed = self.seed.fork(self.frames as u64);
+        let draws: Vec<_> = draws
+            .map(|k| {
+                let stream = |member: &Member| seed.fork(member.agent.id.0 as u64).fork(WATCH + k);
+                let streams: Vec<Seed> = self.members.iter().map(stream).collect();
+                engine.decide(&self.hidden, &streams, draw, &mut room)
+            })
+            .collect();
+        let members = self.members.iter().enumerate();
+        let told = members.filter(|(_, member)| driven != Some(member.agent.id));
+        let outlook = |(i, member): (usize, &Member)| PredictiveSamples {
+            future,
+            step,
+            agent: member.agent.id,
+            draws: draws
+                .iter()
+                .map(|bins| {
+                    let next = member.now().then(member.now().pose * dequantize(bins[i]));
+                    AgentState {
+                        pose: next.pose,
+                        velocity: next.velocity(),
+                    }
+                })
+                .collect(),
+        };
+        told.map(outlook).collect()
+    }
+
+    fn frame(&self) -> Frame {
+        let agents = self.members.iter().map(|member| member.agent);
+        let all = agents.chain(self.others.iter().copied()).collect();
+        Frame::new(all, self.lights.clone())
+    }
+}
+
+impl Member {
+    fn now(&self) -> Shown {
+        self.seen.now()
+    }
+
+    /// Half a second later it is here; its velocity is what it moved by.
+    fn push(&mut self, state: AgentState) {
+        self.seen.push(state.pose);
+        self.agent.state = AgentState {
+            pose: state.pose,
+            velocity: self.now().velocity(),
+        };
+    }
+}
+
+fn body(agent: &Agent) -> Body {
+    Body {
+        kind: agent.kind,
+        length: agent.length,
+        width: agent.width,
+        sized: true,
+    }
+}
+
+/// The lights of the last frame, and how long they have shown their colour as far as was seen.
+fn lights_at(history: &[Frame], dt: f64) -> Lights {
+    let Some((now, before)) = history.split_last() else {
+        return Lights::default();
+    };
+    let by_lane = now.lights().iter().map(|light| {
+        let mut shown = 0;
+        let changed = before.iter().rev().find_map(|frame| {
+            let then = frame.light(light.lane)?.state;
+            shown += 1;
+            (then != light.state).then_some(then)
+        });
+        let seen = changed.is_some_and(|then| then != LightState::Unknown);
+        let elapsed = seen.then_some((shown - 1) as f64 * dt);
+        (light.lane, light.state, elapsed)
+    });
+    Lights {
+        by_lane: by_lane.collect(),
+    }
+}
+
+/// Futures in progress.
+struct RelativeSession<'a> {
+    world: &'a RelativeWorld,
+    futures: Vec<Future>,
+    /// Steps made so far.
+    step: usize,
+}
+
+impl Session for RelativeSession<'_> {
+    fn dt(&self) -> f64 {
+        TOKEN_DT
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        let (engine, sampling) = (&self.world.engine, &self.world.sampling);
+        let watch = self.world.watch;
+        if watch.futures > 0 && watch.draws > 0 {
+            let watched = self.futures.iter().take(watch.futures).enumerate();
+            let seen = watched.flat_map(|(i, future)| {
+                let driven = ego.is_some().then_some(future.scene.ego);
+                let draws = 0..watch.draws as u64;
+                future.outlooks(engine, sampling, (draws, i, self.step), driven)
+            });
+            let mut kept = self.world.outlooks.lock();
+            let kept = kept
+                .as_mut()
+                .map_err(|_| "a thread panicked while watching")?;
+            kept.extend(seen);
+        }
+        self.step += 1;
+        self.world.passes.fetch_add(1, Ordering::Relaxed);
+        let frames = self.futures.par_iter_mut().enumerate().map_init(
+            Workspace::default,
+            |room, (i, future)| {
+                future.step(engine, sampling, ego.map(|ego| ego[i]), room);
+                future.frame()
+            },
+        );
+        Ok(frames.collect())
+    }
+
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let mut at = 0;
+        self.futures.retain(|_| {
+            at += 1;
+            futures.binary_search(&(at - 1)).is_ok()
+        });
+        true
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        let (_, mut fresh) = self.world.begin(&start)?;
+        self.futures[future] = fresh.swap_remove(0);
+        Ok(())
+    }
+}

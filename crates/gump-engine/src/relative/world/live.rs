@@ -1,0 +1,213 @@
+//! One future that goes on by hand, half a second at a time.
+//!
+//! A [`Session`] learns where the ego will be before the others move. Whoever
+//! drives it himself does not know that yet: here the others decide first, on the assumption that
+//! the ego goes on as given, are shown on their way, and what the ego really did is told afterwards.
+
+use std::ops::Range;
+
+use gump_geometry::Pose;
+use gump_model::ModelError;
+use gump_model::steps::TOKEN_DT;
+use gump_rollout::Start;
+use gump_scene::{AgentId, AgentState, Frame, Light, SceneState, Seed};
+
+use super::{Future, RelativeWorld, Workspace};
+use crate::predictive_samples::PredictiveSamples;
+
+#[cfg(doc)]
+use gump_rollout::Session;
+
+/// A future of a [`RelativeWorld`] that can be held, copied and led on in several ways.
+///
+/// It belongs to the world that began it, and every call takes that world. Led on by the states
+/// that were assumed, it is future 0 of a session with the same seed, to the bit.
+#[derive(Clone, Debug)]
+pub struct LiveFuture {
+    future: Future,
+    /// What everyone decided to do next, each in its own frame.
+    moves: Vec<Pose>,
+}
+
+impl LiveFuture {
+    /// Seconds between its frames.
+    pub const DT: f64 = TOKEN_DT;
+
+    /// Begins with what a scene has seen.
+    ///
+    /// # Errors
+    /// A time step that does not divide half a second.
+    pub fn begin(
+        world: &RelativeWorld,
+        scene: SceneState<'_>,
+        seed: Seed,
+    ) -> Result<Self, ModelError> {
+        let start = Start {
+            scene,
+            n_futures: 1,
+            seed,
+        };
+        let (_, mut futures) = world.begin(&start)?;
+        Ok(Self {
+            future: futures.swap_remove(0),
+            moves: Vec::new(),
+        })
+    }
+
+    /// Lets everyone decide on the next half second and tells where they will be.
+    ///
+    /// `ego` is where the ego is assumed to be then; others keep clear of it. Without it the
+    /// network decides for the ego, too.
+    pub fn decide(&mut self, world: &RelativeWorld, ego: Option<AgentState>) -> Frame {
+        let mut room = Workspace::default();
+        let future = &self.future;
+        self.moves = future.decide(&world.engine, &world.sampling, ego, &mut room);
+        let decided = future.members.iter().zip(&self.moves);
+        let agents = decided.map(|(member, &step)| {
+            let next = member.now().then(member.now().pose * step);
+            let told = AgentState {
+                pose: next.pose,
+                velocity: next.velocity(),
+            };
+            let driven = ego.filter(|_| member.agent.id == future.scene.ego);
+            member.agent.with_state(driven.unwrap_or(told))
+        });
+        let others = future.others.iter().map(|other| {
+            let mut other = *other;
+            other.state.pose.position += other.state.velocity * TOKEN_DT;
+            other
+        });
+        Frame::new(agents.chain(others).collect(), future.lights.clone())
+    }
+
+    /// Goes on to what was decided; an ego that is given is where it really came to be.
+    ///
+    /// Without a decision before it nobody moves.
+    pub fn go_on(&mut self, world: &RelativeWorld, ego: Option<AgentState>) -> Frame {
+        let mut room = Workspace::default();
+        let mut moves = std::mem::take(&mut self.moves);
+        moves.resize(self.future.members.len(), Pose::IDENTITY);
+        self.future.go(&world.engine, &moves, ego, &mut room);
+        self.future.frame()
+    }
+
+    /// Shows these lights from now on. What has changed has changed now.
+    pub fn show(&mut self, lights: &[Light]) {
+        self.future.lights = lights.to_vec();
+        let before = std::mem::take(&mut self.future.shown_lights.by_lane);
+        let shown = lights.iter().map(|light| {
+            let known = before.iter().find(|(lane, ..)| *lane == light.lane);
+            let elapsed = match known {
+                Some(&(_, state, elapsed)) if state == light.state => elapsed,
+                Some(_) => Some(0.0),
+                None => None,
+            };
+            (light.lane, light.state, elapsed)
+        });
+        let mut shown: Vec<_> = shown.collect();
+        // Looked up by lane.
+        shown.sort_by_key(|(lane, ..)| *lane);
+        self.future.shown_lights.by_lane = shown;
+    }
+
+    /// What everyone but `driven` might do in the next half second, whatever was decided: these of
+    /// any number of draws for each. It changes nothing.
+    pub fn outlooks(
+        &self,
+        world: &RelativeWorld,
+        draws: Range<u64>,
+        driven: Option<AgentId>,
+    ) -> Vec<PredictiveSamples> {
+        let step = self.future.frames;
+        self.future
+            .outlooks(&world.engine, &world.sampling, (draws, 0, step), driven)
+    }
+
+    /// The same present with other randomness ahead.
+    #[must_use]
+    pub fn fork(&self, seed: Seed) -> Self {
+        let mut fork = self.clone();
+        fork.future.seed = seed;
+        fork.moves.clear();
+        fork
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::DVec2;
+    use gump_model::relative::RelativeWeights;
+    use gump_rollout::{Start, WorldModel as _};
+    use gump_scene::{Scenario, Seed, fixture};
+
+    use super::*;
+    use crate::relative::RelativeSampling;
+
+    fn world() -> RelativeWorld {
+        let path = "../../datasets/weights/gump-relative.safetensors";
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+        let weights = RelativeWeights::read(&std::fs::read(path).unwrap()).unwrap();
+        let sampling = RelativeSampling {
+            redraws: 4,
+            limits: true,
+            ..RelativeSampling::default()
+        };
+        RelativeWorld::of_weights(&weights, sampling).unwrap()
+    }
+
+    fn scenario() -> Scenario {
+        fixture::scenario(
+            "lane 1: 0,0 160,0 speed 15
+             edge: 0,-3 160,-3
+             ego vehicle 0: 10,0 velocity 8,0
+             agent vehicle 1: 30,0 velocity 6,0
+             agent bicycle 3: 20,-2 velocity 4,0
+             agent pedestrian 4: 40,5 velocity 0,-1
+             agent other 5: 90,3",
+        )
+        .unwrap()
+    }
+
+    /// The frames of future 0 of a session, and a live future of the same seed.
+    #[test]
+    fn led_on_as_assumed_it_is_a_sessions_future() {
+        let (world, scenario) = (world(), scenario());
+        for driven in [false, true] {
+            let scene = scenario.present();
+            let start = Start {
+                scene,
+                n_futures: 1,
+                seed: Seed(4),
+            };
+            let mut session = world.open(&[start]).unwrap();
+            let mut live = LiveFuture::begin(&world, scene, Seed(4)).unwrap();
+            let mut ego = scene.ego_now().state;
+            for _ in 0..4 {
+                ego.pose.position += DVec2::new(3.0, 0.0);
+                let told = driven.then_some(ego);
+                let ahead = live.decide(&world, told);
+                let expected = session
+                    .step(told.as_ref().map(std::slice::from_ref))
+                    .unwrap();
+                assert_eq!(ahead.agents(), expected[0].agents());
+                let moving = ahead.agents().iter().filter(|agent| agent.kind.is_moving());
+                assert_eq!(live.outlooks(&world, 0..2, None).len(), moving.count());
+                assert_eq!(live.go_on(&world, told), expected[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn copies_go_their_own_ways() {
+        let (world, scenario) = (world(), scenario());
+        let mut live = LiveFuture::begin(&world, scenario.present(), Seed(4)).unwrap();
+        let mut copy = live.clone();
+        let mut fork = live.fork(Seed(5));
+        let ways = [&mut live, &mut copy, &mut fork].map(|future| {
+            future.decide(&world, None);
+            future.go_on(&world, None)
+        });
+        assert_eq!(ways[0], ways[1]);
+        assert_ne!(ways[0], ways[2]);
+    }
+}

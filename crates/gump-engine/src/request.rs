@@ -1,0 +1,118 @@
+//! What is asked of the decoder for one object, and what its answer comes to.
+
+use std::fmt;
+use std::sync::Arc;
+
+use gump_geometry::{DVec2, Pose};
+use gump_model::decoder::{Bins, STEPS};
+use gump_model::local_frame::LocalFrame;
+use gump_scene::{AgentState, Seed};
+use gump_tokenizer::{Field, QuantizedState};
+
+use crate::agreement;
+use crate::kinematic_limits::Limits;
+use crate::sampling::SamplingConfig;
+use crate::temporal_ensemble::ChunkBuffer;
+
+/// What is asked of the decoder for one object.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// In whose frame the bins are said.
+    pub anchor: LocalFrame,
+    /// Bins that are given, per step.
+    pub forced: [Option<u16>; STEPS.len()],
+    /// The object's own stream of randomness in this frame.
+    pub stream: Seed,
+    /// Pose 0 must lie within this distance of a point along both axes, scene frame, metres.
+    pub near: Option<(DVec2, f64)>,
+    /// What earlier chunks say; empty for an object that is driven.
+    pub ring: ChunkBuffer,
+    /// Where it was and how it may move from there.
+    pub limits: Option<(Pose, Limits)>,
+    /// Number of the frame being decoded.
+    pub frame: usize,
+    /// What the draws go by beyond that.
+    pub guide: Option<Arc<dyn Guide>>,
+}
+
+/// What draws go by beside the logits, knowing what was drawn before.
+pub trait Guide: fmt::Debug + Send + Sync {
+    /// Factors on the probabilities of the bins of `step` after the steps in `drawn`, 0 for those
+    /// that may not be drawn; `None` leaves them as they are. Where none may, the draw is free, and
+    /// whoever asked will find out.
+    fn weights(&self, step: usize, drawn: &[u16]) -> Option<Vec<f32>>;
+
+    /// Factor on the temperature of `step`.
+    fn boldness(&self, step: usize) -> f64;
+
+    /// How widely the targets of `step` were spread in training, where that is to be taken off:
+    /// standard deviation in bins.
+    fn smoothing(&self, step: usize) -> Option<f32>;
+
+    /// The number in [0, 1) that decides `step`, instead of one of the object's stream.
+    fn number(&self, step: usize) -> Option<f64>;
+}
+
+impl Request {
+    /// Whether the state is given, so that nothing is left to draw.
+    pub(crate) fn is_driven(&self) -> bool {
+        self.forced[..7].iter().all(Option::is_some)
+    }
+
+    /// Where the object was, scene frame; `None` if that is not known.
+    pub(crate) fn from(&self) -> Option<Pose> {
+        let limited = self.limits.map(|(from, _)| from);
+        limited.or(self.anchor.origin())
+    }
+
+    /// The final state of a decoded object: its sample, aggregated, within its limits, its velocity in
+    /// agreement; scene frame, not quantised.
+    pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
+        let said = AgentState {
+            pose: self.anchor.poses(bins)[0],
+            velocity: self.anchor.velocity(bins),
+        };
+        let average = self.ring.aggregate(self.frame, said.pose, config.decay);
+        let Some(from) = self.from().filter(|_| !self.is_driven()) else {
+            return AgentState {
+                pose: average,
+                ..said
+            };
+        };
+        let steers = self.limits.is_some();
+        let velocity = agreement::follow(from, said, average, steers);
+        let mut settled = AgentState {
+            pose: average,
+            velocity,
+        };
+        if let Some((from, limits)) = self.limits {
+            let kept = limits.keep(from, settled);
+            settled = AgentState {
+                velocity: agreement::follow(from, settled, kept.pose, steers),
+                ..kept
+            };
+        }
+        if config.limits {
+            settled.velocity = agreement::allowed(from, settled.pose, settled.velocity);
+        }
+        settled
+    }
+
+    /// The token state of a decoded object whose final state is `settled`: the one value that
+    /// embedding, sine, geometry and the next surrogate all derive from.
+    pub(crate) fn settled_state(&self, bins: &Bins, settled: AgentState) -> QuantizedState {
+        let mut state = QuantizedState::default();
+        for (field, &bin) in STEPS.iter().zip(bins).take(2) {
+            state.set(*field, bin);
+        }
+        state.with_motion(&settled)
+    }
+}
+
+/// The same state at another pose.
+pub(crate) fn set_pose(mut state: QuantizedState, pose: Pose) -> QuantizedState {
+    state.x = Field::X.quantize(pose.position.x).bin;
+    state.y = Field::Y.quantize(pose.position.y).bin;
+    state.heading = Field::Heading.quantize(pose.heading).bin;
+    state
+}

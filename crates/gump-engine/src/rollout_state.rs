@@ -1,0 +1,279 @@
+//! One future in progress: its window, what its agents foresaw, and how decoded states become its
+//! present.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_geometry::Pose;
+use gump_model::config::KEEP_RANGE_M;
+use gump_model::decoder::{Bins, STEPS};
+use gump_model::exact::ExactFrames;
+use gump_model::local_frame::LocalFrame;
+use gump_model::steps::TOKEN_DT;
+use gump_scene::{Agent, AgentState, Frame, Seed};
+use gump_tokenizer::{Identities, QuantizedState, TokenAgent, TokenFrame};
+
+use crate::cpu::Context;
+use crate::decode::Window;
+use crate::kinematic_limits::Limits;
+use crate::request::{Request, set_pose};
+use crate::sampling::{CacheMode, SamplingConfig, Surrogate};
+use crate::scene::Scene;
+use crate::spawning::Phases;
+use crate::temporal_ensemble::ChunkBuffer;
+use crate::world::TransformerWorld;
+
+/// How far a sampled position may lie from its surrogate (released code), metres.
+const GUARD_M: f64 = 5.0;
+
+/// One future in progress.
+#[derive(Clone, Debug)]
+pub(crate) struct Future {
+    pub(crate) scene: usize,
+    pub(crate) seed: Seed,
+    /// The last token frames: at most `history` of them, or as many as a growing window holds.
+    pub(crate) frames: Vec<TokenFrame>,
+    /// Number of the last frame.
+    pub(crate) index: usize,
+    /// What that was at the start.
+    pub(crate) begun: usize,
+    pub(crate) rings: BTreeMap<u16, ChunkBuffer>,
+    /// The same frames in world coordinates, `history` of them at least where there are as many; the
+    /// last is the present.
+    pub(crate) recent: Vec<Frame>,
+    /// Who has which key; of those who came in this future, too.
+    pub(crate) identities: Identities,
+    /// How long lights have shown what they show, where traffic lives.
+    pub(crate) phases: Phases,
+    /// What the engine keeps of its window.
+    pub(crate) context: Context,
+}
+
+impl Future {
+    /// The window of one future: its history and the next frame with provisional states.
+    pub(crate) fn window(
+        &self,
+        scene: &Scene,
+        world: &TransformerWorld,
+        ego: Option<AgentState>,
+    ) -> Window {
+        let sampling = world.sampling();
+        let index = self.index + 1;
+        let last = self.frames.last().expect("a future has history");
+        let mut next = TokenFrame {
+            lights: last.lights.clone(),
+            tracked: Vec::new(),
+            newborn: Vec::new(),
+        };
+        let mut requests = Vec::new();
+        // Who was newborn is tracked now, and takes its place in the canonical order.
+        let mut agents: Vec<&TokenAgent> = last.agents().collect();
+        agents.sort_by_key(|agent| agent.key.order());
+        for agent in agents {
+            let id = agent.key.id;
+            let surrogate = match (id, ego) {
+                (0, Some(state)) => scene.quantize(state, agent.state),
+                _ => self.surrogate(agent, index, sampling),
+            };
+            let position = surrogate.pose().position;
+            if id != 0 && position.abs().max_element() >= KEEP_RANGE_M {
+                continue;
+            }
+            let driven = id == 0 && ego.is_some();
+            next.tracked.push(TokenAgent {
+                key: agent.key,
+                state: surrogate,
+            });
+            let anchor = self.anchor(agent, scene, world);
+            let is = match (id, ego) {
+                (0, Some(state)) => scene.local(state),
+                _ => surrogate.to_agent_state(),
+            };
+            requests.push(Request {
+                anchor,
+                forced: given(anchor, &surrogate, is, driven),
+                stream: stream(self.seed, index, id),
+                near: Some((position, GUARD_M)),
+                // A driven object was put where it is; what it once foresaw does not count.
+                ring: if driven {
+                    ChunkBuffer::default()
+                } else {
+                    self.rings.get(&id).cloned().unwrap_or_default()
+                },
+                limits: self.limits(agent, scene, sampling).filter(|_| !driven),
+                frame: index,
+                guide: None,
+            });
+        }
+        Window {
+            scene: self.scene,
+            history: self.frames.clone(),
+            exact: self.exact(scene),
+            next,
+            requests,
+            survey: Arc::clone(&scene.survey),
+        }
+    }
+
+    /// The objects of the window's frames, not rounded.
+    pub(crate) fn exact(&self, scene: &Scene) -> ExactFrames {
+        let n = self.frames.len();
+        ExactFrames::last(n, &self.recent, &self.identities, scene.world_from_scene)
+    }
+
+    /// In whose frame the next chunk of `agent`, a token of the last frame, is said: where it is,
+    /// not rounded.
+    fn anchor(&self, agent: &TokenAgent, scene: &Scene, world: &TransformerWorld) -> LocalFrame {
+        if world.network().config().anchored {
+            LocalFrame::at(self.pose(agent, scene))
+        } else {
+            LocalFrame::SCENE
+        }
+    }
+
+    /// Where `agent`, a token of the last frame, is, and how it may move from there.
+    fn limits(
+        &self,
+        agent: &TokenAgent,
+        scene: &Scene,
+        sampling: &SamplingConfig,
+    ) -> Option<(Pose, Limits)> {
+        let limits = Limits::of(agent.key.kind).filter(|_| sampling.limits)?;
+        Some((self.pose(agent, scene), limits))
+    }
+
+    /// Where `agent`, a token of the last frame, is, not rounded; scene frame.
+    fn pose(&self, agent: &TokenAgent, scene: &Scene) -> Pose {
+        let id = self.identities.agent(agent.key.id);
+        let present = self.recent.last().expect("a future has a present");
+        let known = id.and_then(|id| present.agent(id));
+        known.map_or(agent.state.pose(), |known| scene.local(known.state).pose)
+    }
+
+    /// A provisional state of `agent` for frame `index`.
+    fn surrogate(
+        &self,
+        agent: &TokenAgent,
+        index: usize,
+        sampling: &SamplingConfig,
+    ) -> QuantizedState {
+        let (pose, velocity) = (agent.state.pose(), agent.state.velocity());
+        let moved = Pose {
+            position: pose.position + velocity * TOKEN_DT,
+            ..pose
+        };
+        let said = match sampling.surrogate {
+            Surrogate::Chunk => self
+                .rings
+                .get(&agent.key.id)
+                .and_then(|ring| ring.surrogate(index, sampling.decay)),
+            Surrogate::Copy => Some(pose),
+            Surrogate::ConstantVelocity => None,
+        };
+        // Half a second moves nobody farther from a straight line: such a word is noise.
+        let said = said.filter(|said| said.position.distance(moved.position) <= GUARD_M);
+        set_pose(agent.state, said.unwrap_or(moved))
+    }
+
+    /// Makes the decoded states the present and returns it in world coordinates.
+    pub(crate) fn commit(
+        &mut self,
+        window: Window,
+        decoded: &[Bins],
+        scene: &Scene,
+        world: &TransformerWorld,
+        ego: Option<AgentState>,
+    ) -> Frame {
+        let sampling = world.sampling();
+        self.index += 1;
+        let mut next = window.next;
+        let mut moved = BTreeMap::new();
+        for ((agent, request), bins) in next.tracked.iter_mut().zip(&window.requests).zip(decoded) {
+            let id = agent.key.id;
+            let driven = id == 0 && ego.is_some();
+            let ring = self.rings.entry(id).or_default();
+            if driven {
+                ring.clear();
+            }
+            ring.push(self.index, request.anchor.poses(bins));
+            let settled = request.settle(bins, sampling);
+            agent.state = request.settled_state(bins, settled);
+            let state = AgentState {
+                pose: scene.world_from_scene * settled.pose,
+                velocity: scene.world_from_scene.rotate(settled.velocity),
+            };
+            moved.insert(id, if driven { ego.unwrap_or(state) } else { state });
+        }
+        let now = self.recent.last().expect("a future has a present");
+        let agents = now.agents().iter().map(|agent| {
+            let token = self.identities.key(agent.id).and_then(|id| moved.get(&id));
+            let driven = ego.filter(|_| agent.id == scene.ego);
+            agent.with_state(driven.or(token.copied()).unwrap_or_else(|| drift(agent)))
+        });
+        // Lights keep the colour they were seen in.
+        let frame = Frame::new(agents.collect(), now.lights().to_vec());
+        let (before, longest) = (self.frames.last(), world.longest_frame());
+        next.newborn = scene.arrivals(&frame, &next, before, longest, &self.identities);
+        self.recent.push(frame.clone());
+        self.frames.push(next);
+        let history = sampling.history.max(1);
+        if sampling.cache != CacheMode::Growing || self.overflows(world) {
+            self.frames
+                .drain(..self.frames.len().saturating_sub(history));
+        }
+        let kept = history.max(self.frames.len());
+        self.recent.drain(..self.recent.len().saturating_sub(kept));
+        self.rings.retain(|id, _| moved.contains_key(id));
+        // In the first frame of a window nobody is newborn: who was, counts as tracked.
+        let first = std::mem::take(&mut self.frames[0]);
+        self.frames[0] = first.into_first();
+        frame
+    }
+
+    /// Whether the window with a next frame like the last would be longer than a block.
+    fn overflows(&self, world: &TransformerWorld) -> bool {
+        let last = self.frames.last().map_or(0, TokenFrame::len_slots);
+        let all: usize = self.frames.iter().map(TokenFrame::len_slots).sum();
+        all + last > world.network().config().block_size
+    }
+
+    /// How far the ego is from the origin of its scene frame along either axis, metres.
+    pub(crate) fn ego_reach(&self) -> f64 {
+        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        ego.map_or(0.0, |ego| ego.state.pose().position.abs().max_element())
+    }
+
+    /// Moves into another scene of the same traffic: tokens and chunks are expressed in its frame.
+    pub(crate) fn enter(&mut self, index: usize, from: &Scene, to: &Scene) {
+        let to_from_from = to.world_from_scene.inverse() * from.world_from_scene;
+        self.scene = index;
+        self.frames = to.history.clone();
+        self.context.clear();
+        self.rings
+            .values_mut()
+            .for_each(|ring| ring.transform(to_from_from));
+    }
+}
+
+/// The randomness of one object in one frame of one future, whatever the batch.
+pub(crate) fn stream(seed: Seed, frame: usize, id: u16) -> Seed {
+    seed.fork(frame as u64).fork(u64::from(id))
+}
+
+/// Sizes never drift; the state `is` of a driven object is given entirely.
+fn given(
+    anchor: LocalFrame,
+    like: &QuantizedState,
+    is: AgentState,
+    driven: bool,
+) -> [Option<u16>; STEPS.len()] {
+    let state = driven.then_some(is);
+    anchor.bins(*like, [state, None, None, None])
+}
+
+/// Half a second of constant velocity.
+fn drift(agent: &Agent) -> AgentState {
+    let mut state = agent.state;
+    state.pose.position += state.velocity * TOKEN_DT;
+    state
+}

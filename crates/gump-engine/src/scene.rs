@@ -1,0 +1,233 @@
+//! What all futures of a start share: the frame of reference, the identities, the map and what the
+//! network remembers of it.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, OnceLock};
+
+use gump_geometry::Pose;
+use gump_model::config::KEEP_RANGE_M;
+use gump_model::exact::ExactFrames;
+use gump_model::local_context::Survey;
+use gump_model::local_frame::LocalFrame;
+use gump_model::mct::VisualMemory;
+use gump_model::placed_slot::{PlacedSlot, place_exactly};
+use gump_model::steps::TOKEN_DT;
+use gump_model::{ModelConfig, ModelError};
+use gump_raster::rasterize;
+use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, MapGraph, Route, SceneState};
+use gump_tokenizer::{
+    Identities, Key, N_CLASSES, QuantizedState, TokenAgent, TokenFrame, TokenSequence, class_index,
+};
+
+use crate::cpu::{Context, SceneMemory};
+use crate::placement::ground::Ground;
+use crate::world::TransformerWorld;
+
+/// What the network remembers of a map, in the form of whoever computes.
+#[derive(Debug)]
+pub enum Memory {
+    /// For the engine.
+    Packed(SceneMemory),
+    /// For the tensor library.
+    Plain(VisualMemory),
+}
+
+impl Memory {
+    /// The engine's form, if it is that.
+    pub fn packed(&self) -> Option<&SceneMemory> {
+        match self {
+            Self::Packed(memory) => Some(memory),
+            Self::Plain(_) => None,
+        }
+    }
+
+    /// The tensor library's form, if it is that.
+    pub(crate) fn plain(&self) -> Option<&VisualMemory> {
+        match self {
+            Self::Plain(memory) => Some(memory),
+            Self::Packed(_) => None,
+        }
+    }
+}
+
+/// What all futures of a start share.
+#[derive(Debug)]
+pub struct Scene {
+    /// The scene frame in the world.
+    pub world_from_scene: Pose,
+    pub(crate) ego: AgentId,
+    pub(crate) identities: Identities,
+    /// What is kept of the map.
+    pub memory: Memory,
+    /// The history as read by the engine, which futures go on from.
+    pub(crate) prefix: Context,
+    /// Frames before the start, scene frame.
+    pub history: Vec<TokenFrame>,
+    /// The lane that each light token controls, light 1 first.
+    pub(crate) lights: Vec<LaneId>,
+    /// The same frames in world coordinates; the last is the present.
+    pub(crate) recent: Vec<Frame>,
+    pub(crate) map: Arc<MapGraph>,
+    /// The map laid out around the scene.
+    pub survey: Arc<Survey>,
+    pub(crate) route: Option<Arc<Route>>,
+    /// Where agents may be, by class; made when first asked for.
+    grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
+    /// The part of them that leads into what is seen.
+    entries: [OnceLock<Arc<Ground>>; N_CLASSES],
+}
+
+impl Scene {
+    /// What the present of a scene shows.
+    pub fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, ModelError> {
+        let world_from_scene = scene.ego_now().state.pose;
+        let stride = (TOKEN_DT / scene.dt).round().max(1.0) as usize;
+        if (stride as f64 * scene.dt - TOKEN_DT).abs() > 1e-3 {
+            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", scene.dt);
+            return Err(ModelError::Scene(what));
+        }
+        let frames = scene.strided_history(stride, world.sampling().history.max(1));
+        // The ego must be in every frame of the window: start after the last one it is missing in.
+        let first = frames
+            .iter()
+            .rposition(|frame| frame.agent(scene.ego).is_none())
+            .map_or(0, |i| i + 1);
+        let frames = &frames[first..];
+        let identities = Identities::ranked(frames, scene.ego, world_from_scene);
+        let recent = frames.iter().copied().cloned().collect();
+        let map = Arc::clone(scene.map);
+        let route = scene.route.map(Arc::clone);
+        Self::of_window(world, map, route, recent, scene.ego, identities)
+    }
+
+    /// What a window of frames half a second apart shows, in the frame of the ego in its last.
+    pub fn of_window(
+        world: &TransformerWorld,
+        map: Arc<MapGraph>,
+        route: Option<Arc<Route>>,
+        recent: Vec<Frame>,
+        ego: AgentId,
+        identities: Identities,
+    ) -> Result<Self, ModelError> {
+        let view = SceneState {
+            map: &map,
+            route: route.as_ref(),
+            history: &recent,
+            ego,
+            dt: TOKEN_DT,
+        };
+        let world_from_scene = view.ego_now().state.pose;
+        let frames: Vec<&Frame> = recent.iter().collect();
+        let encoded = world
+            .tokenizer()
+            .encode(&map, &frames, ego, world_from_scene, &identities);
+        let (sequence, _) = encoded.sequence.fit(world.longest_frame());
+        let raster = rasterize(world.network().raster_spec(), &view, world_from_scene);
+        let survey = Arc::new(Survey::new(&map, world_from_scene));
+        let memory = world
+            .network()
+            .look(std::slice::from_ref(&raster), vec![Arc::clone(&survey)])?;
+        Ok(Self {
+            world_from_scene,
+            ego,
+            identities,
+            memory: match world.engine() {
+                Some(engine) => Memory::Packed(engine.remember(&memory)?),
+                None => Memory::Plain(memory),
+            },
+            prefix: Context::default(),
+            history: sequence.frames().to_vec(),
+            lights: encoded.lights,
+            recent,
+            map,
+            survey,
+            route,
+            grounds: Default::default(),
+            entries: Default::default(),
+        })
+    }
+
+    /// The state of an object in the present, scene frame, not rounded.
+    pub(crate) fn present(&self, id: u16) -> Option<AgentState> {
+        let now = self.recent.last()?;
+        Some(self.local(now.agent(self.identities.agent(id)?)?.state))
+    }
+
+    /// In whose frame the chunk at a key of the present is said.
+    pub fn anchor(&self, key: &PlacedSlot, config: &ModelConfig) -> LocalFrame {
+        let last = key.last_pose().filter(|_| config.anchored);
+        last.map_or(LocalFrame::SCENE, LocalFrame::at)
+    }
+
+    /// The slots of its own history.
+    pub fn slots(&self) -> Result<Vec<PlacedSlot>, ModelError> {
+        let sequence = TokenSequence::new(Vec::new(), self.history.clone())
+            .map_err(|error| ModelError::Scene(error.to_string()))?;
+        let n = self.history.len();
+        let exact = ExactFrames::last(n, &self.recent, &self.identities, self.world_from_scene);
+        Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
+    }
+
+    /// A world state in tokens, with the size of `like`.
+    pub(crate) fn quantize(&self, state: AgentState, like: QuantizedState) -> QuantizedState {
+        like.with_motion(&self.local(state))
+    }
+
+    /// Where agents of a class may be.
+    pub(crate) fn ground(&self, kind: AgentKind) -> Arc<Ground> {
+        let ground = &self.grounds[class_index(kind)];
+        let make = || Arc::new(Ground::of_class(&self.map, self.world_from_scene, kind));
+        Arc::clone(ground.get_or_init(make))
+    }
+
+    /// Where agents of a class may come into what is seen.
+    pub(crate) fn entries(&self, kind: AgentKind) -> Arc<Ground> {
+        let make = || Arc::new(self.ground(kind).entries());
+        Arc::clone(self.entries[class_index(kind)].get_or_init(make))
+    }
+
+    /// A world state in the scene frame.
+    pub(crate) fn local(&self, state: AgentState) -> AgentState {
+        let scene_from_world = self.world_from_scene.inverse();
+        AgentState {
+            pose: scene_from_world * state.pose,
+            velocity: scene_from_world.rotate(state.velocity),
+        }
+    }
+
+    /// Agents of `frame` inside the window that neither `tokens` nor the frame before knows, because
+    /// they drifted in; as many as fit a frame of `longest` slots. One that has just left waits a
+    /// frame before it can be newborn.
+    pub(crate) fn arrivals(
+        &self,
+        frame: &Frame,
+        tokens: &TokenFrame,
+        before: Option<&TokenFrame>,
+        longest: usize,
+        identities: &Identities,
+    ) -> Vec<TokenAgent> {
+        let present = tokens
+            .agents()
+            .chain(before.into_iter().flat_map(TokenFrame::agents));
+        let known: BTreeSet<u16> = present.map(|agent| agent.key.id).collect();
+        let mut arrivals: Vec<TokenAgent> = frame
+            .agents()
+            .iter()
+            .filter(|agent| agent.kind.is_moving())
+            .filter_map(|agent| {
+                let id = identities.key(agent.id).filter(|id| !known.contains(id))?;
+                let local = self.local(agent.state);
+                let inside = local.pose.position.abs().max_element() < KEEP_RANGE_M;
+                let (state, _) = QuantizedState::new(&local, agent.length, agent.width);
+                let kind = agent.kind;
+                inside.then_some(TokenAgent {
+                    key: Key { id, kind },
+                    state,
+                })
+            })
+            .collect();
+        arrivals.sort_by_key(|agent| agent.key.order());
+        arrivals.truncate(longest.saturating_sub(tokens.len_slots()) / 2);
+        arrivals
+    }
+}

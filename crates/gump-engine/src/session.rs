@@ -1,0 +1,213 @@
+//! Futures of several starts in progress, step by step.
+
+use std::sync::Arc;
+
+use gump_model::ModelError;
+use gump_model::decoder::Bins;
+use gump_model::mct::VisualMemory;
+use gump_model::steps::TOKEN_DT;
+use gump_rollout::{BoxError, Session, Start};
+use gump_scene::{AgentState, Frame};
+use rayon::prelude::*;
+
+use crate::cpu::SceneMemory;
+use crate::decode::{Step, Window, present_all};
+use crate::predictive_samples::{PredictiveSamples, Seen};
+use crate::reference::{Passes, decode};
+use crate::rollout_state::Future;
+use crate::scene::Scene;
+use crate::world::TransformerWorld;
+
+/// An ego farther than this from the origin of its scene gets a new scene around it, metres. Training
+/// shows windows up to 85 m away.
+const RECENTRE_M: f64 = 60.0;
+/// The same where agents come and leave: they do so at the border of the window, which must not come
+/// near.
+const RECENTRE_ALIVE_M: f64 = 20.0;
+
+pub(crate) struct TransformerSession<'a> {
+    pub(crate) world: &'a TransformerWorld,
+    pub(crate) scenes: Vec<Scene>,
+    pub(crate) futures: Vec<Future>,
+}
+
+impl Session for TransformerSession<'_> {
+    fn dt(&self) -> f64 {
+        TOKEN_DT
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        if let Some(states) = ego
+            && states.len() != self.futures.len()
+        {
+            let what = format!(
+                "{} ego states for {} futures",
+                states.len(),
+                self.futures.len()
+            );
+            return Err(ModelError::Scene(what).into());
+        }
+        self.recentre()?;
+        let sampling = self.world.sampling();
+        let mut windows: Vec<Window> = self
+            .futures
+            .iter()
+            .enumerate()
+            .map(|(i, future)| {
+                let scene = &self.scenes[future.scene];
+                future.window(scene, self.world, ego.map(|states| states[i]))
+            })
+            .collect();
+        if sampling.life {
+            self.before_decoding(&mut windows)?;
+        }
+        let decoded = self.decode(&windows)?;
+        let mut frames = Vec::with_capacity(self.futures.len());
+        for (i, (window, bins)) in windows.into_iter().zip(decoded).enumerate() {
+            let scene = &self.scenes[self.futures[i].scene];
+            let ego = ego.map(|states| states[i]);
+            frames.push(self.futures[i].commit(window, &bins, scene, self.world, ego));
+        }
+        if sampling.life {
+            self.after_decoding(&mut frames)?;
+        }
+        Ok(frames)
+    }
+
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        let mut index = 0..;
+        self.futures
+            .retain(|_| index.next().is_some_and(|i| futures.contains(&i)));
+        self.forget_unused_scenes();
+        true
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        let index = self.scenes.len();
+        let mut scene = Scene::new(self.world, start.scene)?;
+        let mut fresh = self.world.futures(index, &mut scene, 1, start.seed)?;
+        self.scenes.push(scene);
+        self.futures[future] = fresh.pop().expect("one future was asked for");
+        self.forget_unused_scenes();
+        Ok(())
+    }
+}
+
+impl TransformerSession<'_> {
+    /// Drops what the engine keeps, so that the next step reads everything afresh.
+    #[cfg(test)]
+    pub(crate) fn forget(&mut self) {
+        for future in &mut self.futures {
+            future.context = crate::cpu::Context::default();
+        }
+    }
+
+    /// Gives every future whose ego nears the edge of its window a scene around the ego's present,
+    /// map and tokens alike; such a future shares its visual memory with no other any more.
+    fn recentre(&mut self) -> Result<(), ModelError> {
+        let reach = match self.world.sampling().life {
+            true => RECENTRE_ALIVE_M,
+            false => RECENTRE_M,
+        };
+        let far: Vec<usize> = (0..self.futures.len())
+            .filter(|i| self.futures[*i].ego_reach() >= reach)
+            .collect();
+        let history = self.world.sampling().history.max(1);
+        let around = |i: &usize| {
+            let future = &self.futures[*i];
+            let from = &self.scenes[future.scene];
+            Scene::of_window(
+                self.world,
+                Arc::clone(&from.map),
+                from.route.clone(),
+                future.recent[future.recent.len().saturating_sub(history)..].to_vec(),
+                from.ego,
+                future.identities.clone(),
+            )
+        };
+        let scenes: Vec<Scene> = far.par_iter().map(around).collect::<Result<_, _>>()?;
+        for (i, to) in far.into_iter().zip(scenes) {
+            let index = self.scenes.len();
+            let future = &mut self.futures[i];
+            future.enter(index, &self.scenes[future.scene], &to);
+            self.scenes.push(to);
+        }
+        self.forget_unused_scenes();
+        Ok(())
+    }
+
+    /// One chunk of bins per tracked agent of every window.
+    fn decode(&mut self, windows: &[Window]) -> Result<Vec<Vec<Bins>>, ModelError> {
+        let (network, sampling) = (self.world.network(), self.world.sampling());
+        let placed = present_all(windows, network.config().block_size)?;
+        let Some(engine) = self.world.engine() else {
+            let memories = self.scenes.iter().filter_map(|scene| scene.memory.plain());
+            let memories: Vec<&VisualMemory> = memories.collect();
+            let passes = Passes::new(network, sampling, &memories);
+            let decoded = decode(&passes, windows, &placed);
+            self.world.count_passes(passes.count());
+            return decoded;
+        };
+        let memories = self.scenes.iter().filter_map(|scene| scene.memory.packed());
+        let memories: Vec<&SceneMemory> = memories.collect();
+        let mut contexts: Vec<_> = self.futures.iter_mut().map(|f| &mut f.context).collect();
+        let step = Step {
+            engine,
+            sampling,
+            memories: &memories,
+            windows,
+            placed,
+            watch: self.world.watch(),
+        };
+        let decoded = step.decode(&mut contexts);
+        self.world.count_passes(decoded.passes);
+        let kept = contexts.iter().map(|context| context.bytes()).sum();
+        self.world.note_context_bytes(kept);
+        let seen = decoded.seen.iter();
+        self.world.keep_outlooks(
+            seen.filter_map(|seen| self.outlook(seen, windows))
+                .collect(),
+        );
+        Ok(decoded.bins)
+    }
+
+    /// Draws of an object in the world frame.
+    fn outlook(&self, seen: &Seen, windows: &[Window]) -> Option<PredictiveSamples> {
+        let future = &self.futures[seen.window];
+        let scene = &self.scenes[future.scene];
+        let window = &windows[seen.window];
+        let (object, request) = (
+            &window.next.tracked[seen.place],
+            &window.requests[seen.place],
+        );
+        let draws = seen.bins.iter().map(|bins| {
+            let settled = request.settle(bins, self.world.sampling());
+            AgentState {
+                pose: scene.world_from_scene * settled.pose,
+                velocity: scene.world_from_scene.rotate(settled.velocity),
+            }
+        });
+        Some(PredictiveSamples {
+            future: seen.window,
+            step: future.index - future.begun,
+            agent: future.identities.agent(object.key.id)?,
+            draws: draws.collect(),
+        })
+    }
+
+    /// Drops scenes that no future is in.
+    fn forget_unused_scenes(&mut self) {
+        let used = |scene: usize| self.futures.iter().any(|future| future.scene == scene);
+        let mut places = Vec::with_capacity(self.scenes.len());
+        let mut n = 0;
+        for scene in 0..self.scenes.len() {
+            places.push(used(scene).then_some(n));
+            n += usize::from(used(scene));
+        }
+        let mut kept = places.iter().map(Option::is_some);
+        self.scenes.retain(|_| kept.next().unwrap_or(false));
+        for future in &mut self.futures {
+            future.scene = places[future.scene].expect("the scene of a future is in use");
+        }
+    }
+}

@@ -1,0 +1,418 @@
+//! Traffic that lives: who leaves, who comes, what the lights show, in futures of any length.
+//!
+//! All three are read off the network. Before the agents of a frame are decoded, its lights are
+//! drawn one after another (`lights`), and whoever is where the map ends is asked whether it is
+//! still there; once they are decoded, new ones come as long as the network wants more. Agents that
+//! leave the window are gone.
+//!
+//! Nobody vanishes in sight and nobody appears there: agents come over the border of the window,
+//! nearing the ego, or from where a lane of the map begins, and leave likewise, away from the ego.
+//! A network that is unsure says births and departures of everybody, and training shows false ones
+//! wherever a sample leaves agents out. How often they come and lights change may be set by
+//! [`RateScale`](crate::RateScale). Switched on by `SamplingConfig::life`; what is
+//! benchmarked on given agents leaves it off.
+
+mod lights;
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use gump_geometry::OrientedBox;
+use gump_scene::{AgentKind, AgentState, Frame, Light, Seed};
+use gump_tokenizer::{Key, TokenAgent, TokenFrame, TokenSequence};
+
+pub(crate) use crate::spawning::lights::Phases;
+use gump_model::ModelError;
+use gump_model::decoder::STEPS;
+use gump_model::local_frame::LocalFrame;
+use gump_model::placed_slot::{PlacedSlot, place_exactly};
+
+use crate::cpu::{Context, Engine, Job};
+use crate::decode::{Window, present_all};
+use crate::nucleus::uniform;
+use crate::placement::births::{BEGIN_AT, next_key, stays};
+use crate::placement::object_spec::{ObjectSpec, agent_of};
+use crate::placement::rules::{Manner, Rules, box_of, state_of};
+use crate::request::Request;
+use crate::rollout_state::{Future, stream};
+use crate::scene::Scene;
+use crate::session::TransformerSession;
+use crate::temporal_ensemble::ChunkBuffer;
+
+/// Most agents that come in one frame of a future.
+const MOST_BIRTHS: usize = 4;
+/// Draws of a new agent before it stays away.
+const TRIES: u64 = 6;
+/// Nobody comes or leaves nearer to the ego than this, metres.
+const SEEN_M: f64 = 50.0;
+
+/// What a decision is about, as the part of a seed.
+#[derive(Clone, Copy)]
+enum About {
+    Lights = 1001,
+    Leaving = 1002,
+    Coming = 1003,
+}
+
+impl TransformerSession<'_> {
+    /// Draws the lights of the next frames and takes out who has left.
+    pub(crate) fn before_decoding(&mut self, windows: &mut [Window]) -> Result<(), ModelError> {
+        let Some(engine) = self.world.engine() else {
+            let what = "traffic lives on a CPU only, and this world is elsewhere";
+            return Err(ModelError::Scene(what.into()));
+        };
+        let block_size = self.world.network().config().block_size;
+        let mut placed = present_all(windows, block_size)?;
+        let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
+        self.draw_lights(engine, windows, &mut placed, &mut contexts);
+        self.take_out(engine, windows, &placed, &mut contexts);
+        Ok(())
+    }
+
+    /// Asks before every tracked agent but the ego whether it is the next; who is in sight is.
+    fn take_out(
+        &self,
+        engine: &Engine,
+        windows: &mut [Window],
+        placed: &[Vec<PlacedSlot>],
+        contexts: &mut [Context],
+    ) {
+        let members: Vec<usize> = (0..windows.len())
+            .filter(|w| windows[*w].next.tracked.len() > 1)
+            .collect();
+        let wanted: Vec<Vec<usize>> = members
+            .iter()
+            .map(|&w| {
+                let n = windows[w].next.tracked.len();
+                let first = placed[w].len() - 2 * n;
+                (1..n).map(|i| first + 2 * i - 1).collect()
+            })
+            .collect();
+        let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
+        let mut said = engine.say(&hidden).into_iter();
+        for &w in &members {
+            let window = &mut windows[w];
+            let scene = &self.scenes[window.scene];
+            let ids: Vec<u16> = window.next.tracked.iter().map(|a| a.key.id).collect();
+            let seed = self.futures[w].decision(About::Leaving);
+            let places = window.next.tracked.iter();
+            let places: Vec<_> = places
+                .map(|a| (a.state.pose().position, a.key.kind))
+                .collect();
+            let mut kept = vec![true];
+            for (i, &id) in ids.iter().enumerate().skip(1) {
+                let said = said.next().expect("one word per tracked agent");
+                let stay = stays(&said, id, &ids[i + 1..]);
+                let (place, kind) = places[i];
+                let is_far = place.distance(places[0].0) >= SEEN_M;
+                let may_leave = is_far && scene.ground(kind).ends_at(place);
+                kept.push(!may_leave || uniform(seed.fork(u64::from(id))) < stay);
+            }
+            let mut of_agents = kept.iter();
+            let mut of_requests = kept.iter();
+            let keep = |next: Option<&bool>| next.copied().unwrap_or(true);
+            window.next.tracked.retain(|_| keep(of_agents.next()));
+            window.requests.retain(|_| keep(of_requests.next()));
+        }
+    }
+
+    /// Hidden vectors of some windows at some slots, one pass for all.
+    fn run(
+        &self,
+        engine: &Engine,
+        windows: &[Window],
+        placed: &[Vec<PlacedSlot>],
+        contexts: &mut [Context],
+        members: &[usize],
+        wanted: &[Vec<usize>],
+    ) -> Vec<f32> {
+        let of_members = contexts.iter_mut().enumerate();
+        let mut wanted = members.iter().zip(wanted).peekable();
+        let mut jobs = Vec::with_capacity(members.len());
+        for (w, context) in of_members {
+            let Some((_, wanted)) = wanted.next_if(|(member, _)| **member == w) else {
+                continue;
+            };
+            let scene = &self.scenes[windows[w].scene];
+            jobs.push(Job {
+                slots: &placed[w],
+                wanted: wanted.clone(),
+                memory: scene
+                    .memory
+                    .packed()
+                    .expect("with an engine the memory is the engine's"),
+                context,
+                keep: true,
+            });
+        }
+        if !jobs.is_empty() {
+            self.world.count_passes(1);
+        }
+        engine.run(&mut jobs)
+    }
+
+    /// Lets agents go that left the window, sets the lights, and lets new agents come; `frames` are
+    /// what has just been committed.
+    pub(crate) fn after_decoding(&mut self, frames: &mut [Frame]) -> Result<(), ModelError> {
+        for (future, frame) in self.futures.iter_mut().zip(frames.iter_mut()) {
+            let scene = &self.scenes[future.scene];
+            *frame = future.without_the_gone(frame, scene);
+        }
+        let engine = self.world.engine().expect("checked before decoding");
+        let arrivals = self.world.sampling().pace.arrivals;
+        let mut open: Vec<usize> = (0..self.futures.len()).collect();
+        let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
+        for birth in 0..MOST_BIRTHS {
+            let before = open.clone();
+            let slots: Vec<Vec<PlacedSlot>> = before
+                .iter()
+                .map(|&f| self.futures[f].slots_to_end(&self.scenes[self.futures[f].scene]))
+                .collect::<Result<_, _>>()?;
+            let hidden = self.read(engine, &mut contexts, &before, &slots);
+            let mut coming = Vec::new();
+            for (&f, said) in before.iter().zip(engine.say(&hidden)) {
+                let future = &mut self.futures[f];
+                let longest = self.world.longest_frame();
+                let seed = future.decision(About::Coming).fork(birth as u64);
+                let last = future.frames.last().expect("a future has a present");
+                let has_room = last.len_slots() + 2 <= longest;
+                let used: BTreeSet<u16> = future.identities.iter().map(|(id, _)| id).collect();
+                let before = last.newborn.last().map(|agent| agent.key);
+                let key = next_key(&said, BEGIN_AT, &used, before, seed, arrivals);
+                match key.filter(|_| has_room) {
+                    Some(key) => coming.push((f, key.kind, seed)),
+                    None => open.retain(|open| *open != f),
+                }
+            }
+            self.let_in(engine, &mut contexts, &mut open, coming, frames)?;
+            if open.is_empty() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Hidden vectors at the last slot of some futures.
+    fn read(
+        &self,
+        engine: &Engine,
+        contexts: &mut [Context],
+        members: &[usize],
+        slots: &[Vec<PlacedSlot>],
+    ) -> Vec<f32> {
+        let mut of_members = members.iter().zip(slots).peekable();
+        let mut jobs = Vec::with_capacity(members.len());
+        for (f, context) in contexts.iter_mut().enumerate() {
+            let Some((_, slots)) = of_members.next_if(|(member, _)| **member == f) else {
+                continue;
+            };
+            let memory = self.scenes[self.futures[f].scene].memory.packed();
+            jobs.push(Job {
+                slots,
+                wanted: vec![slots.len() - 1],
+                memory: memory.expect("with an engine the memory is the engine's"),
+                context,
+                keep: true,
+            });
+        }
+        if !jobs.is_empty() {
+            self.world.count_passes(1);
+        }
+        engine.run(&mut jobs)
+    }
+
+    /// Draws the states of those who come; whoever finds no place stays away, and nobody else comes
+    /// in that frame.
+    fn let_in(
+        &mut self,
+        engine: &Engine,
+        contexts: &mut [Context],
+        open: &mut Vec<usize>,
+        coming: Vec<(usize, AgentKind, Seed)>,
+        frames: &mut [Frame],
+    ) -> Result<(), ModelError> {
+        let mut arriving = Vec::new();
+        for (f, kind, seed) in coming {
+            let future = &mut self.futures[f];
+            let may_come = !self.scenes[future.scene].entries(kind).is_closed();
+            // Who drifted in stands in the list already, perhaps with an id above the lowest free.
+            let newborn = future.frames.last().and_then(|now| now.newborn.last());
+            let last = newborn.filter(|last| last.key.kind == kind);
+            let last = last.map_or(0, |last| last.key.id);
+            let newborn = may_come.then(|| future.identities.newborn_after(last));
+            if let Some((id, agent)) = newborn.flatten() {
+                arriving.push((f, Key { id, kind }, agent, seed));
+            } else {
+                open.retain(|open| *open != f);
+            }
+        }
+        let members: Vec<usize> = arriving.iter().map(|(f, ..)| *f).collect();
+        let slots: Vec<Vec<PlacedSlot>> = arriving
+            .iter()
+            .map(|(f, key, ..)| {
+                let future = &self.futures[*f];
+                future.slots_to_key(*key, &self.scenes[future.scene])
+            })
+            .collect::<Result<_, _>>()?;
+        let hidden = self.read(engine, contexts, &members, &slots);
+        let width = self.world.network().config().width;
+        for ((f, key, agent, seed), hidden) in arriving.into_iter().zip(hidden.chunks(width)) {
+            let future = &mut self.futures[f];
+            let scene = &self.scenes[future.scene];
+            let rules = Arc::new(future.rules(key.kind, scene));
+            let requests: Vec<Request> = (0..TRIES)
+                .map(|i| Request {
+                    anchor: LocalFrame::SCENE,
+                    forced: [None; STEPS.len()],
+                    stream: seed.fork(3).fork(i),
+                    near: None,
+                    ring: ChunkBuffer::default(),
+                    limits: None,
+                    frame: future.index,
+                    guide: Some(Arc::clone(&rules) as _),
+                })
+                .collect();
+            let requests: Vec<&Request> = requests.iter().collect();
+            let bins = engine.sample(
+                &hidden.repeat(TRIES as usize),
+                &requests,
+                self.world.sampling(),
+            );
+            let kept = bins.into_iter().find(|bins| {
+                let state = state_of(bins);
+                let ego = future.frames.last().and_then(|frame| frame.tracked.first());
+                let ego = ego.map_or_else(Default::default, |ego| ego.state.pose().position);
+                let is_far = state.pose().position.distance(ego) >= SEEN_M;
+                is_far
+                    && rules.enters(&state)
+                    && rules
+                        .broken(&state, &box_of(&state), &scene.map, scene.world_from_scene)
+                        .is_none()
+            });
+            let Some(bins) = kept else {
+                future.identities.retain(|id| id != key.id);
+                open.retain(|open| *open != f);
+                continue;
+            };
+            let state = state_of(&bins);
+            let token = TokenAgent { key, state };
+            future
+                .rings
+                .entry(key.id)
+                .or_default()
+                .push(future.index, LocalFrame::SCENE.poses(&bins));
+            let now = future.frames.last_mut().expect("a future has a present");
+            now.newborn.push(token);
+            now.newborn.sort_by_key(|agent| agent.key);
+            let own = box_of(&state);
+            let state = AgentState {
+                pose: scene.world_from_scene * state.pose(),
+                velocity: scene.world_from_scene.rotate(state.velocity()),
+            };
+            let size = [own.length, own.width];
+            let mut agents = frames[f].agents().to_vec();
+            agents.push(agent_of(agent, key.kind, size, state, &scene.map));
+            frames[f] = Frame::new(agents, frames[f].lights().to_vec());
+            if let Some(now) = future.recent.last_mut() {
+                *now = frames[f].clone();
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Index of BEGIN of a window's next frame; its lights follow.
+fn first_slot(window: &Window, slots: &[PlacedSlot]) -> usize {
+    // BEGIN, lights, LIGHTS_END, then two slots per tracked agent.
+    slots.len() - 2 * window.next.tracked.len() - window.next.lights.len() - 2
+}
+
+impl Future {
+    /// Randomness of the decisions of one kind in the frame that is made or was made last.
+    fn decision(&self, about: About) -> Seed {
+        stream(self.seed, self.index, 0).fork(about as u64)
+    }
+
+    /// The frame without the agents that had tokens and have none any more, its lights as drawn;
+    /// their ids are free once no frame of the window has them.
+    fn without_the_gone(&mut self, frame: &Frame, scene: &Scene) -> Frame {
+        let n = self.frames.len();
+        let ids = |frame: Option<&TokenFrame>| -> BTreeSet<u16> {
+            let agents = frame.into_iter().flat_map(TokenFrame::agents);
+            agents.map(|agent| agent.key.id).collect()
+        };
+        let (before, now) = (
+            ids(n.checked_sub(2).map(|i| &self.frames[i])),
+            ids(self.frames.last()),
+        );
+        let gone = |id: &u16| before.contains(id) && !now.contains(id);
+        let stays = |agent: &&gump_scene::Agent| {
+            let id = self.identities.key(agent.id);
+            id.is_none_or(|id| id == 0 || !gone(&id))
+        };
+        let agents = frame.agents().iter().filter(stays).copied().collect();
+        let tokens = self.frames.last().map_or(&[][..], |frame| &frame.lights);
+        let lights = frame.lights().iter().map(|light| {
+            let index = scene.lights.iter().position(|lane| *lane == light.lane);
+            let token = tokens
+                .iter()
+                .find(|token| index.is_some_and(|index| usize::from(token.index) == index + 1));
+            Light {
+                state: token.map_or(light.state, |token| token.state),
+                ..*light
+            }
+        });
+        let frame = Frame::new(agents, lights.collect());
+        if let Some(now) = self.recent.last_mut() {
+            *now = frame.clone();
+        }
+        let mut held: BTreeSet<u16> = self.frames.iter().flat_map(|f| ids(Some(f))).collect();
+        let present = frame.agents().iter();
+        held.extend(present.filter_map(|agent| self.identities.key(agent.id)));
+        self.identities.retain(|id| held.contains(&id));
+        frame
+    }
+
+    /// All slots of the window, the present frame included, up to where a new agent may come.
+    fn slots_to_end(&self, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
+        let sequence = TokenSequence::new(Vec::new(), self.frames.clone());
+        let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
+        let exact = self.exact(scene);
+        Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
+    }
+
+    /// The same with the key of a new agent after them.
+    fn slots_to_key(&self, key: Key, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
+        let mut frames = self.frames.clone();
+        let now = frames.last_mut().expect("a future has a present");
+        now.newborn.push(TokenAgent {
+            key,
+            state: Default::default(),
+        });
+        let sequence = TokenSequence::new(Vec::new(), frames);
+        let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
+        let exact = self.exact(scene);
+        let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
+        slots.pop();
+        Ok(slots)
+    }
+
+    /// What a new agent keeps to: where lanes or walkways come into what is seen, and clear of
+    /// everybody.
+    fn rules(&self, kind: AgentKind, scene: &Scene) -> Rules {
+        let now = self.frames.last().into_iter().flat_map(TokenFrame::agents);
+        let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();
+        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        let ego = ego.map(|ego| (ego.state.pose().position, ego.state.velocity()));
+        Rules {
+            kind,
+            spec: ObjectSpec::default(),
+            ground: Some(scene.entries(kind)),
+            rows: Vec::new(),
+            taken,
+            comes_to: ego,
+            is_guided: true,
+            manner: Manner::default(),
+        }
+    }
+}

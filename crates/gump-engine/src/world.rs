@@ -1,0 +1,360 @@
+//! The network as a world: scenes in, futures out, through the traits of `gump-rollout`.
+//!
+//! A session keeps, per scene, the frame of reference, the identities and the visual memory, which
+//! all its futures share (`scene`); and per future, the token frames of its window, the chunks of
+//! every agent and the present in world coordinates (`future`). `decode` turns windows into new
+//! states; `session` goes step by step.
+//!
+//! Agents outside the token window, of no predicted kind, or beyond the vocabulary move on with
+//! constant velocity, so that every agent that is there now stays for the whole future; one that
+//! comes into the window is the network's from then on.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use candle_core::Tensor;
+use gump_model::ModelError;
+use gump_model::Network;
+use gump_model::decoder::{Bins, STEPS};
+use gump_model::local_frame::LocalFrame;
+use gump_model::placed_slot::PlacedSlot;
+use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_scene::{SceneState, Seed};
+use gump_tokenizer::{QuantizedState, Slot, Tokenizer, TokenizerConfig};
+use rayon::prelude::*;
+
+use crate::cpu::{Engine, Job};
+use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
+use crate::reference::sample_states;
+use crate::request::Request;
+use crate::rollout_state::{Future, stream};
+use crate::sampling::SamplingConfig;
+use crate::scene::{Memory, Scene};
+use crate::session::TransformerSession;
+use crate::spawning::Phases;
+use crate::temporal_ensemble::{Chunk, ChunkBuffer};
+
+/// Why the list of outlooks can be trusted.
+const WHOLE: &str = "nobody panics between taking and giving back the list";
+
+/// A trained network that imagines traffic.
+#[derive(Debug)]
+pub struct TransformerWorld {
+    network: Network,
+    sampling: SamplingConfig,
+    tokenizer: Tokenizer,
+    /// On a CPU, unless the tensor library was asked for.
+    engine: Option<Engine>,
+    passes: AtomicU64,
+    context_bytes: AtomicUsize,
+    watch: ProbeConfig,
+    outlooks: Mutex<Vec<PredictiveSamples>>,
+}
+
+impl TransformerWorld {
+    /// A world that decodes as `sampling` says: on a CPU by the engine, elsewhere by the tensor
+    /// library.
+    pub fn new(network: Network, sampling: SamplingConfig) -> Self {
+        let engine = network.device().is_cpu().then(|| {
+            Engine::new(&network, sampling.precision)
+                .expect("a network on a CPU has all its parameters in main memory as f32")
+        });
+        Self {
+            engine,
+            ..Self::plain(network, sampling)
+        }
+    }
+
+    /// A world that computes with the tensor library's operations wherever it lives: slower on a
+    /// CPU, and what the engine is held against.
+    pub fn plain(network: Network, sampling: SamplingConfig) -> Self {
+        Self {
+            network,
+            sampling,
+            tokenizer: Tokenizer::new(TokenizerConfig::default()),
+            engine: None,
+            passes: AtomicU64::new(0),
+            context_bytes: AtomicUsize::new(0),
+            watch: ProbeConfig::default(),
+            outlooks: Mutex::default(),
+        }
+    }
+
+    /// The same world, which keeps what its agents might have done; what they do is the same.
+    ///
+    /// The engine does, so on other devices than a CPU there is nothing to see.
+    #[must_use]
+    pub fn watching(self, watch: ProbeConfig) -> Self {
+        Self { watch, ..self }
+    }
+
+    /// Takes what was watched since it was last taken: step by step, futures in their order, and
+    /// agents in the order in which they are decoded.
+    pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
+        std::mem::take(&mut self.outlooks.lock().expect(WHOLE))
+    }
+
+    /// Transformer passes made so far, whatever their batch; the first of a session reads history.
+    pub fn passes(&self) -> u64 {
+        self.passes.load(Ordering::Relaxed)
+    }
+
+    /// Floating-point operations of the engine so far, a multiplication and an addition each
+    /// counted; visual encoding not included. 0 without the engine.
+    pub fn operations(&self) -> u64 {
+        self.engine
+            .as_ref()
+            .map_or(0, |engine| 2 * engine.products())
+    }
+
+    /// Bytes of the matrices that the engine multiplies; 0 without it.
+    pub fn weight_bytes(&self) -> usize {
+        self.engine.as_ref().map_or(0, Engine::weight_bytes)
+    }
+
+    /// The most bytes of keys and values that the futures of a session have held at once.
+    pub fn context_bytes(&self) -> usize {
+        self.context_bytes.load(Ordering::Relaxed)
+    }
+
+    /// The network.
+    pub fn network(&self) -> &Network {
+        &self.network
+    }
+
+    /// How it decodes.
+    pub fn sampling(&self) -> &SamplingConfig {
+        &self.sampling
+    }
+
+    pub(crate) fn tokenizer(&self) -> &Tokenizer {
+        &self.tokenizer
+    }
+
+    /// The arithmetic on a processor; `None` where the network lives on a device.
+    pub fn engine(&self) -> Option<&Engine> {
+        self.engine.as_ref()
+    }
+
+    pub(crate) fn note_context_bytes(&self, bytes: usize) {
+        self.context_bytes.fetch_max(bytes, Ordering::Relaxed);
+    }
+
+    pub(crate) fn watch(&self) -> ProbeConfig {
+        self.watch
+    }
+
+    pub(crate) fn keep_outlooks(&self, seen: Vec<PredictiveSamples>) {
+        self.outlooks.lock().expect(WHOLE).extend(seen);
+    }
+
+    /// Adds passes of the network to those counted.
+    pub fn count_passes(&self, n: u64) {
+        self.passes.fetch_add(n, Ordering::Relaxed);
+    }
+
+    /// Slots a frame may take, so that it and the one before it fit the block.
+    pub fn longest_frame(&self) -> usize {
+        self.network.config().block_size / 2
+    }
+
+    /// A session over all futures of all starts.
+    ///
+    /// Starts that show one and the same scene share it: its map is looked at and its history read
+    /// once; those with one seed besides begin with equal futures.
+    pub(crate) fn open_session(
+        &self,
+        starts: &[Start<'_>],
+    ) -> Result<TransformerSession<'_>, ModelError> {
+        let mut distinct: Vec<SceneState<'_>> = Vec::new();
+        let mut scene_of = Vec::with_capacity(starts.len());
+        for start in starts {
+            let known = distinct.iter().position(|seen| is_same(seen, &start.scene));
+            scene_of.push(known.unwrap_or(distinct.len()));
+            if known.is_none() {
+                distinct.push(start.scene);
+            }
+        }
+        let scenes = distinct.par_iter().map(|scene| Scene::new(self, *scene));
+        let mut scenes: Vec<Scene> = scenes.collect::<Result<_, _>>()?;
+        let mut futures: Vec<Vec<Future>> = Vec::with_capacity(starts.len());
+        for (i, start) in starts.iter().enumerate() {
+            let (scene, n) = (scene_of[i], start.n_futures);
+            let like = |j: &usize| {
+                let other = &starts[*j];
+                scene_of[*j] == scene && other.seed == start.seed && other.n_futures == n
+            };
+            futures.push(match (0..i).find(like) {
+                Some(twin) => futures[twin].clone(),
+                None => self.futures(scene, &mut scenes[scene], n, start.seed)?,
+            });
+        }
+        Ok(TransformerSession {
+            world: self,
+            scenes,
+            futures: futures.into_iter().flatten().collect(),
+        })
+    }
+
+    /// `n` futures of scene number `scene`.
+    pub(crate) fn futures(
+        &self,
+        scene: usize,
+        shared: &mut Scene,
+        n: usize,
+        seed: Seed,
+    ) -> Result<Vec<Future>, ModelError> {
+        let chunks = self.first_chunks(shared, n, seed)?;
+        let last = shared
+            .history
+            .last()
+            .map_or(0, |_| shared.history.len() - 1);
+        let future = |(k, rings): (usize, Vec<(u16, Chunk)>)| {
+            let mut future = Future {
+                scene,
+                seed: seed.fork(k as u64),
+                frames: shared.history.clone(),
+                index: last,
+                begun: last,
+                rings: BTreeMap::new(),
+                recent: shared.recent.clone(),
+                identities: shared.identities.clone(),
+                phases: Phases::default(),
+                context: shared.prefix.clone(),
+            };
+            for (id, chunk) in rings {
+                future.rings.entry(id).or_default().push(last, chunk);
+            }
+            future
+        };
+        Ok(chunks.into_iter().enumerate().map(future).collect())
+    }
+
+    /// One pass over the history, shared by all futures, and per future a draw of what the last
+    /// frame's keys foresee: the chunks that the first surrogates come from.
+    fn first_chunks(
+        &self,
+        scene: &mut Scene,
+        n: usize,
+        seed: Seed,
+    ) -> Result<Vec<Vec<(u16, Chunk)>>, ModelError> {
+        let network = &self.network;
+        let slots = scene.slots()?;
+        let last = scene.history.len() - 1;
+        let keys: Vec<(usize, u16, QuantizedState, LocalFrame)> = slots
+            .windows(2)
+            .enumerate()
+            .filter_map(|(i, pair)| match (pair[0].slot, pair[1].slot) {
+                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => {
+                    Some((i, key.id, state, scene.anchor(&pair[0], network.config())))
+                }
+                _ => None,
+            })
+            .collect();
+        let requests: Vec<Request> = (0..n)
+            .flat_map(|k| keys.iter().map(move |key| (k, key)))
+            .map(|(k, (_, id, state, anchor))| {
+                let is = scene.present(*id).unwrap_or(state.to_agent_state());
+                Request {
+                    anchor: *anchor,
+                    forced: anchor.bins(*state, [Some(is), None, None, None]),
+                    stream: stream(seed.fork(k as u64), last, *id),
+                    near: None,
+                    ring: ChunkBuffer::default(),
+                    limits: None,
+                    frame: last,
+                    guide: None,
+                }
+            })
+            .collect();
+        let places: Vec<usize> = keys.iter().map(|(i, ..)| *i).collect();
+        let hidden = self.read_history(scene, &slots, places)?.repeat(n);
+        let bins = match &self.engine {
+            Some(engine) => {
+                let requests: Vec<&Request> = requests.iter().collect();
+                engine.sample(&hidden, &requests, &self.sampling)
+            }
+            None => {
+                let shape = (requests.len(), network.config().width);
+                let hidden = Tensor::from_vec(hidden, shape, network.device())?;
+                sample_states(network, &hidden, &requests, &self.sampling)?
+            }
+        };
+        let per_future = |bins: &[Bins]| {
+            keys.iter()
+                .zip(bins)
+                .map(|((_, id, _, anchor), b)| (*id, anchor.poses(b)))
+                .collect()
+        };
+        Ok(bins.chunks(keys.len().max(1)).map(per_future).collect())
+    }
+
+    /// Hidden vectors `[places, C]` of the history of a scene, in one pass; the engine keeps what
+    /// futures go on from.
+    fn read_history(
+        &self,
+        scene: &mut Scene,
+        slots: &[PlacedSlot],
+        places: Vec<usize>,
+    ) -> Result<Vec<f32>, ModelError> {
+        self.count_passes(1);
+        if let (Some(engine), Memory::Packed(memory)) = (&self.engine, &scene.memory) {
+            return Ok(engine.run(&mut [Job {
+                slots,
+                wanted: places,
+                memory,
+                context: &mut scene.prefix,
+                keep: true,
+            }]));
+        }
+        let memory = scene.memory.plain();
+        let memory = memory.expect("without an engine the memory is the tensor library's");
+        let batch = self.network.pack(&[slots], 0, memory)?;
+        let features = self.network.mct.forward(&batch, memory, None, None)?;
+        let places: Vec<u32> = places.into_iter().map(|i| i as u32).collect();
+        let places = Tensor::new(places, self.network.device())?;
+        let hidden = features.hidden.squeeze(0)?.index_select(&places, 0)?;
+        Ok(hidden.flatten_all()?.to_vec1::<f32>()?)
+    }
+
+    /// What the network makes of the last agent of a scene's present: its hidden vector, then the
+    /// logits of the first field. For comparing devices and ways of computing.
+    ///
+    /// # Errors
+    /// A scene that cannot be tokenised, or what the tensor library reports.
+    pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, ModelError> {
+        let mut scene = Scene::new(self, scene)?;
+        let slots = scene.slots()?;
+        let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
+        let key = key.expect("the ego is in every frame of the window");
+        let mut said = self.read_history(&mut scene, &slots, vec![key])?;
+        let network = &self.network;
+        let hidden = Tensor::from_slice(&said, (1, said.len()), network.device())?;
+        let decoder = &network.decoder;
+        let table = decoder.input_table(&network.mct.token_table()?)?;
+        let output = decoder.step(&table, &mut decoder.begin(&hidden), 0, None)?;
+        let logits = decoder.logits(&output, STEPS[0])?;
+        said.extend(logits.flatten_all()?.to_vec1::<f32>()?);
+        Ok(said)
+    }
+}
+
+/// True if two views look at the same frames on the same road.
+fn is_same(a: &SceneState<'_>, b: &SceneState<'_>) -> bool {
+    let route = |scene: &SceneState<'_>| scene.route.map(Arc::as_ptr);
+    Arc::ptr_eq(a.map, b.map)
+        && std::ptr::eq(a.history, b.history)
+        && route(a) == route(b)
+        && (a.ego, a.dt) == (b.ego, b.dt)
+}
+
+impl WorldModel for TransformerWorld {
+    fn name(&self) -> &str {
+        "model"
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        Ok(Box::new(self.open_session(starts)?))
+    }
+}

@@ -1,0 +1,347 @@
+//! Planners by name, the worlds they imagine and meet, and a stopwatch.
+#![allow(
+    clippy::disallowed_methods,
+    reason = "planners are timed; layers 0-3 may not look at the clock"
+)]
+
+use std::fmt;
+use std::str::FromStr;
+use std::time::{Duration, Instant};
+
+use gump_engine::{CacheMode, SamplingConfig};
+use gump_model::Device;
+use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
+use gump_nuplan::reactive_agents::NuplanIdm;
+use gump_nuplan::tracking::Trajectory;
+use gump_planner::{
+    Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
+    NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
+};
+use gump_rollout::worlds::Idm;
+use gump_rollout::{BoxError, WorldModel};
+use gump_scene::Seed;
+use serde::{Serialize, Serializer};
+
+use crate::EvalError;
+use crate::recordings::Case;
+use crate::worlds::{World, WorldName};
+
+/// Who plans.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlannerName {
+    /// The recorded driver: an oracle.
+    Log,
+    /// nuPlan's IDM planner.
+    Idm,
+    /// Straight on.
+    Simple,
+    /// PDM-Closed.
+    PdmClosed,
+    /// The mean of what an imagined world has the ego do.
+    Imitation,
+    /// 15 policies and imitation, each imagined among others who react.
+    Interactive,
+    /// PDM's 15 proposals, each a planner of its own.
+    Proposals,
+}
+
+impl PlannerName {
+    /// Every planner, simple ones first.
+    pub const ALL: [Self; 7] = [
+        Self::Log,
+        Self::Idm,
+        Self::Simple,
+        Self::PdmClosed,
+        Self::Imitation,
+        Self::Interactive,
+        Self::Proposals,
+    ];
+
+    /// Its name, as [`FromStr`] reads it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Log => "log",
+            Self::Idm => "idm",
+            Self::Simple => "simple",
+            Self::PdmClosed => "pdm-closed",
+            Self::Imitation => "imitation",
+            Self::Interactive => "interactive",
+            Self::Proposals => "proposals",
+        }
+    }
+
+    /// What it does, in a sentence without an end.
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::Log => "The recorded driver: an oracle",
+            Self::Idm => "nuPlan's IDM planner: the route, at the limit, behind whoever is ahead",
+            Self::Simple => "Straight on",
+            Self::PdmClosed => "PDM-Closed: 15 proposals against a constant-velocity forecast",
+            Self::Imitation => {
+                "What the imagined world has the ego do: the mean of several futures"
+            }
+            Self::Interactive => "15 policies and imitation, each imagined among others who react",
+            Self::Proposals => {
+                "PDM's 15 proposals, each alone to the end: two rows, the best of them and the best \
+                 in each scenario, an oracle"
+            }
+        }
+    }
+
+    /// The planner for one case; `imagination` is the world that those think in who do.
+    ///
+    /// # Errors
+    /// [`Self::Proposals`], who are many, and a configuration out of its range.
+    pub fn build<'w>(
+        self,
+        case: &Case,
+        imagination: &'w dyn WorldModel,
+        seed: Seed,
+        config: &PlannerConfig,
+    ) -> Result<Box<dyn Explain + 'w>, EvalError> {
+        Ok(match self {
+            Self::Log => Box::new(LogDriver::new(&case.recording, &case.after)),
+            Self::Idm => Box::new(NuplanIdmDriver::default()),
+            Self::Simple => Box::new(SimpleDriver::default()),
+            Self::PdmClosed => Box::new(PdmClosed::default()),
+            Self::Imitation => Box::new(config.imitation(imagination, seed)?),
+            Self::Interactive => Box::new(config.interactive(imagination, seed)?),
+            Self::Proposals => {
+                let wrong = "proposals are fifteen planners, only evaluate closed-loop takes them";
+                return Err(EvalError::Argument(wrong.into()));
+            }
+        })
+    }
+}
+
+impl FromStr for PlannerName {
+    type Err = EvalError;
+
+    fn from_str(name: &str) -> Result<Self, EvalError> {
+        if name == "model" {
+            return Ok(Self::Imitation);
+        }
+        let found = Self::ALL.into_iter().find(|planner| planner.name() == name);
+        found.ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            EvalError::Argument(format!(
+                "no planner is called {name}, expected one of {known}"
+            ))
+        })
+    }
+}
+
+impl fmt::Display for PlannerName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Serialize for PlannerName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// How planners that imagine do it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlannerConfig {
+    /// Futures that imagining planners see.
+    pub futures: usize,
+    /// Agents that are imagined, those nearest to the ego.
+    pub nearest: usize,
+    /// Seconds that the interactive planner imagines.
+    pub horizon: f64,
+    /// The interactive planner stops imagining after so long.
+    pub wall: Option<Duration>,
+    /// Planners that imagine decide at every so many steps.
+    pub replan_every: usize,
+    /// Discount per half second; without one a future is worth the score of the whole drive.
+    pub discount: Option<f64>,
+}
+
+impl Default for PlannerConfig {
+    fn default() -> Self {
+        Self {
+            futures: 4,
+            nearest: 12,
+            horizon: 4.0,
+            wall: None,
+            replan_every: 5,
+            discount: None,
+        }
+    }
+}
+
+impl PlannerConfig {
+    /// The interactive planner with a clock.
+    ///
+    /// # Errors
+    /// A number out of its range.
+    pub fn interactive<'w>(
+        &self,
+        world: &'w dyn WorldModel,
+        seed: Seed,
+    ) -> Result<InteractiveDriver<'w>, EvalError> {
+        let config = InteractiveDriverConfig {
+            n_futures: self.futures,
+            seed,
+            replan_every: self.replan_every,
+            worth: self
+                .discount
+                .map_or(Worth::Rollout, |gamma| Worth::DiscountedStep { gamma }),
+            budget: PlanBudget {
+                nearest: self.nearest,
+                horizon: self.horizon,
+                wall: self.wall,
+            },
+            ..InteractiveDriverConfig::default()
+        };
+        let began = Instant::now();
+        Ok(InteractiveDriver::new(world, config)?.with_clock(move || began.elapsed()))
+    }
+
+    /// The imitating planner.
+    ///
+    /// # Errors
+    /// A number out of its range.
+    pub fn imitation<'w>(
+        &self,
+        world: &'w dyn WorldModel,
+        seed: Seed,
+    ) -> Result<ImitationDriver<'w>, EvalError> {
+        let (futures, every) = (self.futures, self.replan_every);
+        Ok(ImitationDriver::new(world, futures, every, seed)?)
+    }
+}
+
+/// What the ego meets and what planners imagine, by the name of the world.
+pub struct PlanningWorld {
+    name: WorldName,
+    learned: Option<World>,
+    rules: Idm,
+}
+
+impl PlanningWorld {
+    /// Loads what the world needs, once for all scenarios.
+    ///
+    /// # Errors
+    /// Weights that cannot be read.
+    pub fn load(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+    ) -> Result<Self, EvalError> {
+        let learned = match name {
+            WorldName::Model(_) => Some(World::without_log(device, name, sampling)?),
+            _ => None,
+        };
+        Ok(Self {
+            name: name.clone(),
+            learned,
+            rules: Idm::default(),
+        })
+    }
+
+    /// As [`PlanningWorld::load`], to imagine in: what planners look ahead fits a window that grows,
+    /// in which nothing is read twice.
+    ///
+    /// # Errors
+    /// Weights that cannot be read.
+    pub fn load_imagination(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+    ) -> Result<Self, EvalError> {
+        let growing = SamplingConfig {
+            cache: CacheMode::Growing,
+            ..sampling.clone()
+        };
+        Self::load(device, name, &growing)
+    }
+
+    /// A world to imagine in: the network where there is one, else reactive rules.
+    pub fn imagination(&self) -> &dyn WorldModel {
+        match &self.learned {
+            Some(world) => world.model(),
+            None => &self.rules,
+        }
+    }
+
+    /// The traffic of one drive.
+    pub fn traffic(&self, seed: Seed) -> Box<dyn Traffic + '_> {
+        match (&self.name, &self.learned) {
+            (WorldName::Log, _) => Box::new(Replayed),
+            (WorldName::Idm, _) => Box::new(NuplanIdm::default()),
+            (_, Some(world)) => Box::new(Imagined::new(world.model(), seed)),
+            (_, None) => Box::new(Imagined::new(&gump_rollout::worlds::ConstantVelocity, seed)),
+        }
+    }
+}
+
+/// A driver with a stopwatch and, perhaps, a limit.
+pub struct TimedDriver<'a> {
+    inner: &'a mut dyn Driver,
+    limit: Option<Duration>,
+    spent: Duration,
+    steps: u32,
+}
+
+impl<'a> TimedDriver<'a> {
+    /// Watches a driver; a step longer than `limit` is a failure.
+    pub fn new(inner: &'a mut dyn Driver, limit: Option<Duration>) -> Self {
+        Self {
+            inner,
+            limit,
+            spent: Duration::ZERO,
+            steps: 0,
+        }
+    }
+
+    /// Mean milliseconds per step so far; 0 before the first.
+    pub fn milliseconds_per_step(&self) -> f64 {
+        self.spent.as_secs_f64() * 1e3 / f64::from(self.steps.max(1))
+    }
+}
+
+impl Driver for TimedDriver<'_> {
+    fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.inner.start(mission)
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let began = Instant::now();
+        let plan = self.inner.drive(moment);
+        let took = began.elapsed();
+        self.spent += took;
+        self.steps += 1;
+        match self.limit {
+            Some(limit) if took > limit => Err(format!(
+                "took {:.1} ms for a plan, expected at most {:.1}",
+                took.as_secs_f64() * 1e3,
+                limit.as_secs_f64() * 1e3
+            )
+            .into()),
+            _ => plan,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_read_as_they_are_written() {
+        for planner in PlannerName::ALL {
+            assert_eq!(planner.to_string().parse::<PlannerName>().unwrap(), planner);
+        }
+        let error = "racer".parse::<PlannerName>().unwrap_err();
+        assert!(error.is_argument());
+        assert!(error.to_string().contains("pdm-closed"), "{error}");
+    }
+}

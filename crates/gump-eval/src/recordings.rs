@@ -1,0 +1,128 @@
+//! Recordings to drive through, from any readable file.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
+use gump_scene::{EgoState, MapGraph, Scenario};
+
+use crate::{EvalError, nuplan_recordings};
+
+/// A recording with what judging it takes besides.
+pub struct Case {
+    /// What is driven through.
+    pub recording: Recording,
+    /// What drives are judged on: the map as it was stated.
+    pub map: Arc<MapGraph>,
+    /// What was driven after the recording's end, if that is known.
+    pub after: Vec<EgoState>,
+    /// nuPlan's name of the map; empty for other formats.
+    pub map_name: String,
+}
+
+/// A case or why there is none, by the name of its scenario.
+pub struct Named {
+    /// The scenario's id; where it cannot be read, where it was.
+    pub id: String,
+    /// The log it is of: the name of its file, without endings.
+    pub log_name: String,
+    /// nuPlan's type of scenario; "unknown" for other formats.
+    pub scenario_type: String,
+    /// The case.
+    pub case: Result<Case, EvalError>,
+}
+
+/// Every scenario of a file or folder, read one by one.
+///
+/// Error: nothing there to read.
+pub fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Named> + Send>, EvalError> {
+    let logs = nuplan_recordings::logs_of(path);
+    if !logs.is_empty() {
+        return nuplan_recordings::open(&logs);
+    }
+    let place: PathBuf = path.into();
+    let records = gump_data::open(path)?.enumerate();
+    Ok(Box::new(records.map(move |(i, record)| {
+        let (id, case) = match record {
+            Ok(record) => (record.scenario.id.clone(), of_boxes(record.scenario)),
+            Err(error) => (format!("{}#{i}", place.display()), Err(error.into())),
+        };
+        Named {
+            id,
+            log_name: log_name(&place),
+            scenario_type: "unknown".into(),
+            case,
+        }
+    })))
+}
+
+/// Every scenario of some files or folders, read one by one.
+///
+/// Error: nothing to read at the first; what is wrong with the others is told where it is.
+pub fn open_all(
+    paths: &[PathBuf],
+) -> Result<Box<dyn Iterator<Item = Named> + Send + '_>, EvalError> {
+    let none = || EvalError::Argument("expected scenarios, found none".into());
+    let (first, others) = paths.split_first().ok_or_else(none)?;
+    let others = others.iter().flat_map(|path| match open(path) {
+        Ok(cases) => cases,
+        Err(error) => Box::new(std::iter::once(Named {
+            id: path.display().to_string(),
+            log_name: log_name(path),
+            scenario_type: "unknown".into(),
+            case: Err(error),
+        })) as Box<dyn Iterator<Item = Named> + Send>,
+    });
+    Ok(Box::new(open(first)?.chain(others)))
+}
+
+/// A file's name without its endings.
+pub fn log_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.split('.').next().unwrap_or_default().into()
+}
+
+/// One scenario: `PATH`, `PATH#INDEX` or `PATH#ID`.
+///
+/// Error: no such scenario, or one that cannot be driven through.
+pub fn find(source: &str) -> Result<Case, EvalError> {
+    let (path, wanted) = source.split_once('#').unwrap_or((source, "0"));
+    let logs = nuplan_recordings::logs_of(Path::new(path));
+    if !logs.is_empty() {
+        if logs.len() > 1 && !source.contains('#') {
+            let several = gump_data::DataError::SeveralFiles {
+                files: logs.len(),
+                first: logs[0].clone(),
+                path: path.into(),
+            };
+            return Err(several.into());
+        }
+        let mut all = nuplan_recordings::open(&logs)?.enumerate();
+        let found = all.find(|(i, named)| named.id == wanted || i.to_string() == wanted);
+        let none = || EvalError::Argument(format!("no scenario {wanted} in {path}"));
+        let (_, named) = found.ok_or_else(none)?;
+        return named.case;
+    }
+    of_boxes(gump_data::find(source)?)
+}
+
+/// A case of a scenario that knows boxes alone.
+///
+/// # Errors
+/// No lanes, or a scenario that cannot be driven through.
+pub fn of_boxes(mut scenario: Scenario) -> Result<Case, EvalError> {
+    if scenario.map.lanes().is_empty() {
+        return Err(EvalError::Recording(format!(
+            "scenario {}: expected a map with lanes to plan on, found none",
+            scenario.id
+        )));
+    }
+    let map = Arc::clone(&scenario.map);
+    derive_roadblocks(&mut scenario);
+    Ok(Case {
+        recording: Recording::of_boxes(scenario)?,
+        map,
+        after: Vec::new(),
+        map_name: String::new(),
+    })
+}

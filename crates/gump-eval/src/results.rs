@@ -1,0 +1,341 @@
+//! `scenarios.toml`: what each scenario of an evaluation got, one table each.
+//!
+//! Totals are always computed from these entries in order of the scenarios, whether they were
+//! written by this run, by the run it resumes or by shards on other machines: equal entries give
+//! equal totals, to the bit. TOML, because its numbers come back exactly as they were, NaN too.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::EvalError;
+use crate::shard::Shard;
+
+/// Name of a complete store in an output folder.
+const NAME: &str = "scenarios.toml";
+
+/// How the table of a scenario starts.
+const ENTRY: &str = "[[scenario]]";
+
+/// Which evaluation the entries are of; the first table of the file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// Name of the benchmark, for instance "wosac".
+    pub benchmark: String,
+    /// Which scenarios.
+    pub shard: Shard,
+    /// Everything that the entries depend on; shards of one evaluation agree in it.
+    pub settings: toml::Table,
+}
+
+/// What one scenario got.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Entry<T> {
+    /// Position among all scenarios of the evaluation.
+    pub index: usize,
+    /// Its id.
+    pub id: String,
+    /// The benchmark's own fields.
+    pub scores: T,
+}
+
+/// The form of the file.
+#[derive(Serialize, Deserialize)]
+struct Document<T> {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    evaluation: Option<Header>,
+    #[serde(default = "Vec::new", skip_serializing_if = "Vec::is_empty")]
+    scenario: Vec<T>,
+}
+
+/// A store being written; an entry is safe once [`ResultStore::add`] returns.
+pub struct ResultStore<T> {
+    folder: PathBuf,
+    file: File,
+    entries: BTreeMap<usize, Entry<T>>,
+}
+
+impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
+    /// Opens the store of a folder: goes on where an interrupted run of the same evaluation
+    /// stopped, else begins.
+    pub fn open(folder: &Path, header: &Header) -> Result<Self, EvalError> {
+        let path = partial(folder);
+        let kept: Vec<Entry<T>> = match fs::read_to_string(&path) {
+            Ok(text) => resumable(&text, header),
+            Err(_) => Vec::new(),
+        };
+        let file = File::create(&path).map_err(|cause| EvalError::io("create", &path, cause))?;
+        let mut store = Self {
+            folder: folder.to_owned(),
+            file,
+            entries: BTreeMap::new(),
+        };
+        store.write(&Document::<Entry<T>> {
+            evaluation: Some(header.clone()),
+            scenario: Vec::new(),
+        })?;
+        for entry in kept {
+            store.add(entry)?;
+        }
+        Ok(store)
+    }
+
+    /// True if the scenario at `index` needs no more work.
+    pub fn has(&self, index: usize) -> bool {
+        self.entries.contains_key(&index)
+    }
+
+    /// Scenarios that need no more work.
+    pub fn indices(&self) -> BTreeSet<usize> {
+        self.entries.keys().copied().collect()
+    }
+
+    /// Adds a scenario.
+    pub fn add(&mut self, entry: Entry<T>) -> Result<(), EvalError> {
+        self.write(&Document {
+            evaluation: None,
+            scenario: vec![entry.clone()],
+        })?;
+        self.entries.insert(entry.index, entry);
+        Ok(())
+    }
+
+    /// Gives the file its final name; all entries in order of the scenarios.
+    pub fn close(self) -> Result<Vec<Entry<T>>, EvalError> {
+        let (from, to) = (partial(&self.folder), self.folder.join(NAME));
+        fs::rename(&from, &to).map_err(|cause| EvalError::io("write", &to, cause))?;
+        Ok(self.entries.into_values().collect())
+    }
+
+    fn write(&mut self, document: &Document<Entry<T>>) -> Result<(), EvalError> {
+        let mut text = toml::to_string(document).map_err(|error| {
+            EvalError::Results(format!("results that TOML cannot hold: {error}"))
+        })?;
+        text.push('\n');
+        self.file
+            .write_all(text.as_bytes())
+            .map_err(|cause| EvalError::io("write", &partial(&self.folder), cause))
+    }
+}
+
+fn partial(folder: &Path) -> PathBuf {
+    folder.join(format!("{NAME}.partial"))
+}
+
+/// The entries of an interrupted run, if it was of the same evaluation; without the last, which
+/// may have been cut off.
+fn resumable<T: DeserializeOwned>(text: &str, header: &Header) -> Vec<Entry<T>> {
+    let whole = &text[..text.rfind(ENTRY).unwrap_or(0)];
+    match toml::from_str::<Document<Entry<T>>>(whole) {
+        Ok(found) if found.evaluation.as_ref() == Some(header) => found.scenario,
+        _ => Vec::new(),
+    }
+}
+
+/// Which evaluation `folder` holds, its entries unread.
+///
+/// Error: no complete store there.
+pub fn header(folder: &Path) -> Result<Header, EvalError> {
+    let text = text(folder)?;
+    let start = &text[..text.find(ENTRY).unwrap_or(text.len())];
+    parse::<toml::Table>(start, folder).map(|(header, _)| header)
+}
+
+/// Entries of the shards of one evaluation in order of the scenarios, and the header without shard.
+///
+/// Error: shards that are missing, given twice, or of different evaluations.
+pub fn merge<T: DeserializeOwned>(
+    folders: &[PathBuf],
+) -> Result<(Header, Vec<Entry<T>>), EvalError> {
+    let mut shards: BTreeMap<usize, &Path> = BTreeMap::new();
+    let mut first: Option<(Header, &Path)> = None;
+    let mut entries = BTreeMap::new();
+    for folder in folders {
+        let (header, scenarios) = parse::<Entry<T>>(&text(folder)?, folder)?;
+        let (expected, example) = first.get_or_insert_with(|| (header.clone(), folder));
+        check_same(expected, example, &header, folder)?;
+        if let Some(other) = shards.insert(header.shard.k, folder) {
+            return Err(EvalError::Results(format!(
+                "expected every shard once, found {} in {} and {}",
+                header.shard,
+                other.display(),
+                folder.display()
+            )));
+        }
+        for entry in scenarios {
+            let shard = header.shard;
+            if !shard.holds(entry.index) {
+                return Err(EvalError::Results(format!(
+                    "scenario {} is not of shard {shard}: {}",
+                    entry.index,
+                    folder.display()
+                )));
+            }
+            entries.insert(entry.index, entry);
+        }
+    }
+    let none = || EvalError::Results("expected at least one folder".into());
+    let (header, _) = first.ok_or_else(none)?;
+    let n = header.shard.n;
+    let missing: Vec<_> = (1..=n).filter(|k| !shards.contains_key(k)).collect();
+    if !missing.is_empty() {
+        return Err(EvalError::Results(format!(
+            "expected all {n} shards, missing are {missing:?}"
+        )));
+    }
+    let shard = Shard::WHOLE;
+    Ok((Header { shard, ..header }, entries.into_values().collect()))
+}
+
+fn check_same(
+    expected: &Header,
+    example: &Path,
+    found: &Header,
+    folder: &Path,
+) -> Result<(), EvalError> {
+    let same = expected.benchmark == found.benchmark
+        && expected.settings == found.settings
+        && expected.shard.n == found.shard.n;
+    if same {
+        return Ok(());
+    }
+    Err(EvalError::Results(format!(
+        "expected shards of one evaluation, found {} {} of {} in {} but {} {} of {} in {}",
+        expected.benchmark,
+        expected.settings,
+        expected.shard.n,
+        example.display(),
+        found.benchmark,
+        found.settings,
+        found.shard.n,
+        folder.display()
+    )))
+}
+
+fn text(folder: &Path) -> Result<String, EvalError> {
+    let path = folder.join(NAME);
+    fs::read_to_string(&path).map_err(|cause| {
+        EvalError::Results(format!(
+            "expected a finished evaluation, cannot read {}: {cause}",
+            path.display()
+        ))
+    })
+}
+
+fn parse<T: DeserializeOwned>(text: &str, folder: &Path) -> Result<(Header, Vec<T>), EvalError> {
+    let path = folder.join(NAME);
+    let document: Document<T> = toml::from_str(text).map_err(|error| {
+        EvalError::Results(format!(
+            "expected the scenarios of an evaluation in {}: {error}",
+            path.display()
+        ))
+    })?;
+    let header = document.evaluation;
+    let none = || {
+        let path = path.display();
+        EvalError::Results(format!("expected a table evaluation in {path}"))
+    };
+    let header = header.ok_or_else(none)?;
+    Ok((header, document.scenario))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header(k: usize, n: usize) -> Header {
+        Header {
+            benchmark: "test".into(),
+            settings: toml::Table::from_iter([("year".into(), 2025.into())]),
+            shard: Shard { k, n },
+        }
+    }
+
+    fn entry(index: usize, scores: f64) -> Entry<f64> {
+        let id = format!("s{index}");
+        Entry { index, id, scores }
+    }
+
+    /// Writes a complete shard with a number per scenario that no short decimal can hold.
+    fn shard(folder: &Path, k: usize, n: usize) {
+        fs::create_dir_all(folder).unwrap();
+        let mut store = ResultStore::open(folder, &header(k, n)).unwrap();
+        for index in (0..10).filter(|&i| Shard { k, n }.holds(i)) {
+            store.add(entry(index, (index as f64 + 0.1).sin())).unwrap();
+        }
+        store.close().unwrap();
+    }
+
+    #[test]
+    fn shards_in_any_order_are_the_whole_to_the_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = |name: &str| folder.path().join(name);
+        shard(&place("whole"), 1, 1);
+        for k in 1..=3 {
+            shard(&place(&k.to_string()), k, 3);
+        }
+        let (_, whole) = merge::<f64>(&[place("whole")]).unwrap();
+        let (_, parts) = merge::<f64>(&[place("3"), place("1"), place("2")]).unwrap();
+        assert_eq!(whole.len(), 10);
+        assert_eq!(whole, parts);
+        assert_eq!(whole[7].scores.to_bits(), 7.1f64.sin().to_bits());
+    }
+
+    #[test]
+    fn what_does_not_add_up_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = |name: &str| folder.path().join(name);
+        shard(&place("1of2"), 1, 2);
+        shard(&place("also 1of2"), 1, 2);
+        shard(&place("1of3"), 1, 3);
+        let fails = |names: &[&str], part: &str| {
+            let folders: Vec<_> = names.iter().map(|name| place(name)).collect();
+            let error = format!("{:#}", merge::<f64>(&folders).unwrap_err());
+            assert!(error.contains(part), "{error}");
+        };
+        fails(&["1of2"], "missing are [2]");
+        fails(&["1of2", "also 1of2"], "every shard once, found 1/2");
+        fails(&["1of2", "1of3"], "one evaluation");
+        fails(&["nowhere"], "cannot read");
+    }
+
+    #[test]
+    fn an_interrupted_run_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = ResultStore::open(folder.path(), &header(1, 1)).unwrap();
+        store.add(entry(0, 0.5)).unwrap();
+        store.add(entry(1, 1.5)).unwrap();
+        // Stopped in the middle of a number.
+        let cut = b"[[scenario]]\nindex = 2\nid = \"s2\"\nscores = 2";
+        store.file.write_all(cut).unwrap();
+        drop(store);
+        let mut store = ResultStore::open(folder.path(), &header(1, 1)).unwrap();
+        assert_eq!(store.indices(), BTreeSet::from([0, 1]));
+        store.add(entry(2, 2.5)).unwrap();
+        assert_eq!(store.close().unwrap().len(), 3);
+        let (_, entries) = merge::<f64>(&[folder.path().to_owned()]).unwrap();
+        assert_eq!(entries.iter().map(|e| e.scores).sum::<f64>(), 4.5);
+    }
+
+    #[test]
+    fn another_evaluation_begins_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = ResultStore::open(folder.path(), &header(1, 1)).unwrap();
+        store.add(entry(0, 0.5)).unwrap();
+        drop(store);
+        let other = Header {
+            settings: toml::Table::new(),
+            ..header(1, 1)
+        };
+        assert!(
+            ResultStore::<f64>::open(folder.path(), &other)
+                .unwrap()
+                .indices()
+                .is_empty()
+        );
+    }
+}

@@ -1,0 +1,254 @@
+//! Worlds by name: `log`, `idm`, `constant-velocity` and `model:WEIGHTS`.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use gump_engine::relative::{RelativeSampling, RelativeWorld};
+use gump_engine::{PredictiveSamples, ProbeConfig, SamplingConfig, TransformerWorld};
+use gump_model::{Device, checkpoint, relative};
+use gump_rollout::WorldModel;
+use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
+use gump_scene::Scenario;
+use serde::{Serialize, Serializer};
+
+use crate::EvalError;
+
+/// Which world imagines.
+#[derive(Clone, Debug, PartialEq)]
+pub enum WorldName {
+    /// What was recorded: an oracle.
+    Log,
+    /// Rule-driven traffic that reacts.
+    Idm,
+    /// Everyone goes straight on.
+    ConstantVelocity,
+    /// A trained network.
+    Model(PathBuf),
+}
+
+impl FromStr for WorldName {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "log" => Ok(Self::Log),
+            "idm" => Ok(Self::Idm),
+            "constant-velocity" => Ok(Self::ConstantVelocity),
+            _ => match name.strip_prefix("model:") {
+                Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
+                // Nothing else is named like that: what is meant is clear.
+                None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
+                _ => Err(no_world(name)),
+            },
+        }
+    }
+}
+
+/// How files of weights end.
+const WEIGHTS: &str = ".safetensors";
+
+/// A file of weights, by its path or as a world is named.
+///
+/// # Errors
+/// A world without weights.
+pub fn weights(name: &str) -> Result<PathBuf, String> {
+    match name.parse() {
+        Ok(WorldName::Model(path)) => Ok(path),
+        Ok(world) => Err(format!(
+            "expected a file of weights, found the world {world}"
+        )),
+        Err(_) => Ok(name.into()),
+    }
+}
+
+/// Why a name is no world, and what may be meant.
+fn no_world(name: &str) -> String {
+    let expected = "expected log, idm, constant-velocity or model:WEIGHTS";
+    let is_path = name.contains(['/', '\\', '.']) || Path::new(name).exists();
+    match is_path && !name.starts_with("model:") {
+        true => format!("{expected}; for weights in a file: model:{name}"),
+        false => expected.into(),
+    }
+}
+
+impl fmt::Display for WorldName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Log => f.write_str("log"),
+            Self::Idm => f.write_str("idm"),
+            Self::ConstantVelocity => f.write_str("constant-velocity"),
+            Self::Model(path) => write!(f, "model:{}", path.display()),
+        }
+    }
+}
+
+impl Serialize for WorldName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// A world that is ready to imagine.
+pub enum World {
+    /// One that follows rules.
+    Rule(Box<dyn WorldModel>),
+    /// A trained network of sequences.
+    Learned(Box<TransformerWorld>),
+    /// A trained network with relative attention.
+    Relative(Box<RelativeWorld>),
+}
+
+impl World {
+    /// Builds the world, a network on `device`; only `log` looks at more than the present of the
+    /// scenario.
+    ///
+    /// # Errors
+    /// Weights that cannot be read or do not fit.
+    pub fn build(
+        device: &Device,
+        name: &WorldName,
+        scenario: &Scenario,
+        sampling: &SamplingConfig,
+    ) -> Result<Self, EvalError> {
+        match name {
+            WorldName::Log => Ok(Self::Rule(Box::new(LogReplay::new(scenario)))),
+            _ => Self::without_log(device, name, sampling),
+        }
+    }
+
+    /// Builds a world that looks at no log.
+    ///
+    /// # Errors
+    /// The world `log`, and as [`World::build`].
+    pub fn without_log(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+    ) -> Result<Self, EvalError> {
+        Ok(match name {
+            WorldName::Log => {
+                let wrong = "the world log needs a scenario to replay";
+                return Err(EvalError::Argument(wrong.into()));
+            }
+            WorldName::Idm => Self::Rule(Box::new(Idm::default())),
+            WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
+            WorldName::Model(path) if relative::is_relative(path)? => {
+                if sampling.life {
+                    let wrong = format!(
+                        "the relative network in {} does not say who comes and leaves, \
+                         a sequence network does",
+                        path.display()
+                    );
+                    return Err(EvalError::Argument(wrong));
+                }
+                let network = relative::load(path, device)?;
+                let sampling = RelativeSampling::from(sampling);
+                Self::Relative(Box::new(RelativeWorld::new(&network, sampling)?))
+            }
+            WorldName::Model(path) => {
+                let network = checkpoint::load(path, device)?;
+                Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))
+            }
+        })
+    }
+
+    /// What imagines.
+    pub fn model(&self) -> &dyn WorldModel {
+        match self {
+            Self::Rule(world) => &**world,
+            Self::Learned(world) => &**world,
+            Self::Relative(world) => &**world,
+        }
+    }
+
+    /// Whether a map without lanes leaves it nothing to go by.
+    pub fn follows_lanes(&self) -> bool {
+        match self {
+            Self::Rule(world) => world.name() == "idm",
+            Self::Learned(_) | Self::Relative(_) => true,
+        }
+    }
+
+    /// The same world, which keeps what its agents might have done; rules have nothing to keep.
+    pub fn watching(self, watch: ProbeConfig) -> Self {
+        match self {
+            Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
+            Self::Relative(world) => Self::Relative(Box::new(world.watching(watch))),
+            rule => rule,
+        }
+    }
+
+    /// What was watched; `None` of a world that follows rules.
+    pub fn take_predictive_samples(&self) -> Option<Vec<PredictiveSamples>> {
+        match self {
+            Self::Rule(_) => None,
+            Self::Learned(world) => Some(world.take_predictive_samples()),
+            Self::Relative(world) => Some(world.take_predictive_samples()),
+        }
+    }
+
+    /// Passes of the network made so far, whatever their batch; rules make none.
+    pub fn passes(&self) -> u64 {
+        match self {
+            Self::Rule(_) => 0,
+            Self::Learned(world) => world.passes(),
+            Self::Relative(world) => world.passes(),
+        }
+    }
+}
+
+/// One world for many scenarios: loaded once, but for the log, which is another world in every
+/// scenario.
+pub struct Worlds<'a> {
+    device: Device,
+    name: &'a WorldName,
+    sampling: SamplingConfig,
+    loaded: Option<World>,
+}
+
+impl<'a> Worlds<'a> {
+    /// Names a world; nothing is loaded yet.
+    pub fn new(device: &Device, name: &'a WorldName, sampling: SamplingConfig) -> Self {
+        Self {
+            device: device.clone(),
+            name,
+            sampling,
+            loaded: None,
+        }
+    }
+
+    /// The world for a scenario.
+    ///
+    /// # Errors
+    /// As [`World::build`].
+    pub fn of(&mut self, scenario: &Scenario) -> Result<&World, EvalError> {
+        let world = match self.loaded.take() {
+            Some(world) if *self.name != WorldName::Log => world,
+            _ => World::build(&self.device, self.name, scenario, &self.sampling)?,
+        };
+        Ok(self.loaded.insert(world))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_read_as_they_are_written() {
+        for name in ["log", "idm", "constant-velocity", "model:a/b.safetensors"] {
+            assert_eq!(name.parse::<WorldName>().unwrap().to_string(), name);
+        }
+        for name in ["", "model:", "model", "IDM"] {
+            assert!(name.parse::<WorldName>().is_err(), "{name}");
+        }
+        let bare: WorldName = "a/b.safetensors".parse().unwrap();
+        assert_eq!(bare.to_string(), "model:a/b.safetensors");
+        let other = "a/b.bin".parse::<WorldName>().unwrap_err();
+        assert!(
+            other.ends_with("for weights in a file: model:a/b.bin"),
+            "{other}"
+        );
+    }
+}

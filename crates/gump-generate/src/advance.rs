@@ -1,0 +1,201 @@
+//! Drafts going in step: the next key of each, one pass for all, then draws until each keeps its
+//! rules. A draft's randomness is its own, so its company does not matter.
+
+use std::sync::Arc;
+
+use gump_engine::TransformerWorld;
+use gump_engine::cpu::{Engine, Job};
+use gump_engine::placement::rules::{Rules, state_of};
+use gump_engine::request::Request;
+use gump_engine::temporal_ensemble::ChunkBuffer;
+use gump_geometry::OrientedBox;
+use gump_model::ModelError;
+use gump_model::decoder::Bins;
+use gump_model::local_frame::LocalFrame;
+use gump_model::placed_slot::PlacedSlot;
+use gump_tokenizer::{Key, QuantizedState};
+use rayon::prelude::*;
+
+use crate::GenerateError;
+use crate::draft::Draft;
+
+/// Draws of an object that are made at once: most objects need no more.
+const VOLLEY: usize = 4;
+
+/// Gives every unfinished draft its next object; false once all are finished.
+pub(crate) fn advance(
+    world: &TransformerWorld,
+    drafts: &mut [Draft<'_>],
+) -> Result<bool, GenerateError> {
+    let engine = world.engine().expect("preparing checked that there is one");
+    let mut open: Vec<&mut Draft<'_>> = drafts
+        .iter_mut()
+        .filter(|draft| draft.outcome.is_none())
+        .collect();
+    if open.is_empty() {
+        return Ok(false);
+    }
+    let asking: Vec<bool> = open.iter().map(|draft| draft.asks()).collect();
+    let hidden = read(world, engine, &mut open, |i| asking[i].then_some(None))?;
+    let mut said = engine.say(&hidden).into_iter();
+    let mut keys = Vec::with_capacity(open.len());
+    for (draft, asks) in open.iter_mut().zip(&asking) {
+        let said = if *asks { said.next() } else { None };
+        let key = draft.next_key(said.as_ref());
+        if key.is_none() {
+            draft.outcome = Some(Ok(()));
+        }
+        keys.push(key);
+    }
+    let hidden = read(world, engine, &mut open, |i| keys[i].map(Some))?;
+    let width = world.network().config().width;
+    let mut rows = hidden.chunks_exact(width);
+    let placed = open.into_iter().zip(keys).filter_map(|(draft, key)| {
+        let hidden = rows_next(&mut rows, key)?;
+        Some(Query {
+            rules: Arc::new(draft.rules(key?)),
+            key: key?,
+            draft,
+            hidden,
+            broken: Vec::new(),
+        })
+    });
+    let queries: Vec<Query<'_, '_>> = placed.collect();
+    draw(engine, queries);
+    Ok(true)
+}
+
+/// The next row if there is a key to ask for.
+fn rows_next<'h>(
+    rows: &mut std::slice::ChunksExact<'h, f32>,
+    key: Option<Key>,
+) -> Option<&'h [f32]> {
+    key?;
+    rows.next()
+}
+
+/// Hidden vectors at the last slot of every draft for which `last` tells what that is: the key of
+/// a further agent, or the last value.
+fn read(
+    world: &TransformerWorld,
+    engine: &Engine,
+    open: &mut [&mut Draft<'_>],
+    last: impl Fn(usize) -> Option<Option<Key>>,
+) -> Result<Vec<f32>, ModelError> {
+    let slots = open.iter().enumerate().map(|(i, draft)| {
+        let next = last(i);
+        let slots = next.map(|next| draft.prepared.slots(&draft.agents, next));
+        slots.transpose()
+    });
+    let slots: Vec<Option<Vec<PlacedSlot>>> = slots.collect::<Result<_, _>>()?;
+    let members = open.iter_mut().zip(&slots);
+    let mut jobs: Vec<Job<'_>> = members
+        .filter_map(|(draft, slots)| {
+            let slots = slots.as_ref()?;
+            Some(Job {
+                slots,
+                wanted: vec![slots.len() - 1],
+                memory: draft.prepared.memory(),
+                context: &mut draft.context,
+                keep: true,
+            })
+        })
+        .collect();
+    if !jobs.is_empty() {
+        world.count_passes(1);
+    }
+    Ok(engine.run(&mut jobs))
+}
+
+/// An object to be drawn.
+struct Query<'d, 'a> {
+    draft: &'d mut Draft<'a>,
+    key: Key,
+    rules: Arc<Rules>,
+    hidden: &'d [f32],
+    broken: Vec<String>,
+}
+
+/// Draws every object until it keeps its rules or its draws are used up.
+fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
+    let mut drawn = 0;
+    while !queries.is_empty() {
+        let tries = queries[0].draft.prepared.request.config.tries;
+        let n = if drawn == 0 { 1 } else { VOLLEY }.min(tries - drawn);
+        let requests: Vec<Request> = queries
+            .iter()
+            .flat_map(|query| (0..n).map(|i| request(query, drawn + i)))
+            .collect();
+        let hidden: Vec<f32> = queries
+            .iter()
+            .flat_map(|query| query.hidden.repeat(n))
+            .collect();
+        let references: Vec<&Request> = requests.iter().collect();
+        let sampling = &queries[0].draft.prepared.sampling;
+        let bins = engine.sample_state(&hidden, &references, sampling);
+        drawn += n;
+        let is_last = drawn >= tries;
+        let judged: Vec<Vec<Result<Found, String>>> = queries
+            .par_iter()
+            .zip(bins.par_chunks(n))
+            .map(|(query, bins)| bins.iter().map(|bins| judge(query, bins)).collect())
+            .collect();
+        let mut left = Vec::new();
+        for (mut query, judged) in queries.into_iter().zip(judged) {
+            let mut kept = None;
+            for result in judged {
+                match result {
+                    Ok(found) => {
+                        kept = Some(found);
+                        break;
+                    }
+                    Err(clause) => {
+                        query.draft.redraws += 1;
+                        query.broken.push(clause);
+                    }
+                }
+            }
+            match kept {
+                Some((state, outline)) => query.draft.accept(query.key, state, outline),
+                None if is_last => query.draft.fail(query.key, &query.broken),
+                None => {
+                    // The numbers of the first draw would give the same again.
+                    Arc::make_mut(&mut query.rules).manner.numbers = None;
+                    left.push(query);
+                }
+            }
+        }
+        queries = left;
+    }
+}
+
+fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
+    let stream = query.draft.stream(2 * query.draft.agents.len() as u64 + 2);
+    let rules = Arc::clone(&query.rules);
+    Request {
+        anchor: LocalFrame::SCENE,
+        forced: query.draft.given(query.key),
+        stream: stream.fork(attempt as u64),
+        near: None,
+        ring: ChunkBuffer::default(),
+        limits: None,
+        frame: 0,
+        guide: Some(rules),
+    }
+}
+
+/// A state and its outline.
+type Found = (QuantizedState, OrientedBox);
+
+/// The state that was drawn, or the rule it breaks. The ego's box is given and therefore good.
+fn judge(query: &Query<'_, '_>, bins: &Bins) -> Result<Found, String> {
+    let state = state_of(bins);
+    let prepared = query.draft.prepared;
+    let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
+    let outline = query.rules.outline(&state, map, world_from_scene);
+    let broken = query.rules.broken(&state, &outline, map, world_from_scene);
+    match broken {
+        Some(clause) if !query.key.is_ego() || clause.starts_with("speed") => Err(clause),
+        _ => Ok((state, outline)),
+    }
+}

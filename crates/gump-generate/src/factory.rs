@@ -1,0 +1,274 @@
+//! Scenes that hold what was asked: put where that can be, made, imagined a little further, judged,
+//! and made again.
+//!
+//! A prompt is looked for first in what the world makes of the scene by itself, and then in a drive
+//! of the ego that is what the prompt says (`drive`), to which the world makes the others react.
+
+use std::ops::Range;
+
+use gump_engine::TransformerWorld;
+use gump_metrics::tags;
+use gump_scene::{Scenario, ScenarioTag, Seed};
+use rayon::prelude::*;
+
+use crate::prompt::PromptSpec;
+use crate::search::{Search, any_start};
+use crate::stage::Stage;
+use crate::verdict::{Clause, verdict};
+use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
+
+/// What a factory makes.
+#[derive(Clone, Debug)]
+pub struct GenerationJob {
+    /// What every scene is like.
+    pub request: GenerateRequest,
+    /// True lets each scene have its own place on the map, within 150 m of the request's; a prompt
+    /// in guided placement may take that freedom too.
+    pub roams: bool,
+    /// Seconds to imagine of every scene; 0 for none.
+    pub seconds: f64,
+    /// Scenes made before one is given up that does not hold.
+    pub attempts: usize,
+}
+
+/// A scene that was ordered.
+#[derive(Clone, Debug)]
+pub struct Made {
+    /// The scene that was made first.
+    pub scene: GeneratedScene,
+    /// What was imagined of its future, at 10 Hz. The present is the moment that is what the prompts
+    /// say, at most two seconds later; up to a second before it is kept.
+    pub scenario: Scenario,
+    /// The verdict on the present.
+    pub clauses: Vec<Clause>,
+    /// Scenes made until this one; it is the last, whether it holds or not.
+    pub attempts: usize,
+    /// Whether the ego was driven as the prompts say, rather than by the world.
+    pub is_steered: bool,
+    /// Seconds from the scene that was made to the present.
+    pub moment_s: f64,
+}
+
+impl Made {
+    /// True if no clause fails; what cannot be decided does not.
+    pub fn holds(&self) -> bool {
+        self.clauses
+            .iter()
+            .all(|clause| clause.holds != Some(false))
+    }
+}
+
+/// Makes the scenes with these numbers; what each is depends on its number and the seed alone.
+///
+/// # Errors
+/// What makes the order impossible.
+pub fn make_many(
+    world: &TransformerWorld,
+    order: &GenerationJob,
+    numbers: Range<u64>,
+    seed: Seed,
+) -> Result<Vec<Result<Made, GenerateError>>, GenerateError> {
+    let request = &order.request;
+    if order.roams || !request.prompts.is_empty() {
+        let made = numbers.into_par_iter();
+        return Ok(made
+            .map(|number| make(world, order, number, seed))
+            .collect());
+    }
+    // One place for all and nothing to convince of: they can be made together.
+    let stream = |number: u64| seed.fork(number).fork(0);
+    let seeds: Vec<Seed> = numbers.clone().map(|n| stream(n).fork(1)).collect();
+    let scenes = generate(world, request, &seeds)?;
+    let numbered: Vec<_> = numbers.zip(scenes).collect();
+    let made = numbered.into_par_iter().map(|(number, scene)| {
+        let scene = scene?;
+        let mut scenario = scene.scenario(name(number), &request.map, &[]);
+        takes::extend(world, &mut scenario, order.seconds, stream(number).fork(2))?;
+        Ok(Made {
+            clauses: verdict(&scenario, &[], request.counts.as_ref()),
+            scene,
+            scenario,
+            attempts: 1,
+            is_steered: false,
+            moment_s: 0.0,
+        })
+    });
+    Ok(made.collect())
+}
+
+/// Whether a map admits the prompts of a request: somewhere within 150 m of the request's ego, one
+/// alone with those whom the prompts are about, driving along lanes, is what they say.
+///
+/// That needs no network, and says nothing of whether a scene will hold them.
+pub fn admits(request: &GenerateRequest, seed: Seed) -> bool {
+    let search = Search {
+        cast: &PromptSpec::of(&request.prompts),
+        request,
+        prompts: &request.prompts,
+    };
+    search.anywhere(seed).is_some()
+}
+
+/// Makes scene number `number` of an order.
+///
+/// # Errors
+/// What makes the order impossible, or the last attempt's failure if none gave a scene.
+pub fn make(
+    world: &TransformerWorld,
+    order: &GenerationJob,
+    number: u64,
+    seed: Seed,
+) -> Result<Made, GenerateError> {
+    let seed = seed.fork(number);
+    let mut place = Place::new(order);
+    let mut failure = None;
+    let mut last: Option<Made> = None;
+    for attempt in 0..order.attempts.max(1) {
+        let stream = seed.fork(attempt as u64);
+        let (request, stage) = match place.next(attempt, stream.fork(0)) {
+            // What was possible at first is not called impossible afterwards.
+            Err(_) if attempt > 0 => break,
+            next => next?,
+        };
+        let made = generate(world, &request, &[stream.fork(1)]);
+        let scene = match made.map(|mut scenes| scenes.remove(0)) {
+            Ok(Ok(scene)) => scene,
+            // Another place or another draw may do, but never for what contradicts itself.
+            Ok(Err(error)) | Err(error) => {
+                let is_of_place = match error {
+                    GenerateError::NoLane | GenerateError::NoPlace { .. } => true,
+                    // At this place nobody may be where the prompt wants somebody.
+                    GenerateError::Constraints(_) => stage.is_some(),
+                    _ => false,
+                };
+                if !is_of_place {
+                    return Err(error);
+                }
+                failure = Some(error);
+                continue;
+            }
+        };
+        let made = Made {
+            scenario: scene.scenario(name(number), &request.map, &request.prompts),
+            scene,
+            clauses: Vec::new(),
+            attempts: attempt + 1,
+            is_steered: false,
+            moment_s: 0.0,
+        };
+        let made = judged(world, order, made, stage.as_ref(), stream)?;
+        if made.holds() {
+            return Ok(made);
+        }
+        last = Some(made);
+    }
+    match (last, failure) {
+        (Some(made), _) => Ok(made),
+        (None, Some(error)) => Err(error),
+        (None, None) => unreachable!("the first attempt makes a scene or fails"),
+    }
+}
+
+/// Where the scenes of an order are put, attempt by attempt.
+struct Place<'a> {
+    order: &'a GenerationJob,
+    cast: PromptSpec,
+    /// Whether places other than the one asked for may be looked for.
+    searches: bool,
+}
+
+impl<'a> Place<'a> {
+    fn new(order: &'a GenerationJob) -> Self {
+        Self {
+            order,
+            cast: PromptSpec::of(&order.request.prompts),
+            searches: true,
+        }
+    }
+
+    /// The request of an attempt, and the stage it is put on if prompts need one.
+    fn next(
+        &mut self,
+        attempt: usize,
+        seed: Seed,
+    ) -> Result<(GenerateRequest, Option<Stage>), GenerateError> {
+        let (request, roams) = (&self.order.request, self.order.roams);
+        if request.prompts.is_empty() || request.config.placement != Placement::Guided {
+            let mut request = request.clone();
+            if roams {
+                request.ego = any_start(&request.map, request.ego, seed);
+            }
+            return Ok((request, None));
+        }
+        let search = Search {
+            cast: &self.cast,
+            request,
+            prompts: &request.prompts,
+        };
+        // The place asked for goes first if it will do, and alone if no other does.
+        let here = || search.here(seed.fork(0)).filter(|_| !roams);
+        let anywhere = || search.anywhere(seed.fork(1));
+        let mut stage = if attempt == 0 { here() } else { None };
+        if stage.is_none() && self.searches {
+            stage = anywhere();
+            self.searches = stage.is_some();
+        }
+        let stage = stage.or_else(here).ok_or_else(|| {
+            let names: Vec<&str> = request.prompts.iter().map(|tag| tag.name()).collect();
+            GenerateError::NoStage {
+                prompts: names.join(" and "),
+            }
+        })?;
+        Ok((stage.direct(request), Some(stage)))
+    }
+}
+
+/// The scene with as much of its future as is asked for or needed to judge it, and the verdict.
+fn judged(
+    world: &TransformerWorld,
+    order: &GenerationJob,
+    mut made: Made,
+    stage: Option<&Stage>,
+    stream: Seed,
+) -> Result<Made, GenerateError> {
+    let (prompts, counts) = (&order.request.prompts, order.request.counts.as_ref());
+    let is_tag = |scenario: &Scenario| {
+        let fails = |tag: &ScenarioTag| tags::holds(*tag, scenario) == Some(false);
+        !prompts.iter().any(fails)
+    };
+    let holds = |scenario: &Scenario| {
+        let clauses = || verdict(scenario, &[], counts);
+        is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
+    };
+    if !prompts.is_empty() {
+        let mut found = None;
+        // One future shows who is there; what happens may take several.
+        for (n, i) in [(1, 0), (takes::FUTURES, 1)] {
+            if found.is_none() {
+                let futures = takes::free(world, &made.scenario, n, stream.fork(2).fork(i))?;
+                found = takes::moment(futures, holds);
+            }
+        }
+        if let (None, Some(stage)) = (&found, stage) {
+            let drive = stage.drive_from(made.scenario.present().ego_now());
+            let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;
+            found = takes::moment(steered, holds);
+            made.is_steered = found.is_some();
+        }
+        if let Some((scenario, seconds)) = found {
+            (made.scenario, made.moment_s) = (scenario, seconds);
+        }
+    }
+    let seconds = if prompts.is_empty() {
+        order.seconds
+    } else {
+        order.seconds.max(takes::JUDGED_S)
+    };
+    takes::extend(world, &mut made.scenario, seconds, stream.fork(4))?;
+    made.clauses = verdict(&made.scenario, prompts, counts);
+    Ok(made)
+}
+
+fn name(number: u64) -> String {
+    format!("generated-{number:06}")
+}

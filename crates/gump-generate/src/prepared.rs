@@ -1,0 +1,253 @@
+//! What all scenes of a request share: the map as the network remembers it, the wishes, the ground,
+//! and whether all of it can go together.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_engine::SamplingConfig;
+use gump_engine::TransformerWorld;
+use gump_engine::cpu::SceneMemory;
+use gump_engine::placement::ground::Ground;
+use gump_engine::placement::object_spec::{ObjectSpec, agent_of};
+use gump_engine::placement::rules::{Manner, Rules};
+use gump_engine::scene::Scene;
+use gump_geometry::OrientedBox;
+use gump_model::ModelError;
+use gump_model::placed_slot::{PlacedSlot, place};
+use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, ScenarioTag};
+use gump_tokenizer::{
+    AGENT_KEYS, Identities, Key, QuantizedState, TokenAgent, TokenFrame, TokenSequence,
+};
+
+use crate::constraint::EGO;
+use crate::{GenerateError, GenerateRequest, Placement, constraint};
+
+/// What all scenes of a request share.
+pub(crate) struct Prepared<'a> {
+    pub(super) request: &'a GenerateRequest,
+    pub(super) scene: Scene,
+    prompts: Vec<Option<ScenarioTag>>,
+    /// With relations known from both sides.
+    pub(super) objects: Vec<ObjectSpec>,
+    grounds: BTreeMap<AgentKind, Arc<Ground>>,
+    lanes: BTreeMap<i64, Arc<Ground>>,
+    /// Boxes of what stands around, scene frame.
+    pub(super) fixtures: Vec<OrientedBox>,
+    pub(super) sampling: SamplingConfig,
+    manner: Manner,
+}
+
+impl<'a> Prepared<'a> {
+    pub(crate) fn new(
+        world: &TransformerWorld,
+        request: &'a GenerateRequest,
+    ) -> Result<Self, GenerateError> {
+        let mut objects = request.objects.clone();
+        constraint::check(&objects)?;
+        constraint::mutual(&mut objects);
+        let pose = request.ego.pose;
+        let of_class = |kind| {
+            let ground = Ground::of_class(&request.map, pose, kind);
+            (kind, Arc::new(ground))
+        };
+        let grounds: BTreeMap<_, _> = AgentKind::MOVING.into_iter().map(of_class).collect();
+        if grounds[&AgentKind::Vehicle].is_closed() {
+            return Err(GenerateError::NoLane);
+        }
+        let lanes = lane_grounds(request)?;
+        let prompts = request.prompts.iter().copied().map(Some).collect();
+        let scene = scene_of_ego(world, request)?;
+        let scene_from_world = scene.world_from_scene.inverse();
+        let fixtures = request.fixtures.iter().map(|agent| {
+            let mut own = agent.oriented_box();
+            own.pose = scene_from_world * own.pose;
+            own
+        });
+        let fixtures = fixtures.collect();
+        let config = &request.config;
+        let prepared = Self {
+            manner: Manner {
+                size_boldness: config.size_boldness,
+                place_boldness: config.place_boldness,
+                smoothing_bins: Some(config.smoothing_bins as f32).filter(|bins| *bins > 0.0),
+                smoothed_sizes: config.smoothed_sizes,
+                numbers: None,
+            },
+            request,
+            scene,
+            fixtures,
+            prompts,
+            objects,
+            grounds,
+            lanes,
+            sampling: SamplingConfig {
+                temperature: Some(config.temperature),
+                top_k: config.top_k,
+                ..world.sampling().clone()
+            },
+        };
+        prepared.check_counts(world)?;
+        prepared.check_places()?;
+        // Prompts that do not go together show here, before anything is drawn.
+        prepared.slots(&[], None)?;
+        Ok(prepared)
+    }
+
+    fn check_counts(&self, world: &TransformerWorld) -> Result<(), GenerateError> {
+        let wished = |kind: AgentKind| {
+            let objects = self.objects.iter();
+            objects.filter(move |o| o.id != EGO && o.class.kind() == kind)
+        };
+        let config = &self.request.config;
+        let asked = match &self.request.counts {
+            None => {
+                let n: usize = AgentKind::MOVING
+                    .map(|kind| wished(kind).count())
+                    .iter()
+                    .sum();
+                n.max(config.max_agents)
+            }
+            Some(counts) => {
+                for kind in AgentKind::MOVING {
+                    let (named, asked) = (wished(kind).count(), counts.of(kind));
+                    if named > asked {
+                        return Err(GenerateError::Constraints(format!(
+                            "{named} objects of class {} are described but {asked} asked for",
+                            kind.name()
+                        )));
+                    }
+                }
+                counts.total()
+            }
+        };
+        let fixed = 3 + 2 + self.prompts.len() + self.scene.history[0].lights.len();
+        let room = world.longest_frame().saturating_sub(fixed) / 2;
+        let most = room.min(*AGENT_KEYS.end() as usize);
+        if asked > most {
+            return Err(GenerateError::TooMany { asked, most });
+        }
+        Ok(())
+    }
+
+    /// Every object that is not placed by others has some cell it could be on.
+    fn check_places(&self) -> Result<(), GenerateError> {
+        for object in self.objects.iter().filter(|object| object.id != EGO) {
+            let rules = self.rules(object.class.kind(), object, &[], &BTreeMap::new());
+            let in_row = object.behind.is_some() || object.ahead_of.is_some();
+            if !in_row && !rules.has_place() {
+                let whereabouts = object.lane.map_or("no lane".to_owned(), |lane| {
+                    format!("no point of lane {lane}")
+                });
+                return Err(GenerateError::Constraints(format!(
+                    "{whereabouts} fits the x, y and heading of \"{}\"",
+                    object.id
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// The rules of an object among those that are there.
+    pub(super) fn rules(
+        &self,
+        kind: AgentKind,
+        spec: &ObjectSpec,
+        taken: &[OrientedBox],
+        named: &BTreeMap<String, usize>,
+    ) -> Rules {
+        let is_guided = self.request.config.placement == Placement::Guided;
+        let rows = [(false, &spec.behind), (true, &spec.ahead_of)];
+        let rows = rows.into_iter().filter_map(|(is_ahead, relation)| {
+            let relation = relation.as_ref()?;
+            let other = taken[*named.get(&relation.object)?];
+            Some((is_ahead, other, relation.metres))
+        });
+        let rows: Vec<_> = rows.collect();
+        let fixed = spec.x.is_some_and(|x| x.high - x.low < 1.0)
+            && spec.y.is_some_and(|y| y.high - y.low < 1.0);
+        let of_class = || {
+            let ground = &self.grounds[&kind];
+            let guides = is_guided && rows.is_empty() && !fixed && !ground.is_closed();
+            guides.then(|| Arc::clone(ground))
+        };
+        let of_lane = spec.lane.and_then(|lane| self.lanes.get(&lane)).cloned();
+        Rules {
+            kind,
+            spec: spec.clone(),
+            ground: of_lane.or_else(of_class),
+            taken: taken.to_vec(),
+            rows,
+            comes_to: None,
+            is_guided,
+            manner: self.manner.clone(),
+        }
+    }
+
+    /// The slots of a frame up to its last agent's value, or up to the key of one more agent.
+    pub(super) fn slots(
+        &self,
+        agents: &[TokenAgent],
+        next: Option<Key>,
+    ) -> Result<Vec<PlacedSlot>, ModelError> {
+        let mut tracked = agents.to_vec();
+        tracked.extend(next.map(|key| TokenAgent {
+            key,
+            state: QuantizedState::default(),
+        }));
+        if tracked.is_empty() {
+            tracked = self.scene.history[0].tracked[..1].to_vec();
+        }
+        let frame = TokenFrame {
+            lights: self.scene.history[0].lights.clone(),
+            tracked,
+            newborn: Vec::new(),
+        };
+        let sequence = TokenSequence::new(self.prompts.clone(), vec![frame])
+            .map_err(|error| ModelError::Scene(error.to_string()))?;
+        let mut slots = place(&sequence);
+        // NEWBORN decides nothing yet, nor does the value that is still to come.
+        slots.truncate(slots.len() - 1 - usize::from(next.is_some()));
+        Ok(slots)
+    }
+
+    pub(super) fn memory(&self) -> &SceneMemory {
+        let memory = self.scene.memory.packed();
+        memory.expect("a scene of a world with an engine has the engine's memory")
+    }
+}
+
+/// The ego alone on the map, as the network will see it.
+fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<Scene, ModelError> {
+    if world.engine().is_none() {
+        let what = "scenes are generated on a CPU only, and this world is elsewhere";
+        return Err(ModelError::Scene(what.into()));
+    }
+    let start = request.ego;
+    let state = AgentState {
+        pose: start.pose,
+        velocity: start.velocity.unwrap_or_default(),
+    };
+    let id = AgentId(0);
+    let size = [start.length, start.width];
+    let mut agents = request.fixtures.clone();
+    agents.push(agent_of(id, AgentKind::Vehicle, size, state, &request.map));
+    let frame = Frame::new(agents, request.lights.clone());
+    let identities = Identities::ranked(&[&frame], id, start.pose);
+    let map = Arc::clone(&request.map);
+    Scene::of_window(world, map, None, vec![frame], id, identities)
+}
+
+/// The ground of every lane that objects are to be on.
+fn lane_grounds(request: &GenerateRequest) -> Result<BTreeMap<i64, Arc<Ground>>, GenerateError> {
+    let lanes = request.objects.iter().filter_map(ObjectSpec::lane);
+    let ground = |lane: LaneId| {
+        let ground = Ground::of_lane(&request.map, request.ego.pose, lane)
+            .ok_or_else(|| GenerateError::Constraints(format!("the map has no lane {lane}")))?;
+        if ground.is_closed() {
+            let what = format!("lane {lane} does not come within 100 m of the ego");
+            return Err(GenerateError::Constraints(what));
+        }
+        Ok((lane.0, Arc::new(ground)))
+    };
+    lanes.map(ground).collect()
+}

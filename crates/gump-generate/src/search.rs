@@ -1,0 +1,320 @@
+//! Finding a stage on which prompts can hold: where the user asked for one, or anywhere on the map.
+//!
+//! Whether the tags hold in the trial of a stage says, without any network, whether a map admits
+//! them.
+
+use gump_geometry::{Pose, angle_difference};
+use gump_metrics::tags;
+use gump_scene::{Lane, LaneKind, MapGraph, Rng, ScenarioTag, Seed};
+use rand::Rng as _;
+use rand::seq::{IndexedRandom as _, SliceRandom as _};
+
+use crate::prompt::PromptSpec;
+use crate::stage::Stage;
+use crate::{EgoStart, GenerateRequest};
+
+/// How far from where it is asked the ego may be put, metres.
+const ROAM_M: f64 = 150.0;
+/// Metres between places along a lane.
+const SPACING_M: f64 = 2.0;
+/// Trials of a place that is given.
+const TRIALS: usize = 60;
+/// Times every place of a map is tried, each time another way through the junctions ahead.
+const ROUNDS: usize = 2;
+/// The frames of a trial that may be the moment of the tags; later ones where that takes time.
+const MOMENTS: [usize; 2] = [0, 10];
+
+/// What is looked for.
+pub(crate) struct Search<'a> {
+    pub(crate) cast: &'a PromptSpec,
+    pub(crate) request: &'a GenerateRequest,
+    pub(crate) prompts: &'a [ScenarioTag],
+}
+
+impl Search<'_> {
+    /// A stage at the place the request gives, on whose lanes the ego stays as far to the side as
+    /// it is; `None` if the prompts cannot hold there.
+    pub(crate) fn here(&self, seed: Seed) -> Option<Stage> {
+        let pose = self.request.ego.pose;
+        let map: &MapGraph = &self.request.map;
+        let rng = &mut seed.rng();
+        let mut lanes = Vec::new();
+        for (lane, _) in map.lanes_near(pose.position, 3.0) {
+            let on = lane.centerline.project(pose.position);
+            let way = lane.centerline.pose_at(on.arc_length).heading;
+            if angle_difference(way, pose.heading).abs() < 0.5 {
+                lanes.push((lane, on));
+            }
+        }
+        lanes.retain(|(lane, _)| lane.kind != LaneKind::BikeLane);
+        for _ in 0..TRIALS {
+            let (lane, on) = lanes.choose(rng)?;
+            let stage = self.stage((lane, on.arc_length), on.lateral, rng);
+            if let Some(mut stage) = stage.filter(|stage| self.holds(stage)) {
+                stage.ego.pose = pose;
+                return Some(stage);
+            }
+        }
+        None
+    }
+
+    /// A stage somewhere on the map; `None` if the prompts can hold nowhere.
+    pub(crate) fn anywhere(&self, seed: Seed) -> Option<Stage> {
+        let (map, lights) = (&self.request.map, &self.request.lights);
+        let mut needs = self.cast.needs.iter();
+        if !needs.all(|need| need.is_met(map, lights)) {
+            return None;
+        }
+        let lanes = lanes_around(&self.request.map, self.request.ego.pose);
+        let mut places: Vec<(&Lane, f64)> = lanes
+            .into_iter()
+            .flat_map(|lane| {
+                let n = (lane.centerline.length() / SPACING_M).ceil() as usize;
+                (0..n).map(move |i| (lane, i as f64 * SPACING_M))
+            })
+            .collect();
+        let rng = &mut seed.rng();
+        for _ in 0..ROUNDS {
+            places.shuffle(rng);
+            for &(lane, at) in &places {
+                let at = at + rng.random_range(0.0..SPACING_M);
+                let at = at.min(lane.centerline.length());
+                let stage = self.stage((lane, at), 0.0, rng);
+                if let Some(stage) = stage.filter(|stage| self.holds(stage)) {
+                    return Some(stage);
+                }
+            }
+        }
+        None
+    }
+
+    fn stage(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Stage> {
+        Stage::set(self.cast, self.request, place, offset, rng)
+    }
+
+    /// Whether all tags hold at one moment of the trial.
+    fn holds(&self, stage: &Stage) -> bool {
+        if self.prompts.is_empty() {
+            return true;
+        }
+        let mut trial = stage.trial(self.request);
+        let moments = if stage.takes_time() {
+            &MOMENTS[..]
+        } else {
+            &MOMENTS[..1]
+        };
+        moments.iter().any(|&now| {
+            trial.now = now;
+            let mut tags = self.prompts.iter();
+            tags.all(|tag| tags::holds(*tag, &trial) != Some(false))
+        })
+    }
+}
+
+/// A start on any lane around one, any place as likely as any other; that one if there is no lane.
+pub(crate) fn any_start(map: &MapGraph, around: EgoStart, seed: Seed) -> EgoStart {
+    let lanes = lanes_around(map, around.pose);
+    let total: f64 = lanes.iter().map(|lane| lane.centerline.length()).sum();
+    let mut along = seed.rng().random::<f64>() * total;
+    for lane in lanes {
+        if along < lane.centerline.length() {
+            let pose = lane.centerline.pose_at(along);
+            return EgoStart { pose, ..around };
+        }
+        along -= lane.centerline.length();
+    }
+    around
+}
+
+/// Lanes that vehicles drive on, around a pose.
+fn lanes_around(map: &MapGraph, pose: Pose) -> Vec<&Lane> {
+    let mut lanes: Vec<&Lane> = map
+        .lanes_near(pose.position, ROAM_M)
+        .map(|(lane, _)| lane)
+        .filter(|lane| lane.kind != LaneKind::BikeLane && lane.centerline.length() > 1.0)
+        .collect();
+    lanes.sort_by_key(|lane| lane.id);
+    lanes
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use gump_engine::placement::object_spec::{Bounds, ObjectSpec, Relation};
+    use gump_geometry::DVec2;
+    use gump_scene::{LaneId, MapParts, StopSign, fixture};
+
+    use super::*;
+    use crate::GenerateConfig;
+    use crate::constraint::EGO;
+
+    /// Two lanes that lead to a junction, straight on or to the left, one of which is narrow.
+    const JUNCTION: &str = "lane 1: -120,0 0,0 next 3,4 left 2
+        lane 2: -120,3.5 0,3.5 width 2.6 right 1
+        lane 3: 0,0 20,0 next 5
+        lane 4: 0,0 8,2 14,8 16,16 16,20 next 6
+        lane 5: 20,0 140,0
+        lane 6: 16,20 16,140
+        lane 7: 12,-80 12,60
+        drivable: -120,-2 140,-2 140,6 -120,6
+        ego vehicle 0: -60,0 velocity 5,0";
+
+    fn request(text: &str, change: impl Fn(&mut MapParts)) -> GenerateRequest {
+        let scenario = fixture::scenario(&format!("{JUNCTION}\n{text}")).unwrap();
+        let mut parts = scenario.map.parts().clone();
+        for lane in &mut parts.lanes {
+            lane.in_intersection = matches!(lane.id.0, 3 | 4);
+        }
+        change(&mut parts);
+        GenerateRequest {
+            map: Arc::new(MapGraph::new(parts).unwrap()),
+            ego: EgoStart {
+                pose: Pose::new(-60.0, 0.0, 0.0),
+                length: 4.8,
+                width: 2.0,
+                velocity: None,
+            },
+            lights: scenario.present().now().lights().to_vec(),
+            fixtures: Vec::new(),
+            prompts: Vec::new(),
+            counts: None,
+            objects: Vec::new(),
+            config: GenerateConfig::default(),
+        }
+    }
+
+    fn found(request: &GenerateRequest, tags: &[&str]) -> Option<Stage> {
+        let prompts: Vec<ScenarioTag> = tags.iter().map(|tag| tag.parse().unwrap()).collect();
+        let search = Search {
+            cast: &PromptSpec::of(&prompts),
+            request,
+            prompts: &prompts,
+        };
+        search.anywhere(Seed(3))
+    }
+
+    #[test]
+    fn a_map_admits_what_it_has_a_place_for() {
+        let plain = request("", |_| ());
+        for tag in [
+            "starting_left_turn",
+            "starting_unprotected_cross_turn",
+            "starting_straight_stop_sign_intersection_traversal",
+            "changing_lane_to_left",
+            "changing_lane_with_trail",
+            "crossed_by_vehicle",
+            "crossed_by_bike",
+            "near_trafficcone_on_driveable",
+            "high_magnitude_jerk",
+            "high_lateral_acceleration",
+            "traversing_narrow_lane",
+            "following_lane_with_lead",
+        ] {
+            let is_about_signs = tag.contains("stop_sign");
+            assert_eq!(found(&plain, &[tag]).is_some(), !is_about_signs, "{tag}");
+        }
+        for tag in [
+            "starting_right_turn",
+            "starting_u_turn",
+            "accelerating_at_stop_sign",
+            "stationary_at_crosswalk",
+            "waiting_for_pedestrian_to_cross",
+            "stationary_at_traffic_light_without_lead",
+            "on_carpark",
+            "on_all_way_stop_intersection",
+        ] {
+            assert!(found(&plain, &[tag]).is_none(), "{tag}");
+        }
+    }
+
+    #[test]
+    fn what_the_map_has_more_is_used() {
+        let signed = request("crosswalk: 1,-3 4,-3 4,6 1,6", |parts| {
+            parts.stop_signs = vec![StopSign {
+                id: 900,
+                position: gump_geometry::dvec3(-1.0, -3.0, 2.0),
+                lanes: vec![LaneId(1)],
+            }];
+        });
+        for tag in [
+            "accelerating_at_stop_sign",
+            "stopping_at_stop_sign_without_lead",
+            "starting_straight_stop_sign_intersection_traversal",
+            "stationary_at_crosswalk",
+            "near_pedestrian_on_crosswalk_with_ego",
+        ] {
+            assert!(found(&signed, &[tag]).is_some(), "{tag}");
+        }
+        // The crosswalk is nearer than the tag allows.
+        let without = "accelerating_at_stop_sign_no_crosswalk";
+        assert!(found(&signed, &[without]).is_none());
+        let waits = found(&signed, &["waiting_for_pedestrian_to_cross"]).unwrap();
+        let person = waits.objects.last().unwrap();
+        let ahead = person.x.unwrap().low + 0.25 - waits.ego.length / 2.0;
+        assert!((1.0..6.5).contains(&ahead), "{ahead}");
+        let place = waits.ego.pose * DVec2::new(person.x.unwrap().low + 0.25, 0.0);
+        assert!((1.0..4.0).contains(&place.x), "{place}");
+    }
+
+    #[test]
+    fn drives_keep_to_red_lights() {
+        let red = request("light 3 red: -1,0\nlight 4 green: -1,0", |_| ());
+        assert!(found(&red, &["starting_protected_cross_turn"]).is_some());
+        let straight = "starting_straight_traffic_light_intersection_traversal";
+        assert!(found(&red, &[straight]).is_none());
+        let waits = found(&red, &["stationary_at_traffic_light_without_lead"]).unwrap();
+        assert_eq!(waits.ego.velocity.unwrap().length(), 0.0);
+    }
+
+    #[test]
+    fn the_place_asked_for_is_taken_if_it_will_do() {
+        let request = request("", |_| ());
+        let here = |tag: &str| {
+            let prompts = [tag.parse().unwrap()];
+            let search = Search {
+                cast: &PromptSpec::of(&prompts),
+                request: &request,
+                prompts: &prompts,
+            };
+            search.here(Seed(1))
+        };
+        let stage = here("following_lane_with_lead").unwrap();
+        let directed = stage.direct(&request);
+        assert_eq!(directed.ego.pose, request.ego.pose);
+        assert!((4.5..9.0).contains(&directed.ego.velocity.unwrap().length()));
+        assert_eq!(directed.objects.len(), 1);
+        assert!(here("starting_left_turn").is_none());
+    }
+
+    #[test]
+    fn the_user_has_the_last_word() {
+        let mut request = request("", |_| ());
+        request.objects = vec![
+            ObjectSpec {
+                id: EGO.into(),
+                speed: Some(Bounds::new(5.0, 5.5)),
+                ..ObjectSpec::default()
+            },
+            ObjectSpec {
+                id: "truck".into(),
+                length: Some(Bounds::new(12.0, 12.0)),
+                ahead_of: Some(Relation {
+                    object: EGO.into(),
+                    metres: 6.0,
+                }),
+                ..ObjectSpec::default()
+            },
+        ];
+        let stage = found(&request, &["starting_left_turn"]).unwrap();
+        let speed = stage.ego.velocity.unwrap().length();
+        assert!((5.0..=5.5).contains(&speed), "{speed}");
+        // The truck is the lead that is asked for, and nobody else is put there.
+        let stage = found(&request, &["behind_long_vehicle"]).unwrap();
+        assert_eq!(stage.objects.len(), 2);
+        assert!(found(&request, &["following_lane_without_lead"]).is_none());
+        request.ego.velocity = Some(DVec2::new(8.0, 0.0));
+        let stage = found(&request, &["medium_magnitude_speed"]).unwrap();
+        assert_eq!(stage.ego.velocity, request.ego.velocity);
+    }
+}

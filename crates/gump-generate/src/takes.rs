@@ -1,0 +1,181 @@
+//! Futures of a scene, imagined several times over, and the moment at which one is what was asked
+//! for: a tag is about an instant, so the present of a scenario may be any.
+
+use gump_engine::TransformerWorld;
+use gump_model::ModelError;
+use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_scene::{Rollout, Scenario, Seed};
+
+use crate::drive::{Drive, Steered};
+
+/// Futures imagined of a scene, after one that often will do.
+pub(super) const FUTURES: usize = 4;
+/// What tags say of the future is known from so many seconds of it.
+pub(super) const JUDGED_S: f64 = 4.0;
+/// The moment is found in so many seconds from the scene that was made.
+const MOMENTS_S: f64 = 2.0;
+/// Seconds before the moment that are kept, as long as recorded histories are.
+const HISTORY_S: f64 = 1.0;
+
+/// Some futures in which the world drives everybody, the ego too.
+pub(super) fn free(
+    world: &TransformerWorld,
+    scene: &Scenario,
+    n_futures: usize,
+    seed: Seed,
+) -> Result<Vec<Scenario>, ModelError> {
+    let start = Start {
+        scene: scene.present(),
+        n_futures,
+        seed,
+    };
+    let rollouts = imagine(world, &[start], None, JUDGED_S + MOMENTS_S)?;
+    Ok(rollouts.iter().map(|r| with_future(scene, r)).collect())
+}
+
+/// Some futures in which the ego is driven at first, and then by the world; those in which it
+/// meets with nobody.
+pub(super) fn steered(
+    world: &TransformerWorld,
+    scene: &Scenario,
+    drive: &Drive,
+    seed: Seed,
+) -> Result<Vec<Scenario>, ModelError> {
+    let start = Start {
+        scene: scene.present(),
+        n_futures: FUTURES,
+        seed: seed.fork(0),
+    };
+    let rollouts = imagine(world, &[start], Some(drive), drive.seconds())?;
+    let mut takes: Vec<Scenario> = rollouts.iter().map(|r| with_future(scene, r)).collect();
+    takes.retain(|take| !meets_somebody(take));
+    let starts = takes.iter().zip(1..).map(|(take, i)| Start {
+        scene: take.at(take.log.len() - 1),
+        n_futures: 1,
+        seed: seed.fork(i),
+    });
+    let starts: Vec<Start<'_>> = starts.collect();
+    if starts.is_empty() {
+        return Ok(Vec::new());
+    }
+    let rest = JUDGED_S + MOMENTS_S - drive.seconds();
+    let rollouts = imagine(world, &starts, None, rest)?;
+    let takes = takes.iter().zip(&rollouts);
+    Ok(takes
+        .map(|(take, rollout)| with_future(take, rollout))
+        .collect())
+}
+
+/// The first moment of any of these futures at which `holds` says so, as the present of that
+/// future, and in seconds from the scene; of two at once the first counts.
+pub(super) fn moment(
+    mut takes: Vec<Scenario>,
+    holds: impl Fn(&Scenario) -> bool,
+) -> Option<(Scenario, f64)> {
+    let dt = takes.first()?.dt;
+    let steps = |seconds: f64| (seconds / dt).round() as usize;
+    let found = (0..=steps(MOMENTS_S)).find_map(|now| {
+        takes.iter_mut().position(|take| {
+            take.now = now;
+            holds(take)
+        })
+    })?;
+    let mut take = takes.swap_remove(found);
+    let seconds = take.now as f64 * dt;
+    let cut = take.now.saturating_sub(steps(HISTORY_S));
+    take.log.drain(..cut);
+    take.now -= cut;
+    Some((take, seconds))
+}
+
+/// Imagines on until there are so many seconds after the present.
+pub(super) fn extend(
+    world: &TransformerWorld,
+    scenario: &mut Scenario,
+    seconds: f64,
+    seed: Seed,
+) -> Result<(), ModelError> {
+    let wanted = (seconds / scenario.dt).round() as usize;
+    let missing = wanted.saturating_sub(scenario.future().len());
+    if missing == 0 {
+        return Ok(());
+    }
+    let start = Start {
+        scene: scenario.at(scenario.log.len() - 1),
+        n_futures: 1,
+        seed,
+    };
+    let rollouts = imagine(world, &[start], None, missing as f64 * scenario.dt)?;
+    let future = rollouts.first().map_or(&[][..], Rollout::imagined);
+    scenario.log.extend_from_slice(future);
+    Ok(())
+}
+
+fn imagine(
+    world: &TransformerWorld,
+    starts: &[Start<'_>],
+    drive: Option<&Drive>,
+    seconds: f64,
+) -> Result<Vec<Rollout>, ModelError> {
+    let config = SimulateConfig {
+        seconds,
+        ..SimulateConfig::default()
+    };
+    let result = match drive {
+        Some(drive) => simulate(world, starts, Some(&mut Steered::new(drive)), &config),
+        None => simulate(world, starts, None, &config),
+    };
+    result.map_err(|error| ModelError::Scene(error.to_string()))
+}
+
+fn with_future(scene: &Scenario, rollout: &Rollout) -> Scenario {
+    let mut take = scene.clone();
+    take.log.extend_from_slice(rollout.imagined());
+    take
+}
+
+/// True if the ego's box overlaps another in some frame.
+fn meets_somebody(take: &Scenario) -> bool {
+    take.log.iter().any(|frame| {
+        let ego = frame.agent(take.ego);
+        ego.is_some_and(|ego| gump_metrics::overlapping(frame, ego).next().is_some())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::fixture;
+
+    use super::*;
+
+    /// Ten seconds at 2 m/s from x.
+    fn take(x: f64) -> Scenario {
+        let text = format!("ego vehicle 0: {x},0 velocity 2,0\nhistory 0 future 10 dt 0.1");
+        fixture::scenario(&text).unwrap()
+    }
+
+    fn beyond(x: f64) -> impl Fn(&Scenario) -> bool {
+        move |take| take.present().ego_now().state.pose.position.x > x
+    }
+
+    #[test]
+    fn the_earliest_moment_of_any_future_is_the_present() {
+        let (found, seconds) = moment(vec![take(0.0), take(1.0)], beyond(3.1)).unwrap();
+        assert!((seconds - 1.1).abs() < 1e-9, "{seconds}");
+        // The second is there after 1.1 s, of which one is kept.
+        assert_eq!((found.now, found.log.len()), (10, 100));
+        let x = found.present().ego_now().state.pose.position.x;
+        assert!((x - 3.2).abs() < 1e-9, "{x}");
+        assert!(moment(vec![take(0.0)], beyond(4.1)).is_none());
+        assert!(moment(Vec::new(), beyond(0.0)).is_none());
+    }
+
+    #[test]
+    fn somebody_in_the_way_is_met() {
+        let scene = |y: f64| {
+            let text = format!("ego vehicle 0: 0,0 velocity 2,0\nagent vehicle 1: 12,{y}");
+            fixture::scenario(&text).unwrap()
+        };
+        assert!(meets_somebody(&scene(0.0)) && !meets_somebody(&scene(5.0)));
+    }
+}

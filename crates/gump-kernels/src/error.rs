@@ -1,0 +1,6 @@
+//! What can go wrong in this crate.
+
+/// A kernel that this processor does not have, or that multiplies wrongly.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct KernelError(pub(crate) String);

@@ -1,0 +1,260 @@
+//! Which kernels a processor has, and which of them works: the best one that multiplies a small
+//! matrix rightly, or the one asked for.
+
+use std::fmt;
+use std::sync::OnceLock;
+
+use serde::Serialize;
+
+#[cfg(target_arch = "x86_64")]
+use super::amx::Amx;
+#[cfg(target_arch = "x86_64")]
+use super::avx2::Avx2;
+#[cfg(target_arch = "x86_64")]
+use super::avx512::Avx512;
+#[cfg(target_arch = "x86_64")]
+use super::avx512_bf16::Avx512Bf16;
+#[cfg(target_arch = "x86_64")]
+use super::bf16;
+#[cfg(target_arch = "x86_64")]
+use super::{portable, rounded};
+use crate::KernelError;
+#[cfg(target_arch = "x86_64")]
+use crate::gemm::{Mat, MatMut, Store, Threads};
+#[cfg(target_arch = "x86_64")]
+use crate::panels::PANEL;
+
+/// A set of instructions that matrices are multiplied with. A later one includes the earlier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Kernel {
+    /// No more than every processor has.
+    Portable,
+    /// Vectors of 256 bits with fused multiply-adds.
+    Avx2,
+    /// Vectors of 512 bits; sums of products of bytes where the processor has them.
+    Avx512,
+    /// The same, and products of pairs of bfloat16.
+    Avx512Bf16,
+    /// The same, and products of tiles of bfloat16 and of bytes.
+    Amx,
+}
+
+impl Kernel {
+    /// All of them, the best first.
+    pub const ALL: [Self; 5] = [
+        Self::Amx,
+        Self::Avx512Bf16,
+        Self::Avx512,
+        Self::Avx2,
+        Self::Portable,
+    ];
+
+    /// How it is written: `avx512-bf16`, say.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Portable => "portable",
+            Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
+            Self::Avx512Bf16 => "avx512-bf16",
+            Self::Amx => "amx",
+        }
+    }
+
+    /// The kernel of this name.
+    ///
+    /// # Errors
+    /// [`KernelError`] that lists the names.
+    pub fn named(name: &str) -> Result<Self, KernelError> {
+        let found = Self::ALL.into_iter().find(|kernel| kernel.name() == name);
+        found.ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            KernelError(format!(
+                "no kernel is called {name}, expected one of {known}"
+            ))
+        })
+    }
+
+    /// Whether this processor has the instructions, and its system lets them be used.
+    pub fn is_present(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        match self {
+            Self::Portable => true,
+            Self::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            Self::Avx512 => {
+                Self::Avx2.is_present()
+                    && is_x86_feature_detected!("avx512f")
+                    && is_x86_feature_detected!("avx512bw")
+                    && is_x86_feature_detected!("avx512dq")
+                    && is_x86_feature_detected!("avx512vl")
+            }
+            Self::Avx512Bf16 => Self::Avx512.is_present() && Avx512Bf16::detect().is_some(),
+            Self::Amx => Self::Avx512Bf16.is_present() && Amx::detect().is_some(),
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        {
+            self == Self::Portable
+        }
+    }
+
+    /// Whether it multiplies a small matrix of odd sizes as rounding says it should.
+    fn is_right(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let wide = || {
+                Avx512::detect()
+                    .is_some_and(|v| are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p)))
+            };
+            match self {
+                Self::Portable => true,
+                Self::Avx2 => Avx2::detect().is_some_and(|v| {
+                    are_tiles_right(|r, b| v.tile(r, b), |r, p| v.byte_tile(r, p))
+                }),
+                Self::Avx512 => wide(),
+                Self::Avx512Bf16 => wide() && Avx512Bf16::detect().is_some_and(is_unit_right),
+                Self::Amx => {
+                    wide()
+                        && Amx::detect()
+                            .is_some_and(|unit| is_unit_right(unit) && are_bytes_right(unit))
+                }
+            }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        true
+    }
+}
+
+impl fmt::Display for Kernel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// The kernel that a process multiplies with, and how it came to be chosen.
+#[derive(Clone, Debug, Serialize)]
+pub struct Choice {
+    /// What multiplies.
+    pub kernel: Kernel,
+    /// Whether somebody asked for it.
+    pub forced: bool,
+    /// Kernels that the processor has and that failed their test.
+    pub wrong: Vec<Kernel>,
+}
+
+/// Made once: a process whose kernel changed midway would contradict itself.
+static MADE: OnceLock<Choice> = OnceLock::new();
+
+impl Choice {
+    /// The choice of this process: by then made, or made now.
+    pub fn made() -> &'static Self {
+        MADE.get_or_init(Self::best)
+    }
+
+    /// Lets this process multiply with a certain kernel. To be said before the first product.
+    ///
+    /// # Errors
+    /// [`KernelError`] if the processor does not have it, if it fails its test, or if
+    /// another one has been at work.
+    pub fn force(kernel: Kernel) -> Result<&'static Self, KernelError> {
+        let best = Self::best();
+        let refuse = |why: String| Err(KernelError(why));
+        if !kernel.is_present() {
+            let best = best.kernel;
+            return refuse(format!(
+                "this processor has no kernel {kernel}, its best is {best}"
+            ));
+        }
+        if !kernel.is_right() {
+            return refuse(format!(
+                "kernel {kernel} multiplies wrongly on this processor"
+            ));
+        }
+        let forced = Self {
+            kernel,
+            forced: true,
+            wrong: best.wrong,
+        };
+        let made = MADE.get_or_init(|| forced);
+        if made.kernel != kernel {
+            let other = made.kernel;
+            return refuse(format!(
+                "kernel {kernel} comes too late, {other} is at work"
+            ));
+        }
+        Ok(made)
+    }
+
+    fn best() -> Self {
+        let (mut kernel, mut wrong) = (Kernel::Portable, Vec::new());
+        for candidate in Kernel::ALL {
+            if candidate.is_present() {
+                if candidate.is_right() {
+                    kernel = candidate;
+                    break;
+                }
+                wrong.push(candidate);
+            }
+        }
+        Self {
+            kernel,
+            forced: false,
+            wrong,
+        }
+    }
+}
+
+/// Whether a unit's product of odd sizes is that of rounded numbers, in f64, but for the rounding
+/// of sums in f32.
+#[cfg(target_arch = "x86_64")]
+pub(super) fn is_unit_right<U: bf16::Unit>(unit: U) -> bool {
+    let (m, k, n) = (19, 37, 45);
+    let number = |i: usize| i as f32 / 507.0 - 1.0;
+    let (a, b) = (numbers(m * k, number), numbers(k * n, number));
+    let mut found = vec![0.0; m * n];
+    let (lhs, rhs) = (Mat::new(&a, m, k), Mat::new(&b, k, n));
+    let dst = MatMut::new(&mut found, m, n);
+    bf16::product(unit, dst, Store::Replace, 1.0, (lhs, rhs), Threads::One);
+    (0..m * n).all(|at| {
+        let (i, j) = (at / n, at % n);
+        let term = |p: usize| {
+            f64::from(rounded::round(a[i * k + p])) * f64::from(rounded::round(b[p * n + j]))
+        };
+        let sum: f64 = (0..k).map(term).sum();
+        (f64::from(found[at]) - sum).abs() < 1e-5 * k as f64
+    })
+}
+
+/// Numbers to multiply: of every size, the same everywhere.
+#[cfg(target_arch = "x86_64")]
+fn numbers<T>(n: usize, number: impl Fn(usize) -> T) -> Vec<T> {
+    (0..n).map(|i| number(i * 7919 % 1013)).collect()
+}
+
+/// Whether sums of products, of numbers and of bytes, are those of the portable kernel to the bit.
+#[cfg(target_arch = "x86_64")]
+fn are_tiles_right(
+    tile: impl Fn([&[f32]; 3], std::iter::Once<&[f32]>) -> [[f32; PANEL]; 3],
+    byte_tile: impl Fn([&[u8]; 3], &[i8]) -> [[i32; PANEL]; 3],
+) -> bool {
+    const DEPTH: usize = 20;
+    let a = numbers(3 * DEPTH, |i| i as f32 / 507.0 - 1.0);
+    let b = numbers(DEPTH * PANEL, |i| i as f32 / 507.0 - 1.0);
+    let rows = std::array::from_fn(|r| &a[r * DEPTH..][..DEPTH]);
+    let blocks = || std::iter::once(&b[..]);
+    let bytes = numbers(3 * DEPTH, |i| i as u8);
+    let panel = numbers(DEPTH * PANEL, |i| i as i8);
+    let byte_rows = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
+    tile(rows, blocks()) == portable::tile(rows, blocks())
+        && byte_tile(byte_rows, &panel) == portable::byte_tile(byte_rows, &panel)
+}
+
+/// Whether tiles of bytes sum exactly.
+#[cfg(target_arch = "x86_64")]
+fn are_bytes_right(unit: Amx) -> bool {
+    const DEPTH: usize = 128;
+    let bytes = numbers(16 * DEPTH, |i| i as u8);
+    let panel = numbers(DEPTH * PANEL, |i| i as i8);
+    let rows: [&[u8]; 16] = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
+    let (sums, done) = super::amx::byte_tile(unit, &bytes, &panel);
+    done == DEPTH && sums == portable::byte_tile(rows, &panel)
+}

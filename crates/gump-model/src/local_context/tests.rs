@@ -1,0 +1,158 @@
+//! What objects of small hand-made scenes see.
+
+use gump_geometry::dvec2;
+use gump_scene::{Scenario, fixture};
+
+use super::*;
+use crate::testing::{scenario, slots};
+
+fn seen(scenario: &Scenario) -> Vec<(usize, LocalContext)> {
+    let survey = Survey::new(&scenario.map, scenario.present().ego_now().state.pose);
+    encode_local_context(&survey, &slots(scenario), 0)
+}
+
+/// The part of the first path in what the ego sees last.
+fn ego_path(scenario: &Scenario) -> Vec<f32> {
+    let slots = slots(scenario);
+    let is_ego = |i: usize| matches!(slots[i].slot, Slot::Key(key) if key.is_ego());
+    let last = seen(scenario).into_iter().rfind(|(i, _)| is_ego(*i));
+    last.expect("the ego is in every frame").1[OWN_NUMBERS..][..PATH_NUMBERS].to_vec()
+}
+
+#[test]
+fn the_first_frame_sees_nothing_and_later_ones_the_frame_before() {
+    let (scenario, slots) = (scenario(), slots(&scenario()));
+    let keys = slots
+        .iter()
+        .filter(|p| matches!(p.slot, Slot::Key(_)) && p.last.is_some());
+    let seen = seen(&scenario);
+    assert_eq!(seen.len(), keys.count());
+    assert!(seen.iter().all(|(i, _)| slots[*i].frame > 0));
+    // Looking from later on gives the same numbers.
+    let survey = Survey::new(&scenario.map, scenario.present().ego_now().state.pose);
+    let from = seen[seen.len() / 2].0;
+    assert_eq!(
+        encode_local_context(&survey, &slots, from),
+        seen[seen.len() / 2..]
+    );
+}
+
+#[test]
+fn a_straight_lane_lies_straight_ahead_with_who_drives_on_it() {
+    let path = ego_path(&scenario());
+    assert_eq!(path[0], 1.0);
+    // 44 m on: as far ahead as the last point but the two metres the point abeam may be off.
+    let last = &path[1 + 4 * 6..][..4];
+    assert!(
+        (last[0] - 2.2).abs() < 0.11 && last[1].abs() < 0.05,
+        "{last:?}"
+    );
+    assert!((last[2] - 1.0).abs() < 1e-3);
+    // The lane's limit of 15 m/s, and the vehicle 20 m ahead at 5 m/s.
+    assert_eq!(path[29], 1.0);
+    let ahead = &path[36..];
+    assert!(ahead[0] > 0.5 && (ahead[2] - 0.5).abs() < 0.05, "{ahead:?}");
+}
+
+#[test]
+fn turning_and_moving_the_scene_changes_what_is_seen_by_no_more_than_rounding() {
+    let straight = "lane 1: -100,0 100,0
+         edge: -100,-2 100,-2
+         ego vehicle 0: 0,0 velocity 8,0
+         agent vehicle 1: 20,0 velocity 5,0";
+    let turned = "lane 1: 0,-100 0,100
+         edge: 2,-100 2,100
+         ego vehicle 0: 0,0 heading 1.5707963 velocity 0,8
+         agent vehicle 1: 0,20 heading 1.5707963 velocity 0,5";
+    let (a, b) = [straight, turned]
+        .map(|text| ego_path(&fixture::scenario(text).unwrap()))
+        .into();
+    let off = a
+        .iter()
+        .zip(&b)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f32::max);
+    assert!(off < 0.02, "{off}");
+}
+
+#[test]
+fn a_fork_shows_both_branches_from_left_to_right() {
+    let fork = fixture::scenario(
+        "lane 1: -50,0 10,0 next 2,3
+         lane 2: 10,0 30,0 50,20
+         lane 3: 10,0 30,0 50,-20
+         ego vehicle 0: 0,0 velocity 8,0",
+    )
+    .unwrap();
+    let survey = Survey::new(&fork.map, Pose::default());
+    let ends: Vec<f64> = survey
+        .paths(Pose::default())
+        .iter()
+        .map(|path| survey.point(*path.last().expect("points")).pose.position.y)
+        .collect();
+    assert_eq!(ends.len(), 2);
+    assert!(ends[0] > 5.0 && ends[1] < -5.0, "{ends:?}");
+}
+
+#[test]
+fn points_are_found_where_they_are() {
+    let scenario = scenario();
+    let survey = Survey::new(&scenario.map, Pose::default());
+    let near = survey
+        .edges_near(dvec2(0.0, 0.0), 10.0)
+        .filter(|edge| edge.from.length() < 10.0)
+        .count();
+    // The edge passes two metres to the right.
+    assert!((12..=15).contains(&near), "{near}");
+    assert_eq!(survey.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
+}
+
+/// Everything the ego sees last.
+fn ego_sees(scenario: &Scenario) -> LocalContext {
+    let slots = slots(scenario);
+    let is_ego = |i: usize| matches!(slots[i].slot, Slot::Key(key) if key.is_ego());
+    let last = seen(scenario).into_iter().rfind(|(i, _)| is_ego(*i));
+    last.expect("the ego is in every frame").1
+}
+
+#[test]
+fn an_unknown_limit_is_a_mark_and_no_zero() {
+    let text = |speed: &str| {
+        format!(
+            "lane 1: -100,0 100,0 {speed}
+             ego vehicle 0: 0,0 velocity 8,0
+             agent vehicle 1: 20,0 velocity 5,0"
+        )
+    };
+    let known = ego_sees(&fixture::scenario(&text("speed 13.4")).unwrap());
+    let unknown = ego_sees(&fixture::scenario(&text("")).unwrap());
+    // Without marks a limit that nobody states is a usual one.
+    assert_eq!(known[..N_PLAIN], unknown[..N_PLAIN]);
+    let marks = |seen: LocalContext| seen[N_PLAIN..N_PLAIN + N_PATHS].to_vec();
+    assert_eq!(marks(known), [0.0; N_PATHS]);
+    assert_eq!(marks(unknown), [1.0, 0.0, 0.0], "there is one path");
+}
+
+#[test]
+fn what_the_source_has_no_word_for_is_marked() {
+    let mut scenario = scenario();
+    let rest = |scenario: &Scenario| ego_sees(scenario)[N_PLAIN + N_PATHS..].to_vec();
+    assert_eq!(rest(&scenario), [0.0; N_MARKS - N_PATHS]);
+    let mut parts = scenario.map.parts().clone();
+    parts.unstated.lights = true;
+    scenario.map = std::sync::Arc::new(gump_scene::MapGraph::new(parts).unwrap());
+    // The first neighbour is said to be of the usual size, by whoever could not measure it.
+    for frame in &mut scenario.log {
+        let agents = frame.agents().iter().map(|agent| {
+            let mut agent = *agent;
+            if agent.id.0 == 4 {
+                [agent.length, agent.width, _] = agent.kind.usual_size();
+            }
+            agent
+        });
+        *frame = gump_scene::Frame::new(agents.collect(), frame.lights().to_vec());
+    }
+    let mut expected = [0.0; N_MARKS - N_PATHS];
+    (expected[1], expected[3]) = (1.0, 1.0);
+    assert_eq!(rest(&scenario), expected);
+}

@@ -1,0 +1,53 @@
+//! The shape of the relative network.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// The shape of the network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RelativeConfig {
+    /// Model width, the `C` of every shape.
+    pub width: usize,
+    /// Layers of attention along edges.
+    pub layers: usize,
+    /// Attention heads; must divide the width.
+    pub heads: usize,
+    /// Features of an edge that attention sees.
+    pub edge_width: usize,
+    /// Width of the layer that makes them.
+    pub edge_hidden: usize,
+}
+
+impl Default for RelativeConfig {
+    fn default() -> Self {
+        Self {
+            width: 128,
+            layers: 4,
+            heads: 4,
+            edge_width: 32,
+            edge_hidden: 48,
+        }
+    }
+}
+
+impl RelativeConfig {
+    /// Checks that the numbers fit together.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming the first contradiction.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        let fail = |what: String| Err(ModelError::Config(what));
+        if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
+            return fail(format!(
+                "width {} is not a multiple of {} heads",
+                self.width, self.heads
+            ));
+        }
+        if self.layers == 0 || self.edge_width == 0 || self.edge_hidden == 0 {
+            return fail("layers, edge_width and edge_hidden must be at least 1".into());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,80 @@
+//! Relative networks on disk.
+
+use std::path::Path;
+
+use candle_core::Device;
+use gump_nn::Parameters;
+
+use super::{RelativeConfig, RelativeNetwork};
+use crate::ModelError;
+use crate::checkpoint::{self, Precision};
+
+/// Header entry that tells the two architectures apart.
+const ARCHITECTURE: (&str, &str) = ("architecture", "relative");
+
+/// Writes a network.
+///
+/// # Errors
+/// [`ModelError::Io`] with the path; the previous file, if any, is intact.
+pub fn save(
+    network: &RelativeNetwork,
+    path: &Path,
+    precision: Precision,
+) -> Result<(), ModelError> {
+    let all = network.parameters().all();
+    let tensors = all.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
+    checkpoint::write(
+        path,
+        tensors.collect(),
+        header(network.config())?,
+        precision,
+    )
+}
+
+/// Reads a network.
+///
+/// # Errors
+/// A file that cannot be read, is no checkpoint, or holds another kind of network.
+pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError> {
+    let archive = checkpoint::read(path)?;
+    let config = config(&archive)?;
+    let weights = archive.tensors.into_iter();
+    let weights = weights.filter(|(name, _)| !name.starts_with(checkpoint::OPTIMIZER));
+    let tensors = weights.filter(|(name, _)| {
+        !name.starts_with(checkpoint::TRAINED) && !name.starts_with(checkpoint::DRIVER)
+    });
+    RelativeNetwork::build(config, Parameters::loaded(tensors.collect(), device))
+}
+
+/// Whether a file of weights holds a network of this kind.
+///
+/// # Errors
+/// A file that cannot be read or is no checkpoint.
+pub fn is_relative(path: &Path) -> Result<bool, ModelError> {
+    let archive = checkpoint::read(path)?;
+    Ok(archive.metadata.get(ARCHITECTURE.0).map(String::as_str) == Some(ARCHITECTURE.1))
+}
+
+/// Header entries of a file that holds a network of this shape.
+///
+/// # Errors
+/// A shape that cannot be written as JSON.
+pub fn header(
+    config: &RelativeConfig,
+) -> Result<std::collections::BTreeMap<String, String>, ModelError> {
+    let mut header = checkpoint::header(&crate::ModelConfig::tiny())?;
+    let config = serde_json::to_string(config).map_err(|e| ModelError::Config(e.to_string()))?;
+    header.insert("config".into(), config);
+    header.insert(ARCHITECTURE.0.into(), ARCHITECTURE.1.into());
+    Ok(header)
+}
+
+/// The shape of the network that a file holds.
+///
+/// # Errors
+/// A file without one, or with another kind of network.
+pub fn config(archive: &checkpoint::Archive) -> Result<RelativeConfig, ModelError> {
+    let text = archive.entry("config")?;
+    serde_json::from_str(text)
+        .map_err(|error| archive.error(format!("its configuration is not valid ({error})")))
+}

@@ -1,0 +1,15 @@
+//! The steps of time in which the networks see and speak.
+
+/// Seconds between token frames.
+pub const TOKEN_DT: f64 = 0.5;
+
+/// Frames of history a rollout starts from (paper: 3).
+pub const HISTORY: usize = 3;
+
+/// Frames a rollout may be away from its frame of reference: 8 s.
+pub const LONGEST_ROLLOUT: usize = 16;
+
+/// Log frames per token frame, for a log of steps of `dt` seconds.
+pub fn stride_of(dt: f64) -> usize {
+    (TOKEN_DT / dt).round().max(1.0) as usize
+}

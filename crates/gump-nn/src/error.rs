@@ -1,0 +1,28 @@
+//! What can go wrong in this crate.
+
+/// An error of parameters, of the optimizer's configuration, or of the tensor library below.
+#[derive(Debug, thiserror::Error)]
+pub enum NnError {
+    /// The tensor library failed.
+    #[error("tensor operation failed: {0}")]
+    Tensor(#[from] candle_core::Error),
+    /// A configuration contradicts itself.
+    #[error("configuration: {0}")]
+    Config(String),
+    /// The tensors that parameters are loaded from lack one.
+    #[error("tensor \"{name}\" is missing")]
+    MissingTensor {
+        /// Its name.
+        name: String,
+    },
+    /// A tensor has another shape than is asked for.
+    #[error("tensor \"{name}\" has shape {found:?}, expected {expected:?}")]
+    TensorShape {
+        /// Its name.
+        name: String,
+        /// What is asked for.
+        expected: Vec<usize>,
+        /// What there is.
+        found: Vec<usize>,
+    },
+}

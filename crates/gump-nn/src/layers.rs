@@ -1,0 +1,165 @@
+//! Layers with parameters: linear, layer normalisation, dropout.
+
+use candle_core::{DType, Result, Tensor};
+use gump_seed::Seed;
+
+pub use gump_kernels::norm::NORM_EPS;
+
+use crate::NnError;
+use crate::ops;
+use crate::parameters::{Init, Scope};
+
+/// Deviation from which every table of embeddings starts, as GPT-2's do.
+pub const TABLE_DEVIATION: f64 = 0.02;
+
+/// Layer normalisation with scale and shift.
+#[derive(Debug)]
+pub struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    /// A layer that starts as PyTorch's: scale 1, shift 0.
+    ///
+    /// # Errors
+    /// Weights to be loaded that lack its tensors.
+    pub fn new(
+        scope: &mut Scope<'_>,
+        name: &str,
+        width: usize,
+    ) -> std::result::Result<Self, NnError> {
+        let mut scope = scope.part(name);
+        let weight = scope.get("weight", width, Init::Constant(1.0))?;
+        Ok(Self {
+            weight,
+            bias: scope.get("bias", width, Init::Constant(0.0))?,
+        })
+    }
+
+    /// Shape: any `[.., width]`; the result is shaped alike.
+    ///
+    /// # Errors
+    /// Another width.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        ops::layer_norm(x, &self.weight, &self.bias, NORM_EPS as f32)
+    }
+}
+
+/// A matrix, with or without bias.
+#[derive(Debug)]
+pub struct Linear {
+    weight: Tensor,
+    bias: Option<Tensor>,
+    /// In what the product is computed.
+    product: DType,
+}
+
+impl Linear {
+    /// A layer that PyTorch would build: uniform start.
+    pub fn new(
+        scope: &mut Scope<'_>,
+        name: &str,
+        inputs: usize,
+        outputs: usize,
+    ) -> std::result::Result<Self, NnError> {
+        Self::with(
+            scope,
+            name,
+            inputs,
+            outputs,
+            Init::FanIn(inputs),
+            Some(Init::FanIn(inputs)),
+        )
+    }
+
+    /// A layer whose matrix and bias start as told; `None` for no bias.
+    ///
+    /// # Errors
+    /// Weights to be loaded that lack its tensors.
+    pub fn with(
+        scope: &mut Scope<'_>,
+        name: &str,
+        inputs: usize,
+        outputs: usize,
+        weight: Init,
+        bias: Option<Init>,
+    ) -> std::result::Result<Self, NnError> {
+        let mut scope = scope.part(name);
+        let weight = scope.get("weight", (outputs, inputs), weight)?;
+        Ok(Self {
+            weight,
+            product: scope.products(),
+            bias: bias
+                .map(|init| scope.get("bias", outputs, init))
+                .transpose()?,
+        })
+    }
+
+    /// Shape: `[.., inputs]`; the result `[.., outputs]`.
+    ///
+    /// # Errors
+    /// Another number of inputs.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        if self.product != DType::F32 {
+            return ops::reduced_linear(x, &self.weight, self.bias.as_ref(), self.product);
+        }
+        ops::linear(x, &self.weight, self.bias.as_ref())
+    }
+
+    /// The matrix, `[out, in]`.
+    pub fn weight(&self) -> &Tensor {
+        &self.weight
+    }
+
+    /// What is added, `[out]`, if anything is.
+    pub fn bias(&self) -> Option<&Tensor> {
+        self.bias.as_ref()
+    }
+}
+
+/// Seeded dropout: absent at inference.
+#[derive(Clone, Debug)]
+pub struct Dropout {
+    probability: f64,
+    seed: Seed,
+    calls: std::cell::Cell<u64>,
+}
+
+impl Dropout {
+    /// Dropout of this probability; `None` for 0.
+    pub fn new(probability: f64, seed: Seed) -> Option<Self> {
+        (probability > 0.0).then(|| Self {
+            probability,
+            seed,
+            calls: 0.into(),
+        })
+    }
+}
+
+/// Drops entries of `x` and scales the rest up, if training asks for it.
+pub fn drop_out(x: Tensor, dropout: Option<&Dropout>) -> Result<Tensor> {
+    let Some(Dropout {
+        probability,
+        seed,
+        calls,
+    }) = dropout
+    else {
+        return Ok(x);
+    };
+    let seed = seed.fork(calls.get());
+    calls.set(calls.get() + 1);
+    let mut rng = seed.rng();
+    let keep = 1.0 / (1.0 - probability) as f32;
+    let threshold = (probability * f64::from(u32::MAX)) as u32;
+    let mask: Vec<f32> = (0..x.elem_count())
+        .map(|_| {
+            if rand::RngCore::next_u32(&mut rng) < threshold {
+                0.0
+            } else {
+                keep
+            }
+        })
+        .collect();
+    &x * Tensor::from_vec(mask, x.shape(), x.device())?
+}

@@ -1,0 +1,394 @@
+//! The interactive planner in the closed loop: every proposal is a policy that drives among
+//! imagined others, and the one that does best over several futures drives on.
+//!
+//! Start with [`InteractiveDriver`]. `imagine` lets policies and world take turns, `choice` turns
+//! what happened into values and picks one. Lines, tracker, road and score are those of
+//! [`crate::PdmClosed`], so the two differ in what they expect of others and in nothing else.
+//!
+//! Source: the planner of the GUMP paper, which was never released; what the paper leaves open is a
+//! field of [`InteractiveDriverConfig`].
+
+mod choice;
+mod imagine;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
+use gump_rollout::{BoxError, WorldModel};
+use gump_scene::{EgoState, Rollout, Seed};
+
+use crate::candidates::{Candidate, Explain};
+use crate::pdm::comfort::ComfortFilters;
+use crate::pdm::mission::{State, brake, trajectory};
+use crate::pdm::propose::DT;
+use crate::pdm::{self, STEPS, TRAJECTORY_STEPS};
+use crate::{PdmConfig, PlanError, ProposalKind};
+pub use choice::CandidateScore;
+use choice::{choose, is_emergency};
+use imagine::Imagination;
+
+/// What is imagined, how far, and how it is valued.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InteractiveDriverConfig {
+    /// The policies by rule.
+    pub proposals: PdmConfig,
+    /// Whether the world's own ego is a candidate too.
+    pub imitation: bool,
+    /// Futures per candidate, > 0.
+    pub n_futures: usize,
+    /// Where chance comes from: future *k* of every candidate meets the same chance.
+    pub seed: Seed,
+    /// Iterations of the loop between two decisions, > 0; in between the chosen policy drives.
+    pub replan_every: usize,
+    /// What a future is worth.
+    pub worth: Worth,
+    /// Standard deviations over the futures that are taken off the mean, at least 0.
+    pub caution: f64,
+    /// What the previous choice is given on top of its value.
+    pub hysteresis: f64,
+    /// How much to imagine.
+    pub budget: PlanBudget,
+}
+
+impl Default for InteractiveDriverConfig {
+    /// The paper's numbers: 15 policies and imitation, 4 futures of 4 s, the mean; a decision every
+    /// half second, which is a frame of the learned world.
+    fn default() -> Self {
+        Self {
+            proposals: PdmConfig::default(),
+            imitation: true,
+            n_futures: 4,
+            seed: Seed(0),
+            replan_every: 5,
+            worth: Worth::Rollout,
+            caution: 0.0,
+            hysteresis: 0.0,
+            budget: PlanBudget::default(),
+        }
+    }
+}
+
+/// What a future is worth.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Worth {
+    /// PDM's score of the whole drive: the product of its gates times the weighted mean of its
+    /// terms, 0 to 1.
+    Rollout,
+    /// The same of every half second, discounted: the weighted mean with weights gamma^t, 0 to 1. A
+    /// gate that closes stays closed.
+    DiscountedStep {
+        /// 0 to 1; the further below 1, the less the later counts.
+        gamma: f64,
+    },
+}
+
+/// How much to imagine.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlanBudget {
+    /// So many moving agents, those nearest to the ego, are imagined; others keep their velocity.
+    pub nearest: usize,
+    /// Seconds to imagine, 0.5 to 4; whole half seconds count.
+    pub horizon: f64,
+    /// Stop at the half second in which this is used up; all candidates are then judged by the same,
+    /// shorter horizon. Takes a clock: [`InteractiveDriver::with_clock`].
+    pub wall: Option<Duration>,
+}
+
+impl Default for PlanBudget {
+    /// 12 agents, the paper's 4 s, however long it takes.
+    fn default() -> Self {
+        Self {
+            nearest: 12,
+            horizon: 4.0,
+            wall: None,
+        }
+    }
+}
+
+/// Where the time of a decision went; zeros without a clock.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Phases {
+    /// Opening the world: map, history.
+    pub open: Duration,
+    /// The world's frames.
+    pub frames: Duration,
+    /// The policies: what is in the way, how fast, how the car follows.
+    pub policies: Duration,
+    /// Judging what happened.
+    pub score: Duration,
+}
+
+impl Phases {
+    /// All together.
+    pub fn total(&self) -> Duration {
+        self.open + self.frames + self.policies + self.score
+    }
+}
+
+/// One candidate with what was imagined of it.
+#[derive(Clone, Debug)]
+pub struct Prospect {
+    /// What drives.
+    pub kind: ProposalKind,
+    /// What it came to, future by future.
+    pub score: CandidateScore,
+    /// What it is chosen by: the mean less [`InteractiveDriverConfig::caution`] deviations.
+    pub value: f64,
+    /// Futures with a collision by the ego's fault.
+    pub collisions: usize,
+    /// Mean metres along the way.
+    pub progress_m: f64,
+    /// Mean seconds to the first collision by the ego's fault; the horizon counts where none is.
+    pub collision_s: f64,
+    /// What was imagined: the ego and those near it, every half second, until nothing could make
+    /// the future worth anything any more.
+    pub futures: Vec<Rollout>,
+    /// How the ego drives in each future: states of the rear axle, a tenth of a second apart.
+    pub drives: Vec<Vec<EgoState>>,
+}
+
+/// A decision with everything it rests on.
+#[derive(Clone, Debug)]
+pub struct Decision {
+    /// Index of the chosen prospect.
+    pub chosen: usize,
+    /// True if the ego brakes instead, because even the best one hits something soon.
+    pub brakes: bool,
+    /// All candidates: lateral offsets one after another, within each the speeds, imitation last.
+    pub prospects: Vec<Prospect>,
+    /// Seconds imagined.
+    pub horizon: f64,
+    /// Where the time went.
+    pub phases: Phases,
+}
+
+/// Imagines what every policy would come to and lets the best one drive.
+///
+/// Each policy meets each future on its own: every half second it sees where the imagined others
+/// are, drives on, and the world answers within the same frame. A plan is thus not a line that is
+/// kept whatever happens, and others are no forecast.
+///
+/// A future in which a gate of the score has closed for good can come to nothing any more, so the
+/// world is not asked for the rest of it: an exact bound.
+///
+/// Ties of values (within 1e-6) are broken by fewer collisions, more progress, the previous choice,
+/// the lower index. If nobody is worth anything, who collides last drives; if even that is within 2 s
+/// and the ego is slow, it brakes as PDM does.
+pub struct InteractiveDriver<'w> {
+    world: &'w dyn WorldModel,
+    config: InteractiveDriverConfig,
+    clock: Box<dyn Fn() -> Duration + 'w>,
+    mission: Option<State>,
+    comfort: ComfortFilters,
+    decision: Option<Decision>,
+    decided_at: usize,
+    /// The way of the chosen imitation.
+    following: Option<Trajectory>,
+}
+
+impl<'w> InteractiveDriver<'w> {
+    /// A planner that imagines in `world`.
+    ///
+    /// # Errors
+    /// [`PlanError::Parameter`] for a number out of its range.
+    pub fn new(
+        world: &'w dyn WorldModel,
+        config: InteractiveDriverConfig,
+    ) -> Result<Self, PlanError> {
+        check(&config)?;
+        Ok(Self {
+            world,
+            comfort: ComfortFilters::new(steps(&config.budget) + 1, DT),
+            config,
+            clock: Box::new(|| Duration::ZERO),
+            mission: None,
+            decision: None,
+            decided_at: 0,
+            following: None,
+        })
+    }
+
+    /// Tells the time: what has passed since any fixed moment.
+    #[must_use]
+    pub fn with_clock(self, clock: impl Fn() -> Duration + 'w) -> Self {
+        Self {
+            clock: Box::new(clock),
+            ..self
+        }
+    }
+
+    fn is_due(&self, moment: &Moment<'_>) -> bool {
+        let old = moment.iteration >= self.decided_at + self.config.replan_every;
+        let ends = |way: &Trajectory| way.end_us() < moment.ego.time_us + 2_000_000;
+        old || self.decision.is_none() || self.following.as_ref().is_some_and(ends)
+    }
+
+    fn decide(&mut self, moment: &Moment<'_>, speeds: &[f64]) -> Result<(), PlanError> {
+        let state = self.mission.as_ref().ok_or(PlanError::NoMission)?;
+        let imagination = Imagination {
+            world: self.world,
+            config: &self.config,
+            state,
+            speeds,
+            moment,
+            clock: &*self.clock,
+            comfort: &self.comfort,
+        };
+        let mut decision = imagination.imagine()?;
+        let previous = self.decision.as_ref().map(|decision| decision.chosen);
+        decision.chosen = choose(&decision.prospects, previous, self.config.hysteresis);
+        let chosen = &decision.prospects[decision.chosen];
+        decision.brakes = is_emergency(chosen, moment.ego);
+        self.following = match chosen.kind {
+            ProposalKind::Imitation if !decision.brakes => Some(imitated(chosen, moment.ego)?),
+            _ => None,
+        };
+        self.decision = Some(decision);
+        self.decided_at = moment.iteration;
+        Ok(())
+    }
+
+    /// Lets the chosen policy drive on from where everyone really is.
+    fn follow(&self, moment: &Moment<'_>, speeds: &[f64]) -> Result<Trajectory, PlanError> {
+        let state = self.mission.as_ref().ok_or(PlanError::NoMission)?;
+        let decision = self.decision.as_ref().ok_or(PlanError::NoMission)?;
+        let ego = moment.ego;
+        if decision.brakes {
+            return Ok(trajectory(ego.time_us, &brake(ego, &state.vehicle))?);
+        }
+        if let Some(way) = &self.following {
+            return Ok(way.clone());
+        }
+        let proposer = state.proposer(&self.config.proposals.law, speeds);
+        let (line, speed) = (
+            decision.chosen / speeds.len(),
+            decision.chosen % speeds.len(),
+        );
+        let mut policy = [proposer.begin(line, ego.rear_axle, ego.velocity.x)];
+        policy[0].desired_speed = speeds[speed];
+        proposer.drive(&mut policy, 1..=TRAJECTORY_STEPS);
+        Ok(trajectory(ego.time_us, &policy[0].poses)?)
+    }
+}
+
+impl Driver for InteractiveDriver<'_> {
+    fn name(&self) -> &str {
+        "interactive"
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.mission = Some(State::new(mission)?);
+        (self.decision, self.following) = (None, None);
+        Ok(())
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
+        let speeds = state.prepare(moment, &self.config.proposals)?;
+        if self.is_due(moment) {
+            self.decide(moment, &speeds)?;
+        }
+        Ok(self.follow(moment, &speeds)?)
+    }
+}
+
+impl Explain for InteractiveDriver<'_> {
+    fn candidates(&self) -> Vec<Candidate> {
+        let Some(decision) = &self.decision else {
+            return Vec::new();
+        };
+        let prospects = decision.prospects.iter().enumerate();
+        let mut all: Vec<Candidate> = prospects
+            .map(|(i, prospect)| Candidate {
+                name: prospect.kind.to_string(),
+                chosen: i == decision.chosen && !decision.brakes,
+                score: Some(prospect.value),
+                parts: prospect.score.parts(),
+                poses: prospect.drives[0].iter().map(|s| s.rear_axle).collect(),
+            })
+            .collect();
+        if decision.brakes {
+            let name = ProposalKind::EmergencyBrake.to_string();
+            all.push(Candidate::alone(&name, Vec::new()));
+        }
+        all
+    }
+
+    fn decision(&self) -> Option<&Decision> {
+        self.decision.as_ref()
+    }
+}
+
+/// The drive of the future that ends nearest to where all end on average, and straight on after it.
+fn imitated(prospect: &Prospect, ego: &EgoState) -> Result<Trajectory, PlanError> {
+    let end = |drive: &Vec<EgoState>| drive[drive.len() - 1].rear_axle.position;
+    let n = prospect.drives.len() as f64;
+    let middle = prospect
+        .drives
+        .iter()
+        .map(end)
+        .sum::<gump_geometry::DVec2>()
+        / n;
+    let off = |drive: &Vec<EgoState>| end(drive).distance_squared(middle);
+    let nearest = prospect
+        .drives
+        .iter()
+        .min_by(|a, b| off(a).total_cmp(&off(b)));
+    let drive = nearest.expect("there is at least one future");
+    let mut poses: Vec<_> = drive.iter().map(|state| state.rear_axle).collect();
+    let last = drive[drive.len() - 1];
+    let step = last.rear_axle.direction() * (last.velocity.x.max(0.0) * DT);
+    for i in 1..=TRAJECTORY_STEPS - (poses.len() - 1) {
+        let mut pose = last.rear_axle;
+        pose.position += step * i as f64;
+        poses.push(pose);
+    }
+    Ok(trajectory(ego.time_us, &poses)?)
+}
+
+/// Steps of a tenth of a second within the horizon.
+fn steps(budget: &PlanBudget) -> usize {
+    let decisions = (budget.horizon / imagine::DECISION_S).floor() as usize;
+    decisions * imagine::DECISION
+}
+
+fn check(config: &InteractiveDriverConfig) -> Result<(), PlanError> {
+    pdm::check(&config.proposals)?;
+    let wrong = |name, value, expected| {
+        Err(PlanError::Parameter {
+            name,
+            value,
+            expected,
+        })
+    };
+    for (name, n) in [
+        ("n_futures", config.n_futures),
+        ("replan_every", config.replan_every),
+    ] {
+        if n == 0 {
+            return wrong(name, 0.0, "at least 1");
+        }
+    }
+    for (name, value) in [
+        ("caution", config.caution),
+        ("hysteresis", config.hysteresis),
+    ] {
+        if !(value >= 0.0 && value.is_finite()) {
+            return wrong(name, value, "0 or more");
+        }
+    }
+    if let Worth::DiscountedStep { gamma } = config.worth
+        && !(gamma > 0.0 && gamma <= 1.0)
+    {
+        return wrong("gamma", gamma, "more than 0 and at most 1");
+    }
+    let horizon = config.budget.horizon;
+    let longest = STEPS as f64 * DT;
+    if !(imagine::DECISION_S <= horizon && horizon <= longest) {
+        return wrong("horizon", horizon, "0.5 to 4 s");
+    }
+    Ok(())
+}

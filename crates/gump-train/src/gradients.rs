@@ -1,0 +1,110 @@
+//! What the parts of a batch found, added up over parts and processes.
+
+use std::collections::BTreeMap;
+
+use candle_core::backprop::GradStore;
+use candle_core::{Result, Tensor};
+use gump_model::ModelError;
+use gump_nn::ops::Deferred;
+use gump_nn::parameters::Parameters;
+use rayon::prelude::*;
+
+use super::peers::ProcessGroup;
+use crate::loss::LossParts;
+
+/// Gradients by the names of their parameters; one that nothing reached is not there.
+pub(crate) type Gradients = BTreeMap<String, Tensor>;
+
+/// The loss of a batch, its gradients, and how much was presented.
+#[derive(Default)]
+pub(super) struct BatchGradients {
+    pub(super) gradients: Gradients,
+    pub(super) loss: LossParts,
+    pub(super) tokens: usize,
+}
+
+/// What a part of the batch found.
+pub(super) struct Part {
+    pub(super) gradients: GradStore,
+    /// Gradients of matrices that are still to be computed.
+    pub(super) deferred: Deferred,
+    pub(super) loss: LossParts,
+    pub(super) tokens: usize,
+}
+
+impl BatchGradients {
+    /// Adds what parts of the batch found, in their order.
+    pub(super) fn add(&mut self, parameters: &Parameters, parts: &[Part]) -> Result<()> {
+        let trainable: Vec<_> = parameters.trainable().collect();
+        let sums = trainable.into_par_iter().map(|(name, var)| {
+            let mut sum = self.gradients.get(name).cloned();
+            for part in parts {
+                if let Some(gradient) = part.gradients.get(var) {
+                    sum = Some(match sum {
+                        Some(sum) => (sum + gradient)?,
+                        None => gradient.clone(),
+                    });
+                }
+            }
+            let deferred = parts.iter().map(|part| &part.deferred);
+            let sum = Deferred::take_in(deferred, var, sum)?;
+            Ok(sum.map(|sum| (name.to_owned(), sum)))
+        });
+        let sums: Vec<_> = sums.collect::<Result<_>>()?;
+        self.gradients = sums.into_iter().flatten().collect();
+        for part in parts {
+            self.loss.add(&part.loss);
+            self.tokens += part.tokens;
+        }
+        Ok(())
+    }
+
+    /// Sums what all processes found, and lets their running statistics meet in the middle.
+    pub(super) fn share(
+        &mut self,
+        parameters: &Parameters,
+        peers: &dyn ProcessGroup,
+    ) -> std::result::Result<(), ModelError> {
+        if peers.size() == 1 {
+            return Ok(());
+        }
+        let mut numbers = self.loss.numbers();
+        numbers.push(self.tokens as f32);
+        let n_told = numbers.len();
+        for (name, var) in parameters.trainable() {
+            // Each gradient after whether there is one.
+            match self.gradients.get(name) {
+                Some(gradient) => {
+                    numbers.push(1.0);
+                    numbers.extend(gradient.flatten_all()?.to_vec1::<f32>()?);
+                }
+                None => numbers.resize(numbers.len() + 1 + var.elem_count(), 0.0),
+            }
+        }
+        for (_, var) in parameters.statistics() {
+            numbers.extend(var.flatten_all()?.to_vec1::<f32>()?);
+        }
+        peers.sum(&mut numbers)?;
+        let (told, mut rest) = numbers.split_at(n_told);
+        self.tokens = told[n_told - 1].round() as usize;
+        self.loss = LossParts::of_numbers(&told[..n_told - 1]);
+        let mut take = |n: usize| {
+            let (taken, left) = rest.split_at(n);
+            rest = left;
+            taken
+        };
+        for (name, var) in parameters.trainable() {
+            let is_there = take(1)[0] > 0.0;
+            let gradient = take(var.elem_count());
+            if is_there {
+                let gradient = Tensor::from_slice(gradient, var.shape(), var.device())?;
+                self.gradients.insert(name.to_owned(), gradient);
+            }
+        }
+        for (_, var) in parameters.statistics() {
+            let sum = Tensor::from_slice(take(var.elem_count()), var.shape(), var.device())?;
+            var.set(&(sum / peers.size() as f64)?)?;
+        }
+        Ok(())
+    }
+}

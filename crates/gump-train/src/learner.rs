@@ -1,0 +1,194 @@
+//! What learns, and what a checkpoint of a run holds.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use candle_core::{DType, Device, Tensor};
+use gump_kernels::Operands;
+use gump_model::checkpoint::Precision;
+use gump_model::{ModelError, Network, checkpoint};
+use gump_nn::NnError;
+use gump_nn::optimizer::{AdamW, move_average};
+use gump_nn::parameters::Parameters;
+
+use super::config::TrainConfig;
+use super::gradients::Gradients;
+
+/// A network on its way.
+pub(super) struct TrainState {
+    pub(super) network: Network,
+    /// The moving average of the network, where one is kept.
+    average: Option<Network>,
+    optimizer: AdamW,
+    /// Steps done.
+    pub(super) step: usize,
+    /// In which form a processor's products take their operands; a device's network knows itself.
+    pub(super) operands: Operands,
+    /// The weights that drove, for a resumed run to drive the same; empty without closed loop.
+    drivers: BTreeMap<String, Tensor>,
+}
+
+impl TrainState {
+    /// At the start of a run.
+    pub(super) fn new(network: Network, config: &TrainConfig) -> Result<Self, ModelError> {
+        let average = match config.ema {
+            Some(_) => Some(build_like(&network, copies(&network)?)?),
+            None => None,
+        };
+        let drivers = match config.closed_loop {
+            Some(_) => copies(&network)?,
+            None => BTreeMap::new(),
+        };
+        Ok(Self {
+            optimizer: AdamW::new(network.parameters())?,
+            network,
+            average,
+            step: 0,
+            operands: Operands::F32,
+            drivers,
+        })
+    }
+
+    /// As a checkpoint holds it, with how it is trained.
+    pub(super) fn restore(path: &Path, device: &Device) -> Result<(Self, TrainConfig), ModelError> {
+        let mut archive = checkpoint::read(path)?;
+        let model = archive.config()?;
+        let number = |key: &str| {
+            let text = archive.entry(key)?;
+            text.parse()
+                .map_err(|_| archive.error(format!("its {key} is \"{text}\", expected a number")))
+        };
+        let step: usize = number("step")?;
+        let config: TrainConfig =
+            serde_json::from_str(archive.entry("train")?).map_err(|error| {
+                archive.error(format!("its training configuration is not valid ({error})"))
+            })?;
+        let drivers = archive.take(checkpoint::DRIVER);
+        let mut moments = archive.take(checkpoint::OPTIMIZER);
+        let trained = archive.take(checkpoint::TRAINED);
+        let build = |weights| Network::build(model.clone(), Parameters::loaded(weights, device));
+        let weights = archive.tensors;
+        let (network, average) = match config.ema {
+            Some(_) => (build(trained)?, Some(build(weights)?)),
+            None => (build(weights)?, None),
+        };
+        let optimizer = AdamW::restore(network.parameters(), step, |name| {
+            let tensor = moments.remove(name);
+            tensor.ok_or_else(|| NnError::MissingTensor {
+                name: name.to_owned(),
+            })
+        })?;
+        let learner = Self {
+            network,
+            average,
+            optimizer,
+            step,
+            operands: Operands::F32,
+            drivers,
+        };
+        Ok((learner, config))
+    }
+
+    /// Writes everything a resumed run needs. What serves as weights has the plain names, so that
+    /// the file can be loaded as a network too.
+    pub(super) fn save(&self, path: &Path, config: &TrainConfig) -> Result<(), ModelError> {
+        let mut tensors = named("", self.shipped());
+        if self.average.is_some() {
+            tensors.extend(named(checkpoint::TRAINED, &self.network));
+        }
+        tensors.extend(
+            self.optimizer
+                .state()
+                .map(|(name, tensor)| (name, tensor.clone())),
+        );
+        let drivers = self.drivers.iter();
+        tensors.extend(
+            drivers.map(|(name, tensor)| (format!("{}{name}", checkpoint::DRIVER), tensor.clone())),
+        );
+        let mut header = checkpoint::header(self.network.config())?;
+        let config =
+            serde_json::to_string(config).map_err(|e| ModelError::Config(e.to_string()))?;
+        header.insert("train".to_owned(), config);
+        header.insert("step".to_owned(), self.step.to_string());
+        checkpoint::write(path, tensors, header, Precision::Full)
+    }
+
+    /// The network to validate and to ship: the average where one is kept.
+    pub(super) fn shipped(&self) -> &Network {
+        self.average.as_ref().unwrap_or(&self.network)
+    }
+
+    /// Ends the run and keeps the network to ship.
+    pub(super) fn into_shipped(self) -> Network {
+        self.average.unwrap_or(self.network)
+    }
+
+    /// Lets products take operands of fewer bits, if the run is to.
+    ///
+    /// Error: a tensor error.
+    pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, ModelError> {
+        if !config.mixed_precision {
+            return Ok(self);
+        }
+        if self.network.device().is_cpu() {
+            return Ok(Self {
+                operands: Operands::Bf16,
+                ..self
+            });
+        }
+        Ok(Self {
+            network: self.network.multiplying_in(DType::BF16)?,
+            ..self
+        })
+    }
+
+    /// A copy of the network to ship.
+    pub(super) fn snapshot(&self) -> Result<Network, ModelError> {
+        build_like(self.shipped(), copies(self.shipped())?)
+    }
+
+    /// The network that drives the scenes of closed-loop training.
+    pub(super) fn driver(&self) -> Result<Network, ModelError> {
+        build_like(&self.network, self.drivers.clone())
+    }
+
+    /// One step along the gradients; returns their norm before clipping.
+    pub(super) fn learn(
+        &mut self,
+        gradients: &Gradients,
+        config: &TrainConfig,
+    ) -> Result<f64, ModelError> {
+        let rate = config.optimizer.rate(self.step, config.steps);
+        let parameters = self.network.parameters();
+        let norm = self
+            .optimizer
+            .step(parameters, gradients, &config.optimizer, rate)?;
+        self.step += 1;
+        if let (Some(average), Some(ema)) = (&self.average, config.ema) {
+            let t = self.step as f64;
+            let share = ema.min((1.0 + t) / (10.0 + t));
+            move_average(average.parameters(), parameters, share)?;
+        }
+        Ok(norm)
+    }
+}
+
+/// All tensors of a network, each name after a prefix.
+fn named(prefix: &str, network: &Network) -> BTreeMap<String, Tensor> {
+    let all = network.parameters().all();
+    all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))
+        .collect()
+}
+
+/// The weights as they are now, whatever becomes of them.
+fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, ModelError> {
+    let all = network.parameters().all();
+    all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
+        .collect()
+}
+
+/// A network of the same shape with these weights.
+fn build_like(network: &Network, weights: BTreeMap<String, Tensor>) -> Result<Network, ModelError> {
+    let parameters = Parameters::loaded(weights, network.device());
+    Network::build(network.config().clone(), parameters)
+}

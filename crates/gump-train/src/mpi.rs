@@ -1,0 +1,57 @@
+//! Processes that `mpirun` started, which sum by MPI.
+
+use std::rc::Rc;
+
+use gump_model::ModelError;
+use mpi::Threading;
+use mpi::collective::{CommunicatorCollectives as _, SystemOperation};
+use mpi::environment::Universe;
+use mpi::traits::Communicator as _;
+
+use super::peers::ProcessGroup;
+
+/// The processes that `mpirun` started.
+#[derive(Clone)]
+pub struct Mpi {
+    universe: Rc<Universe>,
+}
+
+impl Mpi {
+    /// Joins the others; a process that `mpirun` did not start is alone.
+    ///
+    /// # Errors
+    /// [`ModelError::Peers`] if this process has joined before.
+    pub fn join() -> Result<Self, ModelError> {
+        // Other threads compute; only this one talks.
+        let joined = mpi::initialize_with_threading(Threading::Funneled);
+        let (universe, _) = joined.ok_or_else(|| {
+            ModelError::Peers("MPI can be joined once by a process, and was before".into())
+        })?;
+        Ok(Self {
+            universe: universe.into(),
+        })
+    }
+
+    /// Never takes leave of the others, so that `mpirun` stops them when this process ends: for one
+    /// that failed while they may not have.
+    pub fn desert(&self) {
+        std::mem::forget(self.clone());
+    }
+}
+
+impl ProcessGroup for Mpi {
+    fn rank(&self) -> usize {
+        usize::try_from(self.universe.world().rank()).expect("ranks count from 0")
+    }
+
+    fn size(&self) -> usize {
+        usize::try_from(self.universe.world().size()).expect("sizes count from 1")
+    }
+
+    fn sum(&self, numbers: &mut [f32]) -> Result<(), ModelError> {
+        let own = numbers.to_vec();
+        let world = self.universe.world();
+        world.all_reduce_into(&own[..], numbers, SystemOperation::sum());
+        Ok(())
+    }
+}

@@ -1,0 +1,246 @@
+//! Drives in training: agents leave the log for where the network's own draws take them, and learn
+//! the way back.
+//!
+//! A network that learns from logs alone meets its own small errors for the first time when it is
+//! rolled out. Here it draws several next moves of every agent and takes the one nearest to the log
+//! (as CAT-K does, Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models",
+//! 2024), so that agents stay near enough to the log for its next states to be their targets.
+//!
+//! In a share of drives agents go their own ways instead, under the rules of `rules`: what would run
+//! into somebody or off the road is drawn again. What they then did is what the network should say,
+//! so that it comes to keep the rules by itself.
+
+use gump_engine::relative::engine::{Draw, Engine, Workspace};
+use gump_engine::relative::rules::settle;
+use gump_engine::relative::seen::{Seen, presents};
+use gump_geometry::{DVec2, Pose, angle_difference};
+use gump_kernels::panels::Precision;
+use gump_model::ModelError;
+use gump_model::local_context::Survey;
+use gump_model::relative::graph::{Lights, Shown};
+use gump_model::relative::grid::dequantize;
+use gump_model::relative::map::VectorMap;
+use gump_model::relative::sample::{Track, TrackDriver};
+use gump_model::relative::{RelativeNetwork, RelativeWeights};
+use gump_scene::{MapGraph, Seed};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+/// Frames that are shown as logged before the network drives.
+const WARM_UP: usize = 2;
+/// Metres that a radian counts for in choosing the move nearest to the log.
+const METRES_PER_RADIAN: f64 = 2.0;
+
+/// How far around a sample edges of the road are looked at, metres.
+const EDGES_M: f64 = 150.0;
+/// Separates the choice of how a sample is driven from its draws.
+const RULED: u64 = 1 << 32;
+
+/// How agents are driven by the network that learns.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeDrives {
+    /// Share of samples whose agents are driven; the others show the log.
+    pub share: f64,
+    /// Draws per agent and step, of which the nearest to the log is taken.
+    pub candidates: usize,
+    /// Where even the nearest draw is farther than this from the way back to the log, metres, an
+    /// agent moves along that way instead: a driver who stays at a light that has turned green says
+    /// nothing of how to catch up.
+    pub tolerance_m: f64,
+    /// Divides the logits of the draws.
+    pub temperature: f64,
+    /// Steps after which the network drives as it is then.
+    pub refresh: usize,
+    /// Share of the driven samples whose agents go their own ways under the rules.
+    pub ruled: f64,
+    /// Of those, how often a move is drawn again at most.
+    pub redraws: usize,
+    /// Of those, draws are among the likeliest bins that together have this probability: targets are
+    /// smoothed, and without the tail cut off draws would spread a little more with each refresh.
+    pub top_p: f64,
+}
+
+impl Default for RelativeDrives {
+    fn default() -> Self {
+        Self {
+            share: 0.5,
+            candidates: 4,
+            tolerance_m: 0.6,
+            temperature: 1.0,
+            refresh: 50,
+            ruled: 0.0,
+            redraws: 8,
+            top_p: 0.95,
+        }
+    }
+}
+
+impl RelativeDrives {
+    /// Error: [`ModelError::Config`] naming the first number out of its range.
+    pub(super) fn validate(&self) -> Result<(), ModelError> {
+        let fail = |what: &str| Err(ModelError::Config(format!("closed_loop: {what}")));
+        for (name, share) in [("share", self.share), ("ruled", self.ruled)] {
+            if !(0.0..=1.0).contains(&share) {
+                return fail(&format!("{name} must be between 0 and 1"));
+            }
+        }
+        if !(self.top_p > 0.0 && self.top_p <= 1.0) {
+            return fail("top_p must be above 0 and at most 1");
+        }
+        if self.candidates == 0 || self.refresh == 0 {
+            return fail("candidates and refresh must be at least 1");
+        }
+        if !self.tolerance_m.is_finite() || self.tolerance_m < 0.0 {
+            return fail("tolerance_m must be 0 or more");
+        }
+        if !self.temperature.is_finite() || self.temperature <= 0.0 {
+            return fail("temperature must be above 0");
+        }
+        Ok(())
+    }
+}
+
+/// A network as it was at a step, that drives.
+pub(crate) struct Driver {
+    engine: Engine,
+    config: RelativeDrives,
+}
+
+impl Driver {
+    pub(super) fn new(
+        network: &RelativeNetwork,
+        config: &RelativeDrives,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            engine: Engine::new(&RelativeWeights::of(network)?, Precision::F32)?,
+            config: config.clone(),
+        })
+    }
+}
+
+impl TrackDriver for Driver {
+    fn share(&self) -> f64 {
+        self.config.share
+    }
+
+    /// Moves the agents of a sample, which lies around `centre`, to where the network drives them.
+    fn drive(
+        &self,
+        (streets, centre): (&MapGraph, DVec2),
+        map: &VectorMap,
+        lights: &[Lights],
+        tracks: &mut [Track],
+        seed: Seed,
+    ) {
+        let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
+        let survey = ruled.then(|| Survey::of_edges(streets, centre, EDGES_M));
+        let memory = self.engine.remember(map);
+        let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
+        let (mut room, mut hidden) = (Workspace::default(), Vec::new());
+        for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
+            for (track, member) in tracks.iter().zip(&mut members) {
+                match (track.states[t], &mut *member) {
+                    (None, _) => *member = None,
+                    (Some(state), Some(seen)) => seen.push(state.shown),
+                    (Some(state), None) => {
+                        let (pose, velocity) = (state.shown, state.velocity);
+                        *member = Some(Seen::first(&self.engine, track.body, pose, velocity));
+                    }
+                }
+            }
+            let agents: Vec<Shown> = members.iter().flatten().map(Seen::now).collect();
+            let mut read = presents(map, lights, members.iter_mut().flatten());
+            self.engine
+                .read(&mut read, t, &memory, &mut room, &mut hidden);
+            if t + 1 < WARM_UP {
+                continue;
+            }
+            let here: Vec<usize> = (0..tracks.len())
+                .filter(|&a| members[a].is_some())
+                .collect();
+            let seed = seed.fork(t as u64);
+            if let Some(survey) = &survey {
+                let moves = self.moves_by_the_rules(&agents, survey, &hidden, seed, &mut room);
+                for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
+                    if let Some(next) = &mut tracks[a].states[t + 1] {
+                        *next = next.led_to(now.pose * step);
+                    }
+                }
+                continue;
+            }
+            let moves = self.draws(&hidden, here.len(), seed, &mut room);
+            for (i, &a) in here.iter().enumerate() {
+                let (Some(now), Some(next)) = (tracks[a].states[t], tracks[a].states[t + 1]) else {
+                    continue;
+                };
+                let candidates = moves.iter().map(|of_draw| agents[i].pose * of_draw[i]);
+                let nearest =
+                    candidates.min_by(|a, b| far(*a, next.logged).total_cmp(&far(*b, next.logged)));
+                let nearest = nearest.expect("there is at least one candidate");
+                let wanted = now.way_back(&next);
+                let shown = match far(nearest, wanted) < self.config.tolerance_m {
+                    true => nearest,
+                    false => wanted,
+                };
+                tracks[a].states[t + 1] = Some(next.driven_to(shown));
+            }
+        }
+    }
+}
+
+impl Driver {
+    /// A move of every agent in its own frame, drawn again where the rules forbid it.
+    fn moves_by_the_rules(
+        &self,
+        agents: &[Shown],
+        survey: &Survey,
+        hidden: &[f32],
+        seed: Seed,
+        room: &mut Workspace,
+    ) -> Vec<Pose> {
+        let draw = Draw {
+            temperature: self.config.temperature,
+            top_p: self.config.top_p,
+        };
+        let c = hidden.len() / agents.len().max(1);
+        let mut drawn = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let rows: Vec<f32> = who
+                .iter()
+                .flat_map(|&i| &hidden[i * c..][..c])
+                .copied()
+                .collect();
+            let of_draw = seed.fork(attempt as u64);
+            let streams: Vec<Seed> = who.iter().map(|&i| of_draw.fork(i as u64)).collect();
+            let bins = self.engine.decide(&rows, &streams, draw, room);
+            bins.into_iter().map(dequantize).collect()
+        };
+        let all: Vec<usize> = (0..agents.len()).collect();
+        let mut moves = drawn(&all, 0);
+        let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
+        let redraws = self.config.redraws;
+        settle(agents, None, survey, redraws, &mut moves, &mut again);
+        moves
+    }
+
+    /// The candidates' moves of all agents, in the agents' frames.
+    fn draws(&self, hidden: &[f32], n: usize, seed: Seed, room: &mut Workspace) -> Vec<Vec<Pose>> {
+        let draw = Draw {
+            temperature: self.config.temperature,
+            top_p: 1.0,
+        };
+        let candidates = (0..self.config.candidates).map(|k| {
+            let of_draw = seed.fork(k as u64);
+            let streams: Vec<Seed> = (0..n).map(|i| of_draw.fork(i as u64)).collect();
+            let bins = self.engine.decide(hidden, &streams, draw, room);
+            bins.into_iter().map(dequantize).collect()
+        });
+        candidates.collect()
+    }
+}
+
+/// How far a pose is from another, metres.
+fn far(a: Pose, b: Pose) -> f64 {
+    a.position.distance(b.position)
+        + METRES_PER_RADIAN * angle_difference(a.heading, b.heading).abs()
+}

@@ -1,0 +1,12 @@
+//! Training of the relative network: drives of its own, rewards by realism, the trainer.
+
+mod drives;
+mod rewards;
+#[cfg(test)]
+mod tests;
+mod train;
+
+pub use self::drives::RelativeDrives;
+pub use self::rewards::RelativeRewards;
+pub use self::train::{RelativeStep, RelativeTrainConfig, RelativeTrainer};
+pub use gump_model::relative::RelativeSampleConfig;

@@ -1,0 +1,227 @@
+//! Learning from one's own rollouts: what a rollout adds to the realism of a group of them.
+//!
+//! Futures of a scene are drawn by the network alone and compared with the log by the metric of
+//! Waymo's Sim Agents Challenge. What each of them adds (its leave-one-out value) is the reward, as in
+//! RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent Traffic Simulation via
+//! Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and step: a move earns what
+//! came after it. Moves that earned more than those of the other futures become likelier, the others
+//! less likely.
+
+use gump_engine::relative::{MAP_M, RelativeSampling, RelativeWorld};
+use gump_model::ModelError;
+use gump_model::relative::RelativeNetwork;
+use gump_model::relative::map::{Hidden, VectorMap};
+use gump_model::relative::sample::{Sample, whole};
+use gump_model::steps::{TOKEN_DT, stride_of};
+use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_scene::{AgentId, Frame, Rollout, Scenario, Seed};
+use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Year};
+use serde::{Deserialize, Serialize};
+
+/// Rewards beyond this many standard deviations count as that many.
+const MOST: f64 = 3.0;
+/// Rewards that differ less than this say nothing, in units of the meta metric.
+const LEAST: f64 = 1e-9;
+
+/// How a network learns from its own rollouts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeRewards {
+    /// Futures of a scene, at least 2: each is compared with the others.
+    pub rollouts: usize,
+    /// Agents of a scene at most, those nearest to the ego.
+    pub agents: usize,
+    /// Weight of the rewarded moves beside the moves of the batch, which anchor the network.
+    pub weight: f64,
+    /// Steps after which the network that drives is the one that has learned.
+    pub refresh: usize,
+}
+
+impl Default for RelativeRewards {
+    fn default() -> Self {
+        Self {
+            rollouts: 8,
+            agents: 40,
+            weight: 0.5,
+            refresh: 10,
+        }
+    }
+}
+
+impl RelativeRewards {
+    /// Error: [`ModelError::Config`] naming the first number out of its range.
+    pub(super) fn validate(&self) -> Result<(), ModelError> {
+        let fail = |what: &str| Err(ModelError::Config(format!("realism: {what}")));
+        if self.rollouts < 2 {
+            return fail("rollouts must be at least 2, as each is compared with the others");
+        }
+        if self.agents == 0 || self.refresh == 0 {
+            return fail("agents and refresh must be at least 1");
+        }
+        if !self.weight.is_finite() || self.weight <= 0.0 {
+            return fail("weight must be above 0");
+        }
+        Ok(())
+    }
+}
+
+/// Futures of one scene with what their moves earned.
+pub(super) struct Group {
+    pub(super) samples: Vec<Sample>,
+    /// Meta metric of all of them together.
+    pub(super) realism: f64,
+}
+
+/// A network as it was at a step, whose rollouts are judged.
+pub(super) struct Judged {
+    world: RelativeWorld,
+    config: RelativeRewards,
+    metric: Config,
+}
+
+impl Judged {
+    pub(super) fn new(
+        network: &RelativeNetwork,
+        config: &RelativeRewards,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            world: RelativeWorld::new(network, RelativeSampling::default())?,
+            config: config.clone(),
+            metric: Config::of(Year::Y2025),
+        })
+    }
+
+    /// Rolls a scene out and judges the moves; `None` for a scene on which realism is not defined
+    /// (too short, without road edges, of another clock) or on which all futures are worth the same.
+    ///
+    /// Error: what rolling out reports.
+    pub(super) fn group(
+        &self,
+        scenario: &Scenario,
+        seed: Seed,
+    ) -> Result<Option<Group>, ModelError> {
+        let scenario = nearest(scenario, self.config.agents);
+        let Ok(log) = Log::of(&scenario) else {
+            return Ok(None);
+        };
+        let start = Start {
+            scene: scenario.present().unguided(),
+            n_futures: self.config.rollouts,
+            seed,
+        };
+        let futures = simulate(&self.world, &[start], None, &SimulateConfig::default())
+            .map_err(|error| ModelError::Scene(format!("{}: {error}", scenario.id)))?;
+        let Ok(rollouts) = Rollouts::of(&scenario.id, &futures, Mode::SimAgents) else {
+            return Ok(None);
+        };
+        let Ok(reference) = Reference::new(&log, &self.metric) else {
+            return Ok(None);
+        };
+        let Ok(evaluation) = reference.evaluate(&rollouts) else {
+            return Ok(None);
+        };
+        let realism = evaluation.scores.metametric;
+        let worth = evaluation.leave_one_out();
+        let Some(worth) = worth.filter(|_| realism.is_finite()) else {
+            return Ok(None);
+        };
+        let samples = judged(&scenario, &futures, &worth);
+        Ok(samples.map(|samples| Group { samples, realism }))
+    }
+}
+
+/// A scene of the agents nearest to its ego, all of which are to be scored.
+fn nearest(scenario: &Scenario, most: usize) -> Scenario {
+    let now = &scenario.log[scenario.now];
+    let ego = now.agent(scenario.ego).map(|ego| ego.state.pose.position);
+    let ego = ego.unwrap_or_default();
+    let moving = now.agents().iter().filter(|agent| agent.kind.is_moving());
+    let mut by_distance: Vec<(f64, AgentId)> = moving
+        .map(|agent| (agent.state.pose.position.distance(ego), agent.id))
+        .collect();
+    by_distance.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    by_distance.truncate(most);
+    let mut kept: Vec<AgentId> = by_distance.into_iter().map(|(_, id)| id).collect();
+    kept.sort_unstable();
+    let crop = |frame: &Frame| {
+        let agents = frame.agents().iter();
+        let agents = agents.filter(|agent| kept.binary_search(&agent.id).is_ok());
+        Frame::new(agents.copied().collect(), frame.lights().to_vec())
+    };
+    let log = scenario.log.iter().map(crop).collect();
+    let targets = kept.iter().copied().filter(|id| *id != scenario.ego);
+    Scenario {
+        log,
+        targets: targets.collect(),
+        ..scenario.clone()
+    }
+}
+
+/// Each future as a sample whose moves weigh what they earned; `None` if all earned the same.
+fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Option<Vec<Sample>> {
+    let per_move = (TOKEN_DT / scenario.dt).round() as usize;
+    let n_moves = worth.n_steps / per_move;
+    let earnings = standardized(&worth.credit, |credit| {
+        let agents = credit.chunks(worth.n_steps);
+        agents.flat_map(|own| to_go(own, per_move)).collect()
+    })?;
+    let stride = stride_of(scenario.dt);
+    let (start, first_move) = (scenario.now % stride, scenario.now / stride);
+    let now = &scenario.log[scenario.now];
+    let ids: Vec<AgentId> = now.agents().iter().map(|agent| agent.id).collect();
+    let scored = |id: &AgentId| worth.agents.iter().position(|agent| agent == id);
+    let scored: Vec<Option<usize>> = ids.iter().map(scored).collect();
+    let centre = now.agent(scenario.ego)?.state.pose.position;
+    let map = VectorMap::new(&scenario.map, centre, MAP_M, Hidden::default());
+    let samples = futures.iter().zip(&earnings).map(|(future, earned)| {
+        let mut log = scenario.log[..=scenario.now].to_vec();
+        log.extend(future.imagined().iter().cloned());
+        let driven = Scenario {
+            log,
+            ..scenario.clone()
+        };
+        let mut sample = whole(&driven, start, &ids, &map)?;
+        sample.weigh(|agent, frame| {
+            let own = scored[agent].zip(frame.checked_sub(first_move));
+            own.map_or(0.0, |(agent, k)| earned[agent * n_moves + k] as f32)
+        });
+        Some(sample)
+    });
+    samples.collect()
+}
+
+/// What is earned from each move on, given what is earned at each step.
+fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
+    let mut earned: Vec<f64> = credit
+        .chunks_exact(per_move)
+        .map(|steps| steps.iter().sum())
+        .collect();
+    for k in (1..earned.len()).rev() {
+        earned[k - 1] += earned[k];
+    }
+    earned
+}
+
+/// What each future earned beyond the mean of all, in standard deviations of the group; `None` if
+/// that says nothing.
+fn standardized(credit: &[Vec<f64>], earned: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Vec<f64>>> {
+    let mut all: Vec<Vec<f64>> = credit.iter().map(|credit| earned(credit)).collect();
+    let n = all.len() as f64;
+    let n_moves = all.first()?.len();
+    let mut squares = 0.0;
+    for at in 0..n_moves {
+        let mean = all.iter().map(|earned| earned[at]).sum::<f64>() / n;
+        for earned in &mut all {
+            earned[at] -= mean;
+            squares += earned[at] * earned[at];
+        }
+    }
+    let spread = (squares / (n * n_moves as f64)).sqrt();
+    if spread.is_nan() || spread <= LEAST {
+        return None;
+    }
+    for earned in all.iter_mut().flatten() {
+        *earned = (*earned / spread).clamp(-MOST, MOST);
+    }
+    Some(all)
+}

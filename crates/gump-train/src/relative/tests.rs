@@ -1,0 +1,318 @@
+//! The relative network against itself: in training and rolled out, resumed and unbroken.
+
+use candle_core::Device;
+use gump_engine::relative::{RelativeSampling, RelativeWorld};
+use gump_model::checkpoint;
+use gump_model::relative::graph::NODE_NUMBERS;
+use gump_model::relative::sample::{SampleConfig, draw};
+use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
+use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
+use gump_scene::{Scenario, Seed, fixture};
+
+use super::*;
+
+fn config() -> RelativeConfig {
+    RelativeConfig {
+        width: 32,
+        layers: 2,
+        heads: 2,
+        edge_width: 16,
+        edge_hidden: 24,
+    }
+}
+
+fn scenario() -> Scenario {
+    fixture::scenario(
+        "lane 1: 0,0 60,0 speed 15 next 2,3
+         lane 2: 60,0 140,0
+         lane 3: 60,0 75,5 80,20 80,60
+         edge: 0,-3 140,-3
+         ego vehicle 0: 10,0 velocity 8,0
+         agent vehicle 1: 30,0 velocity 0,0
+         agent vehicle 2: 50,0 velocity 6,0
+         agent bicycle 3: 20,-2 velocity 4,0
+         agent pedestrian 4: 40,5 velocity 0,-1",
+    )
+    .unwrap()
+}
+
+/// The scenario up to its present, and nothing hidden or pushed: both sides see the same frames.
+#[test]
+fn rolled_out_it_computes_what_it_computes_in_training() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let whole = scenario();
+    let mut seen = whole.clone();
+    seen.log.truncate(whole.now + 1);
+    let sample = draw(&seen, &SampleConfig::plain(), None, Seed(1)).unwrap();
+    let trained = network.hidden(&sample).unwrap().to_vec2::<f32>().unwrap();
+    let world = RelativeWorld::new(&network, RelativeSampling::default()).unwrap();
+    let (numbers, hidden) = world.read_present(whole.present()).unwrap();
+    let n = numbers.len() / NODE_NUMBERS;
+    assert_eq!(n, 5);
+    let last = &sample.nodes[sample.nodes.len() - n * NODE_NUMBERS..];
+    for (i, own) in numbers.chunks_exact(NODE_NUMBERS).enumerate() {
+        let same = |row: &[f32]| row.iter().zip(own).all(|(a, b)| (a - b).abs() < 1e-5);
+        let row = last.chunks_exact(NODE_NUMBERS).position(same);
+        let row = trained.len() - n + row.expect("the same agents are shown alike");
+        for (a, b) in trained[row].iter().zip(&hidden[i * 32..]) {
+            assert!((a - b).abs() < 1e-3, "agent {i}: {a} {b}");
+        }
+    }
+}
+
+#[test]
+fn futures_are_seeded_and_a_driven_ego_is_where_it_is_driven() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let world = RelativeWorld::new(&network, RelativeSampling::default()).unwrap();
+    let scenario = scenario();
+    let start = |n_futures, seed| Start {
+        scene: scenario.present(),
+        n_futures,
+        seed: Seed(seed),
+    };
+    let config = SimulateConfig {
+        seconds: 2.0,
+        ..SimulateConfig::default()
+    };
+    let run = |n, seed| simulate(&world, &[start(n, seed)], None, &config).unwrap();
+    let states = |rollout: &gump_scene::Rollout| format!("{:?}", rollout.last().now());
+    let (two, three) = (run(2, 7), run(3, 7));
+    assert_eq!(states(&two[1]), states(&three[1]));
+    assert_ne!(states(&three[0]), states(&three[1]));
+    let mut session = world.open(&[start(2, 0)]).unwrap();
+    let mut ego = scenario.present().ego_now().state;
+    ego.pose.position.x += 3.0;
+    let frames = session.step(Some(&[ego, ego])).unwrap();
+    assert_eq!(frames[1].agent(scenario.ego).unwrap().state, ego);
+    assert!(session.keep(&[1]));
+    assert_eq!(session.step(None).unwrap().len(), 1);
+}
+
+fn train_config(steps: usize) -> RelativeTrainConfig {
+    RelativeTrainConfig {
+        steps,
+        batch: 2,
+        optimizer: gump_nn::OptimizerConfig {
+            learning_rate: 3e-3,
+            warmup: 5,
+            ..gump_nn::OptimizerConfig::default()
+        },
+        ..RelativeTrainConfig::default()
+    }
+}
+
+#[test]
+fn it_learns_a_scene() {
+    let trainer = |steps| {
+        RelativeTrainer::new(
+            config(),
+            train_config(steps),
+            vec![scenario()],
+            &Device::Cpu,
+        )
+        .unwrap()
+    };
+    let mut trainer = trainer(120);
+    let first = trainer.step().unwrap().loss;
+    let last = (1..120)
+        .map(|_| trainer.step().unwrap().loss)
+        .last()
+        .unwrap();
+    assert!(last < 0.5 * first, "{first} to {last}");
+    let fields = trainer.validate(&[scenario()]).unwrap();
+    assert!(fields.iter().sum::<f64>() < first, "{fields:?}");
+}
+
+#[test]
+fn half_precision_finds_nearly_the_same_losses() {
+    let losses = |mixed_precision| {
+        let config = RelativeTrainConfig {
+            mixed_precision,
+            ..train_config(10)
+        };
+        let new = RelativeTrainer::new(self::config(), config, vec![scenario()], &Device::Cpu);
+        let mut trainer = new.unwrap();
+        (0..10)
+            .map(|_| trainer.step().unwrap().loss)
+            .collect::<Vec<_>>()
+    };
+    let (exact, rounded) = (losses(false), losses(true));
+    assert_ne!(exact, rounded);
+    for (a, b) in exact.iter().zip(&rounded) {
+        assert!((a - b).abs() < 0.03 * a, "{exact:?} {rounded:?}");
+    }
+}
+
+/// Agents that are driven are somewhere else than logged, near enough to come back, and what they
+/// learn leads back.
+#[test]
+fn driven_agents_leave_the_log_and_learn_the_way_back() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let drives = |candidates| {
+        let config = RelativeDrives {
+            share: 1.0,
+            candidates,
+            ..RelativeDrives::default()
+        };
+        drives::Driver::new(&network, &config).unwrap()
+    };
+    let far = |driver: Option<&drives::Driver>| {
+        let driver = driver.map(|driver| driver as _);
+        let sample = draw(&scenario(), &SampleConfig::plain(), driver, Seed(1)).unwrap();
+        let plain = draw(&scenario(), &SampleConfig::plain(), None, Seed(1)).unwrap();
+        assert_eq!(sample.targets.len(), plain.targets.len());
+        let differ = sample
+            .nodes
+            .iter()
+            .zip(&plain.nodes)
+            .filter(|(a, b)| a != b);
+        let bins =
+            |sample: &sample::Sample| -> Vec<_> { sample.targets.iter().map(|t| t.bins).collect() };
+        (differ.count(), bins(&sample) != bins(&plain))
+    };
+    assert_eq!(far(None), (0, false));
+    let (one, many) = (far(Some(&drives(1))), far(Some(&drives(64))));
+    assert!(one.0 > 0 && one.1, "{one:?}");
+    assert!(many.0 > 0, "{many:?}");
+}
+
+/// Under the rules agents go their own ways, and what they then did is what they learn.
+#[test]
+fn agents_that_go_their_own_ways_learn_what_they_did() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 8,0";
+    let alone = fixture::scenario(text).unwrap();
+    let drawn = |ruled| {
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::Driver::new(&network, &config).unwrap();
+        draw(&alone, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap()
+    };
+    // Metres ahead in the step that led to a node, and those that the node before should say; the
+    // first target is of the warm-up.
+    let differences = |sample: &sample::Sample| -> Vec<f64> {
+        let targets = sample.targets.iter().skip(1);
+        let difference = |target: &sample::Target| {
+            let node = target.node as usize + 1;
+            let done = 5.0 * f64::from(sample.nodes[node * NODE_NUMBERS + 8]);
+            (done - grid::dequantize(target.bins).position.x).abs()
+        };
+        targets.map(difference).collect()
+    };
+    let worst = |sample: &sample::Sample| differences(sample).into_iter().fold(0.0, f64::max);
+    let (ruled, led_back) = (drawn(1.0), drawn(0.0));
+    assert!(worst(&ruled) < 1e-4, "{:?}", differences(&ruled));
+    assert_ne!(ruled.nodes, led_back.nodes);
+    assert_eq!(drawn(1.0).nodes, ruled.nodes);
+}
+
+#[test]
+fn a_resumed_run_ends_in_the_same_weights() {
+    let closed_loop = RelativeDrives {
+        refresh: 2,
+        ruled: 0.5,
+        ..RelativeDrives::default()
+    };
+    let realism = RelativeRewards {
+        rollouts: 3,
+        refresh: 2,
+        ..RelativeRewards::default()
+    };
+    let closed_loop = Some(closed_loop);
+    for (closed_loop, realism) in [
+        (None, None),
+        (closed_loop.clone(), None),
+        (closed_loop, Some(realism)),
+    ] {
+        resumes(&RelativeTrainConfig {
+            closed_loop,
+            realism,
+            ..train_config(6)
+        });
+    }
+}
+
+/// What futures did is what is judged: every move of theirs, and no other.
+#[test]
+fn rollouts_are_judged_by_the_moves_they_made() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let config = RelativeRewards {
+        rollouts: 4,
+        ..RelativeRewards::default()
+    };
+    let judged = rewards::Judged::new(&network, &config).unwrap();
+    let group = judged.group(&scenario(), Seed(2)).unwrap().unwrap();
+    assert_eq!(group.samples.len(), 4);
+    assert!(group.realism > 0.0 && group.realism < 1.0);
+    let (mut sum, mut n) = (0.0, 0);
+    for sample in &group.samples {
+        for target in &sample.targets {
+            // Five agents are there at every frame; the present is the third.
+            assert_eq!(target.node, 5 * target.frame + target.agent);
+            assert!((2..18).contains(&target.frame));
+            let next = target.node as usize + 5;
+            let done = 5.0 * f64::from(sample.nodes[next * NODE_NUMBERS + 8]);
+            let said = grid::dequantize(target.bins).position.x;
+            assert!((done - said).abs() < 1e-4, "{done} {said}");
+            sum += f64::from(target.weight);
+            n += 1;
+        }
+    }
+    // Each move is compared with those of the other futures.
+    assert!(n > 100 && (sum / f64::from(n)).abs() < 0.1, "{sum} of {n}");
+    let too_short = fixture::scenario(
+        "lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0\nhistory 1.0 future 2.0 dt 0.1",
+    );
+    assert!(
+        judged
+            .group(&too_short.unwrap(), Seed(2))
+            .unwrap()
+            .is_none()
+    );
+    let alone = RelativeRewards {
+        rollouts: 1,
+        ..RelativeRewards::default()
+    };
+    let told = alone.validate().unwrap_err().to_string();
+    assert!(told.contains("rollouts must be at least 2"), "{told}");
+}
+
+fn resumes(config: &RelativeTrainConfig) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.safetensors");
+    let steps = config.steps;
+    let new = || {
+        RelativeTrainer::new(
+            self::config(),
+            config.clone(),
+            vec![scenario()],
+            &Device::Cpu,
+        )
+        .unwrap()
+    };
+    let mut whole = new();
+    (0..steps).for_each(|_| _ = whole.step().unwrap());
+    let mut broken = new();
+    (0..steps / 2).for_each(|_| _ = broken.step().unwrap());
+    broken.save(&path).unwrap();
+    let mut resumed = RelativeTrainer::resume(&path, vec![scenario()], &Device::Cpu).unwrap();
+    assert_eq!(resumed.steps_done(), steps / 2);
+    (steps / 2..steps).for_each(|_| _ = resumed.step().unwrap());
+    let weights = |trainer: &RelativeTrainer| {
+        let all = trainer.network().parameters().all();
+        all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(weights(&whole), weights(&resumed));
+    assert!(is_relative(&path).unwrap());
+    assert_eq!(load(&path, &Device::Cpu).unwrap().config(), &self::config());
+    // The other architecture refuses the file with a sentence.
+    let error = checkpoint::load(&path, &Device::Cpu).unwrap_err();
+    assert!(
+        error.to_string().contains("configuration is not valid"),
+        "{error}"
+    );
+}

@@ -1,0 +1,554 @@
+//! Training of the relative network: draw samples, differentiate, step, save, resume exactly.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, channel};
+
+use candle_core::backprop::GradStore;
+use candle_core::{Device, Tensor};
+use gump_kernels::Operands;
+use gump_model::checkpoint::Precision;
+use gump_model::relative::grid::FIELDS;
+use gump_model::relative::sample::{Sample, SampleConfig, draw};
+use gump_model::relative::{RelativeConfig, RelativeNetwork};
+use gump_model::{ModelError, checkpoint};
+use gump_nn::ops::Deferred;
+use gump_nn::optimizer::{AdamW, OptimizerConfig, move_average};
+use gump_nn::parameters::Parameters;
+use gump_nn::{Gradients, NnError};
+use gump_scene::{Scenario, Seed};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::relative::drives::{Driver, RelativeDrives};
+use crate::relative::rewards::{Group, Judged, RelativeRewards};
+use crate::scenes::ScenarioSource;
+
+/// How many scenes are tried for a sample.
+const ATTEMPTS: u64 = 64;
+/// Separates the scenes that are rolled out from those of the samples.
+const GROUP: u64 = 1 << 40;
+
+/// What names of the tensors that drive begin with in a checkpoint.
+pub(super) const DRIVER: &str = "driver.";
+
+/// How to train.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RelativeTrainConfig {
+    /// Optimiser steps of the whole run.
+    pub steps: usize,
+    /// Samples per step.
+    pub batch: usize,
+    /// Where all randomness comes from.
+    pub seed: u64,
+    /// Share of the old in a moving average of the weights, which is what is validated and shipped.
+    pub ema: f64,
+    /// Width of the smoothing of targets over neighbouring bins of moves, standard deviation in bins;
+    /// standing is never smoothed.
+    pub smoothing_bins: f64,
+    /// Whether matrix products take their operands in bfloat16; sums and weights stay f32.
+    pub mixed_precision: bool,
+    /// Whether agents are driven by the network that learns, and how; without it samples show logs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub closed_loop: Option<RelativeDrives>,
+    /// Whether the network learns from what its own rollouts add to realism beside that, and how.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub realism: Option<RelativeRewards>,
+    /// How samples are drawn.
+    pub sample: SampleConfig,
+    /// How steps are taken.
+    pub optimizer: OptimizerConfig,
+}
+
+impl Default for RelativeTrainConfig {
+    fn default() -> Self {
+        Self {
+            steps: 20_000,
+            batch: 4,
+            seed: 0,
+            ema: 0.999,
+            smoothing_bins: 0.7,
+            mixed_precision: false,
+            closed_loop: None,
+            realism: None,
+            sample: SampleConfig::default(),
+            optimizer: OptimizerConfig {
+                learning_rate: 1e-3,
+                clip: 1.0,
+                ..OptimizerConfig::default()
+            },
+        }
+    }
+}
+
+impl RelativeTrainConfig {
+    /// Steps after which the network that drives is brought up to date, if one drives.
+    fn refresh(&self) -> Option<usize> {
+        let drives = self.closed_loop.as_ref().map(|drives| drives.refresh);
+        let rewards = self.realism.as_ref().map(|rewards| rewards.refresh);
+        drives.into_iter().chain(rewards).min()
+    }
+
+    /// Checks that the numbers are in their ranges.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] naming the first that is not.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        if self.batch == 0 || self.steps == 0 {
+            let what = "batch and steps must be at least 1".to_owned();
+            return Err(ModelError::Config(what));
+        }
+        self.closed_loop
+            .as_ref()
+            .map_or(Ok(()), RelativeDrives::validate)?;
+        self.realism
+            .as_ref()
+            .map_or(Ok(()), RelativeRewards::validate)?;
+        Ok(self.optimizer.validate()?)
+    }
+}
+
+/// What one step did.
+#[derive(Clone, Debug, Serialize)]
+pub struct RelativeStep {
+    /// Steps done, this one included.
+    pub step: usize,
+    /// Mean over moves, nats: all fields together.
+    pub loss: f64,
+    /// The same by field: stands, ahead, left, turn.
+    pub fields: [f64; FIELDS],
+    /// Norm of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Learning rate of the step.
+    pub learning_rate: f64,
+    /// Agents at frames that were presented.
+    pub nodes: usize,
+    /// Realism of the rollouts that were learned from, if any were.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rollouts: Option<f64>,
+}
+
+/// A training run.
+pub struct RelativeTrainer {
+    trained: RelativeNetwork,
+    average: RelativeNetwork,
+    optimizer: AdamW,
+    config: RelativeTrainConfig,
+    step: usize,
+    source: Arc<Source>,
+    /// The network that drives the agents of samples, as it was at the last refresh.
+    driving: Option<RelativeNetwork>,
+    next: Receiver<Result<Batch, ModelError>>,
+}
+
+/// What a step learns from.
+struct Batch {
+    samples: Vec<Sample>,
+    group: Option<Group>,
+}
+
+/// The network that drives, in both of its roles.
+#[derive(Default)]
+struct Drivers {
+    driver: Option<Driver>,
+    judged: Option<Judged>,
+}
+
+struct Source {
+    scenarios: Box<dyn ScenarioSource>,
+    config: SampleConfig,
+    seed: Seed,
+    batch: usize,
+}
+
+impl Source {
+    fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, ModelError> {
+        let group = drivers.judged.as_ref();
+        let group = group.map(|judged| self.group(step, judged));
+        Ok(Batch {
+            samples: self.samples(step, drivers.driver.as_ref())?,
+            group: group.transpose()?,
+        })
+    }
+
+    fn group(&self, step: usize, judged: &Judged) -> Result<Group, ModelError> {
+        let seed = self.seed.fork(step as u64).fork(GROUP);
+        for attempt in 0..ATTEMPTS {
+            let seed = seed.fork(attempt);
+            let scenario = self.scenarios.pick(step, seed.fork(0).0);
+            let scenario = self.scenarios.get(scenario)?;
+            if let Some(group) = judged.group(&scenario, seed.fork(1))? {
+                return Ok(group);
+            }
+        }
+        Err(ModelError::Config(
+            "realism: no scene has the second of past and the eight seconds of future at 10 Hz, \
+             the road edges and the agents that its rollouts are compared with"
+                .to_owned(),
+        ))
+    }
+
+    fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, ModelError> {
+        let seed = self.seed.fork(step as u64);
+        let drawn = (0..self.batch).map(|i| {
+            let seed = seed.fork(i as u64);
+            for attempt in 0..ATTEMPTS {
+                let seed = seed.fork(attempt);
+                let scenario = self.scenarios.pick(step, seed.fork(0).0);
+                let scenario = self.scenarios.get(scenario)?;
+                let sample = draw(
+                    &scenario,
+                    &self.config,
+                    driver.map(|d| d as _),
+                    seed.fork(1),
+                );
+                if let Some(sample) = sample.filter(|sample| !sample.targets.is_empty()) {
+                    return Ok(sample);
+                }
+            }
+            Err(ModelError::NoData { frames: 3 })
+        });
+        drawn.collect()
+    }
+}
+
+fn prefetch(
+    source: &Arc<Source>,
+    step: usize,
+    drivers: Drivers,
+) -> Receiver<Result<Batch, ModelError>> {
+    let (sender, receiver) = channel();
+    let source = Arc::clone(source);
+    // A receiver that is gone belongs to a trainer that is gone.
+    std::thread::spawn(move || drop(sender.send(source.batch(step, &drivers))));
+    receiver
+}
+
+impl RelativeTrainer {
+    /// Starts a run on a new network.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn new(
+        model: RelativeConfig,
+        config: RelativeTrainConfig,
+        scenarios: impl ScenarioSource + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let network = RelativeNetwork::random(model, Seed(config.seed).fork(0), device)?;
+        Self::continuing(network, config, scenarios)
+    }
+
+    /// Starts a run on a network that has learned something already, with a fresh optimiser.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn continuing(
+        network: RelativeNetwork,
+        config: RelativeTrainConfig,
+        scenarios: impl ScenarioSource + 'static,
+    ) -> Result<Self, ModelError> {
+        let average = build_like(&network, copies(&network)?)?;
+        let optimizer = AdamW::new(network.parameters())?;
+        let driving = driving(&average, &config)?;
+        let run = (network, average, driving);
+        Self::assemble(run, optimizer, config, 0, Box::new(scenarios))
+    }
+
+    /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
+    ///
+    /// # Errors
+    /// A file that is not a run's checkpoint, or no scenario to train on.
+    pub fn resume(
+        path: &Path,
+        scenarios: impl ScenarioSource + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let mut archive = checkpoint::read(path)?;
+        let model = gump_model::relative::config(&archive)?;
+        let text = archive.entry("step")?;
+        let step: usize = text
+            .parse()
+            .map_err(|_| archive.error(format!("its step is \"{text}\", expected a number")))?;
+        let config: RelativeTrainConfig =
+            serde_json::from_str(archive.entry("train")?).map_err(|error| {
+                archive.error(format!("its training configuration is not valid ({error})"))
+            })?;
+        let mut moments = archive.take(checkpoint::OPTIMIZER);
+        let trained = archive.take(checkpoint::TRAINED);
+        let driver = archive.take(DRIVER);
+        let build =
+            |weights| RelativeNetwork::build(model.clone(), Parameters::loaded(weights, device));
+        let (network, average) = (build(trained)?, build(archive.tensors)?);
+        let driving = (!driver.is_empty()).then(|| build(driver)).transpose()?;
+        let optimizer = AdamW::restore(network.parameters(), step, |name| {
+            let tensor = moments.remove(name);
+            tensor.ok_or_else(|| NnError::MissingTensor {
+                name: name.to_owned(),
+            })
+        })?;
+        let run = (network, average, driving);
+        Self::assemble(run, optimizer, config, step, Box::new(scenarios))
+    }
+
+    fn assemble(
+        (network, average, driving): (RelativeNetwork, RelativeNetwork, Option<RelativeNetwork>),
+        optimizer: AdamW,
+        config: RelativeTrainConfig,
+        step: usize,
+        scenarios: Box<dyn ScenarioSource>,
+    ) -> Result<Self, ModelError> {
+        config.validate()?;
+        if scenarios.is_empty() {
+            return Err(ModelError::NoData { frames: 3 });
+        }
+        let source = Arc::new(Source {
+            scenarios,
+            config: config.sample.clone(),
+            seed: Seed(config.seed).fork(1),
+            batch: config.batch,
+        });
+        let next = prefetch(&source, step, drivers(driving.as_ref(), &config)?);
+        Ok(Self {
+            trained: network,
+            average,
+            optimizer,
+            config,
+            step,
+            source,
+            driving,
+            next,
+        })
+    }
+
+    /// One optimiser step.
+    ///
+    /// # Errors
+    /// [`ModelError::LossNotFinite`] before anything is changed, or what drawing samples reports.
+    pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
+        let drawn = self.next.recv();
+        let Batch { samples, group } = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
+        let refresh = self.config.refresh();
+        if refresh.is_some_and(|refresh| self.step.is_multiple_of(refresh)) {
+            self.driving = driving(&self.average, &self.config)?;
+        }
+        let drivers = drivers(self.driving.as_ref(), &self.config)?;
+        self.next = prefetch(&self.source, self.step + 1, drivers);
+        let total = weight(&samples);
+        let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
+        let operands = match self.config.mixed_precision {
+            true => Operands::Bf16,
+            false => Operands::F32,
+        };
+        let judged = group.as_ref().map_or(&[][..], |group| &group.samples);
+        let n_judged: usize = judged.iter().map(|sample| sample.targets.len()).sum();
+        let rewards = self.config.realism.as_ref();
+        let judged_total = rewards.map_or(1.0, |rewards| n_judged as f64 / rewards.weight);
+        let imitated = samples.par_iter().map(|sample| (sample, true));
+        let preferred = judged
+            .par_iter()
+            .filter(|sample| !sample.targets.is_empty());
+        let all = imitated.chain(preferred.map(|sample| (sample, false)));
+        let parts = all.map(|(sample, imitates)| {
+            let deferred = Deferred::default();
+            let build = || match imitates {
+                true => network.loss(sample, total, smoothing),
+                false => network.preference(sample, judged_total),
+            };
+            let (loss, sums) = operands.during(|| deferred.during(build))?;
+            Ok(Part {
+                gradients: loss.backward()?,
+                deferred,
+                sums,
+            })
+        });
+        let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+        let imitated = parts[..samples.len()].iter();
+        let fields = mean_fields(imitated.map(|part| &part.sums), total);
+        let loss: f64 = fields.iter().sum();
+        if !loss.is_finite() {
+            let field = "move".to_owned();
+            return Err(ModelError::LossNotFinite {
+                step: self.step,
+                field,
+            });
+        }
+        let trainable: Vec<_> = self.trained.parameters().trainable().collect();
+        let sums = trainable.into_par_iter().map(|(name, var)| {
+            let mut of_samples = parts.iter().filter_map(|part| part.gradients.get(var));
+            let sum = match of_samples.next() {
+                Some(first) => {
+                    Some(of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?)
+                }
+                None => None,
+            };
+            let deferred = parts.iter().map(|part| &part.deferred);
+            let sum = Deferred::take_in(deferred, var, sum)?;
+            Ok(sum.map(|sum| (name.to_owned(), sum)))
+        });
+        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        let gradients: Gradients = sums.into_iter().flatten().collect();
+        let rate = self.config.optimizer.rate(self.step, self.config.steps);
+        let parameters = self.trained.parameters();
+        let gradient_norm =
+            self.optimizer
+                .step(parameters, &gradients, &self.config.optimizer, rate)?;
+        self.step += 1;
+        let t = self.step as f64;
+        let share = self.config.ema.min((1.0 + t) / (10.0 + t));
+        move_average(self.average.parameters(), parameters, share)?;
+        Ok(RelativeStep {
+            step: self.step,
+            loss,
+            fields,
+            gradient_norm,
+            learning_rate: rate,
+            nodes: samples.iter().chain(judged).map(Sample::n_nodes).sum(),
+            rollouts: group.as_ref().map(|group| group.realism),
+        })
+    }
+
+    /// The loss on other scenarios, nothing hidden, nothing smoothed; by field, nats.
+    ///
+    /// # Errors
+    /// No scenario long enough, or a tensor error.
+    pub fn validate(&self, scenarios: &[Scenario]) -> Result<[f64; FIELDS], ModelError> {
+        let config = SampleConfig {
+            max_agents: self.config.sample.max_agents,
+            ..SampleConfig::plain()
+        };
+        let samples: Vec<Sample> = scenarios
+            .par_iter()
+            .enumerate()
+            .filter_map(|(i, scenario)| draw(scenario, &config, None, Seed(0).fork(i as u64)))
+            .filter(|sample| !sample.targets.is_empty())
+            .collect();
+        if samples.is_empty() {
+            return Err(ModelError::NoData { frames: 3 });
+        }
+        let total = weight(&samples);
+        let network = &self.average;
+        let sums = samples
+            .par_iter()
+            .map(|sample| Ok(network.loss(sample, total, 0.0)?.1));
+        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        Ok(mean_fields(sums.iter(), total))
+    }
+
+    /// Writes everything a resumed run needs; it can be loaded as a network, too.
+    ///
+    /// # Errors
+    /// [`ModelError::Io`]; the previous file is intact.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        let named = |prefix: &str, network: &RelativeNetwork| -> BTreeMap<String, Tensor> {
+            let all = network.parameters().all();
+            all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))
+                .collect()
+        };
+        let mut tensors = named("", &self.average);
+        tensors.extend(named(checkpoint::TRAINED, &self.trained));
+        if let Some(driving) = &self.driving {
+            tensors.extend(named(DRIVER, driving));
+        }
+        let state = self.optimizer.state();
+        tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
+        let mut header = gump_model::relative::header(self.trained.config())?;
+        let config =
+            serde_json::to_string(&self.config).map_err(|e| ModelError::Config(e.to_string()))?;
+        header.insert("train".to_owned(), config);
+        header.insert("step".to_owned(), self.step.to_string());
+        checkpoint::write(path, tensors, header, Precision::Full)
+    }
+
+    /// Ends the run and keeps the network to use.
+    pub fn into_network(self) -> RelativeNetwork {
+        self.average
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> usize {
+        self.step
+    }
+
+    /// How it trains.
+    pub fn config(&self) -> &RelativeTrainConfig {
+        &self.config
+    }
+
+    /// The network to use, as it is now: the moving average.
+    pub fn network(&self) -> &RelativeNetwork {
+        &self.average
+    }
+
+    /// A copy of it, for a world that imagines while training goes on.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn snapshot(&self) -> Result<RelativeNetwork, ModelError> {
+        build_like(&self.average, copies(&self.average)?)
+    }
+}
+
+/// The network that drives from now on, if any does.
+fn driving(
+    average: &RelativeNetwork,
+    config: &RelativeTrainConfig,
+) -> Result<Option<RelativeNetwork>, ModelError> {
+    let copied = config.refresh();
+    let copied = copied.map(|_| build_like(average, copies(average)?));
+    copied.transpose()
+}
+
+fn drivers(
+    driving: Option<&RelativeNetwork>,
+    config: &RelativeTrainConfig,
+) -> Result<Drivers, ModelError> {
+    let driver = driving.zip(config.closed_loop.as_ref());
+    let driver = driver.map(|(network, drives)| Driver::new(network, drives));
+    let judged = driving.zip(config.realism.as_ref());
+    let judged = judged.map(|(network, rewards)| Judged::new(network, rewards));
+    Ok(Drivers {
+        driver: driver.transpose()?,
+        judged: judged.transpose()?,
+    })
+}
+
+/// What one sample of a step found.
+struct Part {
+    gradients: GradStore,
+    /// Gradients of matrices that are still to be computed.
+    deferred: Deferred,
+    /// Sums of the fields' cross-entropies, nats.
+    sums: [f64; FIELDS],
+}
+
+fn weight(samples: &[Sample]) -> f64 {
+    let targets = samples.iter().flat_map(|sample| &sample.targets);
+    targets.map(|target| f64::from(target.weight)).sum()
+}
+
+fn mean_fields<'a>(sums: impl Iterator<Item = &'a [f64; FIELDS]>, total: f64) -> [f64; FIELDS] {
+    let mut mean = [0.0; FIELDS];
+    for sums in sums {
+        for (mean, sum) in mean.iter_mut().zip(sums) {
+            *mean += sum / total;
+        }
+    }
+    mean
+}
+
+fn copies(network: &RelativeNetwork) -> Result<BTreeMap<String, Tensor>, ModelError> {
+    let all = network.parameters().all();
+    all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
+        .collect()
+}
+
+fn build_like(
+    network: &RelativeNetwork,
+    weights: BTreeMap<String, Tensor>,
+) -> Result<RelativeNetwork, ModelError> {
+    let parameters = Parameters::loaded(weights, network.parameters().device());
+    RelativeNetwork::build(network.config().clone(), parameters)
+}

@@ -1,0 +1,411 @@
+//! One training sample: a random centre, a random run of frames, and what should be said of it.
+//!
+//! Augmentation moves and turns the *pose* everything is expressed in, before anything is drawn or
+//! tokenized, so that map and agents cannot fall out of register. Which frames are shown is said in
+//! `window`, what is asked in `targets`.
+
+#[cfg(test)]
+mod driving_tests;
+mod hidden;
+mod targets;
+#[cfg(test)]
+mod tests;
+mod window;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use gump_model::Network;
+use gump_model::exact::ExactFrames;
+use gump_model::local_context::Survey;
+use gump_model::placed_slot::{PlacedSlot, place_exactly};
+use gump_raster::{Raster, RasterSpec, rasterize};
+use gump_scene::{Agent, AgentId, Frame, MapGraph, Rng, Scenario, ScenarioTag, SceneState, Seed};
+use gump_tokenizer::{
+    Field, Identities, MAX_PROMPTS, QuantizedState, Slot, TokenFrame, TokenSequence, Tokenizer,
+    TokenizerConfig,
+};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+use self::hidden::Hidden;
+pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
+use self::targets::{class_targets, control_targets, light_targets, targets};
+pub(crate) use self::window::Driven;
+use self::window::{Window, choose_window};
+use crate::perturbation as drift;
+
+/// Separates the stream of what is hidden from those of other choices.
+const HIDDEN: u64 = 1 << 32;
+
+/// How samples are drawn from scenarios.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SampleConfig {
+    /// Consecutive frames at 2 Hz a sample presents.
+    pub frames: usize,
+    /// Samples keep at most this many agents, those nearest to the centre, and fewer where the
+    /// frames would not fit the network's block.
+    pub max_agents: usize,
+    /// True takes any frame of the log as the present, not only the scenario's own.
+    pub any_present: bool,
+    /// Probability that another vehicle than the ego is the centre (the paper re-centres too).
+    pub other_centre: f64,
+    /// Probability of moving and turning the frame of reference.
+    pub augment: f64,
+    /// Largest turn, radians (paper: π/2).
+    pub rotation: f64,
+    /// Largest move along each axis, metres (paper: 5).
+    pub translation_m: f64,
+    /// Probability of removing a track for a part of the window (paper: 0.1).
+    pub agent_dropout: f64,
+    /// Probability of blanking a frame (paper: 0.1).
+    pub frame_dropout: f64,
+    /// Probability that what drives is shown a little off its way, with the way back asked for.
+    pub sway: f64,
+    /// The farthest that it is pushed to a side at once, metres.
+    pub sway_m: f64,
+    /// Probability that the last frame's values are seen perturbed, as partial-AR decoding sees
+    /// surrogates; the targets stay true.
+    pub surrogate_noise: f64,
+    /// True draws the ids of each sample at random, so that every id is learned; false ranks them as
+    /// inference does.
+    pub shuffle_ids: bool,
+    /// Probability of leaving out the prompts.
+    pub prompt_dropout: f64,
+    /// Probability of showing no speed limit of the map, as of a source that states none.
+    pub hide_limits: f64,
+    /// Likewise of stop signs.
+    pub hide_stop_signs: f64,
+    /// Likewise of lights.
+    pub hide_lights: f64,
+    /// Likewise of sizes: all objects have the usual ones of their kinds.
+    pub hide_sizes: f64,
+    /// Probability that the window begins with the frame of reference, as a scene to generate does.
+    pub from_reference: f64,
+}
+
+impl Default for SampleConfig {
+    fn default() -> Self {
+        Self {
+            frames: 5,
+            max_agents: 48,
+            any_present: true,
+            other_centre: 0.5,
+            augment: 0.5,
+            rotation: std::f64::consts::FRAC_PI_2,
+            translation_m: 5.0,
+            agent_dropout: 0.1,
+            frame_dropout: 0.1,
+            sway: 0.0,
+            sway_m: 0.8,
+            surrogate_noise: 0.5,
+            shuffle_ids: true,
+            prompt_dropout: 0.5,
+            hide_limits: 0.3,
+            hide_stop_signs: 0.1,
+            hide_lights: 0.1,
+            hide_sizes: 0.1,
+            from_reference: 0.25,
+        }
+    }
+}
+
+impl SampleConfig {
+    /// No augmentation, no dropout, the ego as centre: to overfit or to validate.
+    pub fn plain(frames: usize) -> Self {
+        Self {
+            frames,
+            max_agents: 320,
+            any_present: false,
+            other_centre: 0.0,
+            augment: 0.0,
+            agent_dropout: 0.0,
+            frame_dropout: 0.0,
+            sway: 0.0,
+            surrogate_noise: 0.0,
+            shuffle_ids: false,
+            prompt_dropout: 1.0,
+            hide_limits: 0.0,
+            hide_stop_signs: 0.0,
+            hide_lights: 0.0,
+            hide_sizes: 0.0,
+            from_reference: 0.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// Tokens, raster and targets of one sample.
+#[derive(Debug)]
+pub(crate) struct Sample {
+    pub(crate) slots: Vec<PlacedSlot>,
+    pub(crate) raster: Raster,
+    pub(crate) survey: Arc<Survey>,
+    pub(crate) states: Vec<StateTarget>,
+    pub(crate) control: Vec<ControlTarget>,
+    pub(crate) lights: Vec<ControlTarget>,
+    pub(crate) classes: Vec<ControlTarget>,
+    pub(crate) trajectories: Vec<TrajectoryTarget>,
+}
+
+/// What samples are made for.
+pub(crate) struct Reader {
+    pub(crate) spec: RasterSpec,
+    pub(crate) tokenizer: Tokenizer,
+    /// True asks for chunks in the frames of their objects.
+    pub(crate) anchored: bool,
+    /// Longest sequence of tokens.
+    pub(crate) block_size: usize,
+}
+
+impl Reader {
+    /// Samples for this network.
+    pub(crate) fn of(network: &Network) -> Self {
+        Self {
+            spec: network.raster_spec().clone(),
+            tokenizer: Tokenizer::new(TokenizerConfig::default()),
+            anchored: network.config().anchored,
+            block_size: network.config().block_size,
+        }
+    }
+
+    /// Agents of a frame that fit the block beside as many other frames: two tokens each, after
+    /// prompts, lights and the three marks of a frame.
+    fn room(&self, frame: &Frame, n_frames: usize) -> usize {
+        let tokens = self.block_size.saturating_sub(MAX_PROMPTS) / n_frames.max(1);
+        tokens.saturating_sub(3 + frame.lights().len()) / 2
+    }
+}
+
+/// Draws a sample, from a drive of the scenario if there is one; `None` if the scenario is too
+/// short for one.
+pub(crate) fn draw(
+    scenario: &Scenario,
+    driven: Option<Driven<'_>>,
+    reader: &Reader,
+    config: &SampleConfig,
+    seed: Seed,
+) -> Option<Sample> {
+    let mut rng = seed.rng();
+    let mut window = choose_window(scenario, driven, config, &mut rng)?;
+    let swaying = if driven.is_none() && rng.random_bool(config.sway) {
+        let (start, stride) = (window.start, window.stride);
+        let drive = drift::sway(
+            scenario,
+            start,
+            stride,
+            config.frames,
+            config.sway_m,
+            &mut rng,
+        );
+        Some(drive)
+    } else {
+        None
+    };
+    if let Some(drive) = &swaying {
+        let slack = drift::SLACK;
+        window.driven = Some(Driven { drive, slack });
+    }
+    let frames: Vec<Frame> = (0..config.frames)
+        .filter_map(|i| {
+            let frame = window.seen(i, 0)?;
+            let most = config.max_agents.min(reader.room(frame, config.frames));
+            Some(thin(frame, &window, most))
+        })
+        .collect();
+    // A stream of its own, so that what is hidden changes nothing else of the sample.
+    let hidden = Hidden::draw(config, &mut seed.fork(HIDDEN).rng());
+    let frames: Vec<Frame> = frames.iter().map(|frame| hidden.frame(frame)).collect();
+    let map = hidden.map(&scenario.map);
+    let frames = drop_agents(&frames, window.centre, config.agent_dropout, &mut rng);
+    let views: Vec<&Frame> = frames.iter().collect();
+    let (centre, pose) = (window.centre, window.world_from_scene);
+    let identities = if config.shuffle_ids {
+        Identities::shuffled(&views, centre, pose, &mut rng)
+    } else {
+        Identities::ranked(&views, centre, pose)
+    };
+    let encoded = reader.tokenizer.encode(
+        &map,
+        &views,
+        window.centre,
+        window.world_from_scene,
+        &identities,
+    );
+    let prompts = prompts(&window, config, &mut rng);
+    let sequence = TokenSequence::new(prompts, encoded.sequence.frames().to_vec()).ok()?;
+    let n = sequence.frames().len();
+    let exact = ExactFrames::last(n, &frames, &identities, pose);
+    let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
+    let (mut states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
+    if hidden.sizes {
+        // Nobody should learn that objects have these sizes.
+        states.iter_mut().for_each(StateTarget::forget_size);
+    }
+    let mut sample = Sample {
+        raster: draw_raster(&window, &map, hidden, &reader.spec),
+        survey: Arc::new(Survey::new(&map, window.world_from_scene)),
+        slots: Vec::new(),
+        states,
+        control: control_targets(&slots),
+        lights: light_targets(&slots),
+        classes: class_targets(&slots),
+        trajectories,
+    };
+    if rng.random_bool(config.surrogate_noise) {
+        perturb_last_frame(&mut slots, sequence.frames(), &mut rng);
+    }
+    sample.slots = slots;
+    blank_frames(&mut sample, config, &mut rng);
+    Some(sample)
+}
+
+/// The frame with only its nearest `most` agents.
+fn thin(frame: &Frame, window: &Window<'_>, most: usize) -> Frame {
+    let mut agents = frame.agents().to_vec();
+    if agents.len() > most {
+        let centre = window.world_from_scene.position;
+        agents.sort_by(|a, b| {
+            let key = |agent: &Agent| {
+                if agent.id == window.centre {
+                    -1.0
+                } else {
+                    agent.state.pose.position.distance(centre)
+                }
+            };
+            key(a).total_cmp(&key(b)).then(a.id.cmp(&b.id))
+        });
+        agents.truncate(most);
+    }
+    Frame::new(agents, frame.lights().to_vec())
+}
+
+/// Removes whole tracks for a random part of the window, which makes births and disappearances.
+fn drop_agents(frames: &[Frame], centre: AgentId, probability: f64, rng: &mut Rng) -> Vec<Frame> {
+    let mut ids: Vec<AgentId> = frames
+        .iter()
+        .flat_map(|f| f.agents().iter().map(|a| a.id))
+        .collect();
+    ids.sort();
+    ids.dedup();
+    ids.retain(|&id| id != centre);
+    let n = frames.len();
+    let gaps: BTreeMap<AgentId, std::ops::Range<usize>> = ids
+        .into_iter()
+        .filter_map(|id| {
+            let (dropped, a, b) = (
+                rng.random_bool(probability),
+                rng.random_range(0..=n),
+                rng.random_range(0..=n),
+            );
+            dropped.then(|| (id, a.min(b)..a.max(b)))
+        })
+        .collect();
+    let keep = |i: usize, id: AgentId| gaps.get(&id).is_none_or(|gap| !gap.contains(&i));
+    let kept = frames.iter().enumerate().map(|(i, frame)| {
+        let agents = frame
+            .agents()
+            .iter()
+            .copied()
+            .filter(|agent| keep(i, agent.id))
+            .collect();
+        Frame::new(agents, frame.lights().to_vec())
+    });
+    kept.collect()
+}
+
+/// Some of the tags that hold for the centre in the first presented frame, which is what prompts of
+/// a scene to generate are about.
+fn prompts(window: &Window<'_>, config: &SampleConfig, rng: &mut Rng) -> Vec<Option<ScenarioTag>> {
+    if rng.random_bool(config.prompt_dropout) {
+        return Vec::new();
+    }
+    let scenario = window.scenario;
+    let is_own = window.centre == scenario.ego && window.start == scenario.now;
+    let mut tags = if is_own && !scenario.tags.is_empty() {
+        scenario.tags.clone()
+    } else {
+        let seen = Scenario {
+            now: window.start,
+            ego: window.centre,
+            route: None,
+            ..scenario.clone()
+        };
+        gump_metrics::tags::mine(&seen)
+    };
+    for i in (1..tags.len()).rev() {
+        tags.swap(i, rng.random_range(0..=i));
+    }
+    tags.into_iter().take(MAX_PROMPTS).map(Some).collect()
+}
+
+fn draw_raster(
+    window: &Window<'_>,
+    map: &Arc<MapGraph>,
+    hidden: Hidden,
+    spec: &RasterSpec,
+) -> Raster {
+    let scenario = window.scenario;
+    let log = &scenario.log[..=window.reference];
+    let shown: Vec<Frame> = match hidden.shows_frames() {
+        true => Vec::new(),
+        false => log.iter().map(|frame| hidden.frame(frame)).collect(),
+    };
+    let scene = SceneState {
+        map,
+        // The route is the ego's; another centre has none.
+        route: scenario
+            .route
+            .as_ref()
+            .filter(|_| window.centre == scenario.ego),
+        history: if hidden.shows_frames() { log } else { &shown },
+        ego: window.centre,
+        dt: scenario.dt,
+    };
+    rasterize(spec, &scene, window.world_from_scene)
+}
+
+/// Replaces the last frame's values by what a surrogate might have said: off by a few bins.
+fn perturb_last_frame(slots: &mut [PlacedSlot], frames: &[TokenFrame], rng: &mut Rng) {
+    let last = frames.len() - 1;
+    let scale = rng.random_range(0.0..1.0);
+    for placed in slots.iter_mut().filter(|placed| placed.frame == last) {
+        if let Slot::Value(state) = &mut placed.slot {
+            *state = perturb(*state, scale, rng);
+        }
+    }
+}
+
+/// A pose off by up to a metre along and 0.4 m across the motion, growing with speed.
+fn perturb(state: QuantizedState, scale: f64, rng: &mut Rng) -> QuantizedState {
+    let (pose, velocity) = (state.pose(), state.velocity());
+    let reach = scale * (velocity.length() * 0.1).min(1.0);
+    let mut within = |bound: f64| bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0);
+    let offset = pose.rotate(gump_geometry::dvec2(within(reach), within(0.4 * reach)));
+    let mut moved = state;
+    moved.x = Field::X.quantize(pose.position.x + offset.x).bin;
+    moved.y = Field::Y.quantize(pose.position.y + offset.y).bin;
+    moved.heading = Field::Heading
+        .quantize(pose.heading + within(0.1 * reach))
+        .bin;
+    moved
+}
+
+/// Blanks whole frames (never the first, which everything builds on) and forgets their targets.
+fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
+    let blanked: Vec<bool> = (0..config.frames)
+        .map(|frame| rng.random_bool(config.frame_dropout) && frame > 0)
+        .collect();
+    let is_blank = |slot: usize| blanked[sample.slots[slot].frame.min(blanked.len() - 1)];
+    sample.states.retain(|target| !is_blank(target.key));
+    sample.trajectories.retain(|target| !is_blank(target.key));
+    for targets in [&mut sample.control, &mut sample.lights, &mut sample.classes] {
+        targets.retain(|target| !is_blank(target.slot));
+    }
+    for placed in &mut sample.slots {
+        if blanked[placed.frame.min(blanked.len() - 1)] && !matches!(placed.slot, Slot::Prompt(_)) {
+            placed.slot = Slot::Pad;
+        }
+    }
+}

@@ -1,0 +1,323 @@
+//! Training: draw samples, differentiate, step, save; interrupted anywhere, it resumes exactly.
+//!
+//! Sample `i` of step `s` depends on the seed, `s` and `i` alone, so neither threads, processes nor
+//! a restart change what is learned. What is run is in `config`, where samples come from in
+//! `source`, how parts of a batch add up in `gradients` and `peers`, what is saved in `learner`.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use candle_core::Device;
+use gump_scene::{Scenario, Seed};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use gump_model::ModelError;
+use gump_model::Network;
+use gump_model::config::ModelConfig;
+use gump_nn::layers::Dropout;
+use gump_nn::ops::Deferred;
+
+use crate::closed_loop;
+use crate::config::TrainConfig;
+use crate::gradients::{BatchGradients, Part};
+use crate::learner::TrainState;
+use crate::loss::{Counts, LossConfig, LossParts, loss};
+use crate::peers::{ProcessGroup, SingleProcess};
+use crate::sample::{Reader, Sample, SampleConfig, draw};
+use crate::scenes::ScenarioSource;
+use crate::source::{SampleReceiver, Source, check_rate, prefetch};
+
+/// What one step did.
+#[derive(Clone, Debug, Serialize)]
+pub struct StepReport {
+    /// Steps done, this one included.
+    pub step: usize,
+    /// The loss before the step.
+    pub loss: LossParts,
+    /// Learning rate of the step.
+    pub learning_rate: f64,
+    /// Norm of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Tokens presented.
+    pub tokens: usize,
+    /// Realism of the rollouts that were learned from, if any were.
+    pub rollouts: Option<f64>,
+}
+
+/// A training run.
+pub struct Trainer {
+    pub(crate) learner: TrainState,
+    pub(crate) config: TrainConfig,
+    pub(crate) peers: Box<dyn ProcessGroup>,
+    pub(crate) source: Arc<Source>,
+    /// Samples of the next step, being drawn while the present one is computed.
+    pub(crate) next: SampleReceiver,
+}
+
+impl Trainer {
+    /// Starts a run on a new network.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn new(
+        model: ModelConfig,
+        config: TrainConfig,
+        scenarios: impl ScenarioSource + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let network = Network::random(model, Seed(config.seed).fork(0), device)?;
+        Self::continuing(network, config, scenarios)
+    }
+
+    /// Starts a run on a network that has learned something already, with a fresh optimiser.
+    ///
+    /// # Errors
+    /// A configuration that contradicts itself, or no scenario to train on.
+    pub fn continuing(
+        network: Network,
+        config: TrainConfig,
+        scenarios: impl ScenarioSource + 'static,
+    ) -> Result<Self, ModelError> {
+        let learner = TrainState::new(network, &config)?;
+        Self::assemble(learner, config, Box::new(scenarios))
+    }
+
+    /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
+    ///
+    /// # Errors
+    /// A file that is not a run's checkpoint, or no scenario to train on.
+    pub fn resume(
+        path: &Path,
+        scenarios: impl ScenarioSource + 'static,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        let (learner, config) = TrainState::restore(path, device)?;
+        Self::assemble(learner, config, Box::new(scenarios))
+    }
+
+    fn assemble(
+        learner: TrainState,
+        config: TrainConfig,
+        scenarios: Box<dyn ScenarioSource>,
+    ) -> Result<Self, ModelError> {
+        config.validate(1)?;
+        let learner = learner.in_precision_of(&config)?;
+        if scenarios.is_empty() {
+            return Err(ModelError::NoData {
+                frames: config.sample.frames,
+            });
+        }
+        let drives = match &config.closed_loop {
+            Some(closed_loop) => {
+                let seed = Seed(config.seed).fork(3);
+                closed_loop::drive(learner.driver()?, scenarios.as_ref(), closed_loop, seed)?
+            }
+            None => Vec::new(),
+        };
+        let source = Arc::new(Source {
+            drives,
+            closed_loop: config.closed_loop.clone().unwrap_or_default(),
+            scenarios,
+            reader: Reader::of(&learner.network),
+            config: config.sample.clone(),
+            seed: Seed(config.seed).fork(1),
+        });
+        let next = prefetch(&source, learner.step, share(&config, &SingleProcess));
+        Ok(Self {
+            learner,
+            config,
+            peers: Box::new(SingleProcess),
+            source,
+            next,
+        })
+    }
+
+    /// The same run, shared with other processes that have begun it with the same arguments.
+    ///
+    /// # Errors
+    /// A batch that is too small to be shared.
+    pub fn among(self, peers: impl ProcessGroup + 'static) -> Result<Self, ModelError> {
+        self.config.validate(peers.size())?;
+        let share = share(&self.config, &peers);
+        Ok(Self {
+            next: prefetch(&self.source, self.learner.step, share),
+            peers: Box::new(peers),
+            ..self
+        })
+    }
+
+    /// One optimiser step.
+    ///
+    /// # Errors
+    /// [`ModelError::LossNotFinite`] before anything is changed, [`ModelError::Scene`] for a scenario
+    /// that cannot be fetched, [`ModelError::Peers`] if another process failed, or a tensor error.
+    pub fn step(&mut self) -> Result<StepReport, ModelError> {
+        let no_data = ModelError::NoData {
+            frames: self.config.sample.frames,
+        };
+        let drawn = self.next.recv().unwrap_or(Err(no_data));
+        if self.any(drawn.is_err())? {
+            drawn?;
+            let why = "another one could not draw its samples".to_owned();
+            return Err(ModelError::Peers(why));
+        }
+        let samples = drawn?;
+        let step = self.learner.step;
+        let share = share(&self.config, &*self.peers);
+        self.next = prefetch(&self.source, step + 1, share);
+        let found = self.differentiate(&samples)?;
+        if let Some(field) = found.loss.first_not_finite() {
+            return Err(ModelError::LossNotFinite { step, field });
+        }
+        let gradient_norm = self.learner.learn(&found.gradients, &self.config)?;
+        Ok(StepReport {
+            step: self.learner.step,
+            loss: found.loss,
+            learning_rate: self.config.optimizer.rate(step, self.config.steps),
+            gradient_norm,
+            tokens: found.tokens,
+            rollouts: None,
+        })
+    }
+
+    /// Loss and gradients of a batch, of which these are this process's samples.
+    pub(crate) fn differentiate(&self, samples: &[Sample]) -> Result<BatchGradients, ModelError> {
+        let (network, config) = (&self.learner.network, &self.config.loss);
+        let operands = self.learner.operands;
+        let whole = self.total(Counts::of(samples, &self.config.loss))?;
+        let seed = Seed(self.config.seed).fork(2);
+        let seed = seed.fork(self.learner.step as u64);
+        let mut found = BatchGradients::default();
+        let part = samples.len().div_ceil(self.config.accumulate).max(1);
+        for (i, samples) in samples.chunks(part).enumerate() {
+            let seed = seed.fork((i * self.peers.size() + self.peers.rank()) as u64);
+            let alone = network.samples_together(samples.len());
+            let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
+                let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
+                let deferred = Deferred::default();
+                let build = || loss(network, samples, config, &whole, true, dropout.as_ref());
+                let (total, loss) = operands.during(|| deferred.during(build))?;
+                let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
+                Ok(Part {
+                    gradients: total.backward()?,
+                    deferred,
+                    loss,
+                    tokens,
+                })
+            });
+            let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+            found.add(network.parameters(), &parts)?;
+        }
+        found.share(network.parameters(), &*self.peers)?;
+        Ok(found)
+    }
+
+    /// The loss on up to `limit` samples of other scenarios, the ego as centre, no augmentation.
+    ///
+    /// # Errors
+    /// No scenario long enough, or a tensor error.
+    pub fn validate(&self, scenarios: &[Scenario], limit: usize) -> Result<LossParts, ModelError> {
+        let config = SampleConfig {
+            max_agents: self.config.sample.max_agents,
+            ..SampleConfig::plain(self.config.sample.frames)
+        };
+        scenarios.iter().take(limit).try_for_each(check_rate)?;
+        let (reader, network) = (&self.source.reader, self.learner.shipped());
+        let (rank, size) = (self.peers.rank(), self.peers.size());
+        let samples: Vec<Sample> = scenarios
+            .par_iter()
+            .take(limit)
+            .enumerate()
+            .filter(|(i, _)| i % size == rank)
+            .filter_map(|(i, scenario)| {
+                draw(scenario, None, reader, &config, Seed(0).fork(i as u64))
+            })
+            .collect();
+        let loss_config = LossConfig {
+            smoothing_bins: 0.0,
+            ..self.config.loss.clone()
+        };
+        let whole = self.total(Counts::of(&samples, &loss_config))?;
+        let mut sum = LossParts::default();
+        let part = self.config.batch.div_ceil(self.config.accumulate * size);
+        for samples in samples.chunks(part) {
+            let (_, parts) = loss(network, samples, &loss_config, &whole, false, None)?;
+            sum.add(&parts);
+        }
+        if size > 1 {
+            let mut numbers = sum.numbers();
+            self.peers.sum(&mut numbers)?;
+            sum = LossParts::of_numbers(&numbers);
+        }
+        Ok(sum)
+    }
+
+    /// Targets over all processes.
+    ///
+    /// Error: there are none at all.
+    fn total(&self, own: Counts) -> Result<Counts, ModelError> {
+        let mut whole = own;
+        if self.peers.size() > 1 {
+            let mut numbers = whole.numbers();
+            self.peers.sum(&mut numbers)?;
+            whole = Counts::of_numbers(&numbers);
+        }
+        if whole.scenes == 0.0 {
+            let frames = self.config.sample.frames;
+            return Err(ModelError::NoData { frames });
+        }
+        Ok(whole)
+    }
+
+    /// True if any process says so.
+    ///
+    /// # Errors
+    /// [`ModelError::Peers`] if another process is gone.
+    pub fn any(&self, said: bool) -> Result<bool, ModelError> {
+        let mut number = [f32::from(u8::from(said))];
+        self.peers.sum(&mut number)?;
+        Ok(number[0] > 0.0)
+    }
+
+    /// Writes everything a resumed run needs.
+    ///
+    /// # Errors
+    /// [`ModelError::Io`]; the previous file is intact.
+    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+        self.learner.save(path, &self.config)
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> usize {
+        self.learner.step
+    }
+
+    /// How it trains.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// The network to use, as it is now: the moving average where one is kept.
+    pub fn network(&self) -> &Network {
+        self.learner.shipped()
+    }
+
+    /// A copy of that network, for a world that imagines while training goes on.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn snapshot(&self) -> Result<Network, ModelError> {
+        self.learner.snapshot()
+    }
+
+    /// Ends the run and keeps the network to use.
+    pub fn into_network(self) -> Network {
+        self.learner.into_shipped()
+    }
+}
+
+/// Numbers of the samples of a step that a process draws.
+pub(crate) fn share(config: &TrainConfig, peers: &dyn ProcessGroup) -> Vec<usize> {
+    (peers.rank()..config.batch).step_by(peers.size()).collect()
+}

@@ -1,0 +1,329 @@
+//! How a learned world decodes, as flags.
+
+use gump_engine::{CacheMode, Mode, Precision, SamplingConfig};
+use gump_eval::worlds::WorldName;
+use serde::Serialize;
+
+use crate::cli::WrongArguments;
+use crate::decoding::Decoding;
+
+/// How a learned world decodes.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Sampling {
+    /// Decode all agents of a frame at once, or one after another
+    #[arg(long, value_enum, default_value_t = ModeName::PartialAr)]
+    mode: ModeName,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) draw: Draw,
+}
+
+/// How a learned world decodes, whatever the order.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct Draw {
+    /// What is kept between the passes of a frame
+    #[arg(long, value_enum, default_value_t = CacheName::Window)]
+    cache: CacheName,
+    /// In which form the weights are multiplied
+    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
+    precision: PrecisionName,
+    /// Divides the logits; above 1 is bolder [default: 0.5, and 1 of a relative network]
+    #[arg(long, value_name = "X")]
+    temperature: Option<f64>,
+    /// Bins that may be drawn per field [default: 40]
+    #[arg(long, value_name = "N")]
+    top_k: Option<usize>,
+    /// Draws among the likeliest bins that together have this probability [default: 1, and 0.95 of a relative network]
+    #[arg(long, value_name = "X")]
+    top_p: Option<f64>,
+    /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
+    #[arg(long, value_name = "X")]
+    decay: Option<f64>,
+    /// Draws again at most that often what would run into something or off the road, 0 for never [default: 12]
+    #[arg(long, value_name = "N")]
+    redraws: Option<usize>,
+    /// Vehicles and bicycles may turn on the spot and slip sideways as the model says
+    #[arg(long)]
+    no_limits: bool,
+    /// The network alone: nothing is drawn again, nothing held back
+    #[arg(long)]
+    raw: bool,
+    /// The paper's decoding: temperature 1.1, decay 1.2, no rules; straight lines between frames, smoothed
+    #[arg(long)]
+    paper: bool,
+    /// With rules alone, where tables show the network alone beside it
+    #[arg(long)]
+    ruled: bool,
+    /// Agents come and leave and lights change as the model says
+    #[arg(long)]
+    life: bool,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum ModeName {
+    PartialAr,
+    FullAr,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum CacheName {
+    /// Every pass reads the whole window
+    None,
+    /// The window slides; within a frame nothing is read twice
+    Window,
+    /// The window grows as far as it fits; between frames nothing is read twice either
+    Growing,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum PrecisionName {
+    F32,
+    Bf16,
+    Int8,
+}
+
+impl PrecisionName {
+    /// The model's form of the name.
+    pub(crate) fn resolve(self) -> Precision {
+        match self {
+            Self::F32 => Precision::F32,
+            Self::Bf16 => Precision::Bf16,
+            Self::Int8 => Precision::Int8,
+        }
+    }
+}
+
+impl Sampling {
+    /// The model's form of the flags.
+    ///
+    /// Error: as [`Draw::resolve`].
+    pub(crate) fn resolve(&self) -> anyhow::Result<SamplingConfig> {
+        self.draw.resolve(self.mode())
+    }
+
+    /// How the futures of a world are made.
+    ///
+    /// Error: as [`Draw::resolve`].
+    pub(crate) fn decoding(&self, world: &WorldName) -> anyhow::Result<Decoding> {
+        Ok(self.draw.decoding(self.mode())?.for_world(world))
+    }
+
+    /// Every way that a table shows of a world: of a network under rules also the network alone,
+    /// unless one way is asked for.
+    ///
+    /// Error: as [`Draw::resolve`].
+    pub(crate) fn decodings(&self, world: &WorldName) -> anyhow::Result<Vec<Decoding>> {
+        match world {
+            WorldName::Model(_) => self.draw.decodings(self.mode()),
+            _ => Ok(vec![self.decoding(world)?]),
+        }
+    }
+
+    fn mode(&self) -> Mode {
+        match self.mode {
+            ModeName::PartialAr => Mode::PartialAr,
+            ModeName::FullAr => Mode::FullAr,
+        }
+    }
+}
+
+impl Draw {
+    /// True if agents come and leave.
+    pub(crate) fn has_life(&self) -> bool {
+        self.life
+    }
+
+    /// The model's form of the flags.
+    ///
+    /// Error: [`WrongArguments`] for a number out of its range, or flags that contradict each other.
+    pub(crate) fn resolve(&self, mode: Mode) -> anyhow::Result<SamplingConfig> {
+        if let Some(wrong) = self.contradiction() {
+            return Err(WrongArguments(wrong).into());
+        }
+        let base = match (self.raw, self.paper) {
+            (_, true) => SamplingConfig::paper(),
+            (true, _) => SamplingConfig::raw(),
+            _ => SamplingConfig::default(),
+        };
+        let config = SamplingConfig {
+            mode,
+            cache: match self.cache {
+                CacheName::None => CacheMode::None,
+                CacheName::Window => CacheMode::Window,
+                CacheName::Growing => CacheMode::Growing,
+            },
+            precision: self.precision.resolve(),
+            life: self.life,
+            temperature: self.temperature.or(base.temperature),
+            top_k: self.top_k.unwrap_or(base.top_k),
+            top_p: self.top_p.or(base.top_p),
+            decay: self.decay.unwrap_or(base.decay),
+            redraws: self.redraws.unwrap_or(base.redraws),
+            limits: base.limits && !self.no_limits,
+            ..base
+        };
+        let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
+        let wrong = if let Some(t) = config.temperature.filter(absurd) {
+            format!("--temperature: expected a number above 0, found {t}")
+        } else if config.top_k == 0 {
+            "--top-k: expected at least 1, found 0".into()
+        } else if let Some(p) = config.top_p.filter(|p| !(*p > 0.0 && *p <= 1.0)) {
+            format!("--top-p: expected a number above 0 and at most 1, found {p}")
+        } else if !(config.decay >= 0.0 && config.decay.is_finite()) {
+            format!("--decay: expected 0 or more, found {}", config.decay)
+        } else if self.ruled && !config.has_rules() {
+            "--ruled: expected a rule, found --redraws 0 and --no-limits".into()
+        } else {
+            return Ok(config);
+        };
+        Err(WrongArguments(wrong).into())
+    }
+
+    /// How futures are made: under rules unless something else is asked for.
+    ///
+    /// Error: as [`Draw::resolve`].
+    pub(crate) fn decoding(&self, mode: Mode) -> anyhow::Result<Decoding> {
+        let sampling = self.resolve(mode)?;
+        Ok(match self.paper {
+            true => Decoding::paper(sampling),
+            false => Decoding::of(sampling),
+        })
+    }
+
+    /// Every way that a table shows: beside rules also the network alone, unless one way is asked
+    /// for.
+    ///
+    /// Error: as [`Draw::resolve`].
+    pub(crate) fn decodings(&self, mode: Mode) -> anyhow::Result<Vec<Decoding>> {
+        let one = self.decoding(mode)?;
+        let is_alone = self.ruled || !one.sampling.has_rules();
+        let raw = (!is_alone).then(|| one.without_rules());
+        Ok(std::iter::once(one).chain(raw).collect())
+    }
+
+    /// Flags that cannot both be meant, as a sentence.
+    fn contradiction(&self) -> Option<String> {
+        let ways = [
+            ("--raw", self.raw),
+            ("--paper", self.paper),
+            ("--ruled", self.ruled),
+        ];
+        let mut ways = ways.iter().filter(|(_, is_asked)| *is_asked);
+        let (way, _) = ways.next()?;
+        if let Some((other, _)) = ways.next() {
+            return Some(format!(
+                "{way}: expected one way of decoding, found {other} too"
+            ));
+        }
+        let redraws = self.redraws.map(|n| n.to_string());
+        if self.raw {
+            return redraws.map(|n| {
+                format!(
+                    "--raw: expected no --redraws, since the network alone draws nothing again, \
+                     found --redraws {n}"
+                )
+            });
+        }
+        let given = [
+            ("--temperature", self.temperature.map(|x| x.to_string())),
+            ("--top-k", self.top_k.map(|n| n.to_string())),
+            ("--top-p", self.top_p.map(|x| x.to_string())),
+            ("--decay", self.decay.map(|x| x.to_string())),
+            ("--redraws", redraws),
+        ];
+        let mut given = given.into_iter().filter(|_| self.paper);
+        given.find_map(|(flag, value)| {
+            let value = value?;
+            Some(format!(
+                "--paper: expected no {flag}, since the paper's decoding sets it, found {flag} {value}"
+            ))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn draw() -> Draw {
+        Draw {
+            cache: CacheName::Window,
+            precision: PrecisionName::F32,
+            temperature: None,
+            top_k: None,
+            top_p: None,
+            decay: None,
+            redraws: None,
+            no_limits: false,
+            raw: false,
+            paper: false,
+            ruled: false,
+            life: false,
+        }
+    }
+
+    #[test]
+    fn flags_choose_the_decodings_of_a_table() {
+        let check = |flags: Draw, expected: &[&str]| {
+            let found = flags.decodings(Mode::FullAr).unwrap();
+            let names: Vec<_> = found.iter().map(|decoding| decoding.name).collect();
+            assert_eq!(names, expected);
+            assert!(found.iter().all(|d| d.sampling.mode == Mode::FullAr));
+            found
+        };
+        let redraws = Some(0);
+        let both = check(draw(), &["ruled", "raw"]);
+        assert_eq!(both[0].sampling.clone().without_rules(), both[1].sampling);
+        check(
+            Draw {
+                ruled: true,
+                ..draw()
+            },
+            &["ruled"],
+        );
+        check(
+            Draw {
+                raw: true,
+                ..draw()
+            },
+            &["raw"],
+        );
+        check(Draw { redraws, ..draw() }, &["ruled", "raw"]);
+        let no_limits = true;
+        let flags = || Draw {
+            redraws,
+            no_limits,
+            ..draw()
+        };
+        check(flags(), &["raw"]);
+        assert!(
+            Draw {
+                ruled: true,
+                ..flags()
+            }
+            .resolve(Mode::FullAr)
+            .is_err()
+        );
+        let paper = check(
+            Draw {
+                paper: true,
+                ..draw()
+            },
+            &["paper"],
+        );
+        let expected = SamplingConfig {
+            mode: Mode::FullAr,
+            ..SamplingConfig::paper()
+        };
+        assert_eq!(paper[0].sampling, expected);
+        let warm = Draw {
+            temperature: Some(0.9),
+            ..draw()
+        };
+        let raw = check(Draw { raw: true, ..warm }, &["raw"]);
+        assert_eq!(raw[0].sampling.temperature, Some(0.9));
+    }
+}
