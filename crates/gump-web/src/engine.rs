@@ -1,0 +1,27 @@
+//! Where the network comes from. The game takes it from here and from nowhere else.
+
+pub(crate) use gump_engine::relative::{LiveFuture, RelativeWorld};
+
+use gump_engine::SamplingConfig;
+use gump_engine::relative::RelativeSampling;
+use gump_kernels::{Choice, Kernel};
+use gump_model::relative::RelativeWeights;
+
+/// The world of some weights, with the rules that the driver's worlds have.
+///
+/// Error: a sentence.
+pub(crate) fn world(weights: &[u8]) -> Result<RelativeWorld, String> {
+    let sampling = RelativeSampling::from(&SamplingConfig::default());
+    let weights = RelativeWeights::read(weights).map_err(|error| error.to_string())?;
+    RelativeWorld::of_weights(&weights, sampling).map_err(|error| error.to_string())
+}
+
+/// Lets this process multiply with the portable kernel, as the engine in a browser does. To be said
+/// before any game is opened.
+///
+/// # Errors
+/// A sentence if another kernel has been at work.
+pub fn compute_as_browsers_do() -> Result<(), String> {
+    let forced = Choice::force(Kernel::Portable);
+    forced.map(drop).map_err(|error| error.to_string())
+}

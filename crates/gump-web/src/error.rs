@@ -1,0 +1,85 @@
+//! What can go wrong, as sentences for the page.
+
+/// Why the game cannot do what was asked. Each is one sentence for whoever plays.
+#[derive(Debug, thiserror::Error)]
+pub enum GameError {
+    /// The file holds no scenario that can be read.
+    #[error("This file cannot be read as a scene: {0}.")]
+    Scene(String),
+    /// There is nobody to drive.
+    #[error(
+        "The scene {0} has no car to drive: its ego is not a vehicle, or not there at the start."
+    )]
+    NoEgo(String),
+    /// The frames of the scene do not come ten times a second.
+    #[error(
+        "The scene has a frame every {0} s, and the page drives scenes with a frame every 0.1 s."
+    )]
+    Clock(f64),
+    /// There is no road.
+    #[error("The scene {0} has no lanes, and the network needs a road to imagine traffic on.")]
+    NoLanes(String),
+    /// Too many agents.
+    #[error(
+        "The scene is too large: it has {found} agents, and the page drives among at most {limit}. Drive it with a lower density."
+    )]
+    TooManyAgents {
+        /// Those at the start, after thinning.
+        found: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+    /// Too many points of the map.
+    #[error(
+        "The scene is too large: its map has {found} points, and the page draws at most {limit}."
+    )]
+    TooLargeMap {
+        /// Those there are.
+        found: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+    /// The weights are damaged or of another network.
+    #[error("These weights cannot be used: {0}.")]
+    Weights(String),
+    /// A setting out of its range.
+    #[error("The {name} must be between {from} and {to}, and is {found}.")]
+    Setting {
+        /// Which one.
+        name: &'static str,
+        /// The least it may be.
+        from: f64,
+        /// The most it may be.
+        to: f64,
+        /// What it is.
+        found: f64,
+    },
+    /// A driver that cannot drive here.
+    #[error("{driver} cannot drive here: {what}.")]
+    Driver {
+        /// Its name.
+        driver: &'static str,
+        /// Why not.
+        what: String,
+    },
+    /// The drive is as long as drives get.
+    #[error("The drive is over: a drive lasts at most {0} minutes.")]
+    Over(usize),
+    /// A moment that has not been driven.
+    #[error("The moment {asked:.1} s has not been driven: the drive is {driven:.1} s long.")]
+    Moment {
+        /// Seconds asked for.
+        asked: f64,
+        /// Seconds there are.
+        driven: f64,
+    },
+    /// A link that holds no drive.
+    #[error("This link holds no drive that can be replayed: {0}.")]
+    Link(&'static str),
+    /// Too little was driven for what was asked.
+    #[error("{0}")]
+    TooShort(&'static str),
+    /// A score that cannot be computed.
+    #[error("The drive cannot be scored: {0}.")]
+    Score(String),
+}

@@ -1,0 +1,635 @@
+//! The game: one drive through one scene, a tenth of a second at a time.
+//!
+//! The network answers every half second: at the start of each everyone decides, on the assumption
+//! that the ego goes on as it does; on the way the ego goes where it is driven; then the network is
+//! told where that was. What was asked of the ego is kept, so a drive can be taken back to any
+//! moment, led on from there in eight ways, or told in a link and driven again to the bit.
+//!
+//! Start with [`Game::open`], then [`Game::tick`].
+
+use gump_metrics::{Metric as _, OffRoad, RedLight, overlapping};
+use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
+use gump_rollout::{SimulateConfig, dynamics, fill};
+use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, Scenario, SceneState, Seed};
+
+use crate::GameError;
+use crate::branches::Branches;
+use crate::drivers::{self, Place, ego_state};
+use crate::engine::{self, LiveFuture, RelativeWorld};
+use crate::signals::Signals;
+use crate::tape::{Driver, Input};
+
+/// Seconds between frames.
+pub const DT: f64 = 0.1;
+/// Frames in a half second of the network.
+pub(crate) const STRIDE: usize = 5;
+/// Frames of the longest drive, five minutes.
+pub const MAX_FRAMES: usize = 3000;
+/// Agents that a scene may have at its start: more would not be imagined in time on a phone.
+pub const MAX_AGENTS: usize = 128;
+/// Points that a map may have; a scene of Waymo's has some ten thousand.
+pub const MAX_POINTS: usize = 200_000;
+/// Every so many half seconds a copy of what the network remembers is kept; those in between are
+/// made again from the copy before them. A copy for 40 agents takes a megabyte.
+const COPY_EVERY: usize = 16;
+
+/// Hardest braking and acceleration, metres per second squared: what a family car does on a dry
+/// road when pressed, not what is comfortable.
+const PEDAL: [f64; 2] = [-7.0, 3.0];
+/// Sharpest turn, radians per metre: a radius of 5 m, as passenger cars have.
+const MAX_CURVATURE: f64 = 0.2;
+/// Sharpest turn at speed, metres per second squared across.
+const MAX_LATERAL: f64 = 6.0;
+/// Nobody is faster, metres per second.
+const MAX_SPEED: f64 = 40.0;
+/// What a car loses per second when no pedal is pressed, metres per second squared.
+const ROLLING: f64 = 0.3;
+
+/// How a drive is set up. The temperature is no part of it: it may change on the way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// Everything random comes from it.
+    pub seed: u64,
+    /// Share of the other agents that are kept, 0 to 1.
+    pub density: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            density: 1.0,
+        }
+    }
+}
+
+/// Something that happened to the ego.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Event {
+    /// Frames after the start.
+    pub frame: usize,
+    /// What.
+    pub kind: EventKind,
+}
+
+/// What can happen to the ego.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EventKind {
+    /// Its box came to overlap that of somebody.
+    Collision(AgentId),
+    /// A corner of it left the road.
+    OffRoad,
+    /// It drove past a red light.
+    RedLight,
+}
+
+/// What is kept of a half second.
+#[derive(Clone, Debug)]
+pub(crate) struct Knot {
+    driver: Driver,
+    temperature: f64,
+    /// Where the ego was assumed to be at its end; `None` if the network decides.
+    assumed: Option<AgentState>,
+    /// What the network remembered at its start, where a copy is kept.
+    copy: Option<LiveFuture>,
+}
+
+/// One drive through one scene.
+#[derive(Debug)]
+pub struct Game {
+    world: RelativeWorld,
+    settings: Settings,
+    /// The scene, thinned.
+    scenario: Scenario,
+    recording: Recording,
+    signals: Signals,
+    /// History and drive, ten frames a second; the first `scenario.now + 1` were recorded.
+    frames: Vec<Frame>,
+    /// The ego at each frame of the drive, the start included.
+    ego: Vec<EgoState>,
+    inputs: Vec<Input>,
+    /// One for each half second that has begun.
+    knots: Vec<Knot>,
+    /// At the start of the last half second that has begun, or of the next.
+    live: LiveFuture,
+    /// The frames of the half second that has begun.
+    ahead: Vec<Frame>,
+    /// Where rules that drive the ego want to be in them.
+    planned: Vec<AgentState>,
+    events: Vec<Event>,
+    /// Who overlapped the ego at the start: that is nobody's collision.
+    entangled: Vec<AgentId>,
+    branches: Option<Branches>,
+}
+
+impl Game {
+    /// Opens a scene to drive in: the bytes of a file (scenario JSON, GPUDrive's JSON or Waymo's
+    /// TFRecord, of which the first) and of the network's weights.
+    ///
+    /// # Errors
+    /// [`GameError`] for bytes that are neither, and for scenes that the page cannot take.
+    pub fn open(
+        scene: &[u8],
+        name: &str,
+        weights: &[u8],
+        settings: Settings,
+    ) -> Result<Self, GameError> {
+        let scenario = gump_data::parse(scene, name);
+        let scenario = scenario.map_err(|error| GameError::Scene(error.to_string()))?;
+        let world = engine::world(weights).map_err(GameError::Weights)?;
+        Self::new(scenario, world, settings)
+    }
+
+    /// A game in a scenario.
+    fn new(
+        scenario: Scenario,
+        mut world: RelativeWorld,
+        settings: Settings,
+    ) -> Result<Self, GameError> {
+        check(&scenario, settings)?;
+        let scenario = thinned(scenario, settings.density);
+        let found = scenario.present().now().agents().len();
+        if found > MAX_AGENTS {
+            return Err(GameError::TooManyAgents {
+                found,
+                limit: MAX_AGENTS,
+            });
+        }
+        world.set_temperature(1.0);
+        let start = scenario.present().unguided();
+        let live = LiveFuture::begin(&world, start, Seed(settings.seed));
+        let live = live.map_err(|error| GameError::Scene(error.to_string()))?;
+        let mut driven = scenario.clone();
+        derive_roadblocks(&mut driven);
+        let recording = Recording::of_boxes(driven);
+        let recording = recording.map_err(|error| GameError::Scene(error.to_string()))?;
+        let ego = scenario.present().ego_now();
+        let entangled = overlapping(scenario.present().now(), ego).collect();
+        Ok(Self {
+            world,
+            settings,
+            signals: Signals::of(&scenario),
+            frames: scenario.log[..=scenario.now].to_vec(),
+            ego: vec![ego_state(&recording, None, &ego.state, DT)],
+            inputs: Vec::new(),
+            knots: Vec::new(),
+            live,
+            ahead: Vec::new(),
+            planned: Vec::new(),
+            events: Vec::new(),
+            entangled,
+            branches: None,
+            recording,
+            scenario,
+        })
+    }
+
+    /// The same scene from its start, set up anew.
+    ///
+    /// # Errors
+    /// As [`Game::open`].
+    pub fn restarted(
+        self,
+        scene: &[u8],
+        name: &str,
+        settings: Settings,
+    ) -> Result<Self, GameError> {
+        let scenario = gump_data::parse(scene, name);
+        let scenario = scenario.map_err(|error| GameError::Scene(error.to_string()))?;
+        Self::new(scenario, self.world, settings)
+    }
+
+    /// Drives for a tenth of a second.
+    ///
+    /// # Errors
+    /// [`GameError::Over`] after five minutes; [`GameError::Driver`] for a driver that cannot drive
+    /// here, after which another may go on.
+    pub fn tick(&mut self, input: Input) -> Result<(), GameError> {
+        let input = input.held();
+        let (frame, into) = (self.driven(), self.driven() % STRIDE);
+        if frame >= MAX_FRAMES {
+            return Err(GameError::Over(MAX_FRAMES / 600));
+        }
+        if into == 0 {
+            self.begin_knot(input)?;
+        }
+        let now = self.scene().ego_now().state;
+        let ego = self.scenario.ego;
+        let driver = self.knots.last().map_or(input.driver, |knot| knot.driver);
+        let decided = self.ahead[into].agent(ego).map(|agent| agent.state);
+        let next = match driver {
+            Driver::Hand => by_hand(&now, input, DT),
+            Driver::Network => decided.unwrap_or(now),
+            Driver::Idm | Driver::Pdm => self.planned.get(into).copied().unwrap_or(now),
+        };
+        let shown = &self.ahead[into];
+        let agents = shown.agents().iter().map(|agent| match agent.id == ego {
+            true => agent.with_state(next),
+            false => *agent,
+        });
+        let lights = self.signals.at(frame + 1);
+        self.frames.push(Frame::new(agents.collect(), lights));
+        let state = ego_state(&self.recording, self.ego.last(), &next, DT);
+        self.ego.push(state);
+        // A link tells what was asked; a change of driver that had to wait is told as it was made.
+        self.inputs.push(input);
+        self.note();
+        if into + 1 == STRIDE {
+            let told = (driver != Driver::Network).then_some(next);
+            self.live.go_on(&self.world, told);
+            self.ahead.clear();
+        }
+        Ok(())
+    }
+
+    /// Lets everyone decide on the next half second.
+    fn begin_knot(&mut self, input: Input) -> Result<(), GameError> {
+        let frame = self.driven();
+        let now = self.scene().ego_now().state;
+        let place = Place {
+            recording: &self.recording,
+            scene: SceneState {
+                map: &self.recording.scenario().map,
+                route: self.recording.scenario().route.as_ref(),
+                history: &self.frames,
+                ego: self.scenario.ego,
+                dt: DT,
+            },
+            ego: &self.ego,
+        };
+        self.planned = drivers::plan(input.driver, &place, STRIDE)?;
+        let assumed = match input.driver {
+            Driver::Hand => Some(by_hand(&now, input, DT * STRIDE as f64)),
+            Driver::Network => None,
+            Driver::Idm | Driver::Pdm => Some(self.planned.last().copied().unwrap_or(now)),
+        };
+        let index = frame / STRIDE;
+        self.knots.truncate(index);
+        self.live.show(&self.signals.at(frame));
+        let knot = Knot {
+            driver: input.driver,
+            temperature: f64::from(input.temperature) / Input::PER_UNIT,
+            assumed,
+            copy: index.is_multiple_of(COPY_EVERY).then(|| self.live.clone()),
+        };
+        self.decide(&knot)?;
+        self.knots.push(knot);
+        Ok(())
+    }
+
+    /// The decisions of a half second that begins now, as frames.
+    fn decide(&mut self, knot: &Knot) -> Result<(), GameError> {
+        self.world.set_temperature(knot.temperature);
+        let next = self.live.decide(&self.world, knot.assumed);
+        let begun = self.scenario.now + 1 + self.driven() / STRIDE * STRIDE;
+        let scene = self.scene();
+        let scene = SceneState {
+            history: &scene.history[..begun],
+            ..scene
+        };
+        let filled = fill(scene, &next, LiveFuture::DT, &SimulateConfig::default());
+        self.ahead = filled.map_err(|error| GameError::Scene(error.to_string()))?;
+        Ok(())
+    }
+
+    /// Notes what has happened in the last frame.
+    fn note(&mut self) {
+        let frame = self.driven();
+        let scene = self.scene();
+        let Some(ego) = scene.now().agent(scene.ego) else {
+            return;
+        };
+        let before = &scene.history[scene.history.len() - 2];
+        let was = before.agent(scene.ego);
+        let mut kinds: Vec<EventKind> = overlapping(scene.now(), ego)
+            .filter(|other| !self.entangled.contains(other))
+            .filter(|other| {
+                let overlapped =
+                    was.is_some_and(|ego| overlapping(before, ego).any(|o| o == *other));
+                !overlapped
+            })
+            .map(EventKind::Collision)
+            .collect();
+        if is_off_road(&scene) && !is_off_road(&self.before()) {
+            kinds.push(EventKind::OffRoad);
+        }
+        if RedLight.at(&scene, ego) == Some(1.0) {
+            kinds.push(EventKind::RedLight);
+        }
+        let events = kinds.into_iter().map(|kind| Event { frame, kind });
+        self.events.extend(events.collect::<Vec<_>>());
+    }
+
+    /// Takes the drive back to so many frames after its start.
+    ///
+    /// # Errors
+    /// [`GameError::Moment`] for a moment that has not been driven.
+    pub fn rewind(&mut self, frame: usize) -> Result<(), GameError> {
+        self.check_moment(frame)?;
+        let knot = frame / STRIDE;
+        self.live = self.live_at(knot);
+        self.frames.truncate(self.scenario.now + 1 + frame);
+        self.ego.truncate(frame + 1);
+        self.inputs.truncate(frame);
+        self.events.retain(|event| event.frame <= frame);
+        self.ahead.clear();
+        self.branches = None;
+        if frame.is_multiple_of(STRIDE) {
+            self.knots.truncate(knot);
+            return Ok(());
+        }
+        self.knots.truncate(knot + 1);
+        let begun = self.knots[knot].clone();
+        self.decide(&begun)?;
+        self.planned = match begun.assumed {
+            Some(_) if begun.driver != Driver::Hand => self.rest_of_plan(knot),
+            _ => Vec::new(),
+        };
+        Ok(())
+    }
+
+    /// What a rule had planned for a half second that has begun: it is planned again.
+    fn rest_of_plan(&mut self, knot: usize) -> Vec<AgentState> {
+        let frame = knot * STRIDE;
+        let place = Place {
+            recording: &self.recording,
+            scene: SceneState {
+                map: &self.recording.scenario().map,
+                route: self.recording.scenario().route.as_ref(),
+                history: &self.frames[..self.scenario.now + 1 + frame],
+                ego: self.scenario.ego,
+                dt: DT,
+            },
+            ego: &self.ego[..=frame],
+        };
+        let driver = self.knots[knot].driver;
+        let planned = drivers::plan(driver, &place, STRIDE);
+        planned.unwrap_or_default()
+    }
+
+    /// What the network remembered at the start of a half second that has been driven.
+    pub(crate) fn live_at(&mut self, knot: usize) -> LiveFuture {
+        if knot == self.driven() / STRIDE {
+            return self.live.clone();
+        }
+        let copies = self.knots[..=knot].iter().enumerate();
+        let mut kept = copies.filter_map(|(i, k)| Some((i, k.copy.clone()?)));
+        let (first, mut live) = kept
+            .next_back()
+            .expect("the first half second always has a copy");
+        for i in first..knot {
+            let Knot {
+                driver,
+                temperature,
+                assumed,
+                ..
+            } = self.knots[i];
+            self.world.set_temperature(temperature);
+            live.show(&self.signals.at(i * STRIDE));
+            live.decide(&self.world, assumed);
+            let end = &self.frames[self.scenario.now + (i + 1) * STRIDE];
+            let ego = end.agent(self.scenario.ego).map(|agent| agent.state);
+            live.go_on(&self.world, ego.filter(|_| driver != Driver::Network));
+        }
+        live.show(&self.signals.at(knot * STRIDE));
+        live
+    }
+
+    /// Begins eight futures from so many frames after the start, at the half second before it.
+    ///
+    /// # Errors
+    /// [`GameError::Moment`] for a moment that has not been driven.
+    pub fn branch(&mut self, frame: usize) -> Result<(), GameError> {
+        self.check_moment(frame)?;
+        let knot = frame / STRIDE;
+        let temperature = self
+            .inputs
+            .get(frame.saturating_sub(1))
+            .map_or(1.0, |input| f64::from(input.temperature) / Input::PER_UNIT);
+        let live = self.live_at(knot);
+        let frames = self.frames[..=self.scenario.now + knot * STRIDE].to_vec();
+        self.branches = Some(Branches::new(
+            &live,
+            &frames,
+            self.settings.seed,
+            knot,
+            temperature,
+        ));
+        Ok(())
+    }
+
+    /// Goes on with one of the eight futures for half a second; false once all are done.
+    pub fn go_on_branching(&mut self) -> bool {
+        let Some(mut branches) = self.branches.take() else {
+            return false;
+        };
+        self.world.set_temperature(branches.temperature());
+        let context = SceneState {
+            history: &[],
+            ..self.scene()
+        };
+        let more = branches.step(&self.world, &self.signals, context);
+        self.branches = Some(branches);
+        more
+    }
+
+    /// The eight futures, if any were begun.
+    pub fn branches(&self) -> Option<&Branches> {
+        self.branches.as_ref()
+    }
+
+    /// Frames driven so far.
+    pub fn driven(&self) -> usize {
+        self.inputs.len()
+    }
+
+    /// The scene as it was so many frames after the start.
+    ///
+    /// # Errors
+    /// [`GameError::Moment`] for a moment that has not been driven.
+    pub fn at(&self, frame: usize) -> Result<SceneState<'_>, GameError> {
+        self.check_moment(frame)?;
+        let scene = self.scene();
+        Ok(SceneState {
+            history: &scene.history[..=self.scenario.now + frame],
+            ..scene
+        })
+    }
+
+    /// Everyone up to now.
+    pub fn scene(&self) -> SceneState<'_> {
+        SceneState {
+            history: &self.frames,
+            ..self.scenario.present()
+        }
+    }
+
+    fn before(&self) -> SceneState<'_> {
+        let scene = self.scene();
+        SceneState {
+            history: &scene.history[..scene.history.len() - 1],
+            ..scene
+        }
+    }
+
+    /// The scene as it was opened, without those who were thinned out.
+    pub fn scenario(&self) -> &Scenario {
+        &self.scenario
+    }
+
+    /// What has happened to the ego.
+    pub fn events(&self) -> &[Event] {
+        &self.events
+    }
+
+    /// What was asked, frame by frame.
+    pub fn inputs(&self) -> &[Input] {
+        &self.inputs
+    }
+
+    /// How the drive is set up.
+    pub fn settings(&self) -> Settings {
+        self.settings
+    }
+
+    /// The drive as imagined traffic.
+    pub(crate) fn rollout(&self, frames: usize) -> Rollout {
+        let mut rollout = Rollout::begin(self.scenario.present());
+        let first = self.scenario.now + 1;
+        for frame in &self.frames[first..first + frames.min(self.driven())] {
+            rollout.push(frame.clone());
+        }
+        rollout
+    }
+
+    /// What everyone else may do from the start of this half second on: these of any number of draws
+    /// for each of the moving agents, as places from where they were then to a second and a half later. The
+    /// network says half a second of it; the rest goes on as that did.
+    pub fn fans(&self, draws: std::ops::Range<u64>) -> Vec<Fan> {
+        let knot = self.driven() / STRIDE * STRIDE;
+        let start = &self.frames[self.scenario.now + knot];
+        let outlooks = self
+            .live
+            .outlooks(&self.world, draws, Some(self.scenario.ego));
+        let fans = outlooks.into_iter().filter_map(|outlook| {
+            let from = start.agent(outlook.agent)?.state.pose;
+            let way = |state: &AgentState| {
+                let step = from.inverse() * state.pose;
+                let mut at = from;
+                [(); FAN_STEPS].map(|()| {
+                    at = at * step;
+                    [at.position.x, at.position.y]
+                })
+            };
+            Some(Fan {
+                agent: outlook.agent,
+                from: [from.position.x, from.position.y],
+                ways: outlook.draws.iter().map(way).collect(),
+            })
+        });
+        fans.collect()
+    }
+
+    fn check_moment(&self, frame: usize) -> Result<(), GameError> {
+        if frame <= self.driven() {
+            return Ok(());
+        }
+        Err(GameError::Moment {
+            asked: frame as f64 * DT,
+            driven: self.driven() as f64 * DT,
+        })
+    }
+}
+
+/// Half seconds that a fan shows.
+pub const FAN_STEPS: usize = 3;
+
+/// What an agent may do next.
+#[derive(Clone, Debug)]
+pub struct Fan {
+    /// Who.
+    pub agent: AgentId,
+    /// Where it was at the start of this half second, world frame, metres.
+    pub from: [f64; 2],
+    /// Where it may be after each of the next half seconds.
+    pub ways: Vec<[[f64; 2]; FAN_STEPS]>,
+}
+
+/// Whether a corner of the ego is off the road now.
+pub(crate) fn is_off_road(scene: &SceneState<'_>) -> bool {
+    let ego = scene.now().agent(scene.ego);
+    ego.is_some_and(|ego| OffRoad.at(scene, ego) == Some(1.0))
+}
+
+/// Where pedal and wheel lead in `dt` seconds.
+fn by_hand(now: &AgentState, input: Input, dt: f64) -> AgentState {
+    let speed = now.velocity.dot(now.pose.direction());
+    let share = f64::from(input.pedal) / 100.0;
+    let wanted = match input.pedal {
+        0 => -ROLLING,
+        1.. => share * PEDAL[1],
+        _ => -share * PEDAL[0],
+    };
+    // A car that rolls backwards, as some recorded ones do, comes to rest first.
+    let wanted = if speed < 0.0 { PEDAL[1] } else { wanted };
+    let acceleration = wanted.min((MAX_SPEED - speed) / dt);
+    let sharpest = (MAX_LATERAL / (speed * speed).max(1e-6)).min(MAX_CURVATURE);
+    let curvature = f64::from(input.wheel) / 100.0 * sharpest;
+    dynamics::drive(now, acceleration, curvature, dt)
+}
+
+fn check(scenario: &Scenario, settings: Settings) -> Result<(), GameError> {
+    if !(0.0..=1.0).contains(&settings.density) {
+        return Err(GameError::Setting {
+            name: "density",
+            from: 0.0,
+            to: 1.0,
+            found: settings.density,
+        });
+    }
+    if (scenario.dt - DT).abs() > 1e-6 {
+        return Err(GameError::Clock(scenario.dt));
+    }
+    let present = scenario.log[scenario.now].agent(scenario.ego);
+    if present.is_none_or(|ego| ego.kind != gump_scene::AgentKind::Vehicle) {
+        return Err(GameError::NoEgo(scenario.id.clone()));
+    }
+    if scenario.map.lanes().is_empty() {
+        return Err(GameError::NoLanes(scenario.id.clone()));
+    }
+    let lines = scenario.map.road_lines().iter().map(|line| &line.line);
+    let edges = scenario.map.road_edges().iter().map(|edge| &edge.line);
+    let lanes = scenario.map.lanes().iter().map(|lane| &lane.centerline);
+    let points = lines
+        .chain(edges)
+        .chain(lanes)
+        .map(|line| line.points().len());
+    let found = points.sum();
+    if found > MAX_POINTS {
+        return Err(GameError::TooLargeMap {
+            found,
+            limit: MAX_POINTS,
+        });
+    }
+    Ok(())
+}
+
+/// The scene with a share of the other agents, the same ones for the same share.
+fn thinned(mut scenario: Scenario, density: f64) -> Scenario {
+    if density >= 1.0 {
+        return scenario;
+    }
+    let ego = scenario.ego;
+    let stays = |id: AgentId| {
+        // A number between 0 and 1 that belongs to the agent, whatever the density.
+        let own = Seed(0).fork(id.0 as u64).0 >> 11;
+        id == ego || (own as f64) < density * (1_u64 << 53) as f64
+    };
+    for frame in &mut scenario.log {
+        let kept = frame.agents().iter().filter(|agent| stays(agent.id));
+        *frame = Frame::new(kept.copied().collect(), frame.lights().to_vec());
+    }
+    scenario.targets.retain(|&id| stays(id));
+    scenario.objects_of_interest.retain(|&id| stays(id));
+    scenario
+}

@@ -1,0 +1,177 @@
+//! What was asked of the ego, tenth of a second by tenth of a second, and how it travels in a link.
+//!
+//! The code is base64 without padding for addresses: a version, then runs of equal inputs, each as
+//! its length (two bytes, low first), the driver, the pedal, the wheel and the temperature.
+
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+
+use crate::GameError;
+
+/// Who drives the ego.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Driver {
+    /// Whoever plays.
+    #[default]
+    Hand,
+    /// The network, as it drives everyone else.
+    Network,
+    /// The Intelligent Driver Model along the route.
+    Idm,
+    /// The planner PDM-Closed.
+    Pdm,
+}
+
+impl Driver {
+    /// All of them, by number.
+    pub const ALL: [Self; 4] = [Self::Hand, Self::Network, Self::Idm, Self::Pdm];
+
+    /// Its name on the page.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hand => "You",
+            Self::Network => "The network",
+            Self::Idm => "IDM",
+            Self::Pdm => "PDM-Closed",
+        }
+    }
+}
+
+/// One tenth of a second of driving, in whole numbers so that a link replays it exactly.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Input {
+    /// Who drives; a change counts from the next half second on.
+    pub driver: Driver,
+    /// From -100, the hardest braking, to 100, the hardest acceleration.
+    pub pedal: i8,
+    /// From -100, the sharpest turn to the right, to 100, to the left.
+    pub wheel: i8,
+    /// The temperature of the world in twentieths; a change counts from the next half second on.
+    pub temperature: u8,
+}
+
+impl Default for Input {
+    fn default() -> Self {
+        Self {
+            driver: Driver::Hand,
+            pedal: 0,
+            wheel: 0,
+            temperature: Self::PER_UNIT as u8,
+        }
+    }
+}
+
+impl Input {
+    /// Steps of the temperature in 1.
+    pub const PER_UNIT: f64 = 20.0;
+
+    /// Within their ranges: what a page or a link says may be anything.
+    pub(crate) fn held(self) -> Self {
+        Self {
+            pedal: self.pedal.clamp(-100, 100),
+            wheel: self.wheel.clamp(-100, 100),
+            temperature: self.temperature.clamp(1, 60),
+            ..self
+        }
+    }
+}
+
+const VERSION: u8 = 1;
+/// Bytes of a run.
+const RUN: usize = 6;
+
+/// The inputs as a code for a link.
+pub fn encode(inputs: &[Input]) -> String {
+    let mut bytes = vec![VERSION];
+    for run in inputs.chunk_by(|a, b| a == b) {
+        for part in run.chunks(usize::from(u16::MAX)) {
+            let input = part[0];
+            bytes.extend((part.len() as u16).to_le_bytes());
+            bytes.extend([
+                input.driver as u8,
+                input.pedal as u8,
+                input.wheel as u8,
+                input.temperature,
+            ]);
+        }
+    }
+    URL_SAFE_NO_PAD.encode(bytes)
+}
+
+/// The inputs of a code, of which there may be `limit`.
+///
+/// # Errors
+/// [`GameError::Link`] for anything that [`encode`] does not write.
+pub fn decode(code: &str, limit: usize) -> Result<Vec<Input>, GameError> {
+    let bytes = URL_SAFE_NO_PAD
+        .decode(code.trim())
+        .map_err(|_| GameError::Link("it was cut off or changed on its way"))?;
+    let Some((&VERSION, runs)) = bytes.split_first() else {
+        return Err(GameError::Link("it is of another version of this page"));
+    };
+    let (runs, []) = runs.as_chunks::<RUN>() else {
+        return Err(GameError::Link("it was cut off"));
+    };
+    let mut inputs = Vec::new();
+    for &[low, high, driver, pedal, wheel, temperature] in runs {
+        let n = usize::from(u16::from_le_bytes([low, high]));
+        let driver = Driver::ALL.get(usize::from(driver));
+        let driver = *driver.ok_or(GameError::Link("it names a driver that there is not"))?;
+        if inputs.len() + n > limit {
+            return Err(GameError::Link("it is longer than a drive can be"));
+        }
+        let input = Input {
+            driver,
+            pedal: pedal as i8,
+            wheel: wheel as i8,
+            temperature,
+        };
+        inputs.extend(std::iter::repeat_n(input.held(), n));
+    }
+    Ok(inputs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn inputs() -> Vec<Input> {
+        let first = Input {
+            pedal: 100,
+            wheel: -37,
+            ..Input::default()
+        };
+        let second = Input {
+            driver: Driver::Pdm,
+            temperature: 26,
+            ..Input::default()
+        };
+        [vec![first; 70], vec![second; 3], vec![first]].concat()
+    }
+
+    #[test]
+    fn a_code_gives_back_the_inputs() {
+        let code = encode(&inputs());
+        assert_eq!(code.len(), 26);
+        assert_eq!(decode(&code, 74).unwrap(), inputs());
+        assert_eq!(decode(&encode(&[]), 0).unwrap(), []);
+    }
+
+    #[test]
+    fn damaged_codes_are_refused() {
+        let code = encode(&inputs());
+        let check = |code: &str, expected: &str| {
+            let error = decode(code, 74).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        };
+        check("", "another version");
+        check("%%%", "changed on its way");
+        check(&code[..code.len() - 4], "cut off");
+        assert!(
+            decode(&code, 73)
+                .unwrap_err()
+                .to_string()
+                .contains("longer")
+        );
+    }
+}

@@ -1,0 +1,156 @@
+//! The game for JavaScript: the same methods with types that cross the border.
+//!
+//! Numbers go out as `Float32Array`, the rest as JSON or words; what goes wrong is thrown as a
+//! sentence.
+
+use wasm_bindgen::prelude::*;
+
+use crate::{Driver, Game, GameError, Input, MAX_FRAMES, Settings, decode};
+
+/// A drive through a scene.
+#[wasm_bindgen(js_name = Game)]
+pub struct WebGame {
+    game: Game,
+}
+
+#[allow(
+    clippy::needless_pass_by_value,
+    reason = "`map_err` hands errors over by value"
+)]
+fn sentence(error: GameError) -> JsError {
+    JsError::new(&error.to_string())
+}
+
+#[wasm_bindgen(js_class = Game)]
+impl WebGame {
+    /// Opens a scene.
+    #[wasm_bindgen(constructor)]
+    pub fn open(
+        scene: &[u8],
+        name: &str,
+        weights: &[u8],
+        seed: u32,
+        density: f64,
+    ) -> Result<WebGame, JsError> {
+        let settings = Settings {
+            seed: u64::from(seed),
+            density,
+        };
+        let game = Game::open(scene, name, weights, settings).map_err(sentence)?;
+        Ok(Self { game })
+    }
+
+    /// The SHA-256 of a file.
+    pub fn checksum(bytes: &[u8]) -> String {
+        crate::checksum(bytes)
+    }
+
+    /// Drives for a tenth of a second.
+    pub fn tick(
+        &mut self,
+        driver: u8,
+        pedal: i8,
+        wheel: i8,
+        temperature: u8,
+    ) -> Result<(), JsError> {
+        let driver = Driver::ALL.get(usize::from(driver)).copied();
+        let input = Input {
+            driver: driver.unwrap_or_default(),
+            pedal,
+            wheel,
+            temperature,
+        };
+        self.game.tick(input).map_err(sentence)
+    }
+
+    /// The inputs of a link, four numbers for each tenth of a second.
+    pub fn inputs_of(code: &str) -> Result<Vec<i16>, JsError> {
+        let inputs = decode(code, MAX_FRAMES).map_err(sentence)?;
+        let numbers = inputs.iter().flat_map(|input| {
+            [
+                i16::from(input.driver as u8),
+                i16::from(input.pedal),
+                i16::from(input.wheel),
+                i16::from(input.temperature),
+            ]
+        });
+        Ok(numbers.collect())
+    }
+
+    /// The road as JSON.
+    pub fn road(&self) -> String {
+        self.game.road()
+    }
+
+    /// Everyone at a moment.
+    pub fn numbers(&self, frame: usize) -> Result<Vec<f32>, JsError> {
+        self.game.numbers(frame).map_err(sentence)
+    }
+
+    /// What agents may do next, one draw for each.
+    pub fn fan(&self, draw: u32) -> Vec<f32> {
+        let draw = u64::from(draw);
+        self.game.fan_numbers(draw..draw + 1)
+    }
+
+    /// The way of the ego so far.
+    pub fn trail(&self) -> Vec<f32> {
+        self.game.trail()
+    }
+
+    /// Frames driven so far.
+    pub fn driven(&self) -> usize {
+        self.game.driven()
+    }
+
+    /// Takes the drive back.
+    pub fn rewind(&mut self, frame: usize) -> Result<(), JsError> {
+        self.game.rewind(frame).map_err(sentence)
+    }
+
+    /// Begins eight futures.
+    pub fn branch(&mut self, frame: usize) -> Result<(), JsError> {
+        self.game.branch(frame).map_err(sentence)
+    }
+
+    /// Goes on with them; false once they are done.
+    pub fn branch_on(&mut self) -> bool {
+        self.game.go_on_branching()
+    }
+
+    /// How far they are, 0 to 1.
+    pub fn branch_progress(&self) -> f64 {
+        let progress = self.game.branches().map(crate::Branches::progress);
+        progress.map_or(0.0, |(done, all)| done as f64 / all as f64)
+    }
+
+    /// The ways of everyone in one of them.
+    pub fn branch_numbers(&self, k: usize) -> Vec<f32> {
+        self.game.branch_numbers(k)
+    }
+
+    /// How they compare, as JSON.
+    pub fn branch_table(&self) -> String {
+        self.game.branch_table()
+    }
+
+    /// The drive in numbers for people, as JSON.
+    pub fn told(&self) -> Result<String, JsError> {
+        self.game.told().map_err(sentence)
+    }
+
+    /// What has happened to the ego, as JSON.
+    pub fn events(&self) -> String {
+        self.game.events_told()
+    }
+
+    /// The inputs as a code for a link.
+    pub fn code(&self) -> String {
+        self.game.code()
+    }
+
+    /// What two equal drives share.
+    pub fn fingerprint(&self) -> String {
+        self.game.fingerprint()
+    }
+}
