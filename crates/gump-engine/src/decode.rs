@@ -1,8 +1,8 @@
 //! From windows to states: full and partial autoregression in the engine.
 //!
 //! What lives here: what a window is, how it is presented, and in which order its objects are
-//! decoded. What does not: the arithmetic (`engine`), the same for other devices (`plain`), and
-//! what becomes of the states (`future`).
+//! decoded. What does not: the arithmetic (`cpu`), the same for other devices (`reference`), and
+//! what becomes of the states (`rollout_state`).
 
 use std::convert::Infallible;
 use std::sync::Arc;

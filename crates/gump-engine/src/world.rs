@@ -2,7 +2,7 @@
 //!
 //! A session keeps, per scene, the frame of reference, the identities and the visual memory, which
 //! all its futures share (`scene`); and per future, the token frames of its window, the chunks of
-//! every agent and the present in world coordinates (`future`). `decode` turns windows into new
+//! every agent and the present in world coordinates (`rollout_state`). `decode` turns windows into new
 //! states; `session` goes step by step.
 //!
 //! Agents outside the token window, of no predicted kind, or beyond the vocabulary move on with

@@ -2,7 +2,7 @@
 //!
 //! What lives here: [`Panels`], a weight matrix cut into panels of [`PANEL`] columns that a product
 //! reads from front to back, in one of three precisions, under the
-//! kernels of `gemm`. What does not: products with a gradient, which are `linear`'s.
+//! kernels of `gemm`. What does not: products with a gradient, which are `gump-nn`'s.
 //!
 //! Every element of a product is one chain of fused multiply-adds in the order of the inner index,
 //! whatever rows stand around it: a row's bits depend neither on the batch nor on the threads.

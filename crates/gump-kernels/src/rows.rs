@@ -2,7 +2,7 @@
 //! over threads.
 //!
 //! What lives here: helpers that several operations need. What does not: anything that knows a
-//! layer or a tensor (the bridge to candle is in the parent module).
+//! layer or a tensor.
 //!
 //! Two rules make every result independent of the number of threads: work is cut into pieces
 //! whose size depends on the shape only, and partial sums are added in the order of the pieces.

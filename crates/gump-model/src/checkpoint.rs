@@ -22,6 +22,8 @@ use crate::ModelError;
 use crate::config::ModelConfig;
 use crate::local_context::n_numbers;
 use crate::network::Network;
+use crate::prefixes::PREFIXES;
+pub use crate::prefixes::{DRIVER, OPTIMIZER, TRAINED};
 
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";
@@ -37,15 +39,6 @@ pub enum Precision {
     /// Full precision, for resuming.
     Full,
 }
-
-/// Before the names of the optimiser's moments.
-pub const OPTIMIZER: &str = "optimizer.";
-/// Before the names of the weights that drove the scenes of closed-loop training.
-pub const DRIVER: &str = "driver.";
-/// Before the names of the weights being trained, where their moving average is what is shipped.
-pub const TRAINED: &str = "trained.";
-/// What a run's checkpoint holds beside the weights.
-const PREFIXES: [&str; 3] = [OPTIMIZER, DRIVER, TRAINED];
 
 /// Tensors and header entries of a file.
 #[derive(Debug)]

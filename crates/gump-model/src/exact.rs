@@ -1,7 +1,7 @@
 //! Objects as they are, beside the bins in which tokens say them.
 //!
 //! A token rounds a place to 20 cm and a heading to 1.8 degrees. What an object says is read from
-//! its exact pose (`anchor`), so what it sees around itself must be seen from there, too: the slots
+//! its exact pose (`local_frame`), so what it sees around itself must be seen from there, too: the slots
 //! of a window carry both.
 
 use std::collections::BTreeMap;

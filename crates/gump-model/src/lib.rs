@@ -48,6 +48,7 @@ pub mod mct;
 #[cfg(feature = "tensors")]
 mod network;
 pub mod placed_slot;
+pub mod prefixes;
 pub mod relative;
 pub mod steps;
 #[cfg(feature = "tensors")]

@@ -1,7 +1,7 @@
 //! What comes next: whose key or which mark, of which class somebody new is, what a light shows.
 //!
 //! These are rows of matrices that the network has anyway, read at control and value tokens; what
-//! is made of them is the business of `generation`.
+//! is made of them is the business of `spawning` and `gump-generate`.
 
 use gump_kernels::panels::{Panels, Precision, Scratch};
 use gump_model::ModelError;

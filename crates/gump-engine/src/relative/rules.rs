@@ -1,7 +1,8 @@
 //! Rules over the network's draws: what would run into somebody or off the road is drawn again, and
 //! what no vehicle can do is held back.
 //!
-//! They are those of the sequence network (`clearance`, `limits`). That says three poses at once; here
+//! They are those of the sequence network (`rejection`, `kinematic_limits`). That says three poses at
+//! once; here
 //! the second half of what is looked at, a second, goes on as the move that was drawn.
 
 use gump_geometry::Pose;

@@ -8,6 +8,7 @@ use gump_nn::Parameters;
 use super::{RelativeConfig, RelativeNetwork};
 use crate::ModelError;
 use crate::checkpoint::{self, Precision};
+use crate::prefixes::PREFIXES;
 
 /// Header entry that tells the two architectures apart.
 const ARCHITECTURE: (&str, &str) = ("architecture", "relative");
@@ -38,11 +39,9 @@ pub fn save(
 pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError> {
     let archive = checkpoint::read(path)?;
     let config = config(&archive)?;
-    let weights = archive.tensors.into_iter();
-    let weights = weights.filter(|(name, _)| !name.starts_with(checkpoint::OPTIMIZER));
-    let tensors = weights.filter(|(name, _)| {
-        !name.starts_with(checkpoint::TRAINED) && !name.starts_with(checkpoint::DRIVER)
-    });
+    let is_beside = |name: &str| PREFIXES.iter().any(|prefix| name.starts_with(prefix));
+    let tensors = archive.tensors.into_iter();
+    let tensors = tensors.filter(|(name, _)| !is_beside(name));
     RelativeNetwork::build(config, Parameters::loaded(tensors.collect(), device))
 }
 

@@ -7,6 +7,7 @@ use safetensors::tensor::Dtype;
 
 use super::RelativeConfig;
 use crate::ModelError;
+use crate::prefixes::PREFIXES;
 
 /// The numbers of a trained relative network by name, row-major f32, with its shape.
 ///
@@ -43,8 +44,7 @@ impl RelativeWeights {
             .map_err(|error| fail(format!("damaged weights ({error})")))?;
         let mut numbers = BTreeMap::new();
         for (name, view) in file.tensors() {
-            let beside = ["optimizer.", "driver.", "trained."];
-            if beside.iter().any(|prefix| name.starts_with(prefix)) {
+            if PREFIXES.iter().any(|prefix| name.starts_with(prefix)) {
                 continue;
             }
             let data = view.data();

@@ -6,8 +6,8 @@
 //! (as CAT-K does, Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models",
 //! 2024), so that agents stay near enough to the log for its next states to be their targets.
 //!
-//! In a share of drives agents go their own ways instead, under the rules of `rules`: what would run
-//! into somebody or off the road is drawn again. What they then did is what the network should say,
+//! In a share of drives agents go their own ways instead, under the rules of
+//! `gump_engine::relative::rules`: what would run into somebody or off the road is drawn again. What they then did is what the network should say,
 //! so that it comes to keep the rules by itself.
 
 use gump_engine::relative::engine::{Draw, Engine, Workspace};

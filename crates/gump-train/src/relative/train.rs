@@ -30,9 +30,6 @@ const ATTEMPTS: u64 = 64;
 /// Separates the scenes that are rolled out from those of the samples.
 const GROUP: u64 = 1 << 40;
 
-/// What names of the tensors that drive begin with in a checkpoint.
-pub(super) const DRIVER: &str = "driver.";
-
 /// How to train.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -278,7 +275,7 @@ impl RelativeTrainer {
             })?;
         let mut moments = archive.take(checkpoint::OPTIMIZER);
         let trained = archive.take(checkpoint::TRAINED);
-        let driver = archive.take(DRIVER);
+        let driver = archive.take(checkpoint::DRIVER);
         let build =
             |weights| RelativeNetwork::build(model.clone(), Parameters::loaded(weights, device));
         let (network, average) = (build(trained)?, build(archive.tensors)?);
@@ -450,7 +447,7 @@ impl RelativeTrainer {
         let mut tensors = named("", &self.average);
         tensors.extend(named(checkpoint::TRAINED, &self.trained));
         if let Some(driving) = &self.driving {
-            tensors.extend(named(DRIVER, driving));
+            tensors.extend(named(checkpoint::DRIVER, driving));
         }
         let state = self.optimizer.state();
         tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
