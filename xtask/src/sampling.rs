@@ -1,6 +1,6 @@
 //! How a learned world decodes, as flags.
 
-use gump_engine::{CacheMode, Mode, Precision, SamplingConfig};
+use gump_engine::{CacheMode, LightSource, Mode, Precision, SamplingConfig};
 use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
@@ -54,9 +54,12 @@ pub(crate) struct Draw {
     /// With rules alone, where tables show the network alone beside it
     #[arg(long)]
     ruled: bool,
-    /// Agents come and leave and lights change as the model says
-    #[arg(long)]
+    /// Agents come and leave, as many as at the start
+    #[arg(long, visible_alias = "spawn")]
     life: bool,
+    /// What traffic lights show after the present
+    #[arg(long, value_enum, default_value_t = LightsName::Model)]
+    lights: LightsName,
 }
 
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
@@ -75,6 +78,28 @@ enum CacheName {
     Window,
     /// The window grows as far as it fits; between frames nothing is read twice either
     Growing,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum LightsName {
+    /// What signals of such junctions do
+    Model,
+    /// What they show at the present
+    Hold,
+    /// What was recorded, which no actor could know
+    Log,
+}
+
+impl LightsName {
+    /// The model's form of the name.
+    pub(crate) fn resolve(self) -> LightSource {
+        match self {
+            Self::Model => LightSource::Model,
+            Self::Hold => LightSource::Hold,
+            Self::Log => LightSource::Log,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
@@ -157,6 +182,7 @@ impl Draw {
             },
             precision: self.precision.resolve(),
             life: self.life,
+            lights: self.lights.resolve(),
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             top_p: self.top_p.or(base.top_p),
@@ -262,6 +288,7 @@ mod tests {
             paper: false,
             ruled: false,
             life: false,
+            lights: LightsName::Model,
         }
     }
 

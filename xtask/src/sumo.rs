@@ -147,11 +147,13 @@ impl Sumo {
         Place::read(name, file)
     }
 
-    /// Simulates once on a network and cuts scenes out; the same for the same seed.
+    /// Simulates once on a network and cuts scenes out, each of so many seconds after its present;
+    /// the same for the same seed.
     pub(crate) fn scenes(
         &self,
         place: &Place,
         demand: &SumoDemand,
+        future_s: f64,
         seed: Seed,
         id: &str,
         folder: &Path,
@@ -160,6 +162,7 @@ impl Sumo {
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         let cut = CutOptions {
             pause_s: PAUSE_S,
+            future_s,
             without_overlaps: true,
             seed: seed.fork(1),
             ..CutOptions::standard()

@@ -49,7 +49,7 @@ const OF_THE_RUN: [&str; 8] = [
 ];
 
 /// How a network decodes.
-const DECODING: [&str; 13] = [
+const DECODING: [&str; 14] = [
     "mode",
     "cache",
     "precision",
@@ -63,6 +63,7 @@ const DECODING: [&str; 13] = [
     "paper",
     "ruled",
     "life",
+    "lights",
 ];
 
 /// How planners that imagine do it.

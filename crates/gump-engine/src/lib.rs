@@ -79,6 +79,6 @@ pub mod world;
 
 pub use gump_kernels::panels::Precision;
 pub use predictive_samples::{PredictiveSamples, ProbeConfig};
-pub use sampling::{CacheMode, Mode, RateScale, SamplingConfig, Surrogate};
+pub use sampling::{CacheMode, LightSource, Mode, RateScale, SamplingConfig, Surrogate};
 #[cfg(feature = "tensors")]
 pub use world::TransformerWorld;

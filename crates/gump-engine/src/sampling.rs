@@ -31,9 +31,11 @@ pub struct SamplingConfig {
     pub history: usize,
     /// Where provisional states come from in partial-AR decoding.
     pub surrogate: Surrogate,
-    /// Whether agents come and leave and lights change as the network says (on a CPU); else those
-    /// who are there stay, and lights keep the colour they were seen in.
+    /// Whether agents come and leave; else those who are there stay. A sequence network says itself
+    /// who does (on a CPU), and what the lights show then.
     pub life: bool,
+    /// What lights show, where the network does not say it.
+    pub lights: LightSource,
     /// How fast that goes.
     pub pace: RateScale,
     /// How often an object that would run into another or off the road within 1.5 s is drawn again
@@ -57,6 +59,7 @@ impl Default for SamplingConfig {
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
+            lights: LightSource::Model,
             pace: RateScale::default(),
             redraws: 12,
             limits: true,
@@ -128,6 +131,19 @@ impl Default for RateScale {
     }
 }
 
+/// What traffic lights show after the present.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LightSource {
+    /// What signals of such junctions do, from what was seen of them.
+    #[default]
+    Model,
+    /// What they show at the present.
+    Hold,
+    /// What was recorded: nothing that an actor could know.
+    Log,
+}
+
 /// In which order the objects of a frame are decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -185,6 +201,7 @@ mod tests {
             history: 3,
             surrogate: Surrogate::Chunk,
             life: false,
+            lights: LightSource::Model,
             pace: RateScale {
                 arrivals: 1.0,
                 light_changes: 1.0,

@@ -3,13 +3,15 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
-use gump_engine::{PredictiveSamples, ProbeConfig, SamplingConfig, TransformerWorld};
+use gump_engine::{LightSource, PredictiveSamples, ProbeConfig, SamplingConfig, TransformerWorld};
 use gump_model::{Device, checkpoint, relative};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
+use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, RecordedLights};
 use serde::{Serialize, Serializer};
 
 use crate::EvalError;
@@ -96,7 +98,7 @@ pub enum World {
     /// A trained network of sequences.
     Learned(Box<TransformerWorld>),
     /// A trained network with relative attention.
-    Relative(Box<RelativeWorld>),
+    Relative(Box<Living<RelativeWorld>>),
 }
 
 impl World {
@@ -113,44 +115,67 @@ impl World {
     ) -> Result<Self, EvalError> {
         match name {
             WorldName::Log => Ok(Self::Rule(Box::new(LogReplay::new(scenario)))),
-            _ => Self::without_log(device, name, sampling),
+            _ => {
+                let recorded = || LightControl::Recorded(Arc::new(RecordedLights::of(scenario)));
+                Self::with_lights(device, name, sampling, recorded)
+            }
         }
     }
 
     /// Builds a world that looks at no log.
     ///
     /// # Errors
-    /// The world `log`, and as [`World::build`].
+    /// The world `log`, lights as recorded, and as [`World::build`].
     pub fn without_log(
         device: &Device,
         name: &WorldName,
         sampling: &SamplingConfig,
     ) -> Result<Self, EvalError> {
+        if sampling.lights == LightSource::Log {
+            let wrong = "lights as recorded need a world of one scenario; expected model or hold";
+            return Err(EvalError::Argument(wrong.into()));
+        }
+        Self::with_lights(device, name, sampling, || LightControl::Hold)
+    }
+
+    fn with_lights(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+        recorded: impl Fn() -> LightControl,
+    ) -> Result<Self, EvalError> {
+        let living = LivingConfig {
+            lights: match sampling.lights {
+                LightSource::Model => LightControl::Signals,
+                LightSource::Hold => LightControl::Hold,
+                LightSource::Log => recorded(),
+            },
+            arrivals: sampling.life.then(Arrivals::default),
+        };
         Ok(match name {
             WorldName::Log => {
                 let wrong = "the world log needs a scenario to replay";
                 return Err(EvalError::Argument(wrong.into()));
             }
-            WorldName::Idm => Self::Rule(Box::new(Idm::default())),
-            WorldName::ConstantVelocity => Self::Rule(Box::new(ConstantVelocity)),
+            WorldName::Idm => Self::Rule(Box::new(Living::new(Idm::default(), living))),
+            WorldName::ConstantVelocity => {
+                Self::Rule(Box::new(Living::new(ConstantVelocity, living)))
+            }
             WorldName::Model(path) if relative::is_relative(path)? => {
-                if sampling.life {
-                    let wrong = format!(
-                        "the relative network in {} does not say who comes and leaves, \
-                         a sequence network does",
-                        path.display()
-                    );
-                    return Err(EvalError::Argument(wrong));
-                }
                 let network = relative::load(path, device)?;
-                let sampling = RelativeSampling::from(sampling);
-                Self::Relative(Box::new(RelativeWorld::new(&network, sampling)?))
+                let world = RelativeWorld::new(&network, RelativeSampling::from(sampling))?;
+                Self::Relative(Box::new(Living::new(world, living)))
             }
             WorldName::Model(path) => {
                 let network = checkpoint::load(path, device)?;
                 Self::Learned(Box::new(TransformerWorld::new(network, sampling.clone())))
             }
         })
+    }
+
+    /// Whether a world of this name is another one in every scenario.
+    pub fn is_of_scenario(name: &WorldName, sampling: &SamplingConfig) -> bool {
+        *name == WorldName::Log || sampling.lights == LightSource::Log
     }
 
     /// What imagines.
@@ -174,7 +199,7 @@ impl World {
     pub fn watching(self, watch: ProbeConfig) -> Self {
         match self {
             Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
-            Self::Relative(world) => Self::Relative(Box::new(world.watching(watch))),
+            Self::Relative(world) => Self::Relative(Box::new(world.map(|w| w.watching(watch)))),
             rule => rule,
         }
     }
@@ -184,7 +209,7 @@ impl World {
         match self {
             Self::Rule(_) => None,
             Self::Learned(world) => Some(world.take_predictive_samples()),
-            Self::Relative(world) => Some(world.take_predictive_samples()),
+            Self::Relative(world) => Some(world.world().take_predictive_samples()),
         }
     }
 
@@ -193,7 +218,7 @@ impl World {
         match self {
             Self::Rule(_) => 0,
             Self::Learned(world) => world.passes(),
-            Self::Relative(world) => world.passes(),
+            Self::Relative(world) => world.world().passes(),
         }
     }
 }
@@ -224,7 +249,7 @@ impl<'a> Worlds<'a> {
     /// As [`World::build`].
     pub fn of(&mut self, scenario: &Scenario) -> Result<&World, EvalError> {
         let world = match self.loaded.take() {
-            Some(world) if *self.name != WorldName::Log => world,
+            Some(world) if !World::is_of_scenario(self.name, &self.sampling) => world,
             _ => World::build(&self.device, self.name, scenario, &self.sampling)?,
         };
         Ok(self.loaded.insert(world))

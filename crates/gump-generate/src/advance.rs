@@ -13,11 +13,12 @@ use gump_model::ModelError;
 use gump_model::decoder::Bins;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
+use gump_scene::AgentKind;
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
-use crate::GenerateError;
 use crate::draft::Draft;
+use crate::{GenerateError, Placement, reason};
 
 /// Draws of an object that are made at once: most objects need no more.
 const VOLLEY: usize = 4;
@@ -135,10 +136,16 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
         let bins = engine.sample_state(&hidden, &references, sampling);
         drawn += n;
         let is_last = drawn >= tries;
+        // Where nobody can be but in a queue without a head, a queue it is.
+        let is_late = 2 * drawn > tries;
         let judged: Vec<Vec<Result<Found, String>>> = queries
             .par_iter()
             .zip(bins.par_chunks(n))
-            .map(|(query, bins)| bins.iter().map(|bins| judge(query, bins)).collect())
+            .map(|(query, bins)| {
+                bins.iter()
+                    .map(|bins| judge(query, bins, is_late))
+                    .collect()
+            })
             .collect();
         let mut left = Vec::new();
         for (mut query, judged) in queries.into_iter().zip(judged) {
@@ -188,14 +195,44 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
 type Found = (QuantizedState, OrientedBox);
 
 /// The state that was drawn, or the rule it breaks. The ego's box is given and therefore good.
-fn judge(query: &Query<'_, '_>, bins: &Bins) -> Result<Found, String> {
+fn judge(query: &Query<'_, '_>, bins: &Bins, is_late: bool) -> Result<Found, String> {
     let state = state_of(bins);
     let prepared = query.draft.prepared;
     let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
     let outline = query.rules.outline(&state, map, world_from_scene);
     let broken = query.rules.broken(&state, &outline, map, world_from_scene);
+    let stands = || stands_without(query, &state, &outline).filter(|_| !is_late);
+    let broken = broken.or_else(stands);
     match broken {
         Some(clause) if !query.key.is_ego() || clause.starts_with("speed") => Err(clause),
         _ => Ok((state, outline)),
     }
+}
+
+/// The clause that somebody breaks who stands in traffic without a reason. An ego that prompts speak
+/// of may have theirs.
+fn stands_without(
+    query: &Query<'_, '_>,
+    state: &QuantizedState,
+    outline: &OrientedBox,
+) -> Option<String> {
+    let prepared = query.draft.prepared;
+    let request = prepared.request;
+    let is_asked = request.config.standing_has_reasons
+        && request.config.placement == Placement::Guided
+        && query.rules.kind != AgentKind::Pedestrian
+        && query.rules.spec.speed.is_none()
+        && !(query.key.is_ego() && (!request.prompts.is_empty() || request.ego.velocity.is_some()));
+    if !is_asked {
+        return None;
+    }
+    let world = |own: &OrientedBox| OrientedBox {
+        pose: prepared.scene.world_from_scene * own.pose,
+        ..*own
+    };
+    let others: Vec<OrientedBox> = query.rules.taken.iter().map(world).collect();
+    let speed = state.velocity().length();
+    let (map, lights) = (&request.map, &request.lights);
+    reason::stands_without(&world(outline), speed, map, lights, &others)
+        .then(|| "speed: nothing holds it back".into())
 }

@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use gump_engine::TransformerWorld;
 use gump_metrics::tags;
+use gump_rollout::WorldModel;
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rayon::prelude::*;
 
@@ -58,12 +59,31 @@ impl Made {
     }
 }
 
+/// Which worlds make scenes.
+#[derive(Clone, Copy)]
+pub struct GenerationWorlds<'a> {
+    /// The network that puts agents into a scene.
+    pub scenes: &'a TransformerWorld,
+    /// The world in which the scene then goes on; another one, or the same.
+    pub traffic: &'a dyn WorldModel,
+}
+
+impl<'a> GenerationWorlds<'a> {
+    /// The same network for both.
+    pub fn of(world: &'a TransformerWorld) -> Self {
+        Self {
+            scenes: world,
+            traffic: world,
+        }
+    }
+}
+
 /// Makes the scenes with these numbers; what each is depends on its number and the seed alone.
 ///
 /// # Errors
 /// What makes the order impossible.
 pub fn make_many(
-    world: &TransformerWorld,
+    worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
     numbers: Range<u64>,
     seed: Seed,
@@ -72,18 +92,19 @@ pub fn make_many(
     if order.roams || !request.prompts.is_empty() {
         let made = numbers.into_par_iter();
         return Ok(made
-            .map(|number| make(world, order, number, seed))
+            .map(|number| make(worlds, order, number, seed))
             .collect());
     }
     // One place for all and nothing to convince of: they can be made together.
     let stream = |number: u64| seed.fork(number).fork(0);
     let seeds: Vec<Seed> = numbers.clone().map(|n| stream(n).fork(1)).collect();
-    let scenes = generate(world, request, &seeds)?;
+    let scenes = generate(worlds.scenes, request, &seeds)?;
     let numbered: Vec<_> = numbers.zip(scenes).collect();
     let made = numbered.into_par_iter().map(|(number, scene)| {
         let scene = scene?;
         let mut scenario = scene.scenario(name(number), &request.map, &[]);
-        takes::extend(world, &mut scenario, order.seconds, stream(number).fork(2))?;
+        let stream = stream(number).fork(2);
+        takes::extend(worlds.traffic, &mut scenario, order.seconds, stream)?;
         Ok(Made {
             clauses: verdict(&scenario, &[], request.counts.as_ref()),
             scene,
@@ -114,7 +135,7 @@ pub fn admits(request: &GenerateRequest, seed: Seed) -> bool {
 /// # Errors
 /// What makes the order impossible, or the last attempt's failure if none gave a scene.
 pub fn make(
-    world: &TransformerWorld,
+    worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
     number: u64,
     seed: Seed,
@@ -130,7 +151,7 @@ pub fn make(
             Err(_) if attempt > 0 => break,
             next => next?,
         };
-        let made = generate(world, &request, &[stream.fork(1)]);
+        let made = generate(worlds.scenes, &request, &[stream.fork(1)]);
         let scene = match made.map(|mut scenes| scenes.remove(0)) {
             Ok(Ok(scene)) => scene,
             // Another place or another draw may do, but never for what contradicts itself.
@@ -156,7 +177,7 @@ pub fn make(
             is_steered: false,
             moment_s: 0.0,
         };
-        let made = judged(world, order, made, stage.as_ref(), stream)?;
+        let made = judged(worlds.traffic, order, made, stage.as_ref(), stream)?;
         if made.holds() {
             return Ok(made);
         }
@@ -225,7 +246,7 @@ impl<'a> Place<'a> {
 
 /// The scene with as much of its future as is asked for or needed to judge it, and the verdict.
 fn judged(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     order: &GenerationJob,
     mut made: Made,
     stage: Option<&Stage>,

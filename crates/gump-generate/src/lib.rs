@@ -19,6 +19,7 @@ mod even;
 pub mod factory;
 mod prepared;
 mod prompt;
+mod reason;
 mod request;
 mod roadside;
 mod search;

@@ -98,6 +98,9 @@ pub struct GenerateConfig {
     pub top_k: usize,
     /// Where objects may be drawn.
     pub placement: Placement,
+    /// Whether who stands in a lane has a reason to: a light, a sign, a junction or somebody before
+    /// him (paper: no). In guided placement only.
+    pub standing_has_reasons: bool,
     /// Draws per object before the scene is begun anew.
     pub tries: usize,
     /// Times a scene is begun anew before it is given up.
@@ -117,6 +120,7 @@ impl GenerateConfig {
             smoothing_bins: 0.0,
             smoothed_sizes: true,
             even: false,
+            standing_has_reasons: false,
             ..Self::default()
         }
     }
@@ -133,6 +137,7 @@ impl Default for GenerateConfig {
             smoothing_bins: 0.7,
             smoothed_sizes: true,
             even: true,
+            standing_has_reasons: true,
             top_k: 1000,
             placement: Placement::Guided,
             tries: 24,

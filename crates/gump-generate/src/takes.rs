@@ -1,9 +1,8 @@
 //! Futures of a scene, imagined several times over, and the moment at which one is what was asked
 //! for: a tag is about an instant, so the present of a scenario may be any.
 
-use gump_engine::TransformerWorld;
 use gump_model::ModelError;
-use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Rollout, Scenario, Seed};
 
 use crate::drive::{Drive, Steered};
@@ -19,7 +18,7 @@ const HISTORY_S: f64 = 1.0;
 
 /// Some futures in which the world drives everybody, the ego too.
 pub(super) fn free(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     scene: &Scenario,
     n_futures: usize,
     seed: Seed,
@@ -36,7 +35,7 @@ pub(super) fn free(
 /// Some futures in which the ego is driven at first, and then by the world; those in which it
 /// meets with nobody.
 pub(super) fn steered(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     scene: &Scenario,
     drive: &Drive,
     seed: Seed,
@@ -90,7 +89,7 @@ pub(super) fn moment(
 
 /// Imagines on until there are so many seconds after the present.
 pub(super) fn extend(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     scenario: &mut Scenario,
     seconds: f64,
     seed: Seed,
@@ -112,7 +111,7 @@ pub(super) fn extend(
 }
 
 fn imagine(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     starts: &[Start<'_>],
     drive: Option<&Drive>,
     seconds: f64,

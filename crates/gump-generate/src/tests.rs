@@ -171,7 +171,13 @@ fn what_a_prompt_says_is_made_and_judged() {
         seconds: 0.0,
         attempts: 20,
     };
-    let made = factory::make_many(&world(), &order, 0..2, Seed(1)).unwrap();
+    let made = factory::make_many(
+        factory::GenerationWorlds::of(&world()),
+        &order,
+        0..2,
+        Seed(1),
+    )
+    .unwrap();
     for made in made.into_iter().map(Result::unwrap) {
         assert_eq!(made.clauses[0].clause, "behind_bike");
         assert_eq!(made.clauses[0].holds, Some(true), "{:?}", made.clauses);
@@ -194,7 +200,15 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
     let order = order("stopping_with_lead");
     let made_by = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        let made = || factory::make_many(&world(), &order, 0..3, Seed(1)).unwrap();
+        let made = || {
+            factory::make_many(
+                factory::GenerationWorlds::of(&world()),
+                &order,
+                0..3,
+                Seed(1),
+            )
+            .unwrap()
+        };
         pool.build().unwrap().install(made)
     };
     let made: Vec<_> = made_by(1).into_iter().map(Result::unwrap).collect();
@@ -218,7 +232,9 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
             attempts: 2,
         }
     };
-    let make = |order: &factory::GenerationJob| factory::make(&world(), order, 0, Seed(1));
+    let make = |order: &factory::GenerationJob| {
+        factory::make(factory::GenerationWorlds::of(&world()), order, 0, Seed(1))
+    };
     let error = make(&order("on_carpark", Placement::Guided)).unwrap_err();
     assert!(error.to_string().contains("can hold on_carpark"), "{error}");
     // Where the network has its way nothing is looked for, and the verdict says what is wrong.
@@ -244,7 +260,7 @@ fn a_place_where_nobody_walks_is_left_for_another() {
         seconds: 0.0,
         attempts: 60,
     };
-    let made = factory::make(&world(), &order, 0, Seed(1)).unwrap();
+    let made = factory::make(factory::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
     assert!(made.attempts > 1 && made.holds(), "{:?}", made.clauses);
     let ego = made.scene.frame.agent(made.scene.ego).unwrap();
     assert!((-40.0..0.0).contains(&ego.state.pose.position.x));
@@ -285,7 +301,7 @@ fn cones_stand_clear_of_everybody() {
         seconds: 0.0,
         attempts: 20,
     };
-    let made = factory::make(&world(), &order, 0, Seed(1)).unwrap();
+    let made = factory::make(factory::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
     assert!(made.holds(), "{:?}", made.clauses);
     let present = made.scenario.present();
     let agents = present.now().agents().iter();

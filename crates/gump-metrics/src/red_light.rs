@@ -1,7 +1,7 @@
 //! Driving past a red light.
 
 use gump_geometry::{DVec2, Pose};
-use gump_scene::{Agent, AgentKind, Lane, Light, LightState, SceneState};
+use gump_scene::{Agent, AgentKind, LightState, SceneState, stop_line};
 
 use crate::{Metric, Reduce};
 
@@ -47,16 +47,6 @@ pub(crate) fn passes(line: Pose, width: f64, before: DVec2, now: Pose) -> bool {
     let (from, to) = (line.inverse() * before, line.inverse() * now.position);
     let along = now.direction().dot(line.direction()) > 0.0;
     along && from.x <= 0.0 && to.x > 0.0 && to.y.abs() <= width / 2.0
-}
-
-/// The middle of the stop line, heading along the lane.
-pub(crate) fn stop_line(lane: &Lane, light: &Light) -> Pose {
-    let center = &lane.centerline;
-    center.pose_at(match light.stop_point {
-        Some(point) => center.project(point).arc_length,
-        None if lane.in_intersection => 0.0,
-        None => center.length(),
-    })
 }
 
 #[cfg(test)]

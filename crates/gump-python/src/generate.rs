@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use gump_generate::constraint::parse_constraints;
-use gump_generate::factory::{GenerationJob, Made, make_many};
+use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
 use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
 use gump_scene::{ScenarioTag, Seed};
 use pyo3::prelude::*;
@@ -110,7 +110,14 @@ pub(crate) fn generate<'py>(
     for first in (0..wish.count).step_by(BATCH as usize) {
         py.check_signals()?;
         let numbers = first..(first + BATCH).min(wish.count);
-        let made = threads::work(py, || make_many(model, &order, numbers, Seed(wish.seed)))?;
+        let made = threads::work(py, || {
+            make_many(
+                GenerationWorlds::of(model),
+                &order,
+                numbers,
+                Seed(wish.seed),
+            )
+        })?;
         for made in made.map_err(errors::value)? {
             list.append(told(py, made.map_err(errors::runtime)?)?)?;
         }

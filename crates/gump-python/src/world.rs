@@ -5,12 +5,13 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
-use gump_engine::{Mode, Precision, SamplingConfig, TransformerWorld};
+use gump_engine::{LightSource, Mode, Precision, SamplingConfig, TransformerWorld};
 use gump_geometry::{Pose, dvec2};
 use gump_model::{Device, checkpoint, relative};
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentId, AgentState, Frame, Rollout, Seed};
+use gump_traffic::{Arrivals, LightControl, Living, LivingConfig};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 
@@ -55,6 +56,7 @@ struct Sampling {
     raw: bool,
     paper: bool,
     life: bool,
+    lights: String,
     precision: String,
 }
 
@@ -82,6 +84,11 @@ impl Sampling {
                 found => return Err(unknown("precision", "f32, bf16 or int8", found)),
             },
             life: self.life,
+            lights: match self.lights.as_str() {
+                "model" => LightSource::Model,
+                "hold" => LightSource::Hold,
+                found => return Err(unknown("lights", "model or hold", found)),
+            },
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             top_p: self.top_p.or(base.top_p),
@@ -126,8 +133,10 @@ impl World {
         let config = sampling.resolve()?;
         let kind = match (name, &weights) {
             ("log", _) => Kind::Log,
-            ("idm", _) => Kind::Rules(Arc::new(Idm::default())),
-            ("constant-velocity", _) => Kind::Rules(Arc::new(ConstantVelocity)),
+            ("idm", _) => Kind::Rules(Arc::new(Living::new(Idm::default(), living(&config)))),
+            ("constant-velocity", _) => {
+                Kind::Rules(Arc::new(Living::new(ConstantVelocity, living(&config))))
+            }
             (_, Some(path)) => threads::work(py, || load(path, config))??,
             (found, None) => {
                 let expected = "log, idm, constant-velocity, model or model:WEIGHTS";
@@ -233,6 +242,17 @@ impl Kind {
     }
 }
 
+/// What goes on beside how agents move.
+fn living(config: &SamplingConfig) -> LivingConfig {
+    LivingConfig {
+        lights: match config.lights {
+            LightSource::Hold => LightControl::Hold,
+            _ => LightControl::Signals,
+        },
+        arrivals: config.life.then(Arrivals::default),
+    }
+}
+
 /// Reads weights, whatever network they are of.
 fn load(path: &Path, config: SamplingConfig) -> PyResult<Kind> {
     if !path.exists() {
@@ -246,7 +266,7 @@ fn load(path: &Path, config: SamplingConfig) -> PyResult<Kind> {
         let network = relative::load(path, &Device::Cpu).map_err(damaged)?;
         let world =
             RelativeWorld::new(&network, RelativeSampling::from(&config)).map_err(damaged)?;
-        return Ok(Kind::Network(Arc::new(world)));
+        return Ok(Kind::Network(Arc::new(Living::new(world, living(&config)))));
     }
     let network = checkpoint::load(path, &Device::Cpu).map_err(damaged)?;
     let world = TransformerWorld::new(network, config);

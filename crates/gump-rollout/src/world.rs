@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use gump_scene::{AgentState, Frame, SceneState, Seed};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light, SceneState, Seed};
 
 /// An error of whoever implements a world or a policy.
 pub type BoxError = Box<dyn Error + Send + Sync>;
@@ -77,6 +77,16 @@ pub trait WorldModel: Send + Sync {
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError>;
 }
 
+impl<W: WorldModel + ?Sized> WorldModel for Box<W> {
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        (**self).open(starts)
+    }
+}
+
 /// A scene to continue, how often, and from which randomness.
 #[derive(Clone, Copy, Debug)]
 pub struct Start<'a> {
@@ -108,6 +118,25 @@ pub trait Session {
     /// and keeps all; so does the default.
     fn keep(&mut self, futures: &[usize]) -> bool {
         let _ = futures;
+        false
+    }
+
+    /// Shows these lights, all that there are, in the next frame of a future and after it; true if
+    /// it does.
+    ///
+    /// The frame's agents move by what they have seen until then. A session whose lights are its
+    /// own affair says false and shows those; so does the default.
+    fn show(&mut self, future: usize, lights: &[Light]) -> bool {
+        let (_, _) = (future, lights);
+        false
+    }
+
+    /// Before its next frame, takes agents out of a future and puts others in, where they are now;
+    /// true if it does. The ego stays, whoever is asked to leave.
+    ///
+    /// A session that cannot says false and nothing changes; so does the default.
+    fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
+        let (_, _, _) = (future, leave, come);
         false
     }
 

@@ -38,6 +38,7 @@ mod rollout;
 mod route;
 mod scenario;
 mod scene_state;
+mod stop_line;
 mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
@@ -55,4 +56,5 @@ pub use rollout::Rollout;
 pub use route::Route;
 pub use scenario::{Scenario, ScenarioError};
 pub use scene_state::SceneState;
+pub use stop_line::{stop_line, ways_beyond, ways_cross, ways_join};
 pub use tag::ScenarioTag;

@@ -102,7 +102,7 @@ impl Branches {
             return false;
         };
         let n = branch.frames.len();
-        branch.live.show(&signals.at((self.knot + n - 1) * STRIDE));
+        branch.live.show(&signals.at((self.knot + n) * STRIDE));
         branch.live.decide(world, None);
         let told = branch.live.go_on(world, None);
         let lights = signals.at((self.knot + n) * STRIDE);

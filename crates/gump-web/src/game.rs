@@ -265,7 +265,7 @@ impl Game {
         };
         let index = frame / STRIDE;
         self.knots.truncate(index);
-        self.live.show(&self.signals.at(frame));
+        self.live.show(&self.signals.at(frame + STRIDE));
         let knot = Knot {
             driver: input.driver,
             temperature: f64::from(input.temperature) / Input::PER_UNIT,
@@ -385,13 +385,12 @@ impl Game {
                 ..
             } = self.knots[i];
             self.world.set_temperature(temperature);
-            live.show(&self.signals.at(i * STRIDE));
+            live.show(&self.signals.at((i + 1) * STRIDE));
             live.decide(&self.world, assumed);
             let end = &self.frames[self.scenario.now + (i + 1) * STRIDE];
             let ego = end.agent(self.scenario.ego).map(|agent| agent.state);
             live.go_on(&self.world, ego.filter(|_| driver != Driver::Network));
         }
-        live.show(&self.signals.at(knot * STRIDE));
         live
     }
 

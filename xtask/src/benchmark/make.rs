@@ -17,6 +17,8 @@ use crate::progress::Progress;
 use crate::run::stop_if_interrupted;
 use crate::sumo::{Place, Sumo};
 
+/// How long scenes of SUMO go on after their present, seconds.
+const FUTURE_S: f64 = 8.0;
 /// So many runs of SUMO more than are needed mean that there is no room to drive.
 const SPARE_RUNS: u64 = 200;
 
@@ -258,9 +260,9 @@ impl<'a> Simulation<'a> {
             }
         };
         let id = format!("{}-{}-{r:05}", place.name, self.part.seed);
-        let mut all = self
-            .sumo
-            .scenes(place, &self.demand, seed.fork(2), &id, &folder)?;
+        let mut all =
+            self.sumo
+                .scenes(place, &self.demand, FUTURE_S, seed.fork(2), &id, &folder)?;
         let n = all.len();
         let taken: Vec<usize> = (0..few.min(n)).map(|k| k * n / few.min(n)).collect();
         let mut index = 0;

@@ -9,9 +9,9 @@ use anyhow::Context as _;
 use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{SamplingConfig, TransformerWorld};
-use gump_eval::worlds;
+use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::constraint::parse_constraints;
-use gump_generate::factory::{GenerationJob, Made, make_many};
+use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
 use gump_generate::verdict::{off_road, overlaps};
 use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
 use gump_model::{Device, checkpoint};
@@ -22,6 +22,7 @@ use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, stop_if_interrupted};
+use crate::sampling::LightsName;
 use crate::{futures, shipped};
 
 /// Scenes made together.
@@ -55,9 +56,15 @@ pub(crate) struct Args {
     /// How far to imagine every scene's future
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     simulate: f64,
-    /// In imagined futures agents come and leave and lights change, as the model says
-    #[arg(long)]
+    /// In imagined futures agents come and leave, as many as there are at first
+    #[arg(long, visible_alias = "spawn")]
     life: bool,
+    /// In which world scenes go on
+    #[arg(long, value_name = "WORLD", default_value_t = shipped::world())]
+    world: WorldName,
+    /// What traffic lights show in it
+    #[arg(long, value_enum, default_value_t = LightsName::Model)]
+    lights: LightsName,
     /// Where the ego starts
     #[arg(long, value_enum, default_value_t = StartName::Recorded)]
     start: StartName,
@@ -121,6 +128,18 @@ impl Args {
         let world = run.phase("load", |run| {
             world(run.device(), self.weights.as_ref(), self.life)
         })?;
+        let traffic = run.phase("load", |run| {
+            let sampling = SamplingConfig {
+                life: self.life,
+                lights: self.lights.resolve(),
+                ..SamplingConfig::default()
+            };
+            Ok(World::without_log(run.device(), &self.world, &sampling)?)
+        })?;
+        let worlds = GenerationWorlds {
+            scenes: &world,
+            traffic: traffic.model(),
+        };
         let order = GenerationJob {
             request: GenerateRequest {
                 prompts,
@@ -133,7 +152,7 @@ impl Args {
             seconds: self.simulate,
             attempts: self.attempts.get(),
         };
-        let (made, elapsed) = run.phase("generate", |run| self.make(run, &world, &order))?;
+        let (made, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
         run.phase("write", |run| write(run, &made))?;
         tell(run, &made, elapsed)
     }
@@ -188,7 +207,7 @@ impl Args {
     fn make(
         &self,
         run: &Run,
-        world: &TransformerWorld,
+        worlds: GenerationWorlds<'_>,
         order: &GenerationJob,
     ) -> anyhow::Result<(Vec<Made>, Duration)> {
         let n = self.count.get() as u64;
@@ -198,7 +217,7 @@ impl Args {
         for first in (0..n).step_by(BATCH as usize) {
             stop_if_interrupted()?;
             let numbers = first..(first + BATCH).min(n);
-            for made in make_many(world, order, numbers, run.seed())? {
+            for made in make_many(worlds, order, numbers, run.seed())? {
                 all.push(made?);
                 progress.advance(1);
             }

@@ -1,21 +1,33 @@
-//! Rules over the network's draws: what would run into somebody or off the road is drawn again, and
-//! what no vehicle can do is held back.
+//! Rules over the network's draws: what would run into somebody, off the road or over a red light is
+//! drawn again, and what no vehicle can do is held back.
 //!
 //! They are those of the sequence network (`rejection`, `kinematic_limits`). That says three poses at
 //! once; here
 //! the second half of what is looked at, a second, goes on as the move that was drawn.
 
-use gump_geometry::Pose;
+use gump_geometry::{Polyline, Pose, angle_difference};
 use gump_model::local_context::Survey;
 use gump_model::relative::graph::Shown;
 use gump_model::steps::TOKEN_DT;
-use gump_scene::{AgentKind, AgentState};
+use gump_scene::{
+    AgentKind, AgentState, LaneId, Light, LightState, MapGraph, stop_line, ways_beyond,
+};
 
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 
 /// Slower than this nobody brakes, metres per second.
 const CREEPING: f64 = 0.5;
+/// How far a front bumper may be over a line before it is passed, metres.
+const OVER_M: f64 = 0.5;
+/// A way that turns right by more is a right turn, radians.
+const RIGHT: f64 = 0.52;
+/// Who is slower may turn right at red, metres per second.
+const TURNS_AT_RED: f64 = 2.0;
+/// Braking for a light begins where this is enough, metres per second squared, ...
+const GENTLY: f64 = 4.0;
+/// ... and nobody brakes harder for one.
+const HARDEST: f64 = 6.0;
 
 /// Draws the moves of agents, given by number, anew for an attempt.
 pub(super) type Again<'a> = dyn FnMut(&[usize], usize) -> Vec<Pose> + 'a;
@@ -34,6 +46,117 @@ pub(super) fn held_back(now: &Shown, step: Pose) -> Pose {
         return step;
     }
     now.pose.inverse() * kept
+}
+
+/// The line at which a light stops vehicles.
+#[derive(Clone, Debug)]
+pub(super) struct StopLine {
+    pub(super) lane: LaneId,
+    /// Its middle, heading along the lane.
+    line: Pose,
+    width: f64,
+    /// Whether all ways behind it turn right, which is allowed at red once one has stopped.
+    is_right: bool,
+}
+
+impl StopLine {
+    /// Those of lights of a map.
+    pub(super) fn of(map: &MapGraph, lights: &[Light]) -> Vec<Self> {
+        let of = |light: &Light| {
+            let lane = map.lane(light.lane)?;
+            let line = stop_line(lane, light);
+            let turns_right = |way: &Polyline| {
+                let end = way.pose_at(way.length()).heading;
+                angle_difference(end, way.pose_at(0.0).heading) < -RIGHT
+            };
+            let ways = ways_beyond(map, lane, line);
+            Some(Self {
+                lane: lane.id,
+                line,
+                width: lane.width,
+                is_right: !ways.is_empty() && ways.iter().all(turns_right),
+            })
+        };
+        lights.iter().filter_map(of).collect()
+    }
+
+    /// Whether the front bumper of somebody comes over the line by this move, or cannot be held before
+    /// it any more after it.
+    fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
+        let half = now.body.length / 2.0;
+        let to = now.pose * step;
+        let along = to.direction().dot(self.line.direction()) > 0.5;
+        let ahead = |pose: Pose| self.line.inverse() * (pose.position + pose.direction() * half);
+        let (before, after) = (ahead(now.pose), ahead(to));
+        let speed = step.position.length() / TOKEN_DT;
+        let reach = after.x + speed * speed / (2.0 * GENTLY);
+        along && before.x <= OVER_M && reach > OVER_M && after.y.abs() <= self.width / 2.0
+    }
+}
+
+/// Whether somebody who makes this move runs a red light: every line that he comes over is shut.
+fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
+    let stopped = now.velocity().length() < TURNS_AT_RED;
+    let crossed = lines.iter().filter(|(line, _)| line.is_crossed(now, step));
+    let mut shut =
+        crossed.map(|(line, state)| *state == LightState::Red && !(line.is_right && stopped));
+    let first = shut.next();
+    first.is_some_and(|first| first && shut.all(|shut| shut))
+}
+
+/// Replaces moves of vehicles over a red light, up to `redraws` times each; who draws no other
+/// brakes, if that stops him.
+pub(super) fn heed(
+    agents: &[Shown],
+    driven: Option<usize>,
+    lines: &[(&StopLine, LightState)],
+    redraws: usize,
+    moves: &mut [Pose],
+    again: &mut Again<'_>,
+) {
+    if lines.iter().all(|(_, state)| *state != LightState::Red) {
+        return;
+    }
+    let runs = |i: usize, step: Pose| runs_red(&agents[i], step, lines);
+    let is_bound = |i: &usize| agents[*i].body.kind == AgentKind::Vehicle && driven != Some(*i);
+    let mut left: Vec<usize> = (0..agents.len())
+        .filter(is_bound)
+        .filter(|&i| runs(i, moves[i]))
+        .collect();
+    for attempt in 0..redraws {
+        if left.is_empty() {
+            return;
+        }
+        let drawn = again(&left, attempt);
+        let mut shut = Vec::new();
+        for (&i, step) in left.iter().zip(drawn) {
+            match runs(i, step) {
+                true => shut.push(i),
+                false => moves[i] = step,
+            }
+        }
+        left = shut;
+    }
+    for i in left {
+        let now = &agents[i];
+        let speed = now.velocity().length();
+        let stands = speed < CREEPING;
+        // Whoever cannot stop before the line any more goes on.
+        let ahead = lines
+            .iter()
+            .filter(|(line, _)| line.is_crossed(now, moves[i]));
+        let room = ahead.map(|(line, _)| {
+            let local = line.line.inverse() * now.pose.position;
+            -local.x - now.body.length / 2.0 + OVER_M
+        });
+        let room = room.fold(f64::INFINITY, f64::min);
+        if stands || speed * speed / (2.0 * HARDEST) <= room {
+            moves[i] = match braking(now, moves[i]) {
+                Some((step, _)) => step,
+                None => Pose::IDENTITY,
+            };
+        }
+    }
 }
 
 /// Replaces moves that are not clear, up to `redraws` times each; who finds no clear way brakes.
@@ -180,6 +303,49 @@ mod tests {
         let braked = settled(None)[0].position.x;
         assert!((braked - 3.375).abs() < 1e-9, "{braked}");
         assert_eq!(settled(Some(0))[0], straight(4.0));
+    }
+
+    #[test]
+    fn nobody_runs_a_red_light_but_who_cannot_stop() {
+        let line = StopLine {
+            lane: LaneId(1),
+            line: Pose::new(5.0, 0.0, 0.0),
+            width: 3.5,
+            is_right: false,
+        };
+        let settled = |car: Shown, step: f64, lights: &[(&StopLine, LightState)], drawn: f64| {
+            let mut moves = [straight(step)];
+            let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
+            heed(&[car], None, lights, 3, &mut moves, &mut again);
+            moves[0].position.x
+        };
+        let red = [(&line, LightState::Red)];
+        // Its front is at 2 m and would be at 6.
+        assert_eq!(settled(car(0.0, 1.0), 4.0, &red, 1.0), 1.0);
+        // It would stand before the line, but not be held there in the next half second.
+        assert_eq!(settled(car(0.0, 2.0), 2.9, &red, 1.0), 1.0);
+        assert_eq!(
+            settled(car(0.0, 1.0), 4.0, &[(&line, LightState::Green)], 1.0),
+            4.0
+        );
+        // One way behind the line is open.
+        let open = [(&line, LightState::Red), (&line, LightState::Yellow)];
+        assert_eq!(settled(car(0.0, 1.0), 4.0, &open, 1.0), 4.0);
+        // No other draw: it brakes, or stays where it stands.
+        let braked = settled(car(0.0, 2.5), 4.0, &red, 4.0);
+        assert!(braked < 2.6, "{braked}");
+        assert_eq!(settled(car(0.0, 0.0), 4.0, &red, 4.0), 0.0);
+        // At 16 m/s three metres before the line.
+        assert_eq!(settled(car(0.0, 8.0), 8.0, &red, 8.0), 8.0);
+        // Over the line already.
+        assert_eq!(settled(car(4.0, 4.0), 4.0, &red, 1.0), 4.0);
+        let right = StopLine {
+            is_right: true,
+            ..line.clone()
+        };
+        let red = [(&right, LightState::Red)];
+        assert_eq!(settled(car(0.0, 0.5), 4.0, &red, 1.0), 4.0);
+        assert_eq!(settled(car(0.0, 2.0), 4.0, &red, 1.0), 1.0);
     }
 
     #[test]

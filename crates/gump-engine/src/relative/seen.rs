@@ -28,6 +28,13 @@ impl Seen {
         *self.shown.last().expect("an agent has been seen")
     }
 
+    /// Forgets that it has stood for longer than this, seconds.
+    pub fn has_stood_at_most(&mut self, seconds: f64) {
+        if let Some(now) = self.shown.last_mut() {
+            *now = now.stood_at_most(seconds);
+        }
+    }
+
     /// Half a second later it is here.
     pub fn push(&mut self, pose: Pose) {
         self.shown.push(self.now().then(pose));

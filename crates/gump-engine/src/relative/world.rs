@@ -1,8 +1,9 @@
 //! The relative network as a world: scenes in, futures out.
 //!
 //! A future keeps its agents with what the network remembers of them; the map is laid out and
-//! computed once for all futures of a scene. Agents of kinds that are not predicted go on with
-//! constant velocity, and lights hold.
+//! computed once for all futures of a scene, and laid out anew for one whose ego leaves it behind.
+//! Agents of kinds that are not predicted go on with constant velocity; lights hold unless they are
+//! shown ([`Session::show`]).
 
 mod live;
 
@@ -11,7 +12,7 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gump_geometry::{DVec2, Pose};
+use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::ModelError;
 use gump_model::local_context::Survey;
@@ -21,13 +22,16 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::{Hidden, VectorMap};
 use gump_model::steps::TOKEN_DT;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
-use gump_scene::{Agent, AgentId, AgentState, Frame, Light, LightState, SceneState, Seed};
+use gump_scene::{
+    Agent, AgentId, AgentKind, AgentState, Frame, Lane, Light, LightState, MapGraph, SceneState,
+    Seed,
+};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
-use crate::relative::rules::{held_back, settle};
+use crate::relative::rules::{StopLine, heed, held_back, settle};
 use crate::relative::seen::{Seen, presents};
 use crate::sampling::SamplingConfig;
 
@@ -35,6 +39,21 @@ pub use live::LiveFuture;
 
 /// How far around the ego the map is laid out, metres.
 pub const MAP_M: f64 = 300.0;
+
+/// For how long it is known when a light changed, seconds: as long as the scenes last that the network
+/// learned from.
+const REMEMBERED_S: f64 = 9.0;
+
+/// For how long somebody has stood in a lane as far as the network is told, seconds. Scenes that it
+/// learned from last nine: whoever stood throughout was parked, as a rule, and stayed; in a long
+/// rollout those who wait at a junction come to look like that, and would wait for ever.
+const WAITED_S: f64 = 4.0;
+/// Who is this near to a lane's middle, and along it, stands in the lane: metres, radians.
+const IN_LANE: (f64, f64) = (1.0, 0.35);
+
+/// How far the ego may come from the middle of the map that is laid out, metres: farther than in 8 s
+/// of a city.
+const FOLLOW_M: f64 = 180.0;
 
 /// Draws are among the likeliest bins that together have this probability, unless told otherwise.
 /// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1
@@ -211,25 +230,47 @@ impl WorldModel for RelativeWorld {
 /// What all futures of a start share.
 #[derive(Debug)]
 pub(super) struct Scene {
+    source: Arc<MapGraph>,
+    /// The middle of what is laid out.
+    centre: DVec2,
     map: VectorMap,
     pub memory: MapMemory,
-    /// The edges of the road, where rules look at them.
+    /// The edges of the road and the lines before lights, where rules look at them.
     pub survey: Survey,
+    lines: Vec<StopLine>,
     ego: AgentId,
 }
 
 impl Scene {
     fn new(engine: &Engine, scene: SceneState<'_>, sampling: &RelativeSampling) -> Self {
         let centre = scene.ego_now().state.pose.position;
-        let map = VectorMap::new(scene.map, centre, MAP_M, Hidden::default());
+        let lights = scene.now().lights();
+        let source = Arc::clone(scene.map);
+        Self::around(engine, source, centre, (scene.ego, lights), sampling)
+    }
+
+    fn around(
+        engine: &Engine,
+        source: Arc<MapGraph>,
+        centre: DVec2,
+        (ego, lights): (AgentId, &[Light]),
+        sampling: &RelativeSampling,
+    ) -> Self {
+        let map = VectorMap::new(&source, centre, MAP_M, Hidden::default());
         Self {
             memory: engine.remember(&map),
             map,
             survey: match sampling.redraws {
                 0 => Survey::default(),
-                _ => Survey::of_edges(scene.map, centre, MAP_M),
+                _ => Survey::of_edges(&source, centre, MAP_M),
             },
-            ego: scene.ego,
+            lines: match sampling.redraws {
+                0 => Vec::new(),
+                _ => StopLine::of(&source, lights),
+            },
+            source,
+            centre,
+            ego,
         }
     }
 }
@@ -251,8 +292,12 @@ struct Future {
     members: Vec<Member>,
     /// Those who are not predicted.
     others: Vec<Agent>,
+    /// What lights show in the next frame.
     lights: Vec<Light>,
+    /// What the network sees of them.
     shown_lights: Lights,
+    /// What they show now.
+    lights_now: Vec<Light>,
     /// What the present's nodes ended with, `[members, C]`.
     hidden: Vec<f32>,
 }
@@ -282,6 +327,7 @@ impl Future {
             members: Vec::new(),
             others,
             lights: state.now().lights().to_vec(),
+            lights_now: state.now().lights().to_vec(),
             shown_lights: Lights::default(),
             hidden: Vec::new(),
         };
@@ -328,6 +374,26 @@ impl Future {
         self.frames += 1;
     }
 
+    /// Lets it read the present again, after others have come or gone.
+    fn reread(&mut self, engine: &Engine, room: &mut Workspace) {
+        self.frames -= 1;
+        self.read(engine, room);
+    }
+
+    /// Lays the map out anew once the ego has come far from the middle of what is laid out.
+    fn follow(&mut self, engine: &Engine, sampling: &RelativeSampling) {
+        let scene = &self.scene;
+        let ego = self.members.iter().find(|m| m.agent.id == scene.ego);
+        let Some(ego) = ego.map(|member| member.now().pose.position) else {
+            return;
+        };
+        if ego.distance(scene.centre) > FOLLOW_M {
+            let source = Arc::clone(&scene.source);
+            let next = Scene::around(engine, source, ego, (scene.ego, &self.lights), sampling);
+            self.scene = Arc::new(next);
+        }
+    }
+
     /// Goes on by half a second.
     fn step(
         &mut self,
@@ -338,6 +404,7 @@ impl Future {
     ) {
         let moves = self.decide(engine, sampling, ego, room);
         self.go(engine, &moves, ego, room);
+        self.follow(engine, sampling);
     }
 
     /// What everyone will do in the next half second, if the ego does what is given.
@@ -374,12 +441,20 @@ impl Future {
                 member.agent.state = driven;
             }
         }
+        let map = &self.scene.source;
+        for member in &mut self.members {
+            if member.now().stood() > WAITED_S && stands_in_lane(map, &member.agent) {
+                member.seen.has_stood_at_most(WAITED_S);
+            }
+        }
         for other in &mut self.others {
             other.state.pose.position += other.state.velocity * TOKEN_DT;
         }
         for light in &mut self.shown_lights.by_lane {
-            light.2 = light.2.map(|elapsed| elapsed + TOKEN_DT);
+            let elapsed = light.2.map(|elapsed| elapsed + TOKEN_DT);
+            light.2 = elapsed.filter(|elapsed| *elapsed <= REMEMBERED_S);
         }
+        self.lights_now.clone_from(&self.lights);
         self.read(engine, room);
     }
 
@@ -422,6 +497,13 @@ impl Future {
         };
         let (survey, redraws) = (&self.scene.survey, sampling.redraws);
         let driven = driven.map(|(i, _)| i);
+        let lines = self.scene.lines.iter().filter_map(|line| {
+            let lights = &self.lights_now;
+            let i = lights.binary_search_by_key(&line.lane, |light| light.lane);
+            Some((line, lights[i.ok()?].state))
+        });
+        let lines: Vec<_> = lines.collect();
+        heed(&agents, driven, &lines, redraws, &mut moves, &mut again);
         settle(&agents, driven, survey, redraws, &mut moves, &mut again);
         moves
     }
@@ -464,6 +546,53 @@ impl Future {
         told.map(outlook).collect()
     }
 
+    /// Shows these lights in the next frame.
+    fn show(&mut self, lights: &[Light]) {
+        self.lights = lights.to_vec();
+        let before = std::mem::take(&mut self.shown_lights.by_lane);
+        let shown = lights.iter().map(|light| {
+            let known = before.iter().find(|(lane, ..)| *lane == light.lane);
+            let elapsed = match known {
+                Some(&(_, state, elapsed)) if state == light.state => elapsed,
+                // None has passed once that frame is there.
+                Some(_) => Some(-TOKEN_DT),
+                None => None,
+            };
+            (light.lane, light.state, elapsed)
+        });
+        let mut shown: Vec<_> = shown.collect();
+        // Looked up by lane.
+        shown.sort_by_key(|(lane, ..)| *lane);
+        self.shown_lights.by_lane = shown;
+    }
+
+    /// Lets agents go and others come, whom the network sees for the first time where they are now.
+    fn exchange(
+        &mut self,
+        engine: &Engine,
+        leave: &[AgentId],
+        come: &[Agent],
+        room: &mut Workspace,
+    ) {
+        let ego = self.scene.ego;
+        let stays = |agent: &Agent| agent.id == ego || !leave.contains(&agent.id);
+        self.members.retain(|member| stays(&member.agent));
+        self.others.retain(stays);
+        for agent in come {
+            if !agent.kind.is_moving() {
+                self.others.push(*agent);
+                continue;
+            }
+            let state = agent.state;
+            self.members.push(Member {
+                agent: *agent,
+                seen: Seen::first(engine, body(agent), state.pose, state.velocity),
+            });
+        }
+        self.members.sort_by_key(|member| member.agent.id);
+        self.reread(engine, room);
+    }
+
     fn frame(&self) -> Frame {
         let agents = self.members.iter().map(|member| member.agent);
         let all = agents.chain(self.others.iter().copied()).collect();
@@ -484,6 +613,18 @@ impl Member {
             velocity: self.now().velocity(),
         };
     }
+}
+
+/// Whether a vehicle stands in a lane, where others drive, and not beside it.
+fn stands_in_lane(map: &MapGraph, agent: &Agent) -> bool {
+    let pose = agent.state.pose;
+    let is_along = |lane: &Lane| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let heading = lane.centerline.pose_at(at).heading;
+        angle_difference(heading, pose.heading).abs() < IN_LANE.1
+    };
+    let mut lanes = map.lanes_near(pose.position, IN_LANE.0);
+    agent.kind == AgentKind::Vehicle && lanes.any(|(lane, _)| is_along(lane))
 }
 
 fn body(agent: &Agent) -> Body {
@@ -563,6 +704,18 @@ impl Session for RelativeSession<'_> {
             at += 1;
             futures.binary_search(&(at - 1)).is_ok()
         });
+        true
+    }
+
+    fn show(&mut self, future: usize, lights: &[Light]) -> bool {
+        self.futures[future].show(lights);
+        true
+    }
+
+    fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
+        let mut room = Workspace::default();
+        let engine = &self.world.engine;
+        self.futures[future].exchange(engine, leave, come, &mut room);
         true
     }
 

@@ -10,12 +10,11 @@
 use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
-use gump_scene::{Agent, AgentKind, Frame, LightState, MapGraph};
+use gump_scene::{Agent, AgentKind, Frame, LightState, MapGraph, stop_line};
 
 use super::reach::{Ahead, ahead, nearest};
 use super::track::Track;
 use super::{Counter, MOVES, STANDS};
-use crate::red_light::stop_line;
 
 /// Farther beside the centre line one is not on the lane, metres.
 const ON_LANE_M: f64 = 1.0;

@@ -1,14 +1,16 @@
 //! Lights that are passed at red, and lights that contradict one another.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::f64::consts::{FRAC_PI_4, FRAC_PI_6};
+use std::f64::consts::FRAC_PI_4;
 
-use gump_geometry::{DVec2, Polyline, Pose, angle_difference, segments_intersect};
-use gump_scene::{Lane, LaneId, Light, LightState, MapGraph, Scenario};
+use gump_geometry::{Polyline, Pose, angle_difference};
+use gump_scene::{
+    Lane, LaneId, Light, LightState, MapGraph, Scenario, stop_line, ways_beyond, ways_cross,
+};
 
 use super::track::{Take, Track};
 use super::{Class, Counter, Measure, vehicles};
-use crate::red_light::{passes, stop_line};
+use crate::red_light::passes;
 
 /// Lines passed within so long of the first belong to one passage, seconds: the lanes that fork
 /// from an approach have a line each.
@@ -18,8 +20,6 @@ const FOLLOWED_S: f64 = 2.0;
 const FOLLOWED_M: f64 = 8.0;
 /// Metres that a radian between a vehicle and a lane counts for when the lane it follows is sought.
 const M_PER_RADIAN: f64 = 3.0;
-/// Lanes that start so near to one another fork and do not cross, metres.
-const FORK_M: f64 = 2.0;
 
 /// A light that rules a lane, frame by frame.
 struct Gate<'a> {
@@ -173,7 +173,7 @@ pub(super) fn crossing(scenario: &Scenario) -> Vec<(LaneId, LaneId)> {
         .filter_map(|id| {
             let lane = scenario.map.lane(id)?;
             let line = stop_line(lane, lights[&id]);
-            Some((id, line.heading, ways(&scenario.map, lane, line)))
+            Some((id, line.heading, ways_beyond(&scenario.map, lane, line)))
         })
         .collect();
     let mut pairs = Vec::new();
@@ -183,7 +183,7 @@ pub(super) fn crossing(scenario: &Scenario) -> Vec<(LaneId, LaneId)> {
             let is_across = (FRAC_PI_4..=3.0 * FRAC_PI_4).contains(&between);
             let meet = || {
                 own.iter()
-                    .any(|one| others.iter().any(|other| cross(one, other)))
+                    .any(|one| others.iter().any(|other| ways_cross(one, other)))
             };
             if is_across && meet() {
                 pairs.push((*a, *b));
@@ -191,32 +191,4 @@ pub(super) fn crossing(scenario: &Scenario) -> Vec<(LaneId, LaneId)> {
         }
     }
     pairs
-}
-
-/// Where the traffic of a light goes once it has passed the line: the rest of its lane, or where
-/// the line is at its end, the lanes that follow.
-fn ways(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
-    let centre = &lane.centerline;
-    let from = centre.project(line.position).arc_length;
-    if from < centre.length() - FORK_M {
-        return vec![centre.slice(from, centre.length())];
-    }
-    let next = map.successors(lane.id);
-    next.map(|lane| lane.centerline.clone()).collect()
-}
-
-/// True if two ways cross at more than 30 degrees; where they fork or join they do not.
-fn cross(one: &Polyline, other: &Polyline) -> bool {
-    let ends = |line: &Polyline| (line.points()[0], line.points()[line.points().len() - 1]);
-    let ((a, b), (c, d)) = (ends(one), ends(other));
-    let near = |p: DVec2, q: DVec2| p.distance(q) < FORK_M;
-    if near(a, c) || near(b, d) {
-        return false;
-    }
-    one.segments().any(|(a, b)| {
-        other.segments().any(|(c, d)| {
-            let angle = angle_difference((b - a).to_angle(), (d - c).to_angle()).abs();
-            angle > FRAC_PI_6 && segments_intersect(a, b, c, d)
-        })
-    })
 }

@@ -66,6 +66,20 @@ pub struct Shown {
 }
 
 impl Shown {
+    /// For how long it has stood as far as is known, seconds.
+    pub fn stood(&self) -> f64 {
+        self.stood
+    }
+
+    /// The same agent, known to have stood for so many seconds at most.
+    #[must_use]
+    pub fn stood_at_most(self, seconds: f64) -> Self {
+        Self {
+            stood: self.stood.min(seconds),
+            ..self
+        }
+    }
+
     /// An agent seen for the first time, with its stated velocity.
     pub fn first(body: Body, pose: Pose, velocity: DVec2) -> Self {
         let local = pose.inverse().rotate(velocity) * TOKEN_DT;

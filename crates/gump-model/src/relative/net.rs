@@ -20,6 +20,9 @@ use crate::relative::grid::{ALL_BINS, BINS, FIELDS, first_bin};
 use crate::relative::map::PIECE_NUMBERS;
 use crate::relative::sample::Sample;
 
+/// The matrices by which a layer adds to what it was given.
+const ADDS: [&str; 2] = [".out.weight", ".mlp_out.weight"];
+
 /// Two layers with a smooth bend between them.
 #[derive(Debug)]
 pub(super) struct Mlp {
@@ -201,6 +204,38 @@ impl RelativeNetwork {
             norm,
             decoder,
         })
+    }
+
+    /// The same network with more layers at its end, drawn from `seed`, which add nothing yet: it says
+    /// what this one says until it is trained on.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if there would be fewer layers than now.
+    pub fn deepened(
+        &self,
+        layers: usize,
+        seed: gump_scene::Seed,
+    ) -> std::result::Result<Self, ModelError> {
+        let now = self.config.layers;
+        if layers < now {
+            let wrong = format!("a network of {now} layers cannot go on with {layers}");
+            return Err(ModelError::Config(wrong));
+        }
+        let config = RelativeConfig {
+            layers,
+            ..self.config.clone()
+        };
+        let deeper = Self::random(config, seed, self.parameters.device())?;
+        for (name, var) in deeper.parameters.all() {
+            match self.parameters.find(name) {
+                Some(own) => var.set(own.as_tensor())?,
+                None if ADDS.iter().any(|end| name.ends_with(end)) => {
+                    var.set(&var.as_tensor().zeros_like()?)?;
+                }
+                None => {}
+            }
+        }
+        Ok(deeper)
     }
 
     /// The shape it was built from.

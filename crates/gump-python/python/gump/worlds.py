@@ -28,7 +28,8 @@ class World:
     among them the likeliest that together have the probability `top_p`; `decay` weighs earlier
     predictions of a moment, `redraws` is how often what would run into something or off the road is
     drawn again, `limits` hold back what cannot move so. `raw` is the network alone, `paper` the
-    paper's decoding, `life` lets agents come and leave and lights change. `mode` is "partial-ar" or
+    paper's decoding, `life` lets agents come and leave, as many as at the start. `lights` is what
+    traffic lights show: "model", what signals of such junctions do, or "hold". `mode` is "partial-ar" or
     "full-ar", `precision` "f32", "bf16" or "int8".
 
     Raises `ValueError` for another name or a number out of its range, `FileNotFoundError` and
@@ -48,6 +49,7 @@ class World:
         raw: bool = False,
         paper: bool = False,
         life: bool = False,
+        lights: str = "model",
         mode: str = "partial-ar",
         precision: str = "f32",
     ) -> None:
@@ -69,6 +71,7 @@ class World:
             "raw": raw,
             "paper": paper,
             "life": life,
+            "lights": lights,
             "precision": precision,
         }
         self._world = _native.World(name, weights, sampling)

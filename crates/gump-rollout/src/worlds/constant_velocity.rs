@@ -1,11 +1,11 @@
 //! The simplest world: everyone keeps its velocity.
 
-use gump_scene::{Agent, AgentId, AgentState, Frame};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light};
 
 use super::independent::{Future, Independent};
 use crate::{BoxError, Session, Start, WorldModel};
 
-/// Every agent keeps its velocity and its heading; lights stay as they are. All futures of a scene
+/// Every agent keeps its velocity and its heading; lights stay as they are unless they are shown. All futures of a scene
 /// are equal.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ConstantVelocity;
@@ -36,6 +36,19 @@ struct Coasting {
 }
 
 impl Future for Coasting {
+    fn show(&mut self, lights: &[Light]) -> bool {
+        self.frame = Frame::new(self.frame.agents().to_vec(), lights.to_vec());
+        true
+    }
+
+    fn exchange(&mut self, leave: &[AgentId], come: &[Agent]) -> bool {
+        let agents = self.frame.agents().iter();
+        let stay = agents.filter(|agent| agent.id == self.ego || !leave.contains(&agent.id));
+        let all = stay.chain(come).copied().collect();
+        self.frame = Frame::new(all, self.frame.lights().to_vec());
+        true
+    }
+
     fn step(&mut self, ego: Option<AgentState>) -> Frame {
         let agents = self.frame.agents().iter().map(|agent| match ego {
             Some(state) if agent.id == self.ego => agent.with_state(state),

@@ -1,6 +1,6 @@
 //! A session of futures that do not know of each other, stepped in parallel.
 
-use gump_scene::{AgentState, Frame};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light};
 use rayon::prelude::*;
 
 use crate::{BoxError, RolloutError, Session, Start};
@@ -9,6 +9,18 @@ use crate::{BoxError, RolloutError, Session, Start};
 pub(crate) trait Future: Send {
     /// The next frame; `ego` is the ego's state in it, if someone else drives.
     fn step(&mut self, ego: Option<AgentState>) -> Frame;
+
+    /// Shows these lights from now on, if they are not its own affair.
+    fn show(&mut self, lights: &[Light]) -> bool {
+        let _ = lights;
+        false
+    }
+
+    /// Takes agents out, but for the ego, and puts others in, if it can.
+    fn exchange(&mut self, leave: &[AgentId], come: &[Agent]) -> bool {
+        let (_, _) = (leave, come);
+        false
+    }
 }
 
 /// What opens all futures of a start, in order.
@@ -72,6 +84,14 @@ impl<F: Future> Session for Independent<'_, F> {
         self.futures
             .retain(|_| index.next().is_some_and(|i| futures.contains(&i)));
         true
+    }
+
+    fn show(&mut self, future: usize, lights: &[Light]) -> bool {
+        self.futures[future].show(lights)
+    }
+
+    fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
+        self.futures[future].exchange(leave, come)
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {

@@ -60,6 +60,31 @@ fn rolled_out_it_computes_what_it_computes_in_training() {
     }
 }
 
+/// Layers that are added say nothing at first, and learn.
+#[test]
+fn a_deeper_network_goes_on_from_what_it_said() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let deeper = network.deepened(4, Seed(9)).unwrap();
+    assert_eq!(deeper.config().layers, 4);
+    let sample = draw(&scenario(), &SampleConfig::plain(), None, Seed(1)).unwrap();
+    let hidden = |network: &RelativeNetwork| network.hidden(&sample).unwrap().to_vec2::<f32>();
+    assert_eq!(hidden(&network).unwrap(), hidden(&deeper).unwrap());
+    assert!(network.deepened(1, Seed(9)).is_err());
+    let train = RelativeTrainConfig {
+        batch: 1,
+        ..RelativeTrainConfig::default()
+    };
+    let before = hidden(&deeper).unwrap();
+    let mut trainer = RelativeTrainer::continuing(deeper, train, vec![scenario()]).unwrap();
+    trainer.step().unwrap();
+    trainer.step().unwrap();
+    let name = "layers.3.out.weight";
+    let added = trainer.network().parameters().find(name).unwrap();
+    let sum = added.abs().unwrap().sum_all().unwrap();
+    assert!(sum.to_scalar::<f32>().unwrap() > 0.0);
+    assert_ne!(before, hidden(trainer.network()).unwrap());
+}
+
 #[test]
 fn futures_are_seeded_and_a_driven_ego_is_where_it_is_driven() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();

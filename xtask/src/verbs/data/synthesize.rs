@@ -40,6 +40,9 @@ pub(crate) struct Args {
     /// Multiplies the number of agents, 0.1 to 3
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     density: f64,
+    /// How long scenes go on after their present, seconds, 1 to 600
+    #[arg(long, value_name = "X", default_value_t = 8.0)]
+    seconds: f64,
     /// The kind of road, for instance "roundabout" [default: any]
     #[arg(long, value_name = "NAME", value_parser = road_family)]
     #[serde(serialize_with = "as_name")]
@@ -94,6 +97,11 @@ impl Args {
     }
 
     fn check(&self) -> anyhow::Result<()> {
+        if !(1.0..=600.0).contains(&self.seconds) {
+            let found = self.seconds;
+            let wrong = format!("--seconds: expected 1 to 600, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
         let why = match self.kind {
             Kind::Procedural if self.network.is_some() => "--network is for --kind sumo",
             Kind::Sumo if self.family.is_some() => "--family is for --kind procedural",
@@ -115,6 +123,7 @@ impl Args {
     fn procedural(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
         let config = SynthesisConfig {
             density: self.density,
+            future_s: self.seconds,
             family: self.family,
             ..self.profile.config()
         };
@@ -200,7 +209,7 @@ impl Args {
                 }
             };
             let id = format!("{}-{r:05}", place.name);
-            sumo.scenes(place, &demand, seed.fork(2), &id, &folder)
+            sumo.scenes(place, &demand, self.seconds, seed.fork(2), &id, &folder)
         };
         let n = self.scenes.get();
         let names = shard_names(self.n_shards(SHARDS.max(n.div_ceil(SHARD_SCENES))));

@@ -8,9 +8,11 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use gump_eval::worlds;
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::{self, World};
 use gump_generate::Placement;
 use gump_generate::baseline::{overlapping_vehicles, wrong_way};
+use gump_generate::factory::GenerationWorlds;
 use gump_generate::verdict::off_road;
 use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
 use gump_metrics::{Interval, intervals};
@@ -82,6 +84,14 @@ impl Args {
         let world = run.phase("load", |run| {
             generate::world(run.device(), self.weights.as_ref(), false)
         })?;
+        let traffic = run.phase("load", |run| {
+            let sampling = SamplingConfig::default();
+            Ok(World::without_log(
+                run.device(),
+                &shipped::world(),
+                &sampling,
+            )?)
+        })?;
         let protocol = MmdProtocol {
             min_vehicles: self.min_vehicles,
             ..MmdProtocol::gump()
@@ -118,7 +128,11 @@ impl Args {
             tallies.push((source, tally));
         }
         let prompts = run.phase("prompts", |run| {
-            prompts::satisfaction(run, &world, &scenarios, self.prompt_maps, self.attempts)
+            let worlds = GenerationWorlds {
+                scenes: &world,
+                traffic: traffic.model(),
+            };
+            prompts::satisfaction(run, worlds, &scenarios, self.prompt_maps, self.attempts)
         })?;
         let rows = tallies.iter().map(|(source, tally)| {
             let satisfaction = match source {

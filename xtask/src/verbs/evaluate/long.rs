@@ -4,8 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use gump_engine::TransformerWorld;
-use gump_rollout::{BoxError, Start, WorldModel as _};
+use gump_engine::SamplingConfig;
+use gump_eval::worlds::World;
+use gump_rollout::{BoxError, Start, WorldModel};
 use gump_scene::{AgentId, Frame, LaneId, LightState, Scenario, SceneState, Seed};
 use gump_synthesis::{SynthesisConfig, try_synthesize};
 use gump_viz::Bars;
@@ -14,6 +15,7 @@ use serde_json::{Value, json};
 
 use crate::charts;
 use crate::run::{Run, stop_if_interrupted};
+use crate::shipped;
 use crate::verbs::generate;
 
 /// How far ahead is imagined.
@@ -63,17 +65,25 @@ pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Re
     let mut rows = vec![row("log", &logged, &logged)];
     for (name, life) in [("those who are there", false), ("life", true)] {
         stop_if_interrupted()?;
-        let world = generate::world(run.device(), weights, life)?;
-        let imagined = imagined(&world, &scenarios, seed)?;
+        let sampling = SamplingConfig {
+            life,
+            ..SamplingConfig::default()
+        };
+        let traffic = World::without_log(run.device(), &shipped::world(), &sampling)?;
+        let imagined = imagined(traffic.model(), &scenarios, seed)?;
         rows.push(row(name, &imagined, &logged));
     }
+    stop_if_interrupted()?;
+    let world = generate::world(run.device(), weights, true)?;
+    let imagined = imagined(&world, &scenarios, seed)?;
+    rows.push(row("life of the sequence network", &imagined, &logged));
     Ok(rows)
 }
 
 /// What each scene shows when its ego drives as it was recorded: how many are around it depends on
 /// where it goes first of all.
 fn imagined(
-    world: &TransformerWorld,
+    world: &dyn WorldModel,
     scenarios: &[Scenario],
     seed: Seed,
 ) -> anyhow::Result<Vec<Seen>> {

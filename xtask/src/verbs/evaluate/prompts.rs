@@ -3,8 +3,7 @@
 //! A tag is asked for on maps that admit it, which is found out without the network; a tag that no
 //! map given admits (a car park, an all-way stop) is listed and does not count.
 
-use gump_engine::TransformerWorld;
-use gump_generate::factory::{GenerationJob, admits, make};
+use gump_generate::factory::{GenerationJob, GenerationWorlds, admits, make};
 use gump_generate::{Counts, GenerateRequest};
 use gump_metrics::tags::{self, rules};
 use gump_scene::{Scenario, ScenarioTag, Seed};
@@ -53,7 +52,7 @@ struct Asked {
 /// being asked for.
 pub(super) fn satisfaction(
     run: &Run,
-    world: &TransformerWorld,
+    worlds: GenerationWorlds<'_>,
     scenarios: &[Scenario],
     n_maps: usize,
     attempts: usize,
@@ -80,7 +79,7 @@ pub(super) fn satisfaction(
         .map(|number| {
             let (tag, recorded) = cases[number];
             let order = order(recorded, Some(tags[tag]), attempts);
-            let asked = ask(world, &order, tag, number as u64, seed.fork(7));
+            let asked = ask(worlds, &order, tag, number as u64, seed.fork(7));
             progress.advance(1);
             asked
         })
@@ -89,7 +88,7 @@ pub(super) fn satisfaction(
         .into_par_iter()
         .filter_map(|i| {
             let order = order(shuffled[i % shuffled.len()], None, 1);
-            let made = make(world, &order, i as u64, seed.fork(8)).ok()?;
+            let made = make(worlds, &order, i as u64, seed.fork(8)).ok()?;
             Some(tags::mine(&made.scenario))
         })
         .collect();
@@ -132,14 +131,14 @@ fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Gene
 }
 
 fn ask(
-    world: &TransformerWorld,
+    worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
     tag: usize,
     number: u64,
     seed: Seed,
 ) -> Asked {
     let prompt = order.request.prompts[0];
-    match make(world, order, number, seed) {
+    match make(worlds, order, number, seed) {
         Ok(made) => Asked {
             tag,
             holds: made.holds(),

@@ -26,6 +26,9 @@ use crate::run::Run;
 /// The name of the architecture in `--model`.
 const NAME: &str = "relative";
 
+/// Separates the stream of layers that are added.
+const DEEPER: u64 = 11;
+
 /// What a run of one stage is.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -83,19 +86,28 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
     run.result("weights", weights)
 }
 
-/// The weights to go on from.
+/// The weights to go on from; layers that they lack begin as ones that add nothing.
 ///
-/// Error: [`WrongArguments`] if they are of another shape than the configuration.
+/// Error: [`WrongArguments`] if they differ from the configuration in anything but having fewer
+/// layers.
 fn from(weights: &Path, config: &Config, device: &Device) -> anyhow::Result<RelativeNetwork> {
     let network = relative::load(weights, device)?;
-    if *network.config() != config.relative {
+    let layers = config.relative.layers;
+    let deeper = RelativeConfig {
+        layers,
+        ..network.config().clone()
+    };
+    if deeper != config.relative || layers < network.config().layers {
         let wrong = format!(
             "{} holds another model than the configuration",
             weights.display()
         );
         return Err(WrongArguments(wrong).into());
     }
-    Ok(network)
+    match layers == network.config().layers {
+        true => Ok(network),
+        false => Ok(network.deepened(layers, Seed(config.train.seed).fork(DEEPER))?),
+    }
 }
 
 fn train(

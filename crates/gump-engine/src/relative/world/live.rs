@@ -88,26 +88,13 @@ impl LiveFuture {
         let mut moves = std::mem::take(&mut self.moves);
         moves.resize(self.future.members.len(), Pose::IDENTITY);
         self.future.go(&world.engine, &moves, ego, &mut room);
+        self.future.follow(&world.engine, &world.sampling);
         self.future.frame()
     }
 
-    /// Shows these lights from now on. What has changed has changed now.
+    /// Shows these lights once it has gone on. What has changed changes then.
     pub fn show(&mut self, lights: &[Light]) {
-        self.future.lights = lights.to_vec();
-        let before = std::mem::take(&mut self.future.shown_lights.by_lane);
-        let shown = lights.iter().map(|light| {
-            let known = before.iter().find(|(lane, ..)| *lane == light.lane);
-            let elapsed = match known {
-                Some(&(_, state, elapsed)) if state == light.state => elapsed,
-                Some(_) => Some(0.0),
-                None => None,
-            };
-            (light.lane, light.state, elapsed)
-        });
-        let mut shown: Vec<_> = shown.collect();
-        // Looked up by lane.
-        shown.sort_by_key(|(lane, ..)| *lane);
-        self.future.shown_lights.by_lane = shown;
+        self.future.show(lights);
     }
 
     /// What everyone but `driven` might do in the next half second, whatever was decided: these of

@@ -343,6 +343,13 @@ impl Follower {
 }
 
 impl Driver {
+    /// Lets it see what the lights show now.
+    pub(super) fn show(&mut self, lights: &[Light]) {
+        if let Self::Follow(follower) = self {
+            follower.path.show(lights);
+        }
+    }
+
     /// The agent's state `dt` seconds on; `own` is its index among the obstacles.
     pub(super) fn step(
         &mut self,

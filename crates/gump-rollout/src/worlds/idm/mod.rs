@@ -101,7 +101,7 @@ impl IdmConfig {
 ///   the centre as it drives, so nothing jumps. Where the map ends it drives straight on.
 /// * It reacts to any agent whose box reaches into the strip it will sweep, to red lights, and to
 ///   yellow ones it can stop for. At a light of unknown colour those wait that stand there now.
-///   **Lights keep their present colour.** It slows down for curves and speed limits.
+///   **Lights keep their present colour** unless they are shown ([`Session::show`](crate::Session::show)). It slows down for curves and speed limits.
 /// * A standing vehicle beside its lane is parked and stays. A moving one off every lane brakes
 ///   comfortably along its heading.
 /// * Pedestrians, bicycles and everything else keep their velocity.

@@ -57,6 +57,7 @@ struct Vertex {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Stop {
     pub(super) s: f64,
+    pub(super) lane: LaneId,
     pub(super) state: LightState,
 }
 
@@ -170,9 +171,6 @@ impl Path {
             return;
         };
         let state = lights[i].state;
-        if state == LightState::Green {
-            return;
-        }
         let marked = lights[i].stop_point.and_then(|point| {
             let foot = self.project(point, start - STOP_REACH, self.end())?;
             (foot.lateral.abs() <= STOP_REACH).then_some(foot.s)
@@ -182,7 +180,17 @@ impl Path {
             None if lane.in_intersection => start,
             None => self.end(),
         };
-        self.stops.push(Stop { s, state });
+        let lane = lane.id;
+        self.stops.push(Stop { s, lane, state });
+    }
+
+    /// Lets the lights ahead show what they do now.
+    pub(super) fn show(&mut self, lights: &[Light]) {
+        for stop in &mut self.stops {
+            if let Ok(i) = lights.binary_search_by_key(&stop.lane, |light| light.lane) {
+                stop.state = lights[i].state;
+            }
+        }
     }
 
     /// Recomputes headings and curve speeds after points were appended, and forgets what lies far
@@ -401,11 +409,17 @@ mod tests {
             path.push_lane(&road, LaneId(2), lights);
             assert_eq!(path.stops().first().map(|stop| stop.s), expected);
             assert_eq!(path.last_lane(), Some(LaneId(2)));
+            let red = Light {
+                state: LightState::Red,
+                ..lights[0]
+            };
+            path.show(&[red]);
+            assert_eq!(path.stops()[0].state, LightState::Red);
         };
         check("light 1 red: 38,1", Some(38.0));
         check("light 2 red: 49,1", Some(49.0));
         check("light 1 red: 38,30", Some(50.0));
         check("light 1 red:", Some(50.0));
-        check("light 1 green: 38,1", None);
+        check("light 1 green: 38,1", Some(38.0));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rollout, Seed};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Light, Rollout, Seed};
 use rayon::prelude::*;
 
 use super::IdmConfig;
@@ -117,7 +117,48 @@ impl Traffic<'_> {
     }
 }
 
+impl Traffic<'_> {
+    /// The driver of somebody who has just come.
+    fn driver_of(&self, agent: &Agent) -> Driver {
+        if agent.kind != AgentKind::Vehicle {
+            return Driver::Coast;
+        }
+        let ground = Ground {
+            config: self.config,
+            road: &self.road,
+            lights: self.frame.lights(),
+        };
+        let now = Frame::new(vec![*agent], Vec::new());
+        let mut scene = self.origin.at(0);
+        scene.history = std::slice::from_ref(&now);
+        let seed = driver_seed(self.seed, agent.id, 0);
+        Situation::of(agent, scene, &self.road).decide(agent, ground, seed)
+    }
+}
+
 impl Future for Traffic<'_> {
+    fn show(&mut self, lights: &[Light]) -> bool {
+        for driver in &mut self.drivers {
+            driver.show(lights);
+        }
+        self.frame = Frame::new(self.frame.agents().to_vec(), lights.to_vec());
+        true
+    }
+
+    fn exchange(&mut self, leave: &[AgentId], come: &[Agent]) -> bool {
+        let agents = self.frame.agents().iter().copied();
+        let drivers = std::mem::take(&mut self.drivers);
+        let stay = agents.zip(drivers);
+        let stay = stay.filter(|(agent, _)| agent.id == self.ego || !leave.contains(&agent.id));
+        let new = come.iter().map(|agent| (*agent, self.driver_of(agent)));
+        let mut all: Vec<(Agent, Driver)> = stay.chain(new).collect();
+        all.sort_by_key(|(agent, _)| agent.id);
+        let (agents, drivers) = all.into_iter().unzip();
+        self.drivers = drivers;
+        self.frame = Frame::new(agents, self.frame.lights().to_vec());
+        true
+    }
+
     fn step(&mut self, ego: Option<AgentState>) -> Frame {
         self.hand_over(ego.is_some());
         let ground = Ground {

@@ -141,8 +141,8 @@ impl Source {
                 seed,
                 built,
             } => {
-                if built.is_none() || *name == WorldName::Log {
-                    let sampling = &decoding.sampling;
+                let sampling = &decoding.sampling;
+                if built.is_none() || World::is_of_scenario(name, sampling) {
                     *built = Some(World::build(run.device(), name, scenario, sampling)?);
                 }
                 let world = built.as_ref().context("the world has just been built")?;

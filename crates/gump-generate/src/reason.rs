@@ -1,0 +1,141 @@
+//! Whether somebody who stands in traffic has a reason to: a light, a sign, a junction or somebody
+//! before him.
+//!
+//! A network that draws one object after another puts vehicles down in the middle of open lanes that
+//! stand there; whoever then imagines the scene lets them stand, as double-parked ones do, and half
+//! a minute later everybody stands behind them.
+
+use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, angle_difference};
+use gump_scene::{Lane, Light, LightState, MapGraph, stop_line};
+
+/// Slower is standing, metres per second.
+const STANDS: f64 = 0.5;
+/// Whoever is this near to a lane's middle, and turned by no more, stands in traffic; farther off he
+/// is parked. Metres and radians.
+const IN_LANE_M: f64 = 1.0;
+const ALONG: f64 = 0.35;
+/// How far ahead of the front bumper a reason may be, metres: a light or sign, a junction, another.
+const LINE_M: f64 = 25.0;
+const JUNCTION_M: f64 = 10.0;
+const NEXT_M: f64 = 12.0;
+/// How far beside the middle of the way another may be to be in it, metres.
+const BESIDE_M: f64 = 1.8;
+
+/// True if a box, world frame, stands in a lane and nothing holds it back.
+pub(crate) fn stands_without(
+    own: &OrientedBox,
+    speed: f64,
+    map: &MapGraph,
+    lights: &[Light],
+    others: &[OrientedBox],
+) -> bool {
+    if speed >= STANDS {
+        return false;
+    }
+    let Some(lane) = lane_of(own.pose, map) else {
+        return false;
+    };
+    let from = lane.centerline.project(own.pose.position).arc_length;
+    let front = own.length / 2.0;
+    if lane.in_intersection {
+        return false;
+    }
+    // Every way ahead needs to be free: who waits for a turn has one that is not.
+    !ways(map, lane, from).iter().any(|(lanes, way)| {
+        let is_held_by_line = lanes.iter().any(|lane| {
+            let ahead = |at: DVec2| {
+                let gap = way.project(at).arc_length - front;
+                (-3.0..LINE_M).contains(&gap) && way.project(at).distance < 5.0
+            };
+            let binds = |light: &&Light| light.lane == lane.id && light.state != LightState::Green;
+            let mut lines = lights.iter().filter(binds);
+            let mut signs = map
+                .stop_signs()
+                .iter()
+                .filter(|s| s.lanes.contains(&lane.id));
+            lines.any(|light| ahead(stop_line(lane, light).position))
+                || signs.any(|sign| ahead(DVec2::new(sign.position.x, sign.position.y)))
+        });
+        let enters = |lane: &&&Lane| {
+            let start = way.project(lane.centerline.points()[0]).arc_length;
+            lane.in_intersection && start - front < JUNCTION_M
+        };
+        let is_blocked = others.iter().any(|other| {
+            let foot = way.project(other.pose.position);
+            let gap = foot.arc_length - front - other.length / 2.0;
+            foot.arc_length > 0.0 && gap < NEXT_M && foot.distance < BESIDE_M
+        });
+        is_held_by_line || lanes.iter().any(|lane| enters(&lane)) || is_blocked
+    })
+}
+
+/// The lane that somebody is in the middle of, if there is one.
+fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
+    let near = map.lanes_near(pose.position, IN_LANE_M);
+    let along = near.filter(|(lane, _)| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let heading = lane.centerline.pose_at(at).heading;
+        angle_difference(heading, pose.heading).abs() < ALONG
+    });
+    let nearest = along.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
+    nearest.map(|(lane, _)| lane)
+}
+
+/// The ways ahead of a place on a lane, each with its lanes.
+fn ways<'m>(map: &'m MapGraph, lane: &'m Lane, from: f64) -> Vec<(Vec<&'m Lane>, Polyline)> {
+    let rest = lane.centerline.slice(from, lane.centerline.length());
+    let mut next: Vec<&Lane> = map.successors(lane.id).collect();
+    next.sort_by_key(|lane| lane.id);
+    if next.is_empty() || rest.length() > LINE_M + 10.0 {
+        return vec![(vec![lane], rest)];
+    }
+    let longer = |next: &'m Lane| {
+        let points = rest.points().iter().chain(next.centerline.points());
+        let way = Polyline::new(points.copied().collect()).unwrap_or_else(|| rest.clone());
+        (vec![lane, next], way)
+    };
+    next.into_iter().map(longer).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::dvec2;
+    use gump_scene::fixture;
+
+    use super::*;
+
+    #[test]
+    fn reasons_are_lights_junctions_and_others() {
+        let check = |light: &str, at: (f64, f64), other: Option<(f64, f64)>, expected: bool| {
+            let scenario = fixture::scenario(&format!(
+                "lane 1: 0,0 60,0 120,0\n{light}\nego vehicle 0: 0,0"
+            ))
+            .unwrap();
+            let boxed = |(x, y): (f64, f64)| OrientedBox {
+                pose: Pose {
+                    position: dvec2(x, y),
+                    heading: 0.0,
+                },
+                length: 4.6,
+                width: 1.9,
+            };
+            let others: Vec<OrientedBox> = other.into_iter().map(boxed).collect();
+            let lights = scenario.present().now().lights();
+            let found = stands_without(&boxed(at), 0.0, &scenario.map, lights, &others);
+            assert_eq!(found, expected, "{light} {at:?} {other:?}");
+        };
+        check("", (30.0, 0.2), None, true);
+        check("light 1 green:", (110.0, 0.2), None, true);
+        check("light 1 red:", (110.0, 0.2), None, false);
+        check("light 1 red:", (30.0, 0.2), None, true);
+        // Parked beside the lane, behind somebody, before somebody, next to somebody.
+        check("", (30.0, 2.4), None, false);
+        check("", (30.0, 0.2), Some((38.0, 0.0)), false);
+        check("", (30.0, 0.2), Some((22.0, 0.0)), true);
+        check("", (30.0, 0.2), Some((31.0, 3.0)), true);
+        let open = fixture::scenario("lane 1: 0,0 60,0\nego vehicle 0: 30,0").unwrap();
+        let ego = open.present().ego_now().oriented_box();
+        assert!(!stands_without(&ego, 3.0, &open.map, &[], &[]));
+        assert!(stands_without(&ego, 0.0, &open.map, &[], &[]));
+    }
+}

@@ -1,0 +1,476 @@
+//! Who comes and who leaves: agents enter where lanes come into a window, in platoons as signals
+//! upstream make them, and leave where they drive out of it or the map ends.
+//!
+//! There is a window around the place where the scene was seen, and another around the ego once it
+//! has gone on from there.
+//!
+//! As many are there, on average, as at the start. Nobody appears or vanishes in sight of the ego,
+//! but for those whose lane ends there.
+
+use std::collections::BTreeMap;
+
+use gump_geometry::{DVec2, Polyline, Pose, dvec2};
+use gump_scene::{
+    Agent, AgentId, AgentKind, AgentState, Frame, Lane, LaneId, LaneKind, MapGraph, Rng,
+    SceneState, Seed, TYPICAL_SPEED_LIMIT,
+};
+use rand::Rng as _;
+
+/// Where agents come and leave.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Arrivals {
+    /// Radius of the windows around the start and around the ego, metres.
+    pub window_m: f64,
+    /// Nobody comes or leaves nearer to the ego than this, metres.
+    pub sight_m: f64,
+}
+
+impl Default for Arrivals {
+    /// A window of 110 m, in which recordings show most agents; 50 m of sight.
+    fn default() -> Self {
+        Self {
+            window_m: 110.0,
+            sight_m: 50.0,
+        }
+    }
+}
+
+/// The kinds that come, and what is usual of each.
+const KINDS: [AgentKind; 3] = AgentKind::MOVING;
+/// Usual speeds of those who move, metres per second, where nobody shows any.
+const USUAL_SPEED: [f64; 3] = [7.0, 1.3, 4.5];
+/// Share of the window's width that somebody crosses who comes in.
+const CROSSED: f64 = 0.6;
+/// How far the ego may go before it has a window of its own, or its gates are looked for anew, metres.
+const MOVED_M: f64 = 20.0;
+/// Who is that much farther than the window and goes away leaves, metres.
+const BEYOND_M: f64 = 12.0;
+/// Agents so many windows away leave, even if they stand.
+const FAR: f64 = 1.8;
+/// Who comes nearer to the end of the map leaves there, metres.
+const END_M: f64 = 5.0;
+/// The way in front of a gate that is looked at, metres.
+const PATH_M: f64 = 70.0;
+/// Gaps before and behind that somebody needs to come in, metres.
+const LEAST_GAP_M: f64 = 7.0;
+const LEAST_REAR_M: f64 = 10.0;
+/// The longest queue before a gate.
+const LONGEST_QUEUE: u32 = 4;
+/// Faster roads have signals that let traffic through in platoons, metres per second.
+const PLATOON_LIMIT: f64 = 8.0;
+/// Periods of such signals, seconds, and the share in which they let traffic through.
+const PERIOD_S: (f64, f64) = (40.0, 80.0);
+const OPEN: f64 = 0.5;
+
+/// A place where somebody comes in.
+#[derive(Clone, Debug)]
+struct Gate {
+    kind: usize,
+    /// Index of the window it leads into.
+    window: usize,
+    lane: LaneId,
+    pose: Pose,
+    /// The way ahead of it.
+    path: Polyline,
+    limit: f64,
+}
+
+/// Comings and goings of one future.
+#[derive(Clone, Debug)]
+pub(crate) struct Flow {
+    config: Arrivals,
+    seed: Seed,
+    step: u64,
+    time: f64,
+    gates: Vec<Gate>,
+    /// Where the ego was when they were looked for.
+    looked_at: DVec2,
+    /// The middles of the windows: the start, and the ego if it has gone on.
+    centres: Vec<DVec2>,
+    /// How many of each kind were in the window at the start, and how fast those were that moved.
+    usual: [f64; 3],
+    speed: [f64; 3],
+    /// Extents of those who were there at the start.
+    sizes: [Vec<[f64; 3]>; 3],
+    /// Who waits to come in, by lane and kind.
+    waiting: BTreeMap<(LaneId, usize), u32>,
+    next_id: i64,
+}
+
+fn index_of(kind: AgentKind) -> Option<usize> {
+    KINDS.iter().position(|known| *known == kind)
+}
+
+impl Flow {
+    /// From what is seen of a scene; `None` if nothing leads into it.
+    pub(crate) fn begin(config: &Arrivals, scene: SceneState<'_>, seed: Seed) -> Option<Self> {
+        let ego = scene.ego_now().state.pose.position;
+        let now = scene.now();
+        let mut this = Self {
+            config: config.clone(),
+            seed,
+            step: 0,
+            time: 0.0,
+            gates: gates(scene.map, &[ego], ego, config),
+            looked_at: ego,
+            centres: vec![ego],
+            usual: [0.0; 3],
+            speed: USUAL_SPEED,
+            sizes: Default::default(),
+            waiting: BTreeMap::new(),
+            next_id: 1 + now
+                .agents()
+                .iter()
+                .map(|agent| agent.id.0)
+                .max()
+                .unwrap_or(0),
+        };
+        this.usual = this.count(scene.map, now, scene.ego)[0];
+        for (k, kind) in KINDS.into_iter().enumerate() {
+            let of = now.agents().iter().filter(|agent| agent.kind == kind);
+            let others = of.filter(|agent| agent.id != scene.ego);
+            let sizes = others.clone().map(|a| [a.length, a.width, a.height]);
+            this.sizes[k] = sizes.collect();
+            let moving: Vec<f64> = others
+                .map(|agent| agent.state.speed())
+                .filter(|speed| *speed > 0.5)
+                .collect();
+            if !moving.is_empty() {
+                let mean = moving.iter().sum::<f64>() / moving.len() as f64;
+                this.speed[k] = mean.max(USUAL_SPEED[k] / 2.0);
+            }
+        }
+        (!this.gates.is_empty()).then_some(this)
+    }
+
+    /// Who takes part in traffic, by the window he is nearest to the middle of, and by kind: parked
+    /// vehicles do not.
+    fn count(&self, map: &MapGraph, frame: &Frame, ego: AgentId) -> Vec<[f64; 3]> {
+        let mut counts = vec![[0.0; 3]; self.centres.len()];
+        for agent in frame.agents().iter().filter(|agent| agent.id != ego) {
+            let at = agent.state.pose.position;
+            let Some(kind) = index_of(agent.kind) else {
+                continue;
+            };
+            let is_parked = || {
+                agent.kind == AgentKind::Vehicle
+                    && agent.state.speed() < 0.5
+                    && map.lanes_near(at, 1.5).next().is_none()
+            };
+            let (window, distance) = nearest(&self.centres, at);
+            if distance <= self.config.window_m && !is_parked() {
+                counts[window][kind] += 1.0;
+            }
+        }
+        counts
+    }
+
+    /// Who leaves and who comes before the next frame, `dt` seconds on.
+    pub(crate) fn step(
+        &mut self,
+        map: &MapGraph,
+        frame: &Frame,
+        ego: AgentId,
+        dt: f64,
+    ) -> (Vec<AgentId>, Vec<Agent>) {
+        self.step += 1;
+        self.time += dt;
+        let Some(driven) = frame.agent(ego) else {
+            return (Vec::new(), Vec::new());
+        };
+        let centre = driven.state.pose.position;
+        if centre.distance(self.looked_at) > MOVED_M {
+            self.looked_at = centre;
+            self.centres.truncate(1);
+            self.centres.push(centre);
+            self.gates = gates(map, &self.centres, centre, &self.config);
+        }
+        let others = frame.agents().iter().filter(|agent| agent.id != ego);
+        let leave: Vec<AgentId> = others
+            .filter(|agent| self.leaves(map, agent))
+            .map(|agent| agent.id)
+            .collect();
+        let counts = self.count(map, frame, ego);
+        let mut there: Vec<Agent> = frame.agents().to_vec();
+        there.retain(|agent| !leave.contains(&agent.id));
+        let mut come = Vec::new();
+        for g in 0..self.gates.len() {
+            let seed = self.seed.fork(self.step).fork(g as u64);
+            if let Some(agent) = self.at_gate(g, map, &there, &counts, dt, &mut seed.rng()) {
+                there.push(agent);
+                come.push(agent);
+            }
+        }
+        (leave, come)
+    }
+
+    fn leaves(&self, map: &MapGraph, agent: &Agent) -> bool {
+        let (at, velocity) = (agent.state.pose.position, agent.state.velocity);
+        let (nearest, distance) = nearest(&self.centres, at);
+        let away = at - self.centres[nearest];
+        let window = self.config.window_m;
+        if distance > FAR * window {
+            return true;
+        }
+        let moves = velocity.length() > 0.5;
+        if moves && distance > window + BEYOND_M && velocity.dot(away) > 0.0 {
+            return true;
+        }
+        agent.kind != AgentKind::Pedestrian && moves && ends_at(map, agent)
+    }
+
+    /// Who comes in at a gate in this step, if somebody does and finds room.
+    fn at_gate(
+        &mut self,
+        g: usize,
+        map: &MapGraph,
+        there: &[Agent],
+        counts: &[[f64; 3]],
+        dt: f64,
+        rng: &mut Rng,
+    ) -> Option<Agent> {
+        let gate = &self.gates[g];
+        let k = gate.kind;
+        let is_beside = |other: &&Gate| (other.kind, other.window) == (k, gate.window);
+        let same = self.gates.iter().filter(is_beside).count() as f64;
+        let usual = self.usual[k];
+        if usual == 0.0 {
+            return None;
+        }
+        // As many come as leave in the mean, more of them while some are missing.
+        let crossing = CROSSED * 2.0 * self.config.window_m / self.speed[k];
+        let missing = (usual - counts[gate.window][k]) / usual;
+        let rate = usual / crossing * (1.0 + 2.0 * missing).clamp(0.0, 3.0);
+        let expected = rate / same * self.platoon(gate) * dt;
+        let key = (gate.lane, k);
+        let queue = self.waiting.entry(key).or_default();
+        if rng.random::<f64>() < expected {
+            *queue = (*queue + 1).min(LONGEST_QUEUE);
+        }
+        if *queue == 0 {
+            return None;
+        }
+        let gate = &self.gates[g];
+        let size = match self.sizes[k].as_slice() {
+            [] => KINDS[k].usual_size(),
+            sizes => sizes[rng.random_range(0..sizes.len())],
+        };
+        let wanted = match KINDS[k] {
+            AgentKind::Vehicle => gate.limit * rng.random_range(0.8..1.05),
+            _ => USUAL_SPEED[k] * rng.random_range(0.8..1.2),
+        };
+        let speed = entering_speed(gate, there, size[0], wanted)?;
+        *self.waiting.entry(key).or_default() -= 1;
+        let id = AgentId(self.next_id);
+        self.next_id += 1;
+        let position = gate.pose.position;
+        Some(Agent {
+            id,
+            kind: KINDS[k],
+            length: size[0],
+            width: size[1],
+            height: size[2],
+            elevation: map.elevation_at(position).unwrap_or_default() + size[2] / 2.0,
+            state: AgentState {
+                pose: gate.pose,
+                velocity: gate.pose.direction() * speed,
+            },
+        })
+    }
+
+    /// How much denser than usual traffic is at a gate now: platoons and what is between them.
+    fn platoon(&self, gate: &Gate) -> f64 {
+        if KINDS[gate.kind] != AgentKind::Vehicle || gate.limit < PLATOON_LIMIT {
+            return 1.0;
+        }
+        let mut rng = self.seed.fork(u64::MAX).fork(gate.lane.0 as u64).rng();
+        let period = rng.random_range(PERIOD_S.0..PERIOD_S.1);
+        let offset = rng.random_range(0.0..period);
+        let is_open = (self.time + offset) % period < OPEN * period;
+        if is_open { 1.0 / OPEN } else { 0.0 }
+    }
+}
+
+/// Whether a vehicle or bicycle has come to where its lane ends and none follows.
+fn ends_at(map: &MapGraph, agent: &Agent) -> bool {
+    let pose = agent.state.pose;
+    let lanes = map.lanes_near(pose.position, 3.0);
+    let along = lanes.filter(|(lane, _)| {
+        let foot = lane.centerline.project(pose.position);
+        let heading = lane.centerline.pose_at(foot.arc_length).heading;
+        gump_geometry::angle_difference(heading, pose.heading).abs() < 0.8
+    });
+    let nearest = along.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
+    nearest.is_some_and(|(lane, _)| {
+        let foot = lane.centerline.project(pose.position);
+        let left = lane.centerline.length() - foot.arc_length - agent.length / 2.0;
+        left < END_M && map.successors(lane.id).next().is_none()
+    })
+}
+
+/// The speed at which somebody may come in who wants to go so fast; `None` if there is no room.
+fn entering_speed(gate: &Gate, there: &[Agent], length: f64, wanted: f64) -> Option<f64> {
+    let mut speed = wanted;
+    for agent in there {
+        let at = agent.state.pose.position;
+        if at.distance_squared(gate.pose.position) > PATH_M * PATH_M {
+            continue;
+        }
+        let foot = gate.path.project(at);
+        if foot.distance > 1.0 + agent.width / 2.0 && foot.arc_length > 0.0 {
+            continue;
+        }
+        let gap = foot.arc_length - (length + agent.length) / 2.0;
+        if foot.arc_length <= 0.0 {
+            // Behind, or beside the gate.
+            let behind = gate.pose.inverse() * at;
+            if behind.x > -LEAST_REAR_M - agent.length && behind.y.abs() < 3.0 {
+                return None;
+            }
+            continue;
+        }
+        if gap < LEAST_GAP_M {
+            return None;
+        }
+        let room = gap - 2.0;
+        let along = agent.state.velocity.dot(gate.pose.direction()).max(0.0);
+        // So that a second of headway is left, and gentle braking is enough.
+        let safe = (along * along + 2.0 * 1.5 * room).sqrt();
+        speed = speed.min(safe).min(room / 1.0);
+    }
+    Some(speed)
+}
+
+/// Which of these places is nearest, and how far it is.
+fn nearest(centres: &[DVec2], at: DVec2) -> (usize, f64) {
+    let each = centres.iter().map(|centre| centre.distance(at)).enumerate();
+    each.min_by(|a, b| a.1.total_cmp(&b.1))
+        .unwrap_or((0, f64::INFINITY))
+}
+
+/// Where lanes come into the windows around these middles, and where people walk beside them; out of
+/// sight of the ego.
+fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Vec<Gate> {
+    let mut gates = Vec::new();
+    let reach = config.window_m + 5.0;
+    let mut lanes: Vec<&Lane> = centres
+        .iter()
+        .flat_map(|centre| map.lanes_in_square(*centre, reach))
+        .collect();
+    lanes.sort_by_key(|lane| lane.id);
+    lanes.dedup_by_key(|lane| lane.id);
+    for lane in lanes {
+        if lane.in_intersection {
+            continue;
+        }
+        let is_for_bicycles = lane.kind == LaneKind::BikeLane;
+        let mut entries: Vec<f64> = Vec::new();
+        if map.predecessors(lane.id).next().is_none() {
+            entries.push(0.5_f64.min(lane.centerline.length() / 2.0));
+        }
+        entries.extend(crossings(lane, centres, config.window_m, 1.0));
+        for s in entries {
+            let pose = lane.centerline.pose_at(s);
+            let (window, distance) = nearest(centres, pose.position);
+            let is_seen = pose.position.distance(ego) < config.sight_m;
+            if is_seen || distance > config.window_m + 1.0 {
+                continue;
+            }
+            let Some(path) = path_from(map, lane, s) else {
+                continue;
+            };
+            let limit = lane.speed_limit.unwrap_or(TYPICAL_SPEED_LIMIT);
+            let gate = |kind: usize, pose: Pose| Gate {
+                kind,
+                window,
+                lane: lane.id,
+                pose,
+                path: path.clone(),
+                limit,
+            };
+            if !is_for_bicycles {
+                gates.push(gate(0, pose));
+            }
+            let edge = if is_for_bicycles {
+                0.0
+            } else {
+                0.7 - lane.width / 2.0
+            };
+            gates.push(gate(2, aside(pose, edge)));
+        }
+        for (inward, turned) in [(1.0, 0.0), (-1.0, std::f64::consts::PI)] {
+            for s in crossings(lane, centres, config.window_m, inward) {
+                let pose = aside(lane.centerline.pose_at(s), -lane.width / 2.0 - 2.0);
+                let is_seen = pose.position.distance(ego) < config.sight_m;
+                if is_seen || map.lanes_containing(pose.position).next().is_some() {
+                    continue;
+                }
+                let pose = Pose {
+                    heading: gump_geometry::wrap_angle(pose.heading + turned),
+                    ..pose
+                };
+                let end = pose.position + pose.direction() * 10.0;
+                let Some(path) = Polyline::new(vec![pose.position, end]) else {
+                    continue;
+                };
+                gates.push(Gate {
+                    kind: 1,
+                    window: nearest(centres, pose.position).0,
+                    lane: lane.id,
+                    pose,
+                    path,
+                    limit: TYPICAL_SPEED_LIMIT,
+                });
+            }
+        }
+    }
+    gates
+}
+
+/// A pose so many metres to the left.
+fn aside(pose: Pose, left: f64) -> Pose {
+    Pose {
+        position: pose * dvec2(0.0, left),
+        ..pose
+    }
+}
+
+/// Where a lane comes into circles around these middles, or leaves them where `inward` is -1.
+fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f64> {
+    let line = &lane.centerline;
+    let beyond = |p: DVec2| inward * (nearest(centres, p).1 - radius);
+    let pairs = line.points().windows(2).zip(line.arc_lengths().windows(2));
+    pairs
+        .filter_map(|(points, s)| {
+            let (from, to) = (beyond(points[0]), beyond(points[1]));
+            let share = from / (from - to);
+            (from > 0.0 && to <= 0.0).then(|| s[0] + share * (s[1] - s[0]))
+        })
+        .collect()
+}
+
+/// The way ahead from a place on a lane, straight on where it forks; `None` if it is short.
+fn path_from(map: &MapGraph, lane: &Lane, s: f64) -> Option<Polyline> {
+    let mut path = lane.centerline.slice(s, lane.centerline.length());
+    let mut last = lane;
+    for _ in 0..4 {
+        if path.length() >= PATH_M {
+            break;
+        }
+        let heading = path.pose_at(path.length()).heading;
+        let turn = |lane: &Lane| {
+            let way = &lane.centerline;
+            let end = way.pose_at(way.length()).heading;
+            gump_geometry::angle_difference(end, heading).abs()
+        };
+        let next = map.successors(last.id);
+        let Some(next) = next.min_by(|a, b| turn(a).total_cmp(&turn(b)).then(a.id.cmp(&b.id)))
+        else {
+            break;
+        };
+        let points = path.points().iter().chain(next.centerline.points());
+        path = Polyline::new(points.copied().collect())?;
+        last = next;
+    }
+    (path.length() > 25.0).then_some(path)
+}

@@ -1,0 +1,40 @@
+//! Traffic that goes on for a minute: signals that work as junctions do, and agents that come and
+//! leave, around any world.
+//!
+//! A [`WorldModel`](gump_rollout::WorldModel) says how agents move. What the lights show and who is
+//! there is given to it: held as at the present, or led on by [`Living`].
+//!
+//! # Terms
+//! * **movement**: one way through a junction that a light rules. **Signal group**: movements whose
+//!   lights show the same. **Phase**: groups that are green together.
+//! * **gate**: where a lane comes into what is simulated.
+//!
+//! ```
+//! use gump_rollout::{SimulateConfig, Start, simulate, worlds::Idm};
+//! use gump_scene::{LightState, Seed};
+//! use gump_traffic::{Living, LivingConfig};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: -60,0 -8,0 next 3
+//!      lane 2: 0,-60 0,-8 next 4
+//!      lane 3: -8,0 60,0
+//!      lane 4: 0,-8 0,60
+//!      light 3 red:
+//!      light 4 green:
+//!      ego vehicle 0: -30,0 velocity 8,0",
+//! ).unwrap();
+//! let world = Living::new(Idm::default(), LivingConfig::default());
+//! let start = Start { scene: scenario.present(), n_futures: 1, seed: Seed(0) };
+//! let minute = SimulateConfig { seconds: 60.0, ..SimulateConfig::default() };
+//! let futures = simulate(&world, &[start], None, &minute).unwrap();
+//! // The light turns green in the end, and the ego has driven on.
+//! assert!(futures[0].last().ego_now().state.pose.position.x > 60.0);
+//! ```
+
+mod gates;
+mod living;
+mod signals;
+
+pub use gates::Arrivals;
+pub use living::{LightControl, Living, LivingConfig, RecordedLights};
+pub use signals::{SignalPlan, Signals};

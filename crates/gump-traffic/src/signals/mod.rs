@@ -1,0 +1,197 @@
+//! Traffic lights that work as those of a junction do: groups, phases, yellow and clearance.
+
+mod movement;
+mod plan;
+mod timing;
+
+use std::sync::Arc;
+
+use gump_geometry::Pose;
+use gump_scene::{Light, LightState, Seed};
+
+pub use plan::SignalPlan;
+use plan::{Begun, Junction, Phase};
+use timing::{CLEARANCE_S, green_s, rest_s};
+
+/// Seconds for which a phase goes on if nobody waits for another.
+const EXTENSION_S: f64 = 4.0;
+
+/// The lights of one future as they go on from the present.
+///
+/// Phases last as long as is usual, drawn from the future's seed; one that nobody waits for is left
+/// out, as detectors in the road do, and green rests where nobody waits anywhere.
+#[derive(Clone, Debug)]
+pub struct Signals {
+    plan: Arc<SignalPlan>,
+    seed: Seed,
+    turns: Vec<Turn>,
+    /// Seconds of yellow left for lights that showed green against the phase they began in.
+    fading: Vec<f64>,
+    shown: Vec<Light>,
+}
+
+/// Where a junction is.
+#[derive(Clone, Debug)]
+struct Turn {
+    phase: usize,
+    /// Which comes next, once that is decided.
+    next: usize,
+    stage: Stage,
+    /// Seconds left of it.
+    left: f64,
+    /// Phases so far.
+    n: u64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stage {
+    Green,
+    Yellow,
+    Red,
+}
+
+impl Signals {
+    /// As at the present.
+    pub fn begin(plan: &Arc<SignalPlan>, seed: Seed) -> Self {
+        let begin = |(j, junction): (usize, &Junction)| {
+            let seed = seed.fork(j as u64).fork(0);
+            let share = || rand::Rng::random::<f64>(&mut seed.fork(1).rng());
+            let phase = &junction.phases[junction.phase];
+            let (stage, left) = match junction.stage {
+                Begun::Green(age) => (Stage::Green, rest_s(phase.is_left, age, seed)),
+                Begun::Yellow => (Stage::Yellow, share() * junction.yellow),
+                Begun::Red => (Stage::Red, share() * CLEARANCE_S),
+            };
+            Turn {
+                phase: junction.phase,
+                next: (junction.phase + 1) % junction.phases.len(),
+                stage,
+                left,
+                n: 1,
+            }
+        };
+        let turns = plan.junctions.iter().enumerate().map(begin).collect();
+        let mut this = Self {
+            plan: Arc::clone(plan),
+            seed,
+            turns,
+            fading: vec![0.0; plan.lights.len()],
+            shown: plan.lights.clone(),
+        };
+        // Whoever is green against the phase that was found turns yellow first.
+        let planned = this.colours();
+        for (light, state) in planned {
+            if this.shown[light].state == LightState::Green && state == LightState::Red {
+                this.fading[light] = timing::yellow_s(0.0);
+            }
+        }
+        this
+    }
+
+    /// What all lights show now, by lane: as logged at the present, as planned after it.
+    pub fn lights(&self) -> &[Light] {
+        &self.shown
+    }
+
+    /// Goes on by `dt` seconds; `vehicles` are where those are who may wait at a light. Without them
+    /// it is as if somebody waited everywhere.
+    pub fn advance(&mut self, dt: f64, vehicles: Option<&[Pose]>) {
+        let plan = Arc::clone(&self.plan);
+        for (j, junction) in plan.junctions.iter().enumerate() {
+            let mut left = dt;
+            // Each pass ends a stage or uses the time up; stages last for a second at least.
+            while self.turns[j].left <= left {
+                left -= self.turns[j].left;
+                self.end_stage(j, junction, vehicles);
+            }
+            self.turns[j].left -= left;
+        }
+        for left in &mut self.fading {
+            *left = (*left - dt).max(0.0);
+        }
+        for (light, state) in self.colours() {
+            let fades = self.fading[light] > 0.0 && state == LightState::Red;
+            self.shown[light].state = if fades { LightState::Yellow } else { state };
+        }
+    }
+
+    fn end_stage(&mut self, j: usize, junction: &Junction, vehicles: Option<&[Pose]>) {
+        let seed = self.seed.fork(j as u64).fork(self.turns[j].n);
+        match self.turns[j].stage {
+            Stage::Green => match self.next_phase(j, junction, vehicles) {
+                Some(next) => {
+                    let turn = &mut self.turns[j];
+                    turn.next = next;
+                    turn.stage = Stage::Yellow;
+                    turn.left = junction.yellow;
+                }
+                None => self.turns[j].left = EXTENSION_S,
+            },
+            Stage::Yellow => {
+                self.turns[j].stage = Stage::Red;
+                self.turns[j].left = CLEARANCE_S;
+            }
+            Stage::Red => {
+                let turn = &mut self.turns[j];
+                turn.phase = turn.next;
+                turn.stage = Stage::Green;
+                turn.left = green_s(junction.phases[turn.phase].is_left, seed);
+                turn.n += 1;
+            }
+        }
+    }
+
+    /// The next phase in turn that somebody waits for; `None` to stay. Whether anybody waits who has
+    /// no light that is known is not known, so such a phase has its turn.
+    fn next_phase(
+        &self,
+        j: usize,
+        junction: &Junction,
+        vehicles: Option<&[Pose]>,
+    ) -> Option<usize> {
+        let n = junction.phases.len();
+        let now = self.turns[j].phase;
+        let is_red = |group: usize| !junction.phases[now].green[group];
+        let is_asked_for = |phase: &Phase| {
+            let green = (0..junction.groups.len()).filter(|&g| phase.green[g]);
+            let lights = green
+                .filter(|&g| is_red(g))
+                .flat_map(|g| &junction.groups[g].members);
+            let mut movements = lights.filter_map(|&l| self.plan.movements[l].as_ref());
+            movements.any(|movement| match vehicles {
+                Some(all) => all.iter().any(|at| movement.is_asked_for_by(*at)),
+                None => true,
+            })
+        };
+        let is_blank = |phase: &Phase| phase.green.iter().all(|green| !green);
+        let mut turns = (1..n).map(|k| (now + k) % n);
+        turns.find(|&phase| {
+            let phase = &junction.phases[phase];
+            is_blank(phase) || is_asked_for(phase)
+        })
+    }
+
+    /// What every light of a junction shows by its phase.
+    fn colours(&self) -> Vec<(usize, LightState)> {
+        let junctions = self.plan.junctions.iter().zip(&self.turns);
+        let of = |(junction, turn): (&Junction, &Turn)| {
+            let (now, next) = (&junction.phases[turn.phase], &junction.phases[turn.next]);
+            let colour = |group: usize| match (turn.stage, now.green[group], next.green[group]) {
+                (_, false, _) => LightState::Red,
+                (Stage::Green, true, _) | (_, true, true) => LightState::Green,
+                (Stage::Yellow, true, false) => LightState::Yellow,
+                (Stage::Red, true, false) => LightState::Red,
+            };
+            let groups = junction.groups.iter().enumerate();
+            let each = groups.flat_map(|(g, group)| {
+                let colour = colour(g);
+                group.members.iter().map(move |&light| (light, colour))
+            });
+            each.collect::<Vec<_>>()
+        };
+        junctions.flat_map(of).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;

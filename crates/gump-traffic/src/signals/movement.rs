@@ -1,0 +1,166 @@
+//! What a light rules: where traffic stops, which way it goes, and which other ways that crosses.
+
+use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
+use gump_scene::{
+    Lane, LaneKind, Light, MapGraph, TYPICAL_SPEED_LIMIT, stop_line, ways_beyond, ways_cross,
+    ways_join,
+};
+
+/// Lights whose traffic comes from the same direction differ by less than this, radians.
+const SAME_APPROACH: f64 = 0.52;
+/// Roads that lie opposite differ by more than this, radians.
+const OPPOSITE: f64 = 2.36;
+/// A way that turns by more is a turn, radians.
+const TURN: f64 = 0.52;
+/// Stop lines of one approach lie within this, metres.
+const APPROACH_M: f64 = 25.0;
+/// Stop lines of one junction lie within this, metres, ...
+const JUNCTION_M: f64 = 70.0;
+/// ... and its ways come as near to one another as this, metres.
+const NEAR_M: f64 = 8.0;
+/// Steps in which ways are compared, metres.
+const STEP_M: f64 = 4.0;
+/// How far before its line somebody waits for a light or comes up to it, metres.
+const WAITING_M: f64 = 45.0;
+/// How far beside the middle of a lane he may be, metres.
+const BESIDE_M: f64 = 2.5;
+
+/// How two movements stand to each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Relation {
+    /// They never meet.
+    Free,
+    /// They come from opposite roads and cross: a turn that gives way to oncoming traffic.
+    Opposing,
+    /// They come from roads that lie across one another, and cross or join.
+    Across,
+}
+
+/// One way, or several from one line, that a light rules.
+#[derive(Clone, Debug)]
+pub(super) struct Movement {
+    /// The middle of the stop line.
+    pub(super) line: Pose,
+    /// Beyond the line.
+    ways: Vec<Polyline>,
+    /// Up to the line.
+    approaches: Vec<Polyline>,
+    /// Whether all of its ways turn left, from lanes that lead nowhere else.
+    pub(super) is_left_only: bool,
+    /// Speed limit, metres per second.
+    pub(super) limit: f64,
+    /// Whether it is for bicycles alone.
+    is_for_bicycles: bool,
+}
+
+impl Movement {
+    /// What a light of this lane rules.
+    pub(super) fn of(map: &MapGraph, lane: &Lane, light: &Light) -> Self {
+        let line = stop_line(lane, light);
+        let ways = ways_beyond(map, lane, line);
+        let turns_left = |way: &Polyline| turn_of(way) > TURN;
+        let shares = |lane: &Lane| {
+            let before = map.predecessors(lane.id);
+            let mut beside = before.flat_map(|lane| map.successors(lane.id));
+            beside.any(|lane| !turns_left(&lane.centerline))
+        };
+        let is_left = !ways.is_empty() && ways.iter().all(turns_left);
+        Self {
+            line,
+            approaches: approaches(map, lane, line),
+            is_left_only: is_left && !shares(lane),
+            limit: lane.speed_limit.unwrap_or(TYPICAL_SPEED_LIMIT),
+            is_for_bicycles: lane.kind == LaneKind::BikeLane,
+            ways,
+        }
+    }
+
+    /// How it stands to another movement.
+    pub(super) fn relation(&self, other: &Self) -> Relation {
+        let between = angle_difference(self.line.heading, other.line.heading).abs();
+        let meets = |meet: fn(&Polyline, &Polyline) -> bool| {
+            let all = |one: &Polyline| other.ways.iter().any(|other| meet(one, other));
+            self.ways.iter().any(all)
+        };
+        if between < SAME_APPROACH {
+            Relation::Free
+        } else if between > OPPOSITE {
+            match meets(ways_cross) {
+                true => Relation::Opposing,
+                false => Relation::Free,
+            }
+        } else if meets(ways_cross) || meets(ways_join) {
+            Relation::Across
+        } else {
+            Relation::Free
+        }
+    }
+
+    /// Whether both come to their lines from the same road.
+    pub(super) fn shares_approach(&self, other: &Self) -> bool {
+        let between = angle_difference(self.line.heading, other.line.heading).abs();
+        let apart = self.line.position.distance(other.line.position);
+        between < SAME_APPROACH
+            && apart < APPROACH_M
+            && self.is_for_bicycles == other.is_for_bicycles
+    }
+
+    /// Whether both belong to one junction.
+    pub(super) fn shares_junction(&self, other: &Self) -> bool {
+        let apart = self.line.position.distance(other.line.position);
+        if apart > JUNCTION_M {
+            return false;
+        }
+        let near = |p: &DVec2, line: &Polyline| line.project(*p).distance < NEAR_M;
+        let meets = |one: &Polyline| {
+            let near = |other: &Polyline| {
+                let (one, other) = (one.resample(STEP_M), other.resample(STEP_M));
+                one.points().iter().any(|p| near(p, &other))
+            };
+            other.ways.iter().any(near)
+        };
+        self.shares_approach(other)
+            || self.relation(other) != Relation::Free
+            || self.ways.iter().any(meets)
+    }
+
+    /// Whether somebody at this place waits for the light or comes up to it.
+    pub(super) fn is_asked_for_by(&self, at: Pose) -> bool {
+        if at.position.distance(self.line.position) > WAITING_M + BESIDE_M {
+            return false;
+        }
+        let comes = |way: &Polyline| {
+            let foot = way.project(at.position);
+            let along = way.pose_at(foot.arc_length).heading;
+            foot.distance < BESIDE_M && angle_difference(at.heading, along).abs() < 1.0
+        };
+        self.approaches.iter().any(comes)
+    }
+}
+
+/// By how much a way turns to the left, radians.
+fn turn_of(way: &Polyline) -> f64 {
+    let end = way.pose_at(way.length()).heading;
+    angle_difference(end, way.pose_at(0.0).heading)
+}
+
+/// The lanes up to a line, from [`WAITING_M`] before it.
+fn approaches(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
+    let centre = &lane.centerline;
+    let at = centre.project(line.position).arc_length;
+    let mut all = Vec::new();
+    if at > 1.0 {
+        all.push(centre.slice((at - WAITING_M).max(0.0), at));
+    }
+    let missing = WAITING_M - at;
+    if missing > 1.0 {
+        for before in map.predecessors(lane.id) {
+            let end = before.centerline.length();
+            let from = (end - missing).max(0.0);
+            if end - from > 0.5 {
+                all.push(before.centerline.slice(from, end));
+            }
+        }
+    }
+    all
+}

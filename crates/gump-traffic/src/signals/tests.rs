@@ -1,0 +1,243 @@
+//! Signals of made-up junctions.
+
+use gump_geometry::dvec2;
+use gump_scene::{Frame, LaneId, Scenario, fixture};
+
+use super::*;
+use LightState::{Green, Red, Unknown, Yellow};
+
+/// A junction of two roads: through lanes 1 to 4 from west, east, south and north, and 5, a left turn
+/// from the west with a lane of its own.
+fn crossing(states: [&str; 5]) -> Scenario {
+    let light = |(i, state): (usize, &&str)| format!("light {} {state}:", i + 1);
+    let lights: Vec<String> = states.iter().enumerate().map(light).collect();
+    let text = format!(
+        "lane 11: -90,-2 -10,-2 next 1
+         lane 12: 90,2 10,2 next 2
+         lane 13: 2,-90 2,-10 next 3
+         lane 14: -2,90 -2,10 next 4
+         lane 15: -90,1 -10,1 next 5
+         lane 1: -10,-2 10,-2 next 21
+         lane 2: 10,2 -10,2 next 22
+         lane 3: 2,-10 2,10 next 23
+         lane 4: -2,10 -2,-10 next 24
+         lane 5: -10,1 -3,3 0,5 2,10 next 23
+         lane 21: 10,-2 90,-2
+         lane 22: -10,2 -90,2
+         lane 23: 2,10 2,90
+         lane 24: -2,-10 -2,-90
+         {}
+         ego vehicle 0: -20,-2",
+        lights.join("\n")
+    );
+    // Lanes of the fixture are not told to be in an intersection: lines are where lanes end.
+    let mut scenario = fixture::scenario(&text).unwrap();
+    let stop = [
+        (-10.0, -2.0),
+        (10.0, 2.0),
+        (2.0, -10.0),
+        (-2.0, 10.0),
+        (-10.0, 1.0),
+    ];
+    for frame in &mut scenario.log {
+        let mut lights = frame.lights().to_vec();
+        for (light, (x, y)) in lights.iter_mut().zip(stop) {
+            light.stop_point = Some(dvec2(x, y));
+        }
+        *frame = Frame::new(frame.agents().to_vec(), lights);
+    }
+    scenario
+}
+
+fn plan(scenario: &Scenario) -> Arc<SignalPlan> {
+    let scene = scenario.present();
+    Arc::new(SignalPlan::of(scene.map, scene.history, scene.dt))
+}
+
+fn states(signals: &Signals) -> Vec<LightState> {
+    signals.lights().iter().map(|light| light.state).collect()
+}
+
+/// Somebody waits everywhere.
+fn everywhere() -> Vec<Pose> {
+    let at = |x: f64, y: f64, heading: f64| Pose {
+        position: dvec2(x, y),
+        heading,
+    };
+    let half = std::f64::consts::FRAC_PI_2;
+    vec![
+        at(-15.0, -2.0, 0.0),
+        at(15.0, 2.0, 2.0 * half),
+        at(2.0, -15.0, half),
+        at(-2.0, 15.0, -half),
+        at(-15.0, 1.0, 0.0),
+    ]
+}
+
+#[test]
+fn lights_of_one_junction_are_found_and_grouped() {
+    let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
+    let groups = plan.groups();
+    assert_eq!(groups.len(), 1);
+    // Every approach is a group, and the left turn is one of its own.
+    let lanes: Vec<Vec<i64>> = groups[0]
+        .iter()
+        .map(|group| group.iter().map(|lane: &LaneId| lane.0).collect())
+        .collect();
+    assert_eq!(lanes, [[1], [2], [3], [4], [5]]);
+    assert_eq!(plan.contradictions(), 0);
+}
+
+#[test]
+fn movements_that_cross_are_never_green_together() {
+    let conflicts = [(0, 2), (0, 3), (1, 2), (1, 3), (4, 1), (4, 2), (4, 3)];
+    for now in [
+        ["green", "green", "red", "red", "red"],
+        ["red", "red", "green", "green", "red"],
+        ["red", "red", "red", "red", "green"],
+        ["yellow", "yellow", "red", "red", "red"],
+        ["red"; 5],
+        ["unknown"; 5],
+        // A log that contradicts itself.
+        ["green", "green", "green", "red", "red"],
+    ] {
+        let plan = plan(&crossing(now));
+        for seed in 0..20 {
+            let mut signals = Signals::begin(&plan, Seed(seed));
+            let mut greens = [0; 5];
+            let mut before = states(&signals);
+            for step in 0..600 {
+                signals.advance(0.5, Some(&everywhere()));
+                let shown = states(&signals);
+                for (a, b) in conflicts {
+                    let both = shown[a] == Green && shown[b] == Green;
+                    assert!(!both, "{now:?}: {a} and {b} are green at step {step}");
+                }
+                for (i, pair) in before.iter().zip(&shown).enumerate() {
+                    let is_known = step > 0 && *pair.0 != Unknown;
+                    let turns = matches!(pair, (Green, Red) | (Yellow, Green) | (Red, Yellow));
+                    assert!(
+                        !is_known || !turns,
+                        "{now:?}: light {i} {pair:?} at step {step}"
+                    );
+                    greens[i] += usize::from(*pair.1 == Green);
+                }
+                before = shown;
+            }
+            // Five minutes: everybody has had a turn.
+            assert!(greens.iter().all(|green| *green > 10), "{now:?} {greens:?}");
+        }
+    }
+}
+
+#[test]
+fn phases_last_as_long_as_signals_do() {
+    let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
+    let mut signals = Signals::begin(&plan, Seed(3));
+    let mut runs: Vec<(LightState, f64)> = Vec::new();
+    for _ in 0..6000 {
+        signals.advance(0.1, None);
+        match runs.last_mut() {
+            Some((state, seconds)) if *state == states(&signals)[0] => *seconds += 0.1,
+            _ => runs.push((states(&signals)[0], 0.1)),
+        }
+    }
+    let whole = &runs[1..runs.len() - 1];
+    assert!(whole.len() > 20);
+    for (state, seconds) in whole {
+        let range = match state {
+            Green => 9.8..40.2,
+            Yellow => 2.9..3.5,
+            // The cross street and the left turn, or one of them.
+            _ => 8.0..70.0,
+        };
+        assert!(range.contains(seconds), "{state:?} for {seconds} s");
+    }
+}
+
+#[test]
+fn what_nobody_waits_for_is_left_out() {
+    let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
+    let mut signals = Signals::begin(&plan, Seed(0));
+    for _ in 0..400 {
+        signals.advance(0.5, Some(&[]));
+        assert_eq!(states(&signals), [Green, Green, Red, Red, Red]);
+    }
+    // Only the left turn is asked for.
+    let left = [everywhere()[4]];
+    let turned = (0..100).any(|_| {
+        signals.advance(0.5, Some(&left));
+        assert_eq!(states(&signals)[2], Red);
+        states(&signals)[4] == Green
+    });
+    assert!(turned);
+}
+
+#[test]
+fn one_seed_one_course_and_futures_differ() {
+    let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
+    let course = |seed: u64, dt: f64| {
+        let mut signals = Signals::begin(&plan, Seed(seed));
+        let mut course = Vec::new();
+        for _ in 0..30 {
+            (0..(1.0 / dt) as usize).for_each(|_| signals.advance(dt, Some(&everywhere())));
+            course.push(states(&signals));
+        }
+        course
+    };
+    assert_eq!(course(1, 0.5), course(1, 0.5));
+    assert!((2..12).any(|seed| course(seed, 0.5) != course(1, 0.5)));
+}
+
+#[test]
+fn a_light_alone_takes_turns_with_who_is_not_seen() {
+    let scenario = fixture::scenario(
+        "lane 1: 0,0 40,0
+         light 1 red:
+         light 99 green:
+         ego vehicle 0: 0,0",
+    )
+    .unwrap();
+    let plan = plan(&scenario);
+    let mut signals = Signals::begin(&plan, Seed(0));
+    let mut seen = Vec::new();
+    for _ in 0..300 {
+        let waits = Pose {
+            position: dvec2(30.0, 0.0),
+            heading: 0.0,
+        };
+        signals.advance(0.5, Some(&[waits]));
+        let shown = states(&signals);
+        // Lane 99 is not on the map.
+        assert_eq!(shown[1], Green);
+        seen.push(shown[0]);
+    }
+    assert!(seen.contains(&Green) && seen.contains(&Yellow) && seen.contains(&Red));
+}
+
+#[test]
+fn lanes_of_few_points_cross_too() {
+    let scenario = fixture::scenario(
+        "lane 1: -60,0 -8,0 next 3
+         lane 2: 0,-60 0,-8 next 4
+         lane 3: -8,0 60,0
+         lane 4: 0,-8 0,60
+         light 1 green:
+         light 2 red:
+         ego vehicle 0: -30,0",
+    )
+    .unwrap();
+    let plan = plan(&scenario);
+    assert_eq!(plan.groups().len(), 1);
+    let mut signals = Signals::begin(&plan, Seed(5));
+    for _ in 0..2000 {
+        signals.advance(0.5, None);
+        assert_ne!(states(&signals), [Green, Green]);
+    }
+}
+
+#[test]
+fn no_lights_no_plan() {
+    let scenario = fixture::scenario("lane 1: 0,0 40,0\nego vehicle 0: 0,0").unwrap();
+    assert!(plan(&scenario).is_empty());
+}
