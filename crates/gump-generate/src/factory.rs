@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use crate::prompt::PromptSpec;
 use crate::search::{Search, any_start};
 use crate::stage::Stage;
-use crate::verdict::{Clause, verdict};
+use crate::verdict::{Clause, through_time, verdict};
 use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
 
 /// What a factory makes.
@@ -105,8 +105,10 @@ pub fn make_many(
         let mut scenario = scene.scenario(name(number), &request.map, &[]);
         let stream = stream(number).fork(2);
         takes::extend(worlds.traffic, &mut scenario, order.seconds, stream)?;
+        let mut clauses = verdict(&scenario, &[], request.counts.as_ref());
+        through_time(&mut clauses, &scenario, request.counts.as_ref());
         Ok(Made {
-            clauses: verdict(&scenario, &[], request.counts.as_ref()),
+            clauses,
             scene,
             scenario,
             attempts: 1,
@@ -287,6 +289,7 @@ fn judged(
     };
     takes::extend(world, &mut made.scenario, seconds, stream.fork(4))?;
     made.clauses = verdict(&made.scenario, prompts, counts);
+    through_time(&mut made.clauses, &made.scenario, counts);
     Ok(made)
 }
 

@@ -3,9 +3,12 @@
 use std::fmt;
 
 use gump_metrics::{Metric as _, OffRoad, overlapping, tags};
-use gump_scene::{AgentKind, Scenario, ScenarioTag};
+use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, SceneState};
 
 use crate::Counts;
+
+/// Futures are looked at this often, seconds.
+const LOOK_S: f64 = 0.5;
 
 /// One thing that was asked for.
 #[derive(Clone, Debug, PartialEq)]
@@ -14,6 +17,19 @@ pub struct Clause {
     pub clause: String,
     /// Whether it holds; `None` if states and maps do not tell.
     pub holds: Option<bool>,
+    /// Whether it holds at every moment after the present, too; `None` of what is about an instant,
+    /// or where nothing was imagined. See [`through_time`].
+    pub holds_throughout: Option<bool>,
+}
+
+impl Clause {
+    fn new(clause: String, holds: Option<bool>) -> Self {
+        Self {
+            clause,
+            holds,
+            holds_throughout: None,
+        }
+    }
 }
 
 impl fmt::Display for Clause {
@@ -38,46 +54,65 @@ pub fn verdict(
 ) -> Vec<Clause> {
     let mut clauses: Vec<Clause> = prompts
         .iter()
-        .map(|tag| Clause {
-            clause: tag.name().into(),
-            holds: tags::holds(*tag, scenario),
-        })
+        .map(|tag| Clause::new(tag.name().into(), tags::holds(*tag, scenario)))
         .collect();
-    let present = scenario.present();
+    clauses.extend(standing(&scenario.present(), counts));
+    clauses
+}
+
+/// Says of the clauses of a [`verdict`] about numbers, overlaps and the road whether they hold
+/// throughout the scenario's future, looked at twice a second. A prompt is about an instant.
+pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<&Counts>) {
+    let stride = (LOOK_S / scenario.dt).round().max(1.0) as usize;
+    for k in (scenario.now..scenario.log.len()).step_by(stride).skip(1) {
+        let now = standing(&scenario.at(k), counts);
+        // They come last, after the prompts.
+        for (clause, now) in clauses.iter_mut().rev().zip(now.into_iter().rev()) {
+            let before = clause.holds_throughout.or(clause.holds);
+            clause.holds_throughout = before.zip(now.holds).map(|(a, b)| a && b);
+        }
+    }
+}
+
+/// Clauses that can be asked of any moment.
+fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
+    let mut clauses = Vec::new();
     for kind in AgentKind::MOVING {
         let Some(asked) = counts.map(|counts| counts.of(kind)) else {
             continue;
         };
         let agents = present.now().agents().iter();
-        let found = agents.filter(|agent| agent.kind == kind && agent.id != scenario.ego);
-        clauses.push(Clause {
-            clause: format!("{} {asked}", kind.name()),
-            holds: Some(found.count() == asked),
-        });
+        let found = agents.filter(|agent| agent.kind == kind && agent.id != present.ego);
+        let clause = format!("{} {asked}", kind.name());
+        clauses.push(Clause::new(clause, Some(found.count() == asked)));
     }
-    clauses.push(Clause {
-        clause: "nobody overlaps".into(),
-        holds: Some(overlaps(scenario) == 0),
-    });
-    clauses.push(Clause {
-        clause: "vehicles are on the road".into(),
-        holds: Some(off_road(scenario) == 0),
-    });
+    let clear = overlaps_in(present.now()) == 0;
+    clauses.push(Clause::new("nobody overlaps".into(), Some(clear)));
+    let on_road = off_road_in(present) == 0;
+    clauses.push(Clause::new(
+        "vehicles are on the road".into(),
+        Some(on_road),
+    ));
     clauses
 }
 
 /// How many agents overlap another at the present.
 pub fn overlaps(scenario: &Scenario) -> usize {
-    let present = scenario.present();
-    let frame = present.now();
+    overlaps_in(scenario.present().now())
+}
+
+fn overlaps_in(frame: &Frame) -> usize {
     let hit = |agent: &&gump_scene::Agent| overlapping(frame, agent).next().is_some();
     frame.agents().iter().filter(hit).count()
 }
 
 /// How many vehicles have a corner off the road at the present.
 pub fn off_road(scenario: &Scenario) -> usize {
-    let present = scenario.present();
-    let off = |agent: &&gump_scene::Agent| OffRoad.at(&present, agent) == Some(1.0);
+    off_road_in(&scenario.present())
+}
+
+fn off_road_in(present: &SceneState<'_>) -> usize {
+    let off = |agent: &&gump_scene::Agent| OffRoad.at(present, agent) == Some(1.0);
     present.now().agents().iter().filter(off).count()
 }
 
@@ -110,5 +145,39 @@ mod tests {
         let (yes, no) = (Some(true), Some(false));
         assert_eq!(holds, [yes, no, None, yes, no, yes, no, no]);
         assert_eq!((overlaps(&scenario), off_road(&scenario)), (2, 2));
+    }
+
+    #[test]
+    fn what_holds_now_need_not_hold_later() {
+        // In four seconds the ego has come to the one who stands.
+        let scenario = fixture::scenario(
+            "lane 1: -50,0 90,0\nego vehicle 0: 0,0 velocity 8,0\nagent vehicle 1: 36,0",
+        )
+        .unwrap();
+        let counts = Counts {
+            vehicles: 1,
+            ..Counts::default()
+        };
+        let prompts = ["high_magnitude_speed".parse::<ScenarioTag>().unwrap()];
+        let mut clauses = verdict(&scenario, &prompts, Some(&counts));
+        assert!(
+            clauses
+                .iter()
+                .all(|clause| clause.holds_throughout.is_none())
+        );
+        through_time(&mut clauses, &scenario, Some(&counts));
+        let throughout: Vec<_> = clauses.iter().map(|c| c.holds_throughout).collect();
+        let (yes, no) = (Some(true), Some(false));
+        assert_eq!(throughout, [None, yes, yes, yes, no, yes]);
+        assert_eq!(clauses[4].holds, yes);
+        let mut alone = scenario.clone();
+        alone.log.truncate(alone.now + 1);
+        let mut clauses = verdict(&alone, &[], None);
+        through_time(&mut clauses, &alone, None);
+        assert!(
+            clauses
+                .iter()
+                .all(|clause| clause.holds_throughout.is_none())
+        );
     }
 }

@@ -1,5 +1,7 @@
 //! Worlds whose lights change and whose agents come and leave.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};

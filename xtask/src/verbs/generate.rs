@@ -28,6 +28,9 @@ use crate::{futures, shipped};
 /// Scenes made together.
 const BATCH: u64 = 32;
 
+/// Slower is standing, metres per second.
+const STANDS: f64 = 0.5;
+
 /// Arguments of `generate`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
@@ -346,8 +349,26 @@ fn tell(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
     run.result("redraws", redraws)?;
     let restarts: usize = made.iter().map(|made| made.scene.restarts).sum();
     run.result("restarts", restarts)?;
+    if let Some(share) = standing_at_end(made) {
+        run.result("standing_at_end", share)?;
+    }
     run.result("clauses", clauses(made))?;
     run.result("scenes_per_second", n / elapsed.as_secs_f64().max(1e-9))
+}
+
+/// The share of vehicles that stand in the last frames of what was imagined, if anything was.
+fn standing_at_end(made: &[Made]) -> Option<f64> {
+    let imagined = made
+        .iter()
+        .filter(|made| !made.scenario.future().is_empty());
+    let last = imagined.filter_map(|made| made.scenario.log.last());
+    let speeds: Vec<f64> = last
+        .flat_map(|frame| frame.agents())
+        .filter(|agent| agent.kind == AgentKind::Vehicle)
+        .map(|agent| agent.state.speed())
+        .collect();
+    let standing = speeds.iter().filter(|speed| **speed < STANDS).count();
+    (!speeds.is_empty()).then(|| standing as f64 / speeds.len() as f64)
 }
 
 fn agents(made: &Made) -> usize {
@@ -370,9 +391,12 @@ fn clauses(made: &[Made]) -> Vec<Value> {
             .filter(|holds| **holds == Some(true))
             .count();
         let failing = verdicts.contains(&Some(false));
+        let later: Vec<Option<bool>> = made.iter().map(|m| m.clauses[i].holds_throughout).collect();
+        let is_told = later.iter().all(Option::is_some);
         json!({
             "clause": clause.clause,
             "holds": if failing { Some(false) } else { clause.holds },
+            "holds_throughout": is_told.then(|| !later.contains(&Some(false))),
             "share": holding as f64 / made.len() as f64,
         })
     };
