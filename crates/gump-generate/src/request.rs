@@ -99,7 +99,7 @@ pub struct GenerateConfig {
     /// Where objects may be drawn.
     pub placement: Placement,
     /// Whether who stands in a lane has a reason to: a light, a sign, a junction or somebody before
-    /// him (paper: no). In guided placement only.
+    /// him. In guided placement only. Scenes are less like recorded ones for it, and go on better.
     pub standing_has_reasons: bool,
     /// Draws per object before the scene is begun anew.
     pub tries: usize,
@@ -120,7 +120,6 @@ impl GenerateConfig {
             smoothing_bins: 0.0,
             smoothed_sizes: true,
             even: false,
-            standing_has_reasons: false,
             ..Self::default()
         }
     }
@@ -137,7 +136,7 @@ impl Default for GenerateConfig {
             smoothing_bins: 0.7,
             smoothed_sizes: true,
             even: true,
-            standing_has_reasons: true,
+            standing_has_reasons: false,
             top_k: 1000,
             placement: Placement::Guided,
             tries: 24,

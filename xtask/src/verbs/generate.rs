@@ -202,6 +202,8 @@ impl Args {
             temperature: self.temperature.unwrap_or(manner.temperature),
             top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
             placement: self.placement.resolve(),
+            // Whoever stands in the way for nothing is still there half a minute later.
+            standing_has_reasons: self.simulate > 0.0 && !self.paper,
             ..manner
         }
     }
@@ -396,8 +398,8 @@ fn clauses(made: &[Made]) -> Vec<Value> {
         json!({
             "clause": clause.clause,
             "holds": if failing { Some(false) } else { clause.holds },
-            "holds_throughout": is_told.then(|| !later.contains(&Some(false))),
             "share": holding as f64 / made.len() as f64,
+            "holds_throughout": is_told.then(|| !later.contains(&Some(false))),
         })
     };
     first.iter().enumerate().map(row).collect()
