@@ -45,6 +45,8 @@ const CROSSED: f64 = 0.6;
 const MOVED_M: f64 = 20.0;
 /// Who is that much farther than the window and goes away leaves, metres.
 const BEYOND_M: f64 = 12.0;
+/// Steps in which lanes are looked at, metres.
+const STEP_M: f64 = 5.0;
 /// Agents so many windows away leave, even if they stand.
 const FAR: f64 = 1.8;
 /// Who comes nearer to the end of the map leaves there, metres.
@@ -182,7 +184,9 @@ impl Flow {
         if centre.distance(self.looked_at) > MOVED_M {
             self.looked_at = centre;
             self.centres.truncate(1);
-            self.centres.push(centre);
+            if centre.distance(self.centres[0]) > MOVED_M {
+                self.centres.push(centre);
+            }
             self.gates = gates(map, &self.centres, centre, &self.config);
         }
         let others = frame.agents().iter().filter(|agent| agent.id != ego);
@@ -196,6 +200,10 @@ impl Flow {
         let mut come = Vec::new();
         for g in 0..self.gates.len() {
             let seed = self.seed.fork(self.step).fork(g as u64);
+            // Gates are older than the ego's last metres.
+            if self.gates[g].pose.position.distance(centre) < self.config.sight_m {
+                continue;
+            }
             if let Some(agent) = self.at_gate(g, map, &there, &counts, dt, &mut seed.rng()) {
                 there.push(agent);
                 come.push(agent);
@@ -233,7 +241,7 @@ impl Flow {
         let k = gate.kind;
         let is_beside = |other: &&Gate| (other.kind, other.window) == (k, gate.window);
         let same = self.gates.iter().filter(is_beside).count() as f64;
-        let usual = self.usual[k];
+        let usual = self.usual[k] * self.own_share();
         if usual == 0.0 {
             return None;
         }
@@ -276,6 +284,15 @@ impl Flow {
                 velocity: gate.pose.direction() * speed,
             },
         })
+    }
+
+    /// The share of a window that is nearer to its own middle than to the other's.
+    fn own_share(&self) -> f64 {
+        let [start, ego] = self.centres[..] else {
+            return 1.0;
+        };
+        let x = (start.distance(ego) / (2.0 * self.config.window_m)).min(1.0);
+        1.0 - (x.acos() - x * (1.0 - x * x).sqrt()) / std::f64::consts::PI
     }
 
     /// How much denser than usual traffic is at a gate now: platoons and what is between them.
@@ -437,7 +454,7 @@ fn aside(pose: Pose, left: f64) -> Pose {
 
 /// Where a lane comes into circles around these middles, or leaves them where `inward` is -1.
 fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f64> {
-    let line = &lane.centerline;
+    let line = lane.centerline.resample(STEP_M);
     let beyond = |p: DVec2| inward * (nearest(centres, p).1 - radius);
     let pairs = line.points().windows(2).zip(line.arc_lengths().windows(2));
     pairs

@@ -20,6 +20,8 @@ use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 const CREEPING: f64 = 0.5;
 /// How far a front bumper may be over a line before it is passed, metres.
 const OVER_M: f64 = 0.5;
+/// Lines of one junction lie within this, metres.
+const ONE_LINE_M: f64 = 4.0;
 /// A way that turns right by more is a right turn, radians.
 const RIGHT: f64 = 0.52;
 /// Who is slower may turn right at red, metres per second.
@@ -80,6 +82,12 @@ impl StopLine {
         lights.iter().filter_map(of).collect()
     }
 
+    /// Metres that the front bumper of somebody has before it may be no farther.
+    fn room(&self, now: &Shown) -> f64 {
+        let local = self.line.inverse() * now.pose.position;
+        -local.x - now.body.length / 2.0 + OVER_M
+    }
+
     /// Whether the front bumper of somebody comes over the line by this move, or cannot be held before
     /// it any more after it.
     fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
@@ -94,12 +102,40 @@ impl StopLine {
     }
 }
 
+/// The lines that somebody comes over by a move: the nearest ones, since those behind them are
+/// another junction's.
+fn crossed<'l>(
+    now: &Shown,
+    step: Pose,
+    lines: &[(&'l StopLine, LightState)],
+) -> Vec<(&'l StopLine, LightState)> {
+    let mut all: Vec<_> = lines.to_vec();
+    all.retain(|(line, _)| line.is_crossed(now, step));
+    let nearest = all.iter().map(|(line, _)| line.room(now));
+    let nearest = nearest.fold(f64::INFINITY, f64::min);
+    all.retain(|(line, _)| line.room(now) < nearest + ONE_LINE_M);
+    all
+}
+
+/// The same move by somebody who brakes as hard as he has to, to stand after so many metres.
+fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
+    let (speed, length) = (now.velocity().length(), step.position.length());
+    let braking = (speed * speed / (2.0 * room.max(0.1))).min(HARDEST);
+    let slower = (speed - braking * TOKEN_DT).max(0.0);
+    if length < 1e-6 || slower < CREEPING {
+        return Pose::IDENTITY;
+    }
+    let metres = (slower * TOKEN_DT).min(room.max(0.0));
+    Pose::IDENTITY.interpolate(step, (metres / length).min(1.0))
+}
+
 /// Whether somebody who makes this move runs a red light: every line that he comes over is shut.
-fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
+pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
     let stopped = now.velocity().length() < TURNS_AT_RED;
-    let crossed = lines.iter().filter(|(line, _)| line.is_crossed(now, step));
-    let mut shut =
-        crossed.map(|(line, state)| *state == LightState::Red && !(line.is_right && stopped));
+    let crossed = crossed(now, step, lines);
+    let mut shut = crossed
+        .iter()
+        .map(|(line, state)| *state == LightState::Red && !(line.is_right && stopped));
     let first = shut.next();
     first.is_some_and(|first| first && shut.all(|shut| shut))
 }
@@ -142,19 +178,11 @@ pub(super) fn heed(
         let speed = now.velocity().length();
         let stands = speed < CREEPING;
         // Whoever cannot stop before the line any more goes on.
-        let ahead = lines
-            .iter()
-            .filter(|(line, _)| line.is_crossed(now, moves[i]));
-        let room = ahead.map(|(line, _)| {
-            let local = line.line.inverse() * now.pose.position;
-            -local.x - now.body.length / 2.0 + OVER_M
-        });
+        let ahead = crossed(now, moves[i], lines);
+        let room = ahead.iter().map(|(line, _)| line.room(now));
         let room = room.fold(f64::INFINITY, f64::min);
         if stands || speed * speed / (2.0 * HARDEST) <= room {
-            moves[i] = match braking(now, moves[i]) {
-                Some((step, _)) => step,
-                None => Pose::IDENTITY,
-            };
+            moves[i] = slowed(now, moves[i], room);
         }
     }
 }
@@ -346,6 +374,36 @@ mod tests {
         let red = [(&right, LightState::Red)];
         assert_eq!(settled(car(0.0, 0.5), 4.0, &red, 1.0), 4.0);
         assert_eq!(settled(car(0.0, 2.0), 4.0, &red, 1.0), 1.0);
+    }
+
+    #[test]
+    fn who_sees_red_in_time_stands_before_the_line() {
+        for speed in [6.0, 10.0, 13.0, 16.0] {
+            for start in [30.0, 33.0, 36.0, 39.0, 42.0, 60.0] {
+                let line = StopLine {
+                    lane: LaneId(1),
+                    line: Pose::new(start, 0.0, 0.0),
+                    width: 3.5,
+                    is_right: false,
+                };
+                let green = StopLine {
+                    line: Pose::new(start + 12.0, 0.0, 0.0),
+                    ..line.clone()
+                };
+                let lights = [(&line, LightState::Red), (&green, LightState::Green)];
+                let mut now = car(0.0, speed * TOKEN_DT);
+                // It always wants to go on as fast.
+                for _ in 0..40 {
+                    let mut moves = [straight(speed * TOKEN_DT)];
+                    let mut again = |_: &[usize], _: usize| vec![straight(speed * TOKEN_DT)];
+                    heed(&[now], None, &lights, 2, &mut moves, &mut again);
+                    now = now.then(now.pose * moves[0]);
+                }
+                let front = now.pose.position.x + 2.0;
+                let range = start - 4.0..=start + OVER_M;
+                assert!(range.contains(&front), "{speed} m/s, {start} m: {front}");
+            }
+        }
     }
 
     #[test]

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
-use crate::relative::rules::{StopLine, heed, held_back, settle};
+use crate::relative::rules::{StopLine, heed, held_back, runs_red, settle};
 use crate::relative::seen::{Seen, presents};
 use crate::sampling::SamplingConfig;
 
@@ -244,9 +244,12 @@ pub(super) struct Scene {
 impl Scene {
     fn new(engine: &Engine, scene: SceneState<'_>, sampling: &RelativeSampling) -> Self {
         let centre = scene.ego_now().state.pose.position;
-        let lights = scene.now().lights();
+        // Lights that are not seen at the present may be shown later.
+        let seen = scene.history.iter().flat_map(Frame::lights);
+        let seen: BTreeMap<_, _> = seen.map(|light| (light.lane, *light)).collect();
+        let lights: Vec<Light> = seen.into_values().collect();
         let source = Arc::clone(scene.map);
-        Self::around(engine, source, centre, (scene.ego, lights), sampling)
+        Self::around(engine, source, centre, (scene.ego, &lights), sampling)
     }
 
     fn around(
@@ -504,7 +507,17 @@ impl Future {
         });
         let lines: Vec<_> = lines.collect();
         heed(&agents, driven, &lines, redraws, &mut moves, &mut again);
-        settle(&agents, driven, survey, redraws, &mut moves, &mut again);
+        // Nobody comes to run a red light by keeping clear of somebody.
+        let kept = moves.clone();
+        let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let drawn = who.iter().zip(again(who, attempt));
+            let held = drawn.map(|(&i, step)| match runs_red(&agents[i], step, &lines) {
+                true => kept[i],
+                false => step,
+            });
+            held.collect()
+        };
+        settle(&agents, driven, survey, redraws, &mut moves, &mut lawful);
         moves
     }
 
@@ -549,11 +562,14 @@ impl Future {
     /// Shows these lights in the next frame.
     fn show(&mut self, lights: &[Light]) {
         self.lights = lights.to_vec();
+        // Looked up by lane.
+        self.lights.sort_by_key(|light| light.lane);
         let before = std::mem::take(&mut self.shown_lights.by_lane);
         let shown = lights.iter().map(|light| {
             let known = before.iter().find(|(lane, ..)| *lane == light.lane);
             let elapsed = match known {
                 Some(&(_, state, elapsed)) if state == light.state => elapsed,
+                Some((_, LightState::Unknown, _)) => None,
                 // None has passed once that frame is there.
                 Some(_) => Some(-TOKEN_DT),
                 None => None,

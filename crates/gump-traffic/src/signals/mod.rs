@@ -78,10 +78,14 @@ impl Signals {
             fading: vec![0.0; plan.lights.len()],
             shown: plan.lights.clone(),
         };
-        // Whoever is green against the phase that was found turns yellow first.
+        // Whoever is green or yellow against the phase that was found is yellow first.
         let planned = this.colours();
         for (light, state) in planned {
-            if this.shown[light].state == LightState::Green && state == LightState::Red {
+            let was_open = matches!(
+                this.shown[light].state,
+                LightState::Green | LightState::Yellow
+            );
+            if was_open && state == LightState::Red {
                 this.fading[light] = timing::yellow_s(0.0);
             }
         }

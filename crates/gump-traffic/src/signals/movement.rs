@@ -22,6 +22,11 @@ const NEAR_M: f64 = 8.0;
 const STEP_M: f64 = 4.0;
 /// How far before its line somebody waits for a light or comes up to it, metres.
 const WAITING_M: f64 = 45.0;
+/// Most lanes that are looked at for those who come.
+const MOST_LANES: usize = 32;
+/// What is shorter behind a line on a lane that leads up to a junction is not the way through it,
+/// metres.
+const STUB_M: f64 = 15.0;
 /// How far beside the middle of a lane he may be, metres.
 const BESIDE_M: f64 = 2.5;
 
@@ -57,18 +62,20 @@ impl Movement {
     /// What a light of this lane rules.
     pub(super) fn of(map: &MapGraph, lane: &Lane, light: &Light) -> Self {
         let line = stop_line(lane, light);
-        let ways = ways_beyond(map, lane, line);
+        let ways = ways(map, lane, line);
         let turns_left = |way: &Polyline| turn_of(way) > TURN;
         let shares = |lane: &Lane| {
             let before = map.predecessors(lane.id);
             let mut beside = before.flat_map(|lane| map.successors(lane.id));
             beside.any(|lane| !turns_left(&lane.centerline))
         };
+        // A light of a lane that leads up to the junction rules all of its ways.
+        let starts_there = lane.centerline.project(line.position).arc_length < 2.0;
         let is_left = !ways.is_empty() && ways.iter().all(turns_left);
         Self {
             line,
             approaches: approaches(map, lane, line),
-            is_left_only: is_left && !shares(lane),
+            is_left_only: is_left && !(starts_there && shares(lane)),
             limit: lane.speed_limit.unwrap_or(TYPICAL_SPEED_LIMIT),
             is_for_bicycles: lane.kind == LaneKind::BikeLane,
             ways,
@@ -126,7 +133,8 @@ impl Movement {
 
     /// Whether somebody at this place waits for the light or comes up to it.
     pub(super) fn is_asked_for_by(&self, at: Pose) -> bool {
-        if at.position.distance(self.line.position) > WAITING_M + BESIDE_M {
+        let is_far = at.position.distance(self.line.position) > WAITING_M + BESIDE_M;
+        if is_far && !self.approaches.is_empty() {
             return false;
         }
         let comes = |way: &Polyline| {
@@ -134,7 +142,8 @@ impl Movement {
             let along = way.pose_at(foot.arc_length).heading;
             foot.distance < BESIDE_M && angle_difference(at.heading, along).abs() < 1.0
         };
-        self.approaches.iter().any(comes)
+        // Where nothing leads to it, who waits is not on the map.
+        self.approaches.is_empty() || self.approaches.iter().any(comes)
     }
 }
 
@@ -152,15 +161,40 @@ fn approaches(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
     if at > 1.0 {
         all.push(centre.slice((at - WAITING_M).max(0.0), at));
     }
-    let missing = WAITING_M - at;
-    if missing > 1.0 {
+    let mut open = vec![(lane, WAITING_M - at)];
+    for _ in 0..MOST_LANES {
+        let Some((lane, missing)) = open.pop() else {
+            break;
+        };
+        if missing <= 1.0 {
+            continue;
+        }
         for before in map.predecessors(lane.id) {
             let end = before.centerline.length();
             let from = (end - missing).max(0.0);
-            if end - from > 0.5 {
+            if end - from > 0.1 {
                 all.push(before.centerline.slice(from, end));
             }
+            open.push((before, missing - end));
         }
     }
     all
+}
+
+/// Where traffic goes that has passed a line; through the junction, where the line is some metres
+/// before the end of a lane that leads up to it.
+fn ways(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
+    let ways = ways_beyond(map, lane, line);
+    let is_stub = |way: &Polyline| way.length() < STUB_M && !lane.in_intersection;
+    let [rest] = ways.as_slice() else {
+        return ways;
+    };
+    if !is_stub(rest) || map.successors(lane.id).next().is_none() {
+        return ways;
+    }
+    let longer = map.successors(lane.id).filter_map(|next| {
+        let points = rest.points().iter().chain(next.centerline.points());
+        Polyline::new(points.copied().collect())
+    });
+    longer.collect()
 }

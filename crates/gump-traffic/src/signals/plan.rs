@@ -334,8 +334,11 @@ impl<'a> Draft<'a> {
         let shows = |group: usize, state| self.now(group) == state;
         let mut open = Vec::new();
         self.fill(&mut open, (0..n).filter(|&g| shows(g, LightState::Green)));
-        let is_yellow = (0..n).any(|g| shows(g, LightState::Yellow));
-        self.fill(&mut open, (0..n).filter(|&g| shows(g, LightState::Yellow)));
+        // Yellow beside green is the end of another phase, which fades.
+        let is_yellow = open.is_empty() && (0..n).any(|g| shows(g, LightState::Yellow));
+        if is_yellow {
+            self.fill(&mut open, (0..n).filter(|&g| shows(g, LightState::Yellow)));
+        }
         let lit = open.clone();
         if !open.is_empty() {
             // Whose lights are not seen goes with the road that is open.
@@ -362,20 +365,19 @@ impl<'a> Draft<'a> {
             phases.push(self.phase(&set));
         }
         let is_shut = phases[0].green.iter().all(|green| !green);
-        let ages = self.lights.iter().map(|&light| self.seen.age(light));
-        let least = ages.map(|age| match age {
-            Age::Exactly(age) | Age::AtLeast(age) => age,
-        });
-        let least = least.fold(f64::INFINITY, f64::min);
         // Red for a moment only is between two phases; for longer, somebody else is served.
-        let just_now = self
-            .lights
-            .iter()
-            .any(|&l| matches!(self.seen.age(l), Age::Exactly(_)))
-            && least < super::timing::CLEARANCE_S;
+        let just_now = self.lights.iter().any(|&light| {
+            let age = self.seen.age(light);
+            matches!(age, Age::Exactly(age) if age < super::timing::CLEARANCE_S)
+        });
+        let is_known = (0..n).any(|g| !shows(g, LightState::Unknown));
+        let is_between = is_shut && (just_now || !is_known) && phases.len() > 1;
+        if is_between {
+            phases.remove(0);
+        }
         let stage = if is_yellow {
             Begun::Yellow
-        } else if is_shut && just_now && phases.len() > 1 {
+        } else if is_between && is_known {
             Begun::Red
         } else {
             let green = (0..n).filter(|&g| phases[0].green[g] || is_shut);
@@ -397,8 +399,12 @@ impl<'a> Draft<'a> {
         Junction {
             yellow: yellow_s(limits.fold(0.0, f64::max)),
             groups: self.groups,
+            // Between two phases the next one is the first.
+            phase: match stage {
+                Begun::Red => phases.len() - 1,
+                _ => 0,
+            },
             phases,
-            phase: 0,
             stage,
         }
     }

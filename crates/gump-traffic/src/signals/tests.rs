@@ -241,3 +241,49 @@ fn no_lights_no_plan() {
     let scenario = fixture::scenario("lane 1: 0,0 40,0\nego vehicle 0: 0,0").unwrap();
     assert!(plan(&scenario).is_empty());
 }
+
+#[test]
+fn lines_before_the_end_of_a_lane_are_of_the_junction_behind() {
+    let mut scenario = fixture::scenario(
+        "lane 1: -60,0 -8,0 next 3
+         lane 2: 0,-60 0,-8 next 4
+         lane 3: -8,0 60,0
+         lane 4: 0,-8 0,60
+         light 1 green: -11,0
+         light 2 red: 0,-11
+         ego vehicle 0: -30,0",
+    )
+    .unwrap();
+    assert_eq!(plan(&scenario).groups().len(), 1);
+    // Red since a moment ago: another phase is next, and none without green takes turns.
+    let now = scenario.now;
+    let mut lights = scenario.log[now].lights().to_vec();
+    lights[0].state = Red;
+    scenario.log[now] = Frame::new(scenario.log[now].agents().to_vec(), lights);
+    let mut signals = Signals::begin(&plan(&scenario), Seed(1));
+    let mut dark = 0;
+    for _ in 0..400 {
+        signals.advance(0.5, None);
+        dark = match states(&signals) == [Red, Red] {
+            true => dark + 1,
+            false => 0,
+        };
+        assert!(dark <= 4, "all are red for {dark} half seconds");
+    }
+}
+
+#[test]
+fn yellow_beside_green_ends_alone() {
+    let plan = plan(&crossing(["green", "red", "red", "red", "yellow"]));
+    for seed in 0..20 {
+        let mut signals = Signals::begin(&plan, Seed(seed));
+        signals.advance(0.5, Some(&everywhere()));
+        assert!(matches!(states(&signals)[4], Yellow | Red));
+        let stays = (0..20).all(|seed| {
+            let mut signals = Signals::begin(&plan, Seed(seed));
+            signals.advance(0.1, Some(&everywhere()));
+            states(&signals)[0] == Green
+        });
+        assert!(stays);
+    }
+}

@@ -59,6 +59,7 @@ pub(super) fn open<'a>(
                 drivers: drivers.collect(),
                 frame: now.clone(),
                 obstacles: Vec::new(),
+                next_lights: None,
                 seed,
                 n_handovers: 0,
             }
@@ -81,6 +82,8 @@ pub(super) struct Traffic<'a> {
     drivers: Vec<Driver>,
     frame: Frame,
     obstacles: Vec<Obstacle>,
+    /// What lights show in the next frame, if that is told.
+    next_lights: Option<Vec<Light>>,
     seed: Seed,
     n_handovers: u64,
 }
@@ -138,10 +141,7 @@ impl Traffic<'_> {
 
 impl Future for Traffic<'_> {
     fn show(&mut self, lights: &[Light]) -> bool {
-        for driver in &mut self.drivers {
-            driver.show(lights);
-        }
-        self.frame = Frame::new(self.frame.agents().to_vec(), lights.to_vec());
+        self.next_lights = Some(lights.to_vec());
         true
     }
 
@@ -191,7 +191,16 @@ impl Future for Traffic<'_> {
                 _ => agent.with_state(driver.step(agent, &self.obstacles, i, ground, self.dt)),
             });
         }
-        self.frame = Frame::new(agents, self.frame.lights().to_vec());
+        let lights = match self.next_lights.take() {
+            Some(lights) => {
+                self.drivers
+                    .iter_mut()
+                    .for_each(|driver| driver.show(&lights));
+                lights
+            }
+            None => self.frame.lights().to_vec(),
+        };
+        self.frame = Frame::new(agents, lights);
         self.frame.clone()
     }
 }
