@@ -17,7 +17,9 @@ use rand::Rng as _;
 
 /// Simulated seconds before the first window, so that queues have formed.
 const WARMUP_S: f64 = 60.0;
-/// Windows of nine seconds per run.
+/// How long scenes go on after their present unless told otherwise, seconds.
+pub(crate) const FUTURE_S: f64 = 8.0;
+/// Windows per run.
 const WINDOWS: usize = 6;
 /// Seconds between two windows: scenes of one run shall differ.
 const PAUSE_S: f64 = 5.0;

@@ -223,8 +223,8 @@ impl World {
     }
 }
 
-/// One world for many scenarios: loaded once, but for the log, which is another world in every
-/// scenario.
+/// One world for many scenarios: loaded once, but for what is another world in every scenario, the
+/// log and lights as they were recorded.
 pub struct Worlds<'a> {
     device: Device,
     name: &'a WorldName,

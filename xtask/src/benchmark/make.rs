@@ -15,10 +15,8 @@ use super::recorded::sha256;
 use super::{List, Made};
 use crate::progress::Progress;
 use crate::run::stop_if_interrupted;
-use crate::sumo::{Place, Sumo};
+use crate::sumo::{FUTURE_S, Place, Sumo};
 
-/// How long scenes of SUMO go on after their present, seconds.
-const FUTURE_S: f64 = 8.0;
 /// So many runs of SUMO more than are needed mean that there is no room to drive.
 const SPARE_RUNS: u64 = 200;
 

@@ -14,7 +14,7 @@ use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::fresh::profile_of_name;
 use crate::run::{self, Common, Run};
-use crate::sumo::{self, Sumo};
+use crate::sumo::{self, FUTURE_S, Sumo};
 
 /// Files to spread scenes over; fewer if there are fewer scenes.
 const SHARDS: usize = 8;
@@ -40,8 +40,8 @@ pub(crate) struct Args {
     /// Multiplies the number of agents, 0.1 to 3
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     density: f64,
-    /// How long scenes go on after their present, seconds, 1 to 600
-    #[arg(long, value_name = "X", default_value_t = 8.0)]
+    /// For --kind sumo: how long scenes go on after their present, seconds, 1 to 600
+    #[arg(long, value_name = "X", default_value_t = FUTURE_S)]
     seconds: f64,
     /// The kind of road, for instance "roundabout" [default: any]
     #[arg(long, value_name = "NAME", value_parser = road_family)]
@@ -104,6 +104,8 @@ impl Args {
         }
         let why = match self.kind {
             Kind::Procedural if self.network.is_some() => "--network is for --kind sumo",
+            // In few drawn places anybody drives on for longer, so the ego could leave its scene.
+            Kind::Procedural if self.seconds != FUTURE_S => "--seconds is for --kind sumo",
             Kind::Sumo if self.family.is_some() => "--family is for --kind procedural",
             Kind::Sumo if self.profile != Profile::Plain || self.cache || self.clean => {
                 "--profile, --cache and --clean are for --kind procedural"
@@ -123,7 +125,6 @@ impl Args {
     fn procedural(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
         let config = SynthesisConfig {
             density: self.density,
-            future_s: self.seconds,
             family: self.family,
             ..self.profile.config()
         };
