@@ -8,6 +8,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, Command};
 use gump_eval::planners::{PlannerConfig, PlannerName};
+use gump_planner::{Aggregate, Allocation};
 use serde::{Serialize, Serializer};
 
 use crate::cli::WrongArguments;
@@ -130,12 +131,38 @@ fn remote(told: &str) -> Result<Chosen, String> {
     }
 }
 
+/// [`Allocation`] as an argument.
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum AllocationName {
+    /// All futures of all candidates
+    Uniform,
+    /// One future of all candidates, further ones of the better half, and so on
+    Halving,
+}
+
+/// [`Aggregate`] as an argument.
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum AggregateName {
+    /// The mean of its futures
+    Mean,
+    /// The worst of its futures
+    Worst,
+}
+
 /// How planners that imagine do it.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct ImaginationArgs {
     /// Futures that imagining planners see
     #[arg(long, value_name = "N", default_value_t = 4)]
     futures: usize,
+    /// Which candidates the interactive planner imagines how often
+    #[arg(long, value_enum, default_value_t = AllocationName::Halving)]
+    allocation: AllocationName,
+    /// What a candidate of the interactive planner is worth
+    #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
+    aggregate: AggregateName,
     /// Agents that are imagined, those nearest to the ego
     #[arg(long, value_name = "N", default_value_t = 12)]
     nearest: usize,
@@ -167,6 +194,14 @@ impl ImaginationArgs {
         };
         Ok(PlannerConfig {
             futures: self.futures,
+            allocation: match self.allocation {
+                AllocationName::Uniform => Allocation::Uniform,
+                AllocationName::Halving => Allocation::Halving,
+            },
+            aggregate: match self.aggregate {
+                AggregateName::Mean => Aggregate::Mean,
+                AggregateName::Worst => Aggregate::Worst,
+            },
             nearest: self.nearest,
             horizon: self.horizon,
             wall,

@@ -14,8 +14,8 @@ use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traf
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{
-    Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
-    NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
+    Aggregate, Allocation, Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig,
+    LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
 };
 use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
@@ -148,6 +148,10 @@ impl Serialize for PlannerName {
 pub struct PlannerConfig {
     /// Futures that imagining planners see.
     pub futures: usize,
+    /// Which candidates of the interactive planner are imagined how often.
+    pub allocation: Allocation,
+    /// How it makes one value of the futures of a candidate.
+    pub aggregate: Aggregate,
     /// Agents that are imagined, those nearest to the ego.
     pub nearest: usize,
     /// Seconds that the interactive planner imagines.
@@ -164,6 +168,8 @@ impl Default for PlannerConfig {
     fn default() -> Self {
         Self {
             futures: 4,
+            allocation: Allocation::default(),
+            aggregate: Aggregate::default(),
             nearest: 12,
             horizon: 4.0,
             wall: None,
@@ -185,6 +191,8 @@ impl PlannerConfig {
     ) -> Result<InteractiveDriver<'w>, EvalError> {
         let config = InteractiveDriverConfig {
             n_futures: self.futures,
+            allocation: self.allocation,
+            aggregate: self.aggregate,
             seed,
             replan_every: self.replan_every,
             worth: self

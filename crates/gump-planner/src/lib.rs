@@ -94,8 +94,8 @@ pub use compare::{Comparison, PolicyValue, ValueConfig, value_policies};
 pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, SimpleDriver};
 pub use error::PlanError;
 pub use interactive::{
-    CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig, Phases, PlanBudget,
-    Prospect, Worth,
+    Aggregate, Allocation, CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig,
+    Phases, PlanBudget, Prospect, Worth,
 };
 pub use pdm::{PdmClosed, PdmConfig, PdmScore};
 pub use proposal::{Proposal, ProposalKind};

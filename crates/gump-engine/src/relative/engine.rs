@@ -97,12 +97,17 @@ pub struct Workspace {
     scores: Vec<f32>,
 }
 
-/// An agent of the frame that is computed.
+/// An agent of a frame that is computed.
 pub struct Present<'a> {
     pub(super) numbers: [f32; NODE_NUMBERS],
     pub(super) past: Vec<[f32; EDGE_NUMBERS]>,
+    /// Neighbours are counted among all agents that are computed together.
     pub(super) view: View,
     pub(super) memory: &'a mut AgentMemory,
+    /// The map that its view is of.
+    pub(super) map: &'a MapMemory,
+    /// Which frame of its future it is.
+    pub(super) t: usize,
 }
 
 /// How draws are made.
@@ -186,6 +191,11 @@ impl Engine {
         })
     }
 
+    /// Numbers of a hidden vector.
+    pub(super) fn width(&self) -> usize {
+        self.config.width
+    }
+
     fn heads_of(&self) -> Heads {
         Heads {
             n: self.config.heads,
@@ -222,15 +232,9 @@ impl Engine {
         AgentMemory(vec![0.0; self.layers.len() * KEPT * 2 * self.config.width])
     }
 
-    /// Reads frame `t`: the hidden vectors of its agents, `[agents, C]`, into `out`.
-    pub fn read(
-        &self,
-        agents: &mut [Present<'_>],
-        t: usize,
-        map: &MapMemory,
-        room: &mut Workspace,
-        out: &mut Vec<f32>,
-    ) {
+    /// Reads frames, of one future or of several: the hidden vectors of their agents, `[agents, C]`,
+    /// into `out`. A row does not depend on what is computed beside it, to the bit.
+    pub fn read(&self, agents: &mut [Present<'_>], room: &mut Workspace, out: &mut Vec<f32>) {
         let (c, f, heads) = (self.config.width, self.config.edge_width, self.heads_of());
         let n = agents.len();
         room.raw.clear();
@@ -278,7 +282,8 @@ impl Engine {
                 .apply(&room.normed, &mut room.wide, &mut room.panels);
             let rows = room.wide.chunks_exact(2 * c);
             for (agent, row) in agents.iter_mut().zip(rows) {
-                agent.memory.0[(l * KEPT + t % KEPT) * 2 * c..][..2 * c].copy_from_slice(row);
+                let t = agent.t % KEPT;
+                agent.memory.0[(l * KEPT + t) * 2 * c..][..2 * c].copy_from_slice(row);
             }
             room.queries.resize(n * attended, 0.0);
             layer
@@ -286,7 +291,7 @@ impl Engine {
                 .apply(&room.normed, &mut room.queries, &mut room.panels);
             room.attended.resize(n * attended, 0.0);
             for (i, agent) in agents.iter().enumerate() {
-                let (past, view) = (agent.past.len(), &agent.view);
+                let (past, view, t) = (agent.past.len(), &agent.view, agent.t);
                 let near = past + view.neighbours.len();
                 let at = |agent: usize, t: usize| {
                     &agents[agent].memory.0[(l * KEPT + t % KEPT) * 2 * c..][..2 * c]
@@ -298,7 +303,7 @@ impl Engine {
                         at(view.neighbours[e - past].0, t)
                     } else {
                         let piece = view.pieces[e - near].0 as usize;
-                        &map.layers[l][piece * 2 * c..][..2 * c]
+                        &agent.map.layers[l][piece * 2 * c..][..2 * c]
                     }
                 };
                 let first = firsts[i];

@@ -4,7 +4,7 @@ use gump_geometry::{DVec2, Pose};
 use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
 use gump_model::relative::map::VectorMap;
 
-use crate::relative::engine::{AgentMemory, Engine, KEPT, Present};
+use crate::relative::engine::{AgentMemory, Engine, KEPT, MapMemory, Present};
 
 /// An agent as it has been seen.
 #[derive(Clone, Debug)]
@@ -43,23 +43,29 @@ impl Seen {
     }
 }
 
-/// What the network reads of the agents of a frame.
-pub fn presents<'a>(
-    map: &VectorMap,
+/// Adds what the network reads of the agents of a frame, frame `t` of a future.
+pub fn add_presents<'a>(
+    (map, memory): (&VectorMap, &'a MapMemory),
     lights: &Lights,
     seen: impl Iterator<Item = &'a mut Seen>,
-) -> Vec<Present<'a>> {
+    t: usize,
+    presents: &mut Vec<Present<'a>>,
+) {
+    let first = presents.len();
     let seen: Vec<&mut Seen> = seen.collect();
     let agents: Vec<Shown> = seen.iter().map(|seen| seen.now()).collect();
-    let present = seen.into_iter().enumerate().map(|(i, seen)| {
+    presents.extend(seen.into_iter().enumerate().map(|(i, seen)| {
         let now = &agents[i];
         let past = seen.shown.iter().rev().take(PAST + 1).enumerate();
+        let mut view = look(map, lights, &agents, i);
+        view.neighbours.iter_mut().for_each(|(j, _)| *j += first);
         Present {
             numbers: now.numbers(),
             past: past.map(|(ago, then)| past_edge(now, then, ago)).collect(),
-            view: look(map, lights, &agents, i),
+            view,
             memory: &mut seen.memory,
+            map: memory,
+            t,
         }
-    });
-    present.collect()
+    }));
 }

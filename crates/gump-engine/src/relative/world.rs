@@ -18,7 +18,7 @@ use gump_model::ModelError;
 use gump_model::local_context::Survey;
 use gump_model::relative::RelativeWeights;
 use gump_model::relative::graph::{Body, Lights, Shown};
-use gump_model::relative::grid::dequantize;
+use gump_model::relative::grid::{FIELDS, dequantize};
 use gump_model::relative::map::{Hidden, VectorMap};
 use gump_model::steps::TOKEN_DT;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
 use crate::relative::rules::{StopLine, heed, held_back, runs_red, settle};
-use crate::relative::seen::{Seen, presents};
+use crate::relative::seen::{Seen, add_presents};
 use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
@@ -59,6 +59,10 @@ const FOLLOW_M: f64 = 180.0;
 /// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1
 /// somebody on foot now and then shoots off. Chosen on the tuning set (result 19).
 const TOP_P: f64 = 0.95;
+
+/// Futures that are computed together at most: beyond that the weights are fetched rarely enough,
+/// and what is computed no longer fits a core's cache.
+const TOGETHER: usize = 8;
 
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
@@ -182,15 +186,21 @@ impl RelativeWorld {
         self.passes.load(Ordering::Relaxed)
     }
 
-    /// The futures of a start, with the scene they share.
-    fn begin(&self, start: &Start<'_>) -> Result<(Arc<Scene>, Vec<Future>), ModelError> {
-        let scene = Arc::new(Scene::new(&self.engine, start.scene, &self.sampling));
-        let first = Future::begin(&self.engine, &scene, start.scene)?;
-        let futures = (0..start.n_futures).map(|k| Future {
-            seed: start.seed.fork(k as u64),
+    /// The futures of starts from one scene, which share it.
+    fn begin(&self, starts: &[Start<'_>]) -> Result<Vec<Future>, ModelError> {
+        let Some(first) = starts.first() else {
+            return Ok(Vec::new());
+        };
+        let scene = Arc::new(Scene::new(&self.engine, first.scene, &self.sampling));
+        let first = Future::begin(&self.engine, &scene, first.scene)?;
+        let seeds = starts
+            .iter()
+            .flat_map(|start| (0..start.n_futures).map(|k| start.seed.fork(k as u64)));
+        let futures = seeds.map(|seed| Future {
+            seed,
             ..first.clone()
         });
-        Ok((Arc::clone(&scene), futures.collect()))
+        Ok(futures.collect())
     }
 }
 
@@ -217,14 +227,24 @@ impl WorldModel for RelativeWorld {
     }
 
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
-        let begun = starts.par_iter().map(|start| self.begin(start));
+        // Planners open the same scene for each of their candidates: it is read once.
+        let groups: Vec<&[Start<'_>]> = starts.chunk_by(is_same_scene).collect();
+        let begun = groups.par_iter().map(|group| self.begin(group));
         let begun: Vec<_> = begun.collect::<Result<_, _>>()?;
         Ok(Box::new(RelativeSession {
             world: self,
-            futures: begun.into_iter().flat_map(|(_, futures)| futures).collect(),
+            futures: begun.into_iter().flatten().collect(),
             step: 0,
         }))
     }
+}
+
+/// Whether two starts show the same frames of the same map: the same slices, not equal ones.
+fn is_same_scene(a: &Start<'_>, b: &Start<'_>) -> bool {
+    let (a, b) = (a.scene, b.scene);
+    std::ptr::eq(a.history, b.history)
+        && Arc::ptr_eq(a.map, b.map)
+        && (a.ego, a.dt) == (b.ego, b.dt)
 }
 
 /// What all futures of a start share.
@@ -369,12 +389,30 @@ impl Future {
 
     /// Lets the network read the present.
     fn read(&mut self, engine: &Engine, room: &mut Workspace) {
-        let (map, lights) = (&self.scene.map, &self.shown_lights);
-        let seen = self.members.iter_mut().map(|member| &mut member.seen);
-        let mut present = presents(map, lights, seen);
-        let t = self.frames;
-        engine.read(&mut present, t, &self.scene.memory, room, &mut self.hidden);
-        self.frames += 1;
+        Self::read_all(std::slice::from_mut(self), engine, room);
+    }
+
+    /// Lets the network read the present of several futures at once: its weights are then fetched
+    /// once for all of them.
+    fn read_all(futures: &mut [Self], engine: &Engine, room: &mut Workspace) {
+        let mut presents = Vec::new();
+        for future in &mut *futures {
+            let (scene, lights) = (&future.scene, &future.shown_lights);
+            let seen = future.members.iter_mut().map(|member| &mut member.seen);
+            let map = (&scene.map, &scene.memory);
+            add_presents(map, lights, seen, future.frames, &mut presents);
+        }
+        let mut hidden = Vec::new();
+        engine.read(&mut presents, room, &mut hidden);
+        let c = engine.width();
+        let mut rows = &hidden[..];
+        for future in futures {
+            let (own, rest) = rows.split_at(future.members.len() * c);
+            future.hidden.clear();
+            future.hidden.extend_from_slice(own);
+            future.frames += 1;
+            rows = rest;
+        }
     }
 
     /// Lets it read the present again, after others have come or gone.
@@ -397,17 +435,30 @@ impl Future {
         }
     }
 
-    /// Goes on by half a second.
-    fn step(
-        &mut self,
+    /// Several futures go on by half a second; the network computes them together, so that its
+    /// weights are fetched once for all of them.
+    fn step_all(
+        futures: &mut [Self],
         engine: &Engine,
         sampling: &RelativeSampling,
-        ego: Option<AgentState>,
+        egos: Option<&[AgentState]>,
         room: &mut Workspace,
     ) {
-        let moves = self.decide(engine, sampling, ego, room);
-        self.go(engine, &moves, ego, room);
-        self.follow(engine, sampling);
+        let ego = |i: usize| egos.map(|egos| egos[i]);
+        let streams: Vec<Vec<Seed>> = futures.iter().map(Self::streams).collect();
+        let hidden: Vec<f32> = futures.iter().flat_map(|f| &f.hidden).copied().collect();
+        let drawn = engine.decide(&hidden, &streams.concat(), sampling.draw(), room);
+        let mut drawn = &drawn[..];
+        for (i, (future, streams)) in futures.iter_mut().zip(&streams).enumerate() {
+            let (own, rest) = drawn.split_at(streams.len());
+            let moves = future.moves(engine, sampling, (streams, own), ego(i), room);
+            future.go(&moves, ego(i));
+            drawn = rest;
+        }
+        Self::read_all(futures, engine, room);
+        for future in futures {
+            future.follow(engine, sampling);
+        }
     }
 
     /// What everyone will do in the next half second, if the ego does what is given.
@@ -418,20 +469,21 @@ impl Future {
         ego: Option<AgentState>,
         room: &mut Workspace,
     ) -> Vec<Pose> {
-        let seed = self.seed.fork(self.frames as u64);
-        let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
-        let streams: Vec<Seed> = self.members.iter().map(stream).collect();
-        self.moves(engine, sampling, &streams, ego, room)
+        let streams = self.streams();
+        let drawn = engine.decide(&self.hidden, &streams, sampling.draw(), room);
+        self.moves(engine, sampling, (&streams, &drawn), ego, room)
     }
 
-    /// Goes on by these moves; an ego that is given is where it is said to be.
-    fn go(
-        &mut self,
-        engine: &Engine,
-        moves: &[Pose],
-        ego: Option<AgentState>,
-        room: &mut Workspace,
-    ) {
+    /// Where the chance of every agent's next move comes from.
+    fn streams(&self) -> Vec<Seed> {
+        let seed = self.seed.fork(self.frames as u64);
+        let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
+        self.members.iter().map(stream).collect()
+    }
+
+    /// Goes on by these moves, which the network has yet to read; an ego that is given is where it
+    /// is said to be.
+    fn go(&mut self, moves: &[Pose], ego: Option<AgentState>) {
         let id = self.scene.ego;
         for (member, &step) in self.members.iter_mut().zip(moves) {
             let driven = ego.filter(|_| member.agent.id == id);
@@ -458,15 +510,15 @@ impl Future {
             light.2 = elapsed.filter(|elapsed| *elapsed <= REMEMBERED_S);
         }
         self.lights_now.clone_from(&self.lights);
-        self.read(engine, room);
     }
 
-    /// The next moves of all agents, each in its own frame, after the rules.
+    /// The next moves of all agents, each in its own frame: what was drawn from these streams, after
+    /// the rules.
     fn moves(
         &self,
         engine: &Engine,
         sampling: &RelativeSampling,
-        streams: &[Seed],
+        (streams, drawn): (&[Seed], &[[u16; FIELDS]]),
         ego: Option<AgentState>,
         room: &mut Workspace,
     ) -> Vec<Pose> {
@@ -476,7 +528,6 @@ impl Future {
             true => held_back(&agents[i], dequantize(bins)),
             false => dequantize(bins),
         };
-        let drawn = engine.decide(&self.hidden, streams, draw, room);
         let mut moves: Vec<Pose> = (0..agents.len()).map(|i| kept(i, drawn[i])).collect();
         if sampling.redraws == 0 {
             return moves;
@@ -704,14 +755,15 @@ impl Session for RelativeSession<'_> {
         }
         self.step += 1;
         self.world.passes.fetch_add(1, Ordering::Relaxed);
-        let frames = self.futures.par_iter_mut().enumerate().map_init(
-            Workspace::default,
-            |room, (i, future)| {
-                future.step(engine, sampling, ego.map(|ego| ego[i]), room);
-                future.frame()
-            },
-        );
-        Ok(frames.collect())
+        // Enough groups that all threads end at about the same time.
+        let threads = rayon::current_num_threads();
+        let most = self.futures.len().div_ceil(4 * threads).clamp(1, TOGETHER);
+        let groups = self.futures.par_chunks_mut(most).enumerate();
+        groups.for_each_init(Workspace::default, |room, (k, futures)| {
+            let egos = ego.map(|ego| &ego[k * most..][..futures.len()]);
+            Future::step_all(futures, engine, sampling, egos, room);
+        });
+        Ok(self.futures.par_iter().map(Future::frame).collect())
     }
 
     fn keep(&mut self, futures: &[usize]) -> bool {
@@ -736,7 +788,7 @@ impl Session for RelativeSession<'_> {
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
-        let (_, mut fresh) = self.world.begin(&start)?;
+        let mut fresh = self.world.begin(&[start])?;
         self.futures[future] = fresh.swap_remove(0);
         Ok(())
     }

@@ -7,7 +7,7 @@ use gump_scene::{EgoState, Frame, Rollout};
 use rayon::prelude::*;
 
 use super::imagine::{DECISION, Row};
-use super::{InteractiveDriverConfig, Prospect, Worth};
+use super::{Aggregate, InteractiveDriverConfig, Prospect, Worth};
 use crate::ProposalKind;
 use crate::pdm::comfort::ComfortFilters;
 use crate::pdm::propose::DT;
@@ -77,6 +77,7 @@ pub(super) fn judge(
     judge: &Judge<'_>,
     comfort: &ComfortFilters,
     config: &InteractiveDriverConfig,
+    n_futures: usize,
     n_decisions: usize,
 ) -> Vec<PdmScore> {
     let n_states = n_decisions * DECISION + 1;
@@ -95,8 +96,8 @@ pub(super) fn judge(
         judge.parts(&row.drive, filters)
     });
     let mut scores: Vec<PdmScore> = parts.collect();
-    for future in 0..config.n_futures {
-        let of_future = || (future..rows.len()).step_by(config.n_futures);
+    for future in 0..n_futures {
+        let of_future = || (future..rows.len()).step_by(n_futures);
         let mut group: Vec<PdmScore> = of_future().map(|i| scores[i].clone()).collect();
         normalize(&mut group);
         if let Worth::DiscountedStep { gamma } = config.worth {
@@ -161,41 +162,105 @@ fn weighted_mean(terms: [f64; 3]) -> f64 {
     sum / WEIGHTS.iter().sum::<f64>()
 }
 
-/// Rows and scores, candidate by candidate.
-pub(super) fn summarize(
+/// The futures of one candidate so far.
+#[derive(Default)]
+pub(super) struct Tally {
     rows: Vec<Row>,
-    scores: &[PdmScore],
-    config: &InteractiveDriverConfig,
-    kind: impl Fn(usize) -> ProposalKind,
-    film: impl Fn(Vec<Frame>) -> Rollout,
-) -> Vec<Prospect> {
-    let mut prospects = Vec::new();
-    let mut rows = rows.into_iter();
-    for scores in scores.chunks(config.n_futures) {
-        let (mut futures, mut drives, mut candidate) = (Vec::new(), Vec::new(), 0);
-        for row in rows.by_ref().take(scores.len()) {
-            candidate = row.candidate;
+    scores: Vec<PdmScore>,
+}
+
+/// What a candidate is chosen by.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Standing {
+    value: f64,
+    collisions: usize,
+    progress_m: f64,
+    collision_s: f64,
+}
+
+impl Tally {
+    /// Adds futures that were imagined and judged.
+    pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, PdmScore)>) {
+        for (row, score) in judged {
+            self.rows.push(row);
+            self.scores.push(score);
+        }
+    }
+
+    fn score(&self) -> CandidateScore {
+        let told = self.scores.iter().map(told).collect();
+        CandidateScore::new(told).expect("every candidate has a future")
+    }
+
+    fn standing(&self, config: &InteractiveDriverConfig) -> Standing {
+        let n = self.scores.len() as f64;
+        let steps = self.rows[0].drive.len() - 1;
+        let mean = |part: &dyn Fn(&PdmScore) -> f64| self.scores.iter().map(part).sum::<f64>() / n;
+        let score = self.score();
+        let value = match config.aggregate {
+            Aggregate::Mean => {
+                let deviation = score.standard_error.map_or(0.0, |error| error * n.sqrt());
+                score.mean - config.caution * deviation
+            }
+            Aggregate::Worst => {
+                let totals = self.scores.iter().map(|score| score.total);
+                totals.fold(f64::INFINITY, f64::min)
+            }
+        };
+        let collided = self.scores.iter().filter(|s| s.collision_step.is_some());
+        Standing {
+            value,
+            collisions: collided.count(),
+            progress_m: mean(&|score| score.progress_m),
+            collision_s: mean(&|score| score.collision_step.unwrap_or(steps) as f64 * DT),
+        }
+    }
+
+    /// What is told of the candidate.
+    pub(super) fn sum_up(
+        self,
+        kind: ProposalKind,
+        finalist: bool,
+        config: &InteractiveDriverConfig,
+        film: impl Fn(Vec<Frame>) -> Rollout,
+    ) -> Prospect {
+        let standing = self.standing(config);
+        let score = self.score();
+        let (mut futures, mut drives) = (Vec::new(), Vec::new());
+        for row in self.rows {
             futures.push(film(row.frames));
             drives.push(row.drive);
         }
-        let steps = drives[0].len() - 1;
-        let n = scores.len() as f64;
-        let mean = |part: &dyn Fn(&PdmScore) -> f64| scores.iter().map(part).sum::<f64>() / n;
-        let told = scores.iter().map(told).collect();
-        let score = CandidateScore::new(told).expect("there is at least one future");
-        let deviation = score.standard_error.map_or(0.0, |error| error * n.sqrt());
-        prospects.push(Prospect {
-            kind: kind(candidate),
-            value: score.mean - config.caution * deviation,
+        Prospect {
+            kind,
+            value: standing.value,
             score,
-            collisions: scores.iter().filter(|s| s.collision_step.is_some()).count(),
-            progress_m: mean(&|score| score.progress_m),
-            collision_s: mean(&|score| score.collision_step.unwrap_or(steps) as f64 * DT),
+            finalist,
+            collisions: standing.collisions,
+            progress_m: standing.progress_m,
+            collision_s: standing.collision_s,
             futures,
             drives,
-        });
+        }
     }
-    prospects
+}
+
+/// The better half of some candidates, at least two, in their order.
+pub(super) fn best_of(
+    tallies: &[Tally],
+    among: &[usize],
+    config: &InteractiveDriverConfig,
+) -> Vec<usize> {
+    let standing: Vec<Standing> = tallies.iter().map(|tally| tally.standing(config)).collect();
+    let mut left = among.to_vec();
+    let mut kept = Vec::new();
+    while kept.len() < among.len().div_ceil(2).max(2) && !left.is_empty() {
+        let best = first_of(&standing, &left, None, 0.0);
+        left.retain(|&i| i != best);
+        kept.push(best);
+    }
+    kept.sort_unstable();
+    kept
 }
 
 /// A score in the form that all planners tell theirs.
@@ -222,15 +287,36 @@ fn told(score: &PdmScore) -> Score {
     }
 }
 
-/// The best prospect; ties are broken as [`super::InteractiveDriver`] says.
+/// The best prospect of those that were imagined to the end; ties are broken as
+/// [`super::InteractiveDriver`] says.
 pub(super) fn choose(prospects: &[Prospect], previous: Option<usize>, hysteresis: f64) -> usize {
+    let standing = prospects.iter().map(|prospect| Standing {
+        value: prospect.value,
+        collisions: prospect.collisions,
+        progress_m: prospect.progress_m,
+        collision_s: prospect.collision_s,
+    });
+    let finalists: Vec<usize> = (0..prospects.len())
+        .filter(|&i| prospects[i].finalist)
+        .collect();
+    let standing: Vec<Standing> = standing.collect();
+    first_of(&standing, &finalists, previous, hysteresis)
+}
+
+/// The best of some candidates, of which there is at least one.
+fn first_of(
+    standing: &[Standing],
+    among: &[usize],
+    previous: Option<usize>,
+    hysteresis: f64,
+) -> usize {
     let worth = |i: usize| {
-        let kept = previous == Some(i) && prospects[i].value > 0.0;
-        prospects[i].value + if kept { hysteresis } else { 0.0 }
+        let kept = previous == Some(i) && standing[i].value > 0.0;
+        standing[i].value + if kept { hysteresis } else { 0.0 }
     };
-    let hopeless = prospects.iter().all(|prospect| prospect.value <= TIE);
+    let hopeless = among.iter().all(|&i| standing[i].value <= TIE);
     let better = |a: usize, b: usize| {
-        let (x, y) = (&prospects[a], &prospects[b]);
+        let (x, y) = (&standing[a], &standing[b]);
         let first = if hopeless {
             clearly(x.collision_s, y.collision_s)
         } else {
@@ -241,8 +327,8 @@ pub(super) fn choose(prospects: &[Prospect], previous: Option<usize>, hysteresis
             .then(clearly(x.progress_m, y.progress_m))
             .then((previous == Some(a)).cmp(&(previous == Some(b))))
     };
-    let mut best = 0;
-    for i in 1..prospects.len() {
+    let mut best = among[0];
+    for &i in &among[1..] {
         if better(i, best) == Ordering::Greater {
             best = i;
         }

@@ -5,11 +5,11 @@ use std::time::Duration;
 use gump_geometry::Pose;
 use gump_nuplan::closed_loop::Moment;
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
-use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState};
+use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState, Seed};
 use rayon::prelude::*;
 
-use super::choice::{judge, summarize};
-use super::{Decision, InteractiveDriverConfig, Phases, steps};
+use super::choice::{Tally, best_of, judge};
+use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
 use crate::pdm::comfort::ComfortFilters;
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
 use crate::pdm::mission::State;
@@ -40,10 +40,46 @@ pub(super) struct Imagination<'a> {
     pub(super) comfort: &'a ComfortFilters,
 }
 
+/// Separates the chance of rounds after the first from that of iterations.
+const ROUND: u64 = 1 << 32;
+
+/// Some futures of some candidates, imagined together.
+struct Round<'a> {
+    /// When the decision began.
+    began: Duration,
+    scene: SceneState<'a>,
+    proposer: &'a Proposer<'a>,
+    /// Of every line.
+    corridors: &'a [Corridor],
+    /// Indices in their order; imitation, which is the last, has no policy.
+    candidates: &'a [usize],
+    /// Of every candidate.
+    n_futures: usize,
+    /// Half seconds to imagine.
+    n_decisions: usize,
+    /// Future *k* of every candidate meets the same chance.
+    seed: Seed,
+}
+
+impl Allocation {
+    /// Futures of a candidate in every round, `n` together.
+    fn rounds(self, n: usize) -> Vec<usize> {
+        let mut rounds = Vec::new();
+        let mut done = 0;
+        while done < n {
+            let next = match self {
+                Self::Uniform => n,
+                Self::Halving => done.max(1).min(n - done),
+            };
+            rounds.push(next);
+            done += next;
+        }
+        rounds
+    }
+}
+
 /// One future of one candidate.
 pub(super) struct Row {
-    /// Index of the candidate.
-    pub(super) candidate: usize,
     /// Others as imagined so far.
     pub(super) forecast: Forecast,
     /// The policy's own line so far; imitation has none.
@@ -67,29 +103,116 @@ impl Imagination<'_> {
             ..self.moment.scene
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
-        let mut rows = self.rows(&proposer);
-        let lines = self.config.proposals.lateral_offsets.len();
-        let n_ruled = lines * self.speeds.len() * self.config.n_futures;
-        let (mut ruled, mut own) = self.open(scene, n_ruled)?;
-        let per = frames_per_decision(&*ruled).map_err(|error| self.failed(error.into()))?;
-        phases.open = (self.clock)() - began;
-
-        let corridors: Vec<Corridor> = (0..lines)
+        let begun = self.policies(&proposer);
+        let corridors: Vec<Corridor> = (0..self.config.proposals.lateral_offsets.len())
             .map(|line| {
-                let first = &rows[line * self.speeds.len() * self.config.n_futures];
-                proposer.corridor(line, first.policy.drives[0].progress)
+                let first = &begun[line * self.speeds.len()];
+                proposer.corridor(line, first.drives[0].progress)
             })
             .collect();
-        let n_decisions = steps(&self.config.budget) / DECISION;
+        let n_candidates = begun.len() + usize::from(self.config.imitation);
+        let mut tallies: Vec<Tally> = (0..n_candidates).map(|_| Tally::default()).collect();
+        let mut left: Vec<usize> = (0..n_candidates).collect();
+        let mut horizon = steps(&self.config.budget) / DECISION;
+        let rounds = self.config.allocation.rounds(self.config.n_futures);
+        for (r, &n_futures) in rounds.iter().enumerate() {
+            let round = Round {
+                began,
+                scene,
+                proposer: &proposer,
+                corridors: &corridors,
+                candidates: &left,
+                n_futures,
+                n_decisions: horizon,
+                seed: self.seed(r),
+            };
+            let (rows, imagined) = self.round(&round, &begun, &mut phases)?;
+            if r > 0 && imagined < horizon {
+                // Time is up. What all others were judged by reaches farther.
+                break;
+            }
+            horizon = imagined;
+            let time = (self.clock)();
+            let judge_of = self.judge_of();
+            let scores = judge(
+                &rows,
+                &judge_of,
+                self.comfort,
+                self.config,
+                n_futures,
+                horizon,
+            );
+            let mut judged = rows.into_iter().zip(scores);
+            for &candidate in &left {
+                let own = judged.by_ref().take(n_futures);
+                tallies[candidate].add(own);
+            }
+            if r + 1 < rounds.len() {
+                left = best_of(&tallies, &left, self.config);
+            }
+            phases.score += (self.clock)() - time;
+        }
+        let time = (self.clock)();
+        let prospects = tallies.into_iter().enumerate().map(|(i, tally)| {
+            let film = |frames| film(scene, frames);
+            tally.sum_up(self.kind(i), left.contains(&i), self.config, film)
+        });
+        let prospects = prospects.collect();
+        phases.score += (self.clock)() - time;
+        Ok(Decision {
+            chosen: 0,
+            brakes: false,
+            prospects,
+            horizon: horizon as f64 * DECISION_S,
+            phases,
+        })
+    }
+
+    /// Chance of a round: the same for all candidates.
+    fn seed(&self, round: usize) -> Seed {
+        let seed = self.config.seed.fork(self.moment.iteration as u64);
+        match round {
+            0 => seed,
+            _ => seed.fork(ROUND + round as u64),
+        }
+    }
+
+    /// Imagines some futures of some candidates: their rows, futures of one candidate after another,
+    /// and how many half seconds they reach.
+    fn round(
+        &self,
+        round: &Round<'_>,
+        begun: &[Proposal],
+        phases: &mut Phases,
+    ) -> Result<(Vec<Row>, usize), PlanError> {
+        let time = (self.clock)();
+        let mut rows = self.rows(round, begun);
+        let imitates = round.candidates.last() == Some(&begun.len());
+        let n_ruled = rows.len() - if imitates { round.n_futures } else { 0 };
+        let start = Start {
+            scene: round.scene,
+            n_futures: round.n_futures,
+            seed: round.seed,
+        };
+        let open = |starts: &[Start<'_>]| {
+            let opened = self.world.open(starts);
+            opened.map_err(|error| self.failed(error))
+        };
+        // One session in which policies drive and one in which the world does.
+        let mut ruled = open(&vec![start; n_ruled / round.n_futures])?;
+        let mut own = imitates.then(|| open(&[start])).transpose()?;
+        let per = frames_per_decision(&*ruled).map_err(|error| self.failed(error.into()))?;
+        phases.open += (self.clock)() - time;
+
         let mut asked: Vec<usize> = (0..n_ruled).collect();
         let mut imagined = 0;
-        for decision in 1..=n_decisions {
+        for decision in 1..=round.n_decisions {
             let time = (self.clock)();
-            let spent = time - began;
+            let spent = time - round.began;
             if decision > 1 && self.config.budget.wall.is_some_and(|wall| spent > wall) {
                 break;
             }
-            self.drive(&proposer, &corridors, &mut rows[..n_ruled]);
+            self.drive(round.proposer, round.corridors, &mut rows[..n_ruled]);
             let open: Vec<usize> = (0..asked.len()).filter(|&i| !rows[asked[i]].lost).collect();
             if open.len() < asked.len() && !open.is_empty() && ruled.keep(&open) {
                 asked = open.into_iter().map(|i| asked[i]).collect();
@@ -104,31 +227,15 @@ impl Imagination<'_> {
             }
             let answered = (self.clock)();
             phases.frames += answered - driven;
-            let present = scene.now();
+            let present = round.scene.now();
             rows.par_iter_mut()
                 .filter(|row| row.frames.len() == decision)
                 .for_each(|row| row.remember(present));
             phases.policies += (self.clock)() - answered;
             imagined = decision;
         }
-        let time = (self.clock)();
         self.imitate(&mut rows[n_ruled..], imagined);
-        let scores = judge(&rows, &self.judge_of(), self.comfort, self.config, imagined);
-        let prospects = summarize(
-            rows,
-            &scores,
-            self.config,
-            |candidate| self.kind(candidate),
-            |frames| film(scene, frames),
-        );
-        phases.score = (self.clock)() - time;
-        Ok(Decision {
-            chosen: 0,
-            brakes: false,
-            prospects,
-            horizon: imagined as f64 * DECISION_S,
-            phases,
-        })
+        Ok((rows, imagined))
     }
 
     /// The last second of the ego and of those nearest to it.
@@ -152,54 +259,32 @@ impl Imagination<'_> {
         frames.collect()
     }
 
-    /// All rows: futures of one candidate after another, imitation last.
-    fn rows(&self, proposer: &Proposer<'_>) -> Vec<Row> {
+    /// The policies by rule before they have driven, all speeds of a line after one another.
+    fn policies(&self, proposer: &Proposer<'_>) -> Vec<Proposal> {
         let ego = self.moment.ego;
-        let lines = self.config.proposals.lateral_offsets.len();
-        let mut rows = Vec::new();
-        let mut add = |candidate: usize, policy: &Proposal| {
-            rows.extend((0..self.config.n_futures).map(|_| Row {
-                candidate,
-                forecast: self.state.forecast.clone(),
-                policy: policy.clone(),
-                drive: vec![*ego],
-                frames: Vec::new(),
-                lost: false,
-            }));
+        let lines = 0..self.config.proposals.lateral_offsets.len();
+        let of_line = |line| {
+            let begun = proposer.begin(line, ego.rear_axle, ego.velocity.x);
+            self.speeds.iter().map(move |&desired_speed| Proposal {
+                desired_speed,
+                ..begun.clone()
+            })
         };
-        for line in 0..lines {
-            let mut policy = proposer.begin(line, ego.rear_axle, ego.velocity.x);
-            for (i, &speed) in self.speeds.iter().enumerate() {
-                policy.desired_speed = speed;
-                add(line * self.speeds.len() + i, &policy);
-            }
-        }
-        if self.config.imitation {
-            add(lines * self.speeds.len(), &Proposal::default());
-        }
-        rows
+        lines.flat_map(of_line).collect()
     }
 
-    /// One session in which policies drive and one in which the world does.
-    #[expect(clippy::type_complexity, reason = "two sessions, used once")]
-    fn open(
-        &self,
-        scene: SceneState<'_>,
-        n_rows: usize,
-    ) -> Result<(Box<dyn Session + '_>, Option<Box<dyn Session + '_>>), PlanError> {
-        let n_futures = self.config.n_futures;
-        let start = Start {
-            scene,
-            n_futures,
-            seed: self.config.seed.fork(self.moment.iteration as u64),
+    /// The rows of a round before anything has happened. Imitation has no policy.
+    fn rows(&self, round: &Round<'_>, begun: &[Proposal]) -> Vec<Row> {
+        let row = |&candidate: &usize| Row {
+            forecast: self.state.forecast.clone(),
+            policy: begun.get(candidate).cloned().unwrap_or_default(),
+            drive: vec![*self.moment.ego],
+            frames: Vec::new(),
+            lost: false,
         };
-        let open = |starts: &[Start<'_>]| {
-            let opened = self.world.open(starts);
-            opened.map_err(|error| self.failed(error))
-        };
-        let ruled = open(&vec![start; n_rows / n_futures])?;
-        let own = self.config.imitation.then(|| open(&[start])).transpose()?;
-        Ok((ruled, own))
+        let candidates = round.candidates.iter();
+        let rows = candidates.flat_map(|c| (0..round.n_futures).map(move |_| row(c)));
+        rows.collect()
     }
 
     /// Lets every policy drive for half a second among the others as they are known.

@@ -37,14 +37,18 @@ pub struct InteractiveDriverConfig {
     pub proposals: PdmConfig,
     /// Whether the world's own ego is a candidate too.
     pub imitation: bool,
-    /// Futures per candidate, > 0.
+    /// Futures per candidate, > 0; of candidates that drop out, fewer.
     pub n_futures: usize,
+    /// Which candidates are imagined how often.
+    pub allocation: Allocation,
     /// Where chance comes from: future *k* of every candidate meets the same chance.
     pub seed: Seed,
     /// Iterations of the loop between two decisions, > 0; in between the chosen policy drives.
     pub replan_every: usize,
     /// What a future is worth.
     pub worth: Worth,
+    /// How the futures of a candidate become one value.
+    pub aggregate: Aggregate,
     /// Standard deviations over the futures that are taken off the mean, at least 0.
     pub caution: f64,
     /// What the previous choice is given on top of its value.
@@ -61,14 +65,38 @@ impl Default for InteractiveDriverConfig {
             proposals: PdmConfig::default(),
             imitation: true,
             n_futures: 4,
+            allocation: Allocation::default(),
             seed: Seed(0),
             replan_every: 5,
             worth: Worth::Rollout,
+            aggregate: Aggregate::default(),
             caution: 0.0,
             hysteresis: 0.0,
             budget: PlanBudget::default(),
         }
     }
+}
+
+/// Which candidates are imagined how often.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Allocation {
+    /// All futures of all candidates, as in the paper.
+    Uniform,
+    /// Sequential halving (Karnin, Koren and Somekh, 2013): one future of each, then one of the
+    /// better half, two of the better half of those, and so on, until some have had them all. Every
+    /// candidate of a round meets the same chance.
+    #[default]
+    Halving,
+}
+
+/// How the futures of a candidate become one value.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Aggregate {
+    /// Their mean, less [`InteractiveDriverConfig::caution`] deviations.
+    #[default]
+    Mean,
+    /// The worst of them.
+    Worst,
 }
 
 /// What a future is worth.
@@ -93,7 +121,8 @@ pub struct PlanBudget {
     /// Seconds to imagine, 0.5 to 4; whole half seconds count.
     pub horizon: f64,
     /// Stop at the half second in which this is used up; all candidates are then judged by the same,
-    /// shorter horizon. Takes a clock: [`InteractiveDriver::with_clock`].
+    /// shorter horizon. A later round of [`Allocation::Halving`] that is not finished by then does
+    /// not count. Takes a clock: [`InteractiveDriver::with_clock`].
     pub wall: Option<Duration>,
 }
 
@@ -135,8 +164,11 @@ pub struct Prospect {
     pub kind: ProposalKind,
     /// What it came to, future by future.
     pub score: CandidateScore,
-    /// What it is chosen by: the mean less [`InteractiveDriverConfig::caution`] deviations.
+    /// What it is chosen by: [`InteractiveDriverConfig::aggregate`] of its futures.
     pub value: f64,
+    /// Whether it was imagined to the end and could be chosen: [`Allocation::Halving`] drops others
+    /// on the way.
+    pub finalist: bool,
     /// Futures with a collision by the ego's fault.
     pub collisions: usize,
     /// Mean metres along the way.

@@ -41,6 +41,7 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
             ..PdmConfig::default()
         },
         imitation: false,
+        allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
     }
 }
@@ -178,6 +179,7 @@ fn ruled() -> InteractiveDriverConfig {
     InteractiveDriverConfig {
         imitation: false,
         n_futures: 2,
+        allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
     }
 }
@@ -473,6 +475,91 @@ fn threads_change_nothing() {
     let one = with(1);
     assert_eq!(one, with(2));
     assert_eq!(one, with(4));
+}
+
+/// A vehicle ahead whose speed differs from future to future.
+const BEHIND: &str = "ego vehicle 0: 2,0 velocity 6,0
+    agent vehicle 1: 25,0 velocity 5,0";
+
+#[test]
+fn halving_imagines_the_better_candidates_more_often() {
+    let world = ByLaw(at_random_speed);
+    let decision = decide(&world, InteractiveDriverConfig::default(), BEHIND);
+    let of = |p: &Prospect| (p.futures.len(), p.drives.len(), p.finalist);
+    let told: Vec<_> = decision.prospects.iter().map(of).collect();
+    let count = |n: usize, finalist: bool| told.iter().filter(|t| **t == (n, n, finalist)).count();
+    // Of fifteen policies and imitation eight see a second future, four the third and fourth.
+    assert_eq!(
+        (count(1, false), count(2, false), count(4, true)),
+        (8, 4, 4)
+    );
+    assert!(decision.prospects[decision.chosen].finalist);
+    // What drops out was no better, in the futures it saw, than what stayed.
+    let first = |p: &Prospect| p.score.futures[0].total;
+    let (seen, unseen): (Vec<&Prospect>, _) =
+        decision.prospects.iter().partition(|p| p.futures.len() > 1);
+    let worst = seen.iter().map(|p| first(p)).fold(f64::INFINITY, f64::min);
+    assert!(unseen.iter().all(|p| first(p) <= worst + 1e-6));
+}
+
+#[test]
+fn where_futures_are_equal_halving_takes_what_uniform_takes() {
+    for text in [FREE, BEHIND, CROSSING] {
+        let with = |allocation| InteractiveDriverConfig {
+            allocation,
+            ..InteractiveDriverConfig::default()
+        };
+        let all = decide(&ConstantVelocity, with(Allocation::Uniform), text);
+        let half = decide(&ConstantVelocity, with(Allocation::Halving), text);
+        assert_eq!(all.chosen, half.chosen, "{text}");
+        let value = |decision: &Decision| decision.prospects[decision.chosen].value;
+        assert_abs_diff_eq!(value(&all), value(&half), epsilon = 1e-12);
+    }
+}
+
+#[test]
+fn the_worst_future_counts_if_it_is_asked_for() {
+    let world = ByLaw(at_random_speed);
+    let config = InteractiveDriverConfig {
+        aggregate: Aggregate::Worst,
+        ..only(&[0.4, 1.0], &[0.0])
+    };
+    let decision = decide(&world, config, BEHIND);
+    for prospect in &decision.prospects {
+        let totals = prospect.score.futures.iter().map(|score| score.total);
+        assert_eq!(prospect.value, totals.fold(f64::INFINITY, f64::min));
+    }
+    let means = decision.prospects.iter().map(|p| p.score.mean);
+    assert!(
+        decision
+            .prospects
+            .iter()
+            .zip(means)
+            .any(|(p, mean)| p.value < mean - 1e-3)
+    );
+}
+
+#[test]
+fn a_round_that_time_does_not_allow_does_not_count() {
+    let time = Cell::new(0);
+    let clock = || {
+        time.set(time.get() + 1);
+        Duration::from_millis(time.get())
+    };
+    // The first round asks for the time some thirty times, the second runs out of it.
+    let mut config = InteractiveDriverConfig::default();
+    config.budget.wall = Some(Duration::from_millis(45));
+    let mut driver = InteractiveDriver::new(&ConstantVelocity, config)
+        .unwrap()
+        .with_clock(clock);
+    plan_once(&recording(BEHIND), &mut driver).unwrap();
+    let decision = driver.decision().unwrap();
+    assert_eq!(decision.horizon, 4.0);
+    assert!(decision.prospects.iter().all(|p| p.futures.len() == 1));
+    assert!(decision.prospects[decision.chosen].finalist);
+    for prospect in &decision.prospects {
+        assert!(prospect.drives.iter().all(|drive| drive.len() == 41));
+    }
 }
 
 #[test]

@@ -12,7 +12,7 @@
 
 use gump_engine::relative::engine::{Draw, Engine, Workspace};
 use gump_engine::relative::rules::settle;
-use gump_engine::relative::seen::{Seen, presents};
+use gump_engine::relative::seen::{Seen, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::ModelError;
@@ -150,9 +150,10 @@ impl TrackDriver for Driver {
                 }
             }
             let agents: Vec<Shown> = members.iter().flatten().map(Seen::now).collect();
-            let mut read = presents(map, lights, members.iter_mut().flatten());
-            self.engine
-                .read(&mut read, t, &memory, &mut room, &mut hidden);
+            let mut read = Vec::new();
+            let seen = members.iter_mut().flatten();
+            add_presents((map, &memory), lights, seen, t, &mut read);
+            self.engine.read(&mut read, &mut room, &mut hidden);
             if t + 1 < WARM_UP {
                 continue;
             }

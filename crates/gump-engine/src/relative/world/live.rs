@@ -47,7 +47,7 @@ impl LiveFuture {
             n_futures: 1,
             seed,
         };
-        let (_, mut futures) = world.begin(&start)?;
+        let mut futures = world.begin(&[start])?;
         Ok(Self {
             future: futures.swap_remove(0),
             moves: Vec::new(),
@@ -87,7 +87,8 @@ impl LiveFuture {
         let mut room = Workspace::default();
         let mut moves = std::mem::take(&mut self.moves);
         moves.resize(self.future.members.len(), Pose::IDENTITY);
-        self.future.go(&world.engine, &moves, ego, &mut room);
+        self.future.go(&moves, ego);
+        self.future.read(&world.engine, &mut room);
         self.future.follow(&world.engine, &world.sampling);
         self.future.frame()
     }
