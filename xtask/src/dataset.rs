@@ -72,7 +72,7 @@ pub(crate) struct Splits {
 }
 
 /// What scenes are for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Split {
     /// Weights learn from them.

@@ -29,6 +29,7 @@ mod remote;
 mod report;
 mod run;
 mod sampling;
+mod sharding;
 mod shipped;
 mod sumo;
 mod table;

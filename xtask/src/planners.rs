@@ -73,6 +73,13 @@ impl Chosen {
     }
 }
 
+impl Chosen {
+    /// Whether it plans in another process.
+    pub(crate) fn is_remote(&self) -> bool {
+        matches!(self, Self::Remote(_))
+    }
+}
+
 impl fmt::Display for Chosen {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -163,6 +170,9 @@ pub(crate) struct ImaginationArgs {
     /// What a candidate of the interactive planner is worth
     #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
     aggregate: AggregateName,
+    /// What the interactive planner gives its previous choice on top of its value, 0 to 1
+    #[arg(long, value_name = "X", default_value_t = PlannerConfig::default().hysteresis)]
+    hysteresis: f64,
     /// Agents that are imagined, those nearest to the ego
     #[arg(long, value_name = "N", default_value_t = 12)]
     nearest: usize,
@@ -202,6 +212,7 @@ impl ImaginationArgs {
                 AggregateName::Mean => Aggregate::Mean,
                 AggregateName::Worst => Aggregate::Worst,
             },
+            hysteresis: self.hysteresis,
             nearest: self.nearest,
             horizon: self.horizon,
             wall,

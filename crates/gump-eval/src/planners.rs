@@ -152,6 +152,8 @@ pub struct PlannerConfig {
     pub allocation: Allocation,
     /// How it makes one value of the futures of a candidate.
     pub aggregate: Aggregate,
+    /// What it gives its previous choice on top of its value.
+    pub hysteresis: f64,
     /// Agents that are imagined, those nearest to the ego.
     pub nearest: usize,
     /// Seconds that the interactive planner imagines.
@@ -170,6 +172,7 @@ impl Default for PlannerConfig {
             futures: 4,
             allocation: Allocation::default(),
             aggregate: Aggregate::default(),
+            hysteresis: 0.0,
             nearest: 12,
             horizon: 4.0,
             wall: None,
@@ -193,6 +196,7 @@ impl PlannerConfig {
             n_futures: self.futures,
             allocation: self.allocation,
             aggregate: self.aggregate,
+            hysteresis: self.hysteresis,
             seed,
             replan_every: self.replan_every,
             worth: self

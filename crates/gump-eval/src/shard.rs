@@ -19,6 +19,61 @@ impl Shard {
     /// All scenarios.
     pub const WHOLE: Self = Self { k: 1, n: 1 };
 
+    /// The part that a scheduler gives this process, by the environment variables `variable` looks up.
+    ///
+    /// Read are Slurm's array (`SLURM_ARRAY_TASK_ID`, `_MIN`, `_STEP`, `_COUNT`) and tasks
+    /// (`SLURM_PROCID`, `SLURM_NTASKS`), the one within the other where both are set; else the index
+    /// of a Kubernetes job (`JOB_COMPLETION_INDEX`). Kubernetes does not tell a pod of how many: that
+    /// is `GUMP_SHARDS`, which also overrides the count that Slurm gives.
+    ///
+    /// # Errors
+    /// A sentence that says which variable is missing or wrong.
+    pub fn of_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Self, String> {
+        let number = |name: &str| {
+            let text = variable(name).filter(|text| !text.is_empty());
+            let parsed = text.map(|text| {
+                let wrong = format!("expected a number in {name}, found \"{text}\"");
+                text.trim().parse::<usize>().map_err(|_| wrong)
+            });
+            parsed.transpose()
+        };
+        let array = match number("SLURM_ARRAY_TASK_ID")? {
+            Some(id) => {
+                let min = number("SLURM_ARRAY_TASK_MIN")?.unwrap_or(0);
+                let step = number("SLURM_ARRAY_TASK_STEP")?.unwrap_or(1).max(1);
+                Some((
+                    id.saturating_sub(min) / step,
+                    number("SLURM_ARRAY_TASK_COUNT")?,
+                ))
+            }
+            None => None,
+        };
+        let task = match number("SLURM_PROCID")? {
+            Some(id) => Some((id, number("SLURM_NTASKS")?)),
+            None => None,
+        };
+        let (index, known) = match (array, task, number("JOB_COMPLETION_INDEX")?) {
+            (Some((i, n)), Some((k, Some(m))), _) if m > 1 => (i * m + k, n.map(|n| n * m)),
+            (Some(found), ..) | (None, Some(found), _) => found,
+            (None, None, Some(index)) => (index, None),
+            (None, None, None) => {
+                return Err("expected SLURM_ARRAY_TASK_ID, SLURM_PROCID or \
+                            JOB_COMPLETION_INDEX for auto, found none of them"
+                    .into());
+            }
+        };
+        let n = match number("GUMP_SHARDS")?.or(known) {
+            Some(n) => n,
+            None => return Err("expected the number of shards in GUMP_SHARDS, found none".into()),
+        };
+        if index >= n {
+            return Err(format!(
+                "expected fewer than {n} shards counted from 0, found number {index}"
+            ));
+        }
+        Ok(Self { k: index + 1, n })
+    }
+
     /// True if the scenario at `index` of all is this shard's.
     pub fn holds(self, index: usize) -> bool {
         index % self.n == self.k - 1
@@ -68,6 +123,38 @@ mod tests {
             assert_eq!(owners.count(), 1);
         }
         assert!((0..9).all(|index| Shard::WHOLE.holds(index)));
+    }
+
+    #[test]
+    fn schedulers_say_which_part_is_whose() {
+        let auto = |set: &[(&str, &str)]| {
+            let found = Shard::of_variables(|name| {
+                let value = set.iter().find(|(known, _)| *known == name);
+                value.map(|(_, value)| (*value).to_owned())
+            });
+            found.map(|shard| shard.to_string())
+        };
+        let array = [
+            ("SLURM_ARRAY_TASK_ID", "7"),
+            ("SLURM_ARRAY_TASK_MIN", "1"),
+            ("SLURM_ARRAY_TASK_STEP", "2"),
+            ("SLURM_ARRAY_TASK_COUNT", "8"),
+        ];
+        assert_eq!(auto(&array).unwrap(), "4/8");
+        let tasks = [("SLURM_PROCID", "2"), ("SLURM_NTASKS", "3")];
+        assert_eq!(auto(&tasks).unwrap(), "3/3");
+        // Tasks within an array; a job of one task is no part of its own.
+        assert_eq!(auto(&[&array[..], &tasks[..]].concat()).unwrap(), "12/24");
+        let one = [("SLURM_PROCID", "0"), ("SLURM_NTASKS", "1")];
+        assert_eq!(auto(&[&array[..], &one[..]].concat()).unwrap(), "4/8");
+        let pod = ("JOB_COMPLETION_INDEX", "0");
+        assert_eq!(auto(&[pod, ("GUMP_SHARDS", "5")]).unwrap(), "1/5");
+        assert!(auto(&[pod]).unwrap_err().contains("GUMP_SHARDS"));
+        assert!(auto(&[]).unwrap_err().contains("SLURM_PROCID"));
+        let error = auto(&[pod, ("GUMP_SHARDS", "many")]).unwrap_err();
+        assert!(error.contains("found \"many\""), "{error}");
+        let error = auto(&[("JOB_COMPLETION_INDEX", "5"), ("GUMP_SHARDS", "5")]).unwrap_err();
+        assert!(error.contains("found number 5"), "{error}");
     }
 
     #[test]

@@ -27,7 +27,19 @@ enum Generator {
 }
 
 impl Generator {
+    /// The generator of a part.
+    ///
     /// Error: a generator or a version that this build does not have.
+    fn of(part: &Made) -> anyhow::Result<Self> {
+        let mut generator = Self::named(&part.generator)?;
+        if let Some(asked) = part.density {
+            let (Self::Procedural(SynthesisConfig { density, .. })
+            | Self::Sumo(SumoDemand { density, .. })) = &mut generator;
+            *density = asked;
+        }
+        Ok(generator)
+    }
+
     fn named(name: &str) -> anyhow::Result<Self> {
         let known = name.split_once('/').and_then(|(kind, version)| {
             let version = version.parse().ok()?;
@@ -59,7 +71,7 @@ pub(crate) fn make(
     progress: &Progress,
 ) -> anyhow::Result<bool> {
     if !part.scenes.is_empty() && check(list, part, folder).is_ok() {
-        progress.advance(part.count as u64);
+        progress.advance(part.kept() as u64);
         return Ok(false);
     }
     write(list, part, folder, progress)?;
@@ -111,9 +123,9 @@ pub(crate) fn check(list: &List, part: &Made, folder: &Path) -> anyhow::Result<(
         );
     }
     anyhow::ensure!(
-        found.len() == part.count && part.scenes.len() == part.count,
+        found.len() == part.kept() && part.scenes.len() == part.kept(),
         "expected {} scenes as {} says, found {}: {}",
-        part.count,
+        part.kept(),
         list.path.display(),
         found.len(),
         path.display()
@@ -138,9 +150,10 @@ fn sums(path: &Path) -> anyhow::Result<Vec<String>> {
 }
 
 fn write(list: &List, part: &Made, folder: &Path, progress: &Progress) -> anyhow::Result<()> {
-    let scenes = match Generator::named(&part.generator)? {
+    let scenes = match Generator::of(part)? {
         Generator::Procedural(config) => (0..part.count as u64)
             .into_par_iter()
+            .filter(|&k| part.keeps(k as usize))
             .map(|k| {
                 stop_if_interrupted()?;
                 let scene = synthesize(&config, Seed(part.seed).fork(k));
@@ -150,7 +163,13 @@ fn write(list: &List, part: &Made, folder: &Path, progress: &Progress) -> anyhow
             .collect::<anyhow::Result<Vec<_>>>()?,
         Generator::Sumo(demand) => {
             let path = list.file(folder, part).with_extension("work");
-            Simulation::begin(list, part, demand, path)?.scenes(progress)?
+            let mut scenes = Simulation::begin(list, part, demand, path)?.scenes(progress)?;
+            let mut index = 0;
+            scenes.retain(|_| {
+                index += 1;
+                part.keeps(index - 1)
+            });
+            scenes
         }
     };
     let path = list.file(folder, part);

@@ -4,6 +4,7 @@
 //! ([`make()`] makes them anew), recorded ones by id, file and sum. [`Scenes`] is what
 //! `--scenarios` takes; [`fingerprint`] is the sum of a scene.
 
+mod draw;
 mod fingerprint;
 mod make;
 mod recorded;
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use crate::dataset::Split;
 use crate::machine::repository;
 
+pub(crate) use draw::{Draw, Rule, worst_scores};
 pub(crate) use make::{check, freeze, make};
 pub(crate) use recorded::check_recorded;
 pub(crate) use scenes::{Found, Scenes};
@@ -59,8 +61,14 @@ pub(crate) struct Made {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) sumo: Option<String>,
     pub(crate) seed: u64,
+    /// Multiplies the number of agents; else the generator's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) density: Option<f64>,
     /// How many scenes.
     pub(crate) count: usize,
+    /// Which of them, in order; none: all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) keep: Vec<usize>,
     /// Scenes taken of a run of SUMO, at most.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) per_run: Option<usize>,
@@ -148,9 +156,20 @@ impl List {
         );
         let n = part.scenes.len();
         anyhow::ensure!(
-            n == part.count || n == 0,
+            n == part.kept() || n == 0,
             "{place}: expected {} scenes with their sums, found {n}",
+            part.kept()
+        );
+        anyhow::ensure!(
+            part.keep.is_sorted_by(|a, b| a < b) && part.keep.iter().all(|&i| i < part.count),
+            "{place}: expected the indices to keep in order, all below {}",
             part.count
+        );
+        anyhow::ensure!(
+            part.density
+                .is_none_or(|density| (0.1..=3.0).contains(&density)),
+            "{place}: expected a density from 0.1 to 3, found {:?}",
+            part.density
         );
         let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-';
         anyhow::ensure!(
@@ -189,6 +208,20 @@ impl List {
         folder
             .join(&self.name)
             .join(format!("{}.tfrecord.gz", part.file))
+    }
+}
+
+impl Made {
+    /// How many scenes its file has.
+    pub(crate) fn kept(&self) -> usize {
+        match self.keep.len() {
+            0 => self.count,
+            n => n,
+        }
+    }
+
+    fn keeps(&self, index: usize) -> bool {
+        self.keep.is_empty() || self.keep.binary_search(&index).is_ok()
     }
 }
 

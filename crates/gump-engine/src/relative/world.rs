@@ -10,7 +10,7 @@ mod live;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
@@ -132,6 +132,18 @@ pub struct RelativeWorld {
     /// What is kept of the distributions, and what was.
     watch: ProbeConfig,
     outlooks: Mutex<Vec<PredictiveSamples>>,
+    /// Scenes that sessions are in: who opens one more from the same present shares it.
+    scenes: Mutex<Vec<(Laid, Weak<Scene>)>>,
+}
+
+/// What the scene of a start depends on.
+#[derive(Clone, Debug, PartialEq)]
+struct Laid {
+    /// Where the map lies in memory; it does as long as the scene holds it.
+    source: usize,
+    centre: DVec2,
+    ego: AgentId,
+    lights: Vec<Light>,
 }
 
 impl RelativeWorld {
@@ -161,6 +173,7 @@ impl RelativeWorld {
             passes: AtomicU64::new(0),
             watch: ProbeConfig::default(),
             outlooks: Mutex::default(),
+            scenes: Mutex::default(),
         })
     }
 
@@ -186,12 +199,40 @@ impl RelativeWorld {
         self.passes.load(Ordering::Relaxed)
     }
 
+    /// The map around the ego, laid out and read; that of a session from the same present, if there
+    /// is one.
+    fn scene(&self, state: SceneState<'_>) -> Arc<Scene> {
+        let (centre, lights) = Scene::place(state);
+        let laid = Laid {
+            source: Arc::as_ptr(state.map) as usize,
+            centre,
+            ego: state.ego,
+            lights,
+        };
+        let known = || self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
+        let same = |(key, scene): &(Laid, Weak<Scene>)| {
+            let scene = scene.upgrade()?;
+            (*key == laid).then_some(scene)
+        };
+        if let Some(scene) = known().iter().find_map(same) {
+            return scene;
+        }
+        let source = Arc::clone(state.map);
+        let here = (state.ego, &laid.lights[..]);
+        let scene = Scene::around(&self.engine, source, centre, here, &self.sampling);
+        let scene = Arc::new(scene);
+        let mut scenes = known();
+        scenes.retain(|(_, scene)| scene.strong_count() > 0);
+        scenes.push((laid, Arc::downgrade(&scene)));
+        scene
+    }
+
     /// The futures of starts from one scene, which share it.
     fn begin(&self, starts: &[Start<'_>]) -> Result<Vec<Future>, ModelError> {
         let Some(first) = starts.first() else {
             return Ok(Vec::new());
         };
-        let scene = Arc::new(Scene::new(&self.engine, first.scene, &self.sampling));
+        let scene = self.scene(first.scene);
         let first = Future::begin(&self.engine, &scene, first.scene)?;
         let seeds = starts
             .iter()
@@ -211,7 +252,7 @@ impl RelativeWorld {
     /// # Errors
     /// A scene that cannot be rolled out.
     pub fn read_present(&self, scene: SceneState<'_>) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
-        let shared = Arc::new(Scene::new(&self.engine, scene, &self.sampling));
+        let shared = self.scene(scene);
         let future = Future::begin(&self.engine, &shared, scene)?;
         let numbers = future
             .members
@@ -262,14 +303,13 @@ pub(super) struct Scene {
 }
 
 impl Scene {
-    fn new(engine: &Engine, scene: SceneState<'_>, sampling: &RelativeSampling) -> Self {
-        let centre = scene.ego_now().state.pose.position;
+    /// The middle of what is laid out for a start, and the lights that may be shown.
+    fn place(scene: SceneState<'_>) -> (DVec2, Vec<Light>) {
         // Lights that are not seen at the present may be shown later.
         let seen = scene.history.iter().flat_map(Frame::lights);
         let seen: BTreeMap<_, _> = seen.map(|light| (light.lane, *light)).collect();
-        let lights: Vec<Light> = seen.into_values().collect();
-        let source = Arc::clone(scene.map);
-        Self::around(engine, source, centre, (scene.ego, &lights), sampling)
+        let centre = scene.ego_now().state.pose.position;
+        (centre, seen.into_values().collect())
     }
 
     fn around(

@@ -84,6 +84,6 @@ pub use paper::{MEAN_PROGRESS, RlEpisode, RlScore};
 pub use progress::{ExpertProgress, expert_progress};
 pub use savgol::SavitzkyGolay;
 pub use scoring::{Aggregate, MetricScores, Row, ScenarioScores, Scoring};
-pub use speed_limit::{SpeedLimit, speed_limit};
+pub use speed_limit::{MAX_OVERSPEED, SpeedLimit, speed_limit};
 pub use statistics::Statistics;
 pub use time_to_collision::{Place, TimeToCollision, TimeToCollisionConfig, time_to_collision};

@@ -9,7 +9,7 @@ use super::statistics::mean_step;
 /// Driving this much too fast all the time scores 0, metres per second.
 ///
 /// Source: nuPlan's challenges.
-const MAX_OVERSPEED: f64 = 2.23;
+pub const MAX_OVERSPEED: f64 = 2.23;
 
 /// How much too fast the ego was.
 #[derive(Clone, Debug, PartialEq)]

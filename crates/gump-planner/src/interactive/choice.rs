@@ -2,16 +2,16 @@
 
 use std::cmp::Ordering;
 
-use gump_metrics::{Gate, Score, Term};
+use gump_metrics::{ComfortBounds, Gate, Score, Term};
+use gump_nuplan::metrics::{ComfortSeries, MAX_OVERSPEED, Motion};
 use gump_scene::{EgoState, Frame, Rollout};
 use rayon::prelude::*;
 
 use super::imagine::{DECISION, Row};
 use super::{Aggregate, InteractiveDriverConfig, Prospect, Worth};
 use crate::ProposalKind;
-use crate::pdm::comfort::ComfortFilters;
 use crate::pdm::propose::DT;
-use crate::pdm::score::{Judge, NO_PROGRESS, PdmScore, WEIGHTS, normalize};
+use crate::pdm::score::{Judge, NO_PROGRESS, PdmScore, normalize};
 use crate::pdm::{BRAKE_SPEED, BRAKE_STEPS};
 
 /// Two values this close are a tie; rounding must not decide.
@@ -71,49 +71,108 @@ impl CandidateScore {
     }
 }
 
-/// The score of every row; progress is a share of the farthest candidate's in the same future.
-pub(super) fn judge(
-    rows: &[Row],
-    judge: &Judge<'_>,
-    comfort: &ComfortFilters,
-    config: &InteractiveDriverConfig,
-    n_futures: usize,
-    n_decisions: usize,
-) -> Vec<PdmScore> {
-    let n_states = n_decisions * DECISION + 1;
-    let filters = || {
-        if comfort.n() == n_states {
-            comfort.clone()
-        } else {
-            ComfortFilters::new(n_states, DT)
-        }
-    };
-    let parts = rows.par_iter().map_init(filters, |filters, row| {
-        let judge = Judge {
-            forecast: &row.forecast,
-            ..*judge
-        };
-        judge.parts(&row.drive, filters)
-    });
-    let mut scores: Vec<PdmScore> = parts.collect();
-    for future in 0..n_futures {
-        let of_future = || (future..rows.len()).step_by(n_futures);
-        let mut group: Vec<PdmScore> = of_future().map(|i| scores[i].clone()).collect();
-        normalize(&mut group);
-        if let Worth::DiscountedStep { gamma } = config.worth {
-            let drives: Vec<&[EgoState]> = of_future().map(|i| &rows[i].drive[..]).collect();
-            discount(&mut group, &drives, judge, gamma);
-        }
-        for (i, score) in of_future().zip(group) {
-            scores[i] = score;
-        }
+/// How the drives of a moment are judged: by PDM's score with the terms and weights of nuPlan's.
+#[derive(Clone, Copy)]
+pub(super) struct Reward<'a> {
+    pub(super) judge: Judge<'a>,
+    pub(super) worth: Worth,
+    /// What the ego has driven so far of the drive that nuPlan will judge, oldest first: a drive
+    /// that begins with a jolt is not comfortable.
+    pub(super) past: &'a [EgoState],
+    /// The limit that is stated, metres per second.
+    pub(super) limit: Option<f64>,
+}
+
+/// The score of a row with its parts.
+#[derive(Clone, Debug)]
+pub(super) struct Judged {
+    parts: PdmScore,
+    /// 1 if never too fast; falls with the mean excess.
+    speed_limit: f64,
+    /// What counts.
+    total: f64,
+}
+
+/// Weights of progress, time to collision, the speed limit and comfort, as in nuPlan's score.
+const WEIGHTS: [f64; 4] = [5.0, 5.0, 4.0, 2.0];
+
+impl Judged {
+    fn terms(&self) -> [f64; 4] {
+        let parts = &self.parts;
+        [
+            parts.progress,
+            parts.time_to_collision,
+            self.speed_limit,
+            parts.comfort,
+        ]
     }
-    scores
+}
+
+impl Reward<'_> {
+    /// The score of every row, `n_futures` of a candidate after another; progress is a share of the
+    /// farthest candidate's in the same future.
+    pub(super) fn judge(&self, rows: &[Row], n_futures: usize) -> Vec<Judged> {
+        let judged = rows.par_iter().map(|row| {
+            let judge = Judge {
+                forecast: &row.forecast,
+                ..self.judge
+            };
+            judge.parts(&row.drive, self.is_comfortable(&row.drive))
+        });
+        let mut parts: Vec<PdmScore> = judged.collect();
+        for future in 0..n_futures {
+            let of_future = || (future..rows.len()).step_by(n_futures);
+            let mut group: Vec<PdmScore> = of_future().map(|i| parts[i].clone()).collect();
+            normalize(&mut group);
+            of_future()
+                .zip(group)
+                .for_each(|(i, score)| parts[i] = score);
+        }
+        let all = rows.iter().zip(parts).map(|(row, parts)| {
+            let mut judged = Judged {
+                parts,
+                speed_limit: self.speed_limit(&row.drive),
+                total: 0.0,
+            };
+            judged.total = judged.parts.gates() * weighted_mean(judged.terms());
+            judged
+        });
+        let mut all: Vec<Judged> = all.collect();
+        if let Worth::DiscountedStep { gamma } = self.worth {
+            for future in 0..n_futures {
+                let mut of_future: Vec<(&mut Judged, &[EgoState])> = all
+                    .iter_mut()
+                    .zip(rows)
+                    .skip(future)
+                    .step_by(n_futures)
+                    .map(|(judged, row)| (judged, &row.drive[..]))
+                    .collect();
+                discount(&mut of_future, &self.judge, gamma);
+            }
+        }
+        all
+    }
+
+    /// Whether nuPlan's metric finds the last part of the drive and what is to follow comfortable.
+    fn is_comfortable(&self, drive: &[EgoState]) -> bool {
+        let states: Vec<EgoState> = self.past.iter().chain(drive).copied().collect();
+        let series = ComfortSeries::of(&Motion::of(self.judge.vehicle, &states));
+        series.is_none_or(|series| series.is_comfortable(&ComfortBounds::NUPLAN))
+    }
+
+    fn speed_limit(&self, drive: &[EgoState]) -> f64 {
+        let Some(limit) = self.limit else {
+            return 1.0;
+        };
+        let excess = drive.iter().map(|state| (state.speed() - limit).max(0.0));
+        let mean = excess.sum::<f64>() / drive.len() as f64;
+        (1.0 - mean / MAX_OVERSPEED).max(0.0)
+    }
 }
 
 /// Replaces the totals of one future's candidates by discounted sums over half seconds.
-fn discount(scores: &mut [PdmScore], drives: &[&[EgoState]], judge: &Judge<'_>, gamma: f64) {
-    let n = (drives[0].len() - 1) / DECISION;
+fn discount(rows: &mut [(&mut Judged, &[EgoState])], judge: &Judge<'_>, gamma: f64) {
+    let n = (rows[0].1.len() - 1) / DECISION;
     let open = |score: &PdmScore, t: usize| {
         let by_then = |step: Option<usize>| step.is_some_and(|step| step <= t * DECISION);
         let hit = if by_then(score.collision_step) {
@@ -124,40 +183,42 @@ fn discount(scores: &mut [PdmScore], drives: &[&[EgoState]], judge: &Judge<'_>, 
         let on_road = f64::from(u8::from(!by_then(score.off_road_step)));
         hit * on_road * score.driving_direction
     };
-    let places: Vec<Vec<f64>> = drives
+    let places: Vec<Vec<f64>> = rows
         .iter()
-        .map(|drive| {
+        .map(|(_, drive)| {
             let states = drive.iter().step_by(DECISION);
             states.map(|state| judge.place(state)).collect()
         })
         .collect();
-    let (mut sums, mut weights) = (vec![0.0; scores.len()], 0.0);
+    let (mut sums, mut weights) = (vec![0.0; rows.len()], 0.0);
     for t in 1..=n {
-        let gained: Vec<f64> = scores
+        let gained: Vec<f64> = rows
             .iter()
             .zip(&places)
-            .map(|(score, s)| (s[t] - s[t - 1]).max(0.0) * open(score, t))
+            .map(|((judged, _), s)| (s[t] - s[t - 1]).max(0.0) * open(&judged.parts, t))
             .collect();
         let most = gained.iter().copied().fold(0.0, f64::max);
         let weight = gamma.powi(t as i32 - 1);
         weights += weight;
-        for ((sum, score), gained) in sums.iter_mut().zip(&*scores).zip(gained) {
+        for ((sum, (judged, _)), gained) in sums.iter_mut().zip(&*rows).zip(gained) {
+            let score = &judged.parts;
             let progress = if most > NO_PROGRESS / n as f64 {
                 gained / most
             } else {
                 1.0
             };
             let clear = score.ttc_step.is_none_or(|step| step > t * DECISION);
-            let terms = [progress, f64::from(u8::from(clear)), score.comfort];
+            let clear = f64::from(u8::from(clear));
+            let terms = [progress, clear, judged.speed_limit, score.comfort];
             *sum += weight * open(score, t) * weighted_mean(terms);
         }
     }
-    for (score, sum) in scores.iter_mut().zip(sums) {
-        score.total = sum / weights;
+    for ((judged, _), sum) in rows.iter_mut().zip(sums) {
+        judged.total = sum / weights;
     }
 }
 
-fn weighted_mean(terms: [f64; 3]) -> f64 {
+fn weighted_mean(terms: [f64; 4]) -> f64 {
     let sum: f64 = terms.iter().zip(WEIGHTS).map(|(t, w)| t * w).sum();
     sum / WEIGHTS.iter().sum::<f64>()
 }
@@ -166,7 +227,7 @@ fn weighted_mean(terms: [f64; 3]) -> f64 {
 #[derive(Default)]
 pub(super) struct Tally {
     rows: Vec<Row>,
-    scores: Vec<PdmScore>,
+    scores: Vec<Judged>,
 }
 
 /// What a candidate is chosen by.
@@ -180,7 +241,7 @@ pub(super) struct Standing {
 
 impl Tally {
     /// Adds futures that were imagined and judged.
-    pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, PdmScore)>) {
+    pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, Judged)>) {
         for (row, score) in judged {
             self.rows.push(row);
             self.scores.push(score);
@@ -195,7 +256,10 @@ impl Tally {
     fn standing(&self, config: &InteractiveDriverConfig) -> Standing {
         let n = self.scores.len() as f64;
         let steps = self.rows[0].drive.len() - 1;
-        let mean = |part: &dyn Fn(&PdmScore) -> f64| self.scores.iter().map(part).sum::<f64>() / n;
+        let mean = |part: &dyn Fn(&PdmScore) -> f64| {
+            let parts = self.scores.iter().map(|judged| part(&judged.parts));
+            parts.sum::<f64>() / n
+        };
         let score = self.score();
         let value = match config.aggregate {
             Aggregate::Mean => {
@@ -203,11 +267,12 @@ impl Tally {
                 score.mean - config.caution * deviation
             }
             Aggregate::Worst => {
-                let totals = self.scores.iter().map(|score| score.total);
+                let totals = self.scores.iter().map(|judged| judged.total);
                 totals.fold(f64::INFINITY, f64::min)
             }
         };
-        let collided = self.scores.iter().filter(|s| s.collision_step.is_some());
+        let collided = self.scores.iter();
+        let collided = collided.filter(|judged| judged.parts.collision_step.is_some());
         Standing {
             value,
             collisions: collided.count(),
@@ -264,26 +329,26 @@ pub(super) fn best_of(
 }
 
 /// A score in the form that all planners tell theirs.
-fn told(score: &PdmScore) -> Score {
+fn told(judged: &Judged) -> Score {
+    let parts = &judged.parts;
     let gate = |name, factor| Gate { name, factor };
     let sum: f64 = WEIGHTS.iter().sum();
-    let term = |name, weight: f64, value| Term {
-        name,
-        weight: weight / sum,
-        value: Some(value),
-    };
+    let names = ["progress", "time_to_collision", "speed_limit", "comfort"];
+    let terms = names.into_iter().zip(WEIGHTS).zip(judged.terms());
     Score {
-        total: score.total,
+        total: judged.total,
         gates: vec![
-            gate("no_at_fault_collisions", score.no_at_fault_collision),
-            gate("drivable_area", score.drivable_area),
-            gate("driving_direction", score.driving_direction),
+            gate("no_at_fault_collisions", parts.no_at_fault_collision),
+            gate("drivable_area", parts.drivable_area),
+            gate("driving_direction", parts.driving_direction),
         ],
-        terms: vec![
-            term("progress", WEIGHTS[0], score.progress),
-            term("time_to_collision", WEIGHTS[1], score.time_to_collision),
-            term("comfort", WEIGHTS[2], score.comfort),
-        ],
+        terms: terms
+            .map(|((name, weight), value)| Term {
+                name,
+                weight: weight / sum,
+                value: Some(value),
+            })
+            .collect(),
     }
 }
 

@@ -8,9 +8,8 @@ use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState, Seed};
 use rayon::prelude::*;
 
-use super::choice::{Tally, best_of, judge};
+use super::choice::{Reward, Tally, best_of};
 use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
-use crate::pdm::comfort::ComfortFilters;
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
 use crate::pdm::mission::State;
 use crate::pdm::propose::{Corridor, DT, Proposal, Proposer};
@@ -36,9 +35,11 @@ pub(super) struct Imagination<'a> {
     pub(super) speeds: &'a [f64],
     pub(super) moment: &'a Moment<'a>,
     pub(super) clock: &'a dyn Fn() -> Duration,
-    /// For whole horizons.
-    pub(super) comfort: &'a ComfortFilters,
 }
+
+/// States of the past, a tenth of a second apart, that comfort is judged with: nuPlan's longest filter
+/// sees 1.5 s.
+const COMFORT_PAST: usize = 20;
 
 /// Separates the chance of rounds after the first from that of iterations.
 const ROUND: u64 = 1 << 32;
@@ -92,7 +93,7 @@ pub(super) struct Row {
     lost: bool,
 }
 
-impl Imagination<'_> {
+impl<'a> Imagination<'a> {
     /// Imagines all candidates and judges them; nobody is chosen yet.
     pub(super) fn imagine(&self) -> Result<Decision, PlanError> {
         let began = (self.clock)();
@@ -115,6 +116,8 @@ impl Imagination<'_> {
         let mut left: Vec<usize> = (0..n_candidates).collect();
         let mut horizon = steps(&self.config.budget) / DECISION;
         let rounds = self.config.allocation.rounds(self.config.n_futures);
+        // Sessions of a round stay open, so that those of later ones may share what they read.
+        let mut opened: Vec<Box<dyn Session + '_>> = Vec::new();
         for (r, &n_futures) in rounds.iter().enumerate() {
             let round = Round {
                 began,
@@ -126,22 +129,14 @@ impl Imagination<'_> {
                 n_decisions: horizon,
                 seed: self.seed(r),
             };
-            let (rows, imagined) = self.round(&round, &begun, &mut phases)?;
+            let (rows, imagined) = self.round(&round, &begun, &mut opened, &mut phases)?;
             if r > 0 && imagined < horizon {
                 // Time is up. What all others were judged by reaches farther.
                 break;
             }
             horizon = imagined;
             let time = (self.clock)();
-            let judge_of = self.judge_of();
-            let scores = judge(
-                &rows,
-                &judge_of,
-                self.comfort,
-                self.config,
-                n_futures,
-                horizon,
-            );
+            let scores = self.reward().judge(&rows, n_futures);
             let mut judged = rows.into_iter().zip(scores);
             for &candidate in &left {
                 let own = judged.by_ref().take(n_futures);
@@ -183,6 +178,7 @@ impl Imagination<'_> {
         &self,
         round: &Round<'_>,
         begun: &[Proposal],
+        opened: &mut Vec<Box<dyn Session + 'a>>,
         phases: &mut Phases,
     ) -> Result<(Vec<Row>, usize), PlanError> {
         let time = (self.clock)();
@@ -235,6 +231,8 @@ impl Imagination<'_> {
             imagined = decision;
         }
         self.imitate(&mut rows[n_ruled..], imagined);
+        opened.push(ruled);
+        opened.extend(own);
         Ok((rows, imagined))
     }
 
@@ -388,6 +386,18 @@ impl Imagination<'_> {
                 .collect();
             let ego = self.moment.ego;
             tracker.drive(ego, &poses, vehicle.wheel_base, &mut row.drive);
+        }
+    }
+
+    fn reward(&self) -> Reward<'_> {
+        // Of what was driven before the first iteration nothing is judged.
+        let past = self.moment.past;
+        let driven = self.moment.iteration.min(COMFORT_PAST).min(past.len());
+        Reward {
+            judge: self.judge_of(),
+            worth: self.config.worth,
+            past: &past[past.len() - driven..],
+            limit: self.state.stated_limit,
         }
     }
 

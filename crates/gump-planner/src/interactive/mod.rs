@@ -21,7 +21,6 @@ use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Rollout, Seed};
 
 use crate::candidates::{Candidate, Explain};
-use crate::pdm::comfort::ComfortFilters;
 use crate::pdm::mission::{State, brake, trajectory};
 use crate::pdm::propose::DT;
 use crate::pdm::{self, STEPS, TRAJECTORY_STEPS};
@@ -102,8 +101,10 @@ pub enum Aggregate {
 /// What a future is worth.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Worth {
-    /// PDM's score of the whole drive: the product of its gates times the weighted mean of its
-    /// terms, 0 to 1.
+    /// The score of the whole drive, 0 to 1: the product of PDM's gates times the mean of progress,
+    /// time to collision, the speed limit and comfort with the weights of nuPlan's closed-loop score.
+    /// Comfort is that of nuPlan's metric, the last 2 s of the drive so far included; a limit that is
+    /// not stated is kept at any speed.
     Rollout,
     /// The same of every half second, discounted: the weighted mean with weights gamma^t, 0 to 1. A
     /// gate that closes stays closed.
@@ -214,7 +215,6 @@ pub struct InteractiveDriver<'w> {
     config: InteractiveDriverConfig,
     clock: Box<dyn Fn() -> Duration + 'w>,
     mission: Option<State>,
-    comfort: ComfortFilters,
     decision: Option<Decision>,
     decided_at: usize,
     /// The way of the chosen imitation.
@@ -233,7 +233,6 @@ impl<'w> InteractiveDriver<'w> {
         check(&config)?;
         Ok(Self {
             world,
-            comfort: ComfortFilters::new(steps(&config.budget) + 1, DT),
             config,
             clock: Box::new(|| Duration::ZERO),
             mission: None,
@@ -267,7 +266,6 @@ impl<'w> InteractiveDriver<'w> {
             speeds,
             moment,
             clock: &*self.clock,
-            comfort: &self.comfort,
         };
         let mut decision = imagination.imagine()?;
         let previous = self.decision.as_ref().map(|decision| decision.chosen);

@@ -235,12 +235,12 @@ fn every_candidate_keeps_its_score() {
                     "driving_direction"
                 ]
             );
-            // Gates multiply, terms add with weights of 5, 5 and 2 of 12.
+            // Gates multiply, terms add with weights of 5, 5, 4 and 2 of 16.
             let gates: f64 = future.gates.iter().map(|gate| gate.factor).product();
             let terms = future.terms.iter().map(|term| term.value.unwrap());
             let weighted = terms
-                .zip([5.0, 5.0, 2.0])
-                .map(|(value, w)| value * w / 12.0);
+                .zip([5.0, 5.0, 4.0, 2.0])
+                .map(|(value, w)| value * w / 16.0);
             assert_abs_diff_eq!(future.total, gates * weighted.sum::<f64>(), epsilon = 1e-12);
         }
     }

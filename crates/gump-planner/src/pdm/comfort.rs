@@ -79,11 +79,6 @@ impl ComfortFilters {
         }
     }
 
-    /// States of the drives that these are for.
-    pub(crate) fn n(&self) -> usize {
-        self.acceleration.rows.len()
-    }
-
     /// True if every moment of the drive stays within the bounds of nuPlan's comfort metric.
     pub(crate) fn are_comfortable(&mut self, states: &[EgoState]) -> bool {
         let bounds = &ComfortBounds::NUPLAN;

@@ -33,6 +33,8 @@ pub(crate) struct State {
     way: Option<Way>,
     pub(crate) ground: Ground,
     pub(crate) forecast: Forecast,
+    /// The limit that the lane states, metres per second, once a moment was prepared.
+    pub(crate) stated_limit: Option<f64>,
 }
 
 #[derive(Debug)]
@@ -58,6 +60,7 @@ impl State {
             way: None,
             ground: Ground::default(),
             forecast: Forecast::default(),
+            stated_limit: None,
         })
     }
 
@@ -81,6 +84,7 @@ impl State {
         self.lay_lines(lane, config)?;
         let lane = self.map.lane(lane);
         let limit = lane.and_then(|lane| lane.speed_limit.or(lane.kind.usual_speed_limit()));
+        self.stated_limit = lane.and_then(|lane| lane.speed_limit);
         let limit = limit.unwrap_or(config.fallback_speed);
         Ok(config.speed_fractions.iter().map(|f| f * limit).collect())
     }

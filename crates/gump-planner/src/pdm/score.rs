@@ -88,14 +88,17 @@ impl Judge<'_> {
         drives: &[Vec<EgoState>],
         comfort: &mut ComfortFilters,
     ) -> Vec<PdmScore> {
-        let judged = drives.iter().map(|states| self.parts(states, comfort));
+        let judged = drives.iter().map(|states| {
+            let comfortable = comfort.are_comfortable(states);
+            self.parts(states, comfortable)
+        });
         let mut scores: Vec<PdmScore> = judged.collect();
         normalize(&mut scores);
         scores
     }
 
     /// The parts of a score that take no other drive; [`normalize`] adds the rest.
-    pub(crate) fn parts(&self, states: &[EgoState], comfort: &mut ComfortFilters) -> PdmScore {
+    pub(crate) fn parts(&self, states: &[EgoState], comfortable: bool) -> PdmScore {
         let tracked = self.track(states);
         let (no_at_fault_collision, collision_step) = self.collision(&tracked);
         let ttc_step = self.time_to_collision(&tracked);
@@ -108,7 +111,7 @@ impl Judge<'_> {
             time_to_collision: f64::from(u8::from(ttc_step.is_none())),
             drivable_area: f64::from(u8::from(off_road_step.is_none())),
             driving_direction: driving_direction(&tracked),
-            comfort: f64::from(u8::from(comfort.are_comfortable(states))),
+            comfort: f64::from(u8::from(comfortable)),
             progress_m: self.progress(&tracked),
             ..PdmScore::default()
         }

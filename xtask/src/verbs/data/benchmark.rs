@@ -1,13 +1,14 @@
 //! `data benchmark`: the scenes of a frozen list, made anew or looked for, and held to its sums.
 
 use std::io::Write as _;
-use std::path::PathBuf;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::benchmark::{self, List};
+use crate::benchmark::{self, Draw, List, Rule};
 use crate::run::{Common, Run};
 
 /// Arguments of `data benchmark`.
@@ -25,6 +26,18 @@ pub(crate) struct Args {
     /// Write the sums of what is made into the list: for a new list, never for a published one
     #[arg(long, conflicts_with = "check")]
     freeze: bool,
+    /// Make nothing: draw a new list from this one, of at most so many scenes of each split
+    #[arg(long, value_name = "N", requires = "into", conflicts_with_all = ["check", "freeze"])]
+    draw: Option<NonZeroUsize>,
+    /// Where the new list goes; its name is the file's
+    #[arg(long, value_name = "LIST.toml", requires = "draw")]
+    into: Option<PathBuf>,
+    /// Draw only scenes in which a planner of --report scored below this in some world, 0 to 1
+    #[arg(long, value_name = "X", requires_all = ["draw", "report"])]
+    below: Option<f64>,
+    /// The report.json of an `evaluate closed-loop` of this list
+    #[arg(long, value_name = "FILE", requires = "below")]
+    report: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -33,6 +46,9 @@ pub(crate) struct Args {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let mut list = List::read(&self.list)?;
+        if let (Some(n), Some(into)) = (self.draw, &self.into) {
+            return self.draw(run, &list, n.get(), into);
+        }
         let mut rows: Vec<Value> = Vec::new();
         let folder = self.check.clone().unwrap_or_else(|| run.out().to_owned());
         for i in 0..list.made.len() {
@@ -43,7 +59,7 @@ impl Args {
                     "split": part.split,
                     "generator": part.generator,
                     "seed": part.seed,
-                    "scenes": part.count,
+                    "scenes": part.kept(),
                     "state": state,
                 })
             };
@@ -52,7 +68,7 @@ impl Args {
                 rows.push(row(part, "as listed"));
                 continue;
             }
-            let progress = run.progress(&part.file, part.count as u64, "scenes");
+            let progress = run.progress(&part.file, part.kept() as u64, "scenes");
             if self.freeze {
                 let scenes = run.phase(&part.file, |_| {
                     benchmark::freeze(&list, part, &folder, &progress)
@@ -81,6 +97,49 @@ impl Args {
         }
         run.result("list", &list.name)?;
         run.result("rows", rows)
+    }
+
+    /// Writes a list that is drawn from this one; never over one that is there.
+    fn draw(&self, run: &mut Run, list: &List, n: usize, into: &Path) -> anyhow::Result<()> {
+        anyhow::ensure!(
+            !into.exists(),
+            "expected a new file for the list, found {}: a published list never changes",
+            into.display()
+        );
+        let name = into.file_stem().unwrap_or_default().to_string_lossy();
+        let worst = self.report.as_deref().map(benchmark::worst_scores);
+        let worst = worst.transpose()?;
+        let draw = Draw {
+            name: name.into_owned(),
+            rule: match (self.below, &worst) {
+                (Some(bound), Some(worst)) => Rule::Below(bound, worst),
+                _ => Rule::Any,
+            },
+            at_most: n,
+            seed: run.seed(),
+        };
+        let drawn = draw.of(list)?;
+        let comment = "# Drawn by `cargo xtask data benchmark --draw`; made anew on any machine by\n\
+                       # `cargo xtask data benchmark --list` this file. A scene is \"SUM ID\". Never\n\
+                       # changes: another set gets another name.\n";
+        let text = comment.to_owned() + &toml::to_string_pretty(&drawn)?;
+        gump_data::write_atomically(into, |file| {
+            file.write_all(text.as_bytes())
+                .with_context(|| format!("cannot write {}", into.display()))
+        })?;
+        let made = drawn.made.iter().map(|part| {
+            json!({
+                "part": part.file,
+                "split": part.split,
+                "scenes": part.scenes.len(),
+                "of": part.count,
+            })
+        });
+        let recorded = drawn.recorded.iter().map(
+            |part| json!({ "part": part.folder, "split": part.split, "scenes": part.scenes.len() }),
+        );
+        run.result("list", &drawn.name)?;
+        run.result("rows", made.chain(recorded).collect::<Vec<Value>>())
     }
 
     /// The list with its new sums under the comment that it begins with.

@@ -26,7 +26,7 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> Strin
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places.
-pub(super) fn tell(run: &mut Run, worlds: &[(String, Vec<Drives>)]) -> anyhow::Result<()> {
+pub(super) fn tell(run: &mut Run, worlds: &[(String, Vec<Drives<'_>>)]) -> anyhow::Result<()> {
     let Some((_, planners)) = worlds.first().filter(|(_, drives)| drives.len() > 1) else {
         return Ok(());
     };
@@ -96,13 +96,13 @@ impl Change {
 }
 
 /// Of the scenarios that both drove to the end.
-fn compare(a: &Drives, b: &Drives, seed: Seed) -> Option<Comparison> {
+fn compare(a: &Drives<'_>, b: &Drives<'_>, seed: Seed) -> Option<Comparison> {
     let pairs = a.scores().zip(b.scores());
     let (a, b): (Vec<f64>, Vec<f64>) = pairs.filter_map(|(a, b)| a.zip(b)).unzip();
     Comparison::of_scenes(&a, &b, seed)
 }
 
-fn tell_one(world: &str, a: &Drives, b: &Drives, compared: &Comparison) -> Value {
+fn tell_one(world: &str, a: &Drives<'_>, b: &Drives<'_>, compared: &Comparison) -> Value {
     json!({
         "world": world,
         "planner": a.planner,

@@ -21,6 +21,7 @@ use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
+use crate::sharding::shard;
 pub(crate) use tell::tell_merged;
 use ways::{Way, ways};
 
@@ -48,8 +49,9 @@ pub(crate) struct Args {
     /// At most so many scenarios, the first [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N; put the parts together with `evaluate merge`
-    #[arg(long, value_name = "K/N", default_value = "1/1")]
+    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
+    /// with `evaluate merge`
+    #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
     #[command(flatten)]
     #[serde(flatten)]

@@ -30,6 +30,7 @@ use crate::futures;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
+use crate::sharding::shard;
 
 pub(crate) use self::tell::tell_merged;
 
@@ -52,7 +53,7 @@ pub(crate) struct Args {
     #[arg(long, value_enum, default_value_t = Shapes::Current)]
     shapes: Shapes,
     /// Only every N-th scenario from the K-th; see `evaluate merge`
-    #[arg(long, value_name = "K/N", default_value = "1/1")]
+    #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
     #[command(flatten)]
     #[serde(flatten)]

@@ -29,6 +29,7 @@ use crate::benchmark::{Found, Scenes};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
+use crate::sharding::shard;
 use crate::tables;
 pub(crate) use recording::{Recorded, recordings};
 pub(crate) use rollouts::Source;
@@ -56,8 +57,9 @@ pub(crate) struct Args {
     /// Rollouts that a world imagines of each scenario
     #[arg(long, value_name = "N", default_value = "32")]
     rollouts_per_scenario: NonZeroUsize,
-    /// Evaluate part K of N; put the parts together with `evaluate merge`
-    #[arg(long, value_name = "K/N")]
+    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
+    /// with `evaluate merge`
+    #[arg(long, value_name = "K/N|auto", value_parser = shard)]
     shard: Option<Shard>,
     /// Also say what lowered the scores of the first row and when, in explain.jsonl, agents.parquet
     /// and the largest losses in the report, and which agents do what no driver would, in

@@ -1,0 +1,213 @@
+//! Draws a list from a larger one: at random, or by what planners scored in its scenes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::Context as _;
+use gump_scene::Seed;
+use rand::Rng as _;
+use serde_json::Value;
+
+use super::{List, Made, Recorded};
+use crate::dataset::Split;
+
+/// Which scenes are drawn.
+pub(crate) struct Draw<'a> {
+    /// The name of the new list.
+    pub(crate) name: String,
+    pub(crate) rule: Rule<'a>,
+    /// Of every split at most so many, by chance.
+    pub(crate) at_most: usize,
+    pub(crate) seed: Seed,
+}
+
+/// Which scenes may be drawn.
+pub(crate) enum Rule<'a> {
+    /// All of them.
+    Any,
+    /// Those whose worst score is below a bound.
+    Below(f64, &'a BTreeMap<String, f64>),
+}
+
+impl Draw<'_> {
+    /// The scenes of `list` that are drawn, in their order.
+    ///
+    /// Error: a list without sums, or nothing that may be drawn.
+    pub(crate) fn of(&self, list: &List) -> anyhow::Result<List> {
+        let mut drawn: BTreeMap<Split, Vec<(u64, usize, usize)>> = BTreeMap::new();
+        let made = list.made.iter().map(|part| (part.split, &part.scenes));
+        let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
+        for (p, (split, scenes)) in made.chain(recorded).enumerate() {
+            anyhow::ensure!(
+                !scenes.is_empty(),
+                "expected a list with sums, found a part without: `data benchmark --freeze`"
+            );
+            for (i, scene) in scenes.iter().enumerate() {
+                let id = scene.rsplit(' ').next().unwrap_or_default();
+                if self.rule.admits(id) {
+                    // A rank by chance that does not depend on what else may be drawn.
+                    let rank = self.seed.fork(p as u64).fork(i as u64).rng().random();
+                    drawn.entry(split).or_default().push((rank, p, i));
+                }
+            }
+        }
+        anyhow::ensure!(!drawn.is_empty(), "no scene of {} may be drawn", list.name);
+        for scenes in drawn.values_mut() {
+            scenes.sort_unstable();
+            scenes.truncate(self.at_most);
+        }
+        let of_part = |p: usize| {
+            let all = drawn.values().flatten();
+            let mut kept: Vec<usize> = all.filter(|s| s.1 == p).map(|s| s.2).collect();
+            kept.sort_unstable();
+            kept
+        };
+        let made = list.made.iter().enumerate().map(|(p, part)| {
+            let kept = of_part(p);
+            Made {
+                scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
+                keep: kept
+                    .iter()
+                    .map(|&i| part.keep.get(i).copied().unwrap_or(i))
+                    .collect(),
+                ..part.clone()
+            }
+        });
+        let recorded = list.recorded.iter().enumerate().map(|(p, part)| {
+            let kept = of_part(list.made.len() + p);
+            Recorded {
+                scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
+                ..part.clone()
+            }
+        });
+        Ok(List {
+            name: self.name.clone(),
+            about: format!("{} {}", list.about, self.rule.sentence(&list.name)),
+            made: made.filter(|part| !part.keep.is_empty()).collect(),
+            recorded: recorded.filter(|part| !part.scenes.is_empty()).collect(),
+            path: list.path.clone(),
+        })
+    }
+}
+
+impl Rule<'_> {
+    fn admits(&self, id: &str) -> bool {
+        match self {
+            Self::Any => true,
+            Self::Below(bound, worst) => worst.get(id).is_some_and(|score| score < bound),
+        }
+    }
+
+    fn sentence(&self, from: &str) -> String {
+        match self {
+            Self::Any => format!("Drawn from {from} by chance."),
+            Self::Below(bound, _) => format!(
+                "Drawn from {from} by chance among the scenes in which a planner of a report scored \
+                 below {bound} in some world."
+            ),
+        }
+    }
+}
+
+/// The worst score of every scenario of a closed-loop report, over its planners and worlds. Drives
+/// that failed do not count.
+///
+/// Error: a file that is no report of `evaluate closed-loop`.
+pub(crate) fn worst_scores(report: &Path) -> anyhow::Result<BTreeMap<String, f64>> {
+    let text = std::fs::read_to_string(report)
+        .with_context(|| format!("cannot read {}", report.display()))?;
+    let told: Value = serde_json::from_str(&text)
+        .with_context(|| format!("expected a report, found {}", report.display()))?;
+    let scenarios = told["results"]["scenarios"].as_array();
+    let scenarios = scenarios.with_context(|| {
+        format!(
+            "expected results.scenarios of evaluate closed-loop in {}",
+            report.display()
+        )
+    })?;
+    let mut worst = BTreeMap::new();
+    for scenario in scenarios {
+        if let (Some(id), Some(score)) = (scenario["id"].as_str(), scenario["score"].as_f64()) {
+            let known = worst.entry(id.to_owned()).or_insert(score);
+            *known = score.min(*known);
+        }
+    }
+    Ok(worst)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pool() -> List {
+        let part = |file: &str, split: &str, seed: u64| {
+            let scenes: Vec<String> = (0..6).map(|i| format!("\"s{i} {file}-{i}\"")).collect();
+            format!(
+                "[[made]]\nfile = \"{file}\"\nsplit = \"{split}\"\ngenerator = \"procedural/1\"\n\
+                 seed = {seed}\ncount = 6\ndensity = 3.0\nscenes = [{}]\n",
+                scenes.join(", ")
+            )
+        };
+        let text = format!(
+            "name = \"pool\"\nabout = \"Roads.\"\n{}{}",
+            part("a", "tune", 900_000_101),
+            part("b", "test", 900_000_102)
+        );
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("pool.toml");
+        std::fs::write(&path, text).unwrap();
+        List::read(&path).unwrap()
+    }
+
+    fn draw(rule: Rule<'_>, at_most: usize, seed: u64) -> anyhow::Result<List> {
+        let name = "drawn".into();
+        let seed = Seed(seed);
+        let draw = Draw {
+            name,
+            rule,
+            at_most,
+            seed,
+        };
+        draw.of(&pool())
+    }
+
+    #[test]
+    fn scenes_below_the_bound_are_kept_with_their_sums_and_places() {
+        let worst = [("a-1", 0.5), ("a-4", 0.95), ("b-0", 0.0), ("b-5", 0.89)];
+        let worst = worst.map(|(id, score)| (id.to_owned(), score)).into();
+        let list = draw(Rule::Below(0.9, &worst), 10, 0).unwrap();
+        let told: Vec<_> = list
+            .made
+            .iter()
+            .map(|p| (&p.keep[..], &p.scenes[..]))
+            .collect();
+        assert_eq!(told.len(), 2);
+        assert_eq!(
+            (told[0].0, told[0].1),
+            (&[1][..], &["s1 a-1".to_owned()][..])
+        );
+        assert_eq!(told[1].0, [0, 5]);
+        assert!(list.about.contains("below 0.9"), "{}", list.about);
+        // It reads back as it was written.
+        let text = toml::to_string_pretty(&list).unwrap();
+        let again: List = toml::from_str(&text).unwrap();
+        assert_eq!(again.made[1].keep, [0, 5]);
+        assert!(draw(Rule::Below(-1.0, &worst), 10, 0).is_err());
+    }
+
+    #[test]
+    fn a_draw_by_chance_has_so_many_of_every_split_and_depends_on_the_seed() {
+        let kept = |seed: u64| -> Vec<Vec<usize>> {
+            let list = draw(Rule::Any, 3, seed).unwrap();
+            list.made.into_iter().map(|part| part.keep).collect()
+        };
+        let all: Vec<_> = (0..8).map(kept).collect();
+        assert!(
+            all.iter()
+                .flatten()
+                .all(|keep| keep.len() == 3 && keep.is_sorted())
+        );
+        assert_eq!(kept(3), all[3]);
+        assert!(all.iter().any(|keep| *keep != all[0]));
+    }
+}

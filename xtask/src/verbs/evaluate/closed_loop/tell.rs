@@ -1,0 +1,242 @@
+//! The report of closed-loop drives.
+
+use std::path::PathBuf;
+
+use gump_eval::results::{self, Entry};
+use gump_eval::worlds::WorldName;
+use gump_metrics::interval;
+use gump_nuplan::metrics::MetricScores;
+use gump_scene::Seed;
+use gump_viz::Bars;
+use serde_json::{Value, json};
+
+use super::{Driven, Outcome, Settings};
+use crate::run::Run;
+use crate::verbs::evaluate::{any_succeeded, ranking};
+use crate::{charts, tables};
+
+/// Columns of the table, by nuPlan's names of the metrics.
+pub(in crate::verbs::evaluate) const COLUMNS: [(&str, &str); 8] = [
+    ("no_at_fault_collisions", "no_ego_at_fault_collisions"),
+    ("drivable_area", "drivable_area_compliance"),
+    ("driving_direction", "driving_direction_compliance"),
+    ("making_progress", "ego_is_making_progress"),
+    ("time_to_collision", "time_to_collision_within_bound"),
+    ("speed_limit", "speed_limit_compliance"),
+    ("progress", "ego_progress_along_expert_route"),
+    ("comfort", "ego_is_comfortable"),
+];
+
+/// A row of a world's table: one planner, every scenario.
+pub(in crate::verbs::evaluate) struct Drives<'a> {
+    /// Who drove.
+    pub(in crate::verbs::evaluate) planner: String,
+    /// Scenario by scenario.
+    drives: Vec<(&'a Entry<Driven>, &'a Outcome)>,
+}
+
+impl Drives<'_> {
+    /// The scores of the scenarios, in their order; `None` where one failed.
+    pub(in crate::verbs::evaluate) fn scores(&self) -> impl Iterator<Item = Option<f64>> + '_ {
+        let outcomes = self.drives.iter().map(|(_, outcome)| outcome);
+        outcomes.map(|outcome| outcome.finished.as_ref().map(|finished| finished.score))
+    }
+}
+
+/// The report of the shards in some folders.
+pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Driven>(folders)?;
+    tell(run, &header.settings.try_into()?, &entries)
+}
+
+/// Fills the report of a run.
+pub(super) fn tell(
+    run: &mut Run,
+    settings: &Settings,
+    entries: &[Entry<Driven>],
+) -> anyhow::Result<()> {
+    run.result("set", &settings.scenarios)?;
+    let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
+    let mut worlds = Vec::new();
+    for name in &settings.worlds {
+        let drives = of_world(entries, name);
+        let world: WorldName = name.parse().map_err(anyhow::Error::msg)?;
+        let told = drives.iter().map(|drives| row(drives, name, run.seed()));
+        let told: Vec<Value> = told.collect();
+        if settings.worlds.len() > 1 {
+            run.say(&ranking::table_of(&world, &told, run.width()));
+        }
+        rows.extend(told);
+        let of_row = |row: &Drives<'_>| -> Vec<Value> {
+            let drives = row.drives.iter();
+            let told = drives.map(|(entry, outcome)| tell_one(entry, outcome, &row.planner));
+            told.collect()
+        };
+        scenarios.extend(drives.iter().flat_map(of_row));
+        worlds.push((name.clone(), drives));
+    }
+    run.phase("write", |run| {
+        Ok(nuplan_table(&worlds).write(&run.path("nuplan.parquet"))?)
+    })?;
+    run.result("imagination", &settings.imagination)?;
+    charts::save(run, "scores", &chart(&rows, &settings.worlds))?;
+    run.result("rows", rows)?;
+    ranking::tell(run, &worlds)?;
+    run.result("scenarios", &scenarios)?;
+    any_succeeded(&scenarios)
+}
+
+/// The rows of a world's table, planners in their order.
+fn of_world<'a>(entries: &'a [Entry<Driven>], world: &str) -> Vec<Drives<'a>> {
+    let mut rows: Vec<(bool, Drives<'a>)> = Vec::new();
+    for entry in entries {
+        let of_world = entry.scores.outcomes.iter();
+        for outcome in of_world.filter(|outcome| outcome.world == world) {
+            let known = rows
+                .iter_mut()
+                .find(|(_, row)| row.planner == outcome.planner);
+            match known {
+                Some((_, row)) => row.drives.push((entry, outcome)),
+                None => {
+                    let row = Drives {
+                        planner: outcome.planner.clone(),
+                        drives: vec![(entry, outcome)],
+                    };
+                    rows.push((outcome.proposal, row));
+                }
+            }
+        }
+    }
+    let place = rows.iter().position(|(proposal, _)| *proposal);
+    let (alone, mut others): (Vec<_>, Vec<_>) = rows.into_iter().partition(|(alone, _)| *alone);
+    if let Some(place) = place {
+        let alone = alone.into_iter().map(|(_, row)| row).collect();
+        let two = best_and_oracle(alone).into_iter().map(|row| (false, row));
+        others.splice(place..place, two);
+    }
+    others.into_iter().map(|(_, row)| row).collect()
+}
+
+/// Of proposals that were each driven to the end: the one that is best on average, and the best of
+/// every scenario, which no one who does not know the outcome can choose.
+fn best_and_oracle(mut alone: Vec<Drives<'_>>) -> Vec<Drives<'_>> {
+    let average = |drives: &Drives<'_>| mean(&drives.scores().flatten().collect::<Vec<_>>());
+    let value = |drives: &Drives<'_>| average(drives).unwrap_or(f64::NEG_INFINITY);
+    let best = (0..alone.len()).fold(0, |best, i| {
+        if value(&alone[i]) > value(&alone[best]) {
+            i
+        } else {
+            best
+        }
+    });
+    let n = alone[best].drives.len();
+    let oracle = (0..n).map(|scene| {
+        let mut drives: Vec<_> = alone.iter().map(|row| row.drives[scene]).collect();
+        let score = |outcome: &Outcome| outcome.finished.as_ref().map_or(-1.0, |f| f.score);
+        // The first of the best: the sort is stable.
+        drives.sort_by(|a, b| score(b.1).total_cmp(&score(a.1)));
+        drives[0]
+    });
+    let oracle = Drives {
+        planner: "oracle of the proposals".into(),
+        drives: oracle.collect(),
+    };
+    let mut best = alone.swap_remove(best);
+    best.planner = format!("best proposal: {}", best.planner);
+    vec![best, oracle]
+}
+
+fn tell_one(entry: &Entry<Driven>, outcome: &Outcome, planner: &str) -> Value {
+    let mut told = json!({
+        "id": entry.id,
+        "planner": planner,
+        "world": outcome.world,
+    });
+    if let Some(finished) = &outcome.finished {
+        told["score"] = json!(finished.score);
+        for (column, metric) in COLUMNS {
+            told[column] = json!(finished.metrics.get(metric));
+        }
+    }
+    if let Some(error) = &outcome.error {
+        told["error"] = json!(error);
+    }
+    told
+}
+
+/// Every drive that reached its end, as nuPlan's own tables show it.
+fn nuplan_table(worlds: &[(String, Vec<Drives<'_>>)]) -> gump_data::Table {
+    let mut nuplan = tables::NuPlan::default();
+    for (world, rows) in worlds {
+        for row in rows {
+            let finished: Vec<(&Entry<Driven>, f64, MetricScores)> = row
+                .drives
+                .iter()
+                .filter_map(|(entry, outcome)| {
+                    let finished = outcome.finished.as_ref()?;
+                    let metrics = finished.metrics.iter();
+                    let metrics = metrics.map(|(name, value)| (name.clone(), Some(*value)));
+                    Some((*entry, finished.score, metrics.collect()))
+                })
+                .collect();
+            let driven = finished
+                .iter()
+                .map(|(entry, score, metrics)| tables::Driven {
+                    scenario: &entry.id,
+                    log_name: &entry.scores.log_name,
+                    scenario_type: &entry.scores.scenario_type,
+                    score: *score,
+                    metrics,
+                });
+            nuplan.add(&row.planner, world, &driven.collect::<Vec<_>>());
+        }
+    }
+    nuplan.table()
+}
+
+/// Means over the scenarios that were driven to the end; how many were not stands beside them.
+fn row(row: &Drives<'_>, world: &str, seed: Seed) -> Value {
+    let outcomes = row.drives.iter().map(|(_, outcome)| outcome);
+    let done: Vec<_> = outcomes.filter_map(|o| o.finished.as_ref()).collect();
+    let scores: Vec<f64> = done.iter().map(|finished| finished.score).collect();
+    let span = interval(&scores, seed);
+    let mut told = json!({
+        "planner": row.planner,
+        "world": world,
+        "scenarios": row.drives.len(),
+        "failed": row.drives.len() - done.len(),
+        "score": mean(&scores),
+        "low": span.map(|span| span.low),
+        "high": span.map(|span| span.high),
+    });
+    for (column, metric) in COLUMNS {
+        let of_metric = done.iter().filter_map(|f| f.metrics.get(metric).copied());
+        told[column] = json!(mean(&of_metric.collect::<Vec<_>>()));
+    }
+    let times: Vec<f64> = done.iter().map(|finished| finished.milliseconds).collect();
+    told["milliseconds_per_step"] = json!(mean(&times));
+    told
+}
+
+/// The score of every planner in every world.
+fn chart(rows: &[Value], worlds: &[String]) -> Bars {
+    let mut planners: Vec<&Value> = Vec::new();
+    for row in rows.iter().filter(|row| row["world"] == worlds[0]) {
+        planners.push(&row["planner"]);
+    }
+    let names = planners.iter().filter_map(|planner| planner.as_str());
+    let names = names.map(String::from).collect();
+    let legend = worlds.iter().map(|world| charts::legend(world)).collect();
+    let label = "nuPlan score, 0 to 1, with 95 % intervals over scenarios";
+    charts::bars(label, names, legend, |planner, world| {
+        let is =
+            |row: &&Value| row["planner"] == *planners[planner] && row["world"] == worlds[world];
+        let row = rows.iter().find(is)?;
+        charts::bar(&row["score"], &row["low"], &row["high"])
+    })
+}
+
+/// Mean; `None` of nothing.
+pub(in crate::verbs::evaluate) fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
