@@ -855,6 +855,69 @@ fn shards_of_an_evaluation_are_the_whole_to_the_bit() {
 }
 
 #[test]
+fn shards_of_drives_are_the_whole_and_a_stopped_run_goes_on() {
+    let place = Workplace::new();
+    let words = format!(
+        "evaluate closed-loop --scenarios {} --planner pdm-closed,interactive,proposals \
+         --world log,idm --seconds 2 --futures 2 --films 0",
+        two_scenes(&place)
+    );
+    // Whatever took time differs from run to run.
+    let timeless = |mut results: Value| {
+        for row in results["rows"].as_array_mut().unwrap() {
+            assert!(row["milliseconds_per_step"].as_f64().unwrap() > 0.0);
+            row["milliseconds_per_step"] = Value::Null;
+        }
+        results
+    };
+    let same = |a: &Value, b: &Value| {
+        for key in ["set", "rows", "scenarios", "comparisons", "ranking_changes"] {
+            assert_eq!(a[key], b[key], "{key}");
+        }
+    };
+    let whole = timeless(place.report(&words)["results"].clone());
+    assert_eq!(whole["rows"].as_array().unwrap().len(), 2 * 4);
+    let shard = |shard: &str, out: &str| {
+        Command::new(env!("CARGO_BIN_EXE_xtask"))
+            .args(format!("{words} --threads 1 --shard {shard} --out {out}").split(' '))
+            .current_dir(place.folder.path())
+            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
+            .envs([("JOB_COMPLETION_INDEX", "1"), ("GUMP_SHARDS", "2")])
+            .output()
+            .unwrap()
+    };
+    for (k, out) in [("1/2", "first"), ("auto", "second")] {
+        let output = shard(k, out);
+        assert!(output.status.success(), "{}", stderr(&output));
+    }
+    let merged = place.report("evaluate merge second first")["results"].clone();
+    same(&whole, &timeless(merged));
+    place.fails("evaluate merge second --out m", 1, &["missing are [1]"]);
+    let nowhere = format!("{words} --shard auto");
+    place.fails(&nowhere, 2, &["JOB_COMPLETION_INDEX"]);
+
+    // A run that was stopped in its second scenario keeps its first, which it does not drive again.
+    place.report(&words);
+    let ledger = fs::read_to_string(place.path("out/scenarios.toml")).unwrap();
+    let second = ledger.rfind("[[scenario]]").unwrap();
+    let stopped = ledger[..second + 40].replacen("score = ", "score = 7", 1);
+    fs::create_dir(place.path("stopped")).unwrap();
+    fs::write(place.path("stopped/scenarios.toml.partial"), stopped).unwrap();
+    let output = place.run(&format!("{words} --out stopped"));
+    assert!(output.status.success(), "{}", stderr(&output));
+    let resumed = read_report(&place.path("stopped"))["results"].clone();
+    let scores = |results: &Value| -> Vec<Value> {
+        let scenarios = results["scenarios"].as_array().unwrap().iter();
+        scenarios
+            .map(|scenario| scenario["score"].clone())
+            .collect()
+    };
+    let (before, after) = (scores(&whole), scores(&resumed));
+    assert!(after[0].as_f64().unwrap() > 7.0, "{}", after[0]);
+    assert_eq!(before[1..], after[1..]);
+}
+
+#[test]
 fn evaluate_wosac_takes_rollouts_from_files() {
     let place = Workplace::new();
     let scenes = two_scenes(&place);

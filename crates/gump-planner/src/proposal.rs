@@ -29,6 +29,16 @@ pub enum ProposalKind {
         /// Metres to the left of the centre line.
         lateral_offset: f64,
     },
+    /// The same along the centre, by a driver who follows closer and sets off faster.
+    Brisk {
+        /// Desired speed as a share of the limit, > 0.
+        speed_fraction: f64,
+    },
+    /// The same along the centre, by a driver who keeps a long distance and brakes early.
+    Yielding {
+        /// Desired speed as a share of the limit, > 0.
+        speed_fraction: f64,
+    },
     /// What the imagined world has the ego do.
     Imitation,
     /// Braking straight ahead as hard as allowed.
@@ -44,6 +54,12 @@ impl fmt::Display for ProposalKind {
             } => {
                 let percent = speed_fraction * 100.0;
                 write!(f, "idm {percent:.0} % of the limit, {lateral_offset:+.1} m")
+            }
+            Self::Brisk { speed_fraction } => {
+                write!(f, "brisk {:.0} % of the limit", speed_fraction * 100.0)
+            }
+            Self::Yielding { speed_fraction } => {
+                write!(f, "yielding {:.0} % of the limit", speed_fraction * 100.0)
             }
             Self::Imitation => f.write_str("imitation"),
             Self::EmergencyBrake => f.write_str("emergency brake"),

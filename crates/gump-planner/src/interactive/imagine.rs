@@ -4,11 +4,13 @@ use std::time::Duration;
 
 use gump_geometry::Pose;
 use gump_nuplan::closed_loop::Moment;
+use gump_rollout::worlds::IdmConfig;
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState, Seed};
 use rayon::prelude::*;
 
 use super::choice::{Reward, Tally, best_of};
+use super::policies::{self, Policy};
 use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
 use crate::pdm::mission::State;
@@ -85,6 +87,8 @@ pub(super) struct Row {
     pub(super) forecast: Forecast,
     /// The policy's own line so far; imitation has none.
     policy: Proposal,
+    /// How it follows whoever is ahead.
+    law: IdmConfig,
     /// How the car follows it, from now on.
     pub(super) drive: Vec<EgoState>,
     /// What the world said, once per decision; shorter where it was lost and let go.
@@ -104,10 +108,11 @@ impl<'a> Imagination<'a> {
             ..self.moment.scene
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
-        let begun = self.policies(&proposer);
+        let policies = policies::all(self.config, self.speeds);
+        let begun = self.begin(&proposer, &policies);
         let corridors: Vec<Corridor> = (0..self.config.proposals.lateral_offsets.len())
             .map(|line| {
-                let first = &begun[line * self.speeds.len()];
+                let (first, _) = &begun[line * self.speeds.len()];
                 proposer.corridor(line, first.drives[0].progress)
             })
             .collect();
@@ -150,7 +155,9 @@ impl<'a> Imagination<'a> {
         let time = (self.clock)();
         let prospects = tallies.into_iter().enumerate().map(|(i, tally)| {
             let film = |frames| film(scene, frames);
-            tally.sum_up(self.kind(i), left.contains(&i), self.config, film)
+            let policy = policies.get(i);
+            let kind = policy.map_or(ProposalKind::Imitation, |policy| policy.kind);
+            tally.sum_up(kind, left.contains(&i), self.config, film)
         });
         let prospects = prospects.collect();
         phases.score += (self.clock)() - time;
@@ -177,7 +184,7 @@ impl<'a> Imagination<'a> {
     fn round(
         &self,
         round: &Round<'_>,
-        begun: &[Proposal],
+        begun: &[(Proposal, IdmConfig)],
         opened: &mut Vec<Box<dyn Session + 'a>>,
         phases: &mut Phases,
     ) -> Result<(Vec<Row>, usize), PlanError> {
@@ -257,28 +264,29 @@ impl<'a> Imagination<'a> {
         frames.collect()
     }
 
-    /// The policies by rule before they have driven, all speeds of a line after one another.
-    fn policies(&self, proposer: &Proposer<'_>) -> Vec<Proposal> {
+    /// Policies before they have driven, with the laws they drive by.
+    fn begin(&self, proposer: &Proposer<'_>, policies: &[Policy]) -> Vec<(Proposal, IdmConfig)> {
         let ego = self.moment.ego;
-        let lines = 0..self.config.proposals.lateral_offsets.len();
-        let of_line = |line| {
-            let begun = proposer.begin(line, ego.rear_axle, ego.velocity.x);
-            self.speeds.iter().map(move |&desired_speed| Proposal {
-                desired_speed,
-                ..begun.clone()
-            })
+        let begin = |policy: &Policy| {
+            let mut begun = proposer.begin(policy.line, ego.rear_axle, ego.velocity.x);
+            begun.desired_speed = policy.desired_speed;
+            (begun, policy.law.clone())
         };
-        lines.flat_map(of_line).collect()
+        policies.iter().map(begin).collect()
     }
 
     /// The rows of a round before anything has happened. Imitation has no policy.
-    fn rows(&self, round: &Round<'_>, begun: &[Proposal]) -> Vec<Row> {
-        let row = |&candidate: &usize| Row {
-            forecast: self.state.forecast.clone(),
-            policy: begun.get(candidate).cloned().unwrap_or_default(),
-            drive: vec![*self.moment.ego],
-            frames: Vec::new(),
-            lost: false,
+    fn rows(&self, round: &Round<'_>, begun: &[(Proposal, IdmConfig)]) -> Vec<Row> {
+        let row = |&candidate: &usize| {
+            let (policy, law) = begun.get(candidate).cloned().unwrap_or_default();
+            Row {
+                forecast: self.state.forecast.clone(),
+                policy,
+                law,
+                drive: vec![*self.moment.ego],
+                frames: Vec::new(),
+                lost: false,
+            }
         };
         let candidates = round.candidates.iter();
         let rows = candidates.flat_map(|c| (0..round.n_futures).map(move |_| row(c)));
@@ -299,6 +307,7 @@ impl<'a> Imagination<'a> {
                 }
                 let proposer = Proposer {
                     forecast: &row.forecast,
+                    law: &row.law,
                     ..*proposer
                 };
                 let corridor = &corridors[row.policy.line];
@@ -407,18 +416,6 @@ impl<'a> Imagination<'a> {
             forecast: &self.state.forecast,
             ground: &self.state.ground,
             centerline: self.state.centerline(),
-        }
-    }
-
-    fn kind(&self, candidate: usize) -> ProposalKind {
-        let proposals = &self.config.proposals;
-        let n = self.speeds.len();
-        match proposals.lateral_offsets.get(candidate / n) {
-            Some(&lateral_offset) => ProposalKind::Idm {
-                speed_fraction: proposals.speed_fractions[candidate % n],
-                lateral_offset,
-            },
-            None => ProposalKind::Imitation,
         }
     }
 

@@ -10,6 +10,7 @@
 
 mod choice;
 mod imagine;
+mod policies;
 #[cfg(test)]
 mod tests;
 
@@ -34,6 +35,9 @@ use imagine::Imagination;
 pub struct InteractiveDriverConfig {
     /// The policies by rule.
     pub proposals: PdmConfig,
+    /// Whether drivers of other tempers are candidates too: two brisk ones, one who yields and one
+    /// who creeps, all along the centre.
+    pub tempers: bool,
     /// Whether the world's own ego is a candidate too.
     pub imitation: bool,
     /// Futures per candidate, > 0; of candidates that drop out, fewer.
@@ -62,6 +66,7 @@ impl Default for InteractiveDriverConfig {
     fn default() -> Self {
         Self {
             proposals: PdmConfig::default(),
+            tempers: true,
             imitation: true,
             n_futures: 4,
             allocation: Allocation::default(),
@@ -292,13 +297,11 @@ impl<'w> InteractiveDriver<'w> {
         if let Some(way) = &self.following {
             return Ok(way.clone());
         }
-        let proposer = state.proposer(&self.config.proposals.law, speeds);
-        let (line, speed) = (
-            decision.chosen / speeds.len(),
-            decision.chosen % speeds.len(),
-        );
-        let mut policy = [proposer.begin(line, ego.rear_axle, ego.velocity.x)];
-        policy[0].desired_speed = speeds[speed];
+        let policies = policies::all(&self.config, speeds);
+        let chosen = &policies[decision.chosen];
+        let proposer = state.proposer(&chosen.law, speeds);
+        let mut policy = [proposer.begin(chosen.line, ego.rear_axle, ego.velocity.x)];
+        policy[0].desired_speed = chosen.desired_speed;
         proposer.drive(&mut policy, 1..=TRAJECTORY_STEPS);
         Ok(trajectory(ego.time_us, &policy[0].poses)?)
     }

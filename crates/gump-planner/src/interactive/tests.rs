@@ -41,6 +41,7 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
             ..PdmConfig::default()
         },
         imitation: false,
+        tempers: false,
         allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
     }
@@ -178,6 +179,7 @@ fn fraction_and_offset(decision: &Decision) -> (f64, f64) {
 fn ruled() -> InteractiveDriverConfig {
     InteractiveDriverConfig {
         imitation: false,
+        tempers: false,
         n_futures: 2,
         allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()

@@ -1,0 +1,84 @@
+//! The policies by rule among which the planner chooses.
+
+use gump_rollout::worlds::IdmConfig;
+
+use super::InteractiveDriverConfig;
+use crate::ProposalKind;
+
+/// A policy: a line, a desired speed and a car-following law.
+#[derive(Clone, Debug)]
+pub(super) struct Policy {
+    pub(super) kind: ProposalKind,
+    /// Index of the line.
+    pub(super) line: usize,
+    /// Metres per second.
+    pub(super) desired_speed: f64,
+    pub(super) law: IdmConfig,
+}
+
+/// Shares of the limit that brisk drivers desire.
+const BRISK: [f64; 2] = [0.7, 1.0];
+/// Share of the limit that a driver desires who keeps a long distance.
+const YIELDING: f64 = 0.8;
+/// Share of the limit at which a driver creeps forward.
+const CREEPING: f64 = 0.07;
+
+/// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers of
+/// other tempers along the centre, if that is a line and they are asked for. `speeds` are PDM's.
+pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Policy> {
+    let proposals = &config.proposals;
+    let offsets = proposals.lateral_offsets.iter().enumerate();
+    let of_line = |(line, &lateral_offset)| {
+        let speeds = proposals.speed_fractions.iter().zip(speeds);
+        speeds.map(move |(&speed_fraction, &desired_speed)| Policy {
+            kind: ProposalKind::Idm {
+                speed_fraction,
+                lateral_offset,
+            },
+            line,
+            desired_speed,
+            law: proposals.law.clone(),
+        })
+    };
+    let mut policies: Vec<Policy> = offsets.flat_map(of_line).collect();
+    let centre = proposals.lateral_offsets.iter().position(|&y| y == 0.0);
+    if let Some(line) = centre.filter(|_| config.tempers) {
+        let limit = speeds[0] / proposals.speed_fractions[0];
+        let policy = |kind, fraction: f64, law| Policy {
+            kind,
+            line,
+            desired_speed: fraction * limit,
+            law,
+        };
+        let usual = &proposals.law;
+        policies.extend(BRISK.map(|speed_fraction| {
+            let kind = ProposalKind::Brisk { speed_fraction };
+            policy(kind, speed_fraction, brisk(usual))
+        }));
+        for speed_fraction in [YIELDING, CREEPING] {
+            let kind = ProposalKind::Yielding { speed_fraction };
+            policies.push(policy(kind, speed_fraction, yielding(usual)));
+        }
+    }
+    policies
+}
+
+/// Two thirds of the headway; sets off just below what nuPlan finds uncomfortable (2.4 m/s²).
+fn brisk(usual: &IdmConfig) -> IdmConfig {
+    IdmConfig {
+        headway: usual.headway * 2.0 / 3.0,
+        max_acceleration: 2.2,
+        ..usual.clone()
+    }
+}
+
+/// Twice the headway, a car's length when standing, gentle both ways.
+fn yielding(usual: &IdmConfig) -> IdmConfig {
+    IdmConfig {
+        headway: usual.headway * 2.0,
+        min_gap: 4.0,
+        max_acceleration: 1.0,
+        max_deceleration: 2.5,
+        ..usual.clone()
+    }
+}
