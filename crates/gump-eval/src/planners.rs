@@ -39,7 +39,7 @@ pub enum PlannerName {
     PdmClosed,
     /// The mean of what an imagined world has the ego do.
     Imitation,
-    /// 15 policies and imitation, each imagined among others who react.
+    /// 19 policies and imitation, each imagined among others who react.
     Interactive,
     /// PDM's 15 proposals, each a planner of its own.
     Proposals,
@@ -80,7 +80,7 @@ impl PlannerName {
             Self::Imitation => {
                 "What the imagined world has the ego do: the mean of several futures"
             }
-            Self::Interactive => "15 policies and imitation, each imagined among others who react",
+            Self::Interactive => "19 policies and imitation, each imagined among others who react",
             Self::Proposals => {
                 "PDM's 15 proposals, each alone to the end: two rows, the best of them and the best \
                  in each scenario, an oracle"

@@ -61,7 +61,8 @@ pub struct InteractiveDriverConfig {
 }
 
 impl Default for InteractiveDriverConfig {
-    /// The paper's numbers: 15 policies and imitation, 4 futures of 4 s, the mean; a decision every
+    /// The paper's 15 policies and imitation, four more policies of other tempers, 4 futures of 4 s for
+    /// the finalists of sequential halving, the mean; a decision every
     /// half second, which is a frame of the learned world.
     fn default() -> Self {
         Self {

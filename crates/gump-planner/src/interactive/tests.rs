@@ -505,6 +505,59 @@ fn halving_imagines_the_better_candidates_more_often() {
 }
 
 #[test]
+fn brisk_drivers_come_closer_and_those_who_yield_stay_back() {
+    let config = InteractiveDriverConfig {
+        tempers: true,
+        ..ruled()
+    };
+    let decision = decide(
+        &ConstantVelocity,
+        config,
+        "ego vehicle 0: 2,0 velocity 4,0\n agent vehicle 1: 25,0 velocity 5,0",
+    );
+    assert_eq!(decision.prospects.len(), 19);
+    let of = |kind: ProposalKind| {
+        let found = decision.prospects.iter().find(|p| p.kind == kind);
+        found.unwrap_or_else(|| panic!("{kind} is no candidate"))
+    };
+    let usual = of(ProposalKind::Idm {
+        speed_fraction: 1.0,
+        lateral_offset: 0.0,
+    });
+    let brisk = of(ProposalKind::Brisk {
+        speed_fraction: 1.0,
+    });
+    let yields = of(ProposalKind::Yielding {
+        speed_fraction: 0.8,
+    });
+    let creeps = of(ProposalKind::Yielding {
+        speed_fraction: 0.07,
+    });
+    assert!(brisk.progress_m > usual.progress_m + 0.5);
+    assert!(usual.progress_m > yields.progress_m + 2.0);
+    assert!(yields.progress_m > creeps.progress_m + 2.0);
+    // None of them is uncomfortable by itself.
+    assert!([usual, brisk, yields].iter().all(|p| p.collisions == 0));
+}
+
+#[test]
+fn driving_too_fast_and_jolts_cost_what_nuplan_takes_off() {
+    let text = "ego vehicle 0: 2,0 velocity 16,0 size 5,2";
+    let decision = decide(&ConstantVelocity, only(&[1.0], &[0.0]), text);
+    // From 16 m/s where 12 are allowed: PDM has no term for it, nuPlan has.
+    let parts = decision.prospects[0].score.parts();
+    let part = |name: &str| parts.iter().find(|(part, _)| *part == name).unwrap().1;
+    let drive = &decision.prospects[0].drives[0];
+    let excess = drive
+        .iter()
+        .map(|s| (s.speed() - 12.0).max(0.0))
+        .sum::<f64>();
+    let expected = (1.0 - excess / drive.len() as f64 / 2.23).max(0.0);
+    assert_abs_diff_eq!(part("speed_limit"), expected, epsilon = 1e-12);
+    assert!(expected < 0.9, "{expected}");
+}
+
+#[test]
 fn where_futures_are_equal_halving_takes_what_uniform_takes() {
     for text in [FREE, BEHIND, CROSSING] {
         let with = |allocation| InteractiveDriverConfig {

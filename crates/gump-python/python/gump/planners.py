@@ -54,6 +54,6 @@ class Imitation(_Planner):
 
 
 class Interactive(_Planner):
-    """15 policies and imitation, each imagined among others who react."""
+    """19 policies and imitation, each imagined among others who react."""
 
     _gump_planner = "interactive"
