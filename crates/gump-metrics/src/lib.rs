@@ -23,17 +23,20 @@
 //! assert_eq!(summarize(&[rollout], Some(&scenario)).total().collision_rate(), Some(1.0));
 //! ```
 
+pub mod bearing;
 pub mod behaviour;
 mod bootstrap;
 mod border;
 mod collision;
 mod comfort;
 mod displacement;
+pub mod encounter;
 pub mod kinematics;
 mod metric;
 pub mod mmd;
 mod offroad;
 mod progress;
+pub mod reactions;
 mod red_light;
 mod reward;
 mod road_edge;

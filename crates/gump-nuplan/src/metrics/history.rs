@@ -2,7 +2,7 @@
 
 use gump_geometry::{DVec2, OrientedBox};
 use gump_scene::{
-    Agent, AgentId, AgentKind, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters,
+    Agent, AgentId, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters,
 };
 
 use super::comfort::Motion;
@@ -188,13 +188,4 @@ fn centres<'a>(
 ) -> Vec<DVec2> {
     let centre = |state: &EgoState| vehicle.center_of(state.rear_axle).position;
     states.into_iter().map(centre).collect()
-}
-
-/// Speed of an agent, metres per second; things that do not move by themselves have none.
-pub(crate) fn speed(agent: &Agent) -> f64 {
-    if AgentKind::MOVING.contains(&agent.kind) {
-        agent.state.speed()
-    } else {
-        0.0
-    }
 }
