@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use gump_eval::results;
 use serde::Serialize;
 
-use super::{behaviour, motion, wosac};
+use super::{behaviour, motion, reactions, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
@@ -15,6 +15,7 @@ type Tell = fn(&mut Run, &[PathBuf]) -> anyhow::Result<()>;
 const BENCHMARKS: &[(&str, Tell)] = &[
     (behaviour::BENCHMARK, behaviour::tell_merged),
     (motion::NAME, motion::tell_merged),
+    (reactions::BENCHMARK, reactions::tell_merged),
     (wosac::BENCHMARK, wosac::tell_merged),
 ];
 
