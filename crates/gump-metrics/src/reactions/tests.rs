@@ -36,7 +36,10 @@ fn future(attempt: &Attempt<'_>, moved: impl Fn(&Frame, f64) -> Frame) -> Rollou
 fn who_follows_runs_into_an_ego_that_stops_and_who_yields_does_not() {
     let scenario = scene("ego vehicle 0: 0,0 velocity 10,0\nagent vehicle 1: -20,0 velocity 10,0");
     let reactions = Reactions::new(&scenario, 8.0).unwrap();
-    for (manoeuvre, metres) in [(Manoeuvre::Brake, 50.0 / 3.0), (Manoeuvre::Stop, 25.0 / 3.0)] {
+    for (manoeuvre, metres) in [
+        (Manoeuvre::Brake, 50.0 / 3.0),
+        (Manoeuvre::Stop, 25.0 / 3.0),
+    ] {
         let attempt = reactions.attempt(manoeuvre).unwrap();
         assert_eq!(attempt.near(), [AgentId(1)]);
         let end = attempt.plan().last().unwrap();
@@ -152,7 +155,8 @@ fn who_changes_lane_is_to_blame_until_it_is_on_the_other() {
 
 #[test]
 fn a_lane_change_is_smooth_and_agrees_with_itself() {
-    let scenario = scene("ego vehicle 0: 0,0 velocity 10,0\nagent vehicle 1: -30,3.5 velocity 11,0");
+    let scenario =
+        scene("ego vehicle 0: 0,0 velocity 10,0\nagent vehicle 1: -30,3.5 velocity 11,0");
     let reactions = Reactions::new(&scenario, 8.0).unwrap();
     let attempt = reactions.attempt(Manoeuvre::ChangeLane).unwrap();
     let plan = attempt.plan();
@@ -234,11 +238,8 @@ fn the_way_bends_with_the_log_and_goes_on_along_the_lanes() {
          history 1.0 future 4.0 dt 0.1",
     )
     .unwrap();
-    let path = super::path::Path::of_log(
-        &Reactions::new(&fast, 1.0).unwrap().logged,
-        &fast.map,
-        70.0,
-    );
+    let path =
+        super::path::Path::of_log(&Reactions::new(&fast, 1.0).unwrap().logged, &fast.map, 70.0);
     let pose = path.unwrap().pose_at(70.0);
     assert!((pose.position.x - 50.0).abs() < 0.1, "{pose:?}");
     assert!((pose.heading - std::f64::consts::FRAC_PI_2).abs() < 0.05);
@@ -269,10 +270,7 @@ fn the_light_is_run_only_where_it_is_red_and_the_log_stands() {
     assert_eq!(attempt.near(), [AgentId(1)]);
     assert_eq!(ids(&attempt.replayed()), [1], "into its side");
     let refused = |scenario: &Scenario| why(scenario, Manoeuvre::RunLight);
-    assert_eq!(
-        refused(&crossing("green", "-6,0")),
-        Some(Reason::NoLight)
-    );
+    assert_eq!(refused(&crossing("green", "-6,0")), Some(Reason::NoLight));
     assert_eq!(
         refused(&crossing("red", "-6,0 velocity 4,0")),
         Some(Reason::NoLight),
@@ -300,7 +298,11 @@ fn manoeuvres_are_scored_only_where_they_apply() {
         Manoeuvre::SpeedUp,
         Manoeuvre::ChangeLane,
     ] {
-        assert_eq!(why(&slow, manoeuvre), Some(Reason::TooSlow), "{manoeuvre:?}");
+        assert_eq!(
+            why(&slow, manoeuvre),
+            Some(Reason::TooSlow),
+            "{manoeuvre:?}"
+        );
     }
     assert_eq!(why(&slow, Manoeuvre::RunLight), Some(Reason::NoLight));
     let alone = fixture::scenario(

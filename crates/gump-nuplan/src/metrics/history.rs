@@ -1,9 +1,7 @@
 //! What is scored: a finished drive, the expert's drive and the road.
 
 use gump_geometry::{DVec2, OrientedBox};
-use gump_scene::{
-    Agent, AgentId, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters,
-};
+use gump_scene::{Agent, AgentId, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters};
 
 use super::comfort::Motion;
 

@@ -131,9 +131,8 @@ impl Args {
 
     /// The manoeuvres asked for, in the order of tables.
     fn manoeuvres(&self) -> impl Iterator<Item = Manoeuvre> + '_ {
-        let asked = |one: &Manoeuvre| {
-            self.manoeuvre.is_empty() || self.manoeuvre.contains(&one.name())
-        };
+        let asked =
+            |one: &Manoeuvre| self.manoeuvre.is_empty() || self.manoeuvre.contains(&one.name());
         Manoeuvre::ALL.into_iter().filter(asked)
     }
 

@@ -301,9 +301,9 @@ fn chart(settings: &Settings, names: &[&str], lines: &[Line<'_>]) -> Bars {
     let rows = names.iter().map(|name| (*name).to_owned()).collect();
     let label = "share of agents near that run into the ego, with 95 % intervals over scenarios";
     charts::bars(label, rows, legend, |row, column| {
-        let mut found = lines.iter().filter(|line| {
-            line.manoeuvre == names[row] && *line.name == settings.worlds[column]
-        });
+        let mut found = lines
+            .iter()
+            .filter(|line| line.manoeuvre == names[row] && *line.name == settings.worlds[column]);
         let line = found.next()?;
         let span = line.span(0).map(|span| (span.low, span.high));
         let value = line.sum.rates()[0]?;
