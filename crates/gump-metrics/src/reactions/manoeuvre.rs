@@ -22,6 +22,8 @@ const FASTER: f64 = 5.0;
 const RUNS: f64 = 8.0;
 /// A log that is slower at some time has stopped, m/s.
 const HAS_STOPPED: f64 = 0.5;
+/// Who is slower would turn by more than 24 degrees to change lane in time, m/s.
+const CHANGES: f64 = 5.0;
 /// How long a lane change takes, seconds.
 const CHANGE_S: f64 = 3.0;
 /// How far lanes beside one another are apart, metres.
@@ -29,9 +31,9 @@ const BESIDE_M: std::ops::RangeInclusive<f64> = 2.0..=6.0;
 /// How far from its lane's centre line an ego starts to change, metres.
 const ON_LANE_M: f64 = 2.5;
 /// Room that a lane change asks for before and behind the ego, metres, and for how much of
-/// the difference in speed behind it, seconds.
+/// the difference in speed behind it, seconds: nobody is to be there before the change is over.
 const ROOM_M: f64 = 2.0;
-const ROOM_S: f64 = 1.0;
+const ROOM_S: f64 = CHANGE_S;
 /// Below so many metres between two frames a motion has no direction.
 const STILL_M: f64 = 0.02;
 
@@ -150,12 +152,12 @@ impl Reactions<'_> {
         // The horizon and a little: past the last point a way goes straight on.
         let path = Path::of_log(&self.logged, &self.scenario.map, metres(self.n) + 1.0);
         let path = path.ok_or(Reason::LikeLog)?;
-        let poses = (0..=self.n).map(|k| path.pose_at(metres(k))).collect();
-        Ok(self.moving(poses))
+        let poses: Vec<Pose> = (0..=self.n).map(|k| path.pose_at(metres(k))).collect();
+        Ok(self.moving(&poses))
     }
 
     /// States of these poses, with the velocities of their positions; the first is the present.
-    fn moving(&self, poses: Vec<Pose>) -> Vec<AgentState> {
+    fn moving(&self, poses: &[Pose]) -> Vec<AgentState> {
         let last = poses.len() - 1;
         let velocity = |k: usize| {
             let (from, to) = (k.saturating_sub(1), (k + 1).min(last));
@@ -200,7 +202,7 @@ impl Reactions<'_> {
     fn change_lane(&self) -> Result<Vec<AgentState>, Reason> {
         let (map, start) = (&self.scenario.map, self.logged[0].pose);
         let driven: f64 = self.driven_until(self.steps(CHANGE_S).min(self.n));
-        if driven < DRIVES * CHANGE_S {
+        if self.speed() <= CHANGES || driven < CHANGES * CHANGE_S {
             return Err(Reason::TooSlow);
         }
         let here = reach::nearest(map, start, ON_LANE_M, FRAC_PI_6);
@@ -214,7 +216,7 @@ impl Reactions<'_> {
             };
             if let Some(poses) = self.over_to(map, there) {
                 if self.has_room(there) {
-                    return Ok(self.moving(poses));
+                    return Ok(self.moving(&poses));
                 }
                 why = Reason::NoRoom;
             }

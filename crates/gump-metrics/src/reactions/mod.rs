@@ -10,7 +10,7 @@
 //! | `brake` | brakes with 3 m/s² to a stop | it drives faster than 3 m/s |
 //! | `stop` | brakes with 6 m/s² to a stop | it drives faster than 3 m/s |
 //! | `speed-up` | gains 2 m/s² until it is 5 m/s faster | it drives faster than 3 m/s |
-//! | `change-lane` | drives as fast as in its log, within 3 s over to the lane beside, left before right, and on along it | it drives faster than 3 m/s, the lane graph has a lane beside outside of intersections, and nobody is there: from 2 m and one second of the difference in speed behind its box to 2 m before it |
+//! | `change-lane` | drives as fast as in its log, within 3 s over to the lane beside, left before right, and on along it | it drives faster than 5 m/s, now and on average over the change, the lane graph has a lane beside outside of intersections, and nobody is there, nor would be before the change is over: from 2 m and three seconds of the difference in speed behind its box to 2 m before it |
 //! | `run-light` | keeps its speed, gaining 2 m/s² up to 8 m/s if it is slower, past a stop line that is red in the present and in the log of that moment | its log stands at some time (below 0.5 m/s) and does not pass that line |
 //!
 //! **The way.** All but `log` and `change-lane` drive along the positions of the log, with its

@@ -151,6 +151,18 @@ fn who_changes_lane_is_to_blame_until_it_is_on_the_other() {
          agent vehicle 1: -5,3.5 velocity 10,0",
     );
     assert_eq!(why(&scenario, Manoeuvre::ChangeLane), Some(Reason::NoRoom));
+    // Nor be there before the change is over: 33 m behind, 36 m nearer after 3 s.
+    let scenario = scene(
+        "ego vehicle 0: 0,0 velocity 10,0
+         agent vehicle 1: -33,3.5 velocity 22,0",
+    );
+    assert_eq!(why(&scenario, Manoeuvre::ChangeLane), Some(Reason::NoRoom));
+    // Nor is a lane changed at a walking pace.
+    let scenario = scene(
+        "ego vehicle 0: 0,0 velocity 4.9,0
+         agent vehicle 1: -40,3.5 velocity 10,0",
+    );
+    assert_eq!(why(&scenario, Manoeuvre::ChangeLane), Some(Reason::TooSlow));
 }
 
 #[test]
