@@ -68,6 +68,7 @@ scenes=$out/scenes.tfrecord
 run evaluate-wosac evaluate wosac --scenarios $scenes --world $relative --futures 8
 run evaluate-motion evaluate motion --scenarios $scenes --world idm
 run evaluate-behaviour evaluate behaviour --scenarios $scenes --world $relative --futures 4
+run evaluate-reactions evaluate reactions --scenarios $scenes --world log,idm,$relative --futures 2
 run evaluate-closed-loop evaluate closed-loop --scenarios $scenes --planner pdm-closed --world idm
 
 # A few steps of training, of both networks; the weights themselves are digested, without the headers

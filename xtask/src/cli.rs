@@ -136,6 +136,9 @@ impl Cli {
             Verb::Evaluate(evaluate::Verb::Behaviour(args)) => {
                 Run::of("evaluate behaviour", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Evaluate(evaluate::Verb::Reactions(args)) => {
+                Run::of("evaluate reactions", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Plan(args) => {
                 Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))
             }

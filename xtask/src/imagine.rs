@@ -6,7 +6,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use gump_eval::worlds::World;
-use gump_rollout::{BoxError, Session, SimulateConfig, Start, WorldModel, simulate};
+use gump_rollout::{BoxError, Policy, Session, SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentState, Frame, Rollout, Scenario, Seed};
 
 use crate::progress::Progress;
@@ -44,6 +44,21 @@ pub(crate) fn imagine(
     config: &SimulateConfig,
     seed: Seed,
 ) -> anyhow::Result<Imagined> {
+    imagine_around(run, world, scenario, n_futures, config, seed, None)
+}
+
+/// The same around an ego that `driver` drives, if there is one.
+///
+/// Error: as [`imagine`], and what the driver reports.
+pub(crate) fn imagine_around(
+    run: &Run,
+    world: &World,
+    scenario: &Scenario,
+    n_futures: usize,
+    config: &SimulateConfig,
+    seed: Seed,
+    driver: Option<&mut dyn Policy>,
+) -> anyhow::Result<Imagined> {
     anyhow::ensure!(
         !(world.follows_lanes() && scenario.map.lanes().is_empty()),
         "scenario {}: expected a map with lanes to drive on, found none",
@@ -64,7 +79,7 @@ pub(crate) fn imagine(
         cost: Mutex::new(Cost::default()),
     };
     let rollouts =
-        simulate(&watched, &[start], None, config).map_err(|error| anyhow::anyhow!(error))?;
+        simulate(&watched, &[start], driver, config).map_err(|error| anyhow::anyhow!(error))?;
     let cost = watched.into_cost();
     let passes = world.passes().saturating_sub(cost.passes_before);
     Ok(Imagined {

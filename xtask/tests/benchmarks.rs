@@ -582,3 +582,133 @@ fn behaviour_refuses_what_it_cannot_count() {
     );
     fails(&folder, &format!("{verb} --world model:none"), 1, "none");
 }
+
+/// The row of `evaluate reactions` of a world and a manoeuvre.
+fn reaction<'a>(results: &'a Value, world: &str, manoeuvre: &str) -> &'a Value {
+    let rows = results["rows"].as_array().unwrap().iter();
+    let mut found = rows.filter(|row| row["world"] == world && row["manoeuvre"] == manoeuvre);
+    let row = found
+        .next()
+        .unwrap_or_else(|| panic!("no {manoeuvre} in {world}"));
+    assert!(found.next().is_none(), "two rows {manoeuvre} in {world}");
+    row
+}
+
+#[test]
+fn who_reacts_runs_into_the_ego_less_than_who_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let words = format!(
+        "evaluate reactions --scenarios {} --world log,constant-velocity,idm --futures 2",
+        mini()
+    );
+    let found = results(&folder, &words, "out");
+    assert_eq!(found["scenarios"], 24);
+    let number = |row: &Value, key: &str| row[key].as_f64().unwrap();
+    for row in found["rows"].as_array().unwrap() {
+        for key in ["world", "decoding", "manoeuvre", "agents", "low", "high"] {
+            assert!(row.get(key).is_some(), "{key} is missing: {row}");
+        }
+        assert!(number(row, "agents") >= number(row, "scenes"), "{row}");
+        let rate = number(row, "run_into_ego");
+        assert!((0.0..=1.0).contains(&rate), "{row}");
+        // The log replayed is the log.
+        if row["world"] == "log" {
+            assert_eq!(row["run_into_ego"], row["log"], "{row}");
+        }
+        // Every world is judged by the same agents.
+        let log = reaction(&found, "log", row["manoeuvre"].as_str().unwrap());
+        assert_eq!(row["agents"], log["agents"], "{row}");
+    }
+    // Recorded followers do not notice an ego that stops; those of IDM do.
+    let rate = |world, manoeuvre| number(reaction(&found, world, manoeuvre), "run_into_ego");
+    assert!(rate("log", "stop") > 0.05, "{}", found["rows"]);
+    assert!(rate("idm", "stop") < 0.5 * rate("log", "stop"));
+    // Where the ego does as in its log nobody of the log runs into it.
+    assert_eq!(rate("log", "log"), 0.0);
+    let cases = found["cases"].as_array().unwrap();
+    let replayed = cases.iter().filter(|case| {
+        case["world"] == "log" && case["manoeuvre"] == "stop" && case["near"] == true
+    });
+    assert_eq!(
+        replayed.count() as f64,
+        (rate("log", "stop") * number(reaction(&found, "log", "stop"), "agents")).round()
+    );
+    for file in [
+        "reactions.svg",
+        "rows.parquet",
+        "cases.parquet",
+        "scenarios.toml",
+    ] {
+        assert!(folder.path().join("out").join(file).is_file(), "{file}");
+    }
+}
+
+#[test]
+fn reactions_of_shards_add_up_for_any_number_of_threads() {
+    let folder = tempfile::tempdir().unwrap();
+    let verb = format!(
+        "evaluate reactions --scenarios {} --world idm --futures 2 --limit 6 \
+         --manoeuvre brake,change-lane",
+        mini()
+    );
+    let whole = results(&folder, &format!("{verb} --threads 1"), "whole");
+    for k in [1, 2] {
+        results(
+            &folder,
+            &format!("{verb} --threads 3 --shard {k}/2"),
+            &k.to_string(),
+        );
+    }
+    let merged = results(&folder, "evaluate merge 2 1", "merged");
+    assert_eq!(merged, whole);
+}
+
+#[test]
+fn a_network_reacts_with_its_rules_and_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/weights");
+    let words = format!(
+        "evaluate reactions --scenarios {} --world model:{}/gump-relative.safetensors \
+         --manoeuvre stop --futures 1 --seconds 3 --limit 2",
+        mini(),
+        weights.display()
+    );
+    let found = results(&folder, &words, "out");
+    let rows = found["rows"].as_array().unwrap().iter();
+    let ways: Vec<_> = rows
+        .map(|row| (&row["decoding"], &row["manoeuvre"]))
+        .collect();
+    let [stop, all] = ["stop", "all"].map(Value::from);
+    let [ruled, raw] = ["ruled", "raw"].map(Value::from);
+    assert_eq!(
+        ways,
+        [(&ruled, &stop), (&ruled, &all), (&raw, &stop), (&raw, &all)]
+    );
+}
+
+#[test]
+fn reactions_refuse_what_they_cannot_measure() {
+    let folder = tempfile::tempdir().unwrap();
+    let verb = format!("evaluate reactions --scenarios {}", mini());
+    let wrong = [
+        ("--world sumo", "expected log, idm"),
+        ("--world idm --manoeuvre swerve", "expected log, brake"),
+        ("--world idm --seconds 1", "2..=60"),
+        ("--world idm --shard 3/2", "K/N"),
+    ];
+    for (flags, part) in wrong {
+        fails(&folder, &format!("{verb} {flags}"), 2, part);
+    }
+    fails(
+        &folder,
+        &format!("{verb} --world idm --seconds 20 --limit 2"),
+        1,
+        "expected a log that goes on for 20 s, found 8.0 s",
+    );
+    fails(
+        &folder,
+        "evaluate reactions --scenarios nowhere --world idm",
+        1,
+        "nowhere",
+    );
+}

@@ -2,8 +2,8 @@
 //!
 //! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
 //! about many futures at once, [`Reward`] says what is wanted. [`mmd`] compares generated scenes,
-//! [`behaviour`] counts what a driver would notice, [`statistics`] says what any set of scenes is
-//! like. The benchmarks of the field have crates of their own: `gump-wosac` for realism and motion
+//! [`behaviour`] counts what a driver would notice, [`reactions`] who runs into an ego that leaves its
+//! log, [`statistics`] says what any set of scenes is like. The benchmarks of the field have crates of their own: `gump-wosac` for realism and motion
 //! prediction, `gump-nuplan` for planning. Nothing here steps a simulation or reads a file.
 //!
 //! # Terms
@@ -23,17 +23,20 @@
 //! assert_eq!(summarize(&[rollout], Some(&scenario)).total().collision_rate(), Some(1.0));
 //! ```
 
+pub mod bearing;
 pub mod behaviour;
 mod bootstrap;
 mod border;
 mod collision;
 mod comfort;
 mod displacement;
+pub mod encounter;
 pub mod kinematics;
 mod metric;
 pub mod mmd;
 mod offroad;
 mod progress;
+pub mod reactions;
 mod red_light;
 mod reward;
 mod road_edge;

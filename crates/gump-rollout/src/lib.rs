@@ -27,11 +27,13 @@ pub mod dynamics;
 mod error;
 mod policy;
 mod resample;
+mod scripted;
 mod simulate;
 mod world;
 pub mod worlds;
 
 pub use error::RolloutError;
 pub use policy::{Command, Policy};
+pub use scripted::Scripted;
 pub use simulate::{Interpolation, SimulateConfig, fill, simulate};
 pub use world::{BoxError, Session, Start, WorldModel};

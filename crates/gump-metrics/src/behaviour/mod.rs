@@ -49,7 +49,7 @@ mod lane_change;
 mod lights;
 mod measure;
 mod overlap;
-mod reach;
+pub(crate) mod reach;
 mod standing;
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,7 @@ use gump_geometry::{Pose, Projection, angle_difference};
 use gump_scene::{Lane, LaneKind, MapGraph};
 
 /// Where `pose` is on a lane, if it points along it within `turn` radians.
-pub(super) fn along(lane: &Lane, pose: Pose, turn: f64) -> Option<Projection> {
+pub(crate) fn along(lane: &Lane, pose: Pose, turn: f64) -> Option<Projection> {
     let found = lane.centerline.project(pose.position);
     let heading = lane.centerline.pose_at(found.arc_length).heading;
     (angle_difference(pose.heading, heading).abs() <= turn).then_some(found)
@@ -12,7 +12,7 @@ pub(super) fn along(lane: &Lane, pose: Pose, turn: f64) -> Option<Projection> {
 
 /// The nearest lane for cars that points along `pose` within `turn` radians and whose centre line
 /// passes within `metres`.
-pub(super) fn nearest(
+pub(crate) fn nearest(
     map: &MapGraph,
     pose: Pose,
     metres: f64,
@@ -24,15 +24,15 @@ pub(super) fn nearest(
 }
 
 /// A lane that a vehicle may come to.
-pub(super) struct Ahead<'a> {
-    pub(super) lane: &'a Lane,
+pub(crate) struct Ahead<'a> {
+    pub(crate) lane: &'a Lane,
     /// Metres from the vehicle to the start of the lane, below 0 for the lane it is on.
-    pub(super) base_m: f64,
+    pub(crate) base_m: f64,
 }
 
 /// The lane a vehicle is on, `arc_m` metres from its start, all that lead on from there within
 /// `metres`, and whether any of them reaches as far.
-pub(super) fn ahead<'a>(
+pub(crate) fn ahead<'a>(
     map: &'a MapGraph,
     lane: &'a Lane,
     arc_m: f64,

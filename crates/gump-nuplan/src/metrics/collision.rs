@@ -1,32 +1,11 @@
-//! Collisions of the ego: of which kind, whose fault, how bad.
+//! Collisions of the ego: whose fault, how bad. Of which kind they are is told by [`classify`].
 
 use std::collections::BTreeSet;
 
-use gump_geometry::{OrientedBox, Pose};
-use gump_scene::{Agent, AgentId, AgentKind};
+use gump_metrics::encounter::{CollisionKind, classify, speed};
+use gump_scene::{AgentId, AgentKind};
 
-use super::bearing::is_behind;
-use super::history::{Drive, speed};
-
-/// Below this speed one stands, metres per second.
-///
-/// Source: nuplan-devkit.
-const STANDING: f64 = 0.05;
-
-/// How the ego met something; the first that holds, in this order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum CollisionKind {
-    /// The ego stood.
-    StoppedEgo,
-    /// The other stood, or never moves.
-    StoppedTrack,
-    /// The other came from behind.
-    ActiveRear,
-    /// The ego's front bumper hit it.
-    ActiveFront,
-    /// From the side.
-    ActiveLateral,
-}
+use super::history::Drive;
 
 /// The first contact with one agent; later contacts with the same do not count.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -111,39 +90,4 @@ pub fn collisions(drive: &Drive<'_>, in_one_lane: &[bool]) -> Collisions {
         * factor(found.n_at_fault(is_vehicle), 0.0)
         * factor(found.n_at_fault(is_object), 1.0);
     found
-}
-
-/// How the ego, with this box, rear axle and speed, met an agent that it touches.
-pub fn classify(
-    footprint: &OrientedBox,
-    rear_axle: Pose,
-    ego_speed: f64,
-    agent: &Agent,
-) -> CollisionKind {
-    let [front_left, .., front_right] = footprint.corners();
-    if ego_speed <= STANDING {
-        CollisionKind::StoppedEgo
-    } else if speed(agent) <= STANDING {
-        CollisionKind::StoppedTrack
-    } else if is_behind(rear_axle, agent.state.pose.position) {
-        CollisionKind::ActiveRear
-    } else if agent
-        .oriented_box()
-        .intersects_segment(front_left, front_right)
-    {
-        CollisionKind::ActiveFront
-    } else {
-        CollisionKind::ActiveLateral
-    }
-}
-
-impl CollisionKind {
-    /// Whether the ego is to blame; from the side only where it was not within one lane.
-    pub fn is_at_fault(self, in_one_lane: bool) -> bool {
-        match self {
-            Self::StoppedTrack | Self::ActiveFront => true,
-            Self::ActiveLateral => !in_one_lane,
-            Self::StoppedEgo | Self::ActiveRear => false,
-        }
-    }
 }

@@ -1,9 +1,7 @@
 //! What is scored: a finished drive, the expert's drive and the road.
 
 use gump_geometry::{DVec2, OrientedBox};
-use gump_scene::{
-    Agent, AgentId, AgentKind, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters,
-};
+use gump_scene::{Agent, AgentId, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters};
 
 use super::comfort::Motion;
 
@@ -188,13 +186,4 @@ fn centres<'a>(
 ) -> Vec<DVec2> {
     let centre = |state: &EgoState| vehicle.center_of(state.rear_axle).position;
     states.into_iter().map(centre).collect()
-}
-
-/// Speed of an agent, metres per second; things that do not move by themselves have none.
-pub(crate) fn speed(agent: &Agent) -> f64 {
-    if AgentKind::MOVING.contains(&agent.kind) {
-        agent.state.speed()
-    } else {
-        0.0
-    }
 }

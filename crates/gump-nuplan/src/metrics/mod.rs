@@ -49,7 +49,6 @@
 //! assert!((result.score(&Scoring::closed_loop()) - 15.0 / 16.0).abs() < 1e-9);
 //! ```
 
-mod bearing;
 mod closed_loop;
 mod collision;
 mod comfort;
@@ -67,13 +66,14 @@ mod speed_limit;
 mod statistics;
 mod time_to_collision;
 
-pub use bearing::{bearing, is_ahead, is_behind, signed_lateral_gap};
 pub use closed_loop::{ClosedLoop, score};
-pub use collision::{CollisionEvent, CollisionKind, Collisions, classify, collisions};
+pub use collision::{CollisionEvent, Collisions, collisions};
 pub use comfort::{ComfortSeries, Motion};
 pub use drivable_area::{DrivableArea, TOLERANCE, drivable_area};
 pub use driving_direction::{DrivingDirection, DrivingDirectionConfig, driving_direction};
 pub use error::NuPlanError;
+pub use gump_metrics::bearing::{bearing, is_ahead, is_behind, signed_lateral_gap};
+pub use gump_metrics::encounter::{CollisionKind, classify};
 pub use history::{Drive, RolloutDrive, Sample, vehicle_of};
 pub use lanes::{
     CornerLanes, Keeping, LaneChange, Lanes, corner_lanes, followed_lanes, is_in_intersection,

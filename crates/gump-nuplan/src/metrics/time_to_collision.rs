@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 
 use gump_geometry::{DVec2, OrientedBox};
+use gump_metrics::bearing::{is_ahead, is_behind};
+use gump_metrics::encounter::speed;
 use gump_scene::{Agent, AgentId};
 
-use super::bearing::{is_ahead, is_behind};
 use super::collision::Collisions;
-use super::history::{Drive, speed};
+use super::history::Drive;
 
 /// The ego that is slower is never about to collide, metres per second.
 ///

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use gump_eval::results;
 use serde::Serialize;
 
-use super::{behaviour, closed_loop, motion, wosac};
+use super::{behaviour, closed_loop, motion, reactions, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
@@ -16,6 +16,7 @@ const BENCHMARKS: &[(&str, Tell)] = &[
     (behaviour::BENCHMARK, behaviour::tell_merged),
     (closed_loop::BENCHMARK, closed_loop::tell_merged),
     (motion::NAME, motion::tell_merged),
+    (reactions::BENCHMARK, reactions::tell_merged),
     (wosac::BENCHMARK, wosac::tell_merged),
 ];
 

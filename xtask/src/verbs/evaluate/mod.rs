@@ -14,7 +14,9 @@ pub(crate) mod motion;
 mod open_loop;
 mod prompts;
 mod ranking;
+pub(crate) mod reactions;
 mod sources;
+mod ways;
 pub(crate) mod wosac;
 
 pub(crate) use closed_loop::Driving;
@@ -28,6 +30,8 @@ pub(crate) enum Verb {
     Wosac(wosac::Args),
     /// What a driver would notice, in worlds and in the log: parked cars that move, overlaps, slip
     Behaviour(behaviour::Args),
+    /// The ego leaves its log; who runs into it
+    Reactions(reactions::Args),
     /// Generated scenes: likeness to recorded ones, overlaps, prompts
     Generation(generation::Args),
     /// How well a planner drives, as nuPlan scores it

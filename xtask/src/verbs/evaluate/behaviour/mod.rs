@@ -2,10 +2,9 @@
 //!
 //! Scenarios stream through one at a time; of each the ledger keeps what the log shows and what the
 //! futures of every world show, as counts. What is counted and per what is in
-//! `gump_metrics::behaviour`; `ways` names worlds and decodings, `tell` makes the report.
+//! `gump_metrics::behaviour`; `tell` makes the report.
 
 mod tell;
-mod ways;
 
 use std::num::NonZeroUsize;
 
@@ -17,13 +16,13 @@ use gump_eval::worlds::{WorldName, Worlds};
 use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
 use serde::{Deserialize, Serialize};
 
+use super::ways::{Named, Way, ways};
 use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 pub(crate) use tell::tell_merged;
-use ways::{Way, ways};
 
 /// Name of the benchmark in ledgers.
 pub(crate) const BENCHMARK: &str = "behaviour";
@@ -79,14 +78,6 @@ struct Settings {
     sampling: String,
     seed: String,
     worlds: Vec<Named>,
-}
-
-/// A world and how it decodes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Named {
-    world: String,
-    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
-    decoding: String,
 }
 
 /// What one scenario shows.

@@ -10,8 +10,8 @@ use gump_scene::Seed;
 use gump_viz::Bars;
 use serde_json::{Map, Value, json};
 
-use super::{Counted, Named, Settings};
-use crate::decoding::Decoding;
+use super::super::ways::Named;
+use super::{Counted, Settings};
 use crate::run::Run;
 use crate::{charts, table};
 
@@ -95,15 +95,7 @@ impl Column {
 
     /// What it is called beside the others.
     fn label(&self) -> String {
-        let Some(name) = &self.name else {
-            return "log".into();
-        };
-        let world = charts::legend(&name.world);
-        match name.decoding.as_str() {
-            Decoding::NONE if world == "log" => "log replayed".into(),
-            Decoding::NONE => world,
-            decoding => format!("{world} ({decoding})"),
-        }
+        self.name.as_ref().map_or("log".into(), Named::label)
     }
 }
 

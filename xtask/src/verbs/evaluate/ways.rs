@@ -1,10 +1,31 @@
 //! Worlds and how they decode: a learned one as it is used and without its rules.
 
 use gump_eval::worlds::WorldName;
+use serde::{Deserialize, Serialize};
 
-use super::Named;
+use crate::charts;
 use crate::decoding::Decoding;
 use crate::sampling::Sampling;
+
+/// A world and how it decodes, as ledgers name it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Named {
+    pub(super) world: String,
+    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
+    pub(super) decoding: String,
+}
+
+impl Named {
+    /// What it is called beside the others.
+    pub(super) fn label(&self) -> String {
+        let world = charts::legend(&self.world);
+        match self.decoding.as_str() {
+            Decoding::NONE if world == "log" => "log replayed".into(),
+            Decoding::NONE => world,
+            decoding => format!("{world} ({decoding})"),
+        }
+    }
+}
 
 /// One column of the table.
 pub(super) struct Way {

@@ -1,0 +1,156 @@
+//! Who comes into contact with the ego, and who is to blame.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::FRAC_PI_6;
+
+use gump_geometry::{OrientedBox, Pose};
+use gump_scene::{Agent, AgentId, AgentState, Frame, MapGraph};
+
+use super::Attempt;
+use crate::behaviour::reach;
+use crate::encounter::classify;
+
+/// Shallower overlaps do not count, metres: that is within what trackers are off.
+const DEEP_M: f64 = 0.1;
+/// Who is slower stands, and runs into nobody, m/s: a tracker's jitter is as much.
+const STANDS: f64 = 0.3;
+/// An ego keeps its lane up to here beside the centre line, metres: a car of 2 m then still is on
+/// a lane of usual width.
+const KEEPS_M: f64 = 0.9;
+/// Boxes farther above one another do not meet, metres: a bridge is higher.
+const ABOVE_M: f64 = 3.0;
+/// How far the rear axle of a car is behind its middle, of its length.
+///
+/// Source: 1.46 m of 5.18 m, nuPlan's Pacifica.
+const AXLE: f64 = 0.28;
+
+/// A first contact.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Contact {
+    /// The other.
+    pub agent: AgentId,
+    /// When the boxes came to overlap, seconds after the present.
+    pub at_s: f64,
+}
+
+/// What became of a future.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outcome {
+    /// Agents near that ran into the ego, in order of time.
+    pub run_into_ego: Vec<Contact>,
+    /// The same of agents that were not near.
+    pub others: Vec<Contact>,
+    /// Whom the ego ran into; nothing after it is counted.
+    pub ego_runs_into: Option<Contact>,
+}
+
+/// Who is to blame for a contact.
+enum Blame {
+    Other,
+    Ego,
+    /// Neither moves, as where a tracker's boxes grow.
+    Nobody,
+}
+
+impl Attempt<'_> {
+    /// Looks through frames from the one after the present; the ego is where the plan says.
+    pub(super) fn judge(&self, frames: &[Frame]) -> Outcome {
+        let mut outcome = Outcome::default();
+        let Some(ego) = self.scenario.log[self.scenario.now].agent(self.scenario.ego) else {
+            return outcome;
+        };
+        let mut met = self.touching(ego);
+        // Where the overlap began that goes on, by agent.
+        let mut began: BTreeMap<AgentId, (usize, Agent)> = BTreeMap::new();
+        for (k, frame) in (1..self.plan.len()).zip(frames) {
+            let ego = self.ego_in(frame, ego, k);
+            let own = ego.oriented_box();
+            for agent in frame.agents() {
+                let is_other = agent.id != ego.id && agent.kind.is_moving();
+                if !is_other || met.contains(&agent.id) {
+                    continue;
+                }
+                let box_ = agent.oriented_box();
+                let is_over = (agent.elevation - ego.elevation).abs() > ABOVE_M;
+                if is_over || !own.overlaps(&box_) {
+                    began.remove(&agent.id);
+                    continue;
+                }
+                let &mut (since, first) = began.entry(agent.id).or_insert((k, *agent));
+                if own.signed_distance(&box_) < -DEEP_M {
+                    met.insert(agent.id);
+                    self.note(&mut outcome, since, &first);
+                }
+            }
+            if outcome.ego_runs_into.is_some() {
+                break;
+            }
+        }
+        outcome
+    }
+
+    /// Who overlaps the ego in the present.
+    fn touching(&self, ego: &Agent) -> BTreeSet<AgentId> {
+        let present = &self.scenario.log[self.scenario.now];
+        crate::overlapping(present, ego).collect()
+    }
+
+    /// The ego as it is driven, as high as the world has it.
+    fn ego_in(&self, frame: &Frame, ego: &Agent, k: usize) -> Agent {
+        let known = frame.agent(ego.id).unwrap_or(ego);
+        Agent {
+            elevation: known.elevation,
+            ..ego.with_state(self.plan[k])
+        }
+    }
+
+    fn note(&self, outcome: &mut Outcome, k: usize, other: &Agent) {
+        let contact = Contact {
+            agent: other.id,
+            at_s: k as f64 * self.scenario.dt,
+        };
+        match self.blame(k, other) {
+            Blame::Other if self.near.binary_search(&other.id).is_ok() => {
+                outcome.run_into_ego.push(contact);
+            }
+            Blame::Other => outcome.others.push(contact),
+            Blame::Ego => {
+                outcome.ego_runs_into.get_or_insert(contact);
+            }
+            Blame::Nobody => {}
+        }
+    }
+
+    fn blame(&self, k: usize, other: &Agent) -> Blame {
+        let Some(ego) = self.scenario.log[self.scenario.now].agent(self.scenario.ego) else {
+            return Blame::Nobody;
+        };
+        let state = self.plan[k];
+        let speed = state.speed();
+        if other.state.speed() < STANDS {
+            return if speed < STANDS {
+                Blame::Nobody
+            } else {
+                Blame::Ego
+            };
+        }
+        let footprint = OrientedBox {
+            pose: state.pose,
+            length: ego.length,
+            width: ego.width,
+        };
+        let axle = state.pose * Pose::new(-AXLE * ego.length, 0.0, 0.0);
+        match classify(&footprint, axle, speed, other).is_at_fault(self.keeps_lane[k]) {
+            true => Blame::Ego,
+            false => Blame::Other,
+        }
+    }
+}
+
+/// Whether an ego in these states keeps its lane.
+pub(super) fn keeps_lane(map: &MapGraph, plan: &[AgentState]) -> Vec<bool> {
+    let keeps = |state: &AgentState| {
+        map.lanes().is_empty() || reach::nearest(map, state.pose, KEEPS_M, FRAC_PI_6).is_some()
+    };
+    plan.iter().map(keeps).collect()
+}
