@@ -49,7 +49,9 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
 
 fn fraction(prospect: &Prospect) -> f64 {
     match prospect.kind {
-        ProposalKind::Idm { speed_fraction, .. } => speed_fraction,
+        ProposalKind::Idm { speed_fraction, .. } | ProposalKind::Brisk { speed_fraction } => {
+            speed_fraction
+        }
         other => panic!("{other} has no speed"),
     }
 }
@@ -490,10 +492,10 @@ fn halving_imagines_the_better_candidates_more_often() {
     let of = |p: &Prospect| (p.futures.len(), p.drives.len(), p.finalist);
     let told: Vec<_> = decision.prospects.iter().map(of).collect();
     let count = |n: usize, finalist: bool| told.iter().filter(|t| **t == (n, n, finalist)).count();
-    // Of fifteen policies and imitation eight see a second future, four the third and fourth.
+    // Of nineteen policies and imitation ten see a second future, five the third and fourth.
     assert_eq!(
         (count(1, false), count(2, false), count(4, true)),
-        (8, 4, 4)
+        (10, 5, 5)
     );
     assert!(decision.prospects[decision.chosen].finalist);
     // What drops out was no better, in the futures it saw, than what stayed.
@@ -787,6 +789,7 @@ fn imitation_is_a_candidate_like_any_other() {
             lateral_offsets: vec![0.0],
             ..PdmConfig::default()
         },
+        tempers: false,
         ..InteractiveDriverConfig::default()
     };
     let text = "ego vehicle 0: 2,0 velocity 9,0";
