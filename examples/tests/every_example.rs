@@ -18,7 +18,7 @@ const SAYS: [(&str, &str); 13] = [
     ("closest_calls", "8 scenes, the closest calls first"),
     ("conflict_point", "11 and 14 m/s"),
     ("drive_in_traffic", "log: 32 episodes"),
-    ("explain_a_choice", "chosen: idm"),
+    ("explain_a_choice", "chosen: brisk"),
     ("film_a_scene", "out/scene.png: 640 x 480 pixels"),
     ("make_scenes", "4 scenes in out/roundabouts.tfrecord"),
     ("measure_realism", "idm: realism 0."),

@@ -745,7 +745,7 @@ fn a_decision_is_explained() {
     let decision = &results["decision"];
     assert_eq!(
         (&decision["candidates"], &decision["futures"]),
-        (&16.into(), &2.into())
+        (&20.into(), &2.into())
     );
     assert!(decision["milliseconds"]["frames"].as_f64().unwrap() > 0.0);
     let page = fs::read_to_string(place.path("out/explain.html")).unwrap();

@@ -36,10 +36,11 @@
 //! let mut planner = InteractiveDriver::new(&world, config).unwrap();
 //! plan_once(&recording, &mut planner).unwrap();
 //! let decision = planner.decision().unwrap();
-//! // Five speeds on three lines, and what the world has the ego do.
-//! assert_eq!(decision.prospects.len(), 16);
+//! // Five speeds on three lines, four drivers of other tempers, and what the world has the ego do.
+//! assert_eq!(decision.prospects.len(), 20);
 //! let best = decision.prospects[decision.chosen].value;
-//! assert!(decision.prospects.iter().all(|prospect| prospect.value <= best + 1e-6));
+//! let mut finalists = decision.prospects.iter().filter(|prospect| prospect.finalist);
+//! assert!(finalists.all(|prospect| prospect.value <= best + 1e-6));
 //! ```
 //!
 //! # Scoring a planner

@@ -30,7 +30,7 @@ fn check(scenario: &Scenario, expected: Range<f64>) {
         let mut planner = InteractiveDriver::new(world, config).unwrap();
         plan_once(&recording, &mut planner).unwrap();
         let decision = planner.decision().unwrap();
-        assert_eq!(decision.prospects.len(), 16);
+        assert_eq!(decision.prospects.len(), 20);
         assert!(!decision.brakes, "the emergency brake was needed");
         for prospect in &decision.prospects {
             for pair in prospect.drives[0].windows(2) {

@@ -29,9 +29,11 @@ pub(crate) fn write(
     let chosen = &decision.prospects[decision.chosen];
     let n_futures = chosen.futures.len();
     page.section("The decision").prose(&format!(
-        "{} candidates drove {n_futures} futures of {:.1} s each, among others who react. {}",
+        "{} candidates drove {:.1} s among others who react, the best {} of them in {n_futures} \
+         futures, the others in fewer. {}",
         decision.prospects.len(),
         decision.horizon,
+        decision.prospects.iter().filter(|p| p.finalist).count(),
         if decision.brakes {
             "Even the best of them hits something soon: the ego brakes.".to_owned()
         } else {
@@ -60,8 +62,9 @@ pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
     let mut order: Vec<usize> = (0..decision.prospects.len()).collect();
     order.sort_by(|&a, &b| {
         let value = |i: usize| decision.prospects[i].value;
-        let first = |i: usize| i == decision.chosen;
-        first(b).cmp(&first(a)).then(value(b).total_cmp(&value(a)))
+        // Values of fewer futures do not compare.
+        let rank = |i: usize| (i == decision.chosen, decision.prospects[i].futures.len());
+        rank(b).cmp(&rank(a)).then(value(b).total_cmp(&value(a)))
     });
     order
 }
@@ -97,8 +100,9 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
         .collect();
     page.section("What each is worth")
         .prose(
-            "Gates (collision, road, direction) multiply; progress, time to collision and comfort \
-             add with weights of 5, 5 and 2. All are means over the futures.",
+            "Gates (collision, road, direction) multiply; progress, time to collision, \
+             the speed limit and comfort add with weights of 5, 5, 4 and 2. All are means over the \
+             futures that a candidate was imagined in.",
         )
         .table(&columns, &rows);
 }
@@ -234,7 +238,7 @@ pub(crate) fn summary(decision: &Decision) -> Value {
         "brakes": decision.brakes,
         "horizon_s": decision.horizon,
         "candidates": decision.prospects.len(),
-        "futures": decision.prospects[0].futures.len(),
+        "futures": decision.prospects[decision.chosen].futures.len(),
         "milliseconds": {
             "open": ms(phases.open),
             "frames": ms(phases.frames),
