@@ -206,8 +206,14 @@ impl Args {
             )?)
         })?;
         let worlds = run.phase("load", |run| {
-            let load = |world| PlanningWorld::load(run.device(), world, &sampling);
-            Ok(self.world.iter().map(load).collect::<Result<Vec<_>, _>>()?)
+            let load = |world| {
+                let loaded = PlanningWorld::load(run.device(), world, &sampling);
+                loaded.map_err(anyhow::Error::from)
+            };
+            self.world
+                .iter()
+                .map(load)
+                .collect::<anyhow::Result<Vec<_>>>()
         })?;
         let drives = drive::Drives {
             args: self,
