@@ -749,7 +749,7 @@ fn a_decision_is_explained() {
     );
     assert!(decision["milliseconds"]["frames"].as_f64().unwrap() > 0.0);
     let page = fs::read_to_string(place.path("out/explain.html")).unwrap();
-    assert_eq!(page.matches("data:image/gif;base64,").count(), 16);
+    assert_eq!(page.matches("data:image/gif;base64,").count(), 20);
     for part in ["What the others did", "time_to_collision", "vehicle 1"] {
         assert!(page.contains(part), "{part}");
     }
