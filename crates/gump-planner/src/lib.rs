@@ -36,7 +36,7 @@
 //! let mut planner = InteractiveDriver::new(&world, config).unwrap();
 //! plan_once(&recording, &mut planner).unwrap();
 //! let decision = planner.decision().unwrap();
-//! // Five speeds on three lines, four drivers of other tempers, and what the world has the ego do.
+//! // Five speeds on three lines, four other driving styles, and what the world has the ego do.
 //! assert_eq!(decision.prospects.len(), 20);
 //! let best = decision.prospects[decision.chosen].value;
 //! let mut finalists = decision.prospects.iter().filter(|prospect| prospect.finalist);

@@ -35,9 +35,9 @@ use imagine::Imagination;
 pub struct InteractiveDriverConfig {
     /// The policies by rule.
     pub proposals: PdmConfig,
-    /// Whether drivers of other tempers are candidates too: two brisk ones, one who yields and one
+    /// Whether other driving styles are candidates too: two brisk ones, one who yields and one
     /// who creeps, all along the centre.
-    pub tempers: bool,
+    pub driving_styles: bool,
     /// Whether the world's own ego is a candidate too.
     pub imitation: bool,
     /// Futures per candidate, > 0; of candidates that drop out, fewer.
@@ -61,13 +61,13 @@ pub struct InteractiveDriverConfig {
 }
 
 impl Default for InteractiveDriverConfig {
-    /// The paper's 15 policies and imitation, four more policies of other tempers, 4 futures of 4 s for
+    /// The paper's 15 policies and imitation, four more policies of other driving styles, 4 futures of 4 s for
     /// the finalists of sequential halving, the mean; a decision every
     /// half second, which is a frame of the learned world.
     fn default() -> Self {
         Self {
             proposals: PdmConfig::default(),
-            tempers: true,
+            driving_styles: true,
             imitation: true,
             n_futures: 4,
             allocation: Allocation::default(),

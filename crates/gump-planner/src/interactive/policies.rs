@@ -42,7 +42,7 @@ pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Polic
     };
     let mut policies: Vec<Policy> = offsets.flat_map(of_line).collect();
     let centre = proposals.lateral_offsets.iter().position(|&y| y == 0.0);
-    if let Some(line) = centre.filter(|_| config.tempers) {
+    if let Some(line) = centre.filter(|_| config.driving_styles) {
         let limit = speeds[0] / proposals.speed_fractions[0];
         let policy = |kind, fraction: f64, law| Policy {
             kind,

@@ -41,7 +41,7 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
             ..PdmConfig::default()
         },
         imitation: false,
-        tempers: false,
+        driving_styles: false,
         allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
     }
@@ -181,7 +181,7 @@ fn fraction_and_offset(decision: &Decision) -> (f64, f64) {
 fn ruled() -> InteractiveDriverConfig {
     InteractiveDriverConfig {
         imitation: false,
-        tempers: false,
+        driving_styles: false,
         n_futures: 2,
         allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
@@ -509,7 +509,7 @@ fn halving_imagines_the_better_candidates_more_often() {
 #[test]
 fn brisk_drivers_come_closer_and_those_who_yield_stay_back() {
     let config = InteractiveDriverConfig {
-        tempers: true,
+        driving_styles: true,
         ..ruled()
     };
     let decision = decide(
@@ -789,7 +789,7 @@ fn imitation_is_a_candidate_like_any_other() {
             lateral_offsets: vec![0.0],
             ..PdmConfig::default()
         },
-        tempers: false,
+        driving_styles: false,
         ..InteractiveDriverConfig::default()
     };
     let text = "ego vehicle 0: 2,0 velocity 9,0";
