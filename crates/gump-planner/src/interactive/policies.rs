@@ -23,8 +23,8 @@ const YIELDING: f64 = 0.8;
 /// Share of the limit at which a driver creeps forward.
 const CREEPING: f64 = 0.07;
 
-/// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers of
-/// other tempers along the centre, if that is a line and they are asked for. `speeds` are PDM's.
+/// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers with
+/// other driving styles along the centre, if that is a line and they are asked for. `speeds` are PDM's.
 pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Policy> {
     let proposals = &config.proposals;
     let offsets = proposals.lateral_offsets.iter().enumerate();
