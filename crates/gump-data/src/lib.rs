@@ -1,12 +1,13 @@
-//! Dataset formats in and out, with [`Scenario`](gump_scene::Scenario) in between.
+//! Readers and writers of dataset formats; every reader yields a
+//! [`Scenario`](gump_scene::Scenario).
 //!
-//! The only crate that knows a file layout. What a format states is taken as it is; what it lacks
-//! (lane widths, drivable surfaces, the ego's route) is inferred by one set of rules for all
-//! formats, counted in a [`ReadReport`] and switchable by [`ReadOptions`]. Nothing here simulates,
-//! scores or draws.
+//! This is the only crate that knows file layouts. Values that a format states are kept. What it
+//! lacks (lane widths, drivable surfaces, the ego's route) is inferred by one set of rules for all
+//! formats, counted in a [`ReadReport`] and controlled by [`ReadOptions`]. The crate does not
+//! simulate, score or draw.
 //!
-//! Start with [`open`], which recognises a file by its content, or [`find`], which reads one
-//! scenario by a name like `FILE#3` or `FILE#637f20cafde22ff8`.
+//! Start with [`open`], which detects the format of a file from its content, or [`find`], which
+//! reads one scenario by a name like `FILE#3` or `FILE#637f20cafde22ff8`.
 //!
 //! ```
 //! use gump_data::{find, open, womd};
@@ -26,17 +27,17 @@
 //!
 //! # Terms
 //! * **record**: one scenario's bytes in a file; **place**: which record, at which byte.
-//! * **stated** is what a format says, **inferred** what a reader adds, **dropped** what a reader
-//!   leaves out because [`Scenario`](gump_scene::Scenario) has no room for it or it is unusable.
+//! * **stated**: given by the format. **Inferred**: added by a reader. **Dropped**: left out by a
+//!   reader because [`Scenario`](gump_scene::Scenario) cannot represent it or it is unusable.
 //!
 //! A new format is one file beside `womd` in `formats` and one line in the table of
 //! `formats/registry.rs`.
 //!
 //! # Features
-//! All are on by default. Without any, Waymo's and GPUDrive's files, Scenario-JSON and the cache are
-//! read, and neither SQLite nor Parquet nor an XML reader is compiled. `argoverse2`, `commonroad`,
-//! `nuplan`, `sumo` and `taf-bw` are the formats of these names; `parquet` writes tables and reads
-//! rollouts from them.
+//! All are on by default. Without any of them the crate reads Waymo's and GPUDrive's files,
+//! Scenario-JSON and the cache, and compiles neither SQLite nor Parquet nor an XML reader.
+//! `argoverse2`, `commonroad`, `nuplan`, `sumo` and `taf-bw` add the formats of these names;
+//! `parquet` adds writing tables and reading rollouts from them.
 #![cfg_attr(
     not(all(
         feature = "argoverse2",

@@ -1,19 +1,21 @@
-//! Rollouts of the learned world models in closed loop.
+//! Closed-loop rollouts of the learned world models.
 //!
-//! What lives here: worlds ([`TransformerWorld`], [`relative::RelativeWorld`]) that a network drives;
-//! partial autoregression and its caches (`decode`, `session`); the networks' arithmetic on a
-//! processor without a tensor library (`cpu`, `relative`); drawing (`draw`, `nucleus`), redraws and
-//! limits that correct draws (`rejection`, `kinematic_limits`); agents that come and leave
-//! (`spawning`). What does not: the networks themselves, which are `gump-model`'s, and learning.
+//! * Worlds driven by a network: [`TransformerWorld`], [`relative::RelativeWorld`].
+//! * Partial autoregression and its caches: `decode`, `session`.
+//! * CPU implementations of the networks without a tensor library: `cpu`, `relative`.
+//! * Sampling (`draw`, `nucleus`), and corrections of draws: `rejection`, `kinematic_limits`.
+//! * Agents that enter and leave: `spawning`.
 //!
-//! Without the feature `tensors` (on by default in the workspace's drivers) there is the relative
-//! network from plain weights alone, and the crate builds for `wasm32-unknown-unknown`.
+//! The networks are in `gump-model`, training is in `gump-train`.
+//!
+//! Without the feature `tensors` (on by default in the workspace's drivers) only the relative
+//! network from plain weights is available, and the crate builds for `wasm32-unknown-unknown`.
 //!
 //! # Terms
-//! * **surrogate**: a provisional state, from earlier chunks, that lets all objects of a frame be
-//!   decoded in one pass (partial autoregression).
-//! * **temporal ensemble**: averaging what several chunks say of the same instant.
-//! * **predictive samples**: what an agent might have done next, as draws from its distribution.
+//! * **surrogate**: a provisional state from earlier chunks, which allows all objects of a frame to
+//!   be decoded in one pass (partial autoregression).
+//! * **temporal ensemble**: the average of the predictions of several chunks for the same instant.
+//! * **predictive samples**: an agent's possible next states, as draws from its distribution.
 //!
 //! ```
 //! # #[cfg(feature = "tensors")] {

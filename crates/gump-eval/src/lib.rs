@@ -1,13 +1,14 @@
-//! What evaluations are made of, below any command line.
+//! Building blocks of evaluations, independent of the command line.
 //!
 //! * [`worlds`]: worlds by name (`log`, `idm`, `constant-velocity`, `model:WEIGHTS`), loaded once.
-//! * [`planners`]: planners by name, their imagination and their traffic, and a stopwatch.
-//! * [`recordings`]: recordings to drive through, from any readable file, nuPlan's logs among them.
-//! * [`results`]: what each scenario got, in a file that an interrupted run goes on with and that
-//!   shards of one evaluation are merged from; [`shard`]: which scenarios are whose.
+//! * [`planners`]: planners by name, the worlds that they roll out and drive in, and timing.
+//! * [`recordings`]: recordings to drive in, from any readable file, including nuPlan's logs.
+//! * [`results`]: results by scenario, in a file from which interrupted runs resume and shards of
+//!   one evaluation are merged; [`shard`]: the assignment of scenarios to shards.
 //! * [`rollout_files`]: files of futures given by path.
 //!
-//! What does not live here: metrics, worlds and planners themselves; arguments, progress and reports.
+//! Metrics, worlds and planners are in their own crates; arguments, progress and reports are in
+//! `xtask`.
 //!
 //! ```
 //! use gump_engine::SamplingConfig;

@@ -1,14 +1,17 @@
-//! Scenes out of nothing: a map, perhaps a prompt and some constraints, and traffic appears.
+//! Scene generation: traffic on a given map, optionally from a prompt and constraints.
 //!
-//! Objects come one after another in canonical order, the ego first: a key is appended, one pass
-//! reads it (what came before stays in the cache), the decoder draws the fields of its state one by
-//! one, and the state is what the next object sees. How many there are is given, or left to the
-//! network. Start with [`GenerateRequest`] and [`generate`]; constraints on single objects are in
-//! [`constraint`], scenes that hold a prompt in [`factory`]. What a draw may not do and where on a map
-//! things belong is `gump_engine::placement`'s.
+//! Start with [`GenerateRequest`] and [`generate`]. Constraints on single objects are in
+//! [`constraint`], scenes that satisfy a prompt in [`factory`]. `gump_engine::placement` decides
+//! which positions on a map are valid.
+//!
+//! Objects are generated one after another in canonical order, the ego first: a key is appended,
+//! one pass of the network reads it (earlier slots stay in the cache), and the decoder draws the
+//! fields of its state one by one; later objects see that state. The number of objects is given, or
+//! decided by the network.
 //!
 //! Source: GUMP's scene generation, in full autoregression ([`GenerateConfig::paper`]); masks,
-//! rejection, sharper and even draws, and counts left to the model are ours.
+//! rejection, deconvolved and stratified draws, and counts decided by the network are our
+//! additions.
 
 mod advance;
 pub mod baseline;

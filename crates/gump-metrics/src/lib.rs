@@ -1,15 +1,20 @@
-//! What is good and what is bad: metrics of rollouts and rewards made of them.
+//! Metrics of rollouts, and rewards that combine them.
 //!
-//! Start with [`Metric`]; [`ALL`] lists what there is. [`summarize`] answers the usual questions
-//! about many futures at once, [`Reward`] says what is wanted. [`mmd`] compares generated scenes,
-//! [`behaviour`] counts what a driver would notice, [`reactions`] who runs into an ego that leaves its
-//! log, [`statistics`] says what any set of scenes is like. The benchmarks of the field have crates of their own: `gump-wosac` for realism and motion
-//! prediction, `gump-nuplan` for planning. Nothing here steps a simulation or reads a file.
+//! Start with [`Metric`]; [`ALL`] lists the metrics. [`summarize`] computes the usual metrics of
+//! many futures at once, and [`Reward`] combines metrics into one number. [`mmd`] compares
+//! generated scenes, [`behaviour`] counts events that a driver would notice, [`reactions`] counts
+//! the agents that run into an ego that leaves its log, and [`statistics`] describes a set of
+//! scenes.
+//!
+//! Benchmarks have their own crates: `gump-wosac` for realism and motion prediction, `gump-nuplan`
+//! for planning. This crate neither steps a simulation nor reads files.
 //!
 //! # Terms
-//! * **metric** measures, **reward** combines, **score** is the number with its parts.
+//! * **metric**: a measurement. **Reward**: a combination of metrics. **Score**: its value, with
+//!   its parts.
 //! * **gate**: a factor of a reward. **Term**: a summand.
-//! * **ADE**, **FDE**: average and final displacement from the log; *min* is over futures.
+//! * **ADE**, **FDE**: average and final displacement error relative to the log; *min* is over
+//!   futures.
 //!
 //! ```
 //! use gump_metrics::{Collision, logged, over_rollout, summarize};

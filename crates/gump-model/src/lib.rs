@@ -1,21 +1,23 @@
-//! The learned world models: what they see, their networks, and checkpoints.
+//! The networks of the learned world models: inputs, layers and checkpoints.
 //!
-//! Two networks say what comes next in a scene. The sequence network is the paper's: the scene as
-//! tokens and a raster, a causal transformer, a decoder of states. Read [`config::ModelConfig`] for
-//! its shape, `mct.rs` for the network in one sitting, `decoder.rs` for how a hidden vector becomes
-//! a state. The relative network sees agents and map pieces by their relative poses ([`relative`]).
-//! Rolling them out is `gump-engine`'s, training them `gump-train`'s.
+//! There are two networks, and both predict the next frame of a scene. The sequence network is the
+//! paper's: the scene as tokens and a raster, a causal transformer, and a decoder of states.
+//! [`config::ModelConfig`] describes its shape, `mct.rs` contains the transformer, and `decoder.rs`
+//! turns a hidden vector into a state. The relative network ([`relative`]) sees agents and pieces
+//! of map by their relative poses. `gump-engine` rolls the networks out, `gump-train` trains them.
 //!
-//! Without the feature `tensors` (on by default) the networks themselves are left out; what remains
-//! needs no tensor library: inputs, outputs, and weights as plain numbers
-//! ([`relative::RelativeWeights`]).
+//! Without the feature `tensors` (on by default) the networks are left out and no tensor library is
+//! needed; inputs, outputs and weights as plain numbers ([`relative::RelativeWeights`]) remain.
 //!
 //! # Terms
-//! * **key, value**: the two tokens of an object; the hidden vector at the key says the state.
-//! * **chunk**: the four poses decoded at a key, half a second apart; the first is the frame's own.
-//! * **local frame**: the pose in whose frame a chunk is said: the object's last one, or the scene's.
-//! * **local context**: what an object sees of map and traffic in its own frame.
-//! * **visual memory**: keys and values of the map, computed once per scene.
+//! * **key, value**: the two tokens of an object; its state is decoded from the hidden vector at
+//!   the key.
+//! * **chunk**: the four poses decoded at a key, half a second apart; the first belongs to the
+//!   frame.
+//! * **local frame**: the pose relative to which a chunk is expressed: the object's last, or the
+//!   scene's.
+//! * **local context**: an object's view of map and traffic in its own frame.
+//! * **visual memory**: attention keys and values of the map, computed once per scene.
 //!
 //! ```
 //! # #[cfg(feature = "tensors")] {

@@ -1,9 +1,9 @@
 //! nuPlan's benchmark, equal to its devkit: closed loop, reactive agents, metrics and scores.
 //!
-//! [`closed_loop::drive`] lets a driver drive a recording among some traffic, [`tracking`] moves its
-//! vehicle, [`reactive_agents`] are the traffic of the reactive challenge, and [`metrics`] measures
-//! and scores what was driven, in closed loop and open loop. Drivers are in `gump-planner`, files in
-//! `gump-data`.
+//! [`closed_loop::drive`] simulates a recording with a driver in control of the ego, [`tracking`]
+//! moves the ego's vehicle along the driver's trajectory, [`reactive_agents`] is the traffic of the
+//! reactive challenge, and [`metrics`] scores drives in closed loop and plans in open loop. Drivers
+//! are in `gump-planner`, file formats in `gump-data`.
 
 pub mod closed_loop;
 pub mod metrics;

@@ -1,20 +1,20 @@
-//! Proposals, imagining them in any world, choosing one.
+//! Planners: they propose trajectories, simulate them in a world, score them and choose one.
 //!
-//! Start with [`InteractiveDriver`], the paper's planner: it proposes what the ego might do,
-//! imagines how others answer and keeps every candidate with its score. How traffic moves is a
-//! world's business; nothing here reads a file or steps a world by itself.
+//! Start with [`InteractiveDriver`], the paper's planner: it proposes policies for the ego, rolls
+//! each out in a world in which other agents react, and keeps every candidate with its score.
+//! Traffic is simulated by the world that the planner is given; the crate reads no files.
 //!
-//! All planners are a [`gump_nuplan::closed_loop::Driver`]: [`PdmClosed`], of which
-//! [`InteractiveDriver`] differs by imagining instead of a forecast, [`ImitationDriver`],
-//! [`NuplanIdmDriver`], [`SimpleDriver`] and the oracle [`LogDriver`]. [`closed_loop`] lets one
-//! drive and scores it; [`Comparison`] says who is better and how sure that is,
-//! [`value_policies`] does it for any policy in any world.
+//! All planners implement [`gump_nuplan::closed_loop::Driver`]: [`PdmClosed`], which uses a
+//! constant-velocity forecast where [`InteractiveDriver`] uses rollouts, [`ImitationDriver`],
+//! [`NuplanIdmDriver`], [`SimpleDriver`] and the oracle [`LogDriver`]. [`closed_loop`] drives one
+//! and scores the drive; [`Comparison`] compares planners with confidence intervals, and
+//! [`value_policies`] compares any policies in any world.
 //!
 //! # Terms
-//! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with what was found of it.
-//! * **way**: the line a proposal follows, taken from the route.
-//! * **prospect**: a policy with all that was imagined of it. **Decision**: all prospects and which
-//!   one drives on.
+//! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with its simulated outcome.
+//! * **way**: the line that a proposal follows, taken from the route.
+//! * **prospect**: a policy with its rollouts and scores. **Decision**: all prospects, and the one
+//!   that was chosen.
 //!
 //! ```
 //! use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
@@ -44,8 +44,8 @@
 //! ```
 //!
 //! # Scoring a planner
-//! A planner of one's own is a `Driver`: a name, and a trajectory per step.
-//! `examples/score_a_planner.rs` judges this one in three worlds.
+//! Your own planner implements `Driver`: a name, and a trajectory per step.
+//! `examples/score_a_planner.rs` scores this one in three worlds.
 //! ```
 //! use gump_planner::closed_loop::drive_scenario;
 //! use gump_nuplan::{closed_loop::*, reactive_agents::NuplanIdm, tracking::Trajectory};

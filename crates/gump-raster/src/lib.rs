@@ -1,20 +1,20 @@
-//! A scene as a bird's-eye image: what to draw, and where; how to fill pixels is geometry's.
+//! Bird's-eye rasters of scenes. Filling of pixels is in `gump-geometry`.
 //!
-//! Start with [`RasterSpec`], which names extent, resolution and an ordered list of [`Layer`]s,
-//! then [`rasterize`], which makes a [`Raster`] of it.
+//! Start with [`RasterSpec`], which specifies extent, resolution and an ordered list of [`Layer`]s,
+//! then [`rasterize`], which renders a [`Raster`].
 //!
 //! # Terms
 //! * **raster frame**: the pose at the centre of the image, +x forward, +y left; usually the
-//!   ego's. `world_from_raster` places it; turning that pose turns the whole image, map and
-//!   agents together, so that the two can never be out of register.
-//! * **layer**: one plane of the image, found by name, never by number.
+//!   ego's. `world_from_raster` is that pose; rotating it rotates the whole image, map and agents
+//!   together.
+//! * **layer**: one plane of the image, accessed by name, not by number.
 //! * **row, column**: row 0 is ahead (+x up), column 0 is left (+y left). A world point falls on
 //!   row `floor((half_extent - x) / metres_per_px)` and column
 //!   `floor((half_extent - y) / metres_per_px)` in raster-frame coordinates.
 //!
 //! Nothing is anti-aliased: a polygon covers the pixels whose centres it contains, a line the
-//! pixels it passes. Values lie in [0, 1], except in the layers for which [`Layer::is_signed`]
-//! holds, which use [-1, 1].
+//! pixels it passes through. Values lie in [0, 1], except in the layers for which
+//! [`Layer::is_signed`] holds, which use [-1, 1].
 //!
 //! ```
 //! use gump_raster::{Layer, RasterSpec, rasterize};
@@ -49,5 +49,5 @@ pub use raster::Raster;
 pub use rasterize::rasterize;
 pub use spec::RasterSpec;
 
-/// The numbering of lights that [`Layer::TrafficLightIndex`] paints and the tokens use.
+/// The numbering of lights in [`Layer::TrafficLightIndex`] and in tokens.
 pub use gump_scene::light_indices;

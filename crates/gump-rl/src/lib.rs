@@ -1,17 +1,16 @@
-//! A vectorised environment over any world, and policies that learn to drive in it.
+//! A vectorised driving environment over any world, and reinforcement learning in it.
 //!
-//! Start with [`DrivingEnv`]: many episodes side by side, one batched call of the world per step. It
-//! is a [`VectorEnv`], which is all that learning algorithms ask for. What is driven on is a
-//! [`Course`], what an action does [`Dynamics`], what is seen an [`ObservationSpec`], what is good
-//! [`RewardWeights`]. One episode as pure functions of values is [`Rules`]. [`sac`] learns from
-//! rewards and from experts, and gives an [`Actor`]. [`server`] lends environments to other
-//! processes.
+//! Start with [`DrivingEnv`]: many episodes in parallel, with one batched call of the world per
+//! step. It implements [`VectorEnv`], the only interface that learning algorithms need. [`Course`]
+//! is a prepared scenario, [`Dynamics`] defines actions, [`ObservationSpec`] observations and
+//! [`RewardWeights`] the reward. [`Rules`] is one episode as pure functions. [`sac`] trains an
+//! [`Actor`] from rewards or from experts. [`server`] provides environments to other processes.
 //!
 //! # Terms
-//! * **row**: a place in the batch. **Episode**: what happens in a row from a start to an end.
-//! * **terminated**: ended by failure, nothing comes after. **Truncated**: cut off, more would
-//!   have come, so a value must be bootstrapped.
-//! * **step**: what an action lasts, half a second; one or more frames of a world.
+//! * **row**: an index of the batch. **Episode**: the steps of a row from a start to an end.
+//! * **terminated**: ended by failure. **Truncated**: cut off before its end, so its value must be
+//!   bootstrapped.
+//! * **step**: the duration of an action, half a second; one or more frames of a world.
 //!
 //! ```
 //! use gump_rl::{Course, DrivingEnv, EnvConfig, Traffic, VectorEnv};

@@ -1,15 +1,15 @@
-//! The closed-loop engine, the traits [`WorldModel`] and [`Policy`], vehicle dynamics and
+//! Closed-loop simulation: the traits [`WorldModel`] and [`Policy`], vehicle dynamics and
 //! rule-based worlds.
 //!
-//! Start with [`simulate`]. Nothing here scores a rollout and nothing here knows of tensors: the
-//! learned world implements [`WorldModel`] from above.
+//! Start with [`simulate`]. The crate does not score rollouts and does not depend on tensors; the
+//! learned worlds in `gump-engine` implement [`WorldModel`].
 //!
 //! # Terms
-//! * **world model**: imagines how traffic goes on. **Session**: its futures in progress.
-//! * **policy**: decides for the ego. **Command**: what it decides.
-//! * **future**: one of several rollouts of the same scene; future *k* depends on its start and
-//!   `seed.fork(k)` alone.
-//! * **knot**: a frame of a world that steps more slowly than the scene.
+//! * **world model**: determines how traffic continues. **Session**: its futures in progress.
+//! * **policy**: controls the ego. **Command**: its output for one step.
+//! * **future**: one of several rollouts of the same scene; future *k* depends only on its start
+//!   and `seed.fork(k)`.
+//! * **knot**: a frame of a world whose time step is longer than the scene's.
 //!
 //! ```
 //! use gump_rollout::{SimulateConfig, Start, simulate, worlds::ConstantVelocity};

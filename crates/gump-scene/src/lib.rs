@@ -1,19 +1,22 @@
-//! The vocabulary of traffic: inert values, no I/O, no tensors.
+//! Data types for traffic scenes: agents, frames, maps, scenarios and rollouts.
 //!
-//! Read this page first; every other crate speaks these words.
+//! Plain values without I/O and without tensors. All other crates use these types and terms, so
+//! read this page first.
 //!
 //! # Terms
-//! * **agent**: anything that moves, with a box; **ego** is the agent a planner may drive.
+//! * **agent**: anything that moves and has a bounding box; **ego**: the agent a planner may drive.
 //! * **track**: one agent over time. **Frame**: all agents and lights at one instant.
-//! * **scenario**: recorded traffic, its future included. **Rollout**: imagined traffic.
-//! * **scene state**: what an actor may see, the past and the present, never the future.
+//! * **scenario**: recorded traffic, including its future. **Rollout**: simulated traffic.
+//! * **scene state**: the part of a scenario that a world or policy may see: past and present,
+//!   never the future.
 //! * **future**: one of several rollouts of the same scene. **Prediction**: a few paths of one
 //!   agent, or of some together, each with a confidence.
-//! * **lane**, **route**: the road as a directed graph, and the ego's way through it.
+//! * **lane**, **route**: the road as a directed graph, and the ego's path through it.
 //! * **roadblock**: lanes side by side in one direction, or their links through an intersection.
 //!
-//! Conventions: SI units, radians counter-clockwise from +x, world frame in f64, an agent's pose
-//! is its **box centre** ([`EgoState`] alone speaks of the rear axle). An absent agent is absent: there are no validity masks here.
+//! Conventions: SI units, radians counter-clockwise from +x, world frame in f64. An agent's pose is
+//! its **box centre**; only [`EgoState`] uses the rear axle. A frame lists the agents that are
+//! present; there are no validity masks.
 //!
 //! ```
 //! let scenario = gump_scene::fixture::scenario(

@@ -1,9 +1,10 @@
-//! Scenarios made up from nothing: procedural roads and rule-driven traffic.
+//! Synthetic scenarios: procedural roads and rule-driven traffic.
 //!
-//! Free of any recording and of its licence, endless, and the same for the same seed. Start with
-//! [`synthesize`], or with [`Profile`] for scenes like recorded ones, which [`track`] shows as a
-//! vehicle's sensors would. Scenes that SUMO simulates begin with [`draw_sumo_demand`]; running SUMO is the
-//! driver's affair, reading what it puts out that of `gump_data::sumo`.
+//! No recording is used, so no licence of one applies. The number of scenes is unlimited, and the
+//! same seed gives the same scene. Start with [`synthesize`], or with [`Profile`] for scenes with
+//! the statistics of recorded ones; [`track`] simulates their observation by a vehicle's sensors.
+//! Scenes simulated by SUMO begin with [`draw_sumo_demand`]; `xtask` runs SUMO, and
+//! `gump_data::sumo` reads its output.
 //!
 //! ```
 //! use gump_scene::Seed;
@@ -30,11 +31,11 @@ mod sumo_demand;
 mod tracker;
 mod traffic;
 
-/// Version of the generators: it grows whenever a seed gives another scene than before.
+/// Version of the generators, increased whenever a seed gives another scene than before.
 ///
-/// Frozen sets of scenes name the version that made them; [`SynthesisConfig::of_version`] and
-/// [`SumoDemand::of_version`] say what a version asked for. `tests/frozen.rs` holds every version
-/// to the scenes it made first.
+/// Frozen sets of scenes name the version that generated them; [`SynthesisConfig::of_version`] and
+/// [`SumoDemand::of_version`] return the configuration of a version. `tests/frozen.rs` checks that
+/// every version still generates its original scenes.
 pub const GENERATOR_VERSION: u32 = 1;
 
 pub use config::SynthesisConfig;

@@ -1,22 +1,23 @@
-//! A scene as tokens and back, with its grammar.
+//! Encoding of scenes as tokens, decoding, and the grammar of token sequences.
 //!
-//! A scene is a few frames half a second apart. Each frame is BEGIN, its traffic lights,
-//! LIGHTS_END, a key (who) and a value (in which state) for every agent the frame before had too,
-//! NEWBORN, and pairs for those it had not. States lie on fixed grids in the frame of one pose.
+//! A scene is a few frames half a second apart. Each frame consists of BEGIN, its traffic lights,
+//! LIGHTS_END, a key (identity) and a value (state) for every agent that was also in the previous
+//! frame, NEWBORN, and such pairs for the agents that were not. States are quantised to fixed grids
+//! in the frame of one pose.
 //!
-//! Nothing here knows a tensor: embedding slots is the model's work, and so is drawing the map.
-//! Start with [`Tokenizer`], then [`TokenSequence`]; [`Field`] is the arithmetic and [`Grammar`]
-//! the one place that says what may follow what.
+//! Start with [`Tokenizer`], then [`TokenSequence`]. [`Field`] quantises numbers, and [`Grammar`]
+//! is the only definition of valid sequences. The crate does not depend on tensors; embedding slots
+//! and rendering the map belong to other crates.
 //!
 //! # Terms
 //! * **slot**: one position of a sequence. **Token**: an index into the vocabulary; most slots are
 //!   one token, a value slot is seven, one per **field**.
-//! * **key**: the slot that addresses an agent by id and class; its **value** follows it.
-//! * **tracked**: present in the frame before as well. **Newborn**: not present there, be it for
-//!   the first time or again. In the first frame everything is tracked.
+//! * **key**: the slot that identifies an agent by id and class; its **value** follows it.
+//! * **tracked**: also present in the previous frame. **Newborn**: not present there, whether it
+//!   appears for the first time or again. In the first frame all agents are tracked.
 //! * **canonical order**: the ego, then by class, then by id.
 //! * **scene frame**: the pose that all states of a window are relative to, usually the ego's now;
-//!   x forward, y left. It stands still while the ego moves.
+//!   x forward, y left. It stays fixed while the ego moves.
 //!
 //! ```
 //! use gump_tokenizer::{Identities, Tokenizer, TokenizerConfig};

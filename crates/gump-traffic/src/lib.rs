@@ -1,13 +1,12 @@
-//! Traffic that goes on for a minute: signals that work as junctions do, and agents that come and
-//! leave, around any world.
+//! Long rollouts of any world: traffic signals with phases, and agents that enter and leave.
 //!
-//! A [`WorldModel`](gump_rollout::WorldModel) says how agents move. What the lights show and who is
-//! there is given to it: held as at the present, or led on by [`Living`].
+//! A [`WorldModel`](gump_rollout::WorldModel) determines how agents move. Lights and the set of
+//! agents are its inputs: they stay as at the present, or [`Living`] updates them.
 //!
 //! # Terms
-//! * **movement**: one way through a junction that a light rules. **Signal group**: movements whose
-//!   lights show the same. **Phase**: groups that are green together.
-//! * **gate**: where a lane comes into what is simulated.
+//! * **movement**: a path through a junction that a light controls. **Signal group**: movements
+//!   whose lights always show the same colour. **Phase**: groups that are green together.
+//! * **gate**: a place where a lane enters the simulated area.
 //!
 //! ```
 //! use gump_rollout::{SimulateConfig, Start, simulate, worlds::Idm};

@@ -1,9 +1,10 @@
 //! Training of the learned world models.
 //!
-//! What lives here: the sequence network's samples ([`sample`]), losses ([`loss`]), closed loop
-//! ([`closed_loop`]) and trainer ([`Trainer`]), and the relative network's drives, rewards and
-//! trainer ([`relative`]). Runs resume exactly, and one seed gives one result for any number of
-//! threads. What does not: the networks, and how runs are driven, shown and stored.
+//! For the sequence network: samples ([`sample`]), losses ([`loss`]), closed-loop training
+//! ([`closed_loop`]) and the trainer ([`Trainer`]). For the relative network: its own rollouts as
+//! training data, rewards, and the trainer ([`relative`]). Runs resume exactly, and the same seed
+//! gives the same result for any number of threads. The networks are in `gump-model`; command line,
+//! progress and output files are in `xtask`.
 
 pub mod closed_loop;
 mod config;

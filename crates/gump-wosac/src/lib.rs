@@ -1,10 +1,10 @@
-//! The metrics of Waymo's challenges, equal to the official ones: realism of simulated agents and of
-//! generated scenes, and motion prediction.
+//! The metrics of Waymo's challenges, equal to the official implementations: realism of simulated
+//! agents and of generated scenes, and motion prediction.
 //!
-//! [`realism`] scores rollouts that come as plain arrays, as messages of Waymo's or as scenes;
-//! [`motion`] scores predictions. Nothing here reads a file.
+//! [`realism`] scores rollouts given as plain arrays, as Waymo's messages or as scenes; [`motion`]
+//! scores predictions. The crate reads no files.
 //!
-//! Realism of one's own arrays under the rules of the Waymo Sim Agents Challenge, no file needed:
+//! Realism of plain arrays by the rules of the Waymo Sim Agents Challenge:
 //!
 //! ```
 //! use gump_wosac::realism::{Config, Log, Rollouts, State, Track, Trajectory, Year, score};
