@@ -1,4 +1,4 @@
-//! What can go wrong in this crate.
+//! Errors of this crate.
 
 use std::path::{Path, PathBuf};
 
@@ -10,13 +10,13 @@ use gump_rollout::RolloutError;
 /// An error of an evaluation's inputs or of its results.
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
-    /// What was asked for does not exist or contradicts itself.
+    /// The request does not exist or contradicts itself.
     #[error("{0}")]
     Argument(String),
     /// A file of scenarios cannot be read.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// Weights cannot be read or do not fit.
+    /// Weights cannot be read or do not fit the network.
     #[error(transparent)]
     Model(#[from] ModelError),
     /// A recording cannot be driven through.
@@ -25,20 +25,20 @@ pub enum EvalError {
     /// A planner cannot be built.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// A recording lacks what driving through it takes.
+    /// A recording lacks information that driving requires.
     #[error("{0}")]
     Recording(String),
     /// Stored results are incomplete, or of different evaluations.
     #[error("{0}")]
     Results(String),
-    /// The operating system refused.
+    /// An input or output error of the operating system.
     #[error("cannot {doing} {}: {cause}", path.display())]
     Io {
-        /// What was tried: "list", "create", "write".
+        /// The operation: "list", "create", "write".
         doing: &'static str,
         /// The file or folder.
         path: PathBuf,
-        /// The system's word.
+        /// The error of the system.
         cause: std::io::Error,
     },
 }
@@ -52,7 +52,7 @@ impl EvalError {
         }
     }
 
-    /// Whether another argument, not another file, would help.
+    /// Whether a different argument, rather than a different file, would help.
     pub fn is_argument(&self) -> bool {
         matches!(
             self,

@@ -1,4 +1,4 @@
-//! Planners by name, the worlds they imagine and meet, and a stopwatch.
+//! Planners by name, the worlds that they roll out and drive in, and timing.
 #![allow(
     clippy::disallowed_methods,
     reason = "planners are timed; layers 0-3 may not look at the clock"
@@ -26,20 +26,20 @@ use crate::EvalError;
 use crate::recordings::Case;
 use crate::worlds::{World, WorldName};
 
-/// Who plans.
+/// A planner by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlannerName {
     /// The recorded driver: an oracle.
     Log,
     /// nuPlan's IDM planner.
     Idm,
-    /// Straight on.
+    /// Drives straight on.
     Simple,
     /// PDM-Closed.
     PdmClosed,
-    /// The mean of what an imagined world has the ego do.
+    /// The mean of the ego's motion in the rollouts of a world.
     Imitation,
-    /// 19 policies and imitation, each imagined among others who react.
+    /// 19 policies and imitation, each rolled out among reactive agents.
     Interactive,
     /// PDM's 15 proposals, each a planner of its own.
     Proposals,
@@ -70,7 +70,7 @@ impl PlannerName {
         }
     }
 
-    /// What it does, in a sentence without an end.
+    /// A short description, as a sentence without a final stop.
     pub fn description(self) -> &'static str {
         match self {
             Self::Log => "The recorded driver: an oracle",
@@ -88,10 +88,10 @@ impl PlannerName {
         }
     }
 
-    /// The planner for one case; `imagination` is the world that those think in who do.
+    /// The planner for one case; `imagination` is the world that planners with rollouts use.
     ///
     /// # Errors
-    /// [`Self::Proposals`], who are many, and a configuration out of its range.
+    /// [`Self::Proposals`], which stands for many planners, and a configuration out of its range.
     pub fn build<'w>(
         self,
         case: &Case,
@@ -143,26 +143,26 @@ impl Serialize for PlannerName {
     }
 }
 
-/// How planners that imagine do it.
+/// Settings of planners that use rollouts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlannerConfig {
-    /// Futures that imagining planners see.
+    /// Number of futures.
     pub futures: usize,
-    /// Which candidates of the interactive planner are imagined how often.
+    /// How rollouts are distributed over the candidates of the interactive planner.
     pub allocation: Allocation,
-    /// How it makes one value of the futures of a candidate.
+    /// How the values of a candidate's futures are combined into one.
     pub aggregate: Aggregate,
-    /// What it gives its previous choice on top of its value.
+    /// Bonus for the previous choice, added to its value.
     pub hysteresis: f64,
-    /// Agents that are imagined, those nearest to the ego.
+    /// Number of agents to simulate, those nearest to the ego.
     pub nearest: usize,
-    /// Seconds that the interactive planner imagines.
+    /// Horizon of the interactive planner, seconds.
     pub horizon: f64,
-    /// The interactive planner stops imagining after so long.
+    /// Time limit for the rollouts of the interactive planner.
     pub wall: Option<Duration>,
-    /// Planners that imagine decide at every so many steps.
+    /// Planners with rollouts decide once in this many steps.
     pub replan_every: usize,
-    /// Discount per half second; without one a future is worth the score of the whole drive.
+    /// Discount per half second; without one a future has the score of the whole drive.
     pub discount: Option<f64>,
 }
 
@@ -227,7 +227,7 @@ impl PlannerConfig {
     }
 }
 
-/// What the ego meets and what planners imagine, by the name of the world.
+/// The traffic of a drive and the world that planners roll out, by the world's name.
 pub struct PlanningWorld {
     name: WorldName,
     learned: Option<World>,
@@ -255,8 +255,8 @@ impl PlanningWorld {
         })
     }
 
-    /// As [`PlanningWorld::load`], to imagine in: what planners look ahead fits a window that grows,
-    /// in which nothing is read twice.
+    /// As [`PlanningWorld::load`], for rollouts of a planner: a planner's horizon fits into a
+    /// growing window, in which nothing is computed twice.
     ///
     /// # Errors
     /// Weights that cannot be read.
@@ -272,7 +272,7 @@ impl PlanningWorld {
         Self::load(device, name, &growing)
     }
 
-    /// A world to imagine in: the network where there is one, else reactive rules.
+    /// The world that planners roll out: the network where there is one, else reactive rules.
     pub fn imagination(&self) -> &dyn WorldModel {
         match &self.learned {
             Some(world) => world.model(),
@@ -291,7 +291,7 @@ impl PlanningWorld {
     }
 }
 
-/// A driver with a stopwatch and, perhaps, a limit.
+/// A driver with timing and, optionally, a time limit.
 pub struct TimedDriver<'a> {
     inner: &'a mut dyn Driver,
     limit: Option<Duration>,
@@ -300,7 +300,7 @@ pub struct TimedDriver<'a> {
 }
 
 impl<'a> TimedDriver<'a> {
-    /// Watches a driver; a step longer than `limit` is a failure.
+    /// Times a driver; a step longer than `limit` is a failure.
     pub fn new(inner: &'a mut dyn Driver, limit: Option<Duration>) -> Self {
         Self {
             inner,

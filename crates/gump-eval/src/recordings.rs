@@ -1,4 +1,4 @@
-//! Recordings to drive through, from any readable file.
+//! Recordings to drive in, from any readable file.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -8,23 +8,23 @@ use gump_scene::{EgoState, MapGraph, Scenario};
 
 use crate::{EvalError, nuplan_recordings};
 
-/// A recording with what judging it takes besides.
+/// A recording with the additional data that scoring needs.
 pub struct Case {
-    /// What is driven through.
+    /// The recording to drive in.
     pub recording: Recording,
-    /// What drives are judged on: the map as it was stated.
+    /// The map as it was stated, which drives are scored on.
     pub map: Arc<MapGraph>,
-    /// What was driven after the recording's end, if that is known.
+    /// The logged drive after the recording's end, if it is known.
     pub after: Vec<EgoState>,
     /// nuPlan's name of the map; empty for other formats.
     pub map_name: String,
 }
 
-/// A case or why there is none, by the name of its scenario.
+/// A case, or why there is none, with the name of its scenario.
 pub struct Named {
-    /// The scenario's id; where it cannot be read, where it was.
+    /// The scenario's id; where it cannot be read, its position.
     pub id: String,
-    /// The log it is of: the name of its file, without endings.
+    /// The log it belongs to: the file name without extensions.
     pub log_name: String,
     /// nuPlan's type of scenario; "unknown" for other formats.
     pub scenario_type: String,
@@ -34,7 +34,7 @@ pub struct Named {
 
 /// Every scenario of a file or folder, read one by one.
 ///
-/// Error: nothing there to read.
+/// Error: the path contains nothing to read.
 pub fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Named> + Send>, EvalError> {
     let logs = nuplan_recordings::logs_of(path);
     if !logs.is_empty() {
@@ -58,7 +58,8 @@ pub fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Named> + Send>, EvalE
 
 /// Every scenario of some files or folders, read one by one.
 ///
-/// Error: nothing to read at the first; what is wrong with the others is told where it is.
+/// Error: the first path contains nothing to read. Errors of later paths are reported at their
+/// position.
 pub fn open_all(
     paths: &[PathBuf],
 ) -> Result<Box<dyn Iterator<Item = Named> + Send + '_>, EvalError> {
@@ -76,7 +77,7 @@ pub fn open_all(
     Ok(Box::new(open(first)?.chain(others)))
 }
 
-/// A file's name without its endings.
+/// A file name without its extensions.
 pub fn log_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     name.split('.').next().unwrap_or_default().into()
@@ -106,7 +107,7 @@ pub fn find(source: &str) -> Result<Case, EvalError> {
     of_boxes(gump_data::find(source)?)
 }
 
-/// A case of a scenario that knows boxes alone.
+/// A case of a scenario that has boxes only.
 ///
 /// # Errors
 /// No lanes, or a scenario that cannot be driven through.

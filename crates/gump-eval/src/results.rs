@@ -1,8 +1,8 @@
-//! `scenarios.toml`: what each scenario of an evaluation got, one table each.
+//! `scenarios.toml`: the results of an evaluation, one table per scenario.
 //!
 //! Totals are always computed from these entries in order of the scenarios, whether they were
 //! written by this run, by the run it resumes or by shards on other machines: equal entries give
-//! equal totals, to the bit. TOML, because its numbers come back exactly as they were, NaN too.
+//! equal totals, bit for bit. The format is TOML, because it keeps all digits of numbers, and NaN.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -21,18 +21,18 @@ const NAME: &str = "scenarios.toml";
 /// How the table of a scenario starts.
 const ENTRY: &str = "[[scenario]]";
 
-/// Which evaluation the entries are of; the first table of the file.
+/// Identifies the evaluation; the first table of the file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
     /// Name of the benchmark, for instance "wosac".
     pub benchmark: String,
     /// Which scenarios.
     pub shard: Shard,
-    /// Everything that the entries depend on; shards of one evaluation agree in it.
+    /// Everything that the entries depend on; the same for all shards of one evaluation.
     pub settings: toml::Table,
 }
 
-/// What one scenario got.
+/// The result of one scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Entry<T> {
     /// Position among all scenarios of the evaluation.
@@ -43,7 +43,7 @@ pub struct Entry<T> {
     pub scores: T,
 }
 
-/// The form of the file.
+/// The structure of the file.
 #[derive(Serialize, Deserialize)]
 struct Document<T> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -60,8 +60,8 @@ pub struct ResultStore<T> {
 }
 
 impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
-    /// Opens the store of a folder: goes on where an interrupted run of the same evaluation
-    /// stopped, else begins.
+    /// Opens the store of a folder: resumes an interrupted run of the same evaluation, or starts a
+    /// new one.
     pub fn open(folder: &Path, header: &Header) -> Result<Self, EvalError> {
         let path = partial(folder);
         let kept: Vec<Entry<T>> = match fs::read_to_string(&path) {
@@ -84,12 +84,12 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
         Ok(store)
     }
 
-    /// True if the scenario at `index` needs no more work.
+    /// True if the scenario at `index` is already done.
     pub fn has(&self, index: usize) -> bool {
         self.entries.contains_key(&index)
     }
 
-    /// Scenarios that need no more work.
+    /// Number of scenarios already done.
     pub fn indices(&self) -> BTreeSet<usize> {
         self.entries.keys().copied().collect()
     }
@@ -126,8 +126,8 @@ fn partial(folder: &Path) -> PathBuf {
     folder.join(format!("{NAME}.partial"))
 }
 
-/// The entries of an interrupted run, if it was of the same evaluation; without the last, which
-/// may have been cut off.
+/// The entries of an interrupted run, if it was of the same evaluation; without the last one, which
+/// may be truncated.
 fn resumable<T: DeserializeOwned>(text: &str, header: &Header) -> Vec<Entry<T>> {
     let whole = &text[..text.rfind(ENTRY).unwrap_or(0)];
     match toml::from_str::<Document<Entry<T>>>(whole) {
@@ -136,7 +136,7 @@ fn resumable<T: DeserializeOwned>(text: &str, header: &Header) -> Vec<Entry<T>> 
     }
 }
 
-/// Which evaluation `folder` holds, its entries unread.
+/// The header of the evaluation in `folder`, without reading its entries.
 ///
 /// Error: no complete store there.
 pub fn header(folder: &Path) -> Result<Header, EvalError> {
@@ -260,7 +260,7 @@ mod tests {
         Entry { index, id, scores }
     }
 
-    /// Writes a complete shard with a number per scenario that no short decimal can hold.
+    /// Writes a complete shard with a number per scenario that has no short decimal form.
     fn shard(folder: &Path, k: usize, n: usize) {
         fs::create_dir_all(folder).unwrap();
         let mut store = ResultStore::open(folder, &header(k, n)).unwrap();

@@ -1,11 +1,11 @@
-//! One evaluation on many machines: which scenarios are whose.
+//! Shards: the assignment of scenarios to machines.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// Part `k` of `n`; scenarios are dealt out in turn, so shards are alike in size and kind.
+/// Part `k` of `n`. Scenarios are assigned in turn, so shards are similar in size and content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Shard {
@@ -19,12 +19,13 @@ impl Shard {
     /// All scenarios.
     pub const WHOLE: Self = Self { k: 1, n: 1 };
 
-    /// The part that a scheduler gives this process, by the environment variables `variable` looks up.
+    /// The shard that a scheduler assigns to this process, from the environment variables that
+    /// `variable` looks up.
     ///
-    /// Read are Slurm's array (`SLURM_ARRAY_TASK_ID`, `_MIN`, `_STEP`, `_COUNT`) and tasks
-    /// (`SLURM_PROCID`, `SLURM_NTASKS`), the one within the other where both are set; else the index
-    /// of a Kubernetes job (`JOB_COMPLETION_INDEX`). Kubernetes does not tell a pod of how many: that
-    /// is `GUMP_SHARDS`, which also overrides the count that Slurm gives.
+    /// Supported are Slurm's array (`SLURM_ARRAY_TASK_ID`, `_MIN`, `_STEP`, `_COUNT`) and tasks
+    /// (`SLURM_PROCID`, `SLURM_NTASKS`), nested where both are set; otherwise the index of a
+    /// Kubernetes job (`JOB_COMPLETION_INDEX`). Kubernetes does not tell a pod the number of
+    /// shards: `GUMP_SHARDS` does, and it also overrides the count of Slurm.
     ///
     /// # Errors
     /// A sentence that says which variable is missing or wrong.

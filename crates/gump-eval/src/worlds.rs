@@ -16,14 +16,14 @@ use serde::{Serialize, Serializer};
 
 use crate::EvalError;
 
-/// Which world imagines.
+/// A world by name.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WorldName {
-    /// What was recorded: an oracle.
+    /// The recording: an oracle.
     Log,
     /// Rule-driven traffic that reacts.
     Idm,
-    /// Everyone goes straight on.
+    /// Constant velocity.
     ConstantVelocity,
     /// A trained network.
     Model(PathBuf),
@@ -47,10 +47,10 @@ impl FromStr for WorldName {
     }
 }
 
-/// How files of weights end.
+/// Extension of files of weights.
 const WEIGHTS: &str = ".safetensors";
 
-/// A file of weights, by its path or as a world is named.
+/// A file of weights, given by its path or by the name of a world.
 ///
 /// # Errors
 /// A world without weights.
@@ -64,7 +64,7 @@ pub fn weights(name: &str) -> Result<PathBuf, String> {
     }
 }
 
-/// Why a name is no world, and what may be meant.
+/// Why a name is not a world, and a suggestion.
 fn no_world(name: &str) -> String {
     let expected = "expected log, idm, constant-velocity or model:WEIGHTS";
     let is_path = name.contains(['/', '\\', '.']) || Path::new(name).exists();
@@ -91,9 +91,9 @@ impl Serialize for WorldName {
     }
 }
 
-/// A world that is ready to imagine.
+/// A world that is ready to simulate.
 pub enum World {
-    /// One that follows rules.
+    /// A rule-based world.
     Rule(Box<dyn WorldModel>),
     /// A trained network of sequences.
     Learned(Box<TransformerWorld>),
@@ -102,7 +102,7 @@ pub enum World {
 }
 
 impl World {
-    /// Builds the world, a network on `device`; only `log` looks at more than the present of the
+    /// Builds the world, with its network on `device`; only `log` uses more than the present of the
     /// scenario.
     ///
     /// # Errors
@@ -122,7 +122,7 @@ impl World {
         }
     }
 
-    /// Builds a world that looks at no log.
+    /// Builds a world that does not use the log.
     ///
     /// # Errors
     /// The world `log`, lights as recorded, and as [`World::build`].
@@ -173,12 +173,12 @@ impl World {
         })
     }
 
-    /// Whether a world of this name is another one in every scenario.
+    /// Whether a world of this name has to be built for every scenario.
     pub fn is_of_scenario(name: &WorldName, sampling: &SamplingConfig) -> bool {
         *name == WorldName::Log || sampling.lights == LightSource::Log
     }
 
-    /// What imagines.
+    /// The world model.
     pub fn model(&self) -> &dyn WorldModel {
         match self {
             Self::Rule(world) => &**world,
@@ -187,7 +187,7 @@ impl World {
         }
     }
 
-    /// Whether a map without lanes leaves it nothing to go by.
+    /// Whether the world cannot simulate on a map without lanes.
     pub fn follows_lanes(&self) -> bool {
         match self {
             Self::Rule(world) => world.name() == "idm",
@@ -195,7 +195,7 @@ impl World {
         }
     }
 
-    /// The same world, which keeps what its agents might have done; rules have nothing to keep.
+    /// The same world, recording predictive samples of its agents; rule-based worlds have none.
     pub fn watching(self, watch: ProbeConfig) -> Self {
         match self {
             Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
@@ -204,7 +204,7 @@ impl World {
         }
     }
 
-    /// What was watched; `None` of a world that follows rules.
+    /// The recorded predictive samples; `None` for rule-based worlds.
     pub fn take_predictive_samples(&self) -> Option<Vec<PredictiveSamples>> {
         match self {
             Self::Rule(_) => None,
@@ -213,7 +213,7 @@ impl World {
         }
     }
 
-    /// Passes of the network made so far, whatever their batch; rules make none.
+    /// Passes of the network so far, whatever their batch size; 0 for rule-based worlds.
     pub fn passes(&self) -> u64 {
         match self {
             Self::Rule(_) => 0,
@@ -223,8 +223,8 @@ impl World {
     }
 }
 
-/// One world for many scenarios: loaded once, but for what is another world in every scenario, the
-/// log and lights as they were recorded.
+/// One world for many scenarios: loaded once, except for the parts that depend on the scenario,
+/// which are the log and recorded lights.
 pub struct Worlds<'a> {
     device: Device,
     name: &'a WorldName,
@@ -233,7 +233,7 @@ pub struct Worlds<'a> {
 }
 
 impl<'a> Worlds<'a> {
-    /// Names a world; nothing is loaded yet.
+    /// Stores the name of a world; nothing is loaded yet.
     pub fn new(device: &Device, name: &'a WorldName, sampling: SamplingConfig) -> Self {
         Self {
             device: device.clone(),

@@ -1,4 +1,4 @@
-//! The names of the planes and what each holds.
+//! The names of the layers and what each contains.
 
 use std::fmt;
 use std::str::FromStr;
@@ -15,7 +15,7 @@ pub enum Layer {
     RoadEdge,
     /// Crosswalk polygons: 1.
     Crosswalk,
-    /// Stop-line polygons, and a line across each lane ruled by a stop sign: 1.
+    /// Stop-line polygons, and a line across each lane that a stop sign applies to: 1.
     StopLine,
     /// Speed-bump polygons: 1.
     SpeedBump,

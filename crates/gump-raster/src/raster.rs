@@ -1,4 +1,4 @@
-//! The finished image.
+//! The rendered image.
 
 use gump_geometry::{DVec2, Pose};
 
@@ -16,7 +16,8 @@ pub struct Raster {
     pub metres_per_px: f64,
     /// All values, `[layer, row, column]`, row 0 ahead, column 0 left.
     pub data: Vec<f32>,
-    /// Where world points fall in the raster frame, whose origin is the centre of the image.
+    /// The transform from world points to the raster frame, whose origin is the centre of the
+    /// image.
     pub raster_from_world: Pose,
     pub(crate) frame: PixelFrame,
 }

@@ -1,4 +1,4 @@
-//! From a scene to a raster: allocates the planes and hands each to the file that draws it.
+//! Renders a scene: allocates the planes and calls the function that draws each.
 
 use gump_geometry::Pose;
 use gump_scene::{AreaKind, LightState, SceneState};
@@ -19,8 +19,8 @@ use crate::{Layer, Raster, RasterSpec};
 /// `world_from_raster` is the pose at the centre of the image, facing up; pass the ego's for the
 /// usual view and a moved or turned one to augment. Map and agents go through the same transform.
 ///
-/// Shape: `[layer, row, column]`, row 0 at +x of the raster frame, column 0 at +y.
-/// Error: none; what the map does not know stays 0.
+/// Shape: `[layer, row, column]`, row 0 at +x of the raster frame, column 0 at +y. Error: none;
+/// layers without map data stay 0.
 pub fn rasterize(spec: &RasterSpec, scene: &SceneState<'_>, world_from_raster: Pose) -> Raster {
     let frame = PixelFrame::new(spec, world_from_raster);
     let area = spec.side_px * spec.side_px;

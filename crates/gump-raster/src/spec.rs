@@ -1,4 +1,4 @@
-//! What a raster should look like.
+//! The specification of a raster.
 
 use crate::Layer;
 
@@ -44,7 +44,7 @@ impl RasterSpec {
         Self::new(416, 0.5, layers)
     }
 
-    /// Sixteen planes that hold everything the map says; the colours of lights are left to tokens.
+    /// Sixteen planes that contain all map data; the colours of lights are left to tokens.
     pub fn full(side_px: usize, metres_per_px: f64) -> Self {
         let layers = vec![
             Layer::RoadLines,

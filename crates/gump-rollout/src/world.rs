@@ -1,18 +1,18 @@
-//! What imagines how traffic goes on.
+//! Worlds: models of how traffic continues.
 
 use std::error::Error;
 
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, SceneState, Seed};
 
-/// An error of whoever implements a world or a policy.
+/// The error type of implementations of worlds and policies.
 pub type BoxError = Box<dyn Error + Send + Sync>;
 
-/// Imagines how traffic goes on, many futures at once.
+/// Simulates how traffic continues, for many futures at once.
 ///
-/// Implementations see a [`SceneState`] and so cannot see the logged future; one that needs the log
-/// is an oracle and takes a `Scenario` in its constructor.
+/// Implementations receive a [`SceneState`], which does not contain the logged future; one that
+/// needs the log is an oracle and takes a `Scenario` in its constructor.
 ///
-/// A world of one's own, in which everyone rolls to a halt:
+/// An example, in which every agent slows down to a halt:
 ///
 /// ```
 /// use gump_rollout::{BoxError, Session, SimulateConfig, Start, WorldModel, simulate};
@@ -73,7 +73,7 @@ pub trait WorldModel: Send + Sync {
     /// start come first.
     ///
     /// # Errors
-    /// Whatever keeps the implementation from imagining these scenes.
+    /// Any reason for which the implementation cannot simulate these scenes.
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError>;
 }
 
@@ -87,54 +87,54 @@ impl<W: WorldModel + ?Sized> WorldModel for Box<W> {
     }
 }
 
-/// A scene to continue, how often, and from which randomness.
+/// A scene to continue, the number of futures, and their seed.
 #[derive(Clone, Copy, Debug)]
 pub struct Start<'a> {
-    /// What has been seen.
+    /// The past and present of the scene.
     pub scene: SceneState<'a>,
-    /// How many futures to imagine.
+    /// Number of futures to simulate.
     pub n_futures: usize,
-    /// Future `k` of this start uses `seed.fork(k)` and nothing else.
+    /// Future `k` of this start uses only `seed.fork(k)`.
     pub seed: Seed,
 }
 
-/// Futures in progress. The session owns whatever the world remembers, a KV cache for instance.
+/// Futures in progress. The session owns the state of the world, such as a KV cache.
 pub trait Session {
     /// Seconds between the frames this session yields.
     fn dt(&self) -> f64;
 
-    /// Imagines the next frame of every future, start-major.
+    /// Simulates the next frame of every future, start-major.
     ///
     /// `ego` gives the ego's next state in every future, start-major; it is final, and the others
     /// react to it within the same frame. `None` lets the world drive the ego too.
     ///
     /// # Errors
-    /// Whatever keeps the implementation from imagining the frame.
+    /// Any reason for which the implementation cannot simulate the frame.
     fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError>;
 
-    /// Goes on with these futures alone, given by ascending index; true if it does.
+    /// Keeps only these futures, given by ascending index; true if it did.
     ///
-    /// What becomes of those kept does not change. A session that cannot let futures go says false
-    /// and keeps all; so does the default.
+    /// The kept futures continue unchanged. A session that cannot drop futures returns false and
+    /// keeps all, as the default does.
     fn keep(&mut self, futures: &[usize]) -> bool {
         let _ = futures;
         false
     }
 
-    /// Shows these lights, all that there are, in the next frame of a future and after it; true if
-    /// it does.
+    /// Sets the lights of the next frame of a future and of later ones; `lights` is the complete
+    /// list. True if the session accepted them.
     ///
-    /// The frame's agents move by what they have seen until then. A session whose lights are its
-    /// own affair says false and shows those; so does the default.
+    /// The agents of that frame still move by the earlier lights. A session that controls its own
+    /// lights returns false and keeps them, as the default does.
     fn show(&mut self, future: usize, lights: &[Light]) -> bool {
         let (_, _) = (future, lights);
         false
     }
 
-    /// Before its next frame, takes agents out of a future and puts others in, where they are now;
-    /// true if it does. The ego stays, whoever is asked to leave.
+    /// Removes agents from a future and adds others at their given states, before its next frame;
+    /// true if it did. The ego is never removed.
     ///
-    /// A session that cannot says false and nothing changes; so does the default.
+    /// A session that does not support this returns false and changes nothing, as the default does.
     fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
         let (_, _, _) = (future, leave, come);
         false
@@ -143,6 +143,6 @@ pub trait Session {
     /// Reuses the slot of a finished future for a fresh start (of one future).
     ///
     /// # Errors
-    /// Whatever keeps the implementation from imagining this scene.
+    /// Any reason for which the implementation cannot simulate this scene.
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError>;
 }

@@ -14,10 +14,11 @@ impl fmt::Display for AgentId {
     }
 }
 
-/// What an agent is.
+/// The kind of an agent.
 ///
-/// Only the kinds of [`AgentKind::MOVING`] are predicted; the others are drawn, never tokenized.
-/// Formats that do not tell cones, barriers and signs apart say [`AgentKind::Other`].
+/// Models predict only the kinds in [`AgentKind::MOVING`]; the others are drawn on rasters but
+/// never tokenized. Formats that do not distinguish cones, barriers and signs use
+/// [`AgentKind::Other`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum AgentKind {
     /// Cars, trucks, buses, motorcycles.
@@ -40,7 +41,7 @@ impl AgentKind {
     /// The kinds a model predicts, in class order.
     pub const MOVING: [Self; 3] = [Self::Vehicle, Self::Pedestrian, Self::Bicycle];
 
-    /// The kinds that only stand in the way.
+    /// The kinds that do not move: obstacles.
     pub const STATIC: [Self; 4] = [Self::TrafficCone, Self::Barrier, Self::Sign, Self::Other];
 
     /// The lower-case English name.
@@ -56,16 +57,16 @@ impl AgentKind {
         }
     }
 
-    /// True for the kinds that move by themselves, whether they stand still or not.
+    /// True for the kinds that can move by themselves, even if the agent stands still.
     pub fn is_moving(self) -> bool {
         Self::MOVING.contains(&self)
     }
 
-    /// Length, width and height of an agent of this kind about which nothing is known, metres;
-    /// readers give exactly this to an agent whose size its format does not state.
+    /// Default length, width and height of an agent of this kind, metres; readers assign exactly
+    /// these to an agent whose size its format does not state.
     ///
-    /// Source: the medians of the 11,672 tracks in 201 scenes of the Waymo Open Motion Dataset;
-    /// for things that do not move, a barrel.
+    /// Source: the medians of the 11,672 tracks in 201 scenes of the Waymo Open Motion Dataset; for
+    /// things that do not move, a barrel.
     pub fn usual_size(self) -> [f64; 3] {
         match self {
             Self::Vehicle => [4.7, 2.1, 1.7],
@@ -76,7 +77,7 @@ impl AgentKind {
     }
 }
 
-/// Where an agent is and how it moves.
+/// Pose and velocity of an agent.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct AgentState {
     /// Box centre and heading, world frame, metres and radians in [-π, π).
@@ -102,7 +103,7 @@ impl AgentState {
 pub struct Agent {
     /// Identity, stable over the scenario.
     pub id: AgentId,
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
     /// Extent along the heading, metres, > 0.
     pub length: f64,
@@ -126,8 +127,9 @@ impl Agent {
         }
     }
 
-    /// True if the footprint is that of [`AgentKind::usual_size`], to what a format with 32-bit
-    /// numbers keeps of it: whoever must not take a guess for a measurement takes it for a guess.
+    /// True if the footprint is that of [`AgentKind::usual_size`], up to the precision of 32-bit
+    /// formats. Code that must not mistake a default for a measurement treats such a size as not
+    /// stated.
     pub fn has_usual_size(&self) -> bool {
         let [length, width, _] = self.kind.usual_size();
         (self.length - length).abs() < 1e-6 && (self.width - width).abs() < 1e-6

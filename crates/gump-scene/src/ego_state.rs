@@ -1,8 +1,8 @@
-//! The ego as a vehicle: what nuPlan records and controllers move, at the rear axle.
+//! The ego's state at its rear axle, as nuPlan records it and controllers use it.
 //!
-//! Everywhere else in the vocabulary an agent's pose is its box centre. Here is the only place
-//! where the rear axle occurs, because a car turns about it: readers that record it and vehicle
-//! dynamics share these two types and convert by [`EgoState::agent_state`].
+//! All other poses in this crate are box centres. The rear axle appears only here, because a car
+//! turns about it: readers that record it and vehicle dynamics share these two types and convert
+//! with [`EgoState::agent_state`].
 
 use gump_geometry::{DVec2, OrientedBox, Pose, dvec2};
 
@@ -74,7 +74,7 @@ impl VehicleParameters {
     }
 }
 
-/// How the ego stands and moves, at its rear axle.
+/// State of the ego at its rear axle.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct EgoState {
     /// Time stamp, microseconds; of a log, since 1970.

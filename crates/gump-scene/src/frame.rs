@@ -1,4 +1,4 @@
-//! All that moves or changes at one instant.
+//! The state of all agents and lights at one instant.
 
 use gump_geometry::DVec2;
 

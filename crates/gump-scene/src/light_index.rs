@@ -4,20 +4,19 @@ use gump_geometry::DVec2;
 
 use crate::{Frame, Light, MapGraph, SceneState};
 
-/// Lights that have an index at most; indices run from 1 to this.
+/// The maximum number of lights with an index; indices run from 1 to this.
 ///
 /// Source: the capacity of 64 in the GUMP paper's code, 0 being "no light".
 pub const MAX_LIGHTS: usize = 63;
 
 /// The lights of the present frame with their index 1, 2, 3, ..., nearest first.
 ///
-/// A light counts if its lane is in the map and the lane starts within `radius` of `centre`; the
-/// distance of that start decides the order, the lane id breaks ties. A larger radius only appends,
-/// so whoever looks less far uses a prefix of the same numbering. At most [`MAX_LIGHTS`].
+/// A light counts if its lane is in the map and the lane starts within `radius` of `centre`. Lights
+/// are ordered by the distance of that start, then by lane id. A larger radius only appends lights,
+/// so a smaller one uses a prefix of the same numbering. At most [`MAX_LIGHTS`].
 ///
-/// Units: world frame, metres.
-/// Source: one numbering for the token list and the painted map, which the paper's code enumerated
-/// twice, over different radii and by state.
+/// Units: world frame, metres. Source: ours; tokens and raster share one numbering, where the
+/// paper's code enumerates lights separately for each, over different radii and by state.
 pub fn light_indices<'a>(
     scene: &SceneState<'a>,
     centre: DVec2,

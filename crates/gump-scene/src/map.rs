@@ -1,4 +1,4 @@
-//! What a road is made of: lanes, roadblocks, lines, edges, areas.
+//! Map features: lanes, roadblocks, lines, edges, areas.
 //!
 //! The queries are in `map_graph`; start with [`Lane`] and [`MapParts`].
 
@@ -27,12 +27,12 @@ impl fmt::Display for RoadblockId {
     }
 }
 
-/// What a lane is for.
+/// The type of a lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LaneKind {
     /// Grade-separated road.
     Freeway,
-    /// Ordinary street, turning paths through intersections included.
+    /// Ordinary street, including turning paths through intersections.
     SurfaceStreet,
     /// Bicycle lane.
     BikeLane,
@@ -41,8 +41,8 @@ pub enum LaneKind {
 }
 
 impl LaneKind {
-    /// What rule-driven vehicles take for the limit of a lane that states none, metres per second;
-    /// `None` for a kind that is not stated either. Never what a network is told.
+    /// The speed limit that rule-driven vehicles assume on a lane without a stated limit, metres
+    /// per second; `None` if the type is not stated either. Networks are never given this value.
     ///
     /// Source: 65 mph on American freeways and 30 mph in their cities; 20 km/h is the pace of an
     /// unhurried cyclist.
@@ -56,13 +56,14 @@ impl LaneKind {
     }
 }
 
-/// A speed limit that says nothing in particular, metres per second: 30 mph. It stands where a
-/// number has to stand for a limit that is not known.
+/// The default that is used where a number is needed for an unknown speed limit, metres per second:
+/// 30 mph.
 pub const TYPICAL_SPEED_LIMIT: f64 = 13.4;
 
-/// What the source of a scene has no word for, so that its absence from the scene says nothing.
+/// Information that the source of a scene cannot express, so that its absence from the scene
+/// carries no meaning.
 ///
-/// The limit of a lane is its own `Option`.
+/// Speed limits are not listed here: each lane has its own `Option`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Unstated {
     /// There may be stop signs on this map.
@@ -76,14 +77,14 @@ pub struct Unstated {
 pub struct Lane {
     /// Identity.
     pub id: LaneId,
-    /// What it is for.
+    /// Its type.
     pub kind: LaneKind,
     /// Centre line in the direction of travel, world frame, metres; exactly the points the format
     /// states, repeated ones included.
     pub centerline: Polyline,
     /// z of each centre-line point, metres.
     pub elevation: Vec<f64>,
-    /// Full width, metres; where the format has none, the reader's estimate.
+    /// Full width, metres; estimated by the reader where the format states none.
     pub width: f64,
     /// Speed limit, metres per second, if stated.
     pub speed_limit: Option<f64>,
@@ -94,7 +95,7 @@ pub struct Lane {
     pub outline: Option<Polygon>,
     /// The roadblock it belongs to, in formats that have them.
     pub roadblock: Option<RoadblockId>,
-    /// Whether traffic lights rule the lane; `None` where the format does not say.
+    /// Whether traffic lights control the lane; `None` where the format does not state it.
     pub has_lights: Option<bool>,
     /// Lanes that lead into this one.
     pub predecessors: Vec<LaneId>,
@@ -107,8 +108,8 @@ pub struct Lane {
 }
 
 impl Lane {
-    /// A lane of these points without neighbours: 3.5 m wide, of no stated kind. For readers,
-    /// which then set the fields that their format states.
+    /// A lane with these points and no neighbours: 3.5 m wide, of no stated type. Readers then set
+    /// the fields that their format states.
     pub fn new(id: LaneId, centerline: Polyline, elevation: Vec<f64>) -> Self {
         Self {
             id,
@@ -182,7 +183,7 @@ pub struct RoadLine {
     pub elevation: Vec<f64>,
 }
 
-/// What kind of border a road edge is.
+/// The type of a road edge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the names are the borders themselves")]
 pub enum RoadEdgeKind {
@@ -204,7 +205,7 @@ pub struct RoadEdge {
     pub elevation: Vec<f64>,
 }
 
-/// What an area is.
+/// The type of an area.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AreaKind {
     /// Pedestrians cross here.
@@ -230,18 +231,18 @@ pub enum AreaKind {
 pub struct Area {
     /// Identity among all map features of its source.
     pub id: i64,
-    /// What it is.
+    /// Its type.
     pub kind: AreaKind,
     /// World frame, metres.
     pub polygon: Polygon,
     /// z of each corner, metres.
     pub elevation: Vec<f64>,
-    /// The lanes it rules (a stop line: those that wait at it); empty if not stated.
+    /// The lanes it applies to (of a stop line: those that wait at it); empty if not stated.
     pub lanes: Vec<LaneId>,
 }
 
 impl Area {
-    /// An area at height 0 that rules no lane.
+    /// An area at height 0 that applies to no lane.
     pub fn new(id: i64, kind: AreaKind, polygon: Polygon) -> Self {
         Self {
             id,
@@ -253,7 +254,7 @@ impl Area {
     }
 }
 
-/// A stop sign and the lanes it rules.
+/// A stop sign and the lanes it applies to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StopSign {
     /// Identity among all map features of its source.
@@ -264,7 +265,7 @@ pub struct StopSign {
     pub lanes: Vec<LaneId>,
 }
 
-/// What a map is built from; see [`MapGraph::new`](crate::MapGraph::new).
+/// The parts that a map is built from; see [`MapGraph::new`](crate::MapGraph::new).
 #[derive(Clone, Debug, Default)]
 #[allow(missing_docs, reason = "each list is one of the type it names")]
 pub struct MapParts {
@@ -276,17 +277,17 @@ pub struct MapParts {
     pub stop_signs: Vec<StopSign>,
     /// Surfaces a vehicle may be on; derived by the reader where the format has none.
     pub drivable: Vec<Polygon>,
-    /// What the source has no word for.
+    /// Information that the source cannot express.
     pub unstated: Unstated,
 }
 
-/// Why parts do not make a map.
+/// Why parts do not form a valid map.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MapError {
-    /// Two lanes claim one id.
+    /// Two lanes have the same id.
     #[error("lane id {0} occurs twice")]
     DuplicateLane(LaneId),
-    /// Two roadblocks claim one id.
+    /// Two roadblocks have the same id.
     #[error("roadblock id {0} occurs twice")]
     DuplicateRoadblock(RoadblockId),
     /// A list of elevations does not match its line.

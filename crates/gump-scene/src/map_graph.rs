@@ -1,7 +1,7 @@
 //! The road as an indexed graph; valid once built.
 //!
-//! The parts themselves are in `map`. Queries are total: an unknown id or a place off the map has
-//! no lanes, it is no error.
+//! The features themselves are in `map`. Queries never fail: an unknown id or a point off the map
+//! yields no lanes.
 
 use std::collections::BTreeMap;
 use std::sync::OnceLock;
@@ -13,7 +13,7 @@ use crate::{
     StopSign, Unstated,
 };
 
-/// An immutable, indexed map; share it by `Arc`, and its indices are built once for all.
+/// An immutable, indexed map. Share it in an `Arc`, so that its indices are built only once.
 #[derive(Clone, Debug, Default)]
 pub struct MapGraph {
     parts: MapParts,
@@ -24,8 +24,8 @@ pub struct MapGraph {
     places: Places,
 }
 
-/// Indices by place, each built when it is first asked for: to build all takes longer than to read
-/// a map, and few uses ask for all.
+/// Spatial indices, each built on first use: building all of them takes longer than reading a map,
+/// and few callers need all.
 #[derive(Clone, Debug, Default)]
 struct Places {
     lane_segments: OnceLock<SegmentIndex<(usize, usize)>>,
@@ -75,13 +75,13 @@ impl MapGraph {
         })
     }
 
-    /// What the map was built from, dead links removed: to change a map, change a clone and build
-    /// anew.
+    /// The parts that the map was built from, without dead links. To change a map, change a clone
+    /// and build a new one.
     pub fn parts(&self) -> &MapParts {
         &self.parts
     }
 
-    /// What the source of the map has no word for.
+    /// Information that the source of the map cannot express.
     pub fn unstated(&self) -> Unstated {
         self.parts.unstated
     }

@@ -1,11 +1,11 @@
-//! Who comes and who leaves: agents enter where lanes come into a window, in platoons as signals
-//! upstream make them, and leave where they drive out of it or the map ends.
+//! Arrivals and departures: agents enter where lanes enter a window, in platoons as upstream
+//! signals produce them, and leave where they drive out of it or where the map ends.
 //!
-//! There is a window around the place where the scene was seen, and another around the ego once it
-//! has gone on from there.
+//! There is one window around the start of the scene, and another around the ego once it has moved
+//! away from there.
 //!
-//! As many are there, on average, as at the start. Nobody appears or vanishes in sight of the ego,
-//! but for those whose lane ends there.
+//! On average the number of agents stays as at the start. Agents do not appear or vanish in sight
+//! of the ego, except where their lane ends.
 
 use std::collections::BTreeMap;
 
@@ -16,12 +16,12 @@ use gump_scene::{
 };
 use rand::Rng as _;
 
-/// Where agents come and leave.
+/// Where agents enter and leave.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Arrivals {
     /// Radius of the windows around the start and around the ego, metres.
     pub window_m: f64,
-    /// Nobody comes or leaves nearer to the ego than this, metres.
+    /// No agent enters or leaves nearer to the ego than this, metres.
     pub sight_m: f64,
 }
 
@@ -35,25 +35,26 @@ impl Default for Arrivals {
     }
 }
 
-/// The kinds that come, and what is usual of each.
+/// The kinds of agents that enter, with their usual values.
 const KINDS: [AgentKind; 3] = AgentKind::MOVING;
-/// Usual speeds of those who move, metres per second, where nobody shows any.
+/// Usual speeds of moving agents, metres per second, where the scene shows none.
 const USUAL_SPEED: [f64; 3] = [7.0, 1.3, 4.5];
-/// Share of the window's width that somebody crosses who comes in.
+/// Share of the window's width that an entering agent crosses.
 const CROSSED: f64 = 0.6;
-/// How far the ego may go before it has a window of its own, or its gates are looked for anew, metres.
+/// How far the ego may move before it gets its own window, or its gates are determined again,
+/// metres.
 const MOVED_M: f64 = 20.0;
-/// Who is that much farther than the window and goes away leaves, metres.
+/// An agent that is this far outside the window and moves away leaves, metres.
 const BEYOND_M: f64 = 12.0;
-/// Steps in which lanes are looked at, metres.
+/// Sampling distance along lanes, metres.
 const STEP_M: f64 = 5.0;
-/// Agents so many windows away leave, even if they stand.
+/// Agents this many windows away leave, even if they stand.
 const FAR: f64 = 1.8;
-/// Who comes nearer to the end of the map leaves there, metres.
+/// An agent nearer than this to the end of the map leaves there, metres.
 const END_M: f64 = 5.0;
-/// The way in front of a gate that is looked at, metres.
+/// Length of the path examined beyond a gate, metres.
 const PATH_M: f64 = 70.0;
-/// Gaps before and behind that somebody needs to come in, metres.
+/// Gaps ahead and behind that an entering agent needs, metres.
 const LEAST_GAP_M: f64 = 7.0;
 const LEAST_REAR_M: f64 = 10.0;
 /// The longest queue before a gate.
@@ -64,7 +65,7 @@ const PLATOON_LIMIT: f64 = 8.0;
 const PERIOD_S: (f64, f64) = (40.0, 80.0);
 const OPEN: f64 = 0.5;
 
-/// A place where somebody comes in.
+/// A place where agents enter.
 #[derive(Clone, Debug)]
 struct Gate {
     kind: usize,
@@ -72,12 +73,12 @@ struct Gate {
     window: usize,
     lane: LaneId,
     pose: Pose,
-    /// The way ahead of it.
+    /// The path beyond it.
     path: Polyline,
     limit: f64,
 }
 
-/// Comings and goings of one future.
+/// Arrivals and departures of one future.
 #[derive(Clone, Debug)]
 pub(crate) struct Flow {
     config: Arrivals,
@@ -85,16 +86,16 @@ pub(crate) struct Flow {
     step: u64,
     time: f64,
     gates: Vec<Gate>,
-    /// Where the ego was when they were looked for.
+    /// Position of the ego when the gates were determined.
     looked_at: DVec2,
-    /// The middles of the windows: the start, and the ego if it has gone on.
+    /// The centres of the windows: the start, and the ego if it has moved on.
     centres: Vec<DVec2>,
-    /// How many of each kind were in the window at the start, and how fast those were that moved.
+    /// Number of agents of each kind in the window at the start, and the speeds of the moving ones.
     usual: [f64; 3],
     speed: [f64; 3],
-    /// Extents of those who were there at the start.
+    /// Extents of the agents at the start.
     sizes: [Vec<[f64; 3]>; 3],
-    /// Who waits to come in, by lane and kind.
+    /// Agents waiting to enter, by lane and kind.
     waiting: BTreeMap<(LaneId, usize), u32>,
     next_id: i64,
 }
@@ -104,7 +105,7 @@ fn index_of(kind: AgentKind) -> Option<usize> {
 }
 
 impl Flow {
-    /// From what is seen of a scene; `None` if nothing leads into it.
+    /// From the visible part of a scene; `None` if no lane leads into it.
     pub(crate) fn begin(config: &Arrivals, scene: SceneState<'_>, seed: Seed) -> Option<Self> {
         let ego = scene.ego_now().state.pose.position;
         let now = scene.now();
@@ -145,8 +146,7 @@ impl Flow {
         (!this.gates.is_empty()).then_some(this)
     }
 
-    /// Who takes part in traffic, by the window he is nearest to the middle of, and by kind: parked
-    /// vehicles do not.
+    /// Agents that take part in traffic, by nearest window and kind; parked vehicles do not.
     fn count(&self, map: &MapGraph, frame: &Frame, ego: AgentId) -> Vec<[f64; 3]> {
         let mut counts = vec![[0.0; 3]; self.centres.len()];
         for agent in frame.agents().iter().filter(|agent| agent.id != ego) {
@@ -167,7 +167,7 @@ impl Flow {
         counts
     }
 
-    /// Who leaves and who comes before the next frame, `dt` seconds on.
+    /// The agents that leave and enter before the next frame, `dt` seconds later.
     pub(crate) fn step(
         &mut self,
         map: &MapGraph,
@@ -227,7 +227,7 @@ impl Flow {
         agent.kind != AgentKind::Pedestrian && moves && ends_at(map, agent)
     }
 
-    /// Who comes in at a gate in this step, if somebody does and finds room.
+    /// The agent that enters at a gate in this step, if one does and there is room.
     fn at_gate(
         &mut self,
         g: usize,
@@ -286,7 +286,7 @@ impl Flow {
         })
     }
 
-    /// The share of a window that is nearer to its own middle than to the other's.
+    /// The share of a window that is nearer to its own centre than to the other's.
     fn own_share(&self) -> f64 {
         let [start, ego] = self.centres[..] else {
             return 1.0;
@@ -295,7 +295,7 @@ impl Flow {
         1.0 - (x.acos() - x * (1.0 - x * x).sqrt()) / std::f64::consts::PI
     }
 
-    /// How much denser than usual traffic is at a gate now: platoons and what is between them.
+    /// Traffic density at a gate relative to its mean: high in a platoon, low between platoons.
     fn platoon(&self, gate: &Gate) -> f64 {
         if KINDS[gate.kind] != AgentKind::Vehicle || gate.limit < PLATOON_LIMIT {
             return 1.0;
@@ -308,7 +308,7 @@ impl Flow {
     }
 }
 
-/// Whether a vehicle or bicycle has come to where its lane ends and none follows.
+/// Whether a vehicle or bicycle has reached the end of a lane without successors.
 fn ends_at(map: &MapGraph, agent: &Agent) -> bool {
     let pose = agent.state.pose;
     let lanes = map.lanes_near(pose.position, 3.0);
@@ -325,7 +325,7 @@ fn ends_at(map: &MapGraph, agent: &Agent) -> bool {
     })
 }
 
-/// The speed at which somebody may come in who wants to go so fast; `None` if there is no room.
+/// The speed at which an agent with this desired speed may enter; `None` if there is no room.
 fn entering_speed(gate: &Gate, there: &[Agent], length: f64, wanted: f64) -> Option<f64> {
     let mut speed = wanted;
     for agent in there {
@@ -358,15 +358,15 @@ fn entering_speed(gate: &Gate, there: &[Agent], length: f64, wanted: f64) -> Opt
     Some(speed)
 }
 
-/// Which of these places is nearest, and how far it is.
+/// Index and distance of the nearest of these points.
 fn nearest(centres: &[DVec2], at: DVec2) -> (usize, f64) {
     let each = centres.iter().map(|centre| centre.distance(at)).enumerate();
     each.min_by(|a, b| a.1.total_cmp(&b.1))
         .unwrap_or((0, f64::INFINITY))
 }
 
-/// Where lanes come into the windows around these middles, and where people walk beside them; out of
-/// sight of the ego.
+/// The places where lanes enter the windows around these centres, and where pedestrians walk beside
+/// the lanes; out of sight of the ego.
 fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Vec<Gate> {
     let mut gates = Vec::new();
     let reach = config.window_m + 5.0;
@@ -452,7 +452,7 @@ fn aside(pose: Pose, left: f64) -> Pose {
     }
 }
 
-/// Where a lane comes into circles around these middles, or leaves them where `inward` is -1.
+/// Where a lane enters circles around these centres, or leaves them if `inward` is -1.
 fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f64> {
     let line = lane.centerline.resample(STEP_M);
     let beyond = |p: DVec2| inward * (nearest(centres, p).1 - radius);
@@ -466,7 +466,7 @@ fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f6
         .collect()
 }
 
-/// The way ahead from a place on a lane, straight on where it forks; `None` if it is short.
+/// The path ahead from a position on a lane, straight on where it forks; `None` if it is short.
 fn path_from(map: &MapGraph, lane: &Lane, s: f64) -> Option<Polyline> {
     let mut path = lane.centerline.slice(s, lane.centerline.length());
     let mut last = lane;

@@ -1,4 +1,4 @@
-//! A world around a world: lights that change and agents that come and leave.
+//! A wrapper around a world that changes lights and adds and removes agents.
 
 use std::sync::Arc;
 
@@ -12,23 +12,23 @@ use rayon::prelude::*;
 use crate::gates::{Arrivals, Flow};
 use crate::signals::{SignalPlan, Signals};
 
-/// Separates what the surroundings draw from what the world does.
+/// Separates the random numbers of the surroundings from those of the world.
 const SIGNALS: u64 = 1 << 56;
 const ARRIVALS: u64 = 1 << 57;
 
 /// What lights show after the present.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum LightControl {
-    /// What they show at the present.
+    /// The same as at the present.
     Hold,
-    /// What signals of such junctions do: [`SignalPlan`].
+    /// Phases of signals at such junctions: [`SignalPlan`].
     #[default]
     Signals,
-    /// What was recorded.
+    /// The recorded lights.
     Recorded(Arc<RecordedLights>),
 }
 
-/// The lights of a recording from its present on; the last ones hold.
+/// The lights of a recording from its present on; the last state is held.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RecordedLights {
     frames: Vec<Vec<Light>>,
@@ -45,7 +45,7 @@ impl RecordedLights {
         }
     }
 
-    /// So many seconds after the present.
+    /// The lights this many seconds after the present.
     fn at(&self, seconds: f64) -> &[Light] {
         let i = (seconds / self.dt).round() as usize;
         let last = self.frames.len().saturating_sub(1);
@@ -53,19 +53,19 @@ impl RecordedLights {
     }
 }
 
-/// What goes on beside how agents move.
+/// Settings of lights and of arrivals and departures.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LivingConfig {
     /// What lights show.
     pub lights: LightControl,
-    /// Whether agents come and leave, and where.
+    /// Whether and where agents enter and leave.
     pub arrivals: Option<Arrivals>,
 }
 
-/// A world whose lights change and whose agents come and leave; how they move is that of `W`.
+/// A world with changing lights and with agents that enter and leave; their motion is that of `W`.
 ///
-/// Future `k` of a start draws what its surroundings do from `seed.fork(k)`, too. A world that shows
-/// lights of its own, as the log does, goes on showing them.
+/// Future `k` of a start draws its lights and arrivals from `seed.fork(k)` as well. A world that
+/// controls its own lights, as the log does, keeps them.
 #[derive(Clone, Debug)]
 pub struct Living<W> {
     world: W,
@@ -73,22 +73,22 @@ pub struct Living<W> {
 }
 
 impl<W> Living<W> {
-    /// Around `world`.
+    /// Wraps `world`.
     pub fn new(world: W, config: LivingConfig) -> Self {
         Self { world, config }
     }
 
-    /// The world that says how agents move.
+    /// The wrapped world, which moves the agents.
     pub fn world(&self) -> &W {
         &self.world
     }
 
-    /// The same, to change.
+    /// The wrapped world, mutably.
     pub fn world_mut(&mut self) -> &mut W {
         &mut self.world
     }
 
-    /// The same surroundings around what `change` makes of the world.
+    /// The same surroundings around the world that `change` returns.
     pub fn map<V>(self, change: impl FnOnce(W) -> V) -> Living<V> {
         Living {
             world: change(self.world),
@@ -116,7 +116,7 @@ impl<W: WorldModel> WorldModel for Living<W> {
     }
 }
 
-/// The surroundings of one future.
+/// Lights and arrivals of one future.
 #[derive(Clone, Debug)]
 struct Life {
     lights: Leads,
@@ -128,7 +128,7 @@ struct Life {
     now: Frame,
 }
 
-/// Who leads the lights on.
+/// The source of the lights.
 #[derive(Clone, Debug)]
 enum Leads {
     Nobody,
@@ -163,7 +163,7 @@ fn plan_of(scene: SceneState<'_>) -> SignalPlan {
     SignalPlan::of(scene.map, scene.history, scene.dt)
 }
 
-/// What is asked of the session before a frame.
+/// The changes requested from the session before a frame.
 struct Orders {
     lights: Option<Vec<Light>>,
     leave: Vec<AgentId>,
@@ -197,7 +197,7 @@ impl Life {
     }
 }
 
-/// Futures in progress, and their surroundings.
+/// Futures in progress, with their lights and arrivals.
 struct LivingSession<'a> {
     session: Box<dyn Session + 'a>,
     config: &'a LivingConfig,

@@ -45,12 +45,12 @@ pub(crate) struct LaneSurfaces {
     segments: Vec<SurfaceSegment>,
 }
 
-/// What layers say about one piece of a lane.
+/// Values of one piece of a lane.
 pub(crate) struct SurfaceSegment {
     /// Cosine and sine of its direction in the raster frame.
     pub(crate) direction: [f32; 2],
     /// Speed limit over [`SPEED_SCALE`], in [0, 1]; [`TYPICAL_SPEED_LIMIT`] where none is stated,
-    /// since 0 would say that nobody may move.
+    /// since 0 would mean that traffic must not move.
     pub(crate) speed_limit: f32,
 }
 
@@ -83,7 +83,7 @@ impl LaneSurfaces {
         Self { owner, segments }
     }
 
-    /// Sets every covered pixel to what `value` says about the piece that covers it.
+    /// Sets every covered pixel to `value` of the piece that covers it.
     pub(crate) fn draw(&self, plane: &mut Plane<'_>, value: impl Fn(&SurfaceSegment) -> f32) {
         for (pixel, &owner) in plane.pixels.iter_mut().zip(&self.owner) {
             if owner > 0.0 {

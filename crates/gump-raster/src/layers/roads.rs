@@ -1,4 +1,4 @@
-//! Paint, borders and areas.
+//! Painted lines, road edges and areas.
 
 use gump_scene::{AreaKind, MapGraph};
 
@@ -32,8 +32,8 @@ pub(crate) fn draw_drivable(plane: &mut Plane<'_>, map: &MapGraph) {
     }
 }
 
-/// Stop lines as areas, where a format has them, and else as lines across the lanes that stop
-/// signs rule: the sign itself stands beside the road, where nobody stops.
+/// Stop lines as areas, where a format has them, otherwise as lines across the lanes that stop
+/// signs apply to: the sign itself stands beside the road.
 pub(crate) fn draw_stop_lines(plane: &mut Plane<'_>, map: &MapGraph) {
     draw_areas(plane, map, AreaKind::StopLine, 1.0);
     for sign in map.stop_signs() {

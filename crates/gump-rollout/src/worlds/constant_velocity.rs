@@ -1,12 +1,12 @@
-//! The simplest world: everyone keeps its velocity.
+//! The simplest world: every agent keeps its velocity.
 
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light};
 
 use super::independent::{Future, Independent};
 use crate::{BoxError, Session, Start, WorldModel};
 
-/// Every agent keeps its velocity and its heading; lights stay as they are unless they are shown. All futures of a scene
-/// are equal.
+/// Every agent keeps its velocity and heading; lights stay unchanged unless they are set. All
+/// futures of a scene are equal.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ConstantVelocity;
 

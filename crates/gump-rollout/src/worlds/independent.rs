@@ -1,4 +1,4 @@
-//! A session of futures that do not know of each other, stepped in parallel.
+//! A session of independent futures, stepped in parallel.
 
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light};
 use rayon::prelude::*;
@@ -7,27 +7,27 @@ use crate::{BoxError, RolloutError, Session, Start};
 
 /// One future of a rule-based world.
 pub(crate) trait Future: Send {
-    /// The next frame; `ego` is the ego's state in it, if someone else drives.
+    /// The next frame; `ego` is the ego's state in it, if it is driven externally.
     fn step(&mut self, ego: Option<AgentState>) -> Frame;
 
-    /// Shows these lights from now on, if they are not its own affair.
+    /// Sets the lights from now on, unless the world controls them itself.
     fn show(&mut self, lights: &[Light]) -> bool {
         let _ = lights;
         false
     }
 
-    /// Takes agents out, but for the ego, and puts others in, if it can.
+    /// Removes agents except the ego and adds others, if supported.
     fn exchange(&mut self, leave: &[AgentId], come: &[Agent]) -> bool {
         let (_, _) = (leave, come);
         false
     }
 }
 
-/// What opens all futures of a start, in order.
+/// A function that opens all futures of a start, in order.
 pub(crate) type Opener<'a, F> = Box<dyn Fn(&Start<'_>) -> Result<Vec<F>, RolloutError> + Send + 'a>;
 
-/// Futures side by side. What one does depends on its own state alone, so the number of threads
-/// changes nothing.
+/// Futures that run in parallel. Each depends only on its own state, so results do not depend on
+/// the number of threads.
 pub(crate) struct Independent<'a, F> {
     dt: f64,
     futures: Vec<F>,
@@ -38,7 +38,7 @@ impl<'a, F: Future> Independent<'a, F> {
     /// Opens all futures of `starts`, start-major.
     ///
     /// # Errors
-    /// [`RolloutError::MixedTimeSteps`], and what `open` reports.
+    /// [`RolloutError::MixedTimeSteps`], and the errors of `open`.
     pub(crate) fn new(starts: &[Start<'_>], open: Opener<'a, F>) -> Result<Self, RolloutError> {
         let dt = starts.first().map_or(0.1, |start| start.scene.dt);
         let mut futures = Vec::new();

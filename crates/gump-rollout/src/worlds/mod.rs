@@ -1,6 +1,6 @@
-//! Worlds that follow rules: the log itself, constant velocity, and reactive traffic.
+//! Rule-based worlds: log replay, constant velocity, and reactive traffic.
 //!
-//! They step at the time step of the scene they start from.
+//! Their time step is that of the scene they start from.
 
 mod constant_velocity;
 mod idm;

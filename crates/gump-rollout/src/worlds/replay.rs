@@ -8,17 +8,18 @@ use crate::{BoxError, RolloutError, Session, Start, WorldModel};
 
 /// Replays a recorded scenario.
 ///
-/// This world has seen the future: use it as an upper bound or as a non-reactive background, never
-/// as a model. The ego can be driven; nobody reacts to it. **Past the end of the log agents keep
-/// their last velocity** and lights their last colour; [`LogReplay::seconds_left`] tells when that
-/// starts. The ego is always present: where its track ends before the log it keeps its velocity.
+/// This world knows the future: use it as an upper bound or as a non-reactive background, not as a
+/// model. The ego can be driven, but other agents do not react to it. **Past the end of the log
+/// agents keep their last velocity** and lights their last colour; [`LogReplay::seconds_left`]
+/// returns when that starts. The ego is always present: where its track ends before the log it
+/// keeps its velocity.
 #[derive(Clone, Debug)]
 pub struct LogReplay {
     scenario: Scenario,
 }
 
 impl LogReplay {
-    /// Keeps a copy of the scenario, future included.
+    /// Keeps a copy of the scenario, including its future.
     pub fn new(scenario: &Scenario) -> Self {
         Self {
             scenario: scenario.clone(),
@@ -58,7 +59,7 @@ impl WorldModel for LogReplay {
     }
 
     /// # Errors
-    /// [`RolloutError::ForeignScene`] if a scene shows no moment of this log,
+    /// [`RolloutError::ForeignScene`] if a scene is not an instant of this log,
     /// [`RolloutError::MixedTimeSteps`] if it has another time step.
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
         let open = |start: &Start<'_>| {

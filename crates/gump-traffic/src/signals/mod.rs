@@ -1,4 +1,4 @@
-//! Traffic lights that work as those of a junction do: groups, phases, yellow and clearance.
+//! Traffic signals with groups, phases, yellow and clearance.
 
 mod movement;
 mod plan;
@@ -13,13 +13,13 @@ pub use plan::SignalPlan;
 use plan::{Begun, Junction, Phase};
 use timing::{CLEARANCE_S, green_s, rest_s};
 
-/// Seconds for which a phase goes on if nobody waits for another.
+/// Seconds for which a phase continues if nobody waits for another.
 const EXTENSION_S: f64 = 4.0;
 
-/// The lights of one future as they go on from the present.
+/// The lights of one future after the present.
 ///
-/// Phases last as long as is usual, drawn from the future's seed; one that nobody waits for is left
-/// out, as detectors in the road do, and green rests where nobody waits anywhere.
+/// Phases have usual durations, drawn from the future's seed. A phase for which no vehicle waits is
+/// skipped, as with detectors in the road, and green continues while no vehicle waits anywhere.
 #[derive(Clone, Debug)]
 pub struct Signals {
     plan: Arc<SignalPlan>,
@@ -34,7 +34,7 @@ pub struct Signals {
 #[derive(Clone, Debug)]
 struct Turn {
     phase: usize,
-    /// Which comes next, once that is decided.
+    /// The next phase, once it is decided.
     next: usize,
     stage: Stage,
     /// Seconds left of it.
@@ -92,13 +92,13 @@ impl Signals {
         this
     }
 
-    /// What all lights show now, by lane: as logged at the present, as planned after it.
+    /// The state of all lights by lane: as logged at the present, as planned after it.
     pub fn lights(&self) -> &[Light] {
         &self.shown
     }
 
-    /// Goes on by `dt` seconds; `vehicles` are where those are who may wait at a light. Without them
-    /// it is as if somebody waited everywhere.
+    /// Advances by `dt` seconds; `vehicles` are the positions of vehicles that may wait at a light.
+    /// Without them every light counts as having a waiting vehicle.
     pub fn advance(&mut self, dt: f64, vehicles: Option<&[Pose]>) {
         let plan = Arc::clone(&self.plan);
         for (j, junction) in plan.junctions.iter().enumerate() {
@@ -145,8 +145,8 @@ impl Signals {
         }
     }
 
-    /// The next phase in turn that somebody waits for; `None` to stay. Whether anybody waits who has
-    /// no light that is known is not known, so such a phase has its turn.
+    /// The next phase in turn for which a vehicle waits; `None` to stay in this one. A phase
+    /// without known lights always gets its turn, because its waiting vehicles are not known.
     fn next_phase(
         &self,
         j: usize,
@@ -175,7 +175,7 @@ impl Signals {
         })
     }
 
-    /// What every light of a junction shows by its phase.
+    /// The state of every light of a junction in its phase.
     fn colours(&self) -> Vec<(usize, LightState)> {
         let junctions = self.plan.junctions.iter().zip(&self.turns);
         let of = |(junction, turn): (&Junction, &Turn)| {

@@ -1,4 +1,5 @@
-//! What a light rules: where traffic stops, which way it goes, and which other ways that crosses.
+//! Movements: where a light stops traffic, which path the traffic takes, and which other paths that
+//! crosses.
 
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
 use gump_scene::{
@@ -8,40 +9,40 @@ use gump_scene::{
 
 /// Lights whose traffic comes from the same direction differ by less than this, radians.
 const SAME_APPROACH: f64 = 0.52;
-/// Roads that lie opposite differ by more than this, radians.
+/// Roads count as opposite if their directions differ by more than this, radians.
 const OPPOSITE: f64 = 2.36;
-/// A way that turns by more is a turn, radians.
+/// A path that turns by more than this is a turn, radians.
 const TURN: f64 = 0.52;
 /// Stop lines of one approach lie within this, metres.
 const APPROACH_M: f64 = 25.0;
 /// Stop lines of one junction lie within this, metres, ...
 const JUNCTION_M: f64 = 70.0;
-/// ... and its ways come as near to one another as this, metres.
+/// ... and its paths come as near to one another as this, metres.
 const NEAR_M: f64 = 8.0;
-/// Steps in which ways are compared, metres.
+/// Sampling distance when paths are compared, metres.
 const STEP_M: f64 = 4.0;
-/// How far before its line somebody waits for a light or comes up to it, metres.
+/// How far before the line a vehicle counts as waiting or approaching, metres.
 const WAITING_M: f64 = 45.0;
-/// Most lanes that are looked at for those who come.
+/// The maximum number of lanes searched for approaching vehicles.
 const MOST_LANES: usize = 32;
-/// What is shorter behind a line on a lane that leads up to a junction is not the way through it,
-/// metres.
+/// A piece behind a line that is shorter than this, on a lane that leads up to a junction, is not
+/// the path through it, metres.
 const STUB_M: f64 = 15.0;
-/// How far beside the middle of a lane he may be, metres.
+/// How far beside the centre of a lane such a vehicle may be, metres.
 const BESIDE_M: f64 = 2.5;
 
-/// How two movements stand to each other.
+/// The relation of two movements.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Relation {
     /// They never meet.
     Free,
     /// They come from opposite roads and cross: a turn that gives way to oncoming traffic.
     Opposing,
-    /// They come from roads that lie across one another, and cross or join.
+    /// They come from roads that cross, and their paths cross or join.
     Across,
 }
 
-/// One way, or several from one line, that a light rules.
+/// One path, or several from one line, that a light controls.
 #[derive(Clone, Debug)]
 pub(super) struct Movement {
     /// The middle of the stop line.
@@ -50,7 +51,7 @@ pub(super) struct Movement {
     ways: Vec<Polyline>,
     /// Up to the line.
     approaches: Vec<Polyline>,
-    /// Whether all of its ways turn left, from lanes that lead nowhere else.
+    /// Whether all of its paths turn left, from lanes that lead nowhere else.
     pub(super) is_left_only: bool,
     /// Speed limit, metres per second.
     pub(super) limit: f64,
@@ -59,7 +60,7 @@ pub(super) struct Movement {
 }
 
 impl Movement {
-    /// What a light of this lane rules.
+    /// The movement that the light of this lane controls.
     pub(super) fn of(map: &MapGraph, lane: &Lane, light: &Light) -> Self {
         let line = stop_line(lane, light);
         let ways = ways(map, lane, line);
@@ -82,7 +83,7 @@ impl Movement {
         }
     }
 
-    /// How it stands to another movement.
+    /// Its relation to another movement.
     pub(super) fn relation(&self, other: &Self) -> Relation {
         let between = angle_difference(self.line.heading, other.line.heading).abs();
         let meets = |meet: fn(&Polyline, &Polyline) -> bool| {
@@ -131,7 +132,7 @@ impl Movement {
             || self.ways.iter().any(meets)
     }
 
-    /// Whether somebody at this place waits for the light or comes up to it.
+    /// Whether a vehicle at this position waits for the light or approaches it.
     pub(super) fn is_asked_for_by(&self, at: Pose) -> bool {
         let is_far = at.position.distance(self.line.position) > WAITING_M + BESIDE_M;
         if is_far && !self.approaches.is_empty() {
@@ -147,7 +148,7 @@ impl Movement {
     }
 }
 
-/// By how much a way turns to the left, radians.
+/// By how much a path turns to the left, radians.
 fn turn_of(way: &Polyline) -> f64 {
     let end = way.pose_at(way.length()).heading;
     angle_difference(end, way.pose_at(0.0).heading)
@@ -181,7 +182,7 @@ fn approaches(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
     all
 }
 
-/// Where traffic goes that has passed a line; through the junction, where the line is some metres
+/// The path of traffic that has passed a line; through the junction, where the line is some metres
 /// before the end of a lane that leads up to it.
 fn ways(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
     let ways = ways_beyond(map, lane, line);

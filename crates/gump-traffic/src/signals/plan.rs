@@ -1,5 +1,5 @@
-//! Signal groups, conflicts and phases of every junction of a map, from its lanes and from what its
-//! lights were seen to show.
+//! Signal groups, conflicts and phases of every junction of a map, derived from its lanes and from
+//! the observed states of its lights.
 
 use std::collections::BTreeMap;
 
@@ -9,15 +9,15 @@ use gump_scene::{Frame, LaneId, Light, LightState, MapGraph};
 use super::movement::{Movement, Relation};
 use super::timing::{Age, yellow_s};
 
-/// How lights that belong together change: which junctions there are, which of their lights show
-/// the same, which never show green together, and in which order they take turns.
+/// The coordination of lights: which junctions there are, which of their lights show the same
+/// colour, which are never green together, and the order of phases.
 ///
-/// By construction no two lights of a phase conflict: movements from roads that lie across one
-/// another conflict if they cross or join; a left turn with a lane of its own and the oncoming
-/// traffic it crosses do, unless they were seen green together.
+/// By construction no two lights of a phase conflict. Movements from roads that cross conflict if
+/// their paths cross or join. A left turn from its own lane conflicts with the oncoming traffic
+/// that it crosses, unless both were seen green together.
 #[derive(Clone, Debug)]
 pub struct SignalPlan {
-    /// Every light that is known, by lane, as it shows at the present; unknown if it is not seen.
+    /// Every known light, by lane, in its present state; unknown if it is not observed.
     pub(super) lights: Vec<Light>,
     pub(super) movements: Vec<Option<Movement>>,
     pub(super) junctions: Vec<Junction>,
@@ -27,16 +27,16 @@ pub struct SignalPlan {
 #[derive(Clone, Debug)]
 pub(super) struct Junction {
     pub(super) groups: Vec<Group>,
-    /// At least two, in the order in which they take turns.
+    /// At least two, in the order of their turns.
     pub(super) phases: Vec<Phase>,
-    /// Which of them is at the present, and how far it has come.
+    /// The present phase, and how far it has progressed.
     pub(super) phase: usize,
     pub(super) stage: Begun,
     /// Seconds of yellow.
     pub(super) yellow: f64,
 }
 
-/// Lights that show the same.
+/// Lights that always show the same colour.
 #[derive(Clone, Debug)]
 pub(super) struct Group {
     /// Indices of lights.
@@ -44,14 +44,15 @@ pub(super) struct Group {
     is_left_only: bool,
 }
 
-/// Groups that are green together; one without any serves whoever has no light that is known.
+/// Groups that are green together; a phase without groups serves movements whose light is not
+/// known.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Phase {
     pub(super) green: Vec<bool>,
     pub(super) is_left: bool,
 }
 
-/// How far the phase of the present has come.
+/// Progress of the present phase.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Begun {
     Green(Age),
@@ -60,9 +61,9 @@ pub(super) enum Begun {
 }
 
 impl SignalPlan {
-    /// From frames of a scene, the last of which is the present, `dt` seconds apart.
+    /// From frames of a scene, `dt` seconds apart; the last one is the present.
     ///
-    /// Lights of lanes that are not on the map show what they show for ever.
+    /// Lights of lanes that are not on the map never change.
     pub fn of(map: &MapGraph, frames: &[Frame], dt: f64) -> Self {
         let seen = Seen::new(frames, dt);
         let lights = &seen.lights;
@@ -85,7 +86,7 @@ impl SignalPlan {
         }
     }
 
-    /// Whether there are lights that take turns.
+    /// Whether any lights alternate.
     pub fn is_empty(&self) -> bool {
         self.junctions.is_empty()
     }
@@ -102,14 +103,14 @@ impl SignalPlan {
             .collect()
     }
 
-    /// Pairs of lights that were seen green together although traffic from roads that lie across
-    /// one another meets behind them.
+    /// Pairs of lights that were seen green together although their traffic comes from crossing
+    /// roads and meets behind them.
     pub fn contradictions(&self) -> usize {
         self.contradictions
     }
 }
 
-/// What the lights were seen to show.
+/// Observed states of the lights.
 struct Seen {
     lights: Vec<Light>,
     /// By light, then by frame.
@@ -154,7 +155,7 @@ impl Seen {
         pairs.any(|pair| pair == (&LightState::Green, &LightState::Green))
     }
 
-    /// For how long a light has shown what it shows.
+    /// How long a light has been in its present state.
     fn age(&self, light: usize) -> Age {
         let states = &self.states[light];
         let now = self.now(light);
@@ -197,14 +198,14 @@ fn together(movements: &[Option<Movement>]) -> Vec<Vec<usize>> {
     junctions.into_values().collect()
 }
 
-/// A junction in the making.
+/// A junction under construction.
 struct Draft<'a> {
     movements: Vec<&'a Movement>,
     seen: &'a Seen,
     /// Index of the light of each movement.
     lights: &'a [usize],
     groups: Vec<Group>,
-    /// Which groups must not be green together, row by row.
+    /// Pairs of groups that must not be green together, row by row.
     conflicts: Vec<Vec<bool>>,
     contradictions: usize,
 }
@@ -284,7 +285,7 @@ impl<'a> Draft<'a> {
         self.conflicts = conflicts;
     }
 
-    /// What a group shows now: what most of its lights do that are known.
+    /// The present state of a group: that of most of its known lights.
     fn now(&self, group: usize) -> LightState {
         let members = &self.groups[group].members;
         let count = |state| {
@@ -299,7 +300,7 @@ impl<'a> Draft<'a> {
             .unwrap_or(LightState::Unknown)
     }
 
-    /// Adds to `set` whom nobody in it conflicts with, in this order.
+    /// Adds groups to `set` that conflict with none in it, in this order.
     fn fill(&self, set: &mut Vec<usize>, candidates: impl Iterator<Item = usize>) {
         for group in candidates {
             let is_free = set.iter().all(|&other| !self.conflicts[group][other]);
@@ -323,7 +324,7 @@ impl<'a> Draft<'a> {
             .heading
     }
 
-    /// Whether two groups come along one road, from whichever end.
+    /// Whether two groups use the same road, from either end.
     fn shares_road(&self, a: usize, b: usize) -> bool {
         let between = angle_difference(self.heading(a), self.heading(b)).abs();
         !(std::f64::consts::FRAC_PI_4..=3.0 * std::f64::consts::FRAC_PI_4).contains(&between)

@@ -1,4 +1,4 @@
-//! Signals of made-up junctions.
+//! Signals of synthetic junctions.
 
 use gump_geometry::dvec2;
 use gump_scene::{Frame, LaneId, Scenario, fixture};

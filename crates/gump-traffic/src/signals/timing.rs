@@ -1,4 +1,4 @@
-//! How long signals show what they show.
+//! Durations of signal states.
 //!
 //! Sources: the Institute of Transportation Engineers' formula for yellow (1 s of reaction, then
 //! braking at 3.05 m/s²), between the 3 and 6 s of the US Manual on Uniform Traffic Control Devices
@@ -9,13 +9,13 @@
 use gump_scene::{Rng, Seed};
 use rand::Rng as _;
 
-/// Seconds in which all who lost their green and all who will get it are red.
+/// Seconds of all-red between phases, for the groups that lose green and those that get it.
 pub(super) const CLEARANCE_S: f64 = 1.5;
-/// Seconds of green of a phase, least and most.
+/// Minimum and maximum green of a phase, seconds.
 const GREEN_S: (f64, f64) = (10.0, 40.0);
-/// The same of one in which traffic only turns left.
+/// The same for a phase in which traffic only turns left.
 const LEFT_S: (f64, f64) = (5.0, 14.0);
-/// Draws of a length that fits what has been seen before the longest is taken.
+/// Number of draws of a duration consistent with the observations before the maximum is used.
 const TRIES: usize = 64;
 
 /// How long a phase has been green already, seconds.
@@ -25,7 +25,7 @@ pub(super) enum Age {
     AtLeast(f64),
 }
 
-/// Seconds of yellow where the speed limit is this, metres per second.
+/// Seconds of yellow at this speed limit.
 pub(super) fn yellow_s(limit: f64) -> f64 {
     (1.0 + limit / 6.1).clamp(3.0, 6.0)
 }
@@ -40,10 +40,10 @@ fn draw(is_left: bool, rng: &mut Rng) -> f64 {
     rng.random_range(least..most)
 }
 
-/// Seconds that a phase stays green that is met at some moment of it.
+/// Seconds of green left of a phase that is observed at a random time.
 ///
-/// Long phases are met more often than short ones, at any of their moments alike; those that
-/// contradict what has been seen are left out.
+/// A long phase is more likely to be observed than a short one, at each of its instants equally;
+/// durations that contradict the observations are excluded.
 pub(super) fn rest_s(is_left: bool, age: Age, seed: Seed) -> f64 {
     let mut rng = seed.rng();
     let most = if is_left { LEFT_S.1 } else { GREEN_S.1 };

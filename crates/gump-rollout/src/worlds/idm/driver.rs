@@ -1,4 +1,4 @@
-//! One vehicle: on which lanes it is, and how it moves.
+//! One vehicle: its lanes and its motion.
 
 use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use gump_scene::{Agent, AgentState, LaneId, Light, LightState, SceneState, Seed};
@@ -35,11 +35,11 @@ pub(super) enum Driver {
     Park,
     /// At constant velocity.
     Coast,
-    /// By someone outside.
+    /// By an external driver.
     Driven,
 }
 
-/// What a driver may be at the start, before chance picks a lane.
+/// Possible paths of a driver, before a lane is drawn at random.
 #[derive(Clone, Debug)]
 pub(super) enum Situation {
     /// The scene's route.
@@ -50,7 +50,7 @@ pub(super) enum Situation {
     Fixed(Driver),
 }
 
-/// Where a follower gets its way from.
+/// Where a follower gets its path from.
 #[derive(Clone, Copy)]
 pub(super) struct Ground<'a> {
     pub(super) config: &'a IdmConfig,
@@ -59,7 +59,7 @@ pub(super) struct Ground<'a> {
 }
 
 impl Situation {
-    /// What `agent`, not the ego, is up to.
+    /// The intention of an agent other than the ego.
     pub(super) fn of(agent: &Agent, scene: SceneState<'_>, road: &Road) -> Self {
         let lanes = road.lanes_of(&agent.state);
         let standing = scene
@@ -77,7 +77,7 @@ impl Situation {
         }
     }
 
-    /// What the ego is up to: its route if it is on it.
+    /// The intention of the ego: its route, if it is on it.
     pub(super) fn of_ego(agent: &Agent, scene: SceneState<'_>, ground: Ground<'_>) -> Self {
         let Some(route) = scene.route else {
             return Self::of(agent, scene, ground.road);
@@ -122,26 +122,26 @@ pub(super) struct Follower {
     /// Arc length of the box centre.
     s: f64,
     speed: f64,
-    /// Speed at the start: nobody drives slower than that for a limit that is not stated.
+    /// Speed at the start: a limit that is not stated never makes a vehicle slower than that.
     start_speed: f64,
-    /// Up to here lights of unknown colour are what it waits for.
+    /// Up to this arc length the vehicle waits for lights of unknown colour.
     waits_until: f64,
     place: Placement,
     seed: Seed,
     n_choices: u64,
 }
 
-/// How a vehicle that starts off the centre of its path comes to it.
+/// The approach of a vehicle that starts off the centre of its path to the centre.
 ///
-/// The offset obeys the critically damped oscillator over distance driven, so place and direction
-/// are continuous and a standing vehicle stays put.
+/// The offset follows a critically damped oscillator over distance driven, so position and
+/// direction are continuous and a standing vehicle stays in place.
 #[derive(Clone, Copy, Debug)]
 struct Placement {
     start: Pose,
     start_s: f64,
     offset: f64,
     slope: f64,
-    /// What projection leaves over, metres.
+    /// Residual of the projection, metres.
     residual: DVec2,
     length: f64,
 }
@@ -343,7 +343,7 @@ impl Follower {
 }
 
 impl Driver {
-    /// Lets it see what the lights show now.
+    /// Updates the lights that it sees.
     pub(super) fn show(&mut self, lights: &[Light]) {
         if let Self::Follow(follower) = self {
             follower.path.show(lights);

@@ -4,10 +4,10 @@ use super::IdmConfig;
 
 /// Acceleration of a vehicle behind another, metres per second squared, before any limit.
 ///
-/// `gap` is the clear distance to the vehicle ahead, metres; gaps below the standstill gap count
-/// as that gap, and an infinite gap is a free road. `lead_speed` is the speed of the vehicle ahead
-/// along one's own way. The desired gap is not floored: behind a vehicle that pulls away very fast
-/// it may turn negative, and its square brakes; the world avoids that, nuPlan does not.
+/// `gap` is the clear distance to the vehicle ahead, metres; gaps below the standstill gap count as
+/// that gap, and an infinite gap is a free road. `lead_speed` is the speed of the vehicle ahead
+/// along the follower's path. The desired gap is not floored: behind a vehicle that pulls away very
+/// fast it may turn negative, and its square brakes. The IDM world avoids that; nuPlan does not.
 ///
 /// Units: metres, metres per second.
 /// Source: Treiber, Hennecke and Helbing 2000; agrees with nuPlan's policy to rounding.
@@ -40,7 +40,7 @@ pub fn idm_euler_step(
     (progress + speed * dt, speed + acceleration * dt)
 }
 
-/// The gap the driver would like to keep, metres.
+/// The desired gap, metres.
 pub(super) fn desired_gap(config: &IdmConfig, speed: f64, lead_speed: f64) -> f64 {
     config.min_gap
         + speed * config.headway

@@ -1,10 +1,10 @@
 //! Reactive traffic: vehicles follow the lane graph by the Intelligent Driver Model.
 //!
-//! Here are the world and its parameters. `law` is the car-following law, `road` and `path` the
-//! way ahead, `obstacles` what stands in it, `driver` one vehicle, `traffic` one future.
+//! This module has the world and its parameters. `law` is the car-following law, `road` and `path`
+//! the path ahead, `obstacles` the agents on it, `driver` one vehicle, `traffic` one future.
 //!
-//! What this world does not do: change lanes, give way to crossing traffic that is not yet in the
-//! corridor, switch lights, or let agents appear or vanish.
+//! Vehicles do not change lanes or give way to crossing traffic that is not yet in their corridor,
+//! lights do not change, and agents neither appear nor vanish.
 
 mod driver;
 mod law;
@@ -23,11 +23,11 @@ use super::independent::Independent;
 use crate::{BoxError, RolloutError, Session, Start, WorldModel};
 use road::Road;
 
-/// Parameters of the law and of the driver around it.
+/// Parameters of the law and of the driver model around it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct IdmConfig {
-    /// Desired speed where a lane states neither a limit nor of what kind it is, metres per second;
-    /// lanes of a kind have its usual limit, and a vehicle that is faster at the start keeps its own
+    /// Desired speed where a lane states neither a limit nor its type, metres per second. Lanes of
+    /// a known type have its usual limit, and a vehicle that is faster at the start keeps its own
     /// speed.
     pub target_velocity: f64,
     /// Gap kept at standstill, metres.
@@ -40,9 +40,9 @@ pub struct IdmConfig {
     pub max_deceleration: f64,
     /// How sharply acceleration falls towards the desired speed.
     pub exponent: f64,
-    /// Braking limit, metres per second squared, positive; the law alone knows none.
+    /// Braking limit, metres per second squared, positive; the law itself has none.
     pub emergency_deceleration: f64,
-    /// How far ahead agents and lights matter, metres.
+    /// How far ahead agents and lights are considered, metres.
     pub look_ahead: f64,
     /// Vehicles slow down for curves to stay below this, metres per second squared.
     pub lateral_acceleration: f64,
@@ -68,7 +68,7 @@ impl Default for IdmConfig {
 }
 
 impl IdmConfig {
-    /// Whether every parameter is a positive number.
+    /// Checks that every parameter is a positive number.
     ///
     /// # Errors
     /// [`RolloutError::Parameter`] with the first that is not.
@@ -94,24 +94,25 @@ impl IdmConfig {
     }
 }
 
-/// Reactive traffic by rules.
+/// Reactive rule-based traffic.
 ///
-/// * A vehicle on a lane follows the lane graph, at forks into a lane drawn from the future's
-///   seed; the ego follows the scene's route. It keeps its place in the lane at first and comes to
-///   the centre as it drives, so nothing jumps. Where the map ends it drives straight on.
-/// * It reacts to any agent whose box reaches into the strip it will sweep, to red lights, and to
-///   yellow ones it can stop for. At a light of unknown colour those wait that stand there now.
-///   **Lights keep their present colour** unless they are shown ([`Session::show`](crate::Session::show)). It slows down for curves and speed limits.
+/// * A vehicle on a lane follows the lane graph and takes a random lane at forks, drawn from the
+///   future's seed; the ego follows the scene's route. A vehicle keeps its offset in the lane at
+///   first and moves to the centre as it drives. Where the map ends it continues straight on.
+/// * It reacts to any agent whose box reaches into the strip that it will sweep, to red lights, and
+///   to yellow ones at which it can stop. At a light of unknown colour, vehicles wait that already
+///   stand there. **Lights keep their present colour** unless they are set
+///   ([`Session::show`](crate::Session::show)). Vehicles slow down for curves and speed limits.
 /// * A standing vehicle beside its lane is parked and stays. A moving one off every lane brakes
 ///   comfortably along its heading.
-/// * Pedestrians, bicycles and everything else keep their velocity.
+/// * Pedestrians, bicycles and all other agents keep their velocity.
 ///
 /// Source: Treiber, Hennecke and Helbing 2000 for the law; the rest in the spirit of nuPlan's
 /// reactive agents, but updated synchronously.
 #[derive(Debug, Default)]
 pub struct Idm {
     config: IdmConfig,
-    /// The road prepared last: planners open many sessions on one map.
+    /// The road prepared last, because planners open many sessions on one map.
     prepared: Mutex<Option<(Arc<MapGraph>, Arc<Road>)>>,
 }
 

@@ -1,4 +1,4 @@
-//! What stands in the way of a vehicle.
+//! Agents in the path of a vehicle.
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::Agent;
@@ -46,7 +46,7 @@ impl Lead {
     }
 }
 
-/// Who asks: a vehicle on its path.
+/// The vehicle that looks ahead, on its path.
 #[derive(Clone, Copy)]
 pub(super) struct Asker<'a, Lateral> {
     pub(super) config: &'a IdmConfig,
@@ -60,7 +60,7 @@ pub(super) struct Asker<'a, Lateral> {
 }
 
 impl<Lateral: Fn(f64) -> f64> Asker<'_, Lateral> {
-    /// The agent ahead that restrains the vehicle most; none on a free road.
+    /// The agent ahead that restrains the vehicle most; `None` on a free road.
     ///
     /// An agent is ahead when its centre is, and in the way when its box, turned into the frame of
     /// the path, reaches into the strip that the vehicle will sweep.
@@ -85,7 +85,8 @@ impl<Lateral: Fn(f64) -> f64> Asker<'_, Lateral> {
         worst.map(|(_, lead)| lead)
     }
 
-    /// How far ahead agents matter: what it takes to stop comfortably, and as much again for ease.
+    /// How far ahead agents are considered: the distance of a comfortable stop, plus the same again
+    /// as a margin.
     fn reach(&self) -> f64 {
         let config = self.config;
         let stopping = self.speed * self.speed / (2.0 * config.max_deceleration);

@@ -1,4 +1,4 @@
-//! The way of one vehicle: a line with speeds and stop lines, extended as it is driven.
+//! The path of one vehicle: a line with speeds and stop lines, extended as it is driven.
 
 use gump_geometry::{DVec2, Pose, angle_difference, interpolate_angle, project_on_segment};
 use gump_scene::{Lane, LaneId, Light, LightState};
@@ -24,12 +24,12 @@ pub(super) struct Path {
     stops: Vec<Stop>,
 }
 
-/// How fast a lane lets drive.
+/// The speed that a lane allows.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Limit {
-    /// What the map states, metres per second.
+    /// The limit that the map states, metres per second.
     pub(super) stated: Option<f64>,
-    /// What lanes of its kind usually have, if the kind is stated.
+    /// The usual limit of lanes of its type, if the type is stated.
     pub(super) usual: Option<f64>,
 }
 
@@ -53,7 +53,7 @@ struct Vertex {
     curve_speed: f64,
 }
 
-/// Where a light asks to stop.
+/// A stop required by a light.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Stop {
     pub(super) s: f64,
@@ -61,7 +61,7 @@ pub(super) struct Stop {
     pub(super) state: LightState,
 }
 
-/// Where something is relative to a path.
+/// A position relative to a path.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Foot {
     pub(super) s: f64,
@@ -184,7 +184,7 @@ impl Path {
         self.stops.push(Stop { s, lane, state });
     }
 
-    /// Lets the lights ahead show what they do now.
+    /// Updates the lights ahead to their present state.
     pub(super) fn show(&mut self, lights: &[Light]) {
         for stop in &mut self.stops {
             if let Ok(i) = lights.binary_search_by_key(&stop.lane, |light| light.lane) {
@@ -280,7 +280,7 @@ impl Path {
 
     /// The nearest place between two arc lengths; none if the path has no segment.
     ///
-    /// Beyond the path's end the last segment is taken to go on straight.
+    /// Beyond the path's end the last segment is extended straight on.
     pub(super) fn project(&self, point: DVec2, from: f64, to: f64) -> Option<Foot> {
         if !self.is_drivable() {
             return None;

@@ -1,4 +1,4 @@
-//! A map prepared for driving: lane centres with few points, and how to get on them.
+//! A map prepared for driving: simplified lane centres, and the lanes that a vehicle may be on.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -60,8 +60,8 @@ impl Road {
             .collect()
     }
 
-    /// The lanes a vehicle may be said to be on, with its signed offset from their centre; the
-    /// best fit first, then others nearly as good.
+    /// The lanes that a vehicle may be on, with its signed offset from their centre: the best fit
+    /// first, then others nearly as good.
     pub(super) fn lanes_of(&self, state: &AgentState) -> Vec<(LaneId, f64)> {
         let position = state.pose.position;
         let reach = if state.speed() < STANDING {

@@ -1,4 +1,4 @@
-//! One future of reactive traffic: everyone sees the same moment, then everyone moves.
+//! One future of reactive traffic: all agents see the same instant, then all move.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use super::road::Road;
 use crate::Start;
 use crate::worlds::independent::Future;
 
-/// Opens all futures of a start; what does not depend on chance is worked out once.
+/// Opens all futures of a start; computes once what does not depend on chance.
 pub(super) fn open<'a>(
     config: &'a IdmConfig,
     road: &Arc<Road>,
@@ -67,7 +67,8 @@ pub(super) fn open<'a>(
         .collect()
 }
 
-/// Every agent draws from its own stream, so that it does not matter who else is there.
+/// Every agent draws from its own stream, so its draws do not depend on which other agents are
+/// present.
 fn driver_seed(seed: Seed, id: AgentId, handover: u64) -> Seed {
     seed.fork(id.0 as u64).fork(handover)
 }
@@ -82,14 +83,14 @@ pub(super) struct Traffic<'a> {
     drivers: Vec<Driver>,
     frame: Frame,
     obstacles: Vec<Obstacle>,
-    /// What lights show in the next frame, if that is told.
+    /// The lights of the next frame, if they were set.
     next_lights: Option<Vec<Light>>,
     seed: Seed,
     n_handovers: u64,
 }
 
 impl Traffic<'_> {
-    /// Gives the wheel to whoever is meant to hold it.
+    /// Applies the states of externally driven agents.
     fn hand_over(&mut self, driven: bool) {
         let agents = self.frame.agents();
         let Ok(i) = agents.binary_search_by_key(&self.ego, |agent| agent.id) else {
@@ -121,7 +122,7 @@ impl Traffic<'_> {
 }
 
 impl Traffic<'_> {
-    /// The driver of somebody who has just come.
+    /// The driver of an agent that has just entered.
     fn driver_of(&self, agent: &Agent) -> Driver {
         if agent.kind != AgentKind::Vehicle {
             return Driver::Coast;
