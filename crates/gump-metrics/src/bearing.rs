@@ -1,4 +1,4 @@
-//! Where something lies as seen from the ego.
+//! Directions and gaps as seen from the ego.
 
 use std::f64::consts::PI;
 

@@ -1,10 +1,10 @@
-//! How sure an average over scenarios is: [`interval`] of a mean, [`intervals`] of anything else.
+//! Confidence intervals over scenarios: [`interval`] of a mean, [`intervals`] of other statistics.
 
 use gump_scene::Seed;
 use rand::Rng as _;
 use rayon::prelude::*;
 
-/// Where a mean lies with 95 % confidence.
+/// The 95 % confidence interval of a mean.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Interval {
     /// Lower end.
@@ -13,14 +13,14 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// Resamples; the ends of an interval then stray by about 2 % of its width.
+/// Number of resamples; the ends of an interval then vary by about 2 % of its width.
 const N_RESAMPLES: usize = 2000;
 
 /// The 95 % interval of the mean of `values`, one per scenario, by resampling scenarios; `None`
 /// for fewer than two.
 ///
-/// Equal seeds and numbers of scenarios draw equal scenarios, so intervals of several metrics are
-/// of the same resamples.
+/// Equal seeds and numbers of scenarios give equal resamples, so intervals of several metrics share
+/// them.
 ///
 /// Source: percentile bootstrap, Efron 1979.
 pub fn interval(values: &[f64], seed: Seed) -> Option<Interval> {
@@ -35,13 +35,13 @@ pub fn interval(values: &[f64], seed: Seed) -> Option<Interval> {
     middle(&mut means)
 }
 
-/// 95 % intervals of the numbers that `statistic` makes of `n` scenarios, for statistics that are
-/// no means over scenarios; empty for fewer than two scenarios.
+/// 95 % intervals of the values of `statistic` over `n` scenarios, for statistics that are not
+/// means over scenarios; empty for fewer than two scenarios.
 ///
-/// `n_resamples` times, `n` scenarios are drawn with replacement, their indices handed to
-/// `statistic`, and the 2.5th and 97.5th percentile of each of its numbers taken. The numbers must
-/// come in the same order every time; resamples in which a number is `None` do not count for it,
-/// and a number that none has gets no interval. The number of threads changes nothing.
+/// `n_resamples` times, `n` scenarios are drawn with replacement and their indices passed to
+/// `statistic`; each interval is the 2.5th to 97.5th percentile of a value. The values must come in
+/// the same order every time. Resamples in which a value is `None` do not count for it; a value
+/// that is always `None` has no interval. Results do not depend on the number of threads.
 ///
 /// Source: percentile bootstrap, Efron 1979.
 pub fn intervals(

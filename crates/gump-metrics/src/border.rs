@@ -1,4 +1,4 @@
-//! The border of the road prepared for many questions: the answers of [`metres_off_road`], sooner.
+//! The road border prepared for many queries: the values of [`metres_off_road`], faster.
 
 use std::sync::{Arc, OnceLock};
 
@@ -12,15 +12,14 @@ use crate::road_edge::{distance_in_space, is_beyond, nearest};
 const CELL: f64 = 1.0;
 /// Cells along the side of a tile, which is prepared at once.
 const TILE: usize = 8;
-/// How much farther in space than in the plane an edge may be before the cells are of no help,
-/// metres.
+/// Difference in height, relative to the plane, beyond which the cells are not used, metres.
 const RISE: f64 = 0.5;
 
-/// A square of the map in which questions about the border of the road are cheap.
+/// A square of the map with fast queries for the road border.
 ///
-/// Each cell of a grid knows the segments of road edges that can be nearest to a point in it. Cells
-/// are prepared when first asked about, by whichever thread asks; their content depends on the map
-/// alone, so the number of threads changes no answer.
+/// Each cell of a grid stores the segments of road edges that can be nearest to a point in it.
+/// Cells are prepared on first use; their content depends only on the map, so results do not depend
+/// on the number of threads.
 #[derive(Debug)]
 pub struct Border {
     map: Arc<MapGraph>,
@@ -51,7 +50,8 @@ struct Cell {
 }
 
 impl Border {
-    /// The square of side `2 * half` metres around `center`, at height `z`; nothing is prepared yet.
+    /// The square of side `2 * half` metres around `center`, at height `z`; cells are prepared on
+    /// first use.
     pub fn new(map: &Arc<MapGraph>, center: DVec2, z: f64, half: f64) -> Self {
         let tile = CELL * TILE as f64;
         let tiles_per_side = (2.0 * half / tile).ceil().max(1.0) as usize;
@@ -66,7 +66,7 @@ impl Border {
         }
     }
 
-    /// What [`metres_off_road`] answers, anywhere on the map and at any height.
+    /// The value of [`metres_off_road`], anywhere on the map and at any height.
     pub fn metres_off_road(&self, point: DVec2, z: f64) -> Option<f64> {
         self.known(point, z)
             .or_else(|| metres_off_road(&self.map, point, z))
@@ -88,7 +88,7 @@ impl Border {
         Some(below * (1.0 - t.y) + above * t.y)
     }
 
-    /// The answer, where the cell of `point` has it.
+    /// The value, where the cell of `point` has it.
     fn known(&self, point: DVec2, z: f64) -> Option<f64> {
         let p = (point - self.corner) / CELL;
         let (tile, cell) = self.cell(p.x.floor(), p.y.floor())?;

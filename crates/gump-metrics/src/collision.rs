@@ -6,9 +6,9 @@ use crate::{Metric, Reduce};
 
 /// 1 if the agent's box overlaps that of any other agent now, else 0.
 ///
-/// Boxes that only touch do not overlap. Whose fault it is does not matter, nor how long it has
-/// lasted; [`crate::summarize`] leaves out overlaps that were there at the start and
-/// `gump-nuplan` tells collisions apart (and counts touching, as its reference does).
+/// Boxes that only touch do not overlap. Fault and duration are ignored. [`crate::summarize`]
+/// leaves out overlaps that exist at the start; `gump-nuplan` classifies collisions (and counts
+/// touching, as its reference does).
 #[derive(Clone, Copy, Debug)]
 pub struct Collision;
 
@@ -27,7 +27,7 @@ impl Metric for Collision {
     }
 }
 
-/// The others whose box overlaps that of `agent`, by id.
+/// Ids of the agents whose box overlaps that of `agent`.
 pub fn overlapping<'a>(frame: &'a Frame, agent: &'a Agent) -> impl Iterator<Item = AgentId> + 'a {
     let own = agent.oriented_box();
     frame

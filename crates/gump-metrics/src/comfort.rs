@@ -1,4 +1,4 @@
-//! Whether those inside would feel well.
+//! Comfort of the motion.
 
 use gump_scene::{Agent, SceneState};
 
@@ -6,15 +6,15 @@ use crate::{Metric, Reduce, kinematics};
 
 /// 1 if any comfort bound is broken now, else 0.
 ///
-/// Bounds that cannot be computed yet do not count; `None` if not even an acceleration can.
-/// Differences are taken frame by frame, so frames from noisy tracks break bounds that the same
-/// drive keeps when it is smoothed; `ComfortSeries` of `gump-nuplan` does that for finished drives.
+/// Bounds that cannot be computed yet do not count; `None` if not even an acceleration is known.
+/// Differences are taken frame by frame, so noisy tracks may exceed bounds that the smoothed drive
+/// keeps; `ComfortSeries` of `gump-nuplan` smooths finished drives.
 ///
 /// Source: the bounds of nuPlan's comfort metric, see [`ComfortBounds`].
 #[derive(Clone, Copy, Debug)]
 pub struct Discomfort;
 
-/// What is still comfortable; absolute values but for the longitudinal acceleration.
+/// Bounds of comfort; absolute values except for the longitudinal acceleration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ComfortBounds {
     /// Lowest acceleration along the heading, metres per second squared.
@@ -33,7 +33,7 @@ pub struct ComfortBounds {
     pub jerk: f64,
 }
 
-/// What those inside feel at one instant; `None` where it is not known.
+/// Accelerations, rates and jerks at one instant; `None` where unknown.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Felt {
     /// Along the heading, metres per second squared.
@@ -51,7 +51,7 @@ pub struct Felt {
 }
 
 impl ComfortBounds {
-    /// True if every known value lies inside its bounds, the bounds themselves excluded.
+    /// True if every known value lies strictly inside its bounds.
     pub fn allow(&self, felt: &Felt) -> bool {
         let within = |value: Option<f64>, bound: f64| value.is_none_or(|v| v.abs() < bound);
         let along = felt.longitudinal_acceleration;

@@ -1,15 +1,15 @@
-//! How far imagination is from what happened.
+//! Displacement errors: distances of futures from the log.
 
 use gump_scene::{AgentId, Rollout, Scenario};
 use rayon::prelude::*;
 
 /// Distance of one agent's futures from its logged track, metres.
 ///
-/// A step counts if the agent is present in it both in the log and in the rollout. A world that
-/// drops agents is therefore not punished here.
+/// A step counts if the agent is present both in the log and in the rollout. A world that drops
+/// agents is therefore not penalised here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Displacement {
-    /// Whose.
+    /// The agent.
     pub agent: AgentId,
     /// Mean over steps, mean over futures.
     pub ade: f64,

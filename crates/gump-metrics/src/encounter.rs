@@ -1,24 +1,24 @@
-//! How the ego met another: of which kind a contact is, and whose fault.
+//! Kinds of contact between the ego and others, and fault.
 //!
-//! The kinds are nuPlan's. When two count as having met is the business of whoever asks:
-//! `gump-nuplan` scores planners with them, [`crate::reactions`] the traffic around one.
+//! The kinds are nuPlan's. The caller decides which contacts count: `gump-nuplan` scores planners
+//! with them, [`crate::reactions`] the traffic around an ego.
 
 use gump_geometry::{OrientedBox, Pose};
 use gump_scene::{Agent, AgentKind};
 
 use crate::bearing::is_behind;
 
-/// Below this speed one stands, metres per second.
+/// Below this speed an agent stands, metres per second.
 ///
 /// Source: nuplan-devkit.
 const STANDING: f64 = 0.05;
 
-/// How the ego met something; the first that holds, in this order.
+/// The kind of a contact; the first that applies, in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum CollisionKind {
-    /// The ego stood.
+    /// The ego stands.
     StoppedEgo,
-    /// The other stood, or never moves.
+    /// The other stands, or is of a kind that never moves.
     StoppedTrack,
     /// The other came from behind.
     ActiveRear,
@@ -29,7 +29,7 @@ pub enum CollisionKind {
 }
 
 impl CollisionKind {
-    /// Whether the ego is to blame; from the side only where it was not within one lane.
+    /// Whether the ego is at fault; for side contacts only if it was not within one lane.
     pub fn is_at_fault(self, in_one_lane: bool) -> bool {
         match self {
             Self::StoppedTrack | Self::ActiveFront => true,
@@ -39,7 +39,8 @@ impl CollisionKind {
     }
 }
 
-/// How the ego, with this box, rear axle and speed, met an agent that it touches.
+/// The kind of contact of the ego, with this box, rear axle and speed, and an agent that it
+/// touches.
 ///
 /// Source: nuPlan's `no_ego_at_fault_collisions`.
 pub fn classify(
@@ -65,7 +66,7 @@ pub fn classify(
     }
 }
 
-/// Speed of an agent, metres per second; things that do not move by themselves have none.
+/// Speed of an agent, metres per second; 0 for kinds that never move.
 pub fn speed(agent: &Agent) -> f64 {
     if AgentKind::MOVING.contains(&agent.kind) {
         agent.state.speed()

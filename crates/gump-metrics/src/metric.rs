@@ -1,4 +1,4 @@
-//! What a metric is, the list of all, and how one is taken over a rollout.
+//! The trait [`Metric`], the list of all metrics, and their reduction over a rollout.
 
 use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use rayon::prelude::*;
@@ -8,9 +8,9 @@ use crate::{
     YawRate,
 };
 
-/// Measures one agent at one instant; what is good and bad is a [`crate::Reward`]'s business.
+/// A measurement of one agent at one instant; a [`crate::Reward`] decides what is good or bad.
 ///
-/// The same definition serves tables and rewards, the log and imagination.
+/// The same definition is used in tables and rewards, for logs and rollouts.
 pub trait Metric: Send + Sync {
     /// Name for tables, `snake_case`, with the unit where it is not a share.
     fn name(&self) -> &'static str;
@@ -19,11 +19,11 @@ pub trait Metric: Send + Sync {
     /// too little history, not a vehicle).
     fn at(&self, scene: &SceneState<'_>, agent: &Agent) -> Option<f64>;
 
-    /// How values over time become one.
+    /// How values over time are reduced to one.
     fn reduce(&self) -> Reduce;
 }
 
-/// How values over time become one.
+/// A reduction of values over time to one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reduce {
     /// 1 if any value is above 0, else 0.
@@ -41,7 +41,7 @@ pub enum Reduce {
 }
 
 impl Reduce {
-    /// One value from those that are defined; `None` if none is.
+    /// One value from the defined ones; `None` if there are none.
     pub fn apply(self, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let mut values = values.into_iter();
         let first = values.next()?;
@@ -59,7 +59,7 @@ impl Reduce {
     }
 }
 
-/// Every metric that needs no log. A new one is a file and a line here.
+/// Every metric that does not need the log. A new one is a file and a line here.
 pub static ALL: [&dyn Metric; 9] = [
     &Collision,
     &OffRoad,
@@ -72,9 +72,9 @@ pub static ALL: [&dyn Metric; 9] = [
     &YawRate,
 ];
 
-/// The metric over all imagined frames in which the agent is present and the metric defined.
+/// The metric over all simulated frames in which the agent is present and the metric is defined.
 ///
-/// The start does not count: nobody imagined it.
+/// The first frame is not simulated and does not count.
 pub fn over_rollout(metric: &dyn Metric, rollout: &Rollout, agent: AgentId) -> Option<f64> {
     let values = (1..=rollout.steps()).filter_map(|step| {
         let scene = rollout.at(step);
@@ -93,7 +93,7 @@ pub fn over_rollouts(
     rollouts.par_iter().map(one).collect()
 }
 
-/// The logged future as a rollout, so that it can be measured like any other.
+/// The logged future as a rollout, so that it can be measured in the same way.
 pub fn logged(scenario: &Scenario) -> Rollout {
     let mut rollout = Rollout::begin(scenario.present());
     for frame in scenario.future() {

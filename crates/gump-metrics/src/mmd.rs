@@ -1,8 +1,8 @@
-//! How alike the agents of a made-up scene and those of a recorded one are: maximum mean
-//! discrepancy of positions, headings, velocities and sizes.
+//! Similarity of generated and recorded scenes: maximum mean discrepancy of positions, headings,
+//! velocities and sizes of agents.
 //!
-//! Start with [`scene_mmd`] for one scene; [`MmdMean`] averages over scenes. [`mmd_squared`] is the
-//! bare number. Making scenes is the business of a world model.
+//! Start with [`scene_mmd`] for one scene; [`MmdMean`] averages over scenes, [`mmd_squared`] is the
+//! statistic itself.
 //!
 //! ```
 //! use gump_metrics::mmd::{MmdProtocol, scene_mmd};
@@ -20,15 +20,15 @@
 use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, SceneState};
 
-/// Which agents of which scenes are compared.
+/// The agents and scenes that are compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MmdProtocol {
-    /// Agents whose centre is farther ahead, behind or aside of the ego than this are left out,
+    /// Agents whose centre is farther ahead of, behind or beside the ego than this are left out,
     /// metres.
     pub half_side: f64,
-    /// Scenes with fewer recorded vehicles, the ego not counted, are left out.
+    /// Scenes with fewer recorded vehicles, not counting the ego, are left out.
     pub min_vehicles: usize,
-    /// Of more vehicles than this the nearest to the ego are taken.
+    /// The maximum number of vehicles, those nearest to the ego.
     pub max_vehicles: usize,
 }
 
@@ -45,8 +45,8 @@ impl MmdProtocol {
     }
 }
 
-/// Discrepancies of one scene; 0 is alike, 2 the most. `None` where all agents of both scenes are
-/// the same, so that there is no scale to compare on.
+/// Discrepancies of one scene, from 0 (equal) to 2. `None` where all agents of both scenes are the
+/// same, so that there is no scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SceneMmd {
     /// Of positions in the ego frame.
@@ -59,13 +59,12 @@ pub struct SceneMmd {
     pub size: Option<f64>,
 }
 
-/// Compares the vehicles of a made-up frame with those recorded now, the ego left out of both.
+/// Compares the vehicles of a generated frame with those recorded at the present, without the ego.
 ///
-/// Both are seen from the recorded ego, which the maker of the scene is given. The number of
-/// vehicles should be the same in both, as the protocol has it; if it is not, every set counts
-/// with the same weight.
+/// Both are taken relative to the recorded ego, which the generator is given. The protocol has the
+/// same number of vehicles in both; otherwise each set has the same total weight.
 ///
-/// `None` if the recorded scene has too few vehicles to take part, or the made-up one has none.
+/// `None` if the recorded scene has too few vehicles, or the generated one has none.
 pub fn scene_mmd(
     recorded: &SceneState<'_>,
     made: &Frame,
@@ -95,7 +94,7 @@ pub fn scene_mmd(
     })
 }
 
-/// The vehicles that take part, the nearest first.
+/// The vehicles that are compared, the nearest first.
 fn vehicles(frame: &Frame, ego: &Agent, protocol: &MmdProtocol) -> Vec<Agent> {
     let ego_from_world = ego.state.pose.inverse();
     let distance = |agent: &Agent| agent.state.pose.position.distance(ego.state.pose.position);
@@ -115,7 +114,7 @@ fn vehicles(frame: &Frame, ego: &Agent, protocol: &MmdProtocol) -> Vec<Agent> {
     vehicles
 }
 
-/// Squared maximum mean discrepancy of two sets of points, from 0 (alike) to 2.
+/// Squared maximum mean discrepancy of two sets of points, from 0 (equal) to 2.
 ///
 /// The kernel is exp(-d²/b), where b is the mean of d² over all pairs of different points of both
 /// sets together. The estimate is the biased one: a point is also paired with itself. `None` if a
@@ -151,7 +150,7 @@ pub fn mmd_squared<const D: usize>(a: &[[f64; D]], b: &[[f64; D]]) -> Option<f64
     Some(mean(a, a) + mean(b, b) - 2.0 * mean(a, b))
 }
 
-/// Means over scenes, each attribute over those that have it.
+/// Means over scenes, each attribute over the scenes that have it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MmdMean {
     sums: [f64; 4],
@@ -186,7 +185,7 @@ impl MmdMean {
         }
     }
 
-    /// Scenes added.
+    /// Number of scenes added.
     pub fn scenes(&self) -> usize {
         self.scenes
     }

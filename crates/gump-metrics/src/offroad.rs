@@ -1,4 +1,4 @@
-//! Leaving the road.
+//! Driving off the road.
 
 use gump_geometry::DVec2;
 use gump_scene::{Agent, AgentKind, MapGraph, SceneState};
@@ -6,8 +6,8 @@ use gump_scene::{Agent, AgentKind, MapGraph, SceneState};
 use crate::road_edge::metres_beyond_road_edge;
 use crate::{Metric, Reduce};
 
-/// 1 if a corner of the vehicle's box is off the road, else 0; `None` for anything but vehicles
-/// and on maps that know no border. See [`metres_off_road`].
+/// 1 if a corner of the vehicle's box is off the road, else 0; `None` for other kinds and on maps
+/// without a border. See [`metres_off_road`].
 #[derive(Clone, Copy, Debug)]
 pub struct OffRoad;
 
@@ -33,13 +33,14 @@ impl Metric for OffRoad {
     }
 }
 
-/// How far `point` at height `z` lies outside the road, metres, 0 on it; `None` on maps that know
-/// no border.
+/// Distance of `point` at height `z` outside the road, metres, 0 on it; `None` on maps without a
+/// border.
 ///
 /// Where the map has road edges, a point is off the road if it lies on the right of the nearest
-/// edge. It is on the road if it lies on the edge, and past the open end of an edge: a vehicle that
+/// edge. It is on the road if it lies on the edge, or past the open end of an edge: a vehicle that
 /// drives out of the map has not left the road. ([`crate::DistanceToRoadEdge`] makes no such
-/// exception.) Where the map has none, a point is off the road if no drivable surface contains it.
+/// exception.) Where the map has no edges, a point is off the road if no drivable surface contains
+/// it.
 pub fn metres_off_road(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
     if !map.road_edges().is_empty() {
         metres_beyond_road_edge(map, point, z)

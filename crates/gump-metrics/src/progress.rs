@@ -1,4 +1,4 @@
-//! Getting ahead on the route.
+//! Progress along the route.
 
 use gump_geometry::{DVec2, Polyline};
 use gump_scene::{Agent, SceneState};

@@ -1,4 +1,4 @@
-//! Driving past a red light.
+//! Passing a red light.
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{Agent, AgentKind, LightState, SceneState, stop_line};
@@ -42,7 +42,7 @@ impl Metric for RedLight {
     }
 }
 
-/// True if an agent comes over a line in its direction, from where it was before.
+/// True if an agent passes over a line in its direction, from its previous position.
 pub(crate) fn passes(line: Pose, width: f64, before: DVec2, now: Pose) -> bool {
     let (from, to) = (line.inverse() * before, line.inverse() * now.position);
     let along = now.direction().dot(line.direction()) > 0.0;

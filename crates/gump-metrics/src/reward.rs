@@ -1,4 +1,4 @@
-//! Metrics combined into one number that says what is wanted.
+//! Rewards: metrics combined into one number.
 
 use gump_scene::{Agent, AgentId, Rollout, SceneState};
 use rayon::prelude::*;
@@ -8,8 +8,8 @@ use crate::{Collision, Discomfort, Metric, OffRoad, Progress, over_rollout};
 /// Gates multiply, weighted terms add: `score = Π gates · Σ weight · term`.
 ///
 /// A gate is a metric of something bad, from 0 (did not happen) to 1 (happened); its factor is one
-/// minus that. A term is any metric. A value that is not defined leaves a gate open and a term
-/// without weight in the sum.
+/// minus that. A term is any metric. An undefined value leaves a gate open and gives a term no
+/// weight in the sum.
 ///
 /// ```
 /// use gump_metrics::{Collision, Progress, Reward, logged};
@@ -28,7 +28,7 @@ pub struct Reward {
     terms: Vec<(f64, Box<dyn Metric>)>,
 }
 
-/// A number and where it comes from.
+/// The value of a reward with its parts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Score {
     /// The reward.
@@ -39,16 +39,16 @@ pub struct Score {
     pub terms: Vec<Term>,
 }
 
-/// What one gate did.
+/// The effect of one gate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gate {
     /// The metric's name.
     pub name: &'static str,
-    /// What the sum was multiplied by, in 0..=1.
+    /// The factor of the sum, in 0..=1.
     pub factor: f64,
 }
 
-/// What one term added.
+/// The contribution of one term.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Term {
     /// The metric's name.
@@ -60,12 +60,12 @@ pub struct Term {
 }
 
 impl Reward {
-    /// A reward of nothing.
+    /// An empty reward.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Adds a metric of something bad that cancels the rest.
+    /// Adds a gate: a metric of something bad that cancels the rest.
     #[must_use]
     pub fn gate(mut self, metric: impl Metric + 'static) -> Self {
         self.gates.push(Box::new(metric));
@@ -82,8 +82,8 @@ impl Reward {
     /// The reward of one step of reinforcement learning: 0.1 per metre of progress, -5 for a
     /// collision, -5 for leaving the road, -0.05 for discomfort.
     ///
-    /// Source: the four parts of the paper's reward; a failure costs about the progress of one
-    /// episode (50 m), which is our choice, as the paper states no weights.
+    /// Source: the four parts of the paper's reward. The paper states no weights; ours make a
+    /// failure cost about the progress of one episode (50 m).
     pub fn driving_step() -> Self {
         Self::new()
             .term(0.1, Progress)

@@ -1,12 +1,12 @@
-//! Signed distance to the border of the road.
+//! Signed distance to the road edge.
 
 use gump_geometry::{DVec2, cross, project_on_segment};
 use gump_scene::{Agent, MapGraph, RoadEdge, SceneState};
 
 use crate::{Metric, Reduce};
 
-/// Vertical metres count this often when the nearest edge is chosen, so that a road above or below
-/// is not taken for this one.
+/// Factor of height differences when the nearest edge is chosen, so that a road above or below is
+/// not mistaken for this one.
 ///
 /// Source: the Waymo Sim Agents Challenge since 2024.
 const Z_STRETCH: f64 = 3.0;
@@ -40,9 +40,9 @@ impl Metric for DistanceToRoadEdge {
 /// Signed distance from `point` at height `z` to the nearest road edge, metres: negative on the
 /// left of the edge's direction, where the road is. `None` on a map without road edges.
 ///
-/// The nearest segment is chosen in space, the distance is measured in the plane. Beside a joint
-/// of two segments the sign follows whether the joint is convex, so that it is right on both sides
-/// of a corner. Past an open end the last segment is taken to go on. A point exactly on an edge has
+/// The nearest segment is chosen in space, the distance is measured in the plane. Beside a joint of
+/// two segments the sign depends on whether the joint is convex, so that it is correct on both
+/// sides of a corner. Past an open end the last segment is extended. A point exactly on an edge has
 /// distance 0.
 ///
 /// Source: the rule of the Waymo Sim Agents Challenge (2024), in f64 and with every edge whose
@@ -53,7 +53,7 @@ pub fn signed_distance_to_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Opt
 }
 
 /// How far `point` lies on the right of the nearest edge, off the road, metres, else 0. 0 past the
-/// open end of an edge, where the map knows nothing of a border. `None` on a map without road edges.
+/// open end of an edge, where the border is unknown. `None` on a map without road edges.
 pub(crate) fn metres_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
     let (distance, edge, segment) = nearest(map, point, z)?;
     let beyond = is_beyond(map, edge, segment, point);

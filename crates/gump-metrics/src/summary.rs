@@ -1,4 +1,4 @@
-//! A handful of rates over many futures, kept as counts so that tables can be merged.
+//! A few rates over many futures, stored as counts so that tables can be merged.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,24 +8,24 @@ use rayon::prelude::*;
 
 use crate::{Metric, OffRoad, average_displacement, overlapping};
 
-/// Counts and sums over agents; rates are questions to it.
+/// Counts and sums over agents; methods compute rates.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Part {
     /// Agents times futures.
     pub agents: usize,
-    /// Of these, how many ever overlap an agent that they did not overlap at the start.
+    /// Of these, the number that ever overlap an agent that they did not overlap at the start.
     pub collided: usize,
     /// Vehicles times futures that were on the road at the start.
     pub on_road: usize,
-    /// Of these, how many leave it.
+    /// Of these, the number that leave it.
     pub left_road: usize,
-    /// Agents (not times futures) that could be compared with the log.
+    /// Agents (not times futures) with displacements from the log.
     pub compared: usize,
-    /// Their average displacements added up, metres.
+    /// Sum of their average displacements, metres.
     pub sum_ade: f64,
     /// The same of the best future, metres.
     pub sum_min_ade: f64,
-    /// Their final displacements added up, metres.
+    /// Sum of their final displacements, metres.
     pub sum_fde: f64,
     /// The same of the best future, metres.
     pub sum_min_fde: f64,
@@ -80,10 +80,10 @@ fn share(sum: f64, n: usize) -> Option<f64> {
     (n > 0).then(|| sum / n as f64)
 }
 
-/// What [`summarize`] counts, by kind of agent.
+/// The counts of [`summarize`], by kind of agent.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Summary {
-    /// Rollouts summarised.
+    /// Number of rollouts.
     pub futures: usize,
     /// One part for every kind that occurs.
     pub by_kind: BTreeMap<AgentKind, Part>,
@@ -111,8 +111,8 @@ impl Summary {
 /// Collisions, off-road driving and, given the log, displacements of all futures of one scenario.
 ///
 /// Agents that are present at the start count, except those of [`AgentKind::STATIC`], which are
-/// obstacles only. What was wrong at the start is not held against anyone: overlaps of pairs that
-/// overlapped then, vehicles that stood off the road then.
+/// obstacles only. Overlaps of pairs that already overlap at the start and vehicles that are off
+/// the road at the start do not count.
 ///
 /// # Panics
 /// If a rollout has another time step than `scenario`.
@@ -186,12 +186,12 @@ fn collided(rollout: &Rollout) -> BTreeSet<AgentId> {
     collided
 }
 
-/// True of a vehicle that is on the road now, where that is known.
+/// True for a vehicle that is on the road now, where that is known.
 pub(crate) fn is_on_road(scene: &SceneState<'_>, agent: &Agent) -> bool {
     OffRoad.at(scene, agent) == Some(0.0)
 }
 
-/// True if a vehicle is off the road at any imagined frame.
+/// True if a vehicle is off the road at any simulated frame.
 pub(crate) fn leaves_road(rollout: &Rollout, id: AgentId) -> bool {
     // Many vehicles stand, and where one stands nothing changes.
     let mut last: Option<([DVec2; 4], f64)> = None;

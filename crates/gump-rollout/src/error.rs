@@ -1,8 +1,8 @@
-//! What can go wrong between a world, a policy and the engine.
+//! Errors of worlds, policies and simulation.
 
 use gump_scene::AgentId;
 
-/// Why traffic could not be simulated; failures inside a world or a policy come as they are.
+/// Why traffic could not be simulated; errors inside a world or a policy are passed on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RolloutError {
     /// The duration is not a positive number.
@@ -24,27 +24,27 @@ pub enum RolloutError {
         /// A time step that differs, seconds.
         other: f64,
     },
-    /// Someone answered for more or fewer futures than were asked.
+    /// A world or policy returned a different number of futures than requested.
     #[error("{who} gave {found} answers for {expected} futures")]
     Count {
-        /// Who answered.
+        /// The world or policy.
         who: &'static str,
         /// Futures in the session.
         expected: usize,
-        /// Answers received.
+        /// Number returned.
         found: usize,
     },
-    /// The world lost the ego, so that no policy can drive it.
+    /// A future has lost the ego, so that no policy can drive it.
     #[error("the world dropped the ego (agent {ego}) from future {future} at step {step}")]
     EgoVanished {
         /// The ego.
         ego: AgentId,
-        /// Which future.
+        /// Index of the future.
         future: usize,
-        /// Session steps imagined by then.
+        /// Session steps simulated by then.
         step: usize,
     },
-    /// A command to follow nothing.
+    /// A trajectory command that cannot be followed.
     #[error(
         "a command to follow needs at least one state and a positive time step, got {n} states {dt} s apart"
     )]
@@ -57,7 +57,7 @@ pub enum RolloutError {
     /// A trajectory too short to be followed.
     #[error("a trajectory needs at least two states, got {0}")]
     TooFewStates(usize),
-    /// A trajectory that does not go forward in time.
+    /// A trajectory whose times do not increase.
     #[error("state {state} of a trajectory is not later than the one before")]
     TimeOrder {
         /// Index of the state.
@@ -73,10 +73,10 @@ pub enum RolloutError {
         /// Time of the last state, microseconds.
         end_us: i64,
     },
-    /// A command or a state that is not a number.
+    /// A command or a state that is not a finite number.
     #[error("{who} gave a value that is not a finite number")]
     NotFinite {
-        /// Who gave it.
+        /// Its origin.
         who: &'static str,
     },
     /// A slot that the session does not have.
@@ -87,31 +87,31 @@ pub enum RolloutError {
         /// Futures in the session.
         n: usize,
     },
-    /// A recording that cannot be driven through.
+    /// A recording that cannot be driven in.
     #[error("the recording {0}")]
     Recording(String),
-    /// A plan that no car drives.
+    /// A plan that no vehicle can drive.
     #[error("the planner asks for {0:.1} m/s, expected less than 50")]
     Speed(f64),
-    /// Someone failed in the middle of a closed loop.
+    /// A planner or traffic failed during a closed loop.
     #[error("iteration {iteration}: {who}: {what}")]
     Loop {
-        /// Iterations driven by then.
+        /// Iterations completed by then.
         iteration: usize,
-        /// Who failed.
+        /// The component that failed.
         who: String,
-        /// What it reported.
+        /// Its error.
         what: String,
     },
-    /// A scene that a replay does not recognise.
+    /// A scene that does not belong to the replayed log.
     #[error("the scene shows no moment of the replayed log \"{0}\"")]
     ForeignScene(String),
     /// A parameter outside its range.
     #[error("the parameter {name} is {value}, expected a positive number")]
     Parameter {
-        /// Which one.
+        /// Its name.
         name: &'static str,
-        /// What was given.
+        /// Its value.
         value: f64,
     },
 }

@@ -1,12 +1,12 @@
-//! What decides for the ego.
+//! Policies, which control the ego.
 
 use gump_scene::{AgentState, SceneState};
 
 use crate::BoxError;
 
-/// Decides for the ego, a batch of scenes at a time.
+/// Controls the ego in a batch of scenes.
 ///
-/// The batch keeps its order over the calls of one simulation, so a policy may remember per row.
+/// The batch keeps its order over the calls of one simulation, so a policy may keep state per row.
 pub trait Policy {
     /// A short name for tables and reports.
     fn name(&self) -> &str;
@@ -14,11 +14,11 @@ pub trait Policy {
     /// One command per scene.
     ///
     /// # Errors
-    /// Whatever keeps the policy from deciding.
+    /// Any reason for which the policy cannot decide.
     fn act(&mut self, scenes: &[SceneState<'_>]) -> Result<Vec<Command>, BoxError>;
 }
 
-/// What the ego should do next.
+/// A command for the ego.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Command {
     /// Follow these states; the first is `dt` seconds ahead, the others `dt` apart.
@@ -28,7 +28,7 @@ pub enum Command {
         /// Box-centre states in the world frame.
         states: Vec<AgentState>,
     },
-    /// Hold these until the next command.
+    /// Constant acceleration and curvature until the next command.
     Drive {
         /// Along the heading, metres per second squared.
         acceleration: f64,

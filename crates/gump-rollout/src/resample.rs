@@ -1,4 +1,5 @@
-//! From the frames of a slow world to the time step of the scene, agent by agent.
+//! Resamples the frames of a world with a long time step to the time step of the scene, agent by
+//! agent.
 //!
 //! A *knot* is a frame of the world, the present being knot 0; a *sample* is a frame of the
 //! result. A *run* is an unbroken presence of one agent.
@@ -13,7 +14,7 @@ use crate::{Interpolation, SimulateConfig};
 /// Samples 1 to `n_samples` after the present of `scene`, `stride` of them per knot.
 ///
 /// Lights hold from their knot until the next. Extents, height and kind of an agent are those of
-/// the first knot of its run, so a world that rounds sizes does not change them.
+/// the first knot of its run, so rounding of sizes by a world has no effect.
 ///
 /// Source: the paper's Waymo post-processing for linear interpolation, elevation and smoothing,
 /// with the sine *and* the cosine of the heading smoothed.
@@ -194,8 +195,8 @@ impl Run<'_> {
         }
     }
 
-    /// Centred moving average over history and run; the window shrinks, still centred, where one
-    /// side ends. History and present stay as logged.
+    /// Centred moving average over history and run. Where one side ends the window shrinks but
+    /// stays centred. History and present stay as logged.
     fn smooth(&self, poses: &[Pose], half_window: usize) -> Vec<Pose> {
         let starts_now = self.knots[0].0 == 0;
         let past = self.scene.history.iter().rev().skip(1).take(half_window);
@@ -216,7 +217,7 @@ impl Run<'_> {
         smooth.split_off(n_past)
     }
 
-    /// Puts the agents on the road, as high over it as they were at the start of the run.
+    /// Sets the elevation of agents to that of the road plus their offset at the start of the run.
     fn elevate(&self, agents: &mut [Agent], config: &SimulateConfig) {
         if !config.relative_elevation {
             return;

@@ -1,14 +1,15 @@
-//! An ego that drives where it was told beforehand.
+//! An ego that follows a given trajectory.
 
 use gump_scene::{AgentState, SceneState};
 
 use crate::{BoxError, Command, Policy, dynamics};
 
-/// Drives the ego through given states, whatever the others do: to see what they do.
+/// Drives the ego through given states regardless of other agents, in order to examine their
+/// reactions.
 ///
-/// The world is told one of its own steps at a time and knows nothing of what comes later. All
-/// futures of a session drive alike; past the last state the ego keeps its velocity. For one
-/// simulation: it counts the steps.
+/// The world receives one of its own steps at a time and never later ones. The ego drives the same
+/// way in all futures of a session; past the last state it keeps its velocity. A value serves one
+/// simulation only, because it counts the steps.
 #[derive(Clone, Debug)]
 pub struct Scripted<'a> {
     states: &'a [AgentState],
@@ -17,8 +18,8 @@ pub struct Scripted<'a> {
 }
 
 impl<'a> Scripted<'a> {
-    /// Drives through `states`, box centres in the world frame, the first of which is the present
-    /// and the others follow `dt` seconds apart.
+    /// Drives through `states`: box centres in the world frame, the first of which is the present;
+    /// the others follow `dt` seconds apart.
     pub fn new(states: &'a [AgentState], dt: f64) -> Self {
         Self {
             states,

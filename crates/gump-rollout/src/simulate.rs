@@ -1,7 +1,7 @@
-//! The closed-loop engine: a world, perhaps a policy, and imagined futures out.
+//! Closed-loop simulation: a world and optionally a policy produce futures.
 //!
-//! Bringing the world's frames to the scene's rate is `resample`'s business; how traffic moves is
-//! the world's.
+//! Resampling of the world's frames to the scene's rate is in `resample`; the world moves the
+//! traffic.
 
 use gump_scene::{AgentState, Frame, Rollout, SceneState};
 use rayon::prelude::*;
@@ -9,27 +9,27 @@ use rayon::prelude::*;
 use crate::resample::resample;
 use crate::{BoxError, Policy, RolloutError, Session, Start, WorldModel, dynamics};
 
-/// How positions are found between the frames of a world that steps more slowly than the scene.
+/// Interpolation of positions between the frames of a world with a longer time step than the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Interpolation {
-    /// Straight between frames; velocities jump there. What the paper's evaluation does.
+    /// Linear; velocities jump at frames. Used by the paper's evaluation.
     Linear,
     /// Cubic Hermite with tangents from finite differences, limited so that it never overshoots.
     Hermite,
 }
 
-/// How long to simulate and how to bring the frames to the scene's rate.
+/// Duration of a simulation, and resampling of frames to the scene's rate.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulateConfig {
-    /// Seconds to imagine, > 0; rounded to whole steps of the scene.
+    /// Seconds to simulate, > 0; rounded to whole steps of the scene.
     pub seconds: f64,
     /// Positions between the world's frames.
     pub interpolation: Interpolation,
     /// Samples in the centred moving average over history and future; 0 and 1 turn it off, an
     /// even number counts as the odd one below it.
     pub smoothing_window: usize,
-    /// True: agents keep their height over the road they are on. False: elevation as the world
-    /// gives it.
+    /// True: agents keep their height over the road they are on. False: the world's elevations are
+    /// kept.
     pub relative_elevation: bool,
 }
 
@@ -57,19 +57,20 @@ impl SimulateConfig {
     }
 }
 
-/// Imagines how the scenes go on, one rollout per future, start-major.
+/// Simulates futures of the scenes, one rollout per future, start-major.
 ///
-/// Rollouts come at the time step of their scene, whatever the world's own: positions are
-/// interpolated per agent, headings turn the short way, velocities are finite differences. An
-/// agent that is missing in the world's next frame is absent from then on; one that appears does
-/// so at its first frame. Frames of a world that already steps at the scene's rate are kept as
-/// they are, velocities included.
+/// Rollouts have the time step of their scene, whatever the world's own: positions are interpolated
+/// per agent, headings turn the shorter way, velocities are finite differences. An agent that is
+/// missing in the world's next frame is absent from then on; one that appears does so at its first
+/// frame. Frames of a world that already has the scene's time step are kept unchanged, including
+/// velocities.
 ///
-/// With a `policy`, it acts on all futures before every step *of the world*, on scenes thinned to
-/// that step, and the world takes the ego's next state as final. Without one the world drives.
+/// A `policy`, if given, acts on all futures before every step *of the world*, on scenes thinned to
+/// that step, and the ego's next state is fixed by its command. Without a policy the world drives
+/// the ego.
 ///
 /// # Errors
-/// What the world or the policy report, and [`RolloutError`] where they do not fit together.
+/// Errors of the world or the policy, and [`RolloutError`] where they do not fit together.
 pub fn simulate(
     world: &dyn WorldModel,
     starts: &[Start<'_>],
@@ -110,11 +111,12 @@ pub fn simulate(
         .collect())
 }
 
-/// The frames from the present of a scene, excluded, to the world's next one, included, at the
-/// scene's rate: what [`simulate`] puts between two frames of a world, for whoever steps one by hand.
+/// The frames from the present of a scene (excluded) to the world's next frame (included) at the
+/// scene's rate: the frames that [`simulate`] inserts between two frames of a world, for callers
+/// that step a world themselves.
 ///
-/// The curve bends as the frame `dt` before the present asks; what comes after `next` is not known
-/// yet, so it ends straight.
+/// The start of the curve matches the frame `dt` before the present. Frames after `next` are not
+/// known yet, so the end is straight.
 ///
 /// # Errors
 /// [`RolloutError::TimeStep`] if `dt`, seconds, is no multiple of the scene's.
@@ -129,7 +131,7 @@ pub fn fill(
     Ok(resample(scene, knots, stride, stride, config))
 }
 
-/// One future in the making, at the time step of the world.
+/// One future in progress, at the time step of the world.
 struct Future<'a> {
     scene: SceneState<'a>,
     stride: usize,
@@ -159,7 +161,7 @@ fn stride(session: f64, scene: f64) -> Result<usize, RolloutError> {
     }
 }
 
-/// A rollout at the world's rate: what a policy sees while the world steps.
+/// A rollout at the world's rate, which is what a policy sees while the world steps.
 fn begin(scene: SceneState<'_>, dt: f64, stride: usize) -> Rollout {
     if stride == 1 {
         return Rollout::begin(scene);
@@ -176,7 +178,7 @@ fn begin(scene: SceneState<'_>, dt: f64, stride: usize) -> Rollout {
     })
 }
 
-/// Asks the policy and turns its commands into the ego's next states.
+/// Calls the policy and turns its commands into the ego's next states.
 fn decide(
     policy: &mut dyn Policy,
     futures: &[Future<'_>],

@@ -1,25 +1,26 @@
-//! Where agents may go: a few paths with confidences, the form motion prediction is judged in.
+//! Predictions: a few paths with confidences per agent, the form that motion prediction metrics
+//! score.
 
 use gump_geometry::DVec2;
 
 use crate::AgentId;
 
-/// A forecast for one agent, or for several agents together.
+/// A prediction for one agent, or jointly for several agents.
 ///
 /// Plain data, like a [`Rollout`](crate::Rollout), so that a metric can score a file without
 /// knowing how it was made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
-    /// Whose forecast; several agents are forecast jointly.
+    /// The predicted agents; several agents are predicted jointly.
     pub agents: Vec<AgentId>,
-    /// What may happen, in the order of the forecaster.
+    /// The possible modes, in the order of the predictor.
     pub modes: Vec<PredictedMode>,
 }
 
-/// One way things may go.
+/// One possible outcome.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PredictedMode {
-    /// How sure the forecaster is; compared across scenes, not normalized.
+    /// The predictor's confidence; compared across scenes, not normalized.
     pub confidence: f64,
     /// A path per agent in the order of [`Prediction::agents`]: world-frame positions in metres,
     /// at even times after the present.

@@ -1,13 +1,13 @@
-//! History plus imagined frames.
+//! A history and the simulated frames after it.
 
 use std::sync::Arc;
 
 use crate::{AgentId, Frame, MapGraph, Route, SceneState};
 
-/// Imagined traffic: the history it started from, then one frame per step.
+/// Simulated traffic: the history it started from, then one frame per step.
 ///
-/// Plain data: any metric, policy or drawing that works on a [`SceneState`] works on the log and
-/// on imagination alike.
+/// Plain data: any metric, policy or drawing that works on a [`SceneState`] works on logs and
+/// rollouts alike.
 #[derive(Clone, Debug)]
 pub struct Rollout {
     map: Arc<MapGraph>,
@@ -19,7 +19,7 @@ pub struct Rollout {
 }
 
 impl Rollout {
-    /// Starts from what a scene has seen.
+    /// Starts from the visible part of a scene.
     pub fn begin(scene: SceneState<'_>) -> Self {
         Self {
             map: Arc::clone(scene.map),
@@ -31,12 +31,12 @@ impl Rollout {
         }
     }
 
-    /// Appends the next imagined frame, `dt` after the last.
+    /// Appends the next simulated frame, `dt` after the last.
     pub fn push(&mut self, frame: Frame) {
         self.frames.push(frame);
     }
 
-    /// The scene after `step` imagined frames; step 0 is the start.
+    /// The scene after `step` simulated frames; step 0 is the start.
     ///
     /// # Panics
     /// If the rollout is shorter.
@@ -50,7 +50,7 @@ impl Rollout {
         }
     }
 
-    /// The scene after the last imagined frame.
+    /// The scene after the last simulated frame.
     pub fn last(&self) -> SceneState<'_> {
         self.at(self.steps())
     }
@@ -60,22 +60,22 @@ impl Rollout {
         &self.frames[self.n_history - 1]
     }
 
-    /// Number of imagined frames.
+    /// Number of simulated frames.
     pub fn steps(&self) -> usize {
         self.frames.len() - self.n_history
     }
 
-    /// The history it started from, oldest first, the start included.
+    /// The history it started from, oldest first, including the start.
     pub fn history(&self) -> &[Frame] {
         &self.frames[..self.n_history]
     }
 
-    /// The imagined frames in order.
+    /// The simulated frames in order.
     pub fn imagined(&self) -> &[Frame] {
         &self.frames[self.n_history..]
     }
 
-    /// The road.
+    /// The map.
     pub fn map(&self) -> &Arc<MapGraph> {
         &self.map
     }

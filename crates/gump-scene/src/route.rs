@@ -1,4 +1,4 @@
-//! The ego's way through the lane graph.
+//! The ego's path through the lane graph.
 
 use gump_geometry::Polyline;
 
@@ -9,8 +9,8 @@ use crate::{LaneId, RoadblockId};
 pub struct Route {
     /// Lanes in driving order; each is a successor or a neighbour of the one before.
     pub lanes: Vec<LaneId>,
-    /// The roadblocks the format states, in driving order; empty where it states none. There may be
-    /// repeats and gaps: they are kept as stated.
+    /// The roadblocks that the format states, in driving order; empty where it states none. Repeats
+    /// and gaps are kept as stated.
     pub roadblocks: Vec<RoadblockId>,
     /// The path itself, world frame, metres; starts at or behind the ego's present position.
     pub path: Polyline,

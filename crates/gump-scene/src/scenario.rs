@@ -1,17 +1,17 @@
-//! Recorded traffic, future included.
+//! Recorded traffic, including its future.
 
 use std::sync::Arc;
 
 use crate::{AgentId, Frame, MapGraph, Route, ScenarioTag, SceneState};
 
-/// Recorded traffic, held only by readers, log-based metrics and oracles.
+/// Recorded traffic. Only readers, log-based metrics and oracles hold one.
 #[derive(Clone, Debug)]
 pub struct Scenario {
     /// Name, unique within its dataset.
     pub id: String,
-    /// The road.
+    /// The map.
     pub map: Arc<MapGraph>,
-    /// The ego's route, if known or derived, usually from the log with its future.
+    /// The ego's route, if known or derived, usually from the log including its future.
     pub route: Option<Arc<Route>>,
     /// One frame every `dt` seconds, past and future.
     pub log: Vec<Frame>,
@@ -25,11 +25,11 @@ pub struct Scenario {
     pub targets: Vec<AgentId>,
     /// Agents marked as interacting, in the order given.
     pub objects_of_interest: Vec<AgentId>,
-    /// What kind of situation it is, sorted; empty if not known.
+    /// The scenario tags that apply, sorted; empty if not known.
     pub tags: Vec<ScenarioTag>,
 }
 
-/// Why a recording is not a scenario.
+/// Why a recording is not a valid scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ScenarioError {
     /// The log has no present.
@@ -40,7 +40,7 @@ pub enum ScenarioError {
         /// Frames in the log.
         frames: usize,
     },
-    /// The ego is not there now.
+    /// The ego is not in the present frame.
     #[error("the ego (agent {0}) is absent in the present frame")]
     NoEgo(AgentId),
     /// The time step is not a positive number.
@@ -71,7 +71,7 @@ pub enum ScenarioError {
 }
 
 impl Scenario {
-    /// Checks what every user of a scenario relies on.
+    /// Checks the invariants that all users of a scenario rely on.
     ///
     /// # Errors
     /// The first violation as a [`ScenarioError`].
@@ -108,13 +108,13 @@ impl Scenario {
         Ok(())
     }
 
-    /// What an actor may see now: the future is cut off, but for the route, which tells where the
-    /// ego goes ([`SceneState::unguided`] leaves it out).
+    /// The present scene without the future. The route is kept, although it reveals where the ego
+    /// goes; [`SceneState::unguided`] removes it.
     pub fn present(&self) -> SceneState<'_> {
         self.at(self.now)
     }
 
-    /// What an actor may see at frame `index` of the log; it must contain the ego.
+    /// The scene as of frame `index` of the log, which must contain the ego.
     pub fn at(&self, index: usize) -> SceneState<'_> {
         SceneState {
             map: &self.map,

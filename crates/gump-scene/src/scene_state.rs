@@ -1,19 +1,19 @@
-//! What an actor may see.
+//! The part of a scenario that a world or policy may see.
 
 use std::sync::Arc;
 
 use crate::{Agent, AgentId, Frame, MapGraph, Route};
 
-/// A copyable view of map, route and history; the last frame is now. It holds no future.
+/// A copyable view of map, route and history; the last frame is the present. It contains no future.
 #[derive(Clone, Copy, Debug)]
 pub struct SceneState<'a> {
-    /// The road.
+    /// The map.
     pub map: &'a Arc<MapGraph>,
     /// The ego's route, if one is known; see [`SceneState::unguided`].
     pub route: Option<&'a Arc<Route>>,
     /// Frames up to now, oldest first, `dt` seconds apart, never empty.
     pub history: &'a [Frame],
-    /// Which agent is the ego; it is present now.
+    /// The id of the ego, which is in the present frame.
     pub ego: AgentId,
     /// Seconds between frames.
     pub dt: f64,
@@ -27,11 +27,12 @@ impl<'a> SceneState<'a> {
             .expect("the history of a scene is never empty")
     }
 
-    /// The same without the ego's route: what an actor may see where its realism is judged.
+    /// The same scene without the ego's route: the input of a world whose realism is scored.
     ///
-    /// Few recordings state a route. Readers take it from where the ego drives *after* the present,
-    /// and files keep it without saying whose word it is; so a route tells which way the ego turns
-    /// at the next fork. That is the task of whoever plans, and a hint to whoever predicts.
+    /// Few recordings state a route. Readers derive it from where the ego drives *after* the
+    /// present, and files store it without its origin; a route therefore reveals which way the ego
+    /// turns at the next fork. For planners it is the task; for predictors it is a leak of the
+    /// future.
     #[must_use]
     pub fn unguided(self) -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! Where a light stops traffic, where that traffic goes, and whether two such ways cross.
+//! Where a light stops traffic, the path of that traffic, and whether two such paths cross.
 
 use std::f64::consts::FRAC_PI_6;
 
@@ -22,8 +22,8 @@ pub fn stop_line(lane: &Lane, light: &Light) -> Pose {
     })
 }
 
-/// Where traffic goes once it has passed the stop line of a lane: the rest of the lane, or where
-/// the line is at its end, the lanes that follow.
+/// The path of traffic that has passed the stop line of a lane: the rest of the lane, or, where the
+/// line is at its end, the lanes that follow.
 pub fn ways_beyond(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
     let centre = &lane.centerline;
     let from = centre.project(line.position).arc_length;
@@ -34,7 +34,7 @@ pub fn ways_beyond(map: &MapGraph, lane: &Lane, line: Pose) -> Vec<Polyline> {
     next.map(|lane| lane.centerline.clone()).collect()
 }
 
-/// True if two ways cross at more than 30 degrees; where they fork or join they do not.
+/// True if two paths cross at more than 30 degrees; paths that fork or join do not cross.
 pub fn ways_cross(one: &Polyline, other: &Polyline) -> bool {
     let ((a, b), (c, d)) = (ends(one), ends(other));
     if is_near(a, c) || is_near(b, d) {
@@ -48,7 +48,7 @@ pub fn ways_cross(one: &Polyline, other: &Polyline) -> bool {
     })
 }
 
-/// True if two ways begin apart and end in the same place.
+/// True if two paths begin apart and end in the same place.
 pub fn ways_join(one: &Polyline, other: &Polyline) -> bool {
     let ((a, b), (c, d)) = (ends(one), ends(other));
     !is_near(a, c) && is_near(b, d)

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-/// One of the 73 kinds of situation that nuPlan distinguishes; the prompt vocabulary.
+/// One of the 73 scenario types of nuPlan; the prompt vocabulary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ScenarioTag(u8);
 
@@ -21,7 +21,7 @@ impl ScenarioTag {
         usize::from(self.0)
     }
 
-    /// The name nuPlan gives it.
+    /// Its name in nuPlan.
     pub fn name(self) -> &'static str {
         NAMES[self.index()]
     }

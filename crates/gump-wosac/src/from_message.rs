@@ -1,7 +1,7 @@
-//! Waymo's messages as what is scored.
+//! Conversion of Waymo's messages to the inputs of the metrics.
 //!
-//! Of a message the metric reads more than a scene keeps: what invalid states hold, which signals
-//! flash and when they were not seen, the order of the map.
+//! The metrics read more of a message than a scene keeps: the values of invalid states, flashing
+//! and unobserved signals, the order of the map.
 
 use gump_proto::{
     FeatureData, LaneType, MapPoint, ObjectState, ObjectType, ScenarioRollouts, SignalState,
@@ -12,9 +12,9 @@ use gump_scene::{AgentId, AgentKind};
 use crate::realism::{Log, Mode, Rollouts, Signal, SignalLane, State, Track, Trajectory};
 
 impl Log {
-    /// What a message says, its ego and whom to predict included where it names them.
+    /// The log of a message, with its ego and prediction targets where it states them.
     ///
-    /// Scores of it equal the official ones to the last digit.
+    /// Scores computed from it equal the official ones to the last digit.
     pub fn of_message(message: &gump_proto::Scenario) -> Self {
         let tracks = message.tracks.iter().map(|track| {
             let states = track.states.iter().map(state).collect();
@@ -49,7 +49,7 @@ impl Log {
 }
 
 impl Rollouts {
-    /// The futures of a message; sizes and classes of agents count in scene generation alone.
+    /// The futures of a message; sizes and classes of agents are used in scene generation only.
     pub fn of_message(message: &ScenarioRollouts, mode: Mode) -> Self {
         let futures = message.joint_scenes.iter().map(|scene| {
             let agents = scene.simulated_trajectories.iter();

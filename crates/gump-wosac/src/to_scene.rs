@@ -1,4 +1,4 @@
-//! Rollouts as the challenge exchanges them, as rollouts of a scene.
+//! Conversion of rollouts in the challenge's messages to rollouts of a scene.
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{Agent, AgentState, Frame, Rollout, Scenario};
@@ -6,8 +6,9 @@ use gump_scene::{Agent, AgentState, Frame, Rollout, Scenario};
 use crate::realism::{Rollouts, Trajectory};
 
 impl Rollouts {
-    /// The same futures in a scene: agents keep what they are in the present, lights are those of the
-    /// log as long as it lasts. Paths of unknown agents are left out; equal copies come once.
+    /// The futures of the message in a scene. Agents keep their size and kind of the present, and
+    /// lights are those of the log as long as it lasts. Paths of unknown agents are left out; equal
+    /// copies occur once.
     pub fn in_scene(&self, scenario: &Scenario) -> Vec<Rollout> {
         let futures = self.futures.iter();
         futures.map(|paths| of_future(scenario, paths)).collect()

@@ -1,4 +1,4 @@
-//! What bodies do that no body can: accelerate too hard, slide sideways.
+//! Motion that is physically implausible: accelerations that are too large, sideways slip.
 
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::AgentKind;
@@ -9,13 +9,13 @@ use super::{Class, Counter, MOVES, Measure, vehicles};
 /// Dry tyres on dry asphalt brake with 8 to 9 m/s² and cars accelerate with less.
 const HARD: f64 = 8.0;
 /// Half of the time over which a velocity is measured, and half of that between two of them,
-/// seconds. Positions 5 cm off then are an acceleration of 0.4 m/s².
+/// seconds. An error of 5 cm in positions then gives an acceleration of 0.4 m/s².
 const REACH_S: f64 = 0.25;
-/// Events with less in between are one, seconds.
+/// Events separated by less than this are one event, seconds.
 const APART_S: f64 = 0.5;
-/// Faster sideways is sliding, m/s.
+/// A vehicle that moves sideways faster than this slips, m/s.
 const SLIDES: f64 = 0.5;
-/// Sliding for at least so long is an incident, seconds.
+/// Slip for at least this long is an incident, seconds.
 const SLIDE_S: f64 = 0.3;
 
 impl Counter<'_> {
@@ -73,11 +73,11 @@ impl Counter<'_> {
         self.add(Measure::Slip, class, events, n_moving as f64);
     }
 
-    /// How fast a vehicle slides at a frame, m/s; `None` unless it moves.
+    /// Slip of a vehicle at a frame, m/s; `None` unless it moves.
     ///
-    /// A car that turns about its rear axle moves its middle sideways by the turn rate times the
-    /// distance between the two, which is somewhere between nothing and half of its length: no slip
-    /// at all if any such place for the axle explains the motion.
+    /// In a vehicle that turns about its rear axle, the box centre moves sideways by the turn rate
+    /// times its distance from the axle, which is between zero and half of the length. The slip is
+    /// zero if some position of the axle in that range explains the motion.
     fn slip(&self, track: &Track, k: usize, reach: usize) -> Option<f64> {
         let velocity = track.velocity(k, reach)?;
         if velocity.length_squared() <= MOVES * MOVES {

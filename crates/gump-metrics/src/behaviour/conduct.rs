@@ -1,4 +1,4 @@
-//! What single agents do, and who is to be looked at first.
+//! Implausible actions (deeds) of single agents, and a ranking of agents by plausibility.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,7 +9,7 @@ use super::{Behaviour, Measure, Seen};
 use crate::logged;
 use crate::summary::{is_on_road, leaves_road};
 
-/// Something that a driver would not do, and that the log of the agent does not show.
+/// An implausible action that the log of the agent does not show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Deed {
     /// One of the measures of this module.
@@ -27,8 +27,7 @@ impl Deed {
         }
     }
 
-    /// The deed that a measure is, if it is one: to stand, to set off and to change lanes is
-    /// nothing strange of a single agent.
+    /// The deed of a measure, if it is one: standing, starting and changing lanes are normal.
     fn of(measure: Measure) -> Option<Self> {
         matches!(
             measure,
@@ -43,21 +42,21 @@ impl Deed {
     }
 }
 
-/// What one agent does in the futures of a scene and not in its log.
+/// The deeds of one agent in the futures of a scene that its log does not show.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Conduct {
     /// The agent.
     pub agent: AgentId,
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
-    /// In which share of the futures it does what, 0 to 1, the most frequent first.
+    /// Each deed with its share of futures, 0 to 1, the most frequent first.
     pub deeds: Vec<(Deed, f64)>,
-    /// In which share of the futures it does any of it.
+    /// Share of futures with any deed.
     pub any: f64,
 }
 
 impl Behaviour<'_> {
-    /// What every agent of the present that moves by itself does, by id.
+    /// The deeds of every moving agent of the present, by id.
     pub fn conduct(&self, rollouts: &[Rollout]) -> Vec<Conduct> {
         let log = self.deeds(&self.log(), &logged(self.scenario));
         let done: Vec<BTreeSet<(AgentId, Deed)>> = rollouts
@@ -70,7 +69,7 @@ impl Behaviour<'_> {
         moving.map(|agent| conduct_of(agent, &done)).collect()
     }
 
-    /// Who does what in one future or the log.
+    /// Deeds by agent, in one future or the log.
     fn deeds(&self, seen: &Seen, rollout: &Rollout) -> BTreeSet<(AgentId, Deed)> {
         let found = seen.incidents.iter();
         let found = found.filter_map(|one| Some((one.agent, Deed::of(one.measure)?)));
@@ -83,7 +82,7 @@ impl Behaviour<'_> {
     }
 }
 
-/// What one agent does, of what everyone does in every future.
+/// The deeds of one agent, from those of all agents in all futures.
 fn conduct_of(agent: &Agent, done: &[BTreeSet<(AgentId, Deed)>]) -> Conduct {
     let share = |n: usize| n as f64 / done.len().max(1) as f64;
     let mut counts: BTreeMap<Deed, usize> = BTreeMap::new();
@@ -108,23 +107,22 @@ fn conduct_of(agent: &Agent, done: &[BTreeSet<(AgentId, Deed)>]) -> Conduct {
     }
 }
 
-/// How plausible one agent's futures are.
+/// Plausibility of one agent's futures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Judged {
-    /// What it does.
+    /// Its deeds.
     pub conduct: Conduct,
-    /// How likely its log is under the futures, 0 to 1, where that was scored.
+    /// Likelihood of its log under the futures, 0 to 1, where that was scored.
     pub realism: Option<f64>,
-    /// Realism (1 where it was not scored) times the share of futures in which the agent does
-    /// nothing that a driver would not do: 0 for a parked car that pulls out in all of them,
-    /// however likely its log is.
+    /// Realism (1 where it was not scored) times the share of futures without deeds of the agent: 0
+    /// for a parked car that pulls out in all of them, even if its log is likely.
     pub plausibility: f64,
 }
 
-/// Sets realism, as far as agents have one, and conduct side by side, the least plausible agent
-/// first; ties by id.
+/// Combines realism, of the agents that have one, with conduct, the least plausible agent first;
+/// ties by id.
 ///
-/// The official score is not touched: this ranks whom to look at.
+/// The official score is not changed; this is a ranking for inspection.
 pub fn judge(
     realism: impl IntoIterator<Item = (AgentId, f64)>,
     conduct: Vec<Conduct>,

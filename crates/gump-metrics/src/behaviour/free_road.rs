@@ -1,11 +1,11 @@
-//! Stops that nothing asks for.
+//! Stops without a reason.
 //!
-//! Reasons to stop, each enough: the vehicle is not on a lane (over 1 m beside the centre line or
-//! 30 degrees off it, as who parks); anybody or anything ahead within 15 m of the front bumper and
-//! half a metre of its way, people and bicycles within 3 m; ahead within 25 m a light that is not
-//! green, a stop line, a stop sign or the end of the road; an intersection within 15 m and someone
-//! within 50 m who moves another way and comes nearer. A stop is free if there is no reason as it begins, at its end
-//! and in between.
+//! Each of these is a reason to stop: the vehicle is not on a lane (over 1 m beside the centre line
+//! or 30 degrees off it, as when parking); an agent is ahead within 15 m of the front bumper and
+//! half a metre of its path, pedestrians and bicycles within 3 m; within 25 m ahead is a light that
+//! is not green, a stop line, a stop sign or the end of the road; an intersection is within 15 m
+//! and within 50 m an agent on another path approaches. A stop is free if there is no reason at its
+//! start, at its end or in between.
 
 use std::f64::consts::FRAC_PI_6;
 
@@ -16,24 +16,26 @@ use super::reach::{Ahead, ahead, nearest};
 use super::track::Track;
 use super::{Counter, MOVES, STANDS};
 
-/// Farther beside the centre line one is not on the lane, metres.
+/// A vehicle farther than this beside the centre line is not on the lane, metres.
 const ON_LANE_M: f64 = 1.0;
-/// How far ahead of the front bumper others matter, and lights, signs and the end of the road.
+/// How far ahead of the front bumper agents are considered, and lights, signs and the end of the
+/// road.
 const OTHERS_M: f64 = 15.0;
 const ROAD_M: f64 = 25.0;
-/// How far beside the way others matter, from the side of the vehicle, metres.
+/// How far beside the path agents are considered, from the side of the vehicle, metres.
 const BESIDE_M: f64 = 0.5;
 const PEOPLE_BESIDE_M: f64 = 3.0;
-/// How near an intersection is given way at, and how near those are who are given way, metres.
+/// Distance to an intersection within which vehicles give way, and distance of the agents they give
+/// way to, metres.
 const JUNCTION_M: f64 = 15.0;
 const CROSSING_M: f64 = 50.0;
-/// A little behind the front bumper still is ahead, metres: boxes are not exact.
+/// Tolerance behind the front bumper that still counts as ahead, metres: boxes are not exact.
 const BEHIND_M: f64 = 1.0;
-/// Signs that name no lane stand within so far of the way, metres.
+/// Stop signs without lanes apply within this distance of the path, metres.
 const SIGN_M: f64 = 10.0;
 
 impl Counter<'_> {
-    /// Whether a vehicle that stands from one frame to another has no reason.
+    /// Whether a vehicle that stands from one frame to another has no reason to.
     pub(super) fn is_free(&self, track: &Track, from: usize, until: usize) -> bool {
         let moments = [from, (from + until) / 2, until];
         moments.into_iter().all(|k| {
@@ -109,7 +111,7 @@ fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
     })
 }
 
-/// At an intersection, someone who moves another way and comes nearer.
+/// True if, at an intersection, an agent on another path approaches.
 fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
     let junction = |part: &Ahead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
     let crosses = |other: &&Agent| {

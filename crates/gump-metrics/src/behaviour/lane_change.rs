@@ -1,4 +1,4 @@
-//! Changes to the lane beside.
+//! Changes to an adjacent lane.
 
 use std::f64::consts::FRAC_PI_6;
 
@@ -9,15 +9,15 @@ use super::reach::{along, nearest};
 use super::track::Track;
 use super::{Class, Counter, Measure, vehicles};
 
-/// How often it is looked which lane a vehicle is on, seconds.
+/// Interval at which the lane of a vehicle is determined, seconds.
 const LOOK_S: f64 = 0.5;
-/// Looks that a lane must be held for, before and after the change: a second.
+/// Number of intervals for which a lane must be held before and after the change: a second.
 const HELD: usize = 2;
-/// A vehicle stays on its lane until it is so many lane widths beside the centre line.
+/// A vehicle stays on its lane until it is this many lane widths beside the centre line.
 const KEEP: f64 = 0.6;
-/// How far lanes beside one another are apart, metres.
+/// Distance of adjacent lanes, metres.
 const BESIDE_M: std::ops::RangeInclusive<f64> = 2.0..=6.0;
-/// Who gets less far than this changes no lane, metres.
+/// A vehicle that moves less than this does not change lanes, metres.
 const SHORT_M: f64 = 5.0;
 
 impl Counter<'_> {
@@ -74,7 +74,7 @@ fn nearest_lane(map: &MapGraph, pose: Pose) -> Option<&Lane> {
     (at.distance <= lane.width / 2.0).then_some(lane)
 }
 
-/// The lane itself or what leads on from it, whichever is nearest; `None` if the vehicle has left
+/// The lane itself or one of its successors, whichever is nearest; `None` if the vehicle has left
 /// all of them.
 fn follow<'a>(map: &'a MapGraph, lane: &'a Lane, pose: Pose) -> Option<&'a Lane> {
     let near = onward(map, lane).filter_map(|lane| {
@@ -85,7 +85,7 @@ fn follow<'a>(map: &'a MapGraph, lane: &'a Lane, pose: Pose) -> Option<&'a Lane>
     nearest.map(|(lane, _)| lane)
 }
 
-/// A lane, those after it, and those after them.
+/// A lane, its successors, and theirs.
 fn onward<'a>(map: &'a MapGraph, lane: &'a Lane) -> impl Iterator<Item = &'a Lane> {
     let next = map.successors(lane.id);
     let after = map
@@ -94,8 +94,8 @@ fn onward<'a>(map: &'a MapGraph, lane: &'a Lane) -> impl Iterator<Item = &'a Lan
     std::iter::once(lane).chain(next).chain(after)
 }
 
-/// True if a vehicle that is on `to` now is beside where `from` leads, so that it did not get there
-/// by driving on.
+/// True if a vehicle that is on `to` now is beside the successors of `from`, so that it did not get
+/// there by driving on.
 fn is_beside(map: &MapGraph, from: &Lane, to: &Lane, pose: Pose) -> bool {
     if from.in_intersection || to.in_intersection {
         return false;

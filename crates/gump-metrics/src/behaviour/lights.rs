@@ -1,4 +1,4 @@
-//! Lights that are passed at red, and lights that contradict one another.
+//! Red lights passed, and lights that contradict one another.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::FRAC_PI_4;
@@ -12,16 +12,16 @@ use super::track::{Take, Track};
 use super::{Class, Counter, Measure, vehicles};
 use crate::red_light::passes;
 
-/// Lines passed within so long of the first belong to one passage, seconds: the lanes that fork
+/// Lines passed within this time of the first belong to one passage, seconds: the lanes that fork
 /// from an approach have a line each.
 const ONE_PASSAGE_S: f64 = 1.0;
-/// After how long, or how far, it is looked which of them a vehicle followed: seconds, metres.
+/// The time, or distance, after which the followed lane is determined: seconds, metres.
 const FOLLOWED_S: f64 = 2.0;
 const FOLLOWED_M: f64 = 8.0;
-/// Metres that a radian between a vehicle and a lane counts for when the lane it follows is sought.
+/// Weight of a radian of difference in heading, in metres, when the followed lane is determined.
 const M_PER_RADIAN: f64 = 3.0;
 
-/// A light that rules a lane, frame by frame.
+/// A light that controls a lane, frame by frame.
 struct Gate<'a> {
     lane: &'a Lane,
     /// Middle of the stop line, heading along the lane.
@@ -29,7 +29,7 @@ struct Gate<'a> {
     states: Vec<Option<LightState>>,
 }
 
-/// A vehicle over a line.
+/// A vehicle that passes a line.
 struct Crossing<'a> {
     k: usize,
     gate: &'a Gate<'a>,
@@ -104,7 +104,7 @@ impl Counter<'_> {
         }
     }
 
-    /// Where a vehicle is once it can be told which lane it took.
+    /// Position of a vehicle at the time when its lane can be determined.
     fn followed_to(&self, track: &Track, k: usize) -> Option<Pose> {
         let from = track.pose(k)?;
         let later = (k..=k + self.take.steps(FOLLOWED_S)).filter_map(|k| track.pose(k));
@@ -140,7 +140,7 @@ impl Counter<'_> {
     }
 }
 
-/// All lights of a take that rule a lane of the map, by lane.
+/// All lights of a take that control a lane of the map, by lane.
 fn gates<'a>(map: &'a MapGraph, take: &Take<'_>) -> Vec<Gate<'a>> {
     let mut gates: BTreeMap<LaneId, Gate<'a>> = BTreeMap::new();
     for (k, frame) in take.frames.iter().enumerate() {
@@ -159,9 +159,9 @@ fn gates<'a>(map: &'a MapGraph, take: &Take<'_>) -> Vec<Gate<'a>> {
     gates.into_values().collect()
 }
 
-/// Pairs of lanes whose lights must not be green at once: their ways cross, and they come from
-/// roads that lie across one another. Who turns left before oncoming traffic gives way at green, so
-/// opposite roads do not count.
+/// Pairs of lanes whose lights must not be green at the same time: their paths cross, and they come
+/// from crossing roads. Left turns give way to oncoming traffic at green, so opposite roads do not
+/// count.
 pub(super) fn crossing(scenario: &Scenario) -> Vec<(LaneId, LaneId)> {
     let mut lights: BTreeMap<LaneId, &Light> = BTreeMap::new();
     for light in scenario.log.iter().flat_map(|frame| frame.lights()) {

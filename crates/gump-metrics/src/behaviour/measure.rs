@@ -1,32 +1,32 @@
-//! What is counted, of whom, and per what.
+//! Measures of behaviour: events, classes of agents, and denominators.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use gump_scene::{AgentId, AgentKind};
 
-/// What a driver would notice. The definitions are in the table of the [module](super).
+/// An event that a driver would notice. The definitions are in the table of the [module](super).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Measure {
-    /// A vehicle that stands for the whole log gets away from its place.
+    /// A vehicle that stands for the whole log moves away from its place.
     ParkedMove,
-    /// A vehicle stops where nothing asks it to.
+    /// A vehicle stops without a reason.
     FreeRoadStop,
     /// Two boxes overlap that did not in the present.
     NewOverlap,
-    /// A change of velocity that no tyre can give.
+    /// A change of velocity beyond the grip of tyres.
     HardAcceleration,
-    /// A vehicle slides sideways.
+    /// A vehicle slips sideways.
     Slip,
-    /// A stop line is passed at red.
+    /// A vehicle passes a stop line at red.
     RedLight,
-    /// A vehicle goes over to the lane beside its own.
+    /// A vehicle changes to an adjacent lane.
     LaneChange,
-    /// Who stood moves.
+    /// A standing vehicle starts.
     SetOff,
-    /// Who stands at a moment.
+    /// An agent stands at a given time.
     Standing,
-    /// Lights of crossing approaches are green at once.
+    /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
 }
 
@@ -61,12 +61,12 @@ impl Measure {
         }
     }
 
-    /// The measure of that name.
+    /// The measure with this name.
     pub fn of_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|measure| measure.name() == name)
     }
 
-    /// What its value is a number of events per.
+    /// The unit of its denominator.
     pub fn per(self) -> &'static str {
         match self {
             Self::ParkedMove => "parked vehicle",
@@ -84,7 +84,7 @@ impl Measure {
         self.per().starts_with("minute")
     }
 
-    /// True if the value depends on how far one looks, so that a log which ends sooner has none.
+    /// True if the value depends on the horizon, so that a shorter log has none.
     pub fn needs_whole_horizon(self) -> bool {
         matches!(self, Self::ParkedMove | Self::NewOverlap)
     }
@@ -96,16 +96,16 @@ impl fmt::Display for Measure {
     }
 }
 
-/// Of whom something is counted.
+/// A class of agents that events are counted for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Class {
-    /// Everyone.
+    /// All agents.
     All,
     /// Vehicles; of pairs those of two vehicles.
     Vehicle,
-    /// People on foot; of pairs those with at least one.
+    /// Pedestrians; of pairs those with at least one.
     Pedestrian,
-    /// Bicycles; of pairs those with one and without people on foot.
+    /// Bicycles; of pairs those with one and without pedestrians.
     Bicycle,
     /// Traffic lights.
     Light,
@@ -132,7 +132,7 @@ impl Class {
         }
     }
 
-    /// The class of that name.
+    /// The class with this name.
     pub fn of_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|class| class.name() == name)
     }
@@ -166,23 +166,23 @@ impl fmt::Display for Class {
     }
 }
 
-/// One line of a table.
+/// One row of a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Key {
-    /// What.
+    /// The measure.
     pub measure: Measure,
-    /// Of whom.
+    /// The class.
     pub class: Class,
-    /// At which second after the present for [`Measure::Standing`], else how far is looked.
+    /// For [`Measure::Standing`] the second after the present, otherwise the horizon.
     pub seconds: u32,
 }
 
-/// How often, and per how much.
+/// Events and their denominator.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Count {
     /// Events.
     pub events: f64,
-    /// What they are counted per, in the unit of [`Measure::per`].
+    /// The denominator, in the unit of [`Measure::per`].
     pub of: f64,
 }
 
@@ -193,12 +193,12 @@ impl Count {
     }
 }
 
-/// Counts by key. Those of several futures, scenarios or machines add up.
+/// Counts by key. Counts of several futures, scenarios or machines can be added.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Tally(pub BTreeMap<Key, Count>);
 
 impl Tally {
-    /// The count of a key; none is a count of nothing.
+    /// The count of a key; zero if there is none.
     pub fn count(&self, measure: Measure, class: Class, seconds: u32) -> Count {
         let key = Key {
             measure,
@@ -223,25 +223,25 @@ impl Tally {
     }
 }
 
-/// Something that happened in a future.
+/// An event in a future.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Incident {
-    /// What.
+    /// The measure.
     pub measure: Measure,
-    /// Who did it.
+    /// The agent.
     pub agent: AgentId,
-    /// With whom, of an overlap.
+    /// The other agent of an overlap.
     pub other: Option<AgentId>,
     /// Seconds after the present.
     pub at_s: f64,
 }
 
-/// What one future, or the log, shows.
+/// The events of one future or of the log.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Seen {
     /// The counts.
     pub tally: Tally,
-    /// What happened, by measure and agent. Who merely stands has done nothing.
+    /// Events by measure and agent. Standing is not an event.
     pub incidents: Vec<Incident>,
 }
 

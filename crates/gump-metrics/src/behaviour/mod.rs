@@ -1,7 +1,8 @@
-//! What a driver would notice in traffic, counted alike in futures and in the log.
+//! Events that a driver would notice in traffic, counted in the same way in futures and in the log.
 //!
-//! Realism asks how likely the log is under many futures. A parked car that pulls out in each of
-//! them costs little there: most of its steps still are likely. Here it is counted as what it is.
+//! Realism measures the likelihood of the log under many futures. A parked car that pulls out in
+//! each of them lowers it little, because most of its steps are still likely. Here it is counted as
+//! an event.
 //!
 //! | measure | event | per |
 //! |---|---|---|
@@ -16,17 +17,17 @@
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
 //!
-//! To *stand* and to *move* is to get less than 0.3 m, more than 1 m away from one's place within a
-//! second. Speeds are those of positions, never those that a tracker or a network states. Counted
-//! are agents that move by themselves and are there in the present; where agents come and leave,
-//! see [`Behaviour::with_newcomers`]. What ends before the horizon has no `parked_move` and no
+//! To *stand* is to move less than 0.3 m within a second, to *move* more than 1 m. Speeds are
+//! computed from positions, not from velocities that a tracker or a network states. Counted are
+//! moving kinds of agents that are in the present frame; where agents enter and leave, see
+//! [`Behaviour::with_newcomers`]. Futures that end before the horizon have no `parked_move` and no
 //! `new_overlap`, which grow with time.
 //!
-//! Lights rule lanes, not turns: turning right at red after a stop, where the law allows it, counts
-//! as a red light here. The log does it too, and that is why it stands beside.
+//! Lights control lanes, not turns: a legal right turn at red after a stop counts as a red light
+//! here. The same happens in the log, so values should be compared with the log's.
 //!
-//! Start with [`Behaviour`]. [`Conduct`] says which agents do such things, [`judge`] sets that
-//! beside realism.
+//! Start with [`Behaviour`]. [`Conduct`] lists the events by agent, and [`judge`] combines them
+//! with realism.
 //!
 //! ```
 //! use gump_metrics::behaviour::{Behaviour, Class, Measure};
@@ -64,27 +65,27 @@ pub use conduct::{Conduct, Deed, Judged, judge};
 pub use measure::{Class, Count, Incident, Key, Measure, Seen, Tally};
 use track::{Take, Track};
 
-/// Moments at which it is counted who stands, seconds after the present.
+/// Times at which standing agents are counted, seconds after the present.
 pub const MOMENTS: [u32; 8] = [2, 4, 8, 10, 20, 30, 40, 60];
 
-/// What is slower stands, m/s.
+/// An agent slower than this stands, m/s.
 const STANDS: f64 = 0.3;
-/// What is faster moves, m/s. Between the two nothing is decided.
+/// An agent faster than this moves, m/s. Between the two it neither stands nor moves.
 const MOVES: f64 = 1.0;
 
-/// Counts what the futures of one scenario show.
+/// Counts events in the futures of one scenario.
 pub struct Behaviour<'a> {
     scenario: &'a Scenario,
     horizon_s: u32,
     newcomers: bool,
     /// Vehicles that stand for the whole log.
     parked: BTreeSet<AgentId>,
-    /// Pairs of lanes with lights that must not be green at once.
+    /// Pairs of lanes with lights that must not be green at the same time.
     crossing: Vec<(LaneId, LaneId)>,
 }
 
 impl<'a> Behaviour<'a> {
-    /// Looks `horizon_s` seconds ahead from the present of `scenario`.
+    /// Examines `horizon_s` seconds from the present of `scenario`.
     pub fn new(scenario: &'a Scenario, horizon_s: u32) -> Self {
         Self {
             scenario,
@@ -95,8 +96,8 @@ impl<'a> Behaviour<'a> {
         }
     }
 
-    /// Counts also those who are not there in the present, in futures and in the log: for worlds in
-    /// which agents come and leave.
+    /// Also counts agents that are not in the present frame, in futures and in the log: for worlds
+    /// in which agents enter and leave.
     pub fn with_newcomers(self) -> Self {
         Self {
             newcomers: true,
@@ -104,17 +105,17 @@ impl<'a> Behaviour<'a> {
         }
     }
 
-    /// What the log shows; nothing if it ends with the present.
+    /// The events of the log; none if it ends with the present.
     pub fn log(&self) -> Seen {
         self.see(&Take::of_log(self.scenario, self.horizon_s.into()))
     }
 
-    /// What a future shows, which began in the present of the scenario.
+    /// The events of a future that starts in the present of the scenario.
     pub fn of(&self, rollout: &Rollout) -> Seen {
         self.see(&Take::of_rollout(rollout, self.horizon_s.into()))
     }
 
-    /// The counts of several futures added up.
+    /// The sum of the counts of several futures.
     pub fn tally(&self, rollouts: &[Rollout]) -> Tally {
         let seen: Vec<Tally> = rollouts.par_iter().map(|one| self.of(one).tally).collect();
         let mut sum = Tally::default();
@@ -177,7 +178,7 @@ impl Counter<'_> {
         self.seen.tally.add(key, Count { events, of });
     }
 
-    /// Notes that an agent did something at frame `k`.
+    /// Records an event of an agent at frame `k`.
     fn note(&mut self, measure: Measure, agent: AgentId, other: Option<AgentId>, k: usize) {
         self.seen.incidents.push(Incident {
             measure,
@@ -187,7 +188,7 @@ impl Counter<'_> {
         });
     }
 
-    /// Minutes of so many frames.
+    /// This number of frames in minutes.
     fn minutes(&self, frames: usize) -> f64 {
         frames as f64 * self.take.dt / 60.0
     }

@@ -1,11 +1,11 @@
-//! Boxes that come to overlap.
+//! New overlaps of boxes.
 
 use gump_geometry::{DVec2, Pose};
 
 use super::track::Track;
 use super::{Class, Counter, Measure, STANDS};
 
-/// Shallower overlaps do not count, metres: that is within what trackers are off.
+/// Shallower overlaps do not count, metres: they are within tracker errors.
 const DEEP_M: f64 = 0.1;
 
 impl Counter<'_> {
@@ -44,8 +44,8 @@ impl Counter<'_> {
         }
     }
 
-    /// Whoever moved did it: nobody drives into others while standing. Both if both stood, as when
-    /// boxes turn on the spot.
+    /// The agents at fault: those that moved, or both if both stood, as when boxes turn on the
+    /// spot.
     fn blame(&mut self, a: &Track, b: &Track, k: usize) {
         let moved = |track: &Track| track.pace(k).is_none_or(|pace| pace >= STANDS);
         let both = moved(a) == moved(b);
@@ -57,7 +57,7 @@ impl Counter<'_> {
         }
     }
 
-    /// The first frame ahead at which two overlap who do not in the present.
+    /// The first frame after the present at which two agents overlap that do not in the present.
     fn new_overlap(&self, a: &Track, b: &Track, reach: f64) -> Option<usize> {
         let now = self.take.now;
         let at_present = a.oriented_box(now).zip(b.oriented_box(now));
@@ -81,7 +81,7 @@ impl Counter<'_> {
     }
 }
 
-/// True if what two span is farther apart than `reach`.
+/// True if the areas spanned by two tracks are farther apart than `reach`.
 fn is_apart(one: (DVec2, DVec2), other: (DVec2, DVec2), reach: f64) -> bool {
     let gap = (other.0 - one.1).max(one.0 - other.1);
     gap.max_element() > reach

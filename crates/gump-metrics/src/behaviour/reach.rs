@@ -3,7 +3,7 @@
 use gump_geometry::{Pose, Projection, angle_difference};
 use gump_scene::{Lane, LaneKind, MapGraph};
 
-/// Where `pose` is on a lane, if it points along it within `turn` radians.
+/// Position of `pose` on a lane, if it points along it within `turn` radians.
 pub(crate) fn along(lane: &Lane, pose: Pose, turn: f64) -> Option<Projection> {
     let found = lane.centerline.project(pose.position);
     let heading = lane.centerline.pose_at(found.arc_length).heading;
@@ -23,15 +23,15 @@ pub(crate) fn nearest(
         .find_map(|(lane, _)| Some((lane, along(lane, pose, turn)?)))
 }
 
-/// A lane that a vehicle may come to.
+/// A lane that a vehicle may reach.
 pub(crate) struct Ahead<'a> {
     pub(crate) lane: &'a Lane,
     /// Metres from the vehicle to the start of the lane, below 0 for the lane it is on.
     pub(crate) base_m: f64,
 }
 
-/// The lane a vehicle is on, `arc_m` metres from its start, all that lead on from there within
-/// `metres`, and whether any of them reaches as far.
+/// The lane of a vehicle, `arc_m` metres from its start, all its successors within `metres`, and
+/// whether any of them reaches that far.
 pub(crate) fn ahead<'a>(
     map: &'a MapGraph,
     lane: &'a Lane,

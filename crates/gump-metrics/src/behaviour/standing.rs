@@ -1,4 +1,4 @@
-//! Who stands, who sets off, who stops.
+//! Standing, starting and stopping.
 
 use std::collections::BTreeSet;
 
@@ -8,16 +8,16 @@ use super::{Class, Counter, Key, MOMENTS, MOVES, Measure, STANDS, vehicles};
 use crate::behaviour::Count;
 use crate::behaviour::track::Track;
 
-/// What a tracker's box may wander while the vehicle stands, metres.
+/// Tolerance for the jitter of a standing vehicle's box, metres.
 const DRIFT_M: f64 = 0.5;
-/// Farther from its place a parked vehicle has moved, metres.
+/// A parked vehicle farther than this from its place has moved, metres.
 const AWAY_M: f64 = 2.0;
-/// How much of the log a parked vehicle must be seen in.
+/// Share of the log in which a parked vehicle must be observed.
 const SEEN_SHARE: f64 = 0.5;
-/// How long one stands after [`Track::pace`] says so for the first time, seconds, until it is a stop.
+/// Duration of standing, after [`Track::pace`] first shows it, that makes a stop, seconds.
 const STOP_S: f64 = 1.0;
 
-/// Vehicles of the present that stand for the whole log, as far as it sees them.
+/// Vehicles of the present that stand for the whole log, as far as they are observed.
 pub(super) fn parked(scenario: &Scenario) -> BTreeSet<AgentId> {
     let n_seen = |agent: &Agent| {
         let mut n = 0;
@@ -41,15 +41,15 @@ pub(super) fn parked(scenario: &Scenario) -> BTreeSet<AgentId> {
         .collect()
 }
 
-/// What a walk over the paces of a track finds.
+/// Starts and stops of a track.
 #[derive(Default)]
 struct Walk {
-    /// Frames ahead in which it is known how fast it goes, and in which it moves.
+    /// Number of later frames with a known speed, and of those in which it moves.
     known: usize,
     moving: usize,
-    /// Frames at which it sets off.
+    /// Frames at which it starts.
     starts: Vec<usize>,
-    /// Frames at which it comes to stand, and those at which that is a stop.
+    /// Frames at which it begins to stand, and those at which that counts as a stop.
     stops: Vec<(usize, usize)>,
 }
 

@@ -1,14 +1,14 @@
-//! Frames around the present as one row of poses per agent.
+//! Frames around the present as one series of poses per agent.
 
 use std::collections::BTreeSet;
 
 use gump_geometry::{DVec2, OrientedBox, Pose};
 use gump_scene::{AgentId, AgentKind, Frame, Rollout, Scenario};
 
-/// How much of the past is looked at, seconds: enough to know who moves in the present.
+/// Length of the past that is used, seconds: enough to tell who moves in the present.
 const PAST_S: f64 = 2.0;
-/// Over how long it is measured how fast somebody goes, seconds: a tracker's jitter of 10 cm then
-/// is 0.1 m/s, and who stands is told from who creeps.
+/// Time over which speed is measured, seconds: a tracker's jitter of 10 cm then is 0.1 m/s, which
+/// separates standing from slow agents.
 const PACE_S: f64 = 1.0;
 
 /// The log or a future, from [`PAST_S`] before the present to the horizon.
@@ -51,7 +51,7 @@ impl<'a> Take<'a> {
         }
     }
 
-    /// Frames in so many seconds, at least one.
+    /// This many seconds in frames, at least one.
     pub(super) fn steps(&self, seconds: f64) -> usize {
         ((seconds / self.dt).round() as usize).max(1)
     }
@@ -66,8 +66,8 @@ impl<'a> Take<'a> {
         (k as f64 - self.now as f64) * self.dt
     }
 
-    /// One track per agent that moves by itself and is there in the present, with `newcomers` also
-    /// of those who come later; by id.
+    /// One track per moving kind of agent in the present frame, with `newcomers` also of those that
+    /// appear later; by id.
     pub(super) fn tracks(&self, newcomers: bool) -> Vec<Track> {
         let n_counted = if newcomers { usize::MAX } else { 1 };
         let cast: BTreeSet<AgentId> = self.frames[self.now..]
@@ -108,11 +108,11 @@ impl<'a> Take<'a> {
     }
 }
 
-/// One agent over the frames of a [`Take`]; `None` where it is not there.
+/// One agent over the frames of a [`Take`]; `None` where it is absent.
 pub(super) struct Track {
     pub(super) id: AgentId,
     pub(super) kind: AgentKind,
-    /// Metres, of the present.
+    /// Extent in metres, of the present.
     pub(super) length: f64,
     pub(super) width: f64,
     pub(super) poses: Vec<Option<Pose>>,
@@ -121,7 +121,7 @@ pub(super) struct Track {
 }
 
 impl Track {
-    /// Where it is at a frame.
+    /// Its pose at a frame.
     pub(super) fn pose(&self, k: usize) -> Option<Pose> {
         self.poses.get(k).copied().flatten()
     }
@@ -135,15 +135,14 @@ impl Track {
         })
     }
 
-    /// Mean velocity from `reach` frames before to as many after frame `k`, m/s. Of positions, since
-    /// velocities that a tracker or a network states need not fit them.
+    /// Mean velocity from `reach` frames before to as many after frame `k`, m/s. Computed from
+    /// positions, since stated velocities may not agree with them.
     pub(super) fn velocity(&self, k: usize, reach: usize) -> Option<DVec2> {
         let (before, after) = (self.pose(k.checked_sub(reach)?)?, self.pose(k + reach)?);
         Some((after.position - before.position) / (2.0 * reach as f64 * self.dt))
     }
 
-    /// How fast it went over the last second, by the distance between where it was then and where
-    /// it is now, m/s.
+    /// Speed over the last second, from the distance between then and now, m/s.
     pub(super) fn pace(&self, k: usize) -> Option<f64> {
         let before = self.pose(k.checked_sub(self.pace_steps)?)?;
         let moved = self.pose(k)?.position.distance(before.position);
@@ -155,7 +154,7 @@ impl Track {
         self.pace_steps
     }
 
-    /// The corners of what its positions span; `None` if it is never there.
+    /// The bounding box of its positions; `None` if it is never present.
     pub(super) fn bounds(&self) -> Option<(DVec2, DVec2)> {
         let mut positions = self.poses.iter().flatten().map(|pose| pose.position);
         let first = positions.next()?;

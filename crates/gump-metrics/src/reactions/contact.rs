@@ -1,4 +1,4 @@
-//! Who comes into contact with the ego, and who is to blame.
+//! Contacts with the ego, and fault.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::FRAC_PI_6;
@@ -10,16 +10,16 @@ use super::Attempt;
 use crate::behaviour::reach;
 use crate::encounter::classify;
 
-/// Shallower overlaps do not count, metres: that is within what trackers are off.
+/// Shallower overlaps do not count, metres: they are within tracker errors.
 const DEEP_M: f64 = 0.1;
-/// Who is slower stands, and runs into nobody, m/s: a tracker's jitter is as much.
+/// An agent slower than this stands and runs into nobody, m/s: trackers have as much jitter.
 const STANDS: f64 = 0.3;
-/// An ego keeps its lane up to here beside the centre line, metres: a car of 2 m then still is on
-/// a lane of usual width.
+/// The ego keeps its lane within this distance of the centre line, metres: a car of 2 m is then
+/// still on a lane of usual width.
 const KEEPS_M: f64 = 0.9;
-/// Boxes farther above one another do not meet, metres: a bridge is higher.
+/// Boxes farther above one another do not meet, metres: bridges are higher.
 const ABOVE_M: f64 = 3.0;
-/// How far the rear axle of a car is behind its middle, of its length.
+/// Distance of a car's rear axle behind its centre, as a share of its length.
 ///
 /// Source: 1.46 m of 5.18 m, nuPlan's Pacifica.
 const AXLE: f64 = 0.28;
@@ -27,33 +27,33 @@ const AXLE: f64 = 0.28;
 /// A first contact.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// The other.
+    /// The other agent.
     pub agent: AgentId,
-    /// When the boxes came to overlap, seconds after the present.
+    /// When the boxes began to overlap, seconds after the present.
     pub at_s: f64,
 }
 
-/// What became of a future.
+/// The contacts of a future.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcome {
-    /// Agents near that ran into the ego, in order of time.
+    /// Near agents that ran into the ego, in order of time.
     pub run_into_ego: Vec<Contact>,
     /// The same of agents that were not near.
     pub others: Vec<Contact>,
-    /// Whom the ego ran into; nothing after it is counted.
+    /// The agent that the ego ran into; later contacts are not counted.
     pub ego_runs_into: Option<Contact>,
 }
 
-/// Who is to blame for a contact.
+/// The agent at fault for a contact.
 enum Blame {
     Other,
     Ego,
-    /// Neither moves, as where a tracker's boxes grow.
+    /// Neither moves, for instance where a tracker's boxes grow.
     Nobody,
 }
 
 impl Attempt<'_> {
-    /// Looks through frames from the one after the present; the ego is where the plan says.
+    /// Examines frames from the one after the present; the ego follows the plan.
     pub(super) fn judge(&self, frames: &[Frame]) -> Outcome {
         let mut outcome = Outcome::default();
         let Some(ego) = self.scenario.log[self.scenario.now].agent(self.scenario.ego) else {
@@ -89,13 +89,13 @@ impl Attempt<'_> {
         outcome
     }
 
-    /// Who overlaps the ego in the present.
+    /// Agents that overlap the ego in the present.
     fn touching(&self, ego: &Agent) -> BTreeSet<AgentId> {
         let present = &self.scenario.log[self.scenario.now];
         crate::overlapping(present, ego).collect()
     }
 
-    /// The ego as it is driven, as high as the world has it.
+    /// The ego in its planned state, at its height in the world.
     fn ego_in(&self, frame: &Frame, ego: &Agent, k: usize) -> Agent {
         let known = frame.agent(ego.id).unwrap_or(ego);
         Agent {

@@ -1,4 +1,4 @@
-//! How the ego leaves its log.
+//! Manoeuvres with which the ego leaves its log.
 
 use std::f64::consts::FRAC_PI_6;
 
@@ -10,34 +10,34 @@ use super::{Reactions, Reason};
 use crate::behaviour::reach;
 use crate::red_light::passes;
 
-/// Who is slower has nothing to change, m/s.
+/// An ego slower than this cannot perform a change of speed, m/s.
 const DRIVES: f64 = 3.0;
 /// A comfortable to firm braking and an emergency, m/s².
 const BRAKES: f64 = 3.0;
 const STOPS: f64 = 6.0;
-/// A brisk acceleration, m/s², and by how much the ego gets faster, m/s.
+/// A brisk acceleration, m/s², and the increase in speed, m/s.
 const GAINS: f64 = 2.0;
 const FASTER: f64 = 5.0;
-/// Who runs a light goes at least as fast at last, m/s.
+/// The minimum final speed of an ego that runs a light, m/s.
 const RUNS: f64 = 8.0;
-/// A log that is slower at some time has stopped, m/s.
+/// A log whose speed falls below this has stopped, m/s.
 const HAS_STOPPED: f64 = 0.5;
-/// Who is slower would turn by more than 24 degrees to change lane in time, m/s.
+/// A slower ego would have to turn by more than 24 degrees to change lane in time, m/s.
 const CHANGES: f64 = 5.0;
-/// How long a lane change takes, seconds.
+/// Duration of a lane change, seconds.
 const CHANGE_S: f64 = 3.0;
-/// How far lanes beside one another are apart, metres.
+/// Distance of adjacent lanes, metres.
 const BESIDE_M: std::ops::RangeInclusive<f64> = 2.0..=6.0;
-/// How far from its lane's centre line an ego starts to change, metres.
+/// Maximum distance of the ego from its lane's centre line at the start of a change, metres.
 const ON_LANE_M: f64 = 2.5;
-/// Room that a lane change asks for before and behind the ego, metres, and for how much of
-/// the difference in speed behind it, seconds: nobody is to be there before the change is over.
+/// Free space that a lane change needs before and behind the ego, metres, and additional space
+/// behind it per difference in speed, seconds: it must be free until the change is complete.
 const ROOM_M: f64 = 2.0;
 const ROOM_S: f64 = CHANGE_S;
-/// Below so many metres between two frames a motion has no direction.
+/// A motion shorter than this between two frames has no direction, metres.
 const STILL_M: f64 = 0.02;
 
-/// What the ego does.
+/// A manoeuvre of the ego.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Manoeuvre {
     /// Follows its log.
@@ -48,14 +48,14 @@ pub enum Manoeuvre {
     Stop,
     /// Drives faster.
     SpeedUp,
-    /// Goes over to a lane beside.
+    /// Changes to an adjacent lane.
     ChangeLane,
     /// Drives past a red light at which its log stopped.
     RunLight,
 }
 
 impl Manoeuvre {
-    /// All, the control first.
+    /// All, with the control first.
     pub const ALL: [Self; 6] = [
         Self::Log,
         Self::Brake,
@@ -77,25 +77,25 @@ impl Manoeuvre {
         }
     }
 
-    /// The manoeuvre of this name.
+    /// The manoeuvre with this name.
     pub fn of_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|one| one.name() == name)
     }
 }
 
-/// A speed that changes evenly up to a bound.
+/// A speed that changes linearly up to a bound.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Profile {
     /// At the start, m/s.
     pub(super) from: f64,
-    /// At last, m/s.
+    /// At the end, m/s.
     pub(super) to: f64,
-    /// How fast it gets there, m/s², > 0.
+    /// Rate of change, m/s², > 0.
     pub(super) rate: f64,
 }
 
 impl Profile {
-    /// Metres driven after so many seconds.
+    /// Distance driven after this many seconds, metres.
     pub(super) fn metres_after(self, seconds: f64) -> f64 {
         let changing = ((self.to - self.from).abs() / self.rate).min(seconds);
         let rate = self.rate.copysign(self.to - self.from);
@@ -105,7 +105,7 @@ impl Profile {
 }
 
 impl Reactions<'_> {
-    /// Where the ego is driven, from the present to the horizon.
+    /// The states of the ego from the present to the horizon.
     pub(super) fn plan(&self, manoeuvre: Manoeuvre) -> Result<Vec<AgentState>, Reason> {
         let speed = self.speed();
         let is_of_drivers = !matches!(manoeuvre, Manoeuvre::Log | Manoeuvre::RunLight);
@@ -135,7 +135,7 @@ impl Reactions<'_> {
         }
     }
 
-    /// How fast the ego drives ahead in the present, m/s.
+    /// Forward speed of the ego in the present, m/s.
     fn speed(&self) -> f64 {
         let now = self.logged[0];
         now.velocity.dot(now.pose.direction()).max(0.0)
@@ -146,7 +146,7 @@ impl Reactions<'_> {
         k as f64 * self.scenario.dt
     }
 
-    /// Along the way of the log at another speed.
+    /// Along the path of the log at another speed.
     fn along(&self, profile: Profile) -> Result<Vec<AgentState>, Reason> {
         let metres = |k: usize| profile.metres_after(self.at_s(k));
         // The horizon and a little: past the last point a way goes straight on.
@@ -174,7 +174,7 @@ impl Reactions<'_> {
         states.collect()
     }
 
-    /// True if the ego passes a line that is red now and then, and its log stops before it.
+    /// True if the ego passes a line that is red at that time, and its log stops before it.
     fn runs_light(&self, plan: &[AgentState]) -> bool {
         let ahead = &self.scenario.log[self.scenario.now..];
         let crossed = |states: &[AgentState], line: Pose, width: f64| {
@@ -198,7 +198,7 @@ impl Reactions<'_> {
             })
     }
 
-    /// Over to the lane beside, left before right, with the speed of the log.
+    /// To the adjacent lane, left before right, at the speed of the log.
     fn change_lane(&self) -> Result<Vec<AgentState>, Reason> {
         let (map, start) = (&self.scenario.map, self.logged[0].pose);
         let driven: f64 = self.driven_until(self.steps(CHANGE_S).min(self.n));
@@ -228,7 +228,7 @@ impl Reactions<'_> {
         (seconds / self.scenario.dt).round() as usize
     }
 
-    /// Metres that the log drives until frame `k`.
+    /// Distance that the log drives until frame `k`, metres.
     fn driven_until(&self, k: usize) -> f64 {
         let pairs = self.logged[..=k].windows(2);
         pairs
@@ -236,7 +236,8 @@ impl Reactions<'_> {
             .sum()
     }
 
-    /// Over to a lane within [`CHANGE_S`] and on along it; `None` if it is not beside the way of the log so long.
+    /// To a lane within [`CHANGE_S`] and along it; `None` if it does not run beside the path of the
+    /// log for that long.
     fn over_to(&self, map: &MapGraph, there: &Lane) -> Option<Vec<Pose>> {
         let start = there.centerline.project(self.logged[0].pose.position);
         let metres = start.arc_length + self.driven_until(self.n) + 1.0;
@@ -261,7 +262,7 @@ impl Reactions<'_> {
         Some(headed(&positions, self.logged[0].pose.heading))
     }
 
-    /// True if nobody is on the lane beside where the ego is to go.
+    /// True if the target positions on the adjacent lane are free.
     fn has_room(&self, there: &Lane) -> bool {
         let present = &self.scenario.log[self.scenario.now];
         let Some(ego) = present.agent(self.scenario.ego) else {
@@ -272,7 +273,7 @@ impl Reactions<'_> {
     }
 }
 
-/// True if another is beside the ego on a line, or comes up from behind within [`ROOM_S`].
+/// True if another agent is beside the ego on a line, or approaches from behind within [`ROOM_S`].
 fn is_in_gap(line: &Polyline, ego: &Agent, other: &Agent) -> bool {
     let foot = line.pose_at(line.project(ego.state.pose.position).arc_length);
     let closing = other.state.velocity.dot(foot.direction()) - ego.state.speed();
@@ -286,7 +287,8 @@ fn is_in_gap(line: &Polyline, ego: &Agent, other: &Agent) -> bool {
     gap.overlaps(&other.oriented_box())
 }
 
-/// Poses of these positions that point where they go, and at the start as given.
+/// Poses at these positions that point in the direction of motion, with the given heading at the
+/// start.
 fn headed(positions: &[DVec2], start: f64) -> Vec<Pose> {
     let mut heading = start;
     let last = positions.len() - 1;

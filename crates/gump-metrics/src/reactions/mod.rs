@@ -1,8 +1,8 @@
-//! Who runs into an ego that leaves its log.
+//! Reactions of traffic to an ego that leaves its log.
 //!
 //! The ego brakes, stops, speeds up, changes lane or runs the light where its log did none of that.
-//! Recorded traffic does not notice and drives through it; traffic that reacts makes room. The rate
-//! says how much a world reacts, for whoever wants to test a planner in it.
+//! Recorded traffic does not react and drives through it; reactive traffic makes room. The rate
+//! measures how well a world reacts, for users who want to test a planner in it.
 //!
 //! | manoeuvre | the ego | where |
 //! |---|---|---|
@@ -13,30 +13,32 @@
 //! | `change-lane` | drives as fast as in its log, within 3 s over to the lane beside, left before right, and on along it | it drives faster than 5 m/s, now and on average over the change, the lane graph has a lane beside outside of intersections, and nobody is there, nor would be before the change is over: from 2 m and three seconds of the difference in speed behind its box to 2 m before it |
 //! | `run-light` | keeps its speed, gaining 2 m/s² up to 8 m/s if it is slower, past a stop line that is red in the present and in the log of that moment | its log stands at some time (below 0.5 m/s) and does not pass that line |
 //!
-//! **The way.** All but `log` and `change-lane` drive along the positions of the log, with its
-//! headings, by the changed speed; where the log ends they go on along the lane graph, at forks
-//! the straightest way, and straight on where there is none. Velocities are those of the positions.
+//! **Path.** All manoeuvres except `log` and `change-lane` drive along the positions of the log,
+//! with its headings, at the changed speed. Where the log ends they continue along the lane graph,
+//! at forks on the straightest lane, and straight on where there is none. Velocities are computed
+//! from positions.
 //!
-//! **Near** is an agent that moves by itself, is there and does not overlap the ego in the present,
-//! gets more than 1 m from its place in the log and comes in it within 2 m of a place (box to box)
-//! that the ego of the manoeuvre takes, not more than 1 s before it and not more than 3 s after
-//! it. Rates are per such agent: they are chosen from the log and the manoeuvre alone, so they
-//! are the same for every world.
+//! **Near** is an agent of a moving kind that is present and does not overlap the ego in the
+//! present, moves more than 1 m from its place in the log, and in the log comes within 2 m (box to
+//! box) of a place that the ego of the manoeuvre occupies, at most 1 s before and at most 3 s after
+//! it. Rates are per near agent. Near agents are chosen from the log and the manoeuvre only, so
+//! they are the same for every world.
 //!
-//! **Runs into the ego** who comes to overlap its box by more than 0.1 m, at any frame, and is to
-//! blame. Whose fault it is, is nuPlan's rule ([`crate::encounter`]), judged where the overlap begins: the
-//! ego's if its front bumper hits the other or the other stands (below 0.3 m/s), and if they meet
-//! side to side while the ego does not keep its lane (its middle within 0.9 m of the centre line of
-//! a lane that points its way, within 30 degrees; where there are no lanes it does); else the
-//! other's: from behind, into its side, or into an ego that stands. Boxes more than 3 m above one
-//! another do not meet. Each agent counts once, by its first contact. Once the ego itself ran into
-//! somebody, a future is over: the way it drives on then is nobody's to react to.
+//! **To run into the ego** is to begin to overlap its box by more than 0.1 m, at any frame, and to
+//! be at fault. Fault follows nuPlan's rule ([`crate::encounter`]), evaluated where the overlap
+//! begins. The ego is at fault if its front bumper hits the other or the other stands (below 0.3
+//! m/s), and in side contacts if the ego does not keep its lane (its centre within 0.9 m of the
+//! centre line of a lane with its direction, within 30 degrees; without lanes it counts as keeping
+//! it). Otherwise the other is at fault: from behind, into the ego's side, or into a standing ego.
+//! Boxes more than 3 m above one another do not meet. Each agent counts once, by its first contact.
+//! A future ends when the ego itself runs into an agent.
 //!
-//! **Not scored** is a manoeuvre ([`Reason`]) that asks for what is not there, that does not leave
-//! its log by 3 m, in which nobody is near, and in which the ego is the first to run into somebody
-//! of the log: no driver does that.
+//! A manoeuvre is **not scored** ([`Reason`]) if the scene does not offer what it needs, if it
+//! stays within 3 m of the log, if no agent is near, or if the ego would be the first to run into
+//! an agent that follows its log.
 //!
-//! Start with [`Reactions`]. Nothing here steps a world: [`Attempt::plan`] says where the ego is to be driven.
+//! Start with [`Reactions`]. The module does not step a world: [`Attempt::plan`] gives the states
+//! of the ego to simulate.
 //!
 //! ```
 //! use gump_metrics::reactions::{Manoeuvre, Reactions};
@@ -69,7 +71,7 @@ pub use manoeuvre::Manoeuvre;
 /// A manoeuvre that stays nearer to the log than this does not leave it, metres.
 const LEAVES_M: f64 = 3.0;
 
-/// Why a scenario says nothing about reactions.
+/// Why a scenario cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Unfit {
     /// The log ends before the horizon.
@@ -77,10 +79,10 @@ pub enum Unfit {
     TooShort {
         /// Seconds of log after the present.
         found: f64,
-        /// Seconds asked for.
+        /// Seconds required.
         needed: f64,
     },
-    /// Where the ego is, is not known all the time.
+    /// The ego is not observed all the time.
     #[error("expected the ego in every frame of the log, not found {at:.1} s after the present")]
     EgoLost {
         /// The first moment without it, seconds after the present.
@@ -91,19 +93,19 @@ pub enum Unfit {
 /// Why a manoeuvre is not scored in a scenario.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Reason {
-    /// The ego is slower than the manoeuvre asks for.
+    /// The ego is too slow for the manoeuvre.
     TooSlow,
-    /// No lane runs beside the ego's.
+    /// There is no lane beside the ego's.
     NoLane,
-    /// Somebody is on the lane beside.
+    /// The lane beside is occupied.
     NoRoom,
     /// No red light ahead at which the log stopped.
     NoLight,
-    /// The log does much the same.
+    /// The log does almost the same.
     LikeLog,
-    /// The ego itself would be the first to run into somebody of the log.
+    /// The ego would be the first to run into an agent that follows its log.
     OwnFault,
-    /// Nobody is near.
+    /// No agent is near.
     Nobody,
 }
 
@@ -143,7 +145,7 @@ pub struct Reactions<'a> {
 }
 
 impl<'a> Reactions<'a> {
-    /// Looks `seconds` ahead from the present of `scenario`.
+    /// Examines `seconds` from the present of `scenario`.
     ///
     /// # Errors
     /// [`Unfit`] if the log is shorter, or the ego is not in all of it.
@@ -199,7 +201,7 @@ impl<'a> Reactions<'a> {
     }
 }
 
-/// A manoeuvre that can be driven, and whom it concerns.
+/// A manoeuvre that can be driven, and the agents near it.
 pub struct Attempt<'a> {
     scenario: &'a Scenario,
     /// From the present, `dt` apart.
@@ -210,24 +212,24 @@ pub struct Attempt<'a> {
 }
 
 impl Attempt<'_> {
-    /// Where the ego is driven: box-centre states in the world frame from the present, included, to
-    /// the horizon, as far apart as the frames of the scenario.
+    /// The states of the ego: box-centre states in the world frame from the present, included, to
+    /// the horizon, at the time step of the scenario.
     pub fn plan(&self) -> &[AgentState] {
         &self.plan
     }
 
-    /// Agents whose reaction is asked for, by id; never empty.
+    /// The near agents, by id; never empty.
     pub fn near(&self) -> &[AgentId] {
         &self.near
     }
 
-    /// What happened in a future in which the ego was driven like that, from the present of the
-    /// scenario and at its rate; frames past the horizon do not count.
+    /// The contacts in a future in which the ego was driven by the plan, from the present of the
+    /// scenario and at its time step; frames past the horizon do not count.
     pub fn outcome(&self, rollout: &Rollout) -> Outcome {
         self.judge(rollout.imagined())
     }
 
-    /// What happens where the others follow their logs.
+    /// The contacts where the other agents follow their logs.
     pub fn replayed(&self) -> Outcome {
         self.judge(self.scenario.future())
     }

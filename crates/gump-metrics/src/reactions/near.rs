@@ -1,17 +1,17 @@
-//! Whom a manoeuvre concerns.
+//! The agents near a manoeuvre.
 
 use gump_geometry::OrientedBox;
 use gump_scene::{Agent, AgentId, AgentState, Scenario};
 
-/// Who gets less far from its place in the log stands, metres.
+/// An agent that moves less than this from its place in the log stands, metres.
 const MOVES_M: f64 = 1.0;
-/// How near, box to box, an agent comes to a place that the ego takes, metres.
+/// Maximum distance, box to box, of an agent from a place that the ego occupies, metres.
 const NEAR_M: f64 = 2.0;
-/// How long before and after the ego it may be there, seconds.
+/// Time window before and after the ego in which the agent may be there, seconds.
 const BEFORE_S: f64 = 1.0;
 const AFTER_S: f64 = 3.0;
 
-/// Agents that in the log come to where the ego is, by id; `plan` starts in the present.
+/// Agents whose log comes near the ego's plan, by id; `plan` starts in the present.
 pub(super) fn near(scenario: &Scenario, plan: &[AgentState]) -> Vec<AgentId> {
     let ahead = &scenario.log[scenario.now..];
     let present = &ahead[0];
@@ -44,8 +44,8 @@ fn moves(agent: &Agent, track: &[Option<&Agent>]) -> bool {
     seen.any(|later| later.state.pose.position.distance(from) > MOVES_M)
 }
 
-/// True if the boxes of a track come near those of the ego at about the same time; of the extent of
-/// the present, for a tracker's changes from frame to frame.
+/// True if the boxes of a track come near those of the ego at about the same time; with the extent
+/// of the present, since a tracker's changes from frame to frame.
 fn comes_near(own: &[OrientedBox], agent: &Agent, track: &[Option<&Agent>], dt: f64) -> bool {
     let steps = |seconds: f64| (seconds / dt).round() as usize;
     let reach = NEAR_M + (agent.length + agent.width + own[0].length + own[0].width) / 2.0;

@@ -1,4 +1,4 @@
-//! The way of the ego: along its log, then along the lanes.
+//! The path of the ego: along its log, then along the lanes.
 
 use std::f64::consts::FRAC_PI_6;
 
@@ -7,20 +7,20 @@ use gump_scene::{AgentState, Lane, MapGraph};
 
 use crate::behaviour::reach;
 
-/// Positions of the log nearer than this to the last that counts add nothing but jitter, metres.
+/// Positions of the log nearer than this to the last one used are jitter, metres.
 const SPACING_M: f64 = 0.5;
-/// Farther than this beside a lane the way does not go on along it, metres.
+/// A lane farther than this beside the path does not continue it, metres.
 const ON_LANE_M: f64 = 2.5;
-/// Over so many metres the way comes over from where the log ends to the centre line.
+/// Distance over which the path moves from the end of the log to the centre line, metres.
 const JOIN_M: f64 = 15.0;
-/// Between the points of a way along lanes, metres.
+/// Spacing of points along lanes, metres.
 const STEP_M: f64 = 1.0;
-/// How far into a lane is looked for the way it leads, metres.
+/// Distance into a lane over which its direction is determined, metres.
 const LOOK_M: f64 = 10.0;
 /// More lanes than this in a row are a loop of lanes without length.
 const MOST_LANES: usize = 100;
 
-/// A way with a heading everywhere; straight on past its end.
+/// A path with a heading everywhere; straight on past its end.
 pub(super) struct Path {
     line: Polyline,
     /// Of each point of the line, radians.
@@ -28,7 +28,8 @@ pub(super) struct Path {
 }
 
 impl Path {
-    /// The way of the log, which starts in the present and may stand, and on for at least `metres` in all.
+    /// The path of the log, which starts in the present and may stand, extended to at least
+    /// `metres` in all.
     pub(super) fn of_log(logged: &[AgentState], map: &MapGraph, metres: f64) -> Option<Self> {
         let mut poses: Vec<Pose> = Vec::with_capacity(logged.len());
         for state in logged {
@@ -54,7 +55,7 @@ impl Path {
         Some(Self { line, headings })
     }
 
-    /// Where the way is after so many metres, and how it points there.
+    /// The pose on the path after this many metres.
     pub(super) fn pose_at(&self, metres: f64) -> Pose {
         let lengths = self.line.arc_lengths();
         let Pose { position, heading } = self.line.pose_at(metres);
@@ -79,8 +80,8 @@ impl Path {
     }
 }
 
-/// On from a pose along the lane under it and those after it, for so many metres, itself excluded;
-/// straight on where there are none.
+/// The continuation from a pose along the lane under it and its successors, for this many metres,
+/// without the pose itself; straight on where there are no lanes.
 fn onward(map: &MapGraph, from: Pose, metres: f64) -> Vec<Pose> {
     let straight = || {
         let position = from.position + from.direction() * metres;
@@ -105,8 +106,8 @@ fn onward(map: &MapGraph, from: Pose, metres: f64) -> Vec<Pose> {
     poses.collect()
 }
 
-/// A lane and those after it, at forks the straightest, from its start for at least `metres` if the
-/// road is as long; `None` for lanes without length.
+/// A lane and its successors, at forks the straightest, from its start for at least `metres` if the
+/// road is that long; `None` for lanes without length.
 pub(super) fn chain(map: &MapGraph, lane: &Lane, metres: f64) -> Option<Polyline> {
     let mut points: Vec<DVec2> = lane.centerline.points().to_vec();
     let (mut length, mut last) = (lane.centerline.length(), lane);

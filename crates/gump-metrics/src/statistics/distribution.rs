@@ -1,6 +1,6 @@
-//! A distribution in fixed bins: it adds up, and it is compared with another of the same bins.
+//! A histogram with fixed bins, which can be added to and compared with another of the same bins.
 
-/// Counts in bins of equal width; what lies outside counts in the first or the last.
+/// Counts in bins of equal width; values outside count in the first or the last bin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Distribution {
     low: f64,
@@ -22,7 +22,7 @@ impl Distribution {
         }
     }
 
-    /// A distribution that was counted before: its mean, its standard deviation and its counts.
+    /// A distribution from stored values: its mean, its standard deviation and its counts.
     pub fn from_parts(low: f64, high: f64, counts: Vec<u64>, mean: f64, deviation: f64) -> Self {
         let n = counts.iter().sum::<u64>() as f64;
         Self {

@@ -1,11 +1,11 @@
-//! The measures: their names, what they mean and their bins.
+//! The measures: names, definitions and bins.
 
-/// Something that is counted. Rates and shares are fractions, other units are SI.
+/// A statistic of scenes. Rates and shares are fractions, other units are SI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Measure {
     /// Share of steps slower than 0.3 m/s.
     Standing,
-    /// Share of tracks of at least two seconds that stay within 1 m of where they were first.
+    /// Share of tracks of at least two seconds that stay within 1 m of their first position.
     Parked,
     /// Of the parked tracks, the share more than 2 m from any lane centre.
     ParkedOffLane,
@@ -13,13 +13,13 @@ pub enum Measure {
     ParkedLaneDistance,
     /// Share of tracks that both stand and drive faster than 1 m/s.
     StopsAndGoes,
-    /// Speed of what moves, m/s.
+    /// Speed of moving agents, m/s.
     Speed,
-    /// Acceleration along the heading of what moves, m/s².
+    /// Acceleration along the heading of moving agents, m/s².
     Acceleration,
-    /// Turning of what moves, either way, rad/s.
+    /// Absolute yaw rate of moving agents, rad/s.
     YawRate,
-    /// Free metres to whoever is ahead in the same direction within 50 m, of those on a lane.
+    /// Gap to the agent ahead in the same direction within 50 m, of agents on a lane, m.
     Gap,
     /// Length of a track's box, m.
     Length,
@@ -31,35 +31,35 @@ pub enum Measure {
     AgentsNear,
     /// Tracks over the whole scene.
     Tracks,
-    /// Share of the scene's steps in which a track is there.
+    /// Share of the scene's steps in which a track is present.
     Presence,
     /// Share of tracks that begin after the first step.
     BeginsLate,
     /// Share of tracks that end before the last step.
     EndsEarly,
-    /// Share of tracks that are missing between two steps in which they are there.
+    /// Share of tracks that are missing between two steps in which they are present.
     Interrupted,
-    /// Metres that the box of a parked track moves per 0.1 s.
+    /// Movement of the box of a parked track per 0.1 s, m.
     Jitter,
-    /// Radians that the box of a parked track turns per 0.1 s.
+    /// Rotation of the box of a parked track per 0.1 s, radians.
     HeadingJitter,
-    /// Speed that the recording states of parked tracks, m/s.
+    /// Stated speed of parked tracks, m/s.
     ParkedSpeed,
-    /// Of what moves, the share within 3 m of the centre of a lane in its direction.
+    /// Share of moving agents within 3 m of the centre of a lane in their direction.
     OnLane,
     /// Distance from that centre, m.
     LateralOffset,
-    /// Share of steps within a crosswalk, of people and bicycles.
+    /// Share of steps within a crosswalk, of pedestrians and bicycles.
     OnCrosswalk,
-    /// Share of steps on a lane outside of crosswalks, of people and bicycles.
+    /// Share of steps on a lane outside of crosswalks, of pedestrians and bicycles.
     OnRoad,
-    /// Share of steps beside the road, of people and bicycles.
+    /// Share of steps beside the road, of pedestrians and bicycles.
     Beside,
     /// Signed distance of the centre to the nearest road edge, m: negative on the road.
     EdgeDistance,
     /// Other agents within 10 m.
     Neighbours,
-    /// Free metres to the nearest other agent.
+    /// Gap to the nearest other agent, m.
     Nearest,
     /// Distance from the ego, m.
     EgoDistance,
@@ -181,7 +181,7 @@ impl Measure {
         Self::ALL.into_iter().find(|measure| measure.name() == name)
     }
 
-    /// Where its bins begin and end, and how many there are. Shares have two: does not hold, holds.
+    /// Lower and upper end of its bins, and their number. Shares have two bins: no and yes.
     pub fn bins(self) -> (f64, f64, usize) {
         match self {
             Self::Standing

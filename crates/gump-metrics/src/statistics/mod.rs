@@ -1,10 +1,10 @@
-//! What traffic is like, as distributions: counted over any number of scenes in constant memory,
+//! Statistics of traffic as distributions, collected over any number of scenes in constant memory
 //! and compared with those of other scenes.
 //!
-//! Start with [`Statistics::add`] and [`Statistics::compare`]; [`Measure::ALL`] lists what is
-//! counted. A measure is counted for vehicles, pedestrians and bicycles separately, or once per
-//! scene. Every distribution has fixed bins, so that counts of parts add up and two sets can be
-//! compared without their scenes.
+//! Start with [`Statistics::add`] and [`Statistics::compare`]; [`Measure::ALL`] lists the measures.
+//! A measure is counted for vehicles, pedestrians and bicycles separately, or once per scene. Every
+//! distribution has fixed bins, so that partial counts can be added and two sets can be compared
+//! without their scenes.
 //!
 //! ```
 //! use gump_metrics::statistics::{Measure, Statistics};
@@ -34,7 +34,7 @@ use gump_scene::{AgentKind, Scenario};
 pub use self::distribution::Distribution;
 pub use self::measure::Measure;
 
-/// Of whom a measure speaks: a kind of agent, or `None` for the scene as a whole.
+/// The class that a measure is counted for: a kind of agent, or `None` for the scene as a whole.
 pub type Class = Option<AgentKind>;
 
 /// The name of a class in tables.
@@ -59,20 +59,20 @@ pub struct Statistics {
 /// One distribution.
 #[derive(Clone, Debug)]
 pub struct Row<'a> {
-    /// What is counted.
+    /// The measure.
     pub measure: Measure,
-    /// Of whom.
+    /// The class.
     pub class: Class,
-    /// How it is distributed.
+    /// Its values.
     pub distribution: &'a Distribution,
 }
 
-/// One distribution beside that of other scenes.
+/// One distribution compared with that of other scenes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Comparison {
-    /// What is compared.
+    /// The measure.
     pub measure: Measure,
-    /// Of whom.
+    /// The class.
     pub class: Class,
     /// Observations in the set.
     pub n: u64,
@@ -90,13 +90,13 @@ pub struct Comparison {
 }
 
 impl Statistics {
-    /// Counts a scene.
+    /// Adds a scene.
     pub fn add(&mut self, scenario: &Scenario) {
         self.scenes += 1;
         observe::observe(scenario, self);
     }
 
-    /// Adds what was counted elsewhere.
+    /// Adds counts from elsewhere.
     pub fn merge(&mut self, other: &Self) {
         self.scenes += other.scenes;
         for (key, distribution) in &other.counted {
@@ -104,12 +104,12 @@ impl Statistics {
         }
     }
 
-    /// Scenes counted.
+    /// Number of scenes.
     pub fn scenes(&self) -> u64 {
         self.scenes
     }
 
-    /// Statistics of `scenes` scenes that were counted before, from their distributions.
+    /// Statistics of `scenes` scenes from stored distributions.
     pub fn from_rows(
         scenes: u64,
         rows: impl IntoIterator<Item = (Measure, Class, Distribution)>,
@@ -133,7 +133,7 @@ impl Statistics {
         self.counted.get(&(measure, class))
     }
 
-    /// Every distribution that either side has, beside that of the reference.
+    /// Every distribution that either side has, compared with that of the reference.
     pub fn compare(&self, reference: &Self) -> Vec<Comparison> {
         let keys = self.counted.keys().chain(reference.counted.keys());
         let keys: std::collections::BTreeSet<_> = keys.copied().collect();
@@ -154,12 +154,12 @@ impl Statistics {
         compared.collect()
     }
 
-    /// Notes an observation.
+    /// Records an observation.
     fn note(&mut self, measure: Measure, class: Class, value: f64) {
         self.of((measure, class)).add(value);
     }
 
-    /// Notes whether something holds.
+    /// Records whether a condition holds.
     fn note_if(&mut self, measure: Measure, class: Class, holds: bool) {
         self.note(measure, class, f64::from(u8::from(holds)));
     }

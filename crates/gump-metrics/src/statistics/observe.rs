@@ -1,4 +1,5 @@
-//! What is noted of a scene: its tracks and their motion. Where agents are is in `surroundings`.
+//! Observations of a scene: its tracks and their motion. Positions of agents relative to the road
+//! are in `surroundings`.
 
 use std::collections::BTreeMap;
 
@@ -10,23 +11,23 @@ use super::{Class, Measure as M, Statistics};
 
 /// Slower agents stand, m/s.
 pub(super) const STANDING: f64 = 0.3;
-/// A track that ever drives faster than this drives, m/s.
+/// A track that is ever faster than this drives, m/s.
 const DRIVES: f64 = 1.0;
-/// A parked track stays this near to where it was first, metres.
+/// A parked track stays this near to its first position, metres.
 const PARKED_REACH: f64 = 1.0;
-/// Shorter tracks are neither parked nor on the way, seconds.
+/// Shorter tracks count neither as parked nor as driving, seconds.
 const LONG_ENOUGH_S: f64 = 2.0;
-/// Seconds between the steps at which the surroundings of agents are looked at.
+/// Interval at which the surroundings of agents are examined, seconds.
 const LOOK_EVERY_S: f64 = 1.0;
 /// Metres around the ego in which an agent is near.
 const NEAR: f64 = 60.0;
-/// Seconds that jitter is told for, whatever the rate of the frames.
+/// Interval of jitter measurements, independent of the frame rate, seconds.
 const JITTER_S: f64 = 0.1;
 
 /// A track: indices of frames and the agent in each.
 pub(super) type Track<'a> = Vec<(usize, &'a Agent)>;
 
-/// Notes all there is to note of a scene.
+/// Records all observations of a scene.
 pub(super) fn observe(scenario: &Scenario, statistics: &mut Statistics) {
     let mut tracks: BTreeMap<AgentId, Track<'_>> = BTreeMap::new();
     for (step, frame) in scenario.log.iter().enumerate() {
@@ -45,7 +46,7 @@ pub(super) fn observe(scenario: &Scenario, statistics: &mut Statistics) {
     note_road(scenario, statistics);
 }
 
-/// Notes a track as a whole and its steps.
+/// Records a track as a whole and its steps.
 fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: &mut Statistics) {
     let (first, last) = (track[0], track[track.len() - 1]);
     let class: Class = Some(first.1.kind);
@@ -102,7 +103,7 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
     }
 }
 
-/// Notes what needs more than one step: acceleration, turning and jitter.
+/// Records values that need more than one step: acceleration, turning and jitter.
 fn note_steps(dt: f64, track: &Track<'_>, parked: bool, statistics: &mut Statistics) {
     let class: Class = Some(track[0].1.kind);
     for triple in track.windows(3) {
@@ -130,7 +131,7 @@ fn note_steps(dt: f64, track: &Track<'_>, parked: bool, statistics: &mut Statist
     }
 }
 
-/// Notes how many of what there are, and the ego.
+/// Records numbers of agents, and the ego.
 fn note_numbers<'a>(
     scenario: &Scenario,
     tracks: impl Iterator<Item = &'a Track<'a>>,

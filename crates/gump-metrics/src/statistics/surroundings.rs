@@ -1,4 +1,4 @@
-//! Where agents are: on lanes, beside them, on crosswalks, among others; and what the road has.
+//! Positions of agents relative to lanes, crosswalks and each other; and properties of the road.
 
 use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{Agent, AgentKind, AreaKind, MapGraph, Scenario};
@@ -7,24 +7,24 @@ use super::observe::STANDING;
 use super::{Class, Measure as M, Statistics};
 use crate::signed_distance_to_road_edge;
 
-/// Farther from the centre of any lane is off the lanes, metres.
+/// An agent farther than this from the centre of any lane is off the lanes, metres.
 const OFF_LANE: f64 = 2.0;
-/// Metres from a lane centre within which whoever moves is on the lane.
+/// Distance from a lane centre within which a moving agent is on the lane, metres.
 const ON_LANE: f64 = 3.0;
 /// Directions that differ by less are the same, radians.
 const ALIGNED: f64 = std::f64::consts::FRAC_PI_4;
-/// Farthest lane that is looked for, metres.
+/// Search radius for lanes, metres.
 const FARTHEST_LANE: f64 = 20.0;
-/// Farthest leader, metres from front to rear.
+/// Maximum distance of a leader, front to rear, metres.
 const FARTHEST_LEADER: f64 = 50.0;
-/// A leader's centre lies this near to the own axis, metres.
+/// Maximum lateral offset of a leader's centre, metres.
 const LEADER_ASIDE: f64 = 1.5;
 /// Metres around an agent in which others are neighbours.
 const NEIGHBOURHOOD: f64 = 10.0;
-/// Lanes of an intersection are this near to another of them, metres.
+/// Maximum distance of a lane of an intersection to another of the same, metres.
 const JUNCTION_REACH: f64 = 25.0;
 
-/// Notes where an agent is relative to the road.
+/// Records the position of an agent relative to the road.
 pub(super) fn note_place(scenario: &Scenario, agent: &Agent, parked: bool, to: &mut Statistics) {
     let (map, class): (_, Class) = (&scenario.map, Some(agent.kind));
     let position = agent.state.pose.position;
@@ -56,8 +56,8 @@ pub(super) fn note_place(scenario: &Scenario, agent: &Agent, parked: bool, to: &
     }
 }
 
-/// Distance to the centre of the nearest lane that runs the agent's way, metres; `None` if there
-/// is none on which it could be.
+/// Distance to the centre of the nearest lane in the agent's direction, metres; `None` if there is
+/// none within reach.
 fn lane_offset(map: &MapGraph, agent: &Agent) -> Option<f64> {
     let pose = agent.state.pose;
     let aligned = |at: DVec2, line: &gump_geometry::Polyline| {
@@ -69,7 +69,7 @@ fn lane_offset(map: &MapGraph, agent: &Agent) -> Option<f64> {
         .map(|(_, distance)| distance)
 }
 
-/// Notes how much room agents have in a frame: neighbours and leaders.
+/// Records gaps between agents in a frame: neighbours and leaders.
 pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
     let agents = scenario.log[step].agents();
     let agents: Vec<&Agent> = agents
@@ -102,7 +102,7 @@ pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
     }
 }
 
-/// Free metres to whoever is ahead on the agent's own axis and looks the same way.
+/// Gap to the agent ahead with the same heading, metres.
 fn gap<'a>(agent: &Agent, others: impl Iterator<Item = &'a Agent>) -> Option<f64> {
     let pose = agent.state.pose;
     let ahead = others.filter_map(|other| {
@@ -119,7 +119,7 @@ fn gap<'a>(agent: &Agent, others: impl Iterator<Item = &'a Agent>) -> Option<f64
     ahead.reduce(f64::min)
 }
 
-/// Notes what the road consists of.
+/// Records properties of the road.
 pub(super) fn note_road(scenario: &Scenario, to: &mut Statistics) {
     let map = &scenario.map;
     let lanes = map.lanes();
@@ -138,7 +138,7 @@ pub(super) fn note_road(scenario: &Scenario, to: &mut Statistics) {
     to.note(M::Driveways, None, areas(AreaKind::Driveway));
 }
 
-/// Groups of lanes in intersections whose middles are near each other.
+/// Groups of lanes in intersections with centres near each other.
 fn junctions(map: &MapGraph) -> usize {
     let inside = map.lanes().iter().filter(|lane| lane.in_intersection);
     let middles: Vec<DVec2> = inside

@@ -1,30 +1,30 @@
-//! What the ego is about to do: turns through intersections and lane changes, read off the log.
+//! Manoeuvres that the ego is about to begin: turns through intersections and lane changes,
+//! determined from the log.
 
 use gump_geometry::angle_difference;
 use gump_scene::{Agent, Lane, MapGraph, Scenario};
 
 use super::situation::{is_on_intersection, lane_of};
 
-/// An intersection is being entered if that happens within so many seconds of the present,
-/// before and after.
+/// Time window around the present in which entering an intersection counts, seconds.
 const ENTRY_S: [f64; 2] = [0.5, 1.0];
-/// Less is no turn, radians (30 degrees).
+/// A smaller change of heading is not a turn, radians (30 degrees).
 const MIN_TURN: f64 = 0.52;
-/// More is a turn around, radians (140 degrees).
+/// A larger one is a U-turn, radians (140 degrees).
 const U_TURN: f64 = 2.44;
-/// A lane change is beginning if the ego is in the other lane within so many seconds.
+/// A lane change begins now if the ego is in the other lane within this time, seconds.
 const CHANGE_S: f64 = 4.0;
 /// And if it moves to that side by at least this in the next second, metres.
 const MOVES: f64 = 0.2;
 
-/// A way through an intersection that begins now.
+/// A path through an intersection that begins now.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Turn {
     /// Change of the heading from entry to exit, radians, positive to the left.
     pub(super) angle: f64,
-    /// Whether a light rules it.
+    /// Whether a light controls it.
     pub(super) is_lit: bool,
-    /// Whether the ego still drives, rather than waiting to.
+    /// Whether the ego drives, rather than waits.
     pub(super) speed: f64,
 }
 
@@ -46,7 +46,7 @@ impl Turn {
     }
 }
 
-/// The turn (or way straight on) that the ego begins at the present.
+/// The turn (or straight path) that the ego begins at the present.
 pub(super) fn turn(scenario: &Scenario) -> Option<Turn> {
     let map: &MapGraph = &scenario.map;
     let ego = |step: usize| scenario.log.get(step)?.agent(scenario.ego);
@@ -70,7 +70,8 @@ pub(super) fn turn(scenario: &Scenario) -> Option<Turn> {
     })
 }
 
-/// The sum of the heading's changes, which knows a turn around to the left from one to the right.
+/// The sum of the changes of heading, which distinguishes a U-turn to the left from one to the
+/// right.
 fn turned(scenario: &Scenario, from: usize, to: usize) -> Option<f64> {
     let headings: Option<Vec<f64>> = (from..=to)
         .map(|step| Some(scenario.log[step].agent(scenario.ego)?.state.pose.heading))

@@ -1,12 +1,13 @@
-//! Which of the 73 kinds of situation a scenario is: the prompt vocabulary, decided by states.
+//! Scenario tags: which of nuPlan's 73 scenario types, the prompt vocabulary, apply to a scenario.
 //!
-//! Start with [`mine`]. [`rules`] lists every tag with its meaning. A tag is about the ego at the
-//! present; the log before and after it is read, because "starting a left turn" is only known from
-//! the turn that follows. Tags of pick-up zones cannot be decided: no map here has such zones.
+//! Start with [`mine`]. [`rules`] lists every tag with its definition. A tag is about the ego at
+//! the present; the log before and after it is used, because "starting a left turn" is only known
+//! from the turn that follows. Tags of pick-up zones cannot be decided, because maps do not contain
+//! such zones.
 //!
 //! Where nuPlan's published descriptions of its fourteen challenge types give numbers (speeds,
-//! distances, counts), they are these; the other tags are defined in the same manner, and their
-//! numbers are ours.
+//! distances, counts), those are used; the other tags are defined similarly with numbers of our
+//! own.
 
 mod maneuver;
 mod situation;
@@ -16,7 +17,7 @@ use gump_scene::{AgentKind, AreaKind, Scenario, ScenarioTag};
 
 use situation::{Other, Situation, footprint, touches};
 
-/// A tag, what it means, and how it is decided.
+/// A tag, its meaning, and its rule.
 #[derive(Clone, Copy)]
 pub struct Rule {
     name: &'static str,
@@ -30,12 +31,12 @@ impl Rule {
         self.name.parse().expect("the table has names of tags only")
     }
 
-    /// The meaning in a few words, with the numbers.
+    /// The definition in a few words, with its numbers.
     pub fn meaning(&self) -> &'static str {
         self.meaning
     }
 
-    /// False for a tag that states and maps do not tell.
+    /// False for a tag that cannot be decided from states and maps.
     pub fn is_decidable(&self) -> bool {
         self.decide.is_some()
     }
@@ -81,7 +82,7 @@ const fn unknowable(name: &'static str) -> Rule {
 
 /// "Starting": below 3 m/s, accelerating by more than 0.6 m/s². "Stopping": braking by more than
 /// 0.6 m/s² and below 0.3 m/s within 3 s. "Stationary": below 0.1 m/s. "Lead": the nearest vehicle
-/// in the ego's way, within 30 m. "Close lead": within 6 m.
+/// in the ego's path, within 30 m. "Close lead": within 6 m.
 const RULES: [Rule; 73] = [
     rule(
         "accelerating_at_crosswalk",
@@ -496,7 +497,7 @@ fn on_road(s: &Situation<'_>, kind: AgentKind, within: f64) -> bool {
     count(s, kind, within, on_road) > 0
 }
 
-/// Passes from one side of the line ahead to the other, rather across than along it.
+/// Passes from one side of the line ahead to the other, more across than along it.
 fn crosses(s: &Situation<'_>, other: &Other<'_>) -> bool {
     let turn = angle_difference(other.agent.state.pose.heading, s.ego.state.pose.heading);
     let across = turn.sin().abs() > 0.5;
@@ -525,7 +526,7 @@ fn shares_crosswalk(s: &Situation<'_>, other: &Other<'_>) -> bool {
     crosswalks.any(|area| area.polygon.intersects(&own))
 }
 
-/// Is in the ego's way now or within 1.5 s, and on a crosswalk then or now.
+/// Is in the ego's path now or within 1.5 s, and on a crosswalk then or now.
 fn will_cross(s: &Situation<'_>, person: &Other<'_>) -> bool {
     let half = s.ego.width / 2.0;
     let velocity = s

@@ -1,5 +1,5 @@
-//! What the tags ask about, measured once per scenario: the ego, who is around it, what it is on
-//! and what comes next on its road.
+//! The facts that tags depend on, computed once per scenario: the ego, the agents around it, the
+//! areas it is on and the road ahead.
 
 use gump_geometry::{DVec2, Polygon, angle_difference};
 use gump_scene::{
@@ -9,21 +9,21 @@ use gump_scene::{
 use super::maneuver::{Turn, lane_change, turn};
 use crate::kinematics;
 
-/// An agent this near to the line ahead is in the ego's way, metres to the side.
+/// Maximum lateral offset of an agent in the ego's path, metres.
 const CORRIDOR: f64 = 1.5;
-/// How far ahead a leader is looked for, metres.
+/// Search distance for a leader ahead, metres.
 const LEAD_RANGE: f64 = 30.0;
-/// How far ahead lights, stop signs and crosswalks are looked for, metres.
+/// Search distance for lights, stop signs and crosswalks ahead, metres.
 const ROAD_RANGE: f64 = 30.0;
-/// Seconds before and after the present over which acceleration is measured: shorter ones see the
-/// noise of trackers.
+/// Time before and after the present over which acceleration is measured, seconds: shorter ones are
+/// dominated by tracker noise.
 const MOTION_S: f64 = 0.3;
-/// The ego's lane points where the ego does, within this, radians.
+/// Maximum difference in direction between the ego's lane and the ego, radians.
 const SAME_WAY: f64 = 0.8;
-/// Metres between two looks at the road ahead.
+/// Sampling distance along the road ahead, metres.
 const LOOK: f64 = 0.5;
 
-/// Somebody in the ego's frame.
+/// An agent in the ego's frame.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Other<'a> {
     pub(super) agent: &'a Agent,
@@ -35,7 +35,7 @@ pub(super) struct Other<'a> {
     pub(super) gap: f64,
 }
 
-/// A light or stop sign ahead, or what the ego stands on.
+/// A light, stop sign or area ahead of the ego or under it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Ahead<T> {
     /// Metres from the ego's front; negative if the front is past it.
@@ -57,14 +57,14 @@ pub(super) struct Situation<'a> {
     pub(super) others: Vec<Other<'a>>,
     pub(super) lane: Option<&'a Lane>,
     pub(super) on_intersection: bool,
-    /// The light that rules the ego's lane inside the intersection it is on.
+    /// The light that controls the ego's lane inside the intersection it is on.
     pub(super) lit_here: bool,
     pub(super) light: Option<Ahead<LightState>>,
     pub(super) stop_sign: Option<Ahead<()>>,
     pub(super) crosswalk: Option<Ahead<()>>,
     pub(super) on_crosswalk: bool,
     pub(super) turn: Option<Turn>,
-    /// Metres to the left that a beginning lane change leads; its sign is the side.
+    /// Offset to the left of a beginning lane change, metres; its sign is the side.
     pub(super) lane_change: Option<f64>,
 }
 
@@ -105,7 +105,7 @@ impl<'a> Situation<'a> {
             .filter(move |other| other.agent.kind == kind)
     }
 
-    /// Those of a kind in the ego's way, nearest first.
+    /// Agents of a kind in the ego's path, nearest first.
     pub(super) fn in_the_way(&self, kind: AgentKind) -> Option<&Other<'a>> {
         self.of_kind(kind)
             .filter(|other| other.place.y.abs() < CORRIDOR && other.place.x > 0.0)
@@ -118,17 +118,17 @@ impl<'a> Situation<'a> {
         self.in_the_way(AgentKind::Vehicle)
     }
 
-    /// A vehicle ahead so near that the ego's stopping or starting has to do with it.
+    /// A vehicle ahead so near that it relates to the ego's stopping or starting.
     pub(super) fn has_close_lead(&self) -> bool {
         self.lead().is_some_and(|lead| lead.gap < 6.0)
     }
 
-    /// Comes to a stop within the next seconds, and has begun to.
+    /// The ego stops within the next seconds, and has begun to brake.
     pub(super) fn is_stopping(&self) -> bool {
         self.speed > 0.3 && self.acceleration < -0.6 && self.slowest_within(3.0) < 0.3
     }
 
-    /// Has begun to drive off from near standstill.
+    /// The ego has begun to drive off from near standstill.
     pub(super) fn is_starting(&self) -> bool {
         self.speed < 3.0 && self.acceleration > 0.6
     }
@@ -137,7 +137,7 @@ impl<'a> Situation<'a> {
         self.speed < 0.1
     }
 
-    /// Neither pulls nor brakes much.
+    /// The ego neither accelerates nor brakes much.
     pub(super) fn is_steady(&self) -> bool {
         self.acceleration.abs() < 1.0
     }
@@ -152,7 +152,7 @@ impl<'a> Situation<'a> {
             .is_some_and(|light| (-2.0..within).contains(&light.distance))
     }
 
-    /// A light that forbids to drive on.
+    /// A light that requires to stop.
     pub(super) fn is_stop_light_within(&self, within: f64) -> bool {
         let stops = |state| matches!(state, LightState::Red | LightState::Yellow);
         self.is_light_within(within) && self.light.is_some_and(|light| stops(light.what))
@@ -163,7 +163,7 @@ impl<'a> Situation<'a> {
             .is_some_and(|crosswalk| crosswalk.distance < within)
     }
 
-    /// Where somebody is after some seconds, in the ego's present frame, if the log tells.
+    /// Position of an agent after some seconds, in the ego's present frame, if it is logged.
     pub(super) fn place_after(&self, other: &Other<'_>, seconds: f64) -> Option<DVec2> {
         let step = self.scenario.now + (seconds / self.scenario.dt).round() as usize;
         let then = self.scenario.log.get(step)?.agent(other.agent.id)?;
@@ -185,7 +185,7 @@ impl<'a> Situation<'a> {
     }
 }
 
-/// The lane an agent drives in: the one around its centre that points its way most.
+/// The lane of an agent: the one around its centre whose direction fits best.
 pub(super) fn lane_of<'a>(map: &'a MapGraph, agent: &Agent) -> Option<&'a Lane> {
     let pose = agent.state.pose;
     let off = |lane: &Lane| {
@@ -204,7 +204,7 @@ pub(super) fn lane_of<'a>(map: &'a MapGraph, agent: &Agent) -> Option<&'a Lane> 
         .map(|(lane, _)| lane)
 }
 
-/// True where the agent's centre is on the area of an intersection or a lane through one.
+/// True if the agent's centre is on the area of an intersection or a lane through one.
 pub(super) fn is_on_intersection(map: &MapGraph, agent: &Agent) -> bool {
     let centre = agent.state.pose.position;
     let on_area = map
@@ -214,7 +214,7 @@ pub(super) fn is_on_intersection(map: &MapGraph, agent: &Agent) -> bool {
     on_area || lane_of(map, agent).is_some_and(|lane| lane.in_intersection)
 }
 
-/// True if the agent's box shares ground with an area of this kind.
+/// True if the agent's box overlaps an area of this kind.
 pub(super) fn touches(map: &MapGraph, agent: &Agent, kind: AreaKind) -> bool {
     let own = footprint(agent);
     let mut areas = map.areas().iter().filter(|area| area.kind == kind);
@@ -279,7 +279,7 @@ fn jerk(scenario: &Scenario) -> f64 {
     }
 }
 
-/// The lanes the ego drives next with the metres from its front to their starts.
+/// The lanes the ego drives next, with the distances from its front to their starts.
 fn ways_ahead<'a>(
     scenario: &'a Scenario,
     ego: &Agent,

@@ -1,4 +1,4 @@
-//! Each tag on a scene in which it holds and one in which it does not.
+//! Each tag on a scene to which it applies and one to which it does not.
 
 use gump_scene::{Frame, Scenario, StopSign, fixture};
 

@@ -5,9 +5,9 @@ use gump_scene::AgentState;
 
 /// The state `dt` seconds after `state` at constant acceleration and curvature.
 ///
-/// The box centre is taken as the point that moves along the heading, as a rear axle would: no
-/// side slip. Curvature is the turn per metre that *this point* drives, so no wheel base enters.
-/// Braking ends at standstill; a vehicle that rolls backwards is braked by a positive acceleration.
+/// The box centre is treated as the point that moves along the heading, as a rear axle would: no
+/// side slip. Curvature is the turn per metre driven by *this point*, so there is no wheel base.
+/// Braking ends at standstill; a positive acceleration brakes a vehicle that rolls backwards.
 ///
 /// Units: metres per second squared, radians per metre (positive to the left), seconds.
 /// Source: closed-form integration of x' = v cos h, y' = v sin h, h' = v * curvature, v' = a.

@@ -1,8 +1,7 @@
-//! How a command becomes the next state of a vehicle.
+//! Vehicle dynamics: the next state of a vehicle under a command.
 //!
-//! [`advance`] works on box-centre states: a command and what it does at once. The ego of nuPlan's
-//! closed loop, a vehicle with a rear axle and lagging actuators, is `gump-nuplan`'s business, what to
-//! command a [`crate::Policy`]'s.
+//! [`advance`] works on box-centre states, and commands take effect at once. nuPlan's ego vehicle,
+//! with a rear axle and actuator lag, is in `gump-nuplan`. Commands come from a [`crate::Policy`].
 
 mod bicycle;
 mod perfect;

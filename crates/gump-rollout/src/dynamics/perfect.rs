@@ -1,4 +1,4 @@
-//! Perfect tracking: the vehicle is where its trajectory says.
+//! Perfect tracking: the vehicle follows its trajectory exactly.
 
 use gump_scene::AgentState;
 
@@ -7,8 +7,8 @@ use crate::RolloutError;
 /// The state `elapsed` seconds along a trajectory that leaves `now`.
 ///
 /// `states[i]` lies `(i + 1) * spacing` seconds ahead. Between states, position and velocity are
-/// interpolated linearly and the heading by the short way; past the last one the vehicle keeps its
-/// velocity.
+/// interpolated linearly and the heading in the shorter direction; past the last one the vehicle
+/// keeps its velocity.
 ///
 /// # Errors
 /// [`RolloutError::Trajectory`] if there is no state or `spacing` is not positive.

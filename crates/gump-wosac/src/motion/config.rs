@@ -1,4 +1,4 @@
-//! What the challenge fixes: times, thresholds, how many modes count, which shapes there are.
+//! Settings of the challenge: times, thresholds, number of modes, shapes.
 
 /// The settings of a motion-prediction benchmark.
 #[derive(Clone, Debug, PartialEq)]
@@ -7,20 +7,21 @@ pub struct MotionConfig {
     pub step_seconds: f64,
     /// Positions in a path.
     pub n_steps: usize,
-    /// Modes that count, the first ones in the order of the forecaster; others are ignored.
+    /// Number of modes that count, the first ones in the order of the predictor; others are
+    /// ignored.
     pub max_modes: usize,
-    /// When is measured, in ascending order.
+    /// The horizons of measurement, in ascending order.
     pub horizons: Vec<Horizon>,
     /// How the miss thresholds shrink for slow agents.
     pub speed_scale: SpeedScale,
-    /// How recorded paths are told apart by shape.
+    /// How recorded paths are classified by shape.
     pub shapes: ShapeRules,
 }
 
-/// One moment that is measured.
+/// One horizon.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Horizon {
-    /// Index into a path, from 0; averages and overlaps take in all positions up to it.
+    /// Index into a path, from 0; averages and overlaps include all positions up to it.
     pub step: usize,
     /// Largest error across the recorded heading that is a match, metres.
     pub lateral: f64,
@@ -41,12 +42,12 @@ pub struct SpeedScale {
     pub fast: f64,
 }
 
-/// Which definition of the shapes of recorded paths holds.
+/// The definition of the shapes of recorded paths.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ShapeRules {
     /// Since March 2024.
     Current,
-    /// Leaderboards of 2021 to 2023: coarser limits, and turns by headings that are not wrapped.
+    /// Leaderboards of 2021 to 2023: coarser limits, and turns from headings that are not wrapped.
     Until2023,
 }
 

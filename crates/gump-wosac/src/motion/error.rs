@@ -1,4 +1,4 @@
-//! Why predictions of a scenario cannot be measured.
+//! Errors in the predictions of a scenario.
 
 use gump_scene::AgentId;
 
@@ -12,7 +12,7 @@ pub struct MotionError {
     pub problem: MotionProblem,
 }
 
-/// What does not fit.
+/// A mismatch between predictions and scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MotionProblem {
     /// Positions of a path do not fall on recorded frames.
@@ -28,22 +28,22 @@ pub enum MotionProblem {
     ShortLog {
         /// Frames needed.
         expected: usize,
-        /// Frames there.
+        /// Frames present.
         found: usize,
     },
     /// An agent that should be predicted is not.
     #[error("expected a prediction of agent {0}, found none")]
     Missing(AgentId),
-    /// An agent is predicted that nobody asked for.
+    /// A predicted agent is not a target.
     #[error("found a prediction of agent {0}, which is not to be predicted")]
     Unexpected(AgentId),
     /// An agent is predicted more than once.
     #[error("expected one prediction of agent {0}, found several")]
     Duplicate(AgentId),
-    /// An agent is in no frame of the recording, so nobody knows what it is.
+    /// An agent is in no frame of the recording, so its kind is not known.
     #[error("agent {0} is to be predicted but is in no recorded frame")]
     NeverPresent(AgentId),
-    /// An agent that should be forecast is not there now.
+    /// An agent to be predicted is absent at the present.
     #[error("agent {0} is to be predicted but is absent in the present frame")]
     AbsentNow(AgentId),
     /// A prediction without agents.
@@ -69,19 +69,19 @@ pub enum MotionProblem {
     /// A path is too short or too long.
     #[error("expected {expected} positions in mode {mode} of agent {agent}, found {found}")]
     PathLength {
-        /// Whose path.
+        /// The agent of the path.
         agent: AgentId,
         /// Index of the mode.
         mode: usize,
-        /// Positions wanted.
+        /// Positions expected.
         expected: usize,
-        /// Positions there.
+        /// Positions present.
         found: usize,
     },
     /// A position is NaN or infinite.
     #[error("position {step} in mode {mode} of agent {agent} is not a number")]
     Position {
-        /// Whose path.
+        /// The agent of the path.
         agent: AgentId,
         /// Index of the mode.
         mode: usize,

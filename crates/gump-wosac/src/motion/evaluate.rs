@@ -1,4 +1,4 @@
-//! From the predictions of one scenario to measurements, after a look at whether they fit.
+//! Checks the predictions of one scenario and measures them.
 
 use std::collections::BTreeSet;
 
@@ -10,10 +10,10 @@ use super::error::{MotionError, MotionProblem};
 use super::measure::Measured;
 use super::shape::Shape;
 
-/// What one prediction got.
+/// The measurements of one prediction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PredictionScore {
-    /// Whose prediction it is.
+    /// The predicted agents.
     pub agents: Vec<AgentId>,
     /// The kind of agent it counts for: the rarest among those predicted together.
     pub kind: AgentKind,
@@ -23,30 +23,31 @@ pub struct PredictionScore {
     pub horizons: Vec<HorizonScore>,
 }
 
-/// What one prediction got at one horizon. `None` where nothing was recorded to compare with.
+/// The measurements of one prediction at one horizon. `None` where nothing was recorded to compare
+/// with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HorizonScore {
     /// Average displacement of the best mode, metres.
     pub min_ade: Option<f64>,
     /// Displacement of the best mode at the horizon, metres.
     pub min_fde: Option<f64>,
-    /// True if the most confident mode has run into another agent by then.
+    /// True if the most confident mode has overlapped another agent by then.
     pub overlaps: bool,
-    /// Every mode that counts, in the order of the forecaster.
+    /// Every mode that counts, in the order of the predictor.
     pub modes: Vec<ModeScore>,
 }
 
-/// What one mode got at one horizon.
+/// The measurements of one mode at one horizon.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModeScore {
-    /// As the forecaster gave it.
+    /// As given by the predictor.
     pub confidence: f64,
-    /// True if it is what happened; `None` if nobody knows.
+    /// True if the mode matches the log; `None` if that is not known.
     pub matches: Option<bool>,
 }
 
 impl HorizonScore {
-    /// True if no mode is what happened; `None` if nobody knows of any.
+    /// True if no mode matches the log; `None` if that is not known of any.
     pub fn missed(&self) -> Option<bool> {
         let known = self.modes.iter().filter_map(|mode| mode.matches);
         known.fold(None, |missed, matches| {
@@ -61,7 +62,7 @@ impl HorizonScore {
 /// [`MotionConfig::max_modes`] are ignored, even if one of them is the best.
 ///
 /// # Errors
-/// [`MotionError`] with the first thing that does not fit.
+/// [`MotionError`] with the first mismatch.
 ///
 /// Source: the metric code of the Waymo motion prediction challenge (as of March 2025); agrees
 /// with its numbers to 1e-6.

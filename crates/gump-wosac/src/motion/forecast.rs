@@ -1,4 +1,4 @@
-//! From many futures of a world to the few modes of a prediction.
+//! Reduces many futures of a world to the few modes of a prediction.
 
 use gump_geometry::DVec2;
 use gump_scene::{AgentId, PredictedMode, Prediction, Rollout, Scenario};
@@ -7,18 +7,18 @@ use super::config::MotionConfig;
 use super::error::{MotionError, MotionProblem};
 use super::evaluate::stride;
 
-/// Turns futures into a prediction of every target, each agent for itself.
+/// Turns futures into a prediction of every target, each agent separately.
 ///
-/// A future votes for every future whose path ends near its own: within the lateral threshold of
+/// Every future votes for the futures whose path ends near its own: within the lateral threshold of
 /// the last horizon, scaled by the agent's speed now. The future with the most votes becomes a mode
-/// with its share of the votes as confidence, those that voted for it leave, and so on until six
-/// modes are found or nobody is left. A mode is thus a path that the world imagined, never an
-/// average of paths. Of equals the earlier future wins.
+/// with its share of the votes as confidence, and the futures that voted for it are removed; this
+/// repeats until there are six modes or no futures are left. A mode is thus a simulated path, never
+/// an average of paths. Ties go to the earlier future.
 ///
-/// An agent that a world has removed stays where it was last.
+/// An agent that a world has removed stays at its last position.
 ///
 /// # Errors
-/// [`MotionProblem::AbsentNow`] if a target is not there at the start of the rollouts,
+/// [`MotionProblem::AbsentNow`] if a target is absent at the start of the rollouts,
 /// [`MotionProblem::ShortLog`] if a rollout is shorter than a path, [`MotionProblem::TimeStep`].
 ///
 /// Source: greedy choice of endpoints by the probability mass within a radius is that of HOME

@@ -1,9 +1,9 @@
-//! A mean that does not depend on the order in which numbers come.
+//! A mean that does not depend on the order of summation.
 
 /// Sum and count of measurements; merging in any order gives the same bits.
 ///
-/// Numbers are summed as multiples of 2⁻⁴⁰ (1e-12), which is far below what any measurement here
-/// is good for; in return a benchmark split over machines totals exactly like one run.
+/// Numbers are summed as multiples of 2⁻⁴⁰ (1e-12), far below the accuracy of any measurement here;
+/// in return a benchmark that is split over machines gives exactly the totals of one run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Mean {
     sum: i128,

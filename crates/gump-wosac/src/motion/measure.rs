@@ -1,6 +1,6 @@
-//! One prediction against what was recorded: distances, matches, overlaps.
+//! Measurements of one prediction against the recording: distances, matches, overlaps.
 //!
-//! A question about a moment at which the agent was not recorded has no answer (`None`).
+//! A measurement at an instant at which the agent was not recorded is `None`.
 
 use gump_geometry::{DVec2, OrientedBox, Pose};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, PredictedMode, Prediction, Scenario};
@@ -44,7 +44,7 @@ impl<'a> Measured<'a> {
         self.least(|agent, path| self.distance(agent, path, horizon.step))
     }
 
-    /// Every mode that counts, and whether it is what happened at a horizon.
+    /// Every mode that counts, and whether it matches the log at a horizon.
     pub(crate) fn modes(&self, horizon: &Horizon) -> Vec<ModeScore> {
         let of_mode = |mode: &PredictedMode| {
             let paths = self.paths(mode);
@@ -58,12 +58,11 @@ impl<'a> Measured<'a> {
         self.counted().iter().map(of_mode).collect()
     }
 
-    /// The first step at which the most confident mode runs into the recorded box of another
-    /// agent that is there now.
+    /// The first step at which the most confident mode overlaps the recorded box of another agent
+    /// that is present now.
     ///
-    /// Agents predicted together are obstacles to each other where they were recorded, not where
-    /// they are predicted. Where the agent itself was not recorded it has no size, so it overlaps
-    /// nothing.
+    /// Agents predicted together are obstacles to each other at their recorded, not their predicted
+    /// positions. Where the agent itself was not recorded it has no size, so it overlaps nothing.
     pub(crate) fn first_overlap(&self) -> Option<usize> {
         let mode = self.most_confident()?;
         let obstacles = self.scenario.present().now().agents();
@@ -140,8 +139,8 @@ impl<'a> Measured<'a> {
 
     /// The most confident of the modes that count, the first of equals.
     ///
-    /// Confidences are divided by their sum over all modes, as the challenge does, which turns
-    /// the order round where the sum is negative.
+    /// Confidences are divided by their sum over all modes, as in the challenge, which reverses the
+    /// order where the sum is negative.
     fn most_confident(&self) -> Option<&'a PredictedMode> {
         let sum: f64 = self.prediction.modes.iter().map(|m| m.confidence).sum();
         let value = |mode: &PredictedMode| {
@@ -188,8 +187,8 @@ fn rarity(kind: AgentKind) -> Option<usize> {
     AgentKind::MOVING.iter().position(|&moving| moving == kind)
 }
 
-/// The direction of a path at a position: that of the segment at either end, the mean direction
-/// of the two segments in between. A path that stands still looks along +x.
+/// The direction of a path at a position: that of the segment at either end, the mean direction of
+/// the two segments in between. A standing path points along +x.
 fn heading(path: &[DVec2], step: usize) -> f64 {
     let segment = |i: usize| (path[i + 1] - path[i]).to_angle();
     let last = path.len() - 1;

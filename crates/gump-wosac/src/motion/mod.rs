@@ -1,9 +1,9 @@
-//! Motion prediction as the Waymo challenge measures it: distances of the best mode, misses,
-//! overlaps and mean average precision, by kind of agent at 3, 5 and 8 s.
+//! Motion prediction metrics of the Waymo challenge: distances of the best mode, misses, overlaps
+//! and mean average precision, by kind of agent at 3, 5 and 8 s.
 //!
-//! Start with [`evaluate_predictions`], which measures the predictions of one scenario; add the
-//! scores of many to a [`MotionTally`] and ask for its [`rows`](MotionTally::rows). [`forecast`] makes predictions of a world's
-//! futures. Files are the business of `gump-data`.
+//! Start with [`evaluate_predictions`], which measures the predictions of one scenario. Add the
+//! scores of many to a [`MotionTally`] and read its [`rows`](MotionTally::rows). [`forecast`] turns
+//! a world's futures into predictions. Files are read and written by `gump-data`.
 //!
 //! ```
 //! use gump_geometry::dvec2;

@@ -1,4 +1,4 @@
-//! Average precision: are the confident modes the right ones?
+//! Average precision of the modes by confidence.
 
 use std::cmp::Ordering;
 
@@ -14,16 +14,16 @@ pub struct PrecisionSamples {
 /// One mode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
-    /// As the forecaster gave it.
+    /// As given by the predictor.
     pub confidence: f64,
-    /// True if it is what happened, and no mode of its prediction was so before.
+    /// True if it matches the log and no earlier mode of its prediction did.
     pub hit: bool,
 }
 
 impl PrecisionSamples {
-    /// Adds the modes of one prediction, given with their matches. Of several matches the most
-    /// confident is the hit; `later_matches_count` says whether the others are false alarms
-    /// (mAP) or forgiven (soft mAP).
+    /// Adds the modes of one prediction, with their matches. Of several matches the most confident
+    /// is the hit; `later_matches_count` selects whether the others are false alarms (mAP) or
+    /// ignored (soft mAP).
     ///
     /// Modes whose match is unknown are left out; a prediction of such modes only is not counted.
     pub(crate) fn add(&mut self, modes: &[ModeScore], later_matches_count: bool) {
@@ -60,7 +60,7 @@ impl PrecisionSamples {
         self.n_predictions
     }
 
-    /// The samples in the order in which they came.
+    /// The samples in order of insertion.
     pub fn samples(&self) -> &[Sample] {
         &self.samples
     }

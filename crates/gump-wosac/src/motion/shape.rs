@@ -7,8 +7,8 @@ use gump_scene::{Agent, AgentId, Scenario};
 
 use super::config::ShapeRules;
 
-/// What a recorded path looks like. In ascending order of priority: agents predicted together
-/// count as the highest among them.
+/// The shape of a recorded path. In ascending order of priority: agents predicted together count as
+/// the highest among them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Shape {
     /// Hardly moves.
@@ -56,8 +56,8 @@ impl Shape {
         }
     }
 
-    /// The shape whose precision it counts towards: the challenge has no right U-turns of their
-    /// own, so of eight shapes seven are averaged.
+    /// The shape that its precision counts towards: the challenge has no separate right U-turns, so
+    /// seven of the eight shapes are averaged.
     pub fn counted_as(self) -> Self {
         match self {
             Self::RightUTurn => Self::RightTurn,

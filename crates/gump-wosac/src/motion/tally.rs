@@ -1,4 +1,4 @@
-//! Measurements of many predictions, pooled by kind of agent and horizon, and the table of them.
+//! Measurements of many predictions, pooled by kind of agent and horizon, and their table.
 
 use std::collections::BTreeMap;
 
@@ -26,17 +26,17 @@ pub struct MotionCell {
     pub min_ade: Mean,
     /// Displacement at the horizon of every prediction's best mode, metres.
     pub min_fde: Mean,
-    /// 1 for a prediction without a mode that is what happened, else 0.
+    /// 1 for a prediction without a mode that matches the log, else 0.
     pub miss_rate: Mean,
-    /// 1 for a prediction whose most confident mode runs into another agent, else 0.
+    /// 1 for a prediction whose most confident mode overlaps another agent, else 0.
     pub overlap_rate: Mean,
     /// By shape of the recorded path; modes after the first match are false alarms.
     pub precision: BTreeMap<Shape, PrecisionSamples>,
-    /// By shape of the recorded path; modes that match after the first match are forgiven.
+    /// By shape of the recorded path; further matches after the first are ignored.
     pub soft_precision: BTreeMap<Shape, PrecisionSamples>,
 }
 
-/// A line of the table: a mean over everything its class and horizon hold.
+/// A row of the table: a mean over the measurements of its class and horizon.
 ///
 /// A number is `None` where nothing could be measured; the official table has 0 there.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -45,19 +45,19 @@ pub struct MotionRow {
     pub kind: Option<AgentKind>,
     /// Seconds after the present; `None` is the mean over horizons.
     pub seconds: Option<f64>,
-    /// Predictions pooled; in a mean over horizons those of one of them.
+    /// Number of pooled predictions; in a mean over horizons that of one horizon.
     pub predictions: u64,
     /// Average displacement of the best mode, metres.
     pub min_ade: Option<f64>,
     /// Displacement of the best mode at the horizon, metres.
     pub min_fde: Option<f64>,
-    /// Share of predictions without a mode that is what happened, 0..1.
+    /// Share of predictions without a mode that matches the log, 0..1.
     pub miss_rate: Option<f64>,
-    /// Share of predictions whose most confident mode runs into another agent, 0..1.
+    /// Share of predictions whose most confident mode overlaps another agent, 0..1.
     pub overlap_rate: Option<f64>,
     /// Mean average precision over shapes, 0..1.
     pub map: Option<f64>,
-    /// The same with further matches forgiven, 0..1.
+    /// The same with further matches ignored, 0..1.
     pub soft_map: Option<f64>,
 }
 
@@ -98,7 +98,7 @@ impl MotionTally {
     /// The table: every kind that occurs at every horizon and over all horizons, then the means
     /// over vehicles, pedestrians and bicycles. The last row is what a leaderboard ranks.
     ///
-    /// `config` is the one the measurements were made with.
+    /// `config` must be the one used for the measurements.
     pub fn rows(&self, config: &MotionConfig) -> Vec<MotionRow> {
         let mut kinds: Vec<AgentKind> = self.cells.keys().map(|&(kind, _)| kind).collect();
         kinds.dedup();

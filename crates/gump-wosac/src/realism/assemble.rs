@@ -1,8 +1,7 @@
-//! Trajectories of all simulated agents on the clock of the log, checked.
+//! Checked trajectories of all simulated agents on the time steps of the log.
 //!
-//! The past is the log's, step by step; the future is a rollout's, or the log's own, with boxes as
-//! they are at the present step. Logged futures are assembled the same way, so they have such
-//! boxes too.
+//! The past is the log's, step by step; the future is a rollout's, or the log's own, with the boxes
+//! of the present step. Logged futures are assembled the same way, so they have these boxes too.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -19,7 +18,7 @@ const NOW: usize = N_HISTORY - 1;
 pub(crate) struct Traffic {
     /// State of an agent at a step, agent-major.
     states: Vec<State>,
-    /// What the agents are.
+    /// The kinds of the agents.
     pub(crate) kinds: Vec<AgentKind>,
 }
 
@@ -168,7 +167,7 @@ fn check_log(log: &Log) -> Result<(), WosacError> {
     check_map(log)
 }
 
-/// The first field of a valid state that cannot be.
+/// The name of the first invalid field of a state marked valid.
 fn problem(state: &State) -> Option<(&'static str, &'static str, f32)> {
     let [x, y, z] = state.position;
     let [length, width, height] = state.size;
@@ -213,7 +212,7 @@ fn check_map(log: &Log) -> Result<(), WosacError> {
     }
 }
 
-/// Checks that rollouts are what the log asks for.
+/// Checks that rollouts contain what the log requires.
 pub(crate) fn check_rollouts(
     scenario: &str,
     simulated: &[&Track],

@@ -1,4 +1,4 @@
-//! Bounding boxes over a list, two levels of them: the first nearest item without looking at all.
+//! A two-level hierarchy of bounding boxes over a list, for finding the first nearest item.
 
 /// An axis-aligned box in space.
 #[derive(Clone, Copy, Debug)]
@@ -92,7 +92,8 @@ impl Blocks {
     }
 }
 
-/// More than rounding can move a distance: items whose cost is as small must not be skipped.
+/// A margin larger than rounding errors of distances: items whose cost may be as small must not be
+/// skipped.
 fn with_margin(cost: f32) -> f32 {
     cost * 1.000_1 + 1e-3
 }

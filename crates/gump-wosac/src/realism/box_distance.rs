@@ -4,7 +4,7 @@ use super::assemble::Traffic;
 use super::config::Algorithm;
 use super::input::State;
 
-/// What is far from everything: a distance where there is none.
+/// The distance used where there is no other box.
 pub(crate) const FAR: f32 = 1e10;
 
 /// Share of a box's half width that rounds its corners since 2024.
@@ -158,7 +158,7 @@ pub(crate) fn nearest_object(
         .collect()
 }
 
-/// What the distance of two boxes is at least, from the discs around them.
+/// A lower bound of the distance of two boxes, from the discs around them.
 fn least_distance(a: &State, b: &State) -> f32 {
     let radius = |s: &State| norm([s.size[0], s.size[1]]) / 2.0;
     let between = [b.position[0] - a.position[0], b.position[1] - a.position[1]];

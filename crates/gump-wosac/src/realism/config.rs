@@ -1,4 +1,4 @@
-//! What a year of the challenge measures: components, estimators, weights. Data, one TOML each.
+//! Settings of each year of the challenge: components, estimators, weights; one TOML file per year.
 
 use serde::{Deserialize, Serialize};
 
@@ -39,7 +39,8 @@ impl Year {
     }
 }
 
-/// How features are computed; the reference's code changed with the years, not only its settings.
+/// The version of the feature code; the reference's code changed with the years, not only its
+/// settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 pub enum Algorithm {
     /// Backward differences; the log counts as valid throughout when distances are computed.
@@ -63,17 +64,17 @@ impl Algorithm {
     }
 }
 
-/// What is imagined and who is scored.
+/// The simulated agents and the scored ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
-    /// 80 future steps of the agents that are there; the ego and the targets are scored.
+    /// 80 future steps of the agents that are present; the ego and the targets are scored.
     SimAgents,
-    /// All 91 steps with sizes and kinds; every agent that is there is scored.
+    /// All 91 steps, with sizes and kinds; every agent that is present is scored.
     Generation,
 }
 
-/// What a score is made of, in the order of the reference.
+/// The components of a score, in the order of the reference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Component {
@@ -99,14 +100,14 @@ pub enum Component {
     TrafficLightViolation,
 }
 
-/// What components are shown together.
+/// Groups of components in reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Group {
-    /// How an agent moves.
+    /// Motion of the agent.
     Kinematic,
-    /// What it does to others.
+    /// Relation to other agents.
     Interactive,
-    /// What it does with the road.
+    /// Relation to the road.
     MapBased,
 }
 
@@ -141,7 +142,7 @@ impl Component {
         }
     }
 
-    /// With which others it is shown.
+    /// The group that it is reported in.
     pub fn group(self) -> Group {
         match self {
             Self::LinearSpeed
@@ -157,7 +158,7 @@ impl Component {
         }
     }
 
-    /// Once per rollout (did it ever happen?) rather than at every step.
+    /// True if it counts once per rollout (did it ever happen?) rather than at every step.
     pub fn is_indication(self) -> bool {
         matches!(
             self,
@@ -166,11 +167,11 @@ impl Component {
     }
 }
 
-/// How a distribution is made of samples.
+/// How a distribution is estimated from samples.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Estimator {
-    /// Shares of equal bins; values outside count at the nearest end, NaN in the last bin.
+    /// Shares of equal bins; values outside count in the nearest bin, NaN in the last bin.
     Histogram {
         /// Lower end of the first bin.
         min: f32,
@@ -193,7 +194,7 @@ pub enum Estimator {
     },
 }
 
-/// How one component is scored.
+/// Settings of one component.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FeatureConfig {
@@ -205,17 +206,17 @@ pub struct FeatureConfig {
     /// True: one distribution for all agents; false: one for each.
     #[serde(default)]
     pub aggregate_agents: bool,
-    /// Share of the meta metric.
+    /// Weight in the metametric.
     pub weight: f32,
 }
 
-/// Everything a year states.
+/// All settings of a year.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// How features are computed.
+    /// The version of the feature code.
     pub algorithm: Algorithm,
-    /// What is imagined and who is scored.
+    /// The simulated agents and the scored ones.
     pub mode: Mode,
     #[allow(missing_docs, reason = "named as the component it is for")]
     pub linear_speed: FeatureConfig,
@@ -256,15 +257,15 @@ impl Config {
         config
     }
 
-    /// Settings of one's own, in the form of the shipped files.
+    /// Custom settings, in the format of the shipped files.
     ///
     /// # Errors
-    /// A sentence with the line that is not understood.
+    /// A sentence with the invalid line.
     pub fn parse(text: &str) -> Result<Self, String> {
         toml::from_str(text).map_err(|error| error.to_string())
     }
 
-    /// How a component is scored; `None` if it is not.
+    /// The settings of a component; `None` if it is not scored.
     pub fn feature(&self, component: Component) -> Option<&FeatureConfig> {
         Some(match component {
             Component::LinearSpeed => &self.linear_speed,

@@ -1,4 +1,4 @@
-//! What can be wrong with a log or with rollouts; every sentence names scenario, agent and field.
+//! Errors in logs and rollouts; every message names scenario, agent and field.
 
 use gump_scene::AgentId;
 
@@ -23,7 +23,7 @@ pub enum WosacError {
         expected: &'static str,
         found: String,
     },
-    /// A logged state that claims to be valid is not a number, or has no extent.
+    /// A logged state marked valid is not a number, or has no extent.
     #[error(
         "scenario {scenario}: expected {expected} as {field} of agent {agent} \
          at logged step {step}, found {value}"
@@ -36,7 +36,7 @@ pub enum WosacError {
         step: usize,
         value: f32,
     },
-    /// Two tracks of the log have one id.
+    /// Two tracks of the log have the same id.
     #[error("scenario {scenario}: expected every agent once in the log, found {agent} twice")]
     LoggedTwice { scenario: String, agent: AgentId },
     /// The ego or a target has no track.
@@ -46,10 +46,10 @@ pub enum WosacError {
         role: &'static str,
         agent: AgentId,
     },
-    /// No ego was named.
+    /// No ego was given.
     #[error("scenario {scenario}: expected an ego, found none")]
     NoEgo { scenario: String },
-    /// An agent that is to be scored is not there at the present step.
+    /// An agent to be scored is absent at the present step.
     #[error(
         "scenario {scenario}: expected agent {agent}, which is to be scored, to be valid at the \
          present step, found it invalid"
@@ -80,7 +80,7 @@ pub enum WosacError {
         rollout: usize,
         agent: AgentId,
     },
-    /// An agent that is not there at the present step.
+    /// An agent that is absent at the present step.
     #[error(
         "scenario {scenario}, rollout {rollout}: agent {agent} is not valid at the present step \
          of the log"
@@ -110,7 +110,7 @@ pub enum WosacError {
         expected: usize,
         found: usize,
     },
-    /// A simulated number is not one.
+    /// A simulated number is not finite.
     #[error(
         "scenario {scenario}, rollout {rollout}: expected a number in {field} of agent {agent} at \
          step {step}, found {value}"

@@ -1,8 +1,8 @@
-//! How likely logged values are under a distribution made of simulated ones.
+//! Likelihoods of logged values under distributions estimated from simulated ones.
 
 use super::config::{Estimator, FeatureConfig};
 
-/// Extent of feature arrays, agent-major; indications have one step.
+/// Extent of feature arrays, agent-major; indicators have one step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shape {
     /// Agents.
@@ -12,7 +12,7 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// Which distribution each value belongs to, in order, and how many there are.
+    /// The distribution that each value belongs to, in order, and the number of distributions.
     fn groups(self, config: &FeatureConfig) -> (Vec<usize>, usize) {
         let n_steps = if config.independent_timesteps {
             1
@@ -36,7 +36,7 @@ impl Shape {
 /// Log-likelihood of every logged value, `[agent, step]`; of a bin's mass, not of a density.
 ///
 /// `simulated` has one array like `log` per rollout, each of which stands for `copies` equal ones.
-/// No validity is looked at; NaN counts as a value of the last bin, as in the reference.
+/// Validity is ignored; NaN counts as a value of the last bin, as in the reference.
 ///
 /// # Panics
 /// If an array is not of the `shape`.

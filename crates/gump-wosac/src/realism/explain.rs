@@ -1,44 +1,44 @@
-//! What lowered a score: which component, which agent, when.
+//! The largest penalties of a score: component, agent and time.
 
 use gump_scene::{AgentId, AgentKind};
 
 use super::config::Component;
 use super::reference::Evaluation;
 
-/// What one agent costs in one component.
+/// The penalty of one agent in one component.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Blame {
     /// The component.
     pub component: Component,
     /// The agent.
     pub agent: AgentId,
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
-    /// Its part in what the meta metric lacks: the weight that the component does not earn, split
-    /// by log-likelihood. The costs of all agents and components and the meta metric make up the
-    /// sum of the weights.
+    /// Its part of the loss of the metametric: the lost weight of the component, split by
+    /// log-likelihood. The costs of all agents and components and the metametric add up to the sum
+    /// of the weights.
     pub cost: f64,
     /// Geometric mean of the likelihoods of its logged values, 0 to 1.
     pub likelihood: f64,
-    /// The scored step that is least likely, from 0; of an indication the first at which it holds,
-    /// in the log or, if never there, in any rollout. `None` if it holds nowhere.
+    /// The scored step with the lowest likelihood, from 0; of an indicator the first at which it
+    /// holds, in the log or, if never there, in any rollout. `None` if it holds nowhere.
     pub step: Option<usize>,
-    /// The logged value at that step, in the unit of the component; of an indication whether it
-    /// ever holds, as 0 or 1.
+    /// The logged value at that step, in the unit of the component; of an indicator whether it ever
+    /// holds, as 0 or 1.
     pub logged: f64,
-    /// The mean of the rollouts at that step; of an indication the share in which it ever holds.
+    /// The mean of the rollouts at that step; of an indicator the share in which it ever holds.
     pub imagined: f64,
 }
 
-/// How likely the log of one agent is under the rollouts.
+/// The likelihood of the log of one agent under the rollouts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AgentRealism {
     /// The agent.
     pub agent: AgentId,
-    /// Weighted mean of its likelihoods in the components that it has, 0 to 1.
+    /// Weighted mean of its likelihoods over its components, 0 to 1.
     pub realism: f64,
-    /// How likely what was logged at each step is, by the components that change from step to
-    /// step; `None` where none of them counts.
+    /// Likelihood of the log at each step, from the components that change from step to step;
+    /// `None` where none of them counts.
     pub steps: Vec<Option<f64>>,
 }
 
@@ -61,7 +61,7 @@ impl Weighted {
 }
 
 impl Evaluation<'_> {
-    /// How likely the log of each scored agent is, under the weights of the year; agents without
+    /// The likelihood of the log of each scored agent, with the weights of the year; agents without
     /// any value that counts are left out.
     pub fn realism(&self) -> Vec<AgentRealism> {
         let features = self.reference.features();
@@ -98,7 +98,7 @@ impl Evaluation<'_> {
         (0..n).filter_map(of_agent).collect()
     }
 
-    /// What each agent costs in each component, dearest first; what costs nothing is left out.
+    /// The penalty of each agent in each component, largest first; zero penalties are left out.
     pub fn explain(&self) -> Vec<Blame> {
         let config = self.reference.config;
         let mut blames: Vec<Blame> = config
@@ -167,7 +167,8 @@ impl Evaluation<'_> {
             .collect()
     }
 
-    /// When an indication first holds, whether it does in the log, and in which share of rollouts.
+    /// The first step at which an indicator holds, whether it holds in the log, and its share of
+    /// rollouts.
     fn when_indicated(&self, component: Component, agent: usize) -> (Option<usize>, f64, f64) {
         let vehicles_only = component == Component::TrafficLightViolation;
         let first = |features| {
@@ -189,7 +190,7 @@ impl Evaluation<'_> {
     }
 }
 
-/// The mean of those that are numbers.
+/// The mean of the finite values.
 fn mean(values: impl Iterator<Item = f32>) -> f64 {
     let values = values.filter(|value| !value.is_nan());
     let (sum, n) = values.fold((0.0, 0.0), |(sum, n), v| (sum + f64::from(v), n + 1.0));

@@ -1,4 +1,4 @@
-//! What is measured of scored agents, on the log and on every rollout alike.
+//! Features of scored agents, of the log and of every rollout.
 
 use gump_scene::{AgentId, AgentKind};
 
@@ -9,23 +9,23 @@ use super::lights::Lights;
 use super::road_edge::{self, RoadEdges};
 use super::{box_distance, following};
 
-/// Features of the scored agents of one scenario, logged or imagined.
+/// Features of the scored agents of one scenario, logged or simulated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Features {
     /// The scored agents.
     pub agents: Vec<AgentId>,
-    /// What they are.
+    /// Their kinds.
     pub kinds: Vec<AgentKind>,
     /// Scored steps: the 80 of the future, or all 91 for scenario generation.
     pub n_steps: usize,
-    /// Values of a component that is no indication, `[agent, step]`; empty for the others.
+    /// Values of a component that is not an indicator, `[agent, step]`; empty for the others.
     values: [Vec<f32>; Component::ALL.len()],
     red_light: Vec<bool>,
 }
 
 impl Features {
     /// Values of a component `[agent, step]`, in its unit; NaN where a difference lacks a
-    /// neighbour. Empty for indications.
+    /// neighbour. Empty for indicators.
     ///
     /// Where an agent is invalid or alone, its distance to others is 1e10, and to the road edge
     /// -1e10 where it is invalid.
@@ -33,7 +33,7 @@ impl Features {
         &self.values[component as usize]
     }
 
-    /// Whether an indication holds, `[agent, step]`. Empty for other components.
+    /// Whether an indicator holds, `[agent, step]`. Empty for other components.
     pub fn holds(&self, component: Component) -> Vec<bool> {
         let of =
             |component, is: fn(f32) -> bool| self.values(component).iter().map(move |&v| is(v));
@@ -46,7 +46,7 @@ impl Features {
     }
 }
 
-/// The map as features need it.
+/// The parts of the map that features need.
 pub(crate) struct Surroundings {
     pub(crate) edges: RoadEdges,
     pub(crate) lights: Option<Lights>,

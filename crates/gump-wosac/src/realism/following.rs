@@ -1,17 +1,17 @@
-//! Time to the collision with whoever drives ahead.
+//! Time to collision with the vehicle ahead.
 
 use super::assemble::Traffic;
 use super::box_distance::FAR;
 use super::input::State;
 use super::kinematics::Differences;
 
-/// The longest time that is told apart, seconds.
+/// The maximum value, seconds.
 const MAX_TIME: f32 = 5.0;
-/// Who points further away than this is not followed: 75 degrees.
+/// A vehicle whose heading differs by more than this is not followed: 75 degrees.
 const MAX_HEADING_DIFFERENCE: f32 = (75.0 * std::f64::consts::PI / 180.0) as f32;
-/// Who points this nearly the same way is followed whatever the overlap: 10 degrees.
+/// A vehicle whose heading differs by less than this is followed whatever the overlap: 10 degrees.
 const SMALL_HEADING_DIFFERENCE: f32 = (10.0 * std::f64::consts::PI / 180.0) as f32;
-/// Lateral overlap that is enough where headings differ more, metres.
+/// Lateral overlap that is sufficient where headings differ more, metres.
 const ENOUGH_OVERLAP: f32 = 0.5;
 
 /// Seconds until agent `agent` hits the one it follows, at most 5, at the steps from `first`.
@@ -30,8 +30,8 @@ pub(crate) fn times(
 /// Seconds until track `agent` hits the one it follows at `step`, at most 5; 5 if it follows none
 /// or falls behind.
 ///
-/// Followed is the valid one with the smallest gap ahead that points roughly the same way and
-/// overlaps sideways. Heading differences are not wrapped, as in the reference: headings are
+/// The followed agent is the valid one with the smallest gap ahead that points roughly the same way
+/// and overlaps sideways. Heading differences are not wrapped, as in the reference: headings are
 /// expected in [-π, π].
 pub(crate) fn time_to_collision(
     tracks: &[&[State]],
@@ -63,7 +63,7 @@ pub(crate) fn time_to_collision(
     }
 }
 
-/// Room between an agent and one it follows, metres; `None` if it does not follow it.
+/// Gap between an agent and one it follows, metres; `None` if it does not follow it.
 fn gap(own: &State, other: &State, [c, s]: [f32; 2]) -> Option<f32> {
     if !other.valid {
         return None;

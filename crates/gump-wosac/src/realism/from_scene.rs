@@ -1,4 +1,4 @@
-//! Scenes and rollouts of `gump-scene` as what is scored.
+//! Conversion of scenes and rollouts of `gump-scene` to the inputs of the metrics.
 
 use std::collections::BTreeMap;
 
@@ -12,9 +12,9 @@ use super::{Mode, WosacError};
 impl Log {
     /// The 9.1 s around the present of a scenario at 10 Hz.
     ///
-    /// A scenario does not tell what a Waymo recording holds where a state is invalid, nor whether
-    /// a red light flashes: invalid states are zeros, all red lights ask to stop. Scores of Waymo
-    /// recordings that are to equal the official ones to the last digit are made of the messages.
+    /// A scenario does not contain the values of invalid states of a Waymo recording, nor whether a
+    /// red light flashes: invalid states are zeros, and all red lights require a stop. To reproduce
+    /// official scores of Waymo recordings to the last digit, convert the messages instead.
     ///
     /// # Errors
     /// [`WosacError::Clock`] for another rate, fewer than 10 frames of past or 80 of future.
@@ -108,11 +108,11 @@ fn signals(frame: &Frame) -> Vec<Signal> {
 }
 
 impl Rollouts {
-    /// Rollouts of a world, at 10 Hz and 80 steps long: the agents that are there at the start.
+    /// Rollouts of a world, at 10 Hz and 80 steps long, of the agents present at the start.
     ///
-    /// The challenge knows no absence, so an agent that a world removes stays where it was last.
-    /// Scenario generation also asks for the past and the boxes: the past is what the rollouts
-    /// started from, an agent that was not yet there stands where it first appears.
+    /// The challenge has no absent agents, so an agent that a world removes stays at its last
+    /// position. Scenario generation also needs past and boxes: the past is the history of the
+    /// rollouts, and an agent that was not yet present stands where it first appears.
     ///
     /// # Errors
     /// [`WosacError::Clock`] for another rate or another number of steps.

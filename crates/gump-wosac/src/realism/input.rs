@@ -1,8 +1,8 @@
-//! What is scored, as plain arrays: a recorded scenario and the rollouts of a world.
+//! Inputs of the metric as plain arrays: a recorded scenario and the rollouts of a world.
 //!
-//! [`Log`] keeps what the reference reads of a recording, invalid states and the order of the map
-//! included, because its quirks depend on them. A recording that has become a
-//! [`gump_scene::Scenario`] turns into a [`Log`] by [`Log::of`], rollouts by [`Rollouts::of`].
+//! [`Log`] contains everything the reference reads of a recording, including invalid states and the
+//! order of the map, because its quirks depend on them. [`Log::of`] converts a
+//! [`gump_scene::Scenario`], [`Rollouts::of`] rollouts.
 
 use gump_scene::{AgentId, AgentKind};
 
@@ -10,9 +10,9 @@ use super::WosacError;
 
 /// Steps of a log: 9.1 s at 10 Hz.
 pub const N_STEPS: usize = 91;
-/// Of these, the past with the present.
+/// Of these, past and present.
 pub const N_HISTORY: usize = 11;
-/// And the future.
+/// Of these, the future.
 pub const N_FUTURE: usize = N_STEPS - N_HISTORY;
 
 /// A recorded agent at one step.
@@ -24,7 +24,8 @@ pub struct State {
     pub heading: f32,
     /// Length, width, height, metres.
     pub size: [f32; 3],
-    /// False where the recording does not know the agent; the rest is then whatever it holds.
+    /// False where the agent was not observed; the other fields then have the values of the
+    /// recording.
     pub valid: bool,
 }
 

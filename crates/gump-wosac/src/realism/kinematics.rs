@@ -1,4 +1,4 @@
-//! Speeds and accelerations, and at which steps their differences mean something.
+//! Speeds and accelerations, and the steps at which their differences are valid.
 
 use super::config::Algorithm;
 use super::input::State;
@@ -8,7 +8,7 @@ const DT: f32 = 0.1;
 /// Its square as the reference rounds it: in f64 first.
 const DT_SQUARED: f32 = 0.01;
 
-/// Which neighbours a difference is taken between.
+/// The neighbours that a difference is taken between.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Differences {
     /// This step less the one before: 2023.
@@ -52,7 +52,7 @@ impl Differences {
     }
 }
 
-/// How one agent moves, per step.
+/// Motion of one agent, per step.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Kinematics {
     /// Speed in space, m/s.
@@ -67,7 +67,7 @@ pub(crate) struct Kinematics {
 
 /// Speeds and accelerations of one agent from its states; NaN where a neighbour is missing.
 ///
-/// Positions of invalid states are used as they are, as the reference does.
+/// Positions of invalid states are used unchanged, as in the reference.
 pub(crate) fn kinematics(states: &[State], differences: Differences) -> Kinematics {
     let column = |f: &dyn Fn(&State) -> f32| states.iter().map(f).collect::<Vec<_>>();
     let [x, y, z] = [0, 1, 2].map(|i| differences.of(&column(&|s| s.position[i])));
@@ -98,10 +98,10 @@ pub(crate) fn kinematics(states: &[State], differences: Differences) -> Kinemati
     }
 }
 
-/// At which steps speeds, and at which accelerations, come from valid states alone.
+/// The steps at which speeds, and at which accelerations, are computed from valid states only.
 ///
-/// Source: as in the reference, a central difference does not ask for the step in its middle, and
-/// the first step never counts, whatever came before it.
+/// Source: as in the reference, a central difference does not require the step in its middle, and
+/// the first step never counts.
 pub(crate) fn validity(valid: &[bool], differences: Differences) -> (Vec<bool>, Vec<bool>) {
     let narrow = |valid: &[bool]| -> Vec<bool> {
         let n = valid.len();

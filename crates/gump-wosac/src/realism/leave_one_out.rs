@@ -1,8 +1,8 @@
-//! What each rollout is worth to the score of all: a reward to learn from.
+//! The contribution of each rollout to the score of all, as a reward for training.
 //!
-//! Realism is a property of a set of rollouts. What one of them adds is the score of all less the
-//! score of the others (its leave-one-out value). Features are measured once; leaving a rollout out
-//! takes its counts from the histograms.
+//! Realism is a property of a set of rollouts. The contribution of one of them is the score of all
+//! minus the score of the others (its leave-one-out value). Features are computed once; leaving a
+//! rollout out subtracts its counts from the histograms.
 
 use std::collections::BTreeMap;
 
@@ -14,29 +14,30 @@ use super::features::Features;
 use super::reference::{Evaluation, geometric_mean};
 use super::scores::{Scores, rounded};
 
-/// Scores without each rollout, and who earned the difference when.
+/// Scores without each rollout, and the attribution of the difference to agents and steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LeaveOneOut {
-    /// Meta metric of all rollouts but this one, by rollout.
+    /// Metametric of all rollouts except this one, by rollout.
     pub metametric: Vec<f64>,
     /// The scored agents.
     pub agents: Vec<AgentId>,
     /// Scored steps.
     pub n_steps: usize,
-    /// What each rollout adds to the meta metric, split by agent and step: `[rollout][agent, step]`.
+    /// The contribution of each rollout to the metametric, split by agent and step:
+    /// `[rollout][agent, step]`.
     ///
     /// With components `c` of weight `w` and likelihood `L` over `n` values that count, the part of
-    /// a value is `w L / n` times the difference of its log-likelihood with and without the rollout;
-    /// to first order the parts of a rollout sum to its leave-one-out value. What an indication (a
-    /// collision, say) adds counts at the step where it first holds in the rollout, and at the last
-    /// one if it never does.
+    /// a value is `w L / n` times the difference of its log-likelihood with and without the
+    /// rollout; to first order the parts of a rollout sum to its leave-one-out value. The part of
+    /// an indicator (a collision, say) counts at the step where it first holds in the rollout, and
+    /// at the last one if it never does.
     pub credit: Vec<Vec<f64>>,
 }
 
 impl Evaluation<'_> {
-    /// What each rollout is worth; `None` for a single one, without which nothing is left.
+    /// The contribution of each rollout; `None` if there is only one.
     ///
-    /// The values equal those of evaluating the others anew.
+    /// The values equal those of evaluating the other rollouts again.
     pub fn leave_one_out(&self) -> Option<LeaveOneOut> {
         let n = self.imagined.len();
         if n * self.copies < 2 {
@@ -88,7 +89,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// The step at which an indication first holds, by agent; the last if it never does.
+    /// The step at which an indicator first holds, by agent; the last if it never does.
     fn first_held(&self, features: &Features, component: Component) -> Vec<usize> {
         let vehicles_only = component == Component::TrafficLightViolation;
         let holds = self.reference.indicated(features, component, vehicles_only);

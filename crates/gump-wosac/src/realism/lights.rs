@@ -1,7 +1,7 @@
-//! Who passes a red light.
+//! Agents that pass a red light.
 //!
-//! The nearest-lane search has two quirks of the reference that are part of its results: it adds
-//! where one expects a difference, and lanes shorter than the longest end with a segment to the
+//! The nearest-lane search has two quirks of the reference that affect its results: it adds where
+//! one would expect a difference, and lanes shorter than the longest end with a segment to the
 //! origin of the world.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,7 +17,7 @@ struct Segment {
 }
 
 impl Segment {
-    /// Where on the line through the segment a point is, 0 at the start and 1 at the end.
+    /// Position of a point along the line through the segment, 0 at the start and 1 at the end.
     fn parameter(&self, point: [f32; 2]) -> f32 {
         let d = self.along;
         let v = [point[0] - self.start[0], point[1] - self.start[1]];
@@ -29,7 +29,7 @@ impl Segment {
         }
     }
 
-    /// What the reference takes for the distance: a sum instead of a difference.
+    /// The reference's distance: a sum instead of a difference.
     fn distance(&self, point: [f32; 2]) -> f32 {
         let on = self.parameter(point).clamp(0.0, 1.0);
         let x = (point[0] - self.start[0]) + self.along[0] * on;
@@ -48,7 +48,7 @@ impl Segment {
 #[derive(Clone, Copy, Debug)]
 struct Gate {
     segment: Segment,
-    /// Where on the segment's line one stops.
+    /// Position of the stop point along the segment's line.
     stop: f32,
     is_red: bool,
 }
@@ -60,12 +60,12 @@ pub(crate) struct Lights {
     /// The lane each segment belongs to.
     lane_of: Vec<i64>,
     blocks: Blocks,
-    /// Per signal: its lane, and what it is at every step.
+    /// Per signal: its lane, and its state at every step.
     signals: Vec<(i64, Vec<Gate>)>,
 }
 
 impl Lights {
-    /// `None` if nothing can be violated: no lanes or no signals.
+    /// `None` if there are no lanes or no signals.
     pub(crate) fn new(log: &Log) -> Option<Self> {
         let lanes: Vec<&SignalLane> = log.lanes.iter().filter(|l| l.points.len() >= 2).collect();
         let longest = lanes.iter().map(|lane| lane.points.len()).max()?;
@@ -122,7 +122,7 @@ impl Lights {
         violations
     }
 
-    /// The nearest lane as the reference finds it, and the index of the segment among all.
+    /// The nearest lane by the reference's search, and the index of the segment among all.
     pub(crate) fn nearest(&self, point: [f32; 2], hint: &mut usize) -> (i64, usize) {
         let cost = |i: usize| self.segments[i].distance(point);
         let nearest = self.blocks.nearest([point[0], point[1], 0.0], *hint, cost);

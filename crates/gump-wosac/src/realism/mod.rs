@@ -1,24 +1,25 @@
-//! Realism as the Waymo Sim Agents Challenge (WOSAC) measures it, equal to the official numbers of
+//! The realism metric of the Waymo Sim Agents Challenge (WOSAC), equal to the official numbers of
 //! 2023 (leaderboards V0 and V1), 2024, 2025 and the scenario-generation challenge of 2025.
 //!
-//! How likely is what really happened under the distribution of what a world imagines? Features of
-//! the logged future (speed, distance to the nearest agent, ...) are scored under histograms of the
-//! same features in many rollouts; the likelihoods of ten components make one number.
+//! The metric is the likelihood of the log under the distribution of a world's rollouts. Features
+//! of the logged future (speed, distance to the nearest agent, ...) are scored under histograms of
+//! the same features over many rollouts; the likelihoods of ten components are combined into one
+//! number.
 //!
 //! Start with [`score`] on plain arrays, with [`Log::of_message`] and [`Rollouts::of_message`] on
-//! Waymo's messages, or with [`Log::of`] and [`Rollouts::of`] on scenes.
-//! [`Reference`] keeps what rollouts are compared with, [`Evaluation`] what the comparison found,
-//! [`Evaluation::explain`] says what lowered the score and when, [`Evaluation::realism`] whose futures
-//! are like the log, [`Evaluation::leave_one_out`] what each rollout adds, as a reward to learn
-//! from; [`Scores::mean`] averages over
-//! scenarios; `gump_metrics::interval` says how sure an average is. A year is a [`Config`], which is a TOML file.
-//! Reading files is the business of `gump-data`, checking a submission too.
+//! Waymo's messages, or with [`Log::of`] and [`Rollouts::of`] on scenes. [`Reference`] is a log
+//! prepared for comparison and [`Evaluation`] the result of one; [`Evaluation::explain`] lists the
+//! largest penalties with their times, [`Evaluation::realism`] gives the realism of each agent, and
+//! [`Evaluation::leave_one_out`] the contribution of each rollout, as a reward for training.
+//! [`Scores::mean`] averages over scenarios; `gump_metrics::interval` computes confidence
+//! intervals. A year is a [`Config`], stored as a TOML file. Files are read and submissions checked
+//! by `gump-data`.
 //!
-//! The front page of the crate scores a scene of one's own in a dozen lines.
+//! The front page of the crate has a complete example on plain arrays.
 //!
 //! # Numbers
-//! The reference computes in f32 at world coordinates of thousands of metres; its rounding is part
-//! of its results. So here, too, features are f32 and in its order of operations.
+//! The reference computes in f32 at world coordinates of thousands of metres, and its rounding
+//! affects its results. Features here are therefore also f32, in the same order of operations.
 //!
 //! Source: the official evaluator, its git history and its quirks; goldens in `tests/golden/realism`.
 

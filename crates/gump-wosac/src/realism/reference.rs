@@ -17,7 +17,7 @@ use super::lights::Lights;
 use super::road_edge::RoadEdges;
 use super::scores::{Scores, rounded};
 
-/// What rollouts of `log` score under `config`.
+/// Scores `rollouts` of `log` with `config`.
 ///
 /// # Errors
 /// Those of [`Reference::new`] and [`Reference::evaluate`].
@@ -43,9 +43,9 @@ impl<'a> Reference<'a> {
     /// Checks and measures a log.
     ///
     /// # Errors
-    /// A log that the metric is not defined on: tracks of other lengths, roles without a track,
-    /// scored agents that are absent at the present step, a map without road edges, numbers that
-    /// are none.
+    /// A log for which the metric is not defined: tracks of different lengths, roles without a
+    /// track, scored agents that are absent at the present step, a map without road edges, numbers
+    /// that are not finite.
     pub fn new(log: &'a Log, config: &'a Config) -> Result<Self, WosacError> {
         let (simulated, scored) = assemble::roles(log, config.mode)?;
         let surroundings = Surroundings {
@@ -86,17 +86,17 @@ impl<'a> Reference<'a> {
         &self.features
     }
 
-    /// Agents that every rollout must have.
+    /// Agents that every rollout must contain.
     pub fn simulated(&self) -> impl Iterator<Item = AgentId> {
         self.simulated.iter().map(|track| track.id)
     }
 
-    /// Compares rollouts with the log, in parallel over rollouts; the number of threads changes
-    /// nothing.
+    /// Compares rollouts with the log, in parallel over rollouts; results do not depend on the
+    /// number of threads.
     ///
     /// # Errors
     /// Rollouts that do not fit: another scenario, no rollouts, agents missing, unknown or twice,
-    /// wrong lengths, numbers that are none.
+    /// wrong lengths, numbers that are not finite.
     pub fn evaluate(&self, rollouts: &Rollouts) -> Result<Evaluation<'_>, WosacError> {
         let mode = self.config.mode;
         assemble::check_rollouts(self.scenario, &self.simulated, rollouts, mode)?;
@@ -160,7 +160,7 @@ impl<'a> Reference<'a> {
         }
     }
 
-    /// At which steps an indication of these features counts, `[agent, step]`.
+    /// The steps at which an indicator of these features counts, `[agent, step]`.
     pub(crate) fn indicated(
         &self,
         features: &Features,
@@ -177,8 +177,8 @@ impl<'a> Reference<'a> {
         holds
     }
 
-    /// What is compared of a component: how many steps it has, and its values `[agent, step]` of the
-    /// log and then of each rollout.
+    /// The compared values of a component: number of steps, and values `[agent, step]` of the log
+    /// and then of each rollout.
     pub(crate) fn values<'f>(
         &'f self,
         component: Component,
@@ -195,7 +195,7 @@ impl<'a> Reference<'a> {
         }
     }
 
-    /// Whether each scored agent ever has an indication, as 0 or 1.
+    /// Whether each scored agent ever has an indicator, as 0 or 1.
     pub(crate) fn ever(
         &self,
         features: &Features,
@@ -218,17 +218,17 @@ fn first_step(mode: Mode) -> usize {
     }
 }
 
-/// What comparing rollouts with a log found.
+/// The result of comparing rollouts with a log.
 pub struct Evaluation<'a> {
     /// The scores.
     pub scores: Scores,
-    /// Features of each rollout; equal ones once.
+    /// Features of each rollout; of equal rollouts only one.
     pub imagined: Vec<Features>,
     /// Mean distance of each scored agent from its log, metres, `[rollout][agent]`; see
     /// [`Scores::ade`].
     pub displacements: Vec<Vec<f32>>,
     pub(crate) reference: &'a Reference<'a>,
-    /// How many equal rollouts each of `imagined` stands for.
+    /// Number of equal rollouts that each of `imagined` stands for.
     pub(crate) copies: usize,
     pub(crate) log_likelihoods: BTreeMap<Component, Vec<f32>>,
 }
@@ -288,14 +288,14 @@ impl<'a> Evaluation<'a> {
         self.reference.values(component, &self.imagined)
     }
 
-    /// Log-likelihood of every logged value of a component before validity is looked at, `[agent,
-    /// step]`, of indications `[agent]`; `None` if the year does not score it.
+    /// Log-likelihood of every logged value of a component before validity is applied,
+    /// `[agent, step]`, of indicators `[agent]`; `None` if the year does not score it.
     pub fn log_likelihoods(&self, component: Component) -> Option<&[f32]> {
         self.log_likelihoods.get(&component).map(Vec::as_slice)
     }
 
-    /// Whether each scored agent ever has an indication: in the log, and in each rollout (equal
-    /// ones once). Empty for other components.
+    /// Whether each scored agent ever has an indicator: in the log, and in each rollout (of equal
+    /// ones only one). Empty for other components.
     pub fn indications(&self, component: Component) -> (Vec<bool>, Vec<Vec<bool>>) {
         let vehicles_only = component == Component::TrafficLightViolation;
         let ever = |features: &Features| {

@@ -1,4 +1,4 @@
-//! Signed distance to the border of the road: negative on it, positive off it.
+//! Signed distance to the road edge: negative on the road, positive off it.
 
 use super::assemble::Traffic;
 use super::blocks::{Blocks, Bounds};
@@ -6,7 +6,7 @@ use super::box_distance::{FAR, box_corners};
 use super::config::Algorithm;
 use super::input::State;
 
-/// How many times a metre of height counts as far as a metre on the ground, since 2024: bridges.
+/// Factor of height differences relative to distances on the ground, since 2024: for bridges.
 const ELEVATION_STRETCH: f32 = 3.0;
 
 /// A polyline whose ends are within this is a ring, metres squared.
@@ -17,7 +17,7 @@ const RING_GAP_SQUARED: f32 = 1.0;
 struct Segment {
     start: [f32; 3],
     along: [f32; 3],
-    /// The segments that end and start here; itself where there is none.
+    /// The segments that end and start here; the segment itself where there is none.
     previous: usize,
     next: usize,
     /// True where the edge turns left at its start, at its end.
@@ -87,7 +87,7 @@ impl RoadEdges {
         }
     }
 
-    /// Signed distance on the ground; `hints` are where the last queries ended.
+    /// Signed distance on the ground; `hints` are the results of the last queries.
     pub(crate) fn signed_distance(&self, point: [f32; 3], hints: &mut Vec<usize>) -> f32 {
         match &self.lookup {
             Lookup::Space { blocks, stretch } => {
@@ -147,7 +147,7 @@ impl RoadEdges {
 
 /// From the nearest place on a segment to a point.
 struct Offset {
-    /// Where on the segment's line, 0 at its start and 1 at its end, not limited.
+    /// Position along the segment's line, 0 at its start and 1 at its end, not limited.
     t: f32,
     rest: [f32; 3],
 }

@@ -1,4 +1,4 @@
-//! The numbers of a scenario, and of many.
+//! Scores of one scenario, and means over many.
 
 use std::collections::BTreeMap;
 
@@ -6,10 +6,10 @@ use serde::{Deserialize, Serialize};
 
 use super::config::{Component, Config, Group};
 
-/// What rollouts score, on one scenario or on average over many.
+/// Scores of rollouts, of one scenario or averaged over many.
 ///
-/// A number is NaN where nothing could be scored (no valid step of any vehicle, for instance), as
-/// in the reference; the meta metric is NaN then, too.
+/// A number is NaN where nothing could be scored (for instance, no valid step of any vehicle), as
+/// in the reference; the metametric is then NaN as well.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scores {
     /// The weighted sum of the components: realism, at most 1.
@@ -20,8 +20,8 @@ pub struct Scores {
     pub interactive: f64,
     /// Weighted mean of the map-based components.
     pub map_based: f64,
-    /// Mean distance from the log in space, metres, over all 91 steps: those of the past, where it
-    /// is 0, included. Lower is better; no part of the meta metric.
+    /// Mean distance from the log in space, metres, over all 91 steps, including those of the past,
+    /// where it is 0. Lower is better; not part of the metametric.
     pub ade: f64,
     /// `ade` of the best rollout for all scored agents together, metres.
     pub min_ade: f64,
@@ -39,7 +39,7 @@ pub struct Scores {
 impl Scores {
     /// Averages over scenarios; `None` without any.
     ///
-    /// The order matters to the last bit of the sums, nothing else.
+    /// The order affects only the last bit of the sums.
     pub fn mean(scores: &[Self]) -> Option<Self> {
         let first = scores.first()?;
         let n = scores.len() as f64;
@@ -61,7 +61,7 @@ impl Scores {
         })
     }
 
-    /// The meta metric and the groups from components; the rest is 0.
+    /// Computes metametric and groups from components; the rest is 0.
     pub(crate) fn of_components(config: &Config, components: BTreeMap<Component, f64>) -> Self {
         // Weights and likelihoods are f32 in the reference, sums are f64 and stored as f32.
         let weighted = |wanted: Option<Group>| {
