@@ -1,7 +1,7 @@
-//! A line to drive along: poses by arc length.
+//! Paths with a heading at every point, by arc length.
 //!
-//! [`gump_geometry::Polyline`] knows points and takes directions from them; here every point comes
-//! with a heading of its own and both are interpolated, as nuPlan's paths are.
+//! A [`gump_geometry::Polyline`] takes directions from its points; here every point has its own
+//! heading and both are interpolated, as in nuPlan's paths.
 
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference, wrap_angle};
 use gump_scene::Lane;
@@ -10,14 +10,14 @@ use gump_scene::Lane;
 const SAME: f64 = 1e-3;
 /// How far apart the points of a curvature are, metres.
 const CURVATURE_SPAN: f64 = 2.0;
-/// How far ahead a baseline looks for its direction, metres.
+/// Distance over which a baseline's direction is determined, metres.
 const HEADING_SPAN: f64 = 0.5;
 
 /// Poses along a line; at least one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Path {
     line: Polyline,
-    /// Without jumps by whole turns.
+    /// Headings without jumps by whole turns.
     headings: Vec<f64>,
 }
 
@@ -33,11 +33,11 @@ impl Path {
         Some(Self { line, headings })
     }
 
-    /// A path through the poses that are followed by another one elsewhere; `None` if there are
-    /// fewer than two.
+    /// A path through poses that another path continues; `None` if there are fewer than two.
     ///
-    /// The last pose is dropped even where it is not repeated, unless too few would be left. Source:
-    /// nuPlan's path of a vehicle; routes are short by one point for it, which the goldens see.
+    /// The last pose is dropped even where it is not repeated, unless too few would be left.
+    /// Source: nuPlan's path of a vehicle; routes are shorter by one point because of it, as the
+    /// golden values show.
     pub fn without_last(poses: &[Pose]) -> Option<Self> {
         let mut kept: Vec<Pose> = poses
             .windows(2)

@@ -1,38 +1,38 @@
-//! Candidates: what a driver weighed before it decided.
+//! Candidates: the alternatives that a driver compared before its decision.
 
 use gump_geometry::Pose;
 use gump_nuplan::closed_loop::Driver;
 
 use crate::Decision;
 
-/// A driver that can say what it weighed in its last step.
+/// A driver that reports the candidates of its last step.
 pub trait Explain: Driver {
     /// All candidates of its last step, one of them chosen; empty before the first.
     fn candidates(&self) -> Vec<Candidate>;
 
-    /// What the last step rests on, from those who imagine before they decide.
+    /// Details of the last step, of drivers that use rollouts.
     fn decision(&self) -> Option<&Decision> {
         None
     }
 }
 
-/// One thing a driver might have done.
+/// One alternative of a driver.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
-    /// What it is, in a few words.
+    /// A short description.
     pub name: String,
-    /// Whether it was done.
+    /// Whether it was chosen.
     pub chosen: bool,
-    /// How good it was found; `None` where nothing is compared.
+    /// Its score; `None` for drivers that do not compare.
     pub score: Option<f64>,
-    /// What the score is made of, by name.
+    /// The parts of the score, by name.
     pub parts: Vec<(&'static str, f64)>,
-    /// Where it leads: rear axle, world frame; may be empty.
+    /// Its path: rear axle, world frame; may be empty.
     pub poses: Vec<Pose>,
 }
 
 impl Candidate {
-    /// What was done without an alternative.
+    /// The only candidate of a driver without alternatives.
     pub fn alone(name: &str, poses: Vec<Pose>) -> Self {
         Self {
             name: name.to_owned(),

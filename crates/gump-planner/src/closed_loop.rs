@@ -1,8 +1,7 @@
-//! Closed-loop evaluation: drive, score, over and over.
+//! Closed-loop evaluation: drives recordings with a planner and scores the drives.
 //!
-//! [`drive_scenario`] does one scenario, [`drive_and_score`] one recording, [`evaluate`] many at
-//! once; [`plan_once`] asks for a plan alone. What fails is an error of its recording; nothing here
-//! averages.
+//! [`drive_scenario`] drives one scenario, [`drive_and_score`] one recording, [`evaluate`] many in
+//! parallel; [`plan_once`] only plans. Errors are reported per recording; nothing is averaged here.
 
 use gump_nuplan::closed_loop::{
     DriveConfig, Driven, Driver, Moment, Recording, Tracking, Traffic, derive_roadblocks, drive,
@@ -16,10 +15,10 @@ use rayon::prelude::*;
 
 use crate::PlanError;
 
-/// A finished drive with what it is worth.
+/// A finished drive with its scores.
 #[derive(Clone, Debug)]
 pub struct Scored {
-    /// What happened.
+    /// The drive.
     pub driven: Driven,
     /// Every metric.
     pub metrics: ClosedLoop,
@@ -27,15 +26,15 @@ pub struct Scored {
     pub score: f64,
 }
 
-/// Lets a driver drive a recording among some traffic and scores it as nuPlan's closed-loop
-/// challenges do.
+/// Drives a recording among some traffic and scores the drive as nuPlan's closed-loop challenges
+/// do.
 ///
-/// `map` is what the drive is judged on; usually that of the recording, but one without the
-/// roadblocks that were derived for driving judges by what was really stated.
+/// `map` is the map used for scoring, usually that of the recording. Passing the map without
+/// derived roadblocks scores the drive on what was really stated.
 ///
 /// # Errors
-/// [`PlanError::Drive`] with the iteration if the loop cannot go on, [`PlanError::Score`] if what
-/// was driven cannot be scored.
+/// [`PlanError::Drive`] with the iteration if the loop cannot continue, [`PlanError::Score`] if the
+/// drive cannot be scored.
 pub fn drive_and_score(
     recording: &Recording,
     map: &MapGraph,
@@ -55,8 +54,8 @@ pub fn drive_and_score(
 
 /// As [`drive_and_score`], for a scenario of lanes and boxes as most datasets have them.
 ///
-/// What nuPlan's drivers ask for besides, roadblocks and a rear axle, is derived for driving
-/// ([`derive_roadblocks`], [`Recording::of_boxes`]); the drive is judged on the map as stated.
+/// The roadblocks and rear axle that nuPlan's drivers need are derived for driving
+/// ([`derive_roadblocks`], [`Recording::of_boxes`]); the drive is scored on the map as stated.
 ///
 /// # Errors
 /// As [`drive_and_score`].
@@ -72,10 +71,10 @@ pub fn drive_scenario(
     drive_and_score(&recording, &scenario.map, traffic, driver, config)
 }
 
-/// What a driver plans in the present of a recording; nothing is driven.
+/// The plan of a driver in the present of a recording; nothing is driven.
 ///
 /// # Errors
-/// Whatever the driver reports.
+/// The error of the driver.
 pub fn plan_once(recording: &Recording, driver: &mut dyn Driver) -> Result<Trajectory, BoxError> {
     driver.start(&recording.mission())?;
     driver.drive(&Moment {
@@ -86,8 +85,8 @@ pub fn plan_once(recording: &Recording, driver: &mut dyn Driver) -> Result<Traje
     })
 }
 
-/// Lets a driver plan along the log without being followed, and compares its plans with what was
-/// driven; `after` is what was driven after the recording's end, if that is known.
+/// Lets a driver plan along the log without following its plans, and compares the plans with the
+/// logged drive; `after` is the drive after the recording's end, if it is known.
 ///
 /// # Errors
 /// As [`drive_and_score`].
@@ -120,7 +119,7 @@ pub fn plan_and_compare(
     Ok(open_loop(&judged, &future, &config)?)
 }
 
-/// What was driven in the form that metrics read.
+/// The drive in the form that metrics read.
 pub fn samples(driven: &Driven) -> Vec<Sample> {
     let states = driven.ego.iter().enumerate();
     states
@@ -151,8 +150,8 @@ fn judged<'a>(
     }
 }
 
-/// Works on recordings side by side, in memory only as many as there are threads; results come in
-/// the order of the recordings, whatever finishes first.
+/// Processes recordings in parallel, with at most as many in memory as there are threads; results
+/// come in the order of the recordings.
 pub fn evaluate<T: Send, R: Send>(
     recordings: impl Iterator<Item = T> + Send,
     work: impl Fn(usize, T) -> R + Sync,

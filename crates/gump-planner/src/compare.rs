@@ -1,20 +1,20 @@
-//! Who is better, how sure that is, and how much more would have to be tried to be sure.
+//! Comparison of policies with confidence intervals, and the sample size needed for significance.
 //!
-//! [`value_policies`] lets policies drive through imagined futures; [`Comparison`] sets two lists of
-//! scores of the same scenes side by side, whoever made them.
+//! [`value_policies`] rolls policies out in futures of a world; [`Comparison`] compares two lists
+//! of scores of the same scenes, from any source.
 
 use gump_metrics::{Interval, Reward, interval};
 use gump_rollout::{BoxError, Policy, SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{SceneState, Seed};
 
-/// How policies are valued.
+/// Settings of the evaluation of policies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ValueConfig {
     /// Futures of every scene, > 0.
     pub n_futures: usize,
-    /// Where chance comes from; all policies meet the same.
+    /// The seed; all policies meet the same random numbers.
     pub seed: Seed,
-    /// How far and how finely.
+    /// Horizon and time step.
     pub simulate: SimulateConfig,
 }
 
@@ -32,7 +32,7 @@ impl Default for ValueConfig {
     }
 }
 
-/// What a policy is worth.
+/// The value of a policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyValue {
     /// Its name.
@@ -45,13 +45,13 @@ pub struct PolicyValue {
     pub interval: Option<Interval>,
 }
 
-/// Lets every policy drive the ego through futures of every scene and values what happens; best
-/// first, the order given where they are equal.
+/// Rolls every policy out in futures of every scene and computes its value; best first, ties in the
+/// given order.
 ///
-/// Future *k* of a scene meets the same chance whoever drives.
+/// Future *k* of a scene has the same random numbers for every policy.
 ///
 /// # Errors
-/// What the world or a policy reports; a state that is not a number is one.
+/// Errors of the world or a policy; a state that is not finite is one.
 pub fn value_policies(
     world: &dyn WorldModel,
     scenes: &[SceneState<'_>],
@@ -95,18 +95,18 @@ pub fn value_policies(
 /// The difference between two lists of scores of the same scenes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Comparison {
-    /// Mean of the first less that of the second.
+    /// Mean of the first minus that of the second.
     pub difference: f64,
     /// Its 95 % interval over scenes.
     pub interval: Interval,
-    /// Variance of the difference between scenes, chance taken out.
+    /// Variance of the difference between scenes, without that between futures.
     pub between_scenes: f64,
     /// Variance of the difference between futures of a scene.
     pub within_scenes: f64,
 }
 
-/// Standard errors between a difference that is told from none and 0: 1.96 for an error of the first
-/// kind of 5 %, 0.84 for one of the second of 20 %.
+/// Number of standard errors of a difference that is detected with power 80 %: 1.96 for a type I
+/// error of 5 %, 0.84 for a type II error of 20 %.
 const TOLD: f64 = 1.96 + 0.84;
 
 impl Comparison {
@@ -147,13 +147,13 @@ impl Comparison {
         Self::new(&alone(a), &alone(b), seed)
     }
 
-    /// True if the interval leaves 0 out.
+    /// True if the interval excludes 0.
     pub fn is_sure(&self) -> bool {
         self.interval.low > 0.0 || self.interval.high < 0.0
     }
 
-    /// How many scenes with `n_futures` futures each would tell the two apart four times out of
-    /// five, if the difference is what it seems; `None` if there is none.
+    /// The number of scenes, with `n_futures` futures each, that would detect the difference with a
+    /// power of 80 %, if it has the observed size; `None` if it is 0.
     ///
     /// Source: sample size of a paired comparison of means, two-sided at 5 %, power 80 %.
     pub fn scenes_needed(&self, n_futures: usize) -> Option<usize> {

@@ -1,16 +1,16 @@
-//! What can keep a planner from planning.
+//! Errors of planners.
 
 use gump_nuplan::metrics::NuPlanError;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::{AgentId, RoadblockId};
 
-/// Why there is no plan.
+/// Why planning failed.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
-    /// A planner of the closed loop was asked before it was told where to go.
+    /// A planner was asked for a plan before it had a mission.
     #[error("the planner was asked to drive before it was given a mission")]
     NoMission,
-    /// There is nowhere to go.
+    /// There is no route.
     #[error("the mission has no route, expected the roadblocks to drive through")]
     NoRoute,
     /// A closed loop stopped.
@@ -34,19 +34,19 @@ pub enum PlanError {
     /// A parameter outside its range.
     #[error("the parameter {name} is {value}, expected {expected}")]
     Parameter {
-        /// Which one.
+        /// Its name.
         name: &'static str,
-        /// What was given.
+        /// Its value.
         value: f64,
-        /// What is allowed.
+        /// The allowed range.
         expected: &'static str,
     },
-    /// The world could not imagine the proposals.
+    /// The world could not simulate the proposals.
     #[error("the world \"{world}\" could not imagine the proposals: {source}")]
     World {
         /// Name of the world.
         world: String,
-        /// What it reported.
+        /// Its error.
         source: BoxError,
     },
 }

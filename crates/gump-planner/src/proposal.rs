@@ -1,17 +1,17 @@
 //! Proposals: trajectories the ego might drive.
 //!
-//! Here is the trajectory and its interpolation; worlds that drive the ego and rules make them,
-//! [`crate::InteractiveDriver`] judges them.
+//! This module has the trajectory and its interpolation. Rules and worlds that drive the ego make
+//! proposals, [`crate::InteractiveDriver`] scores them.
 
 use std::fmt;
 
 use gump_geometry::{Pose, interpolate_angle};
 use gump_scene::AgentState;
 
-/// A trajectory of the ego and where it comes from.
+/// A trajectory of the ego and its origin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Proposal {
-    /// Where it comes from.
+    /// Its origin.
     pub kind: ProposalKind,
     /// Seconds between states, > 0.
     pub dt: f64,
@@ -19,7 +19,7 @@ pub struct Proposal {
     pub states: Vec<AgentState>,
 }
 
-/// Where a proposal comes from.
+/// The origin of a proposal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ProposalKind {
     /// The Intelligent Driver Model along a line beside the centre of the way.
@@ -29,17 +29,17 @@ pub enum ProposalKind {
         /// Metres to the left of the centre line.
         lateral_offset: f64,
     },
-    /// The same along the centre, by a driver who follows closer and sets off faster.
+    /// The same along the centre, with a shorter headway and stronger acceleration.
     Brisk {
         /// Desired speed as a share of the limit, > 0.
         speed_fraction: f64,
     },
-    /// The same along the centre, by a driver who keeps a long distance and brakes early.
+    /// The same along the centre, with a long headway and early braking.
     Yielding {
         /// Desired speed as a share of the limit, > 0.
         speed_fraction: f64,
     },
-    /// What the imagined world has the ego do.
+    /// The world's own motion of the ego.
     Imitation,
     /// Braking straight ahead as hard as allowed.
     EmergencyBrake,
@@ -69,7 +69,7 @@ impl fmt::Display for ProposalKind {
 
 impl Proposal {
     /// Through these box centres, `dt` seconds apart, of which the first is now; velocities are
-    /// taken over two steps, since imagined places come in quanta.
+    /// taken over two steps, since simulated positions are quantised.
     ///
     /// # Panics
     /// If there are fewer than two places.
@@ -88,8 +88,8 @@ impl Proposal {
         Self { kind, dt, states }
     }
 
-    /// The state `elapsed` seconds after `now`, between states by a cubic that meets positions and
-    /// velocities; past the last state at its velocity.
+    /// The state `elapsed` seconds after `now`, between states by a cubic that matches positions
+    /// and velocities; past the last state at its velocity.
     pub fn state_at(&self, now: &AgentState, elapsed: f64) -> AgentState {
         let place = elapsed / self.dt;
         // A sum of steps meets a state up to rounding; snap, so that states are met exactly.
@@ -127,7 +127,7 @@ impl Proposal {
     }
 }
 
-/// Between two states `dt` apart, by the cubic that meets both positions and velocities.
+/// Between two states `dt` apart, by the cubic that matches both positions and velocities.
 fn hermite(from: &AgentState, to: &AgentState, dt: f64, t: f64) -> AgentState {
     let (t2, t3) = (t * t, t * t * t);
     let step = to.pose.position - from.pose.position;

@@ -1,7 +1,7 @@
-//! The way through the graph of roadblocks and lanes.
+//! Search for a route through the graph of roadblocks and lanes.
 //!
-//! A stated route may have gaps, repeats, loops, or begin elsewhere than where the ego is;
-//! [`correct_route`] mends that. [`lanes_of_route`], [`shortest_lanes`] and [`first_lanes`] choose
+//! A stated route may have gaps, repeats or loops, or begin elsewhere than at the ego;
+//! [`correct_route`] repairs it. [`lanes_of_route`], [`shortest_lanes`] and [`first_lanes`] choose
 //! lanes within it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -11,22 +11,22 @@ use gump_geometry::{DVec2, Polygon, Pose, angle_difference, dvec2};
 use gump_nuplan::path::baseline;
 use gump_scene::{Lane, LaneId, MapGraph, Roadblock, RoadblockId};
 
-/// Half the square around the rear axle in which its roadblock is looked for, metres.
+/// Half the side of the square around the rear axle in which its roadblock is searched, metres.
 const HERE: f64 = 1.0;
 /// A roadblock fits if one of its lanes passes this near, metres, ...
 const NEAR: f64 = 3.0;
 /// ... in this direction, radians.
 const ALIGNED: f64 = FRAC_PI_4;
-/// How many roadblocks back the ego is looked for from the start of the route.
+/// How many roadblocks back from the start of the route the ego is searched.
 const DEPTH_BACK: usize = 15;
-/// How many roadblocks ahead the route is looked for from the ego.
+/// How many roadblocks ahead of the ego the route is searched.
 const DEPTH_AHEAD: usize = 30;
-/// Connectors that share more than this are one place, square metres.
+/// Connectors that overlap by more than this are the same place, square metres.
 const SHARED_AREA: f64 = 1.0;
 /// Side of the squares by which shared areas are counted, metres.
 const AREA_CELL: f64 = 0.2;
 
-/// The route from the ego's roadblock on, without gaps, and without coming back to a place.
+/// The route from the ego's roadblock on, without gaps and without returning to a place.
 ///
 /// Source: the route correction of tuPlan Garage's PDM planners.
 pub fn correct_route(map: &MapGraph, route: &[RoadblockId], rear_axle: Pose) -> Vec<RoadblockId> {
@@ -42,7 +42,7 @@ pub fn correct_route(map: &MapGraph, route: &[RoadblockId], rear_axle: Pose) -> 
     route.into_iter().filter(|id| seen.insert(*id)).collect()
 }
 
-/// Leads the ego's roadblock to the route: backwards from its start, else forwards to one of its
+/// Connects the ego's roadblock to the route: backwards from its start, else forwards to one of its
 /// first three roadblocks.
 fn join(
     map: &MapGraph,
@@ -71,7 +71,7 @@ fn join(
     }
 }
 
-/// The roadblock the ego is in, if there is any near, and all that fit.
+/// The roadblock of the ego, if there is one near, and all that fit.
 fn roadblock_of_ego(
     map: &MapGraph,
     route: &[RoadblockId],
@@ -282,7 +282,7 @@ pub fn shortest_lanes(map: &MapGraph, start: LaneId, route: &[RoadblockId]) -> V
 }
 
 /// The first chain of lanes that a breadth-first search within the route finds from `start` to the
-/// route's last roadblock at exactly `depth` lanes; else the chain it looked at last.
+/// route's last roadblock at exactly `depth` lanes; otherwise the chain examined last.
 ///
 /// Source: the route search of nuPlan's IDM planner.
 pub fn first_lanes(

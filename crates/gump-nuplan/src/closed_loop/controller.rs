@@ -1,4 +1,4 @@
-//! From a plan to the ego's next state.
+//! Controllers: from a plan to the ego's next state.
 
 use gump_scene::EgoState;
 
@@ -6,21 +6,21 @@ use super::Recording;
 use crate::tracking::{LqrTracker, Trajectory, propagate};
 use gump_rollout::RolloutError;
 
-/// A tracked speed beyond which a plan is nonsense, metres per second.
+/// A faster tracked speed means that the plan cannot be driven, metres per second.
 const IMPOSSIBLE_SPEED: f64 = 50.0;
 
-/// How the ego follows what is planned.
+/// How the ego follows its plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tracking {
     /// As a car: the LQR tracker steers the kinematic bicycle.
     TwoStage,
-    /// It is where the plan says.
+    /// Perfect tracking.
     Perfect,
-    /// It is where it was in the log, whatever is planned: open loop.
+    /// The logged state, whatever the plan: open loop.
     Log,
 }
 
-/// A way of tracking and what it keeps between steps.
+/// A controller with its state between steps.
 #[derive(Clone, Debug)]
 pub struct Controller {
     tracking: Tracking,
@@ -28,7 +28,7 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// A controller at rest.
+    /// A controller in its initial state.
     pub fn new(tracking: Tracking) -> Self {
         Self {
             tracking,
@@ -40,7 +40,7 @@ impl Controller {
     ///
     /// # Errors
     /// [`RolloutError::OutsideTrajectory`] for a plan that does not reach the next iteration,
-    /// [`RolloutError::NotFinite`] if the motion explodes, [`RolloutError::Speed`] for a plan
+    /// [`RolloutError::NotFinite`] if the motion diverges, [`RolloutError::Speed`] for a plan
     /// faster than 50 m/s.
     pub fn advance(
         &mut self,

@@ -1,4 +1,4 @@
-//! What drives the ego through a closed loop.
+//! Drivers, which control the ego in a closed loop.
 
 use std::sync::Arc;
 
@@ -8,53 +8,52 @@ use gump_scene::{EgoState, MapGraph, Route, SceneState, VehicleParameters};
 use crate::tracking::Trajectory;
 use gump_rollout::BoxError;
 
-/// Told once where to go, then asked for a trajectory at every step.
+/// Receives a mission once, then plans a trajectory at every step.
 ///
-/// Unlike a [`gump_rollout::Policy`] it drives a car with a rear axle in one future, may remember what it
-/// saw, and answers with seconds of trajectory of which a tenth of a second is driven.
+/// Unlike a [`gump_rollout::Policy`] it drives a vehicle with a rear axle in one future, may keep
+/// state, and returns seconds of trajectory of which a tenth of a second is driven.
 pub trait Driver {
     /// A short name for tables and reports.
     fn name(&self) -> &str;
 
-    /// Forgets everything and takes a new mission; a driver that remembers nothing need not say
-    /// how.
+    /// Resets the driver and sets a new mission; a driver without state need not implement this.
     ///
     /// # Errors
-    /// Whatever makes the mission impossible, a route that is not in the map for instance.
+    /// Any reason for which the mission is impossible, for instance a route that is not in the map.
     fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
         let _ = mission;
         Ok(())
     }
 
-    /// What to drive from now on: states of the rear axle, the first not later than now.
+    /// The trajectory from now on: states of the rear axle, the first not later than now.
     ///
     /// # Errors
-    /// Whatever keeps the driver from planning.
+    /// Any reason for which the driver cannot plan.
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError>;
 }
 
-/// Where to go, and in what.
+/// The route, the goal and the vehicle of a drive.
 #[derive(Clone, Copy, Debug)]
 pub struct Mission<'a> {
-    /// The road.
+    /// The map.
     pub map: &'a Arc<MapGraph>,
-    /// The way to take, if one is known.
+    /// The route, if one is known.
     pub route: Option<&'a Arc<Route>>,
-    /// Where the way ends, if known: rear axle, world frame.
+    /// The goal, if known: rear axle, world frame.
     pub goal: Option<Pose>,
     /// The ego's extents.
     pub vehicle: VehicleParameters,
 }
 
-/// One iteration of the loop as the driver sees it.
+/// The input of a driver at one iteration.
 #[derive(Clone, Copy, Debug)]
 pub struct Moment<'a> {
-    /// Iterations driven so far.
+    /// Iterations completed so far.
     pub iteration: usize,
-    /// Everyone up to now.
+    /// The scene up to now.
     pub scene: SceneState<'a>,
     /// The ego now.
     pub ego: &'a EgoState,
-    /// The ego before, oldest first, now excluded.
+    /// Previous states of the ego, oldest first, without the present.
     pub past: &'a [EgoState],
 }

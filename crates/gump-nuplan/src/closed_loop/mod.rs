@@ -1,10 +1,13 @@
-//! The closed loop: a driver plans, a controller moves the ego, traffic answers, again and again.
+//! The closed loop: in every iteration a driver plans, a controller moves the ego, and traffic
+//! reacts.
 //!
-//! [`drive`] is the loop, over a [`Recording`]. A [`Driver`] is what is tested, [`Traffic`] whom it
-//! meets, a [`Controller`] what turns its plan into motion. Nothing here scores.
+//! [`drive`] is the loop, over a [`Recording`]. The [`Driver`] is the planner under test,
+//! [`Traffic`] moves the other agents, and the [`Controller`] turns plans into motion. Scoring is
+//! in `metrics`.
 //!
-//! [`gump_rollout::simulate`] is the other loop: many futures of a scene at once, box centres, no vehicle.
-//! This one follows nuPlan's: one future, the ego a car with a rear axle, clocks as recorded.
+//! [`gump_rollout::simulate`] is a different loop: many futures of a scene at once, box centres, no
+//! vehicle. This one follows nuPlan's: one future, an ego vehicle with a rear axle, recorded time
+//! stamps.
 
 mod controller;
 mod driver;
@@ -23,23 +26,23 @@ use gump_scene::{EgoState, Frame, Rollout, SceneState};
 use crate::tracking::Trajectory;
 use gump_rollout::RolloutError;
 
-/// What a closed loop leaves behind: one entry per executed iteration.
+/// The result of a closed loop: one entry per executed iteration.
 #[derive(Clone, Debug)]
 pub struct Driven {
-    /// The traffic, ego included; imagined frame `i` is iteration `i + 1`.
+    /// The traffic, including the ego; simulated frame `i` is iteration `i + 1`.
     pub rollout: Rollout,
     /// The ego, from iteration 0 on.
     pub ego: Vec<EgoState>,
-    /// What the driver planned at each iteration; empty unless asked for.
+    /// The driver's plan at each iteration; empty unless requested.
     pub plans: Vec<Trajectory>,
 }
 
-/// How a loop is run.
+/// Settings of a loop.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DriveConfig {
-    /// What turns plans into motion.
+    /// How plans are turned into motion.
     pub tracking: Tracking,
-    /// Seconds at most, > 0; a recording may be shorter.
+    /// Maximum duration in seconds, > 0; a recording may be shorter.
     pub seconds: f64,
     /// Whether plans are kept; they take a hundred times the memory of the rest.
     pub keep_plans: bool,
@@ -56,16 +59,17 @@ impl Default for DriveConfig {
     }
 }
 
-/// Drives through a recording from its present on.
+/// Drives in a recording from its present on.
 ///
-/// With `n` recorded frames to drive through there are `n - 1` iterations: after the last plan
-/// nothing moves any more. Collisions do not end the loop.
+/// `n` recorded frames give `n - 1` iterations: nothing moves after the last plan. Collisions do
+/// not end the loop.
 ///
-/// Traffic sees the ego as it is at the iteration that ends, not the one that begins.
+/// Traffic receives the ego's state at the end of the previous iteration, not that of the one that
+/// begins.
 ///
 /// # Errors
-/// [`RolloutError::Recording`] for a recording too short to drive through, [`RolloutError::Loop`]
-/// with the iteration for whatever driver, controller or traffic report.
+/// [`RolloutError::Recording`] for a recording that is too short, [`RolloutError::Loop`] with the
+/// iteration for errors of driver, controller or traffic.
 ///
 /// Source: the simulation loop of nuplan-devkit.
 pub fn drive(
@@ -136,7 +140,7 @@ pub fn drive(
     })
 }
 
-/// The recorded past with the first frame as traffic has it.
+/// The recorded past with the first frame of the traffic.
 fn begin(recording: &Recording, ego: &EgoState, first: Others) -> Rollout {
     let scenario = recording.scenario();
     let mut history = scenario.log[..scenario.now].to_vec();

@@ -1,4 +1,4 @@
-//! What a closed loop starts from: a scenario with its ego as a vehicle.
+//! Recordings: scenarios with the ego as a vehicle, from which closed loops start.
 
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::{Agent, EgoState, Scenario, VehicleParameters};
@@ -19,8 +19,8 @@ impl Recording {
     /// Takes a scenario with the ego's states as recorded, one per frame of the log.
     ///
     /// # Errors
-    /// [`RolloutError::Recording`] if there are more or fewer states than frames, or a clock that
-    /// stands still or runs backwards; [`RolloutError::NotFinite`] for a state that is not a number.
+    /// [`RolloutError::Recording`] if there are more or fewer states than frames, or if time stamps
+    /// do not increase; [`RolloutError::NotFinite`] for a state that is not finite.
     pub fn new(
         scenario: Scenario,
         ego: Vec<EgoState>,
@@ -50,7 +50,7 @@ impl Recording {
         })
     }
 
-    /// Works the vehicle out of a scenario that only has box centres: proportions of nuPlan's car,
+    /// Derives the vehicle of a scenario that only has box centres: proportions of nuPlan's car,
     /// accelerations from differences.
     ///
     /// The log is cut after the last frame that has the ego, and before the present at the last one
@@ -112,7 +112,7 @@ impl Recording {
         &self.expert()[iteration]
     }
 
-    /// What a driver is told.
+    /// The driver's initialization.
     pub fn mission(&self) -> Mission<'_> {
         Mission {
             map: &self.scenario.map,
@@ -141,7 +141,7 @@ impl Recording {
         Ok(n)
     }
 
-    /// The ego as others see it.
+    /// The ego as an agent of the scene.
     pub fn ego_agent(&self, state: &EgoState) -> Agent {
         let present = &self.scenario.log[self.scenario.now];
         let agent = present

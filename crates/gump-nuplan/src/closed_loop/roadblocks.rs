@@ -1,4 +1,5 @@
-//! Roadblocks for maps that have none: what lets datasets of lanes alone run in the closed loop.
+//! Derived roadblocks for maps that have none, so that datasets with lanes only can be used in the
+//! closed loop.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,18 +9,18 @@ use gump_scene::{
     Area, AreaKind, Lane, LaneId, MapGraph, MapParts, Roadblock, RoadblockId, Route, Scenario,
 };
 
-/// How far a route is led on past its end, metres: no planner looks farther ahead.
+/// How far a route is extended past its end, metres: no planner looks farther ahead.
 const BEYOND: f64 = 200.0;
-/// How far into a lane its turn is looked for, metres.
+/// Distance into a lane over which its turn is determined, metres.
 const TURN_SEEN: f64 = 10.0;
-/// Ids of derived areas start here, clear of those of a format.
+/// Ids of derived areas start here, above those of the formats.
 const FIRST_AREA: i64 = 1 << 40;
 
-/// Completes a scenario whose map has lanes but no roadblocks; one that has them is left alone.
+/// Completes a scenario whose map has lanes but no roadblocks; other scenarios are not changed.
 ///
-/// Lanes that are neighbours of one another share a roadblock, named after its lowest lane.
-/// Outlines are the lanes' surfaces. Lanes through intersections become the area of the
-/// intersection. The route names the roadblocks of its lanes and goes on straight for 200 m.
+/// Adjacent lanes share a roadblock, named after its lowest lane. Outlines are the lanes' surfaces.
+/// Lanes through intersections become the area of the intersection. The route gets the roadblocks
+/// of its lanes and is extended straight on by 200 m.
 pub fn derive_roadblocks(scenario: &mut Scenario) {
     if !scenario.map.roadblocks().is_empty() {
         return;
@@ -127,7 +128,7 @@ fn roadblocks(map: &MapGraph, block_of: &BTreeMap<LaneId, RoadblockId>) -> Vec<R
     blocks.collect()
 }
 
-/// The route with the roadblocks of its lanes, led on along the straightest lanes.
+/// The route with the roadblocks of its lanes, extended along the straightest lanes.
 fn with_roadblocks(map: &MapGraph, route: &Route) -> Route {
     let mut lanes = route.lanes.clone();
     let mut beyond = 0.0;
@@ -163,7 +164,7 @@ fn turn_into(lane: &Lane, heading: f64) -> f64 {
     angle_difference(begun, heading).abs()
 }
 
-/// The corners of the smallest convex shape around some points, counter-clockwise.
+/// The convex hull of some points, counter-clockwise.
 fn convex_hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
     points.dedup();

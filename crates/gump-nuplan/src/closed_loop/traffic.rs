@@ -1,4 +1,4 @@
-//! Whom the ego meets in a closed loop.
+//! Traffic around the ego in a closed loop.
 
 use gump_scene::{Agent, AgentState, EgoState, Frame, Light, SceneState, Seed};
 
@@ -6,37 +6,37 @@ use super::Recording;
 use crate::tracking::Trajectory;
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 
-/// Everyone but the ego, one iteration after another.
+/// Moves all agents except the ego, one iteration after another.
 pub trait Traffic {
     /// A short name for tables and reports.
     fn name(&self) -> &str;
 
-    /// Forgets everything and takes its place at the present of the recording.
+    /// Resets the traffic to the present of the recording.
     ///
     /// # Errors
-    /// Whatever keeps the traffic from starting there.
+    /// Any reason for which the traffic cannot start there.
     fn begin(&mut self, recording: &Recording) -> Result<Others, BoxError>;
 
-    /// Where everyone is at the next iteration.
+    /// The states of the agents at the next iteration.
     ///
     /// # Errors
-    /// Whatever keeps the traffic from moving on.
+    /// Any reason for which the traffic cannot continue.
     fn advance(&mut self, step: &Step<'_>) -> Result<Others, BoxError>;
 }
 
-/// A moment of traffic without the ego.
+/// An instant of traffic without the ego.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Others {
-    /// Everyone but the ego.
+    /// All agents except the ego.
     pub agents: Vec<Agent>,
     /// The traffic lights.
     pub lights: Vec<Light>,
 }
 
-/// One step of the loop as traffic sees it.
+/// The input of traffic at one step of the loop.
 #[derive(Clone, Copy, Debug)]
 pub struct Step<'a> {
-    /// What was recorded.
+    /// The recording.
     pub recording: &'a Recording,
     /// The iteration that ends.
     pub iteration: usize,
@@ -44,9 +44,9 @@ pub struct Step<'a> {
     pub ego: &'a EgoState,
     /// The ego at the next.
     pub next: &'a EgoState,
-    /// What the ego intends.
+    /// The ego's plan.
     pub plan: &'a Trajectory,
-    /// Everyone up to the iteration that ends.
+    /// The scene up to the iteration that ends.
     pub scene: SceneState<'a>,
 }
 
@@ -56,13 +56,13 @@ impl Step<'_> {
         (self.next.time_us - self.ego.time_us) as f64 * 1e-6
     }
 
-    /// What the log says of the next iteration.
+    /// The logged agents and lights of the next iteration.
     pub fn logged(&self) -> &Frame {
         &self.recording.scenario().future()[self.iteration]
     }
 }
 
-/// The log as it was; nobody reacts to the ego.
+/// Log replay; agents do not react to the ego.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Replayed;
 
@@ -91,9 +91,9 @@ fn all_but(ego: gump_scene::AgentId, frame: &Frame) -> Others {
 
 /// A world model as traffic.
 ///
-/// At every knot of the world, however long its steps, it is opened afresh on what really happened
-/// and asked for one step, told where the ego plans to be; in between, agents move straight to
-/// where it has them. Agents that it drops stand still. Lights are those of the log.
+/// At every knot of the world, whatever its time step, the world is opened again on the executed
+/// history and asked for one step, given where the ego plans to be; in between, agents move
+/// straight to their next positions. Agents that it drops stand still. Lights are those of the log.
 ///
 /// Source: the released observation class of the GUMP paper, which asks at every iteration.
 pub struct Imagined<'a> {
@@ -110,7 +110,7 @@ struct Knot {
 }
 
 impl<'a> Imagined<'a> {
-    /// Takes the world and the seed of its choices.
+    /// Takes the world and the seed of its futures.
     pub fn new(world: &'a dyn WorldModel, seed: Seed) -> Self {
         Self {
             world,

@@ -18,7 +18,7 @@ use super::time_to_collision::{Place, TimeToCollision, TimeToCollisionConfig, ti
 use super::{Drive, NuPlanError};
 use gump_metrics::ComfortBounds;
 
-/// What nuPlan's closed-loop metrics say of one drive. All series have one entry per sample.
+/// nuPlan's closed-loop metrics of one drive. All series have one entry per sample.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ClosedLoop {
     /// `no_ego_at_fault_collisions`.
@@ -33,7 +33,7 @@ pub struct ClosedLoop {
     pub time_to_collision: TimeToCollision,
     /// `speed_limit_compliance`.
     pub speed_limit: SpeedLimit,
-    /// What `ego_is_comfortable` is judged by; `None` for drives of fewer than four samples.
+    /// The series of `ego_is_comfortable`; `None` for drives of fewer than four samples.
     pub comfort: Option<ComfortSeries>,
     /// `ego_lane_change`, a statistic.
     pub lane_changes: Vec<LaneChange>,
@@ -41,15 +41,15 @@ pub struct ClosedLoop {
     pub followed: Vec<Vec<LaneId>>,
     /// The lanes under its corners, from front left counter-clockwise.
     pub corners: Vec<[Vec<LaneId>; 4]>,
-    /// How those hang together.
+    /// The relations of those lanes.
     pub keeping: Vec<Keeping>,
 }
 
 /// Measures a drive with every closed-loop metric.
 ///
-/// On maps derived from other datasets lanes without outlines are as wide as they are said to be,
-/// the border of the road is that of [`gump_metrics::metres_off_road`], progress is along the expert's own
-/// path, and what the map does not know (limits, borders) is not violated.
+/// On maps derived from other datasets, lanes without outlines have their stated width, the border
+/// of the road is that of [`gump_metrics::metres_off_road`], progress is measured along the
+/// expert's own path, and unknown limits and borders are not violated.
 ///
 /// # Errors
 /// [`NuPlanError`] if samples or expert are missing, not finite or not in order of time.
@@ -98,13 +98,13 @@ pub fn score(drive: &Drive<'_>) -> Result<ClosedLoop, NuPlanError> {
 }
 
 impl ClosedLoop {
-    /// 1 if the drive is comfortable, 0 if not; `None` if it is too short to tell.
+    /// 1 if the drive is comfortable, 0 if not; `None` if it is too short.
     pub fn comfort_score(&self) -> Option<f64> {
         let series = self.comfort.as_ref()?;
         Some(f64::from(series.is_comfortable(&ComfortBounds::NUPLAN)))
     }
 
-    /// The scores by nuPlan's names, for [`Scoring`].
+    /// The scores by nuPlan's names, as input of [`Scoring`].
     pub fn scores(&self) -> MetricScores {
         let named = [
             ("no_ego_at_fault_collisions", Some(self.collisions.score)),
@@ -135,7 +135,7 @@ impl ClosedLoop {
     }
 }
 
-/// How the corners hang together, judged anew only when their lanes change.
+/// The relation of the corners' lanes, evaluated again only when the lanes change.
 fn judged(corners: &[CornerLanes<'_>]) -> Vec<Keeping> {
     let same = |a: &CornerLanes<'_>, b: &CornerLanes<'_>| {
         let ids = |c: &CornerLanes<'_>| c.each_ref().map(|l| l.iter().map(|l| l.id).collect());

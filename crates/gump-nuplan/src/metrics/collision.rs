@@ -1,4 +1,4 @@
-//! Collisions of the ego: whose fault, how bad. Of which kind they are is told by [`classify`].
+//! Collisions of the ego: fault and severity. [`classify`] determines their kinds.
 
 use std::collections::BTreeSet;
 
@@ -14,13 +14,13 @@ pub struct CollisionEvent {
     pub sample: usize,
     /// Time of the sample, microseconds.
     pub time_us: i64,
-    /// The other.
+    /// The other agent.
     pub agent: AgentId,
-    /// What the other is.
+    /// Its kind.
     pub agent_kind: AgentKind,
-    /// How they met.
+    /// The kind of contact.
     pub kind: CollisionKind,
-    /// True if the ego is to blame.
+    /// True if the ego is at fault.
     pub at_fault: bool,
     /// Half the relative speed, metres per second.
     pub energy: f64,
@@ -41,7 +41,7 @@ impl Collisions {
         self.events.iter().filter(|event| event.at_fault)
     }
 
-    /// How many are the ego's fault, with agents for which `counts`.
+    /// Number of collisions at the ego's fault with agents for which `counts`.
     pub fn n_at_fault(&self, counts: impl Fn(AgentKind) -> bool) -> usize {
         self.at_fault().filter(|e| counts(e.agent_kind)).count()
     }
@@ -49,8 +49,8 @@ impl Collisions {
 
 /// Finds the collisions of a drive.
 ///
-/// `in_one_lane` says of each sample whether the ego is within a lane or within connected ones;
-/// elsewhere the side of the ego is its own fault too.
+/// `in_one_lane` states for each sample whether the ego is within a lane or within connected ones;
+/// elsewhere side contacts are also the ego's fault.
 ///
 /// Source: nuPlan's `no_ego_at_fault_collisions`; per group the score is `1 - n / (allowed + 1)`,
 /// at least 0, with one collision allowed with objects and none with road users.

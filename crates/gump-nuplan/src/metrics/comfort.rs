@@ -1,7 +1,7 @@
 //! Comfort of a whole drive: smoothed accelerations, jerks and turning, all within bounds.
 //!
-//! The bounds are those of [`gump_metrics::Discomfort`]; what differs is that a finished drive can be
-//! smoothed, while a reward has only the past.
+//! The bounds are those of [`gump_metrics::Discomfort`]. The difference is smoothing: a finished
+//! drive can be smoothed, while a reward only has the past.
 
 use gump_geometry::DVec2;
 use gump_scene::{EgoState, VehicleParameters};
@@ -10,7 +10,7 @@ use super::savgol::SavitzkyGolay;
 use super::statistics::{mean_step, round8};
 use gump_metrics::{ComfortBounds, Felt};
 
-/// How a vehicle moved: one entry per sample in every list.
+/// The motion of a vehicle: one entry per sample in every list.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Motion {
     /// Times, microseconds, increasing.
@@ -25,7 +25,7 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// How a vehicle in these states moved.
+    /// The motion of a vehicle from its states.
     pub fn of(vehicle: &VehicleParameters, states: &[EgoState]) -> Self {
         let lever = vehicle.rear_axle_to_center();
         // Both terms of turning act along x, unlike those of a rigid body: as in the devkit.
@@ -42,9 +42,10 @@ impl Motion {
     }
 }
 
-/// The smoothed series that comfort is judged by, one value per sample.
+/// The smoothed series that comfort is evaluated on, one value per sample.
 ///
-/// Source: nuPlan's comfort metrics; values are rounded to 8 decimals after each filter as there.
+/// Source: nuPlan's comfort metrics; values are rounded to 8 decimals after each filter, as in the
+/// devkit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ComfortSeries {
     /// Along the heading, metres per second squared.
@@ -71,8 +72,8 @@ const JERK_WINDOW: usize = 15;
 const YAW_WINDOW: usize = 5;
 
 impl ComfortSeries {
-    /// Smooths a drive; `None` for fewer than four samples, which fit no cubic, or a clock that
-    /// stands still.
+    /// Smooths a drive; `None` for fewer than four samples, which do not determine a cubic, or time
+    /// stamps that do not increase.
     pub fn of(motion: &Motion) -> Option<Self> {
         let dt = mean_step(&motion.times_us);
         if dt <= 0.0 {
@@ -97,7 +98,7 @@ impl ComfortSeries {
         })
     }
 
-    /// True if every value lies inside its bounds, the bounds themselves excluded.
+    /// True if every value lies strictly inside its bounds.
     pub fn is_comfortable(&self, bounds: &ComfortBounds) -> bool {
         (0..self.acceleration.len()).all(|i| {
             bounds.allow(&Felt {

@@ -1,4 +1,4 @@
-//! Whether the ego keeps to the drivable area.
+//! Compliance with the drivable area.
 
 use gump_geometry::DVec2;
 use gump_scene::MapGraph;
@@ -7,25 +7,24 @@ use super::history::Drive;
 use super::lanes::{CornerLanes, Lanes, distance};
 use gump_metrics::metres_off_road;
 
-/// How far a corner may be outside, metres, itself excluded.
+/// Tolerance for a corner outside the area, metres, exclusive.
 ///
 /// Source: nuPlan's challenges; the paper's reinforcement learning allows nothing.
 pub const TOLERANCE: f64 = 0.3;
 
-/// Whether the ego kept to the drivable area, and where it did not.
+/// Whether and where the ego left the drivable area.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DrivableArea {
-    /// 1 if no corner was ever outside by the tolerance, else 0.
+    /// 1 if no corner was ever outside by more than the tolerance, else 0.
     pub score: f64,
     /// Per sample, true if no corner was outside at all.
     pub inside: Vec<bool>,
 }
 
-/// Judges a drive; `followed` and `corners` are the lanes of its samples.
+/// Evaluates a drive; `followed` and `corners` are the lanes of its samples.
 ///
-/// A corner on a lane is inside. One that is not is outside by its distance to the drivable area or
-/// to the lanes that are followed, whichever is less. On a map without any border nothing is
-/// outside.
+/// A corner on a lane is inside. Any other corner is outside by its distance to the drivable area
+/// or to the followed lanes, whichever is less. On a map without any border nothing is outside.
 ///
 /// Source: nuPlan's `drivable_area_compliance`.
 pub fn drivable_area(
@@ -58,7 +57,7 @@ pub fn drivable_area(
     }
 }
 
-/// Height of the road; only maps with road edges one above the other need it.
+/// Height of the road; needed only by maps with road edges above one another.
 fn ground(map: &MapGraph, point: DVec2) -> f64 {
     if map.road_edges().is_empty() {
         0.0

@@ -1,10 +1,10 @@
-//! Whether the ego drives against the traffic.
+//! Driving against the direction of traffic.
 
 use super::history::Drive;
 use super::lanes::Lanes;
 use super::statistics::mean_step;
 
-/// How far back in how much time is how bad.
+/// Thresholds of backward progress in a time window.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DrivingDirectionConfig {
     /// Less than this is compliant, metres.
@@ -31,17 +31,17 @@ impl Default for DrivingDirectionConfig {
 pub struct DrivingDirection {
     /// 1, 0.5 or 0.
     pub score: f64,
-    /// Magnitude of the least progress in a window, metres. (Progress is 0 at first, so the least
-    /// is never positive.)
+    /// Magnitude of the lowest progress in a window, metres. (Progress is 0 at first, so the
+    /// minimum is never positive.)
     pub against: f64,
-    /// Per sample, metres along the lane in the window that ends there.
+    /// Per sample, progress along the lane in the window that ends there, metres.
     pub series: Vec<f64>,
 }
 
-/// Judges a drive; `followed` are the lanes of its samples.
+/// Evaluates a drive; `followed` are the lanes of its samples.
 ///
-/// Progress is measured along the centre line of the first lane. On a new lane it is 0 for two
-/// samples, until there is a distance to compare with.
+/// Progress is measured along the centre line of the first lane. After a change of lane it is 0 for
+/// two samples, until there is a distance to compare with.
 ///
 /// Source: nuPlan's `driving_direction_compliance`.
 pub fn driving_direction(
@@ -77,7 +77,7 @@ pub fn driving_direction(
     }
 }
 
-/// Metres along the followed lane since the sample before.
+/// Distance along the followed lane since the previous sample, metres.
 fn lane_progress(drive: &Drive<'_>, followed: &[Lanes<'_>]) -> Vec<f64> {
     let mut lane_before = None;
     let mut distance_before = None;

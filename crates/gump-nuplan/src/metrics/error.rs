@@ -1,12 +1,12 @@
-//! Why something cannot be scored.
+//! Errors of metrics and scores.
 
-/// Why a drive, a plan or a scoring is of no use.
+/// Why a drive or plan cannot be scored.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum NuPlanError {
-    /// There is nothing to score.
+    /// There are no samples.
     #[error("the drive has no samples")]
     NoSamples,
-    /// There is nothing to compare with.
+    /// There is no expert to compare with.
     #[error("the drive has no states of the expert")]
     NoExpert,
     /// A state is NaN or infinite.
@@ -25,28 +25,28 @@ pub enum NuPlanError {
         /// Index of the later state.
         index: usize,
     },
-    /// The expert does not reach far enough.
+    /// The expert's states end too early.
     #[error("the expert has {found} states a second apart, expected {expected}")]
     ShortExpert {
         /// States needed.
         expected: usize,
-        /// States there are.
+        /// States present.
         found: usize,
     },
-    /// A plan is empty, too short, or begins after it was made.
+    /// A plan is empty, too short, or starts after its sample.
     #[error("the plan of sample {sample} covers {covered} of {needed} comparisons")]
     ShortPlan {
         /// Index of the sample.
         sample: usize,
-        /// Comparisons it covers.
+        /// Comparisons possible.
         covered: usize,
-        /// Comparisons asked for.
+        /// Comparisons required.
         needed: usize,
     },
-    /// A scoring is malformed.
+    /// An invalid scoring.
     #[error("cannot read the scoring: {what}")]
     Scoring {
-        /// What was found, and what was expected.
+        /// The invalid entry, and what was expected.
         what: String,
     },
 }

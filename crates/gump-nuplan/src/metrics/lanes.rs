@@ -1,24 +1,24 @@
-//! Which lanes a drive follows, and whether the ego keeps within one.
+//! The lanes that a drive follows, and whether the ego stays within one.
 //!
 //! Lanes inside intersections (nuPlan's lane connectors) overlap, so a point may be on several;
-//! elsewhere it is on one at most. Everything is read off one map query per point.
+//! elsewhere it is on at most one. All results come from one map query per point.
 
 use gump_geometry::DVec2;
 use gump_scene::{AreaKind, Lane, LaneId, LaneKind, MapGraph};
 
-/// Lanes inside an intersection that were left by no more than this may still be followed, metres.
+/// A lane inside an intersection that was left by less than this may still be followed, metres.
 ///
 /// Source: nuplan-devkit.
 const STILL_NEAR: f64 = 5.0;
 
-/// The lanes at one instant; the first is the one that is followed.
+/// The lanes at one instant; the first is the followed one.
 pub type Lanes<'a> = Vec<&'a Lane>;
 
 /// The lanes that a sequence of points follows, one list per point, empty off the lanes.
 ///
 /// A lane is followed until the point leaves it, then its successors are tried before the map.
-/// Where lanes overlap all are kept; at the end those that cannot be meant in view of what came
-/// later are dropped.
+/// Where lanes overlap all are kept; at the end those that are inconsistent with later lanes are
+/// dropped.
 ///
 /// Source: nuPlan's route of a drive (`route_extractor`).
 pub fn followed_lanes<'a>(map: &'a MapGraph, points: &[DVec2]) -> Vec<Lanes<'a>> {
@@ -49,7 +49,7 @@ pub fn followed_lanes<'a>(map: &'a MapGraph, points: &[DVec2]) -> Vec<Lanes<'a>>
     route
 }
 
-/// Where several lanes are kept, drops those that what came later excludes.
+/// Where several lanes are kept, drops those that are inconsistent with later ones.
 fn drop_side_branches(route: &mut [Lanes<'_>]) {
     for i in (0..route.len().saturating_sub(1)).rev() {
         let (before, after) = route.split_at_mut(i + 1);
@@ -78,8 +78,8 @@ pub type CornerLanes<'a> = [Lanes<'a>; 4];
 
 /// The lanes under the corners of each box.
 ///
-/// Source: nuPlan's lanes of the ego's corners; lanes found anew in the second sample are at once
-/// candidates for the corners that follow, as there.
+/// Source: nuPlan's lanes of the ego's corners; as there, lanes found in the second sample are
+/// immediately candidates for the following corners.
 pub fn corner_lanes<'a>(map: &'a MapGraph, boxes: &[[DVec2; 4]]) -> Vec<CornerLanes<'a>> {
     let mut candidates: Lanes<'a> = Vec::new();
     let mut found = Vec::with_capacity(boxes.len());
@@ -104,7 +104,7 @@ pub fn corner_lanes<'a>(map: &'a MapGraph, boxes: &[[DVec2; 4]]) -> Vec<CornerLa
     found
 }
 
-/// How the lanes of the corners hang together.
+/// The relation of the corners' lanes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Keeping {
     /// All corners are on these lanes or on lanes that lead from one to the other.
@@ -122,9 +122,9 @@ impl Keeping {
     }
 }
 
-/// Judges the lanes under the corners of a box.
+/// Evaluates the lanes under the corners of a box.
 ///
-/// Source: nuPlan's test for common or connected lanes, which speaks of rear and front corners
+/// Source: nuPlan's test for common or connected lanes, which pairs rear and front corners
 /// crosswise.
 pub fn keeping(corners: &CornerLanes<'_>) -> Keeping {
     let ids = corners
@@ -161,12 +161,12 @@ pub fn keeping(corners: &CornerLanes<'_>) -> Keeping {
     }
 }
 
-/// The ego on its way from one lane to another.
+/// A lane change of the ego.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LaneChange {
     /// The first sample across lanes.
     pub start: usize,
-    /// The first sample that is not across any more; the last sample if that never came.
+    /// The first sample that is not across any more; the last sample if there is none.
     pub end: usize,
     /// False if it ended off the lanes, on the lane it came from or a following one, or not at all.
     pub success: bool,
@@ -217,8 +217,8 @@ pub fn lane_changes(map: &MapGraph, keeping: &[Keeping]) -> Vec<LaneChange> {
     changes
 }
 
-/// True if the map says that `point` is in an intersection: by its areas if it states any
-/// intersections, else by its lanes.
+/// True if `point` is in an intersection: by the map's areas if it states any intersections, else
+/// by its lanes.
 pub fn is_in_intersection(map: &MapGraph, point: DVec2) -> bool {
     let kind = AreaKind::Intersection;
     if map.areas_containing(point, kind).next().is_some() {
@@ -239,7 +239,8 @@ fn lanes_at(map: &MapGraph, point: DVec2) -> Lanes<'_> {
     lanes.filter(|l| l.kind != LaneKind::BikeLane).collect()
 }
 
-/// The candidates that are still there; if none is and there was one only, those that follow it.
+/// The candidates that still contain the point; if none does and there was only one, those of its
+/// successors.
 fn continued<'a>(map: &'a MapGraph, candidates: &[&'a Lane], here: &[&'a Lane]) -> Lanes<'a> {
     let present = |lane: &&Lane| has(here, lane.id);
     let kept: Lanes<'_> = candidates.iter().copied().filter(present).collect();
@@ -249,7 +250,7 @@ fn continued<'a>(map: &'a MapGraph, candidates: &[&'a Lane], here: &[&'a Lane]) 
     }
 }
 
-/// What the map says without a history: the lane, else all lanes inside the intersection.
+/// The lanes by the map alone, without a history: the lane, else all lanes inside the intersection.
 ///
 /// Lanes outside of intersections do not overlap on nuPlan's maps; where they do, as merging lanes
 /// of derived surfaces, the nearest centre line decides.
@@ -279,7 +280,7 @@ fn common(a: &[LaneId], b: &[LaneId]) -> Vec<LaneId> {
     a.iter().copied().filter(|id| b.contains(id)).collect()
 }
 
-/// The lanes and those they are linked to.
+/// The lanes and their neighbours in the graph.
 fn with_links(lanes: &[&Lane], links: impl Fn(&Lane) -> &Vec<LaneId>) -> Vec<LaneId> {
     let own = lanes.iter().map(|lane| lane.id);
     let linked = lanes.iter().flat_map(|lane| links(lane).iter().copied());

@@ -1,17 +1,17 @@
 //! nuPlan's planning metrics and scores, and the paper's variants for reinforcement learning.
 //!
-//! Start with [`score`]: it measures a [`Drive`] in closed loop, [`ClosedLoop`] keeps every part.
-//! [`open_loop`] compares plans with the expert, [`Scoring`] turns scores of metrics into one number
-//! and a table, [`RlScore`] is the paper's. What is deliberately absent: simulation (`gump-rollout`,
-//! `gump-planner`) and files (`gump-data`).
+//! Start with [`score`]: it measures a [`Drive`] in closed loop; [`ClosedLoop`] contains every
+//! part. [`open_loop`] compares plans with the expert, [`Scoring`] combines metrics into one number
+//! and a table, [`RlScore`] is the paper's score. Simulation is in `gump-rollout` and
+//! `gump-planner`, files are in `gump-data`.
 //!
 //! The numbers agree with nuplan-devkit on its own test scenes and on recorded ones, see
-//! `docs/results/0004-nuplan.md`. Where its prose, the paper and its code differ, the code counts,
-//! because published scores come from it.
+//! `docs/results/0004-nuplan.md`. Where the devkit's documentation, the paper and the devkit's code
+//! differ, the code is followed, because published scores come from it.
 //!
 //! # Terms
-//! * **sample**: one executed step; **drive**: all of them beside the expert's.
-//! * **followed lanes**: the lanes under the ego's centre; **corner lanes**: those under its
+//! * **sample**: one executed step. **Drive**: all samples, with the expert's.
+//! * **followed lanes**: the lanes under the ego's centre. **Corner lanes**: those under its
 //!   corners.
 //! * **at fault**: a collision that counts against the ego.
 //!

@@ -1,4 +1,4 @@
-//! Open loop: how far plans are from what the expert then did.
+//! Open loop: distances of plans from the expert.
 
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::{EgoState, VehicleParameters};
@@ -7,7 +7,7 @@ use super::error::NuPlanError;
 use super::history::{Drive, Sample};
 use super::scoring::MetricScores;
 
-/// What is compared, how often and how far ahead.
+/// Settings of the comparison: rate and horizons.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenLoopConfig {
     /// Seconds between samples of the history.
@@ -49,7 +49,7 @@ pub struct HorizonError {
     pub ahe: f64,
     /// Final heading error, radians.
     pub fhe: f64,
-    /// Share of plans that are anywhere farther from the expert than allowed.
+    /// Share of plans that are farther from the expert than allowed at any time.
     pub miss_rate: f64,
 }
 
@@ -67,9 +67,9 @@ pub struct OpenLoop {
 /// `expert_future` continues the expert after the last compared sample: states 1 s apart, as many
 /// as the longest horizon has seconds. Plans must begin at the time of their sample.
 ///
-/// As in the devkit, the expert of the drive and its future are put one after the other: if the
-/// drive's expert has a state at the first future time, that time occurs twice and some horizons
-/// end a second early.
+/// As in the devkit, the expert of the drive and its future are concatenated: if the drive's expert
+/// has a state at the first future time, that time occurs twice and some horizons end a second
+/// early.
 ///
 /// # Errors
 /// [`NuPlanError`] if a plan or the expert is too short.
@@ -110,7 +110,7 @@ pub fn open_loop(
     Ok(OpenLoop { horizons, scores })
 }
 
-/// How far a plan is from the expert at one instant.
+/// The distance of a plan from the expert at one instant.
 #[derive(Clone, Copy)]
 struct Difference {
     /// Between box centres, metres.
@@ -119,8 +119,8 @@ struct Difference {
     heading: f64,
 }
 
-/// The differences of one plan at each state of the expert after the first; how many there would
-/// be, if too few.
+/// The differences of one plan at each state of the expert after the first; as an error the
+/// possible number, if there are too few.
 fn compare(
     vehicle: &VehicleParameters,
     plan: &[EgoState],
@@ -157,8 +157,8 @@ fn compare(
     Ok(errors.collect())
 }
 
-/// The rear axle at a time, linear between states and the heading by the short way; `None` before
-/// the first and after the last.
+/// The rear axle at a time, linear between states and with the heading in the shorter direction;
+/// `None` before the first and after the last.
 fn pose_at(states: &[EgoState], time_us: i64) -> Option<Pose> {
     let after = states.partition_point(|state| state.time_us < time_us);
     let next = states.get(after)?;
@@ -208,7 +208,7 @@ fn scores(horizons: &[HorizonError; 3], config: &OpenLoopConfig) -> MetricScores
     scores
 }
 
-/// How far the driven box centre is from the expert's, sample by sample, metres; `heading_weight`
+/// Distance of the driven box centre from the expert's, sample by sample, metres; `heading_weight`
 /// metres are added per radian between them.
 ///
 /// Source: nuPlan's `ego_expert_L2_error` (weight 0) and `ego_expert_L2_error_with_yaw` (2.5),

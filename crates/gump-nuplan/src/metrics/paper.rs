@@ -1,6 +1,7 @@
-//! The GUMP paper's metrics of reinforcement learning: stricter than nuPlan's, over whole episodes.
+//! The GUMP paper's metrics of reinforcement learning: stricter than nuPlan's, and over whole
+//! episodes.
 //!
-//! Collision, leaving the road and progress are the very metrics that [`gump_metrics::Reward`] is made of.
+//! Collision, off-road and progress are the metrics that [`gump_metrics::Reward`] uses.
 
 use gump_scene::Rollout;
 
@@ -8,18 +9,18 @@ use super::comfort::{ComfortSeries, Motion};
 use super::history::motion_of;
 use gump_metrics::{Collision, ComfortBounds, Discomfort, Metric, OffRoad, Progress, over_rollout};
 
-/// The mean progress in nuPlan, metres, that an episode's progress is divided by. Nothing is
-/// clipped: more is better.
+/// The mean progress in nuPlan, metres, by which an episode's progress is divided. The ratio is not
+/// clipped.
 ///
 /// Source: the GUMP paper.
 pub const MEAN_PROGRESS: f64 = 62.0;
 
-/// What counts of one episode.
+/// The measurements of one episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RlEpisode {
-    /// The ego touched anybody, whoever was at fault.
+    /// The ego touched an agent, regardless of fault.
     pub collided: bool,
-    /// A corner of the ego left the road, by however little.
+    /// A corner of the ego left the road, without tolerance.
     pub off_road: bool,
     /// Metres along the route.
     pub progress: f64,
@@ -28,10 +29,11 @@ pub struct RlEpisode {
 }
 
 impl RlEpisode {
-    /// Measures the ego of a rollout. Metrics that are not defined (no borders, no route) count as
-    /// kept and as no progress.
+    /// Measures the ego of a rollout. Undefined metrics (no borders, no route) count as no
+    /// violation and no progress.
     ///
-    /// Comfort is judged on the smoothed drive; on one of fewer than four frames frame by frame.
+    /// Comfort is evaluated on the smoothed drive; on a drive of fewer than four frames frame by
+    /// frame.
     pub fn of(rollout: &Rollout) -> Self {
         let ego = rollout.ego();
         let over = |metric: &dyn Metric| over_rollout(metric, rollout, ego).unwrap_or_default();
@@ -47,12 +49,12 @@ impl RlEpisode {
         }
     }
 
-    /// Neither collided nor off the road.
+    /// True if the ego neither collided nor left the road.
     pub fn is_safe(&self) -> bool {
         !self.collided && !self.off_road
     }
 
-    /// The episode's share of the score: 0 if it was not safe.
+    /// The score of the episode: 0 if it was not safe.
     pub fn score(&self) -> f64 {
         let phi = (self.progress / MEAN_PROGRESS + f64::from(self.comfortable)) / 2.0;
         if self.is_safe() { phi } else { 0.0 }
@@ -62,9 +64,9 @@ impl RlEpisode {
 /// One row of the paper's table of reinforcement learning.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct RlScore {
-    /// Episodes behind the numbers.
+    /// Number of episodes.
     pub episodes: usize,
-    /// Share of safe episodes times what those earn on average.
+    /// Share of safe episodes times their mean score.
     pub score: f64,
     /// Share of episodes with a collision.
     pub collision_rate: f64,
@@ -79,8 +81,8 @@ pub struct RlScore {
 impl RlScore {
     /// Summarises episodes; all zero for none.
     ///
-    /// Source: the paper's appendix. Its formula, taken literally, rewards violations; this reading
-    /// reproduces the five published rows to the rounding of their rates.
+    /// Source: the paper's appendix. Its formula, taken literally, rewards violations; this
+    /// interpretation reproduces the five published rows to the rounding of their rates.
     pub fn of(episodes: &[RlEpisode]) -> Self {
         let mean = |n: usize, sum: f64| if n == 0 { 0.0 } else { sum / n as f64 };
         let share = |counts: fn(&RlEpisode) -> bool| {

@@ -1,4 +1,4 @@
-//! How far the ego gets on the way of the expert.
+//! Progress of the ego relative to the expert.
 
 use gump_geometry::{DVec2, Polygon, Polyline};
 use gump_scene::{MapGraph, RoadblockId};
@@ -7,16 +7,16 @@ use super::history::Drive;
 use super::lanes::{Lanes, followed_lanes};
 use gump_metrics::gained;
 
-/// Less than this counts as this, metres; going back by more cancels the score.
+/// Lower progress counts as this, metres; going back by more gives a score of 0.
 ///
 /// Source: nuPlan's challenges (the devkit's prose says 0.1).
 const LEAST: f64 = 2.0;
-/// The least ratio that is progress at all.
+/// The minimum ratio for a score of 1.
 ///
 /// Source: nuPlan's challenges and the paper.
 const MAKING_PROGRESS: f64 = 0.2;
 
-/// How far the ego got, beside the expert.
+/// Progress of the ego and of the expert.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExpertProgress {
     /// Ratio of the ego's progress to the expert's, in [0, 1]; 1 without a route.
@@ -25,12 +25,12 @@ pub struct ExpertProgress {
     pub ego: f64,
     /// Metres of the expert along its route.
     pub expert: f64,
-    /// Per sample, metres of the ego since the sample before.
+    /// Per sample, metres of the ego since the previous sample.
     pub series: Vec<f64>,
 }
 
 impl ExpertProgress {
-    /// 1 if the ego makes progress at all, else 0.
+    /// 1 if the ego makes progress, else 0.
     pub fn making_progress(&self) -> f64 {
         f64::from(self.ratio >= MAKING_PROGRESS)
     }
@@ -38,8 +38,8 @@ impl ExpertProgress {
 
 /// Measures the progress of a drive along the expert's route.
 ///
-/// On maps with roadblocks the route is a chain of roadblocks, each with the centre line the expert
-/// followed in it. On others it is the expert's own path.
+/// On maps with roadblocks the route is a chain of roadblocks, each with the centre line that the
+/// expert followed in it. On other maps it is the expert's own path.
 ///
 /// Source: nuPlan's `ego_progress_along_expert_route`; for other maps ours.
 pub fn expert_progress(drive: &Drive<'_>) -> ExpertProgress {
@@ -77,7 +77,8 @@ pub fn expert_progress(drive: &Drive<'_>) -> ExpertProgress {
     }
 }
 
-/// The lists of a route without repetition: one is kept if it shares no lane with the last kept.
+/// The lists of a route without repetition: a list is kept if it shares no lane with the last kept
+/// one.
 fn simplified(route: Vec<Lanes<'_>>) -> Vec<Lanes<'_>> {
     let mut kept: Vec<Lanes<'_>> = Vec::new();
     for lanes in route {
@@ -89,7 +90,7 @@ fn simplified(route: Vec<Lanes<'_>>) -> Vec<Lanes<'_>> {
     kept
 }
 
-/// One roadblock of a route and the way through it.
+/// One roadblock of a route and the path through it.
 struct Block<'a> {
     id: RoadblockId,
     outline: &'a Polygon,
@@ -113,9 +114,10 @@ fn chain<'a>(map: &'a MapGraph, route: &[Lanes<'a>]) -> Vec<Block<'a>> {
     chain
 }
 
-/// Metres since the point before, along a chain of roadblocks that is not empty.
+/// Metres since the previous point, along a chain of roadblocks that is not empty.
 ///
-/// Whoever leaves the chain makes no progress; on coming back to the same block it is made up for.
+/// An ego outside the chain makes no progress; when it returns to the same block the missing
+/// progress is added.
 fn progress_on_chain(chain: &[Block<'_>], points: &[DVec2]) -> Vec<f64> {
     let along = |block: &Block<'_>, point: DVec2| block.baseline.project(point).arc_length;
     let mut current = 0;
@@ -155,7 +157,7 @@ fn end(line: &Polyline) -> DVec2 {
     line.points()[line.points().len() - 1]
 }
 
-/// Metres since the point before, along a path.
+/// Metres since the previous point, along a path.
 fn progress_on_path(path: &Polyline, points: &[DVec2]) -> Vec<f64> {
     let steps = points.windows(2).map(|pair| gained(path, pair[0], pair[1]));
     let first = points.first().map(|_| 0.0);

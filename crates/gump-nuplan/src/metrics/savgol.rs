@@ -1,6 +1,6 @@
 //! The Savitzky–Golay filter: smoothing and derivatives by polynomials fitted to a sliding window.
 
-/// What to fit and what to read off the fit.
+/// Parameters of the fit and of its evaluation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SavitzkyGolay {
     /// Samples per window; more than `polynomial`. May be even, see [`SavitzkyGolay::filter`].

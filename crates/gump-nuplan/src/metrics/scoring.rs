@@ -1,4 +1,4 @@
-//! From the scores of metrics to one number per scenario, per type of scenario and in all.
+//! Combination of metrics into one number per scenario, per type of scenario and in total.
 //!
 //! The weights are data, in `scoring.toml` beside this file.
 
@@ -11,13 +11,13 @@ use super::NuPlanError;
 /// Scores by the names of nuPlan's metrics; `None` where a metric has no score.
 pub type MetricScores = BTreeMap<String, Option<f64>>;
 
-/// How scores of metrics become one.
+/// How the scores of metrics are combined.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scoring {
-    /// Metrics whose scores multiply the rest.
+    /// Metrics whose scores multiply the weighted mean.
     pub multipliers: Vec<String>,
-    /// Multipliers that join the weighted mean as well.
+    /// Multipliers that are also part of the weighted mean.
     #[serde(default)]
     pub also_averaged: Vec<String>,
     /// Weights of metrics in the mean.
@@ -48,8 +48,8 @@ impl Scoring {
         shipped().open_loop
     }
 
-    /// The closed-loop weights as the GUMP paper prints them, 21 in sum: driving direction is
-    /// averaged as well as multiplied. Published scores are not made this way.
+    /// The closed-loop weights as printed in the GUMP paper, 21 in sum: driving direction is
+    /// averaged as well as multiplied. Published scores are not computed this way.
     pub fn paper_table() -> Self {
         shipped().paper_table
     }
@@ -59,7 +59,7 @@ impl Scoring {
         shipped().default
     }
 
-    /// Reads a scoring in the form of a table of `scoring.toml`.
+    /// Reads a scoring from a table in the format of `scoring.toml`.
     ///
     /// # Errors
     /// [`NuPlanError::Scoring`] for other keys, missing ones and negative weights.
@@ -102,9 +102,9 @@ impl Scoring {
         }
     }
 
-    /// Scores many scenarios, per type and in all.
+    /// Scores many scenarios, per type and in total.
     ///
-    /// Scenarios that failed to run are not here: report them beside the table.
+    /// Scenarios that failed to run are not included: report them beside the table.
     pub fn aggregate(&self, scenarios: &[ScenarioScores]) -> Aggregate {
         let mut by_kind: BTreeMap<&str, Vec<(f64, &MetricScores)>> = BTreeMap::new();
         let mut scores = Vec::with_capacity(scenarios.len());
@@ -127,7 +127,7 @@ impl Scoring {
     }
 }
 
-/// What the metrics say of one scenario.
+/// The metrics of one scenario.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenarioScores {
     /// The type of scenario.
@@ -150,7 +150,7 @@ pub struct Aggregate {
 /// One row of a table.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Row {
-    /// Scenarios behind it.
+    /// Number of scenarios.
     pub n: usize,
     /// Mean score of the scenarios; 0 if there are none.
     pub score: f64,

@@ -1,4 +1,4 @@
-//! Whether the ego keeps the speed limit.
+//! Compliance with the speed limit.
 
 use gump_scene::{Lane, MapGraph};
 
@@ -6,12 +6,12 @@ use super::history::Drive;
 use super::lanes::Lanes;
 use super::statistics::mean_step;
 
-/// Driving this much too fast all the time scores 0, metres per second.
+/// A mean excess of this scores 0, metres per second.
 ///
 /// Source: nuPlan's challenges.
 pub const MAX_OVERSPEED: f64 = 2.23;
 
-/// How much too fast the ego was.
+/// Excess over the speed limit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SpeedLimit {
     /// 1 if never too fast; falls with the mean excess to 0.
@@ -20,10 +20,10 @@ pub struct SpeedLimit {
     pub excess: Vec<f64>,
 }
 
-/// Judges a drive; `followed` are the lanes of its samples.
+/// Evaluates a drive; `followed` are the lanes of its samples.
 ///
-/// Inside an intersection the highest limit of the lanes that lead there and onwards counts. Where
-/// a limit is not stated, any speed is right.
+/// Inside an intersection the highest limit of the lanes before and after counts. Where no limit is
+/// stated there is no excess.
 ///
 /// Source: nuPlan's `speed_limit_compliance`.
 pub fn speed_limit(drive: &Drive<'_>, followed: &[Lanes<'_>]) -> SpeedLimit {

@@ -1,4 +1,4 @@
-//! What a series says in four numbers, and the rounding that the devkit does between its steps.
+//! Four statistics of a series, and the devkit's rounding between its steps.
 
 /// Largest, smallest, average and 90th percentile of a series.
 #[derive(Clone, Copy, Debug, PartialEq)]

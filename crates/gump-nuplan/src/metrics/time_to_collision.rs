@@ -1,4 +1,4 @@
-//! Seconds until the ego would hit something if everybody went straight on.
+//! Time to collision if all agents continued straight on.
 
 use std::collections::BTreeMap;
 
@@ -10,17 +10,17 @@ use gump_scene::{Agent, AgentId};
 use super::collision::Collisions;
 use super::history::Drive;
 
-/// The ego that is slower is never about to collide, metres per second.
+/// A slower ego is never about to collide, metres per second.
 ///
 /// Source: nuplan-devkit.
 const STANDING: f64 = 0.005;
 
-/// How far to look ahead and how soon is too soon.
+/// Horizon and threshold.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TimeToCollisionConfig {
-    /// Between the instants that are looked at, seconds.
+    /// Time step of the search, seconds.
     pub step: f64,
-    /// How far ahead is looked, itself excluded, seconds.
+    /// Horizon, exclusive, seconds.
     pub horizon: f64,
     /// Every time must exceed this, seconds.
     pub least: f64,
@@ -37,13 +37,13 @@ impl Default for TimeToCollisionConfig {
     }
 }
 
-/// The series and whether it stayed long enough.
+/// The series, and whether it stayed above the threshold.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimeToCollision {
-    /// 1 if every time exceeds the least one, else 0.
+    /// 1 if every value exceeds the threshold, else 0.
     pub score: f64,
-    /// Per sample, seconds; infinite where nothing is about to be hit, 0 where the ego collides by
-    /// its own fault.
+    /// Per sample, seconds; infinite without a collision ahead, 0 where the ego collides at its own
+    /// fault.
     pub series: Vec<f64>,
 }
 
@@ -54,7 +54,7 @@ impl TimeToCollision {
     }
 }
 
-/// Where the ego is, as far as times to collision depend on it.
+/// Position of the ego, as far as times to collision depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     /// Within one lane or within connected ones.
@@ -65,10 +65,10 @@ pub struct Place {
 
 /// Measures the times of a drive; one place per sample.
 ///
-/// Those ahead count everywhere; those to the side only in intersections and outside of a lane;
-/// those behind never, nor those the ego has collided with.
+/// Agents ahead always count; those to the side only in intersections and when the ego is not
+/// within one lane; those behind never, nor those the ego has already collided with.
 ///
-/// Source: nuPlan's `time_to_collision_within_bound`: headings decide where everybody goes.
+/// Source: nuPlan's `time_to_collision_within_bound`: headings determine the directions of motion.
 pub fn time_to_collision(
     drive: &Drive<'_>,
     places: &[Place],
@@ -138,7 +138,7 @@ impl Moving {
     }
 }
 
-/// Rounding may part what touches by this much, metres.
+/// Tolerance for rounding at contact, metres.
 const TOUCH: f64 = 1e-9;
 
 /// The times in which two boxes intersect, if they do at any time from now on, seconds.
@@ -168,7 +168,7 @@ fn contact(a: &Moving, b: &Moving) -> Option<(f64, f64)> {
     Some(span)
 }
 
-/// The first instant that is looked at within a span of time.
+/// The first sampled instant within a time span.
 fn first_instant((from, to): (f64, f64), config: &TimeToCollisionConfig) -> Option<f64> {
     let n = ((config.horizon - config.step) / config.step).ceil();
     let k = ((from - config.step) / config.step).ceil().max(0.0);
@@ -194,7 +194,7 @@ mod tests {
         Moving::new(shape, speed)
     }
 
-    /// The slow obvious way: move both, step by step.
+    /// The reference implementation: moves both boxes step by step.
     fn by_steps(a: &Moving, b: &Moving, config: &TimeToCollisionConfig) -> Option<f64> {
         let n = ((config.horizon - config.step) / config.step).ceil() as usize;
         let at = |moving: &Moving, t: f64| {

@@ -10,14 +10,14 @@ use super::{Scene, in_intersection};
 use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
 use gump_rollout::worlds::idm_euler_step;
 
-/// Lanes of the way that a vehicle remembers.
+/// Number of past lanes that a vehicle remembers.
 const REMEMBERED_LANES: usize = 5;
 
 /// A vehicle on its path.
 #[derive(Debug)]
 pub(super) struct Vehicle {
     agent: Agent,
-    /// Which of the vehicles that were there at first this is.
+    /// Index of the vehicle among those present at first.
     index: usize,
     lanes: VecDeque<LaneId>,
     corridor: Corridor,
@@ -27,21 +27,21 @@ pub(super) struct Vehicle {
     progress: f64,
     speed: f64,
     target_speed: f64,
-    /// The box and, once it has moved, where it will be in 1.5 s.
+    /// The box and, once it has moved, its position in 1.5 s.
     footprint: Footprint,
 }
 
-/// Whose ways meet. Found out once per pair of corridors: they only get shorter until they are
-/// renewed.
+/// Pairs of vehicles whose corridors intersect. Computed once per pair of corridors, which only get
+/// shorter until they are renewed.
 #[derive(Debug, Default)]
 pub(super) struct Encounters {
     n: usize,
-    /// By pair of vehicles: the renewals of both at which they were looked at, and what was found.
+    /// By pair of vehicles: the renewals of both at the time of the computation, and its result.
     known: Vec<Option<(u32, u32, bool)>>,
 }
 
 impl Encounters {
-    /// Among `n` vehicles nothing is known.
+    /// For `n` vehicles, without results.
     pub(super) fn among(n: usize) -> Self {
         Self {
             n,
@@ -63,7 +63,7 @@ impl Encounters {
     }
 }
 
-/// What is ahead, in terms of the path.
+/// The leader, in terms of the path.
 #[derive(Clone, Copy)]
 struct Lead {
     gap: f64,
@@ -71,10 +71,10 @@ struct Lead {
 }
 
 impl Vehicle {
-    /// Places the vehicle on the centre of the lane it is on; `None` if it is on none.
+    /// Places the vehicle on the centre of its lane; `None` if it is on none.
     ///
-    /// Where lanes overlap the one whose direction is nearest is taken; directions are compared as
-    /// plain numbers, as nuPlan does. `target` is the desired speed of the vehicle before, and of
+    /// Where lanes overlap the one with the nearest direction is taken; directions are compared as
+    /// plain numbers, as in nuPlan. `target` is the desired speed of the previous vehicle, and of
     /// this one if its lane states no limit.
     pub(super) fn snapped(
         agent: &Agent,
@@ -134,7 +134,7 @@ impl Vehicle {
         self.agent.oriented_box()
     }
 
-    /// Moves for `dt` seconds; `others` as they are by now.
+    /// Moves for `dt` seconds; `others` are in their current states.
     pub(super) fn step<'a>(
         &mut self,
         scene: &Scene<'_>,
@@ -178,7 +178,7 @@ impl Vehicle {
         self.footprint.measure();
     }
 
-    /// Adds lanes while the way ahead is short; where none may be entered it ends.
+    /// Adds lanes while the path ahead is short; it ends where none may be entered.
     fn extend(&mut self, scene: &Scene<'_>) {
         let config = scene.config;
         let needed = config.minimum_path_length + self.target_speed * config.law.headway;
@@ -205,7 +205,7 @@ impl Vehicle {
         }
     }
 
-    /// The nearest of all that reaches into the way ahead; its end, where nothing does.
+    /// The nearest agent that reaches into the path ahead; the end of the path where there is none.
     fn lead<'a>(
         &self,
         scene: &Scene<'_>,
@@ -262,7 +262,7 @@ impl Vehicle {
         }
     }
 
-    /// True if a footprint, perhaps that of a vehicle, reaches into the way ahead.
+    /// True if a footprint, possibly of a vehicle, reaches into the path ahead.
     fn is_crossed(
         &self,
         footprint: &Footprint,
@@ -296,9 +296,9 @@ impl Vehicle {
     }
 }
 
-/// The lane after `last` that turns least where it starts, among those that may be entered.
+/// The successor of `last` that turns least at its start, among those that may be entered.
 ///
-/// A lane ruled by lights may be entered on green alone, another one unless its light is red.
+/// A lane controlled by lights may only be entered at green, any other one unless its light is red.
 fn straightest<'m>(scene: &Scene<'m>, last: LaneId) -> Option<&'m Lane> {
     let mut best: Option<(f64, &Lane)> = None;
     for lane in scene.map.successors(last) {

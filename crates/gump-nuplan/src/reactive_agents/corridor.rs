@@ -1,4 +1,4 @@
-//! The strip of road that a vehicle is going to sweep, cut into convex pieces.
+//! The strip of road that a vehicle will sweep, cut into convex pieces.
 
 use gump_geometry::{DVec2, Polygon, Quad, joint};
 
@@ -7,14 +7,14 @@ use crate::path::Path;
 /// Segments that share bounds.
 const CHUNK: usize = 16;
 
-/// A path made as wide as a vehicle. Pieces are cut once per path, not once per step.
+/// A path widened to the width of a vehicle. Pieces are cut once per path, not once per step.
 #[derive(Clone, Debug)]
 pub(super) struct Corridor {
     path: Path,
     half_width: f64,
     /// The rectangle of each segment.
     stretches: Vec<Quad>,
-    /// What closes the bend at the start of each segment.
+    /// The piece that closes the bend at the start of each segment.
     joints: Vec<Option<Quad>>,
     /// Bounds of all that follows the start of each segment.
     bounds: Vec<(DVec2, DVec2)>,
@@ -165,7 +165,7 @@ impl Corridor {
         })
     }
 
-    /// What arc length `from` leaves of segment `i`.
+    /// The part of segment `i` after arc length `from`.
     fn rest_of(&self, i: usize, from: f64) -> Option<Quad> {
         let arc = self.path.line().arc_lengths();
         if from <= arc[i] {
@@ -211,7 +211,7 @@ fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
     Quad::new([start + side, end + side, end - side, start - side])
 }
 
-/// What a body covers: convex pieces with common bounds.
+/// The area of a body: convex pieces with common bounds.
 #[derive(Clone, Debug)]
 pub(super) struct Footprint {
     pub(super) pieces: Vec<Quad>,

@@ -1,16 +1,17 @@
-//! nuPlan's reactive traffic: vehicles of the first frame on the lane graph, everything else as
-//! recorded.
+//! nuPlan's reactive traffic: vehicles of the first frame drive on the lane graph, all other agents
+//! are replayed.
 //!
-//! Here are the parameters and the traffic as a whole; `agent` is one vehicle, `corridor` the strip
-//! it sweeps. [`gump_rollout::worlds::Idm`] is the other world with the same car-following law
-//! ([`gump_rollout::worlds::idm_acceleration`]): it sees no log, lets pedestrians move on and everyone decides at
-//! once. This one is nuPlan's environment with all its particulars, for scores that compare:
+//! This module has the parameters and the traffic as a whole; `agent` is one vehicle, `corridor`
+//! the strip it sweeps. [`gump_rollout::worlds::Idm`] uses the same car-following law
+//! ([`gump_rollout::worlds::idm_acceleration`]), but does not use the log, moves pedestrians on,
+//! and updates all vehicles at once. This world reproduces nuPlan's environment exactly, for
+//! comparable scores:
 //!
-//! * Vehicles are snapped to the centre of their lane; those on no lane, and those that would then
-//!   touch something, are left out, and so are bicycles and vehicles that appear later.
-//! * Pedestrians and static things are replayed from the log, and so are the lights.
-//! * Vehicles move one after another, each seeing where those before it have gone.
-//! * Who is ever farther than 100 m from the ego is gone for good.
+//! * Vehicles are snapped to the centre of their lane. Vehicles on no lane, those that would then
+//!   touch something, bicycles, and vehicles that appear later are left out.
+//! * Pedestrians, static objects and lights are replayed from the log.
+//! * Vehicles move one after another, each seeing the new positions of those before it.
+//! * A vehicle that is ever farther than 100 m from the ego is removed.
 
 mod agent;
 mod corridor;
@@ -29,11 +30,11 @@ use gump_rollout::{BoxError, RolloutError};
 /// Parameters of nuPlan's reactive agents.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NuplanIdmConfig {
-    /// The car-following law; of its limits only the two accelerations are used.
+    /// The car-following law; only its two accelerations are used as limits.
     pub law: IdmConfig,
-    /// A vehicle extends its way when less than this is left, and 1.5 s of driving, metres.
+    /// A vehicle extends its path when less than this plus 1.5 s of driving is left, metres.
     pub minimum_path_length: f64,
-    /// Vehicles farther from the ego are gone, metres.
+    /// Vehicles farther than this from the ego are removed, metres.
     pub radius: f64,
 }
 
@@ -88,12 +89,12 @@ impl NuplanIdm {
         })
     }
 
-    /// Vehicles that are still there.
+    /// Vehicles that are still present.
     pub fn n_vehicles(&self) -> usize {
         self.vehicles.len()
     }
 
-    /// The vehicles, then everything of `logged` that is replayed.
+    /// The vehicles, followed by the agents of `logged` that are replayed.
     fn others(&self, logged: &Frame) -> Others {
         let replayed = logged.agents().iter().filter(|agent| is_replayed(agent));
         Others {
@@ -167,12 +168,12 @@ impl Traffic for NuplanIdm {
     }
 }
 
-/// What a vehicle decides by, besides the other vehicles.
+/// Inputs of a vehicle's decision other than the other vehicles.
 struct Scene<'a> {
     config: &'a NuplanIdmConfig,
     map: &'a MapGraph,
     frame: &'a Frame,
-    /// The ego first, then what is replayed.
+    /// The ego first, then the replayed agents.
     fixed: Vec<Obstacle>,
 }
 
@@ -188,14 +189,14 @@ impl Scene<'_> {
     }
 }
 
-/// Something that no vehicle of this world steers.
+/// An agent that this world does not control.
 struct Obstacle {
     footprint: Footprint,
     heading: f64,
     speed: f64,
 }
 
-/// Speeds of replayed things count as 0, as in nuPlan.
+/// Speeds of replayed agents count as 0, as in nuPlan.
 fn fixed_obstacles(ego: &OrientedBox, ego_speed: f64, frame: &Frame) -> Vec<Obstacle> {
     let obstacle = |shape: &OrientedBox, speed: f64| Obstacle {
         footprint: Footprint::new(vec![Quad::from(shape)]),
@@ -209,7 +210,7 @@ fn fixed_obstacles(ego: &OrientedBox, ego_speed: f64, frame: &Frame) -> Vec<Obst
         .collect()
 }
 
-/// True for what nuPlan replays in its reactive traffic: everyone on foot and everything static.
+/// True for the kinds that nuPlan replays in its reactive traffic: pedestrians and static objects.
 fn is_replayed(agent: &Agent) -> bool {
     !matches!(agent.kind, AgentKind::Vehicle | AgentKind::Bicycle)
 }

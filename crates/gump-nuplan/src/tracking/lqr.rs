@@ -1,7 +1,7 @@
 //! The linear-quadratic tracker: from a reference to an acceleration and a steering rate.
 //!
-//! Speed and steering are decoupled. Each is steered towards where the reference will be a second
-//! from now by one constant input, which is optimal for its quadratic cost in closed form.
+//! Speed and steering are decoupled. Each is steered towards the reference's state one second ahead
+//! by one constant input, which is optimal for its quadratic cost in closed form.
 //!
 //! Source: nuPlan's LQR tracker with its default parameters (agrees with its goldens to rounding).
 
@@ -27,10 +27,10 @@ const STOPPING_SPEED: f64 = 0.2;
 /// ... by this deceleration per metre per second too fast.
 const STOPPING_GAIN: f64 = 0.5;
 
-/// What the reference asks for from now on.
+/// The reference from now on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
-    /// Where the reference is now.
+    /// The reference's present pose.
     pub pose: Pose,
     /// Its speed at the end of the horizon, metres per second.
     pub speed: f64,
@@ -40,7 +40,7 @@ pub struct Target {
 
 /// The inputs that bring `ego` towards `target`.
 ///
-/// `wheel_base` in metres. Nothing is limited; the vehicle limits its steering angle itself.
+/// `wheel_base` in metres. Inputs are not limited; the vehicle limits its steering angle itself.
 pub fn track_target(ego: &EgoState, target: &Target, wheel_base: f64) -> Controls {
     let speed = ego.velocity.x;
     let excess = speed - target.speed;
@@ -58,7 +58,7 @@ pub fn track_target(ego: &EgoState, target: &Target, wheel_base: f64) -> Control
     }
 }
 
-/// Linearises the bicycle along the speeds to come and answers the error at the horizon's end.
+/// Linearises the bicycle along the coming speeds and corrects the error at the horizon's end.
 fn steering_rate(ego: &EgoState, target: &Target, acceleration: f64, wheel_base: f64) -> f64 {
     let away = ego.rear_axle.position - target.pose.position;
     let lateral = target.pose.direction().perp_dot(away);
@@ -85,7 +85,7 @@ fn steering_rate(ego: &EgoState, target: &Target, acceleration: f64, wheel_base:
     -gain / stiffness
 }
 
-/// Tracks trajectories; keeps what only depends on their length.
+/// Tracks trajectories; caches what depends only on their length.
 #[derive(Clone, Debug, Default)]
 pub struct LqrTracker {
     fit: Option<ProfileFit>,

@@ -1,8 +1,7 @@
-//! How nuPlan's ego follows what it is asked to drive: a vehicle with a rear axle and lagging
-//! actuators.
+//! How nuPlan's ego follows its plan: a vehicle with a rear axle and actuator lag.
 //!
-//! A [`Trajectory`] is what it is asked to drive, [`LqrTracker`] turns that into [`Controls`],
-//! [`propagate`] into the next state.
+//! A [`Trajectory`] is the plan, [`LqrTracker`] turns it into [`Controls`], and [`propagate`]
+//! computes the next state.
 
 mod lqr;
 mod profile;

@@ -1,4 +1,4 @@
-//! How fast and how sharply a sequence of poses is driven: the fits behind the LQR tracker.
+//! Speed and curvature profiles of sequences of poses: the fits in the LQR tracker.
 //!
 //! Both fits are least squares over the displacements between poses a fixed time apart. Written in
 //! speeds and curvatures instead of their rates of change the normal equations have two or fewer
@@ -12,15 +12,15 @@ use gump_geometry::{Pose, angle_difference};
 const JERK_WEIGHT: f64 = 1e-4;
 /// Weight of the squared rate of change of curvature.
 const CURVATURE_RATE_WEIGHT: f64 = 1e-2;
-/// Weight of the first curvature squared; only standing vehicles feel it.
+/// Weight of the first curvature squared; it matters only for standing vehicles.
 const CURVATURE_WEIGHT: f64 = 1e-10;
 
-/// What keeps accelerations of a fitted profile from jumping.
+/// The regularization of a fitted profile's accelerations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Smoothness {
     /// Changes of acceleration cost: nuPlan's tracker.
     Jerk,
-    /// Accelerations but the last two cost, and the last change: what PDM's batched tracker does.
+    /// Accelerations except the last two cost, and the last change: PDM's batched tracker.
     Acceleration,
 }
 
@@ -33,8 +33,7 @@ pub struct Profile {
     pub curvatures: Vec<f64>,
 }
 
-/// Fits profiles to references of one length and time step; what depends on those alone is worked
-/// out once.
+/// Fits profiles to references of one length and time step; precomputes what depends only on those.
 #[derive(Clone, Debug)]
 pub struct ProfileFit {
     dt: f64,

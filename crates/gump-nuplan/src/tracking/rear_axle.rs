@@ -1,6 +1,6 @@
-//! The kinematic bicycle about the rear axle, with lagging actuators.
+//! The kinematic bicycle about the rear axle, with actuator lag.
 //!
-//! [`super::drive`] is the bicycle of commands about a box centre; this one is the vehicle that
+//! The bicycle model of `gump-rollout` moves box centres by commands; this one is the vehicle that
 //! nuPlan's controllers steer, step by step.
 
 use std::f64::consts::FRAC_PI_3;
@@ -15,7 +15,7 @@ const STEERING_LAG: f64 = 0.05;
 /// Largest steering angle to either side, radians.
 const MAX_STEERING: f64 = FRAC_PI_3;
 
-/// What a controller asks of a vehicle.
+/// The inputs of a vehicle from its controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Controls {
     /// Along the heading, metres per second squared.

@@ -47,9 +47,9 @@ impl Trajectory {
 
     /// The state at a time between the first and the last state.
     ///
-    /// Pose, velocity, acceleration and steering are interpolated linearly, the heading by the
-    /// short way; rates of turning and steering are 0, as in nuPlan. At the time of a state that
-    /// state is returned with the same omission.
+    /// Pose, velocity, acceleration and steering are interpolated linearly, the heading in the
+    /// shorter direction; rates of turning and steering are 0, as in nuPlan. At the time of a state
+    /// that state is returned, with the same rates of 0.
     ///
     /// # Errors
     /// [`RolloutError::OutsideTrajectory`] for any other time.

@@ -9,14 +9,15 @@ use gump_scene::{EgoState, Seed, VehicleParameters};
 use crate::candidates::{Candidate, Explain};
 use crate::{PlanError, Proposal, ProposalKind};
 
-/// Seconds of a plan: what nuPlan's open loop compares.
+/// Horizon of a plan, seconds: that of nuPlan's open loop.
 const SECONDS: f64 = 8.0;
-/// Seconds between the states that the vehicle is given.
+/// Seconds between the states of a plan.
 const DT: f64 = 0.1;
 
-/// Plans the mean of what the world has the ego do in several futures.
+/// Plans the mean of the ego's motion in several futures of a world.
 ///
-/// The world sees the whole scene and drives everyone. Source: the open-loop use of the GUMP paper.
+/// The world sees the whole scene and drives all agents. Source: the open-loop use of the GUMP
+/// paper.
 pub struct ImitationDriver<'w> {
     world: &'w dyn WorldModel,
     n_futures: usize,
@@ -27,7 +28,7 @@ pub struct ImitationDriver<'w> {
 }
 
 impl<'w> ImitationDriver<'w> {
-    /// A driver that imagines `n_futures` futures at every `every`-th iteration.
+    /// A driver that simulates `n_futures` futures at every `every`-th iteration.
     ///
     /// # Errors
     /// [`PlanError::Parameter`] if either is 0.
@@ -57,7 +58,7 @@ impl<'w> ImitationDriver<'w> {
         })
     }
 
-    /// Where the ego is in the middle of all futures, now first; and the seconds in between.
+    /// The ego's mean poses over all futures, now first; and the seconds in between.
     fn imagine(&self, moment: &Moment<'_>) -> Result<(Vec<Pose>, f64), BoxError> {
         let scene = moment.scene;
         let mut session = self.world.open(&[Start {

@@ -12,18 +12,18 @@ const STRIDE: usize = 5;
 /// States of a plan besides the present: 8 s.
 const STATES: usize = 16;
 
-/// Plans what was driven: the present and the next 8 s of the log, as far as it goes.
+/// Plans the logged drive: the present and the next 8 s of the log, as far as it goes.
 ///
-/// It has seen the future; its score is that of the recorded driver, or of the controller that
-/// follows it. Source: nuPlan's log-future planner.
+/// It knows the future; its score is that of the recorded driver, or of the controller that follows
+/// it. Source: nuPlan's log-future planner.
 #[derive(Clone, Debug)]
 pub struct LogDriver {
     states: Vec<EgoState>,
 }
 
 impl LogDriver {
-    /// Takes what was driven from the present on, and what was driven after the recording's end if
-    /// that is known.
+    /// Takes the logged drive from the present on, and the drive after the recording's end if it is
+    /// known.
     pub fn new(recording: &Recording, after: &[EgoState]) -> Self {
         let mut states = recording.expert().to_vec();
         states.extend_from_slice(after);

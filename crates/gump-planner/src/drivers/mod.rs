@@ -1,5 +1,5 @@
-//! Drivers of the closed loop that do not compare anything: the log, a car that just rolls, a
-//! follower of the route, the ego of a world.
+//! Drivers that do not compare candidates: the log, a car that rolls on straight, nuPlan's IDM
+//! planner, and the ego of a world.
 
 mod imitation;
 mod log;

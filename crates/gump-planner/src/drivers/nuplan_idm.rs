@@ -1,4 +1,5 @@
-//! nuPlan's IDM planner: the route's centre line at the speed limit, behind whoever is in the way.
+//! nuPlan's IDM planner: follows the route's centre line at the speed limit, behind agents in the
+//! way.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -22,10 +23,10 @@ use crate::route_search::{first_lanes, lanes_of_route};
 const STATES: usize = 16;
 /// ... and the seconds between them.
 const DT: f64 = 0.5;
-/// Objects farther away do not matter, metres.
+/// Objects farther away are ignored, metres.
 const RADIUS: f64 = 40.0;
 
-/// Follows the route by the Intelligent Driver Model; everyone else is taken to stand where it is.
+/// Follows the route by the Intelligent Driver Model; all other agents are assumed to stand.
 ///
 /// Source: nuPlan's IDM planner with its default parameters; agrees with its recorded simulations.
 #[derive(Debug)]
@@ -99,7 +100,7 @@ impl Driver for NuplanIdmDriver {
     }
 }
 
-/// What stands in the way, as nuPlan's planner sees it.
+/// An object in the way, as nuPlan's planner sees it.
 enum Obstacle<'a> {
     Object(Quad, &'a Agent),
     RedLight(Polygon),
@@ -143,7 +144,7 @@ impl Known {
         })
     }
 
-    /// The lane to start from and how many lanes the way has from there.
+    /// The lane to start from, and the number of lanes of the path from there.
     fn start(&self, ego: &EgoState) -> Result<(&Lane, usize), PlanError> {
         let footprint = self.vehicle.footprint(ego.rear_axle);
         let center = footprint.pose.position;
@@ -198,7 +199,7 @@ impl Known {
         }
     }
 
-    /// Clear distance and speed of whom to follow; the end of the path stands.
+    /// Clear distance and speed of the leader; the end of the path counts as standing.
     fn lead(
         &self,
         way: &Way,

@@ -1,4 +1,4 @@
-//! A car that rolls on straight.
+//! A car that continues straight on.
 
 use gump_geometry::DVec2;
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
@@ -14,7 +14,7 @@ const DT: f64 = 0.25;
 /// States of a plan besides the present: 10 s.
 const STATES: usize = 40;
 
-/// Goes straight on at its speed, slowing down to 5 m/s; the floor that others must beat.
+/// Continues straight on at its speed, slowing down to 5 m/s: a baseline.
 ///
 /// Source: nuPlan's simple planner with its default parameters.
 #[derive(Clone, Debug)]

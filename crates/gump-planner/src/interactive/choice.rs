@@ -1,4 +1,4 @@
-//! What the imagined futures are worth, and which candidate to take.
+//! Values of candidates from their simulated futures, and the choice among them.
 
 use std::cmp::Ordering;
 
@@ -14,10 +14,10 @@ use crate::pdm::propose::DT;
 use crate::pdm::score::{Judge, NO_PROGRESS, PdmScore, normalize};
 use crate::pdm::{BRAKE_SPEED, BRAKE_STEPS};
 
-/// Two values this close are a tie; rounding must not decide.
+/// Values within this are a tie, so that rounding does not decide.
 const TIE: f64 = 1e-6;
 
-/// How a candidate did over the imagined futures.
+/// The result of a candidate over its futures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CandidateScore {
     /// Mean reward over the futures.
@@ -29,7 +29,7 @@ pub struct CandidateScore {
 }
 
 impl CandidateScore {
-    /// Sums up the futures of a candidate; `None` if there is none.
+    /// Summarises the futures of a candidate; `None` if there are none.
     pub fn new(futures: Vec<Score>) -> Option<Self> {
         let n = futures.len() as f64;
         if futures.is_empty() {
@@ -64,22 +64,22 @@ impl CandidateScore {
         gates.chain(terms).collect()
     }
 
-    /// True if some gate is closed in every future: there is nothing good about the candidate.
+    /// True if some gate is closed in every future, so that the candidate has no value.
     pub fn is_hopeless(&self) -> bool {
         let closed = |score: &Score| score.gates.iter().any(|gate| gate.factor == 0.0);
         self.futures.iter().all(closed)
     }
 }
 
-/// How the drives of a moment are judged: by PDM's score with the terms and weights of nuPlan's.
+/// How the drives of a decision are scored: by PDM's score with the terms and weights of nuPlan's.
 #[derive(Clone, Copy)]
 pub(super) struct Reward<'a> {
     pub(super) judge: Judge<'a>,
     pub(super) worth: Worth,
-    /// What the ego has driven so far of the drive that nuPlan will judge, oldest first: a drive
-    /// that begins with a jolt is not comfortable.
+    /// The drive so far, oldest first, which nuPlan's metric includes: a drive that begins with a
+    /// jolt is not comfortable.
     pub(super) past: &'a [EgoState],
-    /// The limit that is stated, metres per second.
+    /// The stated limit, metres per second.
     pub(super) limit: Option<f64>,
 }
 
@@ -89,7 +89,7 @@ pub(super) struct Judged {
     parts: PdmScore,
     /// 1 if never too fast; falls with the mean excess.
     speed_limit: f64,
-    /// What counts.
+    /// The total.
     total: f64,
 }
 
@@ -109,8 +109,8 @@ impl Judged {
 }
 
 impl Reward<'_> {
-    /// The score of every row, `n_futures` of a candidate after another; progress is a share of the
-    /// farthest candidate's in the same future.
+    /// The score of every row, with the `n_futures` of a candidate after another; progress is
+    /// relative to the farthest candidate in the same future.
     pub(super) fn judge(&self, rows: &[Row], n_futures: usize) -> Vec<Judged> {
         let judged = rows.par_iter().map(|row| {
             let judge = Judge {
@@ -153,7 +153,7 @@ impl Reward<'_> {
         all
     }
 
-    /// Whether nuPlan's metric finds the last part of the drive and what is to follow comfortable.
+    /// Whether the last part of the drive and the planned one are comfortable by nuPlan's metric.
     fn is_comfortable(&self, drive: &[EgoState]) -> bool {
         let states: Vec<EgoState> = self.past.iter().chain(drive).copied().collect();
         let series = ComfortSeries::of(&Motion::of(self.judge.vehicle, &states));
@@ -230,7 +230,7 @@ pub(super) struct Tally {
     scores: Vec<Judged>,
 }
 
-/// What a candidate is chosen by.
+/// The value by which a candidate is chosen.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Standing {
     value: f64,
@@ -240,7 +240,7 @@ pub(super) struct Standing {
 }
 
 impl Tally {
-    /// Adds futures that were imagined and judged.
+    /// Adds simulated and scored futures.
     pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, Judged)>) {
         for (row, score) in judged {
             self.rows.push(row);
@@ -281,7 +281,7 @@ impl Tally {
         }
     }
 
-    /// What is told of the candidate.
+    /// The reported details of the candidate.
     pub(super) fn sum_up(
         self,
         kind: ProposalKind,
@@ -328,7 +328,7 @@ pub(super) fn best_of(
     kept
 }
 
-/// A score in the form that all planners tell theirs.
+/// A score in the form that all planners report.
 fn told(judged: &Judged) -> Score {
     let parts = &judged.parts;
     let gate = |name, factor| Gate { name, factor };
@@ -352,8 +352,8 @@ fn told(judged: &Judged) -> Score {
     }
 }
 
-/// The best prospect of those that were imagined to the end; ties are broken as
-/// [`super::InteractiveDriver`] says.
+/// The best prospect of those that were simulated to the end; ties are broken as
+/// [`super::InteractiveDriver`] states.
 pub(super) fn choose(prospects: &[Prospect], previous: Option<usize>, hysteresis: f64) -> usize {
     let standing = prospects.iter().map(|prospect| Standing {
         value: prospect.value,
@@ -409,7 +409,7 @@ fn clearly(a: f64, b: f64) -> Ordering {
     }
 }
 
-/// True if even the chosen one hits something soon in most futures and the ego is slow enough for
+/// True if even the chosen candidate collides soon in most futures and the ego is slow enough for
 /// the brake.
 pub(super) fn is_emergency(chosen: &Prospect, ego: &EgoState) -> bool {
     let soon = chosen.collision_s <= BRAKE_STEPS as f64 * DT;

@@ -1,4 +1,4 @@
-//! What becomes of every candidate: policies and world take turns, half a second each.
+//! Rollouts of candidates: policies and world take turns, half a second each.
 
 use std::time::Duration;
 
@@ -19,34 +19,34 @@ use crate::pdm::score::Judge;
 use crate::pdm::track::Tracker;
 use crate::{PlanError, ProposalKind};
 
-/// Steps of a tenth of a second that a policy drives before the world answers ...
+/// Steps of a tenth of a second that a policy drives before the world reacts ...
 pub(super) const DECISION: usize = 5;
 /// ... and the same in seconds.
 pub(super) const DECISION_S: f64 = 0.5;
-/// Steps that a policy looks ahead each time: what it drives and the second that the tracker sees.
+/// Steps that a policy plans ahead each time: those it drives and the second that the tracker
+/// needs.
 const LOOK: usize = DECISION + 10;
-/// Seconds of history that a world is shown: the learned one's three frames.
+/// Seconds of history given to a world: the learned one's three frames.
 const HISTORY_S: f64 = 1.0;
 
-/// What imagining takes.
+/// Inputs of the rollouts.
 pub(super) struct Imagination<'a> {
     pub(super) world: &'a dyn WorldModel,
     pub(super) config: &'a InteractiveDriverConfig,
-    /// Prepared for the moment.
+    /// Prepared for the decision.
     pub(super) state: &'a State,
     pub(super) speeds: &'a [f64],
     pub(super) moment: &'a Moment<'a>,
     pub(super) clock: &'a dyn Fn() -> Duration,
 }
 
-/// States of the past, a tenth of a second apart, that comfort is judged with: nuPlan's longest filter
-/// sees 1.5 s.
+/// Past states, a tenth of a second apart, used for comfort: nuPlan's longest filter needs 1.5 s.
 const COMFORT_PAST: usize = 20;
 
-/// Separates the chance of rounds after the first from that of iterations.
+/// Separates the random numbers of later rounds from those of iterations.
 const ROUND: u64 = 1 << 32;
 
-/// Some futures of some candidates, imagined together.
+/// Some futures of some candidates, simulated together.
 struct Round<'a> {
     /// When the decision began.
     began: Duration,
@@ -60,7 +60,7 @@ struct Round<'a> {
     n_futures: usize,
     /// Half seconds to imagine.
     n_decisions: usize,
-    /// Future *k* of every candidate meets the same chance.
+    /// Future *k* of every candidate has the same random numbers.
     seed: Seed,
 }
 
@@ -83,22 +83,22 @@ impl Allocation {
 
 /// One future of one candidate.
 pub(super) struct Row {
-    /// Others as imagined so far.
+    /// The other agents as simulated so far.
     pub(super) forecast: Forecast,
-    /// The policy's own line so far; imitation has none.
+    /// The policy's own line so far; none for imitation.
     policy: Proposal,
-    /// How it follows whoever is ahead.
+    /// How it follows its leader.
     law: IdmConfig,
     /// How the car follows it, from now on.
     pub(super) drive: Vec<EgoState>,
-    /// What the world said, once per decision; shorter where it was lost and let go.
+    /// Frames of the world, one per decision; shorter where the future was dropped.
     pub(super) frames: Vec<Frame>,
-    /// True once nothing can make it worth anything: it drives no more.
+    /// True once the future can have no value any more: it is not simulated further.
     lost: bool,
 }
 
 impl<'a> Imagination<'a> {
-    /// Imagines all candidates and judges them; nobody is chosen yet.
+    /// Rolls all candidates out and scores them; none is chosen yet.
     pub(super) fn imagine(&self) -> Result<Decision, PlanError> {
         let began = (self.clock)();
         let mut phases = Phases::default();
@@ -170,7 +170,7 @@ impl<'a> Imagination<'a> {
         })
     }
 
-    /// Chance of a round: the same for all candidates.
+    /// Seed of a round: the same for all candidates.
     fn seed(&self, round: usize) -> Seed {
         let seed = self.config.seed.fork(self.moment.iteration as u64);
         match round {
@@ -179,8 +179,8 @@ impl<'a> Imagination<'a> {
         }
     }
 
-    /// Imagines some futures of some candidates: their rows, futures of one candidate after another,
-    /// and how many half seconds they reach.
+    /// Simulates some futures of some candidates: their rows, with the futures of one candidate
+    /// after another, and the number of half seconds reached.
     fn round(
         &self,
         round: &Round<'_>,
@@ -243,7 +243,7 @@ impl<'a> Imagination<'a> {
         Ok((rows, imagined))
     }
 
-    /// The last second of the ego and of those nearest to it.
+    /// The last second of the ego and of the agents nearest to it.
     fn surroundings(&self) -> Vec<Frame> {
         let scene = self.moment.scene;
         let place = scene.ego_now().state.pose.position;
@@ -275,7 +275,7 @@ impl<'a> Imagination<'a> {
         policies.iter().map(begin).collect()
     }
 
-    /// The rows of a round before anything has happened. Imitation has no policy.
+    /// The rows of a round at its start. Imitation has no policy.
     fn rows(&self, round: &Round<'_>, begun: &[(Proposal, IdmConfig)]) -> Vec<Row> {
         let row = |&candidate: &usize| {
             let (policy, law) = begun.get(candidate).cloned().unwrap_or_default();
@@ -293,7 +293,7 @@ impl<'a> Imagination<'a> {
         rows.collect()
     }
 
-    /// Lets every policy drive for half a second among the others as they are known.
+    /// Lets every policy drive for half a second among the other agents as known so far.
     fn drive(&self, proposer: &Proposer<'_>, corridors: &[Corridor], rows: &mut [Row]) {
         let wheel_base = self.state.vehicle.wheel_base;
         let judge = self.judge_of();
@@ -325,7 +325,7 @@ impl<'a> Imagination<'a> {
             });
     }
 
-    /// Asks the world for the half second that was just driven, in those rows that it has.
+    /// Asks the world for the half second that was just driven, in the rows still simulated.
     fn answer(
         &self,
         session: &mut (dyn Session + '_),
@@ -374,7 +374,7 @@ impl<'a> Imagination<'a> {
         Ok(())
     }
 
-    /// Lets the car follow what the world had the ego do.
+    /// Lets the vehicle follow the world's motion of the ego.
     fn imitate(&self, rows: &mut [Row], n_decisions: usize) {
         let (scene, vehicle) = (self.moment.scene, &self.state.vehicle);
         let now = scene.ego_now().state;
@@ -428,8 +428,8 @@ impl<'a> Imagination<'a> {
 }
 
 impl Row {
-    /// Notes where the last frame has the others: straight between frames, and after it on at the
-    /// velocity of the last second, since places come in quanta.
+    /// Records the positions of the others in the last frame: linear between frames, and after it
+    /// at the velocity of the last second, since positions are quantised.
     fn remember(&mut self, present: &Frame) {
         let n = self.frames.len();
         let frame = |i: usize| i.checked_sub(1).map_or(present, |i| &self.frames[i]);
@@ -480,7 +480,7 @@ fn frames_per_decision(session: &(dyn Session + '_)) -> Result<usize, RolloutErr
     }
 }
 
-/// What was imagined as a rollout of its own, from the present on.
+/// The simulated future as a rollout of its own, from the present on.
 fn film(scene: SceneState<'_>, frames: Vec<Frame>) -> Rollout {
     let last = scene.history.len() - 1;
     let mut rollout = Rollout::begin(SceneState {

@@ -1,12 +1,12 @@
 //! The interactive planner in the closed loop: every proposal is a policy that drives among
-//! imagined others, and the one that does best over several futures drives on.
+//! simulated agents, and the one with the best value over several futures is followed.
 //!
-//! Start with [`InteractiveDriver`]. `imagine` lets policies and world take turns, `choice` turns
-//! what happened into values and picks one. Lines, tracker, road and score are those of
-//! [`crate::PdmClosed`], so the two differ in what they expect of others and in nothing else.
+//! Start with [`InteractiveDriver`]. `imagine` simulates policies and world in turns, `choice`
+//! computes values and chooses. Lines, tracker, road and score are those of [`crate::PdmClosed`],
+//! so the two planners differ only in their predictions of other agents.
 //!
-//! Source: the planner of the GUMP paper, which was never released; what the paper leaves open is a
-//! field of [`InteractiveDriverConfig`].
+//! Source: the planner of the GUMP paper, which was never released; details that the paper leaves
+//! open are fields of [`InteractiveDriverConfig`].
 
 mod choice;
 mod imagine;
@@ -30,33 +30,34 @@ pub use choice::CandidateScore;
 use choice::{choose, is_emergency};
 use imagine::Imagination;
 
-/// What is imagined, how far, and how it is valued.
+/// Settings of candidates, rollouts and values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InteractiveDriverConfig {
-    /// The policies by rule.
+    /// The rule-based policies.
     pub proposals: PdmConfig,
-    /// Whether other driving styles are candidates too: two brisk ones, one who yields and one
-    /// who creeps, all along the centre.
+    /// Whether other driving styles are candidates as well: two brisk ones, one that keeps a long
+    /// distance and one that creeps, all along the centre.
     pub driving_styles: bool,
-    /// Whether the world's own ego is a candidate too.
+    /// Whether the world's own ego is a candidate as well.
     pub imitation: bool,
-    /// Futures per candidate, > 0; of candidates that drop out, fewer.
+    /// Futures per candidate, > 0; fewer for candidates that drop out.
     pub n_futures: usize,
-    /// Which candidates are imagined how often.
+    /// How rollouts are distributed over candidates.
     pub allocation: Allocation,
-    /// Where chance comes from: future *k* of every candidate meets the same chance.
+    /// The seed: future *k* of every candidate has the same random numbers.
     pub seed: Seed,
-    /// Iterations of the loop between two decisions, > 0; in between the chosen policy drives.
+    /// Iterations of the loop between two decisions, > 0; in between the chosen policy is followed.
     pub replan_every: usize,
-    /// What a future is worth.
+    /// The value of a future.
     pub worth: Worth,
-    /// How the futures of a candidate become one value.
+    /// How the values of a candidate's futures are combined into one.
     pub aggregate: Aggregate,
-    /// Standard deviations over the futures that are taken off the mean, at least 0.
+    /// Number of standard deviations over the futures that are subtracted from the mean, at least
+    /// 0.
     pub caution: f64,
-    /// What the previous choice is given on top of its value.
+    /// Bonus for the previous choice, added to its value.
     pub hysteresis: f64,
-    /// How much to imagine.
+    /// Budget of the rollouts.
     pub budget: PlanBudget,
 }
 
@@ -82,59 +83,59 @@ impl Default for InteractiveDriverConfig {
     }
 }
 
-/// Which candidates are imagined how often.
+/// How rollouts are distributed over candidates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Allocation {
     /// All futures of all candidates, as in the paper.
     Uniform,
     /// Sequential halving (Karnin, Koren and Somekh, 2013): one future of each, then one of the
-    /// better half, two of the better half of those, and so on, until some have had them all. Every
-    /// candidate of a round meets the same chance.
+    /// better half, two of the better half of those, and so on, until some candidates have had all
+    /// futures. Every candidate of a round has the same random numbers.
     #[default]
     Halving,
 }
 
-/// How the futures of a candidate become one value.
+/// How the values of a candidate's futures are combined into one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Aggregate {
-    /// Their mean, less [`InteractiveDriverConfig::caution`] deviations.
+    /// Their mean minus [`InteractiveDriverConfig::caution`] standard deviations.
     #[default]
     Mean,
-    /// The worst of them.
+    /// Their minimum.
     Worst,
 }
 
-/// What a future is worth.
+/// The value of a future.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Worth {
     /// The score of the whole drive, 0 to 1: the product of PDM's gates times the mean of progress,
-    /// time to collision, the speed limit and comfort with the weights of nuPlan's closed-loop score.
-    /// Comfort is that of nuPlan's metric, the last 2 s of the drive so far included; a limit that is
-    /// not stated is kept at any speed.
+    /// time to collision, the speed limit and comfort with the weights of nuPlan's closed-loop
+    /// score. Comfort is that of nuPlan's metric, including the last 2 s of the drive so far; any
+    /// speed complies with a limit that is not stated.
     Rollout,
     /// The same of every half second, discounted: the weighted mean with weights gamma^t, 0 to 1. A
     /// gate that closes stays closed.
     DiscountedStep {
-        /// 0 to 1; the further below 1, the less the later counts.
+        /// Gamma, 0 to 1; lower values reduce the weight of later half seconds.
         gamma: f64,
     },
 }
 
-/// How much to imagine.
+/// Budget of the rollouts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlanBudget {
-    /// So many moving agents, those nearest to the ego, are imagined; others keep their velocity.
+    /// Number of moving agents to simulate, those nearest to the ego; others keep their velocity.
     pub nearest: usize,
-    /// Seconds to imagine, 0.5 to 4; whole half seconds count.
+    /// Horizon in seconds, 0.5 to 4, in whole half seconds.
     pub horizon: f64,
-    /// Stop at the half second in which this is used up; all candidates are then judged by the same,
-    /// shorter horizon. A later round of [`Allocation::Halving`] that is not finished by then does
-    /// not count. Takes a clock: [`InteractiveDriver::with_clock`].
+    /// Time limit: rollouts stop at the half second in which it is used up, and all candidates are
+    /// scored over the same, shorter horizon. A later round of [`Allocation::Halving`] that is
+    /// unfinished by then does not count. Needs a clock: [`InteractiveDriver::with_clock`].
     pub wall: Option<Duration>,
 }
 
 impl Default for PlanBudget {
-    /// 12 agents, the paper's 4 s, however long it takes.
+    /// 12 agents, the paper's 4 s, without a time limit.
     fn default() -> Self {
         Self {
             nearest: 12,
@@ -144,78 +145,79 @@ impl Default for PlanBudget {
     }
 }
 
-/// Where the time of a decision went; zeros without a clock.
+/// Time spent in the parts of a decision; zeros without a clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Phases {
-    /// Opening the world: map, history.
+    /// Opening the world: map and history.
     pub open: Duration,
     /// The world's frames.
     pub frames: Duration,
-    /// The policies: what is in the way, how fast, how the car follows.
+    /// The policies: leaders, speeds, tracking.
     pub policies: Duration,
-    /// Judging what happened.
+    /// Scoring.
     pub score: Duration,
 }
 
 impl Phases {
-    /// All together.
+    /// In total.
     pub fn total(&self) -> Duration {
         self.open + self.frames + self.policies + self.score
     }
 }
 
-/// One candidate with what was imagined of it.
+/// One candidate with its rollouts and scores.
 #[derive(Clone, Debug)]
 pub struct Prospect {
-    /// What drives.
+    /// The policy, or the world's ego.
     pub kind: ProposalKind,
-    /// What it came to, future by future.
+    /// The result of each future.
     pub score: CandidateScore,
-    /// What it is chosen by: [`InteractiveDriverConfig::aggregate`] of its futures.
+    /// The value by which it is chosen: [`InteractiveDriverConfig::aggregate`] of its futures.
     pub value: f64,
-    /// Whether it was imagined to the end and could be chosen: [`Allocation::Halving`] drops others
-    /// on the way.
+    /// Whether it was simulated to the end and could be chosen: [`Allocation::Halving`] drops
+    /// others on the way.
     pub finalist: bool,
-    /// Futures with a collision by the ego's fault.
+    /// Number of futures with a collision at the ego's fault.
     pub collisions: usize,
-    /// Mean metres along the way.
+    /// Mean progress along the way, metres.
     pub progress_m: f64,
-    /// Mean seconds to the first collision by the ego's fault; the horizon counts where none is.
+    /// Mean time to the first collision at the ego's fault, seconds; the horizon counts where there
+    /// is none.
     pub collision_s: f64,
-    /// What was imagined: the ego and those near it, every half second, until nothing could make
-    /// the future worth anything any more.
+    /// The rollouts: the ego and the agents near it, every half second, until the future could have
+    /// no value any more.
     pub futures: Vec<Rollout>,
-    /// How the ego drives in each future: states of the rear axle, a tenth of a second apart.
+    /// The ego's motion in each future: states of the rear axle, a tenth of a second apart.
     pub drives: Vec<Vec<EgoState>>,
 }
 
-/// A decision with everything it rests on.
+/// A decision with all prospects.
 #[derive(Clone, Debug)]
 pub struct Decision {
     /// Index of the chosen prospect.
     pub chosen: usize,
-    /// True if the ego brakes instead, because even the best one hits something soon.
+    /// True if the ego brakes instead, because even the best candidate collides soon.
     pub brakes: bool,
     /// All candidates: lateral offsets one after another, within each the speeds, imitation last.
     pub prospects: Vec<Prospect>,
-    /// Seconds imagined.
+    /// Horizon that was simulated, seconds.
     pub horizon: f64,
-    /// Where the time went.
+    /// Time spent.
     pub phases: Phases,
 }
 
-/// Imagines what every policy would come to and lets the best one drive.
+/// Rolls out every policy and follows the best one.
 ///
-/// Each policy meets each future on its own: every half second it sees where the imagined others
-/// are, drives on, and the world answers within the same frame. A plan is thus not a line that is
-/// kept whatever happens, and others are no forecast.
+/// Each policy is rolled out separately in each future: every half second it sees the positions of
+/// the simulated agents and drives on, and the world reacts within the same frame. A plan is thus
+/// not a fixed line, and the motion of other agents is not a fixed forecast.
 ///
-/// A future in which a gate of the score has closed for good can come to nothing any more, so the
-/// world is not asked for the rest of it: an exact bound.
+/// A future in which a gate of the score has closed for good has a value of 0, so the world is not
+/// asked for the rest of it. This bound is exact.
 ///
 /// Ties of values (within 1e-6) are broken by fewer collisions, more progress, the previous choice,
-/// the lower index. If nobody is worth anything, who collides last drives; if even that is within 2 s
-/// and the ego is slow, it brakes as PDM does.
+/// the lower index. If no candidate has a value above 0, the one that collides last is followed; if
+/// even that collides within 2 s and the ego is slow, it brakes as PDM does.
 pub struct InteractiveDriver<'w> {
     world: &'w dyn WorldModel,
     config: InteractiveDriverConfig,
@@ -223,12 +225,12 @@ pub struct InteractiveDriver<'w> {
     mission: Option<State>,
     decision: Option<Decision>,
     decided_at: usize,
-    /// The way of the chosen imitation.
+    /// The path of the chosen imitation.
     following: Option<Trajectory>,
 }
 
 impl<'w> InteractiveDriver<'w> {
-    /// A planner that imagines in `world`.
+    /// A planner that rolls candidates out in `world`.
     ///
     /// # Errors
     /// [`PlanError::Parameter`] for a number out of its range.
@@ -248,7 +250,7 @@ impl<'w> InteractiveDriver<'w> {
         })
     }
 
-    /// Tells the time: what has passed since any fixed moment.
+    /// The clock: the time since any fixed instant.
     #[must_use]
     pub fn with_clock(self, clock: impl Fn() -> Duration + 'w) -> Self {
         Self {
@@ -287,7 +289,7 @@ impl<'w> InteractiveDriver<'w> {
         Ok(())
     }
 
-    /// Lets the chosen policy drive on from where everyone really is.
+    /// Lets the chosen policy drive on from the actual positions of all agents.
     fn follow(&self, moment: &Moment<'_>, speeds: &[f64]) -> Result<Trajectory, PlanError> {
         let state = self.mission.as_ref().ok_or(PlanError::NoMission)?;
         let decision = self.decision.as_ref().ok_or(PlanError::NoMission)?;
@@ -356,7 +358,8 @@ impl Explain for InteractiveDriver<'_> {
     }
 }
 
-/// The drive of the future that ends nearest to where all end on average, and straight on after it.
+/// The ego's motion in the future that ends nearest to the mean end of all, and straight on after
+/// it.
 fn imitated(prospect: &Prospect, ego: &EgoState) -> Result<Trajectory, PlanError> {
     let end = |drive: &Vec<EgoState>| drive[drive.len() - 1].rear_axle.position;
     let n = prospect.drives.len() as f64;

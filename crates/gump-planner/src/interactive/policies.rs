@@ -1,4 +1,4 @@
-//! The policies by rule among which the planner chooses.
+//! The rule-based policies among which the planner chooses.
 
 use gump_rollout::worlds::IdmConfig;
 
@@ -24,7 +24,8 @@ const YIELDING: f64 = 0.8;
 const CREEPING: f64 = 0.07;
 
 /// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers with
-/// other driving styles along the centre, if that is a line and they are asked for. `speeds` are PDM's.
+/// other driving styles along the centre, if that is a line and they are requested. `speeds` are
+/// PDM's.
 pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Policy> {
     let proposals = &config.proposals;
     let offsets = proposals.lateral_offsets.iter().enumerate();
@@ -63,7 +64,7 @@ pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Polic
     policies
 }
 
-/// Two thirds of the headway; sets off just below what nuPlan finds uncomfortable (2.4 m/s²).
+/// Two thirds of the headway; accelerates at just below nuPlan's comfort bound (2.4 m/s²).
 fn brisk(usual: &IdmConfig) -> IdmConfig {
     IdmConfig {
         headway: usual.headway * 2.0 / 3.0,
@@ -72,7 +73,7 @@ fn brisk(usual: &IdmConfig) -> IdmConfig {
     }
 }
 
-/// Twice the headway, a car's length when standing, gentle both ways.
+/// Twice the headway, a car's length at standstill, gentle acceleration and braking.
 fn yielding(usual: &IdmConfig) -> IdmConfig {
     IdmConfig {
         headway: usual.headway * 2.0,

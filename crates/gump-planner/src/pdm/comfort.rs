@@ -1,6 +1,7 @@
-//! Whether a tracked proposal would be comfortable.
+//! Comfort of tracked proposals.
 //!
-//! The bounds are those of the metric; the windows are PDM's: a proposal is as short as a window.
+//! The bounds are those of the metric; the windows are PDM's, because a proposal is only as long as
+//! a window.
 
 use gump_geometry::angle_difference;
 use gump_metrics::{ComfortBounds, Felt};
@@ -18,7 +19,7 @@ pub(crate) struct ComfortFilters {
     scratch: [Vec<f64>; 6],
 }
 
-/// A linear filter of series of one length: for every value where its window starts and the
+/// A linear filter of series of one length: for every value the start of its window and its
 /// weights.
 #[derive(Clone, Debug)]
 struct Filter {
@@ -79,7 +80,7 @@ impl ComfortFilters {
         }
     }
 
-    /// True if every moment of the drive stays within the bounds of nuPlan's comfort metric.
+    /// True if all states of the drive stay within the bounds of nuPlan's comfort metric.
     pub(crate) fn are_comfortable(&mut self, states: &[EgoState]) -> bool {
         let bounds = &ComfortBounds::NUPLAN;
         let [raw, smooth, a, b, c, d] = &mut self.scratch;

@@ -1,18 +1,19 @@
-//! Who is where over the next seconds: as imagined, and else with constant speed and direction.
+//! Forecast of the positions of all objects over the next seconds: as simulated where known,
+//! otherwise with constant speed and direction.
 
 use std::collections::BTreeSet;
 
 use gump_geometry::{DVec2, OrientedBox, Polygon, Pose, Quad};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, LaneId};
 
-/// Objects whose centre is farther from the ego's are not seen, metres.
+/// Objects whose centre is farther from the ego's are ignored, metres.
 const RADIUS: f64 = 50.0;
 /// Moments of the forecast, a fifth of a second apart.
 pub(crate) const MOMENTS: usize = 41;
 /// Seconds between moments.
 pub(crate) const MOMENT_DT: f64 = 0.2;
 
-/// What stands in the way: an object or a red light.
+/// An obstacle: an object or a red light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Token {
     /// An object.
@@ -21,13 +22,13 @@ pub(crate) enum Token {
     RedLight(LaneId),
 }
 
-/// One object over all moments: where it is known to be, then straight on.
+/// One object over all instants: at its known positions, then straight on.
 #[derive(Clone, Debug)]
 pub(crate) struct Object {
     pub(crate) agent: Agent,
-    /// From now on, one per moment; never empty.
+    /// Known positions from now on, one per instant; never empty.
     known: Vec<Spot>,
-    /// How it goes on from the last of them: world frame, metres per second.
+    /// The velocity after the last of them: world frame, metres per second.
     drift: DVec2,
     /// Bounds over all moments.
     swept: (DVec2, DVec2),
@@ -38,7 +39,7 @@ pub(crate) struct Object {
 struct Spot {
     quad: Quad,
     pose: Pose,
-    /// 0 for what does not move by itself.
+    /// 0 for kinds that never move.
     speed: f64,
 }
 
@@ -47,12 +48,12 @@ struct Spot {
 pub(crate) struct Forecast {
     pub(crate) objects: Vec<Object>,
     pub(crate) red_lights: Vec<(LaneId, Polygon)>,
-    /// What the ego touches, or has ever touched, and therefore does not care for any more.
+    /// Objects that the ego touches, or has ever touched, and therefore ignores.
     pub(crate) collided: BTreeSet<Token>,
 }
 
 impl Object {
-    /// An object that keeps its speed; it goes along its heading, or against it if it rolls back.
+    /// An object that keeps its speed; it moves along its heading, or against it if it rolls back.
     fn new(agent: &Agent) -> Self {
         let moving = agent.kind.is_moving();
         let velocity = agent.state.velocity;
@@ -78,7 +79,7 @@ impl Object {
         object
     }
 
-    /// Adds where it is imagined at the next moments, and how it goes on from there.
+    /// Adds simulated positions at the next instants, and the velocity after them.
     pub(crate) fn imagine(&mut self, poses: impl Iterator<Item = Pose>, drift: DVec2) {
         for pose in poses {
             let state = AgentState {
@@ -148,7 +149,7 @@ impl Object {
         Token::Agent(self.agent.id)
     }
 
-    /// The last place known by a moment, and how far it has gone on from there.
+    /// The last position known by an instant, and the distance driven from there.
     fn at(&self, moment: usize) -> (&Spot, DVec2) {
         let last = moment.min(self.known.len() - 1);
         let beyond = MOMENT_DT * (moment - last) as f64;
@@ -168,7 +169,7 @@ impl Object {
 }
 
 impl Forecast {
-    /// Sees everyone afresh; what was ever touched stays ignored.
+    /// Updates all objects; those that were ever touched stay ignored.
     pub(crate) fn look<'a>(
         &mut self,
         ego: &OrientedBox,

@@ -1,4 +1,4 @@
-//! The road around the ego: which of its surfaces hold which points.
+//! Surfaces of the road around the ego, and queries for the surfaces under points.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -6,10 +6,10 @@ use std::sync::Arc;
 use gump_geometry::{DVec2, PolygonIndex};
 use gump_scene::{AreaKind, LaneId, MapGraph};
 
-/// Surfaces matter within this square around the ego, half its side in metres.
+/// Surfaces within this square around the ego are considered, half its side in metres.
 pub(crate) const RADIUS: f64 = 50.0;
 
-/// Surfaces near the ego, prepared once per lane and kept for as long as the mission lasts.
+/// Surfaces near the ego, prepared once per lane and kept for the mission.
 #[derive(Debug, Default)]
 pub(crate) struct Ground {
     lanes: BTreeMap<LaneId, Arc<PolygonIndex>>,
@@ -25,10 +25,10 @@ struct Surface {
     on_route: bool,
 }
 
-/// Where a vehicle stands.
+/// The surfaces under a vehicle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Footing {
-    /// Its corners are on several surfaces, none of which holds all.
+    /// Its corners are on several surfaces, none of which contains all.
     pub(crate) multiple_lanes: bool,
     /// Some corner is on no surface.
     pub(crate) off_road: bool,
@@ -37,7 +37,7 @@ pub(crate) struct Footing {
 }
 
 impl Ground {
-    /// Looks around `center`.
+    /// Updates the surfaces around `center`.
     pub(crate) fn look(&mut self, map: &MapGraph, route: &BTreeSet<LaneId>, center: DVec2) {
         self.near.clear();
         for block in map.roadblocks_in_square(center, RADIUS) {
@@ -88,7 +88,7 @@ impl Ground {
         self.near.iter().filter_map(|surface| surface.lane)
     }
 
-    /// Lanes of the route that hold a point.
+    /// Lanes of the route that contain a point.
     pub(crate) fn route_lanes_at(&self, point: DVec2) -> impl Iterator<Item = LaneId> + '_ {
         self.near
             .iter()
@@ -112,7 +112,7 @@ impl Ground {
         }));
     }
 
-    /// Where a vehicle with these corners stands; only `surfaces` are looked at.
+    /// The surfaces under a vehicle with these corners; only `surfaces` are considered.
     pub(crate) fn footing(
         &self,
         corners: &[DVec2; 4],

@@ -1,4 +1,4 @@
-//! What is known since a mission began: the way, the road around the ego and everyone on it.
+//! State of a mission: the way, the road around the ego and the objects on it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use crate::route_search::{correct_route, lanes_of_route, nearest_vertex, shortes
 /// Roadblocks of the route that the centre line is laid through.
 const WINDOW: usize = 30;
 
-/// What it knows since the mission began.
+/// State since the mission began.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(crate) map: Arc<MapGraph>,
@@ -33,7 +33,7 @@ pub(crate) struct State {
     way: Option<Way>,
     pub(crate) ground: Ground,
     pub(crate) forecast: Forecast,
-    /// The limit that the lane states, metres per second, once a moment was prepared.
+    /// The limit stated by the lane, metres per second, once a step was prepared.
     pub(crate) stated_limit: Option<f64>,
 }
 
@@ -48,7 +48,7 @@ struct Way {
 }
 
 impl State {
-    /// Takes a mission; the way is found once the ego is seen.
+    /// Takes a mission; the way is found in the first step.
     ///
     /// # Errors
     /// As [`stated_route`].
@@ -64,12 +64,12 @@ impl State {
         })
     }
 
-    /// Sees the moment and lays the lines if that was not done; returns the desired speeds, metres
-    /// per second.
+    /// Updates the state for a step and lays the lines if necessary; returns the desired speeds,
+    /// metres per second.
     ///
     /// # Errors
-    /// [`PlanError::NoRoute`] if there is no way from where the ego is, [`PlanError::NotFinite`] for
-    /// an agent whose state is no number: in a forecast it would be nowhere and in nobody's way.
+    /// [`PlanError::NoRoute`] if there is no way from the ego's position, [`PlanError::NotFinite`]
+    /// for an agent whose state is not finite, because a forecast could not place it.
     pub(crate) fn prepare(
         &mut self,
         moment: &Moment<'_>,
@@ -89,7 +89,7 @@ impl State {
         Ok(config.speed_fractions.iter().map(|f| f * limit).collect())
     }
 
-    /// What proposes in the prepared moment.
+    /// The proposer of the prepared step.
     pub(crate) fn proposer<'a>(&'a self, law: &'a IdmConfig, speeds: &'a [f64]) -> Proposer<'a> {
         Proposer {
             law,
@@ -100,7 +100,7 @@ impl State {
         }
     }
 
-    /// The middle of the way.
+    /// The centre line of the way.
     pub(crate) fn centerline(&self) -> &Line {
         &self.prepared().centerline
     }
@@ -109,7 +109,7 @@ impl State {
         self.way.as_ref().expect("the moment was prepared")
     }
 
-    /// Takes in the road and everyone around.
+    /// Updates the road and the objects around the ego.
     fn look(&mut self, moment: &Moment<'_>, config: &PdmConfig) -> Result<(), PlanError> {
         let ego = moment.ego;
         if self.way.is_none() {
@@ -145,7 +145,7 @@ impl State {
         Ok(())
     }
 
-    /// The lane of the route that the ego is on, or the one to go to.
+    /// The lane of the route that the ego is on, or the one to drive to.
     fn starting_lane(&self, ego: &EgoState) -> Result<LaneId, PlanError> {
         let way = self.way.as_ref().ok_or(PlanError::NoRoute)?;
         let at = |id: &LaneId| {
@@ -248,7 +248,7 @@ pub(crate) fn stated_route(mission: &Mission<'_>) -> Result<Vec<RoadblockId>, Pl
     Ok(known)
 }
 
-/// Poses of the rear axle a tenth of a second apart as something to follow.
+/// Poses of the rear axle a tenth of a second apart as a reference.
 pub(crate) fn trajectory(start_us: i64, poses: &[Pose]) -> Result<Trajectory, RolloutError> {
     let state = |(i, &rear_axle): (usize, &Pose)| EgoState {
         time_us: start_us + i as i64 * 100_000,
@@ -259,7 +259,7 @@ pub(crate) fn trajectory(start_us: i64, poses: &[Pose]) -> Result<Trajectory, Ro
 }
 
 /// A reference straight ahead at a constant speed that makes the tracker brake hard. That speed is
-/// mostly negative: the reference runs backwards, and is laid afresh at every step.
+/// mostly negative: the reference runs backwards, and is computed again at every step.
 pub(crate) fn brake(ego: &EgoState, vehicle: &VehicleParameters) -> Vec<Pose> {
     let (low, high) = (-4.05, 2.4);
     let speed = ego.velocity.x;

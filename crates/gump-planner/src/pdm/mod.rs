@@ -1,13 +1,12 @@
-//! PDM-Closed: fifteen proposals by rule, each driven and judged against a constant-velocity
+//! PDM-Closed: fifteen rule-based proposals, each simulated and scored against a constant-velocity
 //! forecast; the best one is followed.
 //!
-//! Start with [`PdmClosed`]. `propose` makes the proposals on the lines that the route gives,
-//! `track` drives them, `score` judges them on what `ground` and `forecast` say of the road and of
-//! everyone else.
+//! Start with [`PdmClosed`]. `propose` makes the proposals on lines along the route, `track`
+//! simulates them, `score` scores them with the road of `ground` and the objects of `forecast`.
 //!
-//! Everything is as its authors' code has it, oddities included: where they matter a comment says
-//! so. Source: Dauner et al. 2023, "Parting with Misconceptions about Learning-based Vehicle Motion
-//! Planning", and the released tuPlan Garage; agrees with its goldens.
+//! The behaviour equals that of the authors' code, including oddities; comments mark them where
+//! they matter. Source: Dauner et al. 2023, "Parting with Misconceptions about Learning-based
+//! Vehicle Motion Planning", and the released tuPlan Garage; agrees with its goldens.
 
 pub(crate) mod comfort;
 pub(crate) mod forecast;
@@ -41,21 +40,21 @@ use track::Tracker;
 pub(crate) const STEPS: usize = 40;
 /// Steps of the trajectory that is followed.
 pub(crate) const TRAJECTORY_STEPS: usize = 80;
-/// A collision sooner than this, in steps, calls for the brake ...
+/// A collision sooner than this, in steps, triggers the brake ...
 pub(crate) const BRAKE_STEPS: usize = 20;
 /// ... if the ego is not faster than this, metres per second.
 pub(crate) const BRAKE_SPEED: f64 = 5.0;
 
-/// Which proposals are made.
+/// Settings of the proposals.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PdmConfig {
     /// Desired speeds as shares of the limit.
     pub speed_fractions: Vec<f64>,
     /// Lines to follow, metres to the left of the centre.
     pub lateral_offsets: Vec<f64>,
-    /// The limit of a lane that states neither one nor of what kind it is, metres per second.
+    /// The limit of a lane that states neither a limit nor its type, metres per second.
     pub fallback_speed: f64,
-    /// The car-following law; of its limits only the two accelerations are used.
+    /// The car-following law; only its two accelerations are used as limits.
     pub law: IdmConfig,
 }
 
@@ -88,7 +87,7 @@ pub struct PdmClosed {
     thought: Thought,
 }
 
-/// What it made of the last moment.
+/// The state of the last step.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Thought {
     pub(crate) proposals: Vec<Proposal>,

@@ -1,5 +1,5 @@
-//! The proposals: five desired speeds on each of three lines, each driven by a car-following law
-//! through the forecast.
+//! The proposals: five desired speeds on each of three lines, each driven by a car-following law in
+//! the forecast.
 
 use gump_geometry::{DVec2, LineIndex, Polygon, Pose, Quad, widen};
 use gump_nuplan::path::Path;
@@ -10,14 +10,14 @@ use super::forecast::{Forecast, Object};
 
 /// Seconds between the states of a proposal.
 pub(crate) const DT: f64 = 0.1;
-/// How far ahead a line is looked at, seconds at the highest desired speed.
+/// How far ahead a line is examined, seconds at the highest desired speed.
 const CORRIDOR_SECONDS: f64 = 8.0;
-/// What PDM takes as the length behind the position of a lead that is not there, metres.
+/// Length that PDM assumes behind the position of a lead that does not exist, metres.
 ///
 /// It is half the length of nuPlan's car; PDM has it as a constant of the vehicle.
 const END_REAR: f64 = 2.588;
 
-/// A line to follow, with what is asked of it often.
+/// A line to follow, with frequently used values.
 #[derive(Clone, Debug)]
 pub(crate) struct Line {
     pub(crate) path: Path,
@@ -37,12 +37,13 @@ impl Line {
         self.index.project(self.path.line(), point).arc_length
     }
 
-    /// PDM never asks for the very start of a line.
+    /// PDM never uses the very start of a line.
     fn pose_at(&self, s: f64) -> Pose {
         self.path.pose_at(s.max(1e-5))
     }
 
-    /// What a vehicle would sweep between two arc lengths: the points in between, with square ends.
+    /// The strip that a vehicle sweeps between two arc lengths: the points in between, with square
+    /// ends.
     fn corridor(&self, from: f64, to: f64, half_width: f64) -> Vec<Quad> {
         let line = self.path.line();
         let arc = line.arc_lengths();
@@ -82,7 +83,7 @@ pub(crate) struct Drive {
     pub(crate) speed: f64,
 }
 
-/// What is ahead on the line.
+/// The leader on the line.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Lead {
     pub(crate) progress: f64,
@@ -90,7 +91,7 @@ pub(crate) struct Lead {
     pub(crate) rear: f64,
 }
 
-/// One proposal: where it goes and why.
+/// One proposal: its line, speed and path.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Proposal {
     /// Index of the line.
@@ -104,7 +105,7 @@ pub(crate) struct Proposal {
 }
 
 impl Proposal {
-    /// Forgets all steps after the first `n`.
+    /// Drops all steps after the first `n`.
     pub(crate) fn truncate(&mut self, n: usize) {
         self.drives.truncate(n + 1);
         self.leads.truncate(n + 1);
@@ -112,7 +113,7 @@ impl Proposal {
     }
 }
 
-/// What does not change from proposal to proposal.
+/// Values that are the same for all proposals.
 pub(crate) struct Proposer<'a> {
     pub(crate) law: &'a IdmConfig,
     pub(crate) vehicle: &'a VehicleParameters,
@@ -157,7 +158,7 @@ impl Proposer<'_> {
         self.drive_within(&corridor, batch, steps);
     }
 
-    /// What a vehicle might sweep from some progress along a line on.
+    /// The strip that a vehicle sweeps from some progress along a line on.
     pub(crate) fn corridor(&self, line: usize, progress: f64) -> Corridor {
         let fastest = self.desired_speeds.iter().copied().fold(0.0, f64::max);
         let end = progress + fastest * CORRIDOR_SECONDS;
@@ -201,10 +202,10 @@ impl Proposer<'_> {
         Drive { progress, speed }
     }
 
-    /// Finds the lead of every proposal at step `k`.
+    /// Finds the leader of every proposal at step `k`.
     ///
-    /// One lead is written to proposal after proposal and only the parts that are known are
-    /// renewed, so a speed seen by one is believed by the next; PDM's results depend on it.
+    /// One leader is written to proposal after proposal and only its known parts are renewed, so a
+    /// speed found for one is kept for the next; PDM's results depend on it.
     fn look(&self, line: &Line, around: &Surroundings<'_>, batch: &mut [Proposal], k: usize) {
         let mut lead = Lead::default();
         for proposal in batch {
@@ -228,7 +229,7 @@ impl Proposer<'_> {
     }
 }
 
-/// What reaches into the corridor of a line, moment by moment.
+/// Obstacles that reach into the corridor of a line, by instant.
 struct Surroundings<'a> {
     /// From the first moment looked at, `[moment][obstacle]`.
     moments: Vec<Vec<Obstacle<'a>>>,

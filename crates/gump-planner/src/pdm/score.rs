@@ -1,7 +1,7 @@
-//! How good the tracked proposals are.
+//! Scores of the tracked proposals.
 //!
-//! Definitions shared with nuPlan's metrics (whose fault a collision is, what is ahead, comfort)
-//! come from `gump_nuplan::metrics`; what is PDM's own is here.
+//! Definitions shared with nuPlan's metrics (fault of collisions, what is ahead, comfort) come from
+//! `gump_nuplan::metrics`; this module has PDM's own.
 
 use std::collections::BTreeSet;
 
@@ -14,13 +14,13 @@ use super::forecast::{Forecast, MOMENTS, Object, Token};
 use super::ground::{Footing, Ground};
 use super::propose::Line;
 
-/// Metres against the traffic that halve the score, and that spoil it.
+/// Distances driven against the traffic that halve the score, and that set it to 0, metres.
 const WRONG_WAY: [f64; 2] = [2.0, 6.0];
-/// If no proposal comes farther than this, metres, none is blamed for it.
+/// If no proposal gets farther than this, metres, progress does not count.
 pub(crate) const NO_PROGRESS: f64 = 0.1;
 /// Steps ahead at which a collision at constant speed is looked for.
 const TTC_STEPS: [usize; 4] = [0, 3, 6, 9];
-/// Below this speed, metres per second, nobody runs into anything.
+/// Below this speed, metres per second, an agent cannot run into another.
 const TTC_STANDING: f64 = 0.005;
 /// Weights of progress, time to collision and comfort.
 pub(crate) const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
@@ -28,27 +28,27 @@ pub(crate) const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
 /// The score of a proposal with its parts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PdmScore {
-    /// What counts: the product of the first three parts times the weighted mean of the others.
+    /// The total: the product of the first three parts times the weighted mean of the others.
     pub total: f64,
-    /// 1, 0.5 if a static thing is hit, 0 if anyone else is, by the ego's fault.
+    /// 1, 0.5 if a static object is hit, 0 if any other agent is, at the ego's fault.
     pub no_at_fault_collision: f64,
     /// 1 if the ego stays on the road, else 0.
     pub drivable_area: f64,
     /// 1, 0.5 or 0 by how far the ego drives against the traffic.
     pub driving_direction: f64,
-    /// Share of the way of the proposal that comes farthest.
+    /// Progress relative to the proposal that gets farthest.
     pub progress: f64,
-    /// 1 if nothing is run into within a second at constant speed, else 0.
+    /// 1 if nothing is hit within a second at constant speed, else 0.
     pub time_to_collision: f64,
     /// 1 if it is comfortable, else 0.
     pub comfort: f64,
-    /// Metres along the centre line.
+    /// Progress along the centre line, metres.
     pub progress_m: f64,
-    /// Step of the first collision by the ego's fault.
+    /// Step of the first collision at the ego's fault.
     pub collision_step: Option<usize>,
     /// First step off the road.
     pub off_road_step: Option<usize>,
-    /// First step from which something is run into.
+    /// First step with a collision ahead.
     pub ttc_step: Option<usize>,
 }
 
@@ -58,7 +58,7 @@ impl PdmScore {
     }
 }
 
-/// What proposals are judged against.
+/// Inputs of scoring.
 #[derive(Clone, Copy)]
 pub(crate) struct Judge<'a> {
     pub(crate) vehicle: &'a VehicleParameters,
@@ -67,7 +67,7 @@ pub(crate) struct Judge<'a> {
     pub(crate) centerline: &'a Line,
 }
 
-/// One proposal as the vehicle would drive it.
+/// One proposal as simulated.
 struct Tracked<'a> {
     states: &'a [EgoState],
     boxes: Vec<OrientedBox>,
@@ -97,7 +97,7 @@ impl Judge<'_> {
         scores
     }
 
-    /// The parts of a score that take no other drive; [`normalize`] adds the rest.
+    /// The parts of a score that do not depend on other proposals; [`normalize`] adds the rest.
     pub(crate) fn parts(&self, states: &[EgoState], comfortable: bool) -> PdmScore {
         let tracked = self.track(states);
         let (no_at_fault_collision, collision_step) = self.collision(&tracked);
@@ -123,7 +123,7 @@ impl Judge<'_> {
         self.centerline.project(center.position)
     }
 
-    /// True if nothing that happens after these states can open the gates of the score again.
+    /// True if nothing after these states can open the gates of the score again.
     pub(crate) fn is_lost(&self, states: &[EgoState]) -> bool {
         let tracked = self.track(states);
         tracked.footings.iter().any(|footing| footing.off_road) || self.collision(&tracked).0 == 0.0
@@ -164,7 +164,7 @@ impl Judge<'_> {
         (at(last) - at(first)).max(0.0)
     }
 
-    /// The factor for collisions, and when the first is the ego's fault.
+    /// The factor for collisions, and the step of the first one at the ego's fault.
     fn collision(&self, tracked: &Tracked<'_>) -> (f64, Option<usize>) {
         let mut ignored = self.forecast.collided.clone();
         let (mut score, mut first) = (1.0, None);
@@ -193,7 +193,7 @@ impl Judge<'_> {
         (score, first)
     }
 
-    /// The first step at which going straight on would run into something within a second.
+    /// The first step at which the ego, going straight on, would hit something within a second.
     fn time_to_collision(&self, tracked: &Tracked<'_>) -> Option<usize> {
         let mut ignored: BTreeSet<Token> = self.forecast.collided.clone();
         let ahead = |step: usize, ahead: usize| {
@@ -236,7 +236,7 @@ impl Judge<'_> {
         None
     }
 
-    /// Objects that some of these boxes might ever meet.
+    /// Objects that may ever touch one of these boxes.
     fn nearby<'q>(&self, quads: impl Iterator<Item = &'q Quad>) -> Vec<&Object> {
         let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         let (low, high) = quads
@@ -277,7 +277,7 @@ fn driving_direction(tracked: &Tracked<'_>) -> f64 {
     }
 }
 
-/// Relates progress to the farthest proposal and adds everything up.
+/// Relates progress to the farthest proposal and computes totals.
 pub(crate) fn normalize(scores: &mut [PdmScore]) {
     let farthest = scores
         .iter()

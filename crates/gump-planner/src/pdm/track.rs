@@ -1,4 +1,4 @@
-//! How the ego would really drive the proposals: tracker and vehicle in the loop.
+//! Simulation of proposals with tracker and vehicle model.
 
 use gump_geometry::Pose;
 use gump_nuplan::tracking::{

@@ -46,7 +46,7 @@ impl State {
 pub struct Track {
     /// Identity, unique in the log.
     pub id: AgentId,
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
     /// [`N_STEPS`] states, 0.1 s apart.
     pub states: Vec<State>,
@@ -58,13 +58,13 @@ impl Track {
         Self { id, kind, states }
     }
 
-    /// True if the agent is there at the present step, so that it must be simulated.
+    /// True if the agent is present at the present step, so that it must be simulated.
     pub fn is_simulated(&self) -> bool {
         self.states.get(N_HISTORY - 1).is_some_and(|now| now.valid)
     }
 }
 
-/// A lane of a surface street, as far as traffic lights are concerned.
+/// A lane of a surface street, with the data that traffic lights need.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SignalLane {
     /// The lane's id, to which signals refer.
@@ -84,7 +84,7 @@ pub struct Signal {
     pub stop_point: [f32; 2],
 }
 
-/// What the metric reads of a recorded scenario.
+/// The parts of a recorded scenario that the metric reads.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Log {
     /// Name of the scenario.
@@ -95,8 +95,8 @@ pub struct Log {
     pub ego: Option<AgentId>,
     /// Other agents that are scored.
     pub targets: Vec<AgentId>,
-    /// Borders of the road in the order of the map, the road on their left, metres; those of fewer
-    /// than two points do not count.
+    /// Road edges in the order of the map, with the road on their left, metres; those of fewer than
+    /// two points do not count.
     pub road_edges: Vec<Vec<[f32; 3]>>,
     /// Lanes of surface streets in the order of the map; those of fewer than two points do not
     /// count.
@@ -115,7 +115,7 @@ impl Log {
         }
     }
 
-    /// Names the ego.
+    /// Sets the ego.
     ///
     /// # Errors
     /// [`WosacError::NoTrack`].
@@ -125,7 +125,7 @@ impl Log {
         Ok(self)
     }
 
-    /// Names other agents that are scored.
+    /// Sets other agents that are scored.
     ///
     /// # Errors
     /// [`WosacError::NoTrack`].
@@ -137,21 +137,21 @@ impl Log {
         Ok(self)
     }
 
-    /// Gives the borders of the road, the road on their left.
+    /// Sets the road edges, with the road on their left.
     pub fn road_edges(mut self, road_edges: Vec<Vec<[f32; 3]>>) -> Self {
         self.road_edges = road_edges;
         self
     }
 
-    /// Gives the lanes of surface streets and the signals of every step.
+    /// Sets the lanes of surface streets and the signals of every step.
     pub fn signals(mut self, lanes: Vec<SignalLane>, signals: Vec<Vec<Signal>>) -> Self {
         self.lanes = lanes;
         self.signals = signals;
         self
     }
 
-    /// What really happened as `n` equal rollouts: the best any world can do, in practice less
-    /// than 1. `whole` for the scenario-generation mode, which wants all steps.
+    /// The log as `n` equal rollouts: in practice the best possible score, less than 1. `whole`
+    /// selects the scenario-generation mode, which needs all steps.
     pub fn oracle(&self, n: usize, whole: bool) -> Rollouts {
         let simulated = self.tracks.iter().filter(|track| track.is_simulated());
         let future = simulated.map(|track| {
@@ -199,8 +199,8 @@ pub struct Trajectory {
     pub z: Vec<f32>,
     /// Radians per step.
     pub heading: Vec<f32>,
-    /// Kind, and length, width, height per step: for scenario generation only, which makes them
-    /// up; simulated agents keep what they are and have at the present step.
+    /// Kind, and length, width, height per step: for scenario generation only, which generates
+    /// them; simulated agents keep those of the present step.
     pub shape: Option<(AgentKind, Vec<[f32; 3]>)>,
 }
 
@@ -217,27 +217,27 @@ impl Trajectory {
         }
     }
 
-    /// Adds what scenario generation makes up: the kind, and length, width, height per step.
+    /// Sets generated values of scenario generation: the kind, and length, width, height per step.
     pub fn with_box(mut self, kind: AgentKind, sizes: Vec<[f32; 3]>) -> Self {
         self.shape = Some((kind, sizes));
         self
     }
 }
 
-/// What a world imagines for one scenario.
+/// The rollouts of a world for one scenario.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rollouts {
     /// Name of the scenario.
     pub scenario: String,
-    /// Trajectories of all agents that are there at the present step, in any order, per rollout.
+    /// Trajectories of all agents that are present at the present step, in any order, per rollout.
     pub futures: Vec<Vec<Trajectory>>,
-    /// Each of the futures stands for so many equal ones, ≥ 1: worlds without chance need to be
+    /// Number of equal rollouts that each future stands for, ≥ 1: deterministic worlds need to be
     /// computed only once.
     pub copies: usize,
 }
 
 impl Rollouts {
-    /// Rollouts of the named scenario; the challenge asks for 32.
+    /// Rollouts of the named scenario; the challenge requires 32.
     pub fn new(scenario: impl Into<String>, futures: Vec<Vec<Trajectory>>) -> Self {
         Self {
             scenario: scenario.into(),
@@ -246,7 +246,7 @@ impl Rollouts {
         }
     }
 
-    /// The same as if every future were there `n` times.
+    /// The same with every future repeated `n` times.
     pub fn repeated(self, n: usize) -> Self {
         Self {
             copies: n.max(1),
@@ -254,7 +254,7 @@ impl Rollouts {
         }
     }
 
-    /// How many rollouts these are.
+    /// The number of rollouts.
     pub fn count(&self) -> usize {
         self.futures.len() * self.copies
     }
