@@ -1,33 +1,32 @@
-//! Velocities that agree with displacements.
+//! Velocities consistent with displacements.
 //!
-//! An object says where it will be and how fast, each for itself; averaging with what it said before
-//! and the limits of its body then move the place alone. What it does next starts from both, and
-//! others see both, so the velocity follows the place:
+//! The network predicts position and velocity of an object separately; temporal averaging and
+//! kinematic limits then change only the position. Later predictions depend on both, and other
+//! objects see both, so the velocity is made consistent with the position:
 //!
-//! * what stays where it was stands: its velocity is zero;
-//! * what was turned or moved otherwise than it said drives the other way, too: the velocity turns
-//!   with it and grows or shrinks as the way does;
-//! * the speed at the end of the half second is one that the way made in it allows: nobody's speed
-//!   changes by more than twice `REACH_M_PER_S` within it, and nobody who started from rest is
-//!   faster than twice the mean.
+//! * an object that did not move has velocity zero;
+//! * if averaging or limits changed the displacement, the velocity is rotated and scaled with it;
+//! * the speed at the end of the half second is limited by the displacement: no speed changes by
+//!   more than twice `REACH_M_PER_S` within it, and an object that started from rest is at most as
+//!   fast as twice the mean.
 //!
-//! The paper has no such rule: there, as in the released code, places and velocities part.
+//! The paper has no such rule: there, as in the released code, positions and velocities diverge.
 
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_model::steps::TOKEN_DT;
 use gump_scene::AgentState;
 
-/// How much the speed at the end of half a second may differ from the mean, metres per second: 8 m/s²
-/// all along, the hardest braking on a dry road.
+/// Maximum difference between the speed at the end of half a second and the mean, metres per
+/// second: 8 m/s² throughout, the hardest braking on a dry road.
 const REACH_M_PER_S: f64 = 8.0 * TOKEN_DT / 2.0;
 /// Speeds nearer than this are equal, metres per second: a bin and a half of a token.
 const SLACK_M_PER_S: f64 = 0.3;
-/// Ways shorter than this have neither direction nor proportion, metres: two bins of the finest
-/// chunk.
+/// Displacements shorter than this have neither direction nor proportion, metres: two bins of the
+/// finest chunk.
 const SHORT_M: f64 = 0.1;
 
-/// The velocity of what was at `from`, said it would be in the state `said`, and is at `pose`;
-/// `steers` tells whether it goes where it faces.
+/// The velocity of an object that was at `from`, was decoded to the state `said`, and is at `pose`;
+/// `steers` states whether it moves along its heading.
 pub(crate) fn follow(from: Pose, said: AgentState, pose: Pose, steers: bool) -> DVec2 {
     let (meant, made) = (
         said.pose.position - from.position,
@@ -46,8 +45,8 @@ pub(crate) fn follow(from: Pose, said: AgentState, pose: Pose, steers: bool) -> 
     DVec2::from_angle(turn).rotate(said.velocity) * stretch
 }
 
-/// The velocity nearest to `velocity` that half a second from `from` to `pose` allows; zero for what
-/// has not moved at all.
+/// The velocity nearest to `velocity` that a motion of half a second from `from` to `pose` allows;
+/// zero for an object that has not moved at all.
 pub(crate) fn allowed(from: Pose, pose: Pose, velocity: DVec2) -> DVec2 {
     let made = pose.position - from.position;
     if made == DVec2::ZERO {

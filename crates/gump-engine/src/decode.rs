@@ -1,8 +1,8 @@
-//! From windows to states: full and partial autoregression in the engine.
+//! Decoding of windows to states: full and partial autoregression in the engine.
 //!
-//! What lives here: what a window is, how it is presented, and in which order its objects are
-//! decoded. What does not: the arithmetic (`cpu`), the same for other devices (`reference`), and
-//! what becomes of the states (`rollout_state`).
+//! This module defines windows, their token sequences, and the order in which objects are decoded.
+//! The arithmetic is in `cpu`, and in `reference` for other devices; `rollout_state` processes the
+//! decoded states.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::redraw::Clearance;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
 
-/// What is known of one future's next frame.
+/// The known part of one future's next frame.
 #[derive(Debug)]
 pub(crate) struct Window {
     /// Index of its scene's memory.
@@ -33,14 +33,14 @@ pub(crate) struct Window {
     /// The frame to decode, with provisional states; the order of its tracked agents is the order
     /// of decoding.
     pub(crate) next: TokenFrame,
-    /// One per tracked agent of `next`.
+    /// Prediction of each tracked agent of `next`, before decoding.
     pub(crate) requests: Vec<Request>,
     /// The road of its scene.
     pub(crate) survey: Arc<Survey>,
 }
 
-/// The slots of a window, up to the last provisional value. The oldest frames give way, whole, if
-/// all together would be longer than `block_size`.
+/// The slots of a window, up to the last provisional value. If the window would be longer than
+/// `block_size`, its oldest frames are dropped as a whole.
 pub(crate) fn presented(window: &Window, block_size: usize) -> Result<Vec<PlacedSlot>, ModelError> {
     let mut room = block_size.saturating_sub(window.next.len_slots());
     let newest = window.history.iter().rev();
@@ -77,17 +77,17 @@ pub(crate) struct Step<'a> {
     pub(crate) windows: &'a [Window],
     /// Their slots, as [`presented`].
     pub(crate) placed: Vec<Vec<PlacedSlot>>,
-    /// What is kept of the distributions.
+    /// Settings of predictive samples.
     pub(crate) watch: ProbeConfig,
 }
 
-/// The next frame of every window.
+/// The decoded next frame of every window.
 pub(crate) struct Decoded {
     /// One chunk of bins per tracked agent of every window.
     pub(crate) bins: Vec<Vec<Bins>>,
-    /// Transformer passes that it took.
+    /// Number of transformer passes.
     pub(crate) passes: u64,
-    /// Other draws from the same distributions, as far as they are watched.
+    /// Predictive samples, as far as requested.
     pub(crate) seen: Vec<Seen>,
 }
 
@@ -100,8 +100,8 @@ impl Step<'_> {
         }
     }
 
-    /// Draws again from the distribution of an object, as often as is watched: `hidden` is that at
-    /// its key. The streams are others, so that nothing changes for the draws that count.
+    /// Draws predictive samples of an object, as many as requested; `hidden` is the vector at its
+    /// key. They use separate streams, so the simulated draws do not change.
     fn look(&self, window: usize, place: usize, hidden: &[f32]) -> Option<Seen> {
         let request = &self.windows[window].requests[place];
         if window >= self.watch.futures || request.is_driven() {
@@ -171,8 +171,8 @@ impl Step<'_> {
         }
     }
 
-    /// Full autoregression: each object sees the final states of those before it. The windows go
-    /// in step, object by object; those with fewer objects are done earlier.
+    /// Full autoregression: each object sees the final states of those before it. The windows
+    /// advance in step, object by object; those with fewer objects finish earlier.
     fn one_by_one(mut self, contexts: &mut [&mut Context]) -> Decoded {
         let n = |i: usize| self.windows[i].next.tracked.len();
         let most = (0..self.windows.len()).map(n).max().unwrap_or(0);

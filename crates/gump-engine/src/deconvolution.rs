@@ -1,14 +1,14 @@
-//! Taking label smoothing off again: a network that learned targets spread over neighbouring bins
-//! says distributions that are as blurred, which matters where bins are coarse.
+//! Removal of label smoothing by deconvolution: a network trained on targets smoothed over
+//! neighbouring bins outputs equally smoothed distributions, which matters where bins are coarse.
 //!
 //! Source: Richardson 1972 and Lucy 1974.
 
 use gump_kernels::smoothing::OrdinalSmoothing;
 
-/// Rounds of deconvolution: peaks are as sharp as the targets were then.
+/// Number of iterations, enough to make peaks as sharp as the unsmoothed targets.
 const ROUNDS: usize = 20;
 
-/// The logits of the distribution that, spread as by `smoothing`, is that of `logits`.
+/// The logits of the distribution that, smoothed as by `smoothing`, is that of `logits`.
 pub(crate) fn unsmoothed(logits: &[f32], smoothing: OrdinalSmoothing) -> Vec<f32> {
     let n = logits.len();
     let peak = logits.iter().copied().fold(f32::MIN, f32::max);

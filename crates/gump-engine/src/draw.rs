@@ -1,10 +1,10 @@
-//! Drawing a bin from logits: temperature, top-k, a leash, and streams that never depend on the
-//! batch.
+//! Sampling of bins from logits: temperature, top-k, a limit on position, and random streams that
+//! do not depend on the batch.
 //!
-//! A draw is the inverse of the distribution function over the bins in their order, at a number
-//! that is a function of the object's stream alone. Neighbouring bins are neighbouring values, so
-//! two futures whose logits differ a little draw values that differ a little: candidates of a
-//! planner that share their seed share their noise.
+//! A draw inverts the cumulative distribution over the bins in order, at a number that is a
+//! function of the object's stream only. Neighbouring bins are neighbouring values, so two futures
+//! with slightly different logits draw slightly different values: candidates of a planner with the
+//! same seed share their noise.
 
 use std::ops::Range;
 
@@ -18,11 +18,11 @@ use crate::nucleus::{least_kept, uniform};
 use crate::request::{Guide, Request};
 use crate::sampling::SamplingConfig;
 
-/// Bins that a draw is among, with their logits and then their weights.
+/// The bins of a draw, with their logits and then their weights.
 pub(crate) type Candidates = Vec<(usize, f32)>;
 
-/// Draws the bin of a step; `logits` are those of its field's bins, `drawn` the bins of the steps
-/// before, `room` is memory to work in.
+/// Draws the bin of a step; `logits` are those of its field's bins, `drawn` the bins of earlier
+/// steps, `room` is working memory.
 pub(crate) fn draw_field(
     logits: &[f32],
     step: usize,
@@ -54,22 +54,22 @@ pub(crate) fn draw_field(
     (allowed.start + found) as u16
 }
 
-/// What the logits of a sequence network are divided by unless told otherwise: its targets were
-/// smoothed over neighbouring bins, so that it is less sure than it could be.
+/// Default divisor of the logits of a sequence network: its targets were smoothed over neighbouring
+/// bins, so its distributions are too wide.
 const TEMPERATURE: f64 = 0.5;
 
-/// How far a draw keeps to what is likely.
+/// Truncation and temperature of a draw.
 #[derive(Clone, Copy, Debug)]
 struct Sharpness {
     /// Divides the logits.
     temperature: f64,
-    /// Bins that may be drawn.
+    /// Maximum number of bins that may be drawn.
     top_k: usize,
-    /// Of those, the likeliest that together have this probability.
+    /// Nucleus: of those, the most likely ones that together have this probability.
     top_p: f64,
 }
 
-/// As [`draw_field`], as a guide says.
+/// As [`draw_field`], with the adjustments of a guide.
 fn guided(
     logits: &[f32],
     step: usize,
@@ -107,10 +107,10 @@ fn guided(
     open[draw(&tilted, number, sharpness, room)] as u16
 }
 
-/// The bins of pose 0 near enough to where the object can be.
+/// The bins of pose 0 near enough to the object's possible positions.
 ///
-/// The released code throws away a sample more than 5 m off; restricting the draw instead is the
-/// same distribution given that it is near, and never fails.
+/// The released code discards a sample more than 5 m off; restricting the draw gives the same
+/// distribution conditioned on being near, and never fails.
 fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
     let all = 0..field.n_bins();
     let Some((centre, reach)) = request.near else {

@@ -1,32 +1,33 @@
-//! What a body can do in half a second.
+//! Kinematic limits: motion that is possible within half a second.
 //!
-//! A network that says places in bins cannot say that something stands still, and chance turns
-//! parked cars on the spot. Vehicles and bicycles turn only as they move; one that stands and moves
-//! less than a bin stays where it is. The paper has no such rule; every simulator with a vehicle model does.
+//! A network that predicts positions in bins cannot represent standing exactly, and random draws
+//! rotate parked cars in place. With these limits, vehicles and bicycles turn only as they move,
+//! and one that stands and moves less than a bin stays in place. The paper has no such rule;
+//! simulators with a vehicle model do.
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AgentKind, AgentState};
 
-/// What moves less than this in half a second stays, metres: a word cannot be told from none.
+/// An object that moves less than this in half a second stays, metres: within the resolution of a
+/// token.
 const STILL_M: f64 = 0.05;
-/// And what is slower than this, metres per second: a bin and a half.
+/// And whose speed is below this, metres per second: a bin and a half.
 const STILL_M_PER_S: f64 = 0.3;
 
-/// How a kind of object may move. What a pose that was held back means for the velocity is said in
-/// `agreement`.
+/// Limits on the motion of a kind of object. `agreement` adjusts the velocity of a limited pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Change of heading per metre.
+    /// Maximum change of heading per metre.
     curvature: f64,
-    /// Sideways metres per metre ahead, at the middle of the body.
+    /// Maximum sideways metres per metre ahead, at the box centre.
     slip: f64,
 }
 
 impl Limits {
-    /// The limits of a kind; `None` for those who may turn and step wherever they like.
+    /// The limits of a kind; `None` for kinds that may turn and step anywhere.
     ///
-    /// A car turns about its rear axle in a circle of 4.5 m; its middle then slips by about 0.3. A
-    /// bicycle turns in one of 1.5 m.
+    /// A car turns about its rear axle with a radius of 4.5 m; its centre then slips by about 0.3.
+    /// A bicycle turns with a radius of 1.5 m.
     pub(crate) fn of(kind: AgentKind) -> Option<Self> {
         match kind {
             AgentKind::Vehicle => Some(Self {
@@ -41,7 +42,7 @@ impl Limits {
         }
     }
 
-    /// What comes nearest to `said` of the poses that a body at `from` can reach.
+    /// The pose nearest to `said` that an object at `from` can reach.
     pub(crate) fn keep(self, from: Pose, said: AgentState) -> AgentState {
         let step = from.inverse() * said.pose;
         if step.position.length() <= STILL_M && said.velocity.length() <= STILL_M_PER_S {

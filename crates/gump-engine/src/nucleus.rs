@@ -1,13 +1,13 @@
-//! Draws that keep to what is likely.
+//! Nucleus sampling (top-p), and stateless random numbers.
 
 use gump_scene::Seed;
 
-/// A number in [0, 1) that is a function of the seed alone: no generator, no state.
+/// A number in [0, 1) that is a function of the seed only.
 pub fn uniform(seed: Seed) -> f64 {
     (seed.fork(0).0 >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// The smallest of the largest weights that together have a share `top_p` of all; reorders them.
+/// Keeps the largest weights that together have a share `top_p` of the total; reorders them.
 pub(crate) fn least_kept(weights: &mut [f32], top_p: f64) -> f32 {
     let total: f64 = weights.iter().map(|w| f64::from(*w)).sum();
     // All that are smaller than an even share of the tail add up to less than the tail: they are in

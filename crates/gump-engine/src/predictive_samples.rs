@@ -1,8 +1,8 @@
-//! What agents might have done next: the distributions that states are drawn from, as draws.
+//! Predictive samples: the distributions of agents' next states, represented by draws.
 //!
-//! A state is said field by field, each given those before, so its distribution has no table of
-//! numbers; many draws show it whole, with what is allowed and how chunks are averaged. They come
-//! from streams of their own: what is imagined does not change when somebody looks.
+//! A state is decoded field by field, each given those before, so its distribution has no closed
+//! form; many draws represent it, including truncation and temporal averaging. They come from
+//! separate random streams, so simulated futures do not change.
 
 #[cfg(feature = "tensors")]
 use gump_model::decoder::Bins;
@@ -12,42 +12,42 @@ use gump_scene::{AgentId, AgentState};
 #[cfg(feature = "tensors")]
 use crate::request::Request;
 
-/// What to keep of the distributions while imagining; nothing by default.
+/// Which predictive samples a session records; none by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ProbeConfig {
-    /// Those of the first so many futures of a session.
+    /// Number of futures of a session to record, the first ones.
     pub futures: usize,
     /// Draws per agent and step.
     pub draws: usize,
 }
 
-/// What one agent might be doing half a second later.
+/// The possible states of one agent half a second later.
 ///
-/// Draws that would run into somebody are among them, which the world itself draws again
+/// Draws that overlap other agents are included; the world itself redraws those
 /// ([`SamplingConfig::redraws`](crate::SamplingConfig::redraws)).
 #[derive(Clone, Debug, PartialEq)]
 pub struct PredictiveSamples {
-    /// Which future of the session.
+    /// Index of the future in the session.
     pub future: usize,
-    /// Steps of the session before it: 0 is seen from the start.
+    /// Number of steps of the session before it: 0 is sampled from the start.
     pub step: usize,
-    /// Who.
+    /// The agent.
     pub agent: AgentId,
     /// States, world frame, all equally likely.
     pub draws: Vec<AgentState>,
 }
 
 impl PredictiveSamples {
-    /// How much later than what it is seen from the draws are, seconds.
+    /// Time from the frame it is sampled from to the draws, seconds.
     pub const AHEAD_S: f64 = TOKEN_DT;
 
-    /// When it is seen from, seconds from the start.
+    /// Time of the frame it is sampled from, seconds after the start.
     pub fn from_s(&self) -> f64 {
         self.step as f64 * TOKEN_DT
     }
 }
 
-/// Other draws of an object: its window, its place there, and a chunk of bins each.
+/// Draws of an object: its window, its index there, and a chunk of bins each.
 #[derive(Debug)]
 #[cfg(feature = "tensors")]
 pub(crate) struct Seen {
@@ -56,13 +56,13 @@ pub(crate) struct Seen {
     pub(crate) bins: Vec<Bins>,
 }
 
-/// Separates the streams of those who watch from those of fields and of redraws.
+/// Separates the streams of predictive samples from those of fields and redraws.
 #[cfg(feature = "tensors")]
 const WATCH: u64 = 1 << 40;
 
 #[cfg(feature = "tensors")]
 impl ProbeConfig {
-    /// The same question again and again, each with its own randomness.
+    /// The same request many times, each with its own random stream.
     pub(crate) fn requests(self, request: &Request) -> impl Iterator<Item = Request> {
         (0..self.draws as u64).map(|i| Request {
             stream: request.stream.fork(WATCH + i),

@@ -1,6 +1,6 @@
-//! Drawing again what the sequence network would have run into others or off the road.
+//! Redraws of the sequence network's objects that would overlap others or leave the road.
 //!
-//! Who would is `rejection`'s to say.
+//! `rejection` decides which objects those are.
 
 use std::borrow::Borrow;
 
@@ -18,7 +18,7 @@ use crate::sampling::SamplingConfig;
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
 
-/// The objects of some windows as far as they have been drawn.
+/// The objects of some windows that have been drawn so far.
 pub(crate) struct Clearance<'a, W> {
     windows: &'a [W],
     config: &'a SamplingConfig,
@@ -35,9 +35,9 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
         }
     }
 
-    /// Draws again, up to `config.redraws` times, what is not clear among the objects of `decoded`
-    /// that have come since the last call; those before them stay. `draw` decodes the objects that
-    /// it is given, each by its window and its place there.
+    /// Redraws, up to `config.redraws` times, those of the objects added to `decoded` since the
+    /// last call that are not clear; earlier ones stay. `draw` decodes the objects that it is
+    /// given, each by its window and its index there.
     pub(crate) fn settle<E>(
         &mut self,
         decoded: &mut [Vec<Bins>],
@@ -94,7 +94,7 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
     }
 }
 
-/// Where an object will be, scene frame.
+/// The future positions of an object, scene frame.
 fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
     let said = request.anchor.poses(bins);
     let first = request.settle(bins, config).pose;
@@ -102,7 +102,7 @@ fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
 }
 
 impl Member {
-    /// The chunk of braking on the way that `bins` say; `None` for what hardly moves.
+    /// The chunk of braking along the path of `bins`; `None` for an object that hardly moves.
     pub(crate) fn brake(&self, request: &Request, bins: &Bins) -> Option<Bins> {
         let before = self.before.filter(|_| self.speed > 0.5)?;
         let said = request.anchor.poses(bins);

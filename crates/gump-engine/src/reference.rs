@@ -1,9 +1,9 @@
-//! From windows to states by the tensor library's operations: what devices other than a CPU run,
-//! and the slow, obvious side of every comparison with the engine.
+//! Decoding of windows with the operations of the tensor library: used on devices other than a CPU,
+//! and as the reference for tests of the engine.
 //!
-//! All windows of a session go through the transformer as one padded batch; the map is read from a
-//! memory that futures of one scene share. Keys and values live within a frame only: a growing
-//! window is read afresh, which gives the same result.
+//! All windows of a session go through the transformer as one padded batch; futures of one scene
+//! share the memory of its map. Keys and values are cached within a frame only: a growing window is
+//! computed again, with the same result.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ use crate::redraw::Clearance;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
 
-/// Everything a transformer pass needs.
+/// The inputs of a transformer pass.
 pub(crate) struct Passes<'a> {
     network: &'a Network,
     sampling: &'a SamplingConfig,
@@ -44,7 +44,7 @@ impl<'a> Passes<'a> {
         }
     }
 
-    /// Passes made.
+    /// Number of passes.
     pub(crate) fn count(&self) -> u64 {
         self.count.get()
     }

@@ -1,14 +1,14 @@
-//! Drawing again where objects would run into each other or off the road.
+//! Rejection of draws in which objects would overlap each other or leave the road.
 //!
 //! Objects of a frame are drawn independently, given surrogates of each other, so two of them may
-//! choose the same place. Who would overlap another within the next second and a half is drawn
-//! again, a few times at most, and the draw that stays clear longest is kept; so is a vehicle that
-//! would leave the road. What counts is the whole way, every tenth of a second, not the poses half a
-//! second apart: at 10 m/s these are a car's length from each other, and crossing cars pass through
-//! one another, thin borders between cars. Who is off the road may come back or stay as far off as it
-//! is. Who finds no clear way brakes, if that helps. In full
-//! autoregression, objects give way to those drawn before them. The paper does
-//! none of this; without it, chance alone makes collisions that no driver of the log would have had.
+//! choose the same place. An object that would overlap another within the next second and a half,
+//! and a vehicle that would leave the road, are redrawn a few times at most, and the draw that
+//! stays clear longest is kept. The whole path is checked, every tenth of a second, not only the
+//! poses half a second apart: at 10 m/s those are a car's length apart, and crossing cars or thin
+//! road edges would be missed. An object that is off the road may return or stay as far off as it
+//! is. If no draw is clear, the object brakes if that helps. In full autoregression, objects give
+//! way to those drawn before them. The paper has no such rule; without it, random draws cause
+//! collisions that do not occur in logs.
 
 #[cfg(test)]
 mod tests;
@@ -18,14 +18,14 @@ use gump_model::local_context::{Edge, Survey, metres_across, metres_off};
 
 /// Poses of a chunk that must be clear: 1.5 s.
 pub(crate) const POSES: usize = 3;
-/// Places that are looked at between two poses and at the second: every 0.1 s.
+/// Number of positions checked between two poses, including the second: every 0.1 s.
 const PLACES: usize = 5;
-/// A way, from 0.1 s on.
+/// A path, from 0.1 s on.
 pub(crate) type Way = [Pose; POSES * PLACES];
-/// What is over an edge by less than this is on the road, metres, and what is off it by so little more
-/// than before is not farther off: bins and maps are no finer.
+/// An object over an edge by less than this is on the road, metres, and one that is off it counts
+/// as farther off only beyond this: bins and maps are not more precise.
 const SLACK_M: f64 = 0.05;
-/// How hard a vehicle without a clear way brakes, metres per second squared: firmly, on a dry road.
+/// Braking of a vehicle without a clear path, metres per second squared: firm, on a dry road.
 pub(crate) const BRAKING: f64 = 5.0;
 /// The way through poses half a second apart; what comes from nowhere is at the first all along.
 pub(crate) fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
@@ -39,23 +39,23 @@ pub(crate) fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
     })
 }
 
-/// Objects of a frame, with where they are going.
+/// Objects of a frame, with their paths.
 #[derive(Default)]
 pub(crate) struct Footprints {
     pub(crate) members: Vec<Member>,
 }
 
-/// An object with where it is going.
+/// An object with its path.
 pub(crate) struct Member {
     length: f64,
     width: f64,
     pub(crate) before: Option<Pose>,
-    /// Metres per second, before.
+    /// Previous speed, metres per second.
     pub(crate) speed: f64,
     ahead: Way,
-    /// The edges of the road in reach, beyond which it must not go; none for what is no vehicle.
+    /// The road edges in reach, which it must not cross; none for objects other than vehicles.
     edges: Vec<Edge>,
-    /// How far it was off the road before, metres.
+    /// Its previous distance off the road, metres.
     off: f64,
     /// Driven objects are where they are.
     pub(crate) is_driven: bool,
@@ -63,8 +63,8 @@ pub(crate) struct Member {
 }
 
 impl Member {
-    /// What is of this length and width, metres, moves at `speed`, metres per second, and goes `ahead`;
-    /// driven objects are where they are.
+    /// An object of this length and width, metres, that moves at `speed`, metres per second, along
+    /// `ahead`; driven objects cannot be redrawn.
     pub(crate) fn new(
         [length, width]: [f64; 2],
         before: Option<Pose>,
@@ -93,7 +93,7 @@ impl Member {
         }
     }
 
-    /// How many places pass before the object leaves the road, or is farther off it than it has been.
+    /// Number of positions before the object leaves the road, or is farther off it than before.
     fn places_on_road(&self, ahead: &Way) -> usize {
         if self.edges.is_empty() || self.stays(ahead) {
             return ahead.len();
@@ -112,7 +112,7 @@ impl Member {
         ahead.iter().position(leaves).unwrap_or(ahead.len())
     }
 
-    /// True if a way leads nowhere.
+    /// True if a path leads nowhere.
     fn stays(&self, ahead: &Way) -> bool {
         let near = |pose: &Pose, before: Pose| {
             pose.position.distance(before.position) < SLACK_M / 2.0
@@ -122,7 +122,7 @@ impl Member {
         self.before.is_some_and(stands)
     }
 
-    /// Takes in the edges of the road that it might cross on its way, and how far it is off the road.
+    /// Sets the road edges that it might cross on its path, and its distance off the road.
     pub(crate) fn look_for_edges(&mut self, survey: &Survey) {
         let Some(before) = self.before else {
             return;
@@ -147,8 +147,8 @@ impl Footprints {
         Self { members }
     }
 
-    /// Who of those from `first` on should be drawn again: who leaves the road, and of two that get
-    /// into each other's way the one that moves more, unless only the other may be.
+    /// The objects from `first` on to be redrawn: those that leave the road, and of two that
+    /// conflict the one that moves more, unless only the other may be redrawn.
     pub(crate) fn unclear(&self, first: usize) -> Vec<usize> {
         let leaves = |member: &Member| member.places_on_road(&member.ahead) < member.ahead.len();
         let mut unclear: Vec<bool> = self.members.iter().map(leaves).collect();
@@ -168,8 +168,8 @@ impl Footprints {
             .collect()
     }
 
-    /// Takes a draw of an object if it stays clear of all others, and on the road, longer than what
-    /// it has.
+    /// Accepts a draw of an object if it stays clear of all others, and on the road, longer than
+    /// the present one.
     pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
         let member = &self.members[i];
         let clear = |ahead: &Way| {
@@ -186,8 +186,8 @@ impl Footprints {
     }
 }
 
-/// How many places pass before two objects, the first of them on its way `ahead`, overlap; all of
-/// them for a pair that overlaps already, since no draw can undo that.
+/// Number of positions before two objects, the first of them on its path `ahead`, overlap; all of
+/// them for a pair that already overlaps, since no draw can undo that.
 fn clear_places(a: &Member, ahead: &Way, b: &Member) -> usize {
     let reach = a.reach + b.reach;
     let meets = |(p, q): (&Pose, &Pose)| {

@@ -1,4 +1,4 @@
-//! What is asked of the decoder for one object, and what its answer comes to.
+//! Requests to the decoder for one object, and the processing of their results.
 
 use std::fmt;
 use std::sync::Arc;
@@ -14,47 +14,47 @@ use crate::kinematic_limits::Limits;
 use crate::sampling::SamplingConfig;
 use crate::temporal_ensemble::ChunkBuffer;
 
-/// What is asked of the decoder for one object.
+/// A request to the decoder for one object.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// In whose frame the bins are said.
+    /// The frame in which the bins are expressed.
     pub anchor: LocalFrame,
     /// Bins that are given, per step.
     pub forced: [Option<u16>; STEPS.len()],
     /// The object's own stream of randomness in this frame.
     pub stream: Seed,
-    /// Pose 0 must lie within this distance of a point along both axes, scene frame, metres.
+    /// Pose 0 must be within this distance of a point along both axes, scene frame, metres.
     pub near: Option<(DVec2, f64)>,
-    /// What earlier chunks say; empty for an object that is driven.
+    /// Predictions of earlier chunks; empty for an object that is driven.
     pub ring: ChunkBuffer,
-    /// Where it was and how it may move from there.
+    /// Its previous pose and its kinematic limits.
     pub limits: Option<(Pose, Limits)>,
     /// Number of the frame being decoded.
     pub frame: usize,
-    /// What the draws go by beyond that.
+    /// Further adjustments of the draws.
     pub guide: Option<Arc<dyn Guide>>,
 }
 
-/// What draws go by beside the logits, knowing what was drawn before.
+/// Adjustments of draws in addition to the logits, given the bins drawn before.
 pub trait Guide: fmt::Debug + Send + Sync {
-    /// Factors on the probabilities of the bins of `step` after the steps in `drawn`, 0 for those
-    /// that may not be drawn; `None` leaves them as they are. Where none may, the draw is free, and
-    /// whoever asked will find out.
+    /// Factors on the probabilities of the bins of `step` after the steps in `drawn`, 0 for
+    /// excluded bins; `None` for no change. If all are excluded, the draw is unconstrained, and the
+    /// caller must check the result.
     fn weights(&self, step: usize, drawn: &[u16]) -> Option<Vec<f32>>;
 
     /// Factor on the temperature of `step`.
     fn boldness(&self, step: usize) -> f64;
 
-    /// How widely the targets of `step` were spread in training, where that is to be taken off:
-    /// standard deviation in bins.
+    /// Smoothing of the targets of `step` in training, where it is to be removed: standard
+    /// deviation in bins.
     fn smoothing(&self, step: usize) -> Option<f32>;
 
-    /// The number in [0, 1) that decides `step`, instead of one of the object's stream.
+    /// The number in [0, 1) that decides `step`, in place of one from the object's stream.
     fn number(&self, step: usize) -> Option<f64>;
 }
 
 impl Request {
-    /// Whether the state is given, so that nothing is left to draw.
+    /// Whether the state is given completely.
     pub(crate) fn is_driven(&self) -> bool {
         self.forced[..7].iter().all(Option::is_some)
     }
@@ -65,8 +65,8 @@ impl Request {
         limited.or(self.anchor.origin())
     }
 
-    /// The final state of a decoded object: its sample, aggregated, within its limits, its velocity in
-    /// agreement; scene frame, not quantised.
+    /// The final state of a decoded object: sampled, averaged over chunks, within its limits, with
+    /// a consistent velocity; scene frame, not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
         let said = AgentState {
             pose: self.anchor.poses(bins)[0],
@@ -98,8 +98,8 @@ impl Request {
         settled
     }
 
-    /// The token state of a decoded object whose final state is `settled`: the one value that
-    /// embedding, sine, geometry and the next surrogate all derive from.
+    /// The token state of a decoded object whose final state is `settled`: the one value from which
+    /// embedding, sine features, geometry and the next surrogate are derived.
     pub(crate) fn settled_state(&self, bins: &Bins, settled: AgentState) -> QuantizedState {
         let mut state = QuantizedState::default();
         for (field, &bin) in STEPS.iter().zip(bins).take(2) {

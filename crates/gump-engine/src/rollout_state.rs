@@ -1,5 +1,5 @@
-//! One future in progress: its window, what its agents foresaw, and how decoded states become its
-//! present.
+//! One future in progress: its window, its agents' chunks, and the update of its present from
+//! decoded states.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use crate::spawning::Phases;
 use crate::temporal_ensemble::ChunkBuffer;
 use crate::world::TransformerWorld;
 
-/// How far a sampled position may lie from its surrogate (released code), metres.
+/// Maximum distance of a sampled position from its surrogate (released code), metres.
 const GUARD_M: f64 = 5.0;
 
 /// One future in progress.
@@ -33,19 +33,19 @@ pub(crate) struct Future {
     pub(crate) seed: Seed,
     /// The last token frames: at most `history` of them, or as many as a growing window holds.
     pub(crate) frames: Vec<TokenFrame>,
-    /// Number of the last frame.
+    /// Index of the last frame.
     pub(crate) index: usize,
-    /// What that was at the start.
+    /// Its value at the start.
     pub(crate) begun: usize,
     pub(crate) rings: BTreeMap<u16, ChunkBuffer>,
-    /// The same frames in world coordinates, `history` of them at least where there are as many; the
-    /// last is the present.
+    /// The same frames in world coordinates, at least `history` of them where there are as many;
+    /// the last is the present.
     pub(crate) recent: Vec<Frame>,
-    /// Who has which key; of those who came in this future, too.
+    /// The keys of agents, including those that entered in this future.
     pub(crate) identities: Identities,
-    /// How long lights have shown what they show, where traffic lives.
+    /// How long lights have shown their colour, with spawning.
     pub(crate) phases: Phases,
-    /// What the engine keeps of its window.
+    /// The engine's cache of its window.
     pub(crate) context: Context,
 }
 
@@ -115,14 +115,14 @@ impl Future {
         }
     }
 
-    /// The objects of the window's frames, not rounded.
+    /// The objects of the window's frames, not quantised.
     pub(crate) fn exact(&self, scene: &Scene) -> ExactFrames {
         let n = self.frames.len();
         ExactFrames::last(n, &self.recent, &self.identities, scene.world_from_scene)
     }
 
-    /// In whose frame the next chunk of `agent`, a token of the last frame, is said: where it is,
-    /// not rounded.
+    /// The frame in which the next chunk of `agent`, a token of the last frame, is expressed: its
+    /// pose, not quantised.
     fn anchor(&self, agent: &TokenAgent, scene: &Scene, world: &TransformerWorld) -> LocalFrame {
         if world.network().config().anchored {
             LocalFrame::at(self.pose(agent, scene))
@@ -131,7 +131,7 @@ impl Future {
         }
     }
 
-    /// Where `agent`, a token of the last frame, is, and how it may move from there.
+    /// The pose of `agent`, a token of the last frame, and its kinematic limits.
     fn limits(
         &self,
         agent: &TokenAgent,
@@ -142,7 +142,7 @@ impl Future {
         Some((self.pose(agent, scene), limits))
     }
 
-    /// Where `agent`, a token of the last frame, is, not rounded; scene frame.
+    /// The pose of `agent`, a token of the last frame, not quantised; scene frame.
     fn pose(&self, agent: &TokenAgent, scene: &Scene) -> Pose {
         let id = self.identities.agent(agent.key.id);
         let present = self.recent.last().expect("a future has a present");
@@ -243,7 +243,7 @@ impl Future {
         ego.map_or(0.0, |ego| ego.state.pose().position.abs().max_element())
     }
 
-    /// Moves into another scene of the same traffic: tokens and chunks are expressed in its frame.
+    /// Changes to another scene of the same traffic: tokens and chunks are expressed in its frame.
     pub(crate) fn enter(&mut self, index: usize, from: &Scene, to: &Scene) {
         let to_from_from = to.world_from_scene.inverse() * from.world_from_scene;
         self.scene = index;
@@ -255,12 +255,12 @@ impl Future {
     }
 }
 
-/// The randomness of one object in one frame of one future, whatever the batch.
+/// The random stream of one object in one frame of one future, independent of the batch.
 pub(crate) fn stream(seed: Seed, frame: usize, id: u16) -> Seed {
     seed.fork(frame as u64).fork(u64::from(id))
 }
 
-/// Sizes never drift; the state `is` of a driven object is given entirely.
+/// Sizes never change; the state `is` of a driven object is given completely.
 fn given(
     anchor: LocalFrame,
     like: &QuantizedState,

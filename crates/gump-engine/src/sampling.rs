@@ -1,49 +1,48 @@
-//! How futures are decoded.
+//! Configuration of decoding.
 //!
-//! What lives here: the configuration. What does not: what is asked of the decoder (`request`), and
-//! drawing a bin, which is `draw`'s business.
+//! Requests to the decoder are in `request`, drawing of bins is in `draw`.
 
 use gump_kernels::panels::Precision;
 use serde::{Deserialize, Serialize};
 
-/// How futures are decoded.
+/// Configuration of decoding.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SamplingConfig {
-    /// One object after another, or all objects of a frame at once.
+    /// The order in which the objects of a frame are decoded.
     pub mode: Mode,
-    /// What is kept between passes.
+    /// What is cached between passes.
     pub cache: CacheMode,
-    /// Divides the logits (paper, simulation: 1.1); above 1 is bolder. Without one draws are as the
-    /// network was made for: at 0.5 by the sequence network, whose targets were smoothed, and at 1 by
+    /// Divides the logits (paper, simulation: 1.1); above 1 gives more varied draws. The default
+    /// depends on the network: 0.5 for the sequence network, whose targets were smoothed, and 1 for
     /// the relative one.
     pub temperature: Option<f64>,
-    /// Bins that may be drawn per field (paper, simulation: 40).
+    /// Number of bins that may be drawn per field (paper, simulation: 40).
     pub top_k: usize,
-    /// Draws are among the likeliest bins that together have this probability. Without one they are
-    /// as the network was made for: from all of `top_k` by the sequence network, without the least
-    /// likely tail by the relative one.
+    /// Nucleus: draws are among the most likely bins that together have this probability. The
+    /// default depends on the network: all of `top_k` for the sequence network, without the least
+    /// likely tail for the relative one.
     pub top_p: Option<f64>,
-    /// Weight of a prediction made `i` frames ago is `decay^i` (paper: 1.2); 0 switches aggregation
-    /// off.
+    /// Weight of a prediction made `i` frames ago is `decay^i` (paper: 1.2); 0 switches temporal
+    /// averaging off.
     pub decay: f64,
     /// Frames of history in the window (paper: 3).
     pub history: usize,
-    /// Where provisional states come from in partial-AR decoding.
+    /// The source of provisional states in partial-AR decoding.
     pub surrogate: Surrogate,
-    /// Whether agents come and leave; else those who are there stay. A sequence network says itself
-    /// who does (on a CPU), and what the lights show then.
+    /// Whether agents enter and leave; otherwise the set of agents is fixed. A sequence network
+    /// decides this itself (on a CPU), as well as the states of lights.
     pub life: bool,
-    /// What lights show, where the network does not say it.
+    /// What lights show, where the network does not decide it.
     pub lights: LightSource,
-    /// How fast that goes.
+    /// Factors on the rates of arrivals and of changes of lights.
     pub pace: RateScale,
-    /// How often an object that would run into another or off the road within 1.5 s is drawn again
-    /// at most (paper: 0); in partial-AR decoding only.
+    /// Maximum number of redraws of an object that would overlap another or leave the road within
+    /// 1.5 s (paper: 0); in partial-AR decoding only.
     pub redraws: usize,
-    /// Whether what cannot move by itself or turns too tightly is held back (paper: no).
+    /// Whether kinematic limits apply to vehicles and bicycles (paper: no).
     pub limits: bool,
-    /// In which form the weights are multiplied (on a CPU; other devices compute as trained).
+    /// The form in which the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
 
@@ -69,13 +68,12 @@ impl Default for SamplingConfig {
 }
 
 impl SamplingConfig {
-    /// The network alone: what it says is what happens. Nothing is drawn again and nothing held
-    /// back; temperature and averaging are the default's.
+    /// The network alone: no redraws and no limits; temperature and averaging are the default's.
     pub fn raw() -> Self {
         Self::default().without_rules()
     }
 
-    /// The decoding of the paper's Waymo evaluation: warmer draws, more weight for earlier
+    /// The decoding of the paper's Waymo evaluation: higher temperature, more weight for earlier
     /// predictions, no rules. Its frames are interpolated by `SimulateConfig::compat` of
     /// `gump-rollout`.
     ///
@@ -93,7 +91,7 @@ impl SamplingConfig {
         }
     }
 
-    /// The same decoding with neither redraws nor limits.
+    /// The same decoding without redraws and limits.
     #[must_use]
     pub fn without_rules(self) -> Self {
         Self {
@@ -103,26 +101,25 @@ impl SamplingConfig {
         }
     }
 
-    /// Whether rules correct what the network says.
+    /// Whether rules correct the network's draws.
     pub fn has_rules(&self) -> bool {
         self.redraws > 0 || self.limits
     }
 }
 
-/// Factors on the odds that the network gives to what happens in a frame of living traffic; 1 is what
-/// it says.
+/// Factors on the network's odds of events in a frame with spawning; 1 leaves them unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateScale {
-    /// That a further agent comes.
+    /// Arrival of a further agent.
     pub arrivals: f64,
-    /// That a light changes.
+    /// Change of a light.
     pub light_changes: f64,
 }
 
 impl Default for RateScale {
-    /// As the network says: that makes half a minute of made-up scenes with the shipped weights about
-    /// as lively as the same scenes simulated by rules (docs/results/0012-generation.md).
+    /// No change: half a minute of synthetic scenes with the shipped weights then has about as many
+    /// events as the same scenes simulated by rules (docs/results/0012-generation.md).
     fn default() -> Self {
         Self {
             arrivals: 1.0,
@@ -135,16 +132,16 @@ impl Default for RateScale {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LightSource {
-    /// What signals of such junctions do, from what was seen of them.
+    /// Signal phases, estimated from the observed states.
     #[default]
     Model,
-    /// What they show at the present.
+    /// The same as at the present.
     Hold,
-    /// What was recorded: nothing that an actor could know.
+    /// The recorded states, which no agent could know.
     Log,
 }
 
-/// In which order the objects of a frame are decoded.
+/// The order in which the objects of a frame are decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
@@ -154,31 +151,31 @@ pub enum Mode {
     FullAr,
 }
 
-/// What is kept between passes, and how far back the window reaches.
+/// What is cached between passes, and how far back the window reaches.
 ///
-/// Keys and values are kept token by token as long as the token and all before it stand where they
-/// stood, so every cache is exact: the result is that of reading the same window afresh.
+/// Keys and values are cached token by token as long as the token and all tokens before it are
+/// unchanged, so every cache is exact: the result is that of computing the same window anew.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CacheMode {
     /// Nothing: every pass sees the whole window.
     None,
-    /// Keys and values of the window, which slides by one frame per frame; what slides changes its
-    /// place, so this saves passes over the window within a frame, not between frames.
+    /// Keys and values of the window, which slides by one frame per frame. Tokens that slide change
+    /// their position, so this saves passes over the window within a frame, not between frames.
     Window,
     /// The window grows from frame to frame until it would be longer than a block, then falls back
-    /// to its `history`; only what is new or changed is read. Sees more of the past than
-    /// [`CacheMode::Window`], so its futures are others.
+    /// to its `history`; only new or changed tokens are computed. It covers more of the past than
+    /// [`CacheMode::Window`], so its futures differ.
     Growing,
 }
 
-/// Where provisional states come from.
+/// The source of provisional states.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Surrogate {
     /// Chunks decoded for earlier frames.
     Chunk,
-    /// The last state moved on.
+    /// The last state, extrapolated.
     ConstantVelocity,
     /// The last state itself.
     Copy,
@@ -188,7 +185,7 @@ pub enum Surrogate {
 mod tests {
     use super::*;
 
-    /// Every field is spelled out, so that a new one asks what it is in these decodings.
+    /// Every field is spelled out, so that a new one has to be decided for these decodings.
     #[test]
     fn what_raw_and_paper_set_is_pinned() {
         let raw = SamplingConfig {

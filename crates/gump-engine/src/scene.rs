@@ -1,5 +1,5 @@
-//! What all futures of a start share: the frame of reference, the identities, the map and what the
-//! network remembers of it.
+//! Data shared by all futures of a start: the frame of reference, the identities, the map and its
+//! encoding.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
@@ -23,7 +23,7 @@ use crate::cpu::{Context, SceneMemory};
 use crate::placement::ground::Ground;
 use crate::world::TransformerWorld;
 
-/// What the network remembers of a map, in the form of whoever computes.
+/// The encoding of a map, in the form of the implementation that uses it.
 #[derive(Debug)]
 pub enum Memory {
     /// For the engine.
@@ -50,16 +50,16 @@ impl Memory {
     }
 }
 
-/// What all futures of a start share.
+/// Data shared by all futures of a start.
 #[derive(Debug)]
 pub struct Scene {
     /// The scene frame in the world.
     pub world_from_scene: Pose,
     pub(crate) ego: AgentId,
     pub(crate) identities: Identities,
-    /// What is kept of the map.
+    /// The encoding of the map.
     pub memory: Memory,
-    /// The history as read by the engine, which futures go on from.
+    /// The history as computed by the engine, from which futures continue.
     pub(crate) prefix: Context,
     /// Frames before the start, scene frame.
     pub history: Vec<TokenFrame>,
@@ -68,17 +68,17 @@ pub struct Scene {
     /// The same frames in world coordinates; the last is the present.
     pub(crate) recent: Vec<Frame>,
     pub(crate) map: Arc<MapGraph>,
-    /// The map laid out around the scene.
+    /// The map prepared around the scene.
     pub survey: Arc<Survey>,
     pub(crate) route: Option<Arc<Route>>,
-    /// Where agents may be, by class; made when first asked for.
+    /// Valid positions by class; computed on first use.
     grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
-    /// The part of them that leads into what is seen.
+    /// The part of them where agents may enter the window.
     entries: [OnceLock<Arc<Ground>>; N_CLASSES],
 }
 
 impl Scene {
-    /// What the present of a scene shows.
+    /// The content of the present of a scene.
     pub fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, ModelError> {
         let world_from_scene = scene.ego_now().state.pose;
         let stride = (TOKEN_DT / scene.dt).round().max(1.0) as usize;
@@ -100,7 +100,7 @@ impl Scene {
         Self::of_window(world, map, route, recent, scene.ego, identities)
     }
 
-    /// What a window of frames half a second apart shows, in the frame of the ego in its last.
+    /// The content of a window of frames half a second apart, in the frame of the ego in its last.
     pub fn of_window(
         world: &TransformerWorld,
         map: Arc<MapGraph>,
@@ -153,7 +153,7 @@ impl Scene {
         Some(self.local(now.agent(self.identities.agent(id)?)?.state))
     }
 
-    /// In whose frame the chunk at a key of the present is said.
+    /// The frame in which the chunk at a key of the present is expressed.
     pub fn anchor(&self, key: &PlacedSlot, config: &ModelConfig) -> LocalFrame {
         let last = key.last_pose().filter(|_| config.anchored);
         last.map_or(LocalFrame::SCENE, LocalFrame::at)
@@ -173,14 +173,14 @@ impl Scene {
         like.with_motion(&self.local(state))
     }
 
-    /// Where agents of a class may be.
+    /// Valid positions of agents of a class.
     pub(crate) fn ground(&self, kind: AgentKind) -> Arc<Ground> {
         let ground = &self.grounds[class_index(kind)];
         let make = || Arc::new(Ground::of_class(&self.map, self.world_from_scene, kind));
         Arc::clone(ground.get_or_init(make))
     }
 
-    /// Where agents of a class may come into what is seen.
+    /// Positions where agents of a class may enter the window.
     pub(crate) fn entries(&self, kind: AgentKind) -> Arc<Ground> {
         let make = || Arc::new(self.ground(kind).entries());
         Arc::clone(self.entries[class_index(kind)].get_or_init(make))
@@ -195,9 +195,9 @@ impl Scene {
         }
     }
 
-    /// Agents of `frame` inside the window that neither `tokens` nor the frame before knows, because
-    /// they drifted in; as many as fit a frame of `longest` slots. One that has just left waits a
-    /// frame before it can be newborn.
+    /// Agents of `frame` inside the window that neither `tokens` nor the previous frame contains,
+    /// because they moved into it; as many as fit a frame of `longest` slots. An agent that has
+    /// just left has to wait a frame before it can be newborn.
     pub(crate) fn arrivals(
         &self,
         frame: &Frame,

@@ -1,4 +1,4 @@
-//! Futures of several starts in progress, step by step.
+//! A session: futures of several starts in progress, step by step.
 
 use std::sync::Arc;
 
@@ -18,10 +18,10 @@ use crate::rollout_state::Future;
 use crate::scene::Scene;
 use crate::world::TransformerWorld;
 
-/// An ego farther than this from the origin of its scene gets a new scene around it, metres. Training
-/// shows windows up to 85 m away.
+/// An ego farther than this from the origin of its scene gets a new scene around it, metres.
+/// Training has windows up to 85 m away.
 const RECENTRE_M: f64 = 60.0;
-/// The same where agents come and leave: they do so at the border of the window, which must not come
+/// The same with spawning: agents enter and leave at the border of the window, which must not come
 /// near.
 const RECENTRE_ALIVE_M: f64 = 20.0;
 
@@ -94,7 +94,7 @@ impl Session for TransformerSession<'_> {
 }
 
 impl TransformerSession<'_> {
-    /// Drops what the engine keeps, so that the next step reads everything afresh.
+    /// Clears the engine's caches, so that the next step computes everything anew.
     #[cfg(test)]
     pub(crate) fn forget(&mut self) {
         for future in &mut self.futures {
@@ -102,8 +102,8 @@ impl TransformerSession<'_> {
         }
     }
 
-    /// Gives every future whose ego nears the edge of its window a scene around the ego's present,
-    /// map and tokens alike; such a future shares its visual memory with no other any more.
+    /// Gives every future whose ego nears the edge of its window a new scene around the ego's
+    /// present, with map and tokens; such a future no longer shares its visual memory with others.
     fn recentre(&mut self) -> Result<(), ModelError> {
         let reach = match self.world.sampling().life {
             true => RECENTRE_ALIVE_M,

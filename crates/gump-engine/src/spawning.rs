@@ -1,16 +1,16 @@
-//! Traffic that lives: who leaves, who comes, what the lights show, in futures of any length.
+//! Spawning: departures, arrivals and lights in futures of any length, decided by the network.
 //!
-//! All three are read off the network. Before the agents of a frame are decoded, its lights are
-//! drawn one after another (`lights`), and whoever is where the map ends is asked whether it is
-//! still there; once they are decoded, new ones come as long as the network wants more. Agents that
-//! leave the window are gone.
+//! All three use the network's logits. Before the agents of a frame are decoded, its lights are
+//! drawn one after another (`lights`), and agents at the end of the map are drawn as present or
+//! gone; after decoding, new agents are added as long as the network continues the list. Agents
+//! that leave the window are removed.
 //!
-//! Nobody vanishes in sight and nobody appears there: agents come over the border of the window,
-//! nearing the ego, or from where a lane of the map begins, and leave likewise, away from the ego.
-//! A network that is unsure says births and departures of everybody, and training shows false ones
-//! wherever a sample leaves agents out. How often they come and lights change may be set by
-//! [`RateScale`](crate::RateScale). Switched on by `SamplingConfig::life`; what is
-//! benchmarked on given agents leaves it off.
+//! Agents do not appear or vanish in view: they enter over the border of the window, towards the
+//! ego, or where a lane begins at the end of the map, and leave likewise, away from the ego. An
+//! uncertain network assigns arrivals and departures to all agents, and training samples contain
+//! false ones where they leave agents out. [`RateScale`](crate::RateScale) scales the rates of
+//! arrivals and of changes of lights. `SamplingConfig::life` switches spawning on; benchmarks with
+//! given agents leave it off.
 
 mod lights;
 
@@ -39,14 +39,14 @@ use crate::scene::Scene;
 use crate::session::TransformerSession;
 use crate::temporal_ensemble::ChunkBuffer;
 
-/// Most agents that come in one frame of a future.
+/// Maximum number of agents that enter in one frame of a future.
 const MOST_BIRTHS: usize = 4;
-/// Draws of a new agent before it stays away.
+/// Number of draws of a new agent before it is dropped.
 const TRIES: u64 = 6;
-/// Nobody comes or leaves nearer to the ego than this, metres.
+/// No agent enters or leaves nearer to the ego than this, metres.
 const SEEN_M: f64 = 50.0;
 
-/// What a decision is about, as the part of a seed.
+/// The purpose of a decision, as the part of a seed.
 #[derive(Clone, Copy)]
 enum About {
     Lights = 1001,
@@ -55,7 +55,7 @@ enum About {
 }
 
 impl TransformerSession<'_> {
-    /// Draws the lights of the next frames and takes out who has left.
+    /// Draws the lights of the next frames and removes agents that have left.
     pub(crate) fn before_decoding(&mut self, windows: &mut [Window]) -> Result<(), ModelError> {
         let Some(engine) = self.world.engine() else {
             let what = "traffic lives on a CPU only, and this world is elsewhere";
@@ -69,7 +69,8 @@ impl TransformerSession<'_> {
         Ok(())
     }
 
-    /// Asks before every tracked agent but the ego whether it is the next; who is in sight is.
+    /// Decides for every tracked agent except the ego whether it is still present; agents in view
+    /// always are.
     fn take_out(
         &self,
         engine: &Engine,
@@ -151,8 +152,8 @@ impl TransformerSession<'_> {
         engine.run(&mut jobs)
     }
 
-    /// Lets agents go that left the window, sets the lights, and lets new agents come; `frames` are
-    /// what has just been committed.
+    /// Removes agents that left the window, sets the lights, and adds new agents; `frames` are
+    /// those just committed.
     pub(crate) fn after_decoding(&mut self, frames: &mut [Frame]) -> Result<(), ModelError> {
         for (future, frame) in self.futures.iter_mut().zip(frames.iter_mut()) {
             let scene = &self.scenes[future.scene];
@@ -221,8 +222,8 @@ impl TransformerSession<'_> {
         engine.run(&mut jobs)
     }
 
-    /// Draws the states of those who come; whoever finds no place stays away, and nobody else comes
-    /// in that frame.
+    /// Draws the states of new agents; an agent without a valid position is dropped, and no other
+    /// enters in that frame.
     fn let_in(
         &mut self,
         engine: &Engine,
@@ -328,13 +329,13 @@ fn first_slot(window: &Window, slots: &[PlacedSlot]) -> usize {
 }
 
 impl Future {
-    /// Randomness of the decisions of one kind in the frame that is made or was made last.
+    /// Seed of the decisions of one kind in the frame in progress.
     fn decision(&self, about: About) -> Seed {
         stream(self.seed, self.index, 0).fork(about as u64)
     }
 
-    /// The frame without the agents that had tokens and have none any more, its lights as drawn;
-    /// their ids are free once no frame of the window has them.
+    /// The frame without the agents whose tokens were removed, with its lights as drawn; their ids
+    /// are free once no frame of the window has them.
     fn without_the_gone(&mut self, frame: &Frame, scene: &Scene) -> Frame {
         let n = self.frames.len();
         let ids = |frame: Option<&TokenFrame>| -> BTreeSet<u16> {
@@ -397,8 +398,8 @@ impl Future {
         Ok(slots)
     }
 
-    /// What a new agent keeps to: where lanes or walkways come into what is seen, and clear of
-    /// everybody.
+    /// The constraints of a new agent: positions where lanes or walkways enter the window, clear of
+    /// all agents.
     fn rules(&self, kind: AgentKind, scene: &Scene) -> Rules {
         let now = self.frames.last().into_iter().flat_map(TokenFrame::agents);
         let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();

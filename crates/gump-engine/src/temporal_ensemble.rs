@@ -1,19 +1,19 @@
-//! Temporal aggregation: several chunks speak of the same instant; their average moves smoothly.
+//! Temporal ensemble: the average of several chunks' predictions for the same instant, which
+//! smooths motion.
 //!
-//! A ring per agent keeps its last chunks, tagged with the frame they were decoded for, so that a
-//! stale chunk can never be mistaken for a fresh one. It is only ever filled by the model, never
-//! from a log.
+//! A ring buffer per agent keeps its last chunks, tagged with the frame they were decoded for, so
+//! that stale chunks are never used. It is only filled by the model, never from a log.
 
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_model::decoder::CHUNK;
 
-/// A prediction farther than this from the present one is of another plan and is ignored, metres
-/// (released code: 5).
+/// A prediction farther than this from the present one belongs to another plan and is ignored,
+/// metres (released code: 5).
 const GATE_M: f64 = 5.0;
 /// Likewise for headings, radians.
 const GATE_RAD: f64 = std::f64::consts::FRAC_PI_2;
 
-/// Where an agent says it will be, half a second apart, scene frame.
+/// The predicted poses of an agent, half a second apart, scene frame.
 pub(crate) type Chunk = [Pose; CHUNK];
 
 /// The last chunks of one agent.
@@ -23,7 +23,7 @@ pub struct ChunkBuffer {
 }
 
 impl ChunkBuffer {
-    /// Remembers the raw chunk decoded for `frame`.
+    /// Stores the raw chunk decoded for `frame`.
     pub(crate) fn push(&mut self, frame: usize, chunk: Chunk) {
         self.chunks.retain(|(tag, _)| tag + CHUNK > frame + 1);
         self.chunks.push((frame, chunk));
@@ -36,13 +36,13 @@ impl ChunkBuffer {
         }
     }
 
-    /// Forgets everything, as an agent that was driven from outside must.
+    /// Drops all chunks, as needed for an agent that was driven externally.
     pub(crate) fn clear(&mut self) {
         self.chunks.clear();
     }
 
-    /// What earlier chunks say of `frame`: a surrogate for it, if they say anything; without
-    /// aggregation the newest chunk's word alone.
+    /// The prediction of earlier chunks for `frame`, if there is one: its surrogate. Without
+    /// averaging it is the newest chunk's prediction.
     pub(crate) fn surrogate(&self, frame: usize, decay: f64) -> Option<Pose> {
         let newest = self.said_of(frame).next()?.1;
         Some(if decay == 0.0 {
@@ -52,9 +52,10 @@ impl ChunkBuffer {
         })
     }
 
-    /// `sample`, decoded for `frame`, averaged with what earlier chunks say of the same frame.
+    /// `sample`, decoded for `frame`, averaged with the predictions of earlier chunks for the same
+    /// frame.
     ///
-    /// The prediction made `i` frames ago weighs `decay^i`; 0 switches aggregation off.
+    /// The prediction made `i` frames ago has the weight `decay^i`; 0 switches averaging off.
     pub(crate) fn aggregate(&self, frame: usize, sample: Pose, decay: f64) -> Pose {
         if decay == 0.0 {
             sample

@@ -1,13 +1,13 @@
-//! The network as a world: scenes in, futures out, through the traits of `gump-rollout`.
+//! The sequence network as a world model, through the traits of `gump-rollout`.
 //!
-//! A session keeps, per scene, the frame of reference, the identities and the visual memory, which
+//! A session stores, per scene, the frame of reference, the identities and the visual memory, which
 //! all its futures share (`scene`); and per future, the token frames of its window, the chunks of
-//! every agent and the present in world coordinates (`rollout_state`). `decode` turns windows into new
-//! states; `session` goes step by step.
+//! every agent and the present in world coordinates (`rollout_state`). `decode` turns windows into
+//! new states; `session` advances step by step.
 //!
-//! Agents outside the token window, of no predicted kind, or beyond the vocabulary move on with
-//! constant velocity, so that every agent that is there now stays for the whole future; one that
-//! comes into the window is the network's from then on.
+//! Agents outside the token window, of kinds that are not predicted, or beyond the vocabulary
+//! continue with constant velocity, so that every agent of the present stays for the whole future;
+//! one that moves into the window is controlled by the network from then on.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -38,13 +38,13 @@ use crate::temporal_ensemble::{Chunk, ChunkBuffer};
 /// Why the list of outlooks can be trusted.
 const WHOLE: &str = "nobody panics between taking and giving back the list";
 
-/// A trained network that imagines traffic.
+/// A trained sequence network as a world model.
 #[derive(Debug)]
 pub struct TransformerWorld {
     network: Network,
     sampling: SamplingConfig,
     tokenizer: Tokenizer,
-    /// On a CPU, unless the tensor library was asked for.
+    /// On a CPU, unless the tensor library was requested.
     engine: Option<Engine>,
     passes: AtomicU64,
     context_bytes: AtomicUsize,
@@ -53,8 +53,8 @@ pub struct TransformerWorld {
 }
 
 impl TransformerWorld {
-    /// A world that decodes as `sampling` says: on a CPU by the engine, elsewhere by the tensor
-    /// library.
+    /// A world with these sampling settings: computed by the engine on a CPU, by the tensor library
+    /// elsewhere.
     pub fn new(network: Network, sampling: SamplingConfig) -> Self {
         let engine = network.device().is_cpu().then(|| {
             Engine::new(&network, sampling.precision)
@@ -66,8 +66,8 @@ impl TransformerWorld {
         }
     }
 
-    /// A world that computes with the tensor library's operations wherever it lives: slower on a
-    /// CPU, and what the engine is held against.
+    /// A world that always uses the tensor library's operations: slower on a CPU, and the reference
+    /// for tests of the engine.
     pub fn plain(network: Network, sampling: SamplingConfig) -> Self {
         Self {
             network,
@@ -81,27 +81,28 @@ impl TransformerWorld {
         }
     }
 
-    /// The same world, which keeps what its agents might have done; what they do is the same.
+    /// The same world, recording predictive samples; simulated futures do not change.
     ///
-    /// The engine does, so on other devices than a CPU there is nothing to see.
+    /// Only the engine records them; on devices other than a CPU there are none.
     #[must_use]
     pub fn watching(self, watch: ProbeConfig) -> Self {
         Self { watch, ..self }
     }
 
-    /// Takes what was watched since it was last taken: step by step, futures in their order, and
-    /// agents in the order in which they are decoded.
+    /// Takes the predictive samples recorded since the last call: step by step, futures in order,
+    /// and agents in the order in which they are decoded.
     pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
         std::mem::take(&mut self.outlooks.lock().expect(WHOLE))
     }
 
-    /// Transformer passes made so far, whatever their batch; the first of a session reads history.
+    /// Transformer passes so far, whatever their batch size; the first of a session computes the
+    /// history.
     pub fn passes(&self) -> u64 {
         self.passes.load(Ordering::Relaxed)
     }
 
-    /// Floating-point operations of the engine so far, a multiplication and an addition each
-    /// counted; visual encoding not included. 0 without the engine.
+    /// Floating-point operations of the engine so far, counting a multiplication and an addition
+    /// each; without visual encoding. 0 without the engine.
     pub fn operations(&self) -> u64 {
         self.engine
             .as_ref()
@@ -113,7 +114,7 @@ impl TransformerWorld {
         self.engine.as_ref().map_or(0, Engine::weight_bytes)
     }
 
-    /// The most bytes of keys and values that the futures of a session have held at once.
+    /// The maximum of the bytes of keys and values that the futures of a session have held at once.
     pub fn context_bytes(&self) -> usize {
         self.context_bytes.load(Ordering::Relaxed)
     }
@@ -123,7 +124,7 @@ impl TransformerWorld {
         &self.network
     }
 
-    /// How it decodes.
+    /// Its sampling settings.
     pub fn sampling(&self) -> &SamplingConfig {
         &self.sampling
     }
@@ -132,7 +133,7 @@ impl TransformerWorld {
         &self.tokenizer
     }
 
-    /// The arithmetic on a processor; `None` where the network lives on a device.
+    /// The CPU engine; `None` where the network is on another device.
     pub fn engine(&self) -> Option<&Engine> {
         self.engine.as_ref()
     }
@@ -161,8 +162,8 @@ impl TransformerWorld {
 
     /// A session over all futures of all starts.
     ///
-    /// Starts that show one and the same scene share it: its map is looked at and its history read
-    /// once; those with one seed besides begin with equal futures.
+    /// Starts from the same scene share it: its map is encoded and its history computed once;
+    /// starts that also have the same seed begin with equal futures.
     pub(crate) fn open_session(
         &self,
         starts: &[Start<'_>],
@@ -318,11 +319,11 @@ impl TransformerWorld {
         Ok(hidden.flatten_all()?.to_vec1::<f32>()?)
     }
 
-    /// What the network makes of the last agent of a scene's present: its hidden vector, then the
-    /// logits of the first field. For comparing devices and ways of computing.
+    /// The network's output for the last agent of a scene's present: its hidden vector, then the
+    /// logits of the first field. For comparing devices and implementations.
     ///
     /// # Errors
-    /// A scene that cannot be tokenised, or what the tensor library reports.
+    /// A scene that cannot be tokenised, or errors of the tensor library.
     pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, ModelError> {
         let mut scene = Scene::new(self, scene)?;
         let slots = scene.slots()?;
@@ -340,7 +341,7 @@ impl TransformerWorld {
     }
 }
 
-/// True if two views look at the same frames on the same road.
+/// True if two views have the same frames and the same map.
 fn is_same(a: &SceneState<'_>, b: &SceneState<'_>) -> bool {
     let route = |scene: &SceneState<'_>| scene.route.map(Arc::as_ptr);
     Arc::ptr_eq(a.map, b.map)

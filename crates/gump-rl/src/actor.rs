@@ -1,4 +1,4 @@
-//! The policy that is learned: from observations to a distribution of actions.
+//! The learned policy: a distribution of actions for every observation.
 
 use std::borrow::Cow;
 
@@ -8,8 +8,8 @@ use crate::ObservationForm;
 use crate::networks::{ConvNet, ConvPass, Mlp, Normalizer, Pass, standard_normal};
 use crate::sac::{SacConfig, Squashed};
 
-/// What an observation goes through first, and a network that gives two numbers, mean and log
-/// standard deviation, per number of an action.
+/// Preprocessing of observations, and a network that outputs mean and log standard deviation of
+/// every component of an action.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Actor {
     pub(crate) perception: Perception,
@@ -17,20 +17,20 @@ pub struct Actor {
     pub(crate) log_std_bounds: [f64; 2],
 }
 
-/// How an observation becomes what dense networks take in.
+/// Preprocessing of observations for dense networks.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Perception {
-    /// Number by number.
+    /// Numbers are normalized one by one.
     Scaled(Normalizer),
-    /// As a picture.
+    /// Images pass through a convolutional encoder.
     Encoded(ConvNet),
 }
 
 impl Actor {
-    /// An actor that has learned nothing.
+    /// An untrained actor.
     ///
     /// # Panics
-    /// For an encoder of pictures over numbers; see [`SacConfig::check_form`].
+    /// For an image encoder with vector observations; see [`SacConfig::check_form`].
     pub fn new(
         config: &SacConfig,
         form: impl Into<ObservationForm>,
@@ -62,7 +62,7 @@ impl Actor {
         }
     }
 
-    /// Numbers in an observation.
+    /// Length of an observation.
     pub fn observation_len(&self) -> usize {
         match &self.perception {
             Perception::Scaled(_) => self.n_features(),
@@ -70,17 +70,17 @@ impl Actor {
         }
     }
 
-    /// Numbers that the dense network takes in.
+    /// Number of inputs of the dense network.
     pub(crate) fn n_features(&self) -> usize {
         self.network.sizes()[0]
     }
 
-    /// Numbers in an action.
+    /// Length of an action.
     pub fn action_len(&self) -> usize {
         self.network.sizes().last().map_or(0, |outputs| outputs / 2)
     }
 
-    /// What scales observations, if they are numbers.
+    /// The normalizer of vector observations, if there is one.
     pub(crate) fn normalizer(&self) -> Option<&Normalizer> {
         match &self.perception {
             Perception::Scaled(normalizer) => Some(normalizer),
@@ -88,7 +88,7 @@ impl Actor {
         }
     }
 
-    /// What makes features of observations, if they are pictures.
+    /// The encoder of image observations, if there is one.
     pub fn encoder(&self) -> Option<&ConvNet> {
         match &self.perception {
             Perception::Scaled(_) => None,
@@ -103,7 +103,7 @@ impl Actor {
         }
     }
 
-    /// The most likely actions before squashing: what to do when not exploring.
+    /// The modes of the distributions before squashing: the actions to take without exploration.
     ///
     /// Shape: `[rows, observation_len]` to `[rows, action_len]`, in (-1, 1).
     ///
@@ -113,7 +113,7 @@ impl Actor {
         self.act(observations, |dimension| dimension.mode())
     }
 
-    /// Actions drawn at random. Shape: as [`Actor::modes`].
+    /// Random actions from the distributions. Shape: as [`Actor::modes`].
     ///
     /// # Panics
     /// If the observations are no whole number of rows.
@@ -144,7 +144,7 @@ impl Actor {
             .collect()
     }
 
-    /// The distribution that two outputs of the network stand for.
+    /// The distribution with these two network outputs.
     pub(crate) fn dimension(&self, outputs: &[f32]) -> Squashed {
         Squashed::new(outputs[0], outputs[1], self.log_std_bounds)
     }

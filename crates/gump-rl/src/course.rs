@@ -1,4 +1,4 @@
-//! Scenarios prepared for driving: what an episode asks about at every step, worked out once.
+//! Scenarios prepared for driving: the values that episodes need at every step, computed once.
 
 use std::sync::{Arc, OnceLock};
 
@@ -9,11 +9,11 @@ use gump_scene::{AgentState, Frame, LaneId, LightState, Scenario};
 use crate::RlError;
 use crate::observation::Texture;
 
-/// How far from the ego's start the border of the road is prepared, metres to each side. Beyond,
-/// answers are the same and slower.
+/// Distance from the ego's start within which the road border is prepared, metres to each side.
+/// Beyond it queries give the same results more slowly.
 const HALF: f64 = 256.0;
 
-/// A scenario to drive through, in steps of a fixed length.
+/// A scenario to drive in, with steps of a fixed length.
 #[derive(Debug)]
 pub struct Course {
     scenario: Scenario,
@@ -23,7 +23,7 @@ pub struct Course {
     route: Option<(Polyline, LineIndex)>,
     lights: Vec<RouteLight>,
     pub(crate) border: Border,
-    /// The map from above, for rasters; painted when first looked at.
+    /// The map in bird's-eye view, for rasters; rendered on first use.
     pub(crate) texture: OnceLock<Texture>,
 }
 
@@ -122,8 +122,7 @@ impl Course {
         self.scenario.log.get(index)
     }
 
-    /// How the ego was driven in the log, after `step` steps; `None` where it is absent and past
-    /// the end.
+    /// The ego's logged motion after `step` steps; `None` where it is absent and past the end.
     pub fn logged_ego(&self, step: usize) -> Option<AgentState> {
         let frame = self
             .scenario
@@ -138,7 +137,7 @@ impl Course {
         Some(self.scenario.log[index].agent(self.scenario.ego)?.state)
     }
 
-    /// The way to go.
+    /// The route.
     pub fn route(&self) -> Option<&Polyline> {
         self.route.as_ref().map(|(path, _)| path)
     }
@@ -150,8 +149,8 @@ impl Course {
         })
     }
 
-    /// The next light of the route past `along` metres: metres to its stop point, and its colour in
-    /// `frame`. Lights that the frame does not show are passed over.
+    /// The next light of the route after `along` metres: distance to its stop point, and its colour
+    /// in `frame`. Lights that the frame does not contain are skipped.
     pub(crate) fn light_ahead(&self, along: f64, frame: &Frame) -> Option<(f64, LightState)> {
         self.lights.iter().find_map(|light| {
             let distance = light.stop_at - along;

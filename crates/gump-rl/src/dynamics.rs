@@ -1,14 +1,14 @@
-//! What the ego can do in one step, and what it does to the ego.
+//! Actions: the ego's possible motion in one step.
 //!
-//! An action is a point of the box [-1, 1]; a [`Dynamics`] says what it stands for. Limits hold
-//! here and not in a policy, so that every world sees the same vehicle.
+//! An action is a point of the box [-1, 1]; a [`Dynamics`] defines its meaning. Limits apply here
+//! rather than in a policy, so that every world sees the same vehicle.
 
 use gump_geometry::{DVec2, Pose, angle_difference, dvec2};
 use gump_rollout::dynamics::drive;
 use gump_scene::AgentState;
 use serde::{Deserialize, Serialize};
 
-/// What an action stands for.
+/// The meaning of an action.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Dynamics {
@@ -16,15 +16,15 @@ pub enum Dynamics {
     /// acceleration) and steering (the share of the sharpest turn possible at this speed, positive
     /// to the left), of a kinematic bicycle.
     Bicycle(BicycleLimits),
-    /// Three numbers: where the ego is after the step, in its own frame, tracked perfectly.
+    /// Three numbers: the ego's pose after the step, in its own frame, tracked perfectly.
     NextPose(PoseLimits),
     /// 48 numbers: the poses after 1 to 16 steps, each in the present ego frame and as (x, y,
-    /// heading); pose `k` ranges `k` times as far as the first. The first is tracked perfectly,
-    /// the others say what is intended.
+    /// heading); pose `k` has `k` times the range of the first. The first is tracked perfectly, the
+    /// others state the intention.
     Trajectory(PoseLimits),
 }
 
-/// What a vehicle can do at most.
+/// Limits of a vehicle.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BicycleLimits {
@@ -40,21 +40,21 @@ pub struct BicycleLimits {
     pub max_speed: f64,
 }
 
-/// How far a pose can lie from the one before.
+/// Limits of a pose relative to the one before.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PoseLimits {
-    /// Least metres ahead.
+    /// Minimum metres ahead.
     pub min_dx: f64,
-    /// Most metres ahead.
+    /// Maximum metres ahead.
     pub max_dx: f64,
-    /// Most metres to either side, > 0.
+    /// Maximum metres to either side, > 0.
     pub max_dy: f64,
-    /// Most radians of turn to either side, > 0.
+    /// Maximum turn to either side, radians, > 0.
     pub max_turn: f64,
 }
 
-/// Poses of a [`Dynamics::Trajectory`]: 8 s at half a second, as the paper's policy emits.
+/// Poses of a [`Dynamics::Trajectory`]: 8 s at half a second, as in the paper's policy.
 const N_POSES: usize = 16;
 
 impl Default for BicycleLimits {
@@ -92,7 +92,7 @@ impl Default for Dynamics {
 }
 
 impl Dynamics {
-    /// Numbers in an action.
+    /// Length of an action.
     pub fn action_len(&self) -> usize {
         match self {
             Self::Bicycle(_) => 2,
@@ -145,8 +145,8 @@ impl Dynamics {
         }
     }
 
-    /// All poses that an action of [`Dynamics::Trajectory`] intends, in the world frame; what the
-    /// others lead to, else.
+    /// All poses that an action of [`Dynamics::Trajectory`] intends, in the world frame; for other
+    /// dynamics the result of the action.
     pub fn intended(&self, now: &AgentState, action: &[f32], dt: f64) -> Vec<Pose> {
         match self {
             Self::Trajectory(limits) => action
@@ -158,11 +158,11 @@ impl Dynamics {
         }
     }
 
-    /// The action that comes nearest to being at `targets`, which lie `dt`, `2 * dt`, ... seconds
-    /// ahead; past the last one the vehicle is taken to keep its velocity.
+    /// The action that comes nearest to `targets`, which lie `dt`, `2 * dt`, ... seconds ahead;
+    /// past the last one the vehicle is assumed to keep its velocity.
     ///
-    /// Shape: `action` is `[action_len]`. A bicycle heads for the first target with half of the
-    /// error that it has made so far corrected per step, so that it neither drifts nor swings.
+    /// Shape: `action` is `[action_len]`. A bicycle steers for the first target and corrects half
+    /// of its accumulated error per step, so that it neither drifts nor oscillates.
     pub fn towards(&self, now: &AgentState, targets: &[AgentState], dt: f64, action: &mut [f32]) {
         let coasting = AgentState {
             pose: Pose {
@@ -254,7 +254,7 @@ impl BicycleLimits {
 }
 
 impl PoseLimits {
-    /// The pose, relative to the ego's, that three numbers in [-1, 1] stand for.
+    /// The pose, relative to the ego's, that three numbers in [-1, 1] encode.
     fn pose(&self, action: &[f32], k: f64) -> Pose {
         let [x, y, heading] = [0, 1, 2].map(|i| f64::from(action[i]));
         let (center, half) = self.ahead();

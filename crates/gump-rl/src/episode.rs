@@ -1,8 +1,8 @@
-//! The rules of one episode as functions of values: no randomness, no buffers, nothing hidden.
+//! The rules of one episode as pure functions: no randomness, no buffers, no hidden state.
 //!
-//! A state is cheap to clone, so that one can look ahead from it; the same state and action give
-//! the same successor. Who moves the others is the caller's choice: [`Rules::step`] reads them from
-//! the log, [`Rules::advance`] takes what any world imagined.
+//! A state is cheap to clone, so callers can look ahead from it; the same state and action give the
+//! same successor. The caller chooses the traffic: [`Rules::step`] reads the other agents from the
+//! log, [`Rules::advance`] takes a frame of any world.
 
 use gump_geometry::OrientedBox;
 use gump_metrics::{ComfortBounds, Felt};
@@ -11,13 +11,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Course, Dynamics, RlError};
 
-/// What is driven, for how long and for what.
+/// Dynamics, rewards and horizon of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rules {
-    /// What an action does to the ego.
+    /// The meaning of actions.
     pub dynamics: Dynamics,
-    /// What a step earns.
+    /// The reward.
     pub reward: RewardWeights,
     /// Seconds until an episode is truncated, > 0; rounded to whole steps.
     pub horizon: f64,
@@ -34,10 +34,10 @@ impl Default for Rules {
     }
 }
 
-/// A step's reward is the sum of these weights times what happened in it.
+/// The reward of a step: the sum of these weights times the measurements of the step.
 ///
-/// What happened is measured as [`gump_metrics::Progress`], [`gump_metrics::Collision`],
-/// [`gump_metrics::OffRoad`] and [`gump_metrics::Discomfort`] do.
+/// The measurements are those of [`gump_metrics::Progress`], [`gump_metrics::Collision`],
+/// [`gump_metrics::OffRoad`] and [`gump_metrics::Discomfort`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RewardWeights {
@@ -47,7 +47,7 @@ pub struct RewardWeights {
     pub collision: f64,
     /// For leaving the road.
     pub off_road: f64,
-    /// For a broken comfort bound.
+    /// For exceeding a comfort bound.
     pub discomfort: f64,
 }
 
@@ -66,14 +66,14 @@ impl Default for RewardWeights {
 /// How an episode ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// By failure: nothing comes after.
+    /// By failure: the value after it is 0.
     Terminated(Failure),
-    /// Cut off at the horizon, at the end of the log that others replay or at the end of the
-    /// route: more would have come.
+    /// Cut off at the horizon, at the end of a replayed log or at the end of the route: the value
+    /// after it must be bootstrapped.
     Truncated,
 }
 
-/// What went wrong.
+/// The kind of failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Failure {
     /// The ego's box overlapped another.
@@ -82,26 +82,26 @@ pub enum Failure {
     OffRoad,
 }
 
-/// An episode after some steps.
+/// The state of an episode after some steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeState {
     /// Steps made.
     pub steps: usize,
     /// The ego now.
     pub ego: Agent,
-    /// The ego one and two steps ago, as far as known; for comfort.
+    /// The ego one and two steps ago, as far as known; used for comfort.
     before: [Option<AgentState>; 2],
     /// Metres along the route.
     pub(crate) along: f64,
-    /// What the last step earned.
+    /// Reward of the last step.
     pub reward: f64,
-    /// What all steps brought.
+    /// Totals of all steps.
     pub totals: Totals,
     /// How it ended, if it did.
     pub end: Option<End>,
 }
 
-/// What an episode brought so far.
+/// Totals of an episode so far.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct Totals {
     /// Sum of the rewards.
@@ -112,7 +112,7 @@ pub struct Totals {
     pub collided: bool,
     /// True if a corner of the ego's box left the road.
     pub off_road: bool,
-    /// True if a comfort bound was broken.
+    /// True if a comfort bound was exceeded.
     pub uncomfortable: bool,
 }
 
@@ -132,7 +132,7 @@ impl EpisodeState {
 }
 
 impl Rules {
-    /// The state in which every episode on a course begins: the present of its scenario.
+    /// The initial state of every episode on a course: the present of its scenario.
     pub fn reset(&self, course: &Course) -> EpisodeState {
         let ego = *course.scenario().present().ego_now();
         EpisodeState {
@@ -146,13 +146,13 @@ impl Rules {
         }
     }
 
-    /// One step among others that replay the log.
+    /// One step with the other agents replaying the log.
     ///
     /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
     ///
     /// # Errors
     /// [`RlError::Finished`] if the episode has ended; [`RlError::Count`], [`RlError::NotFinite`]
-    /// and [`RlError::OutOfRange`] for actions that are none.
+    /// and [`RlError::OutOfRange`] for invalid actions.
     pub fn step(
         &self,
         course: &Course,
@@ -166,7 +166,7 @@ impl Rules {
         Ok(self.step_in_log(course, state, action))
     }
 
-    /// One step of `action_len` checked numbers among others that replay the log.
+    /// One step with `action_len` checked numbers, the other agents replaying the log.
     pub(crate) fn step_in_log(
         &self,
         course: &Course,
@@ -182,7 +182,7 @@ impl Rules {
         next
     }
 
-    /// The state after one step that brought the ego to `ego` and everyone to `frame`.
+    /// The state after one step with the ego in state `ego` and all other agents as in `frame`.
     ///
     /// A collision or leaving the road terminates, in this order; an episode that starts in a
     /// collision ends with its first step. The horizon and the end of the route truncate.
@@ -232,8 +232,8 @@ impl Rules {
         next
     }
 
-    /// The action that comes nearest to what the log does next; keeps the velocity where the log
-    /// says nothing.
+    /// The action that comes nearest to the log's next state; keeps the velocity where the log has
+    /// none.
     ///
     /// Shape: `action` is `[action_len]`.
     pub fn expert_action(&self, course: &Course, state: &EpisodeState, action: &mut [f32]) {
@@ -244,7 +244,7 @@ impl Rules {
         self.dynamics.towards(now, &targets, course.dt(), action);
     }
 
-    /// Refuses what is no batch of `n` actions.
+    /// Checks that this is a valid batch of `n` actions.
     pub(crate) fn check_actions(&self, actions: &[f32], n: usize) -> Result<(), RlError> {
         let len = self.dynamics.action_len();
         if actions.len() != n * len {

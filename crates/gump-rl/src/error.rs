@@ -1,22 +1,22 @@
-//! What can go wrong between an environment and who uses it.
+//! Errors of environments, buffers and training.
 
 use gump_rollout::BoxError;
 use gump_scene::{AgentId, ScenarioError};
 
-/// Why an environment or a buffer could not do what was asked.
+/// Why an environment or a buffer could not do what was requested.
 #[derive(Debug, thiserror::Error)]
 pub enum RlError {
-    /// There is nothing to start an episode from.
+    /// There are no scenarios to start an episode from.
     #[error("an environment needs at least one scenario")]
     NoScenario,
     /// A parameter outside its range.
     #[error("the parameter {name} is {value}, expected {expected}")]
     Parameter {
-        /// Which one.
+        /// Its name.
         name: &'static str,
-        /// What was given.
+        /// Its value.
         value: f64,
-        /// What is allowed.
+        /// The allowed range.
         expected: &'static str,
     },
     /// Stepping before the first reset, or after a step that failed.
@@ -25,51 +25,51 @@ pub enum RlError {
     /// A batch of another size than the environment's.
     #[error("{who} gave {found} values, expected {expected}")]
     Count {
-        /// Who answered.
+        /// What has the wrong size.
         who: &'static str,
-        /// What the environment needs.
+        /// The required size.
         expected: usize,
-        /// What it got.
+        /// The given size.
         found: usize,
     },
     /// An action that is NaN or infinite.
     #[error("the action of row {row} is not a finite number")]
     NotFinite {
-        /// Which row.
+        /// The row.
         row: usize,
     },
     /// An action outside its box.
     #[error("number {dimension} of the action of row {row} is {value}, expected -1 to 1")]
     OutOfRange {
-        /// Which row.
+        /// The row.
         row: usize,
-        /// Which number of its action.
+        /// The index within its action.
         dimension: usize,
-        /// What was given.
+        /// The value.
         value: f32,
     },
     /// Stepping an episode that has ended.
     #[error("the episode of row {row} has ended, reset the row first")]
     Finished {
-        /// Which row.
+        /// The row.
         row: usize,
     },
     /// A scenario that does not exist.
     #[error("row {row} asks for scenario {scenario}, but there are {n}")]
     NoSuchScenario {
-        /// Which row.
+        /// The row.
         row: usize,
-        /// What it asked for.
+        /// The requested scenario.
         scenario: usize,
-        /// How many there are.
+        /// Number of scenarios.
         n: usize,
     },
-    /// A scenario that nobody can drive through.
+    /// A scenario that cannot be driven in.
     #[error("the scenario {id} cannot be driven: {source}")]
     Scenario {
         /// Its id.
         id: String,
-        /// Why.
+        /// The reason.
         source: ScenarioError,
     },
     /// The step is not a whole number of frames.
@@ -85,7 +85,7 @@ pub enum RlError {
     EgoVanished {
         /// The ego.
         ego: AgentId,
-        /// Which row.
+        /// The row.
         row: usize,
     },
     /// The world failed.
@@ -93,16 +93,16 @@ pub enum RlError {
     World {
         /// Name of the world.
         world: String,
-        /// What it reported.
+        /// Its error.
         source: BoxError,
     },
-    /// Sampling from a buffer that holds nothing.
+    /// Sampling from an empty buffer.
     #[error("cannot sample {asked} transitions from an empty buffer")]
     EmptyBuffer {
-        /// How many were asked for.
+        /// The requested number.
         asked: usize,
     },
-    /// An environment of another shape than a policy.
+    /// An environment whose shapes differ from the policy's.
     #[error("the environment has {found} numbers in its {what}, the policy expects {expected}")]
     Shape {
         /// Observations or actions.
@@ -112,22 +112,22 @@ pub enum RlError {
         /// The environment's.
         found: usize,
     },
-    /// A convolutional encoder over observations that are no pictures.
+    /// A convolutional encoder with observations that are not images.
     #[error("an encoder of pictures was asked for, but observations are {found} numbers")]
     NoPicture {
-        /// How many.
+        /// Their length.
         found: usize,
     },
-    /// Learning left the realm of numbers.
+    /// A loss or parameter is not finite.
     #[error("learning diverged at gradient step {step}: a loss is not a finite number")]
     Diverged {
-        /// Which gradient step.
+        /// The gradient step.
         step: usize,
     },
-    /// Bytes that are no stored policy or run.
+    /// Bytes that are not a stored policy or run.
     #[error("no policy or run of reinforcement learning: {what}")]
     Archive {
-        /// What is wrong with them.
+        /// The problem.
         what: String,
     },
 }

@@ -1,4 +1,4 @@
-//! How well a policy drives: every scenario once per seed, and the paper's columns.
+//! Evaluation of policies: every scenario once per seed, with the columns of the paper's table.
 
 use std::sync::Arc;
 
@@ -11,30 +11,31 @@ use crate::{
     VectorEnv,
 };
 
-/// Metres of progress of the logged drivers in the paper's test set, by which progress is divided.
+/// Mean progress of the logged drivers in the paper's test set, metres, by which progress is
+/// divided.
 ///
 /// Source: reproduces the paper's scores from its other columns.
 pub const LOGGED_PROGRESS: f64 = 62.0;
 
-/// Who drives.
+/// The driver.
 #[derive(Clone, Copy, Debug)]
 pub enum Driver<'a> {
-    /// A policy, by the mode of its distribution.
+    /// A policy, by the modes of its distributions.
     Learned(&'a Actor),
-    /// The log, as well as the dynamics can follow it: an oracle.
+    /// The log, as far as the dynamics can follow it: an oracle.
     Expert,
     /// Uniformly random actions.
     Random,
-    /// One action for ever. Shape: `[action_len]`.
+    /// One constant action. Shape: `[action_len]`.
     Constant(&'a [f32]),
 }
 
-/// How one episode went.
+/// The outcome of one episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Drive {
     /// Index of the scenario.
     pub scenario: usize,
-    /// Which of the seeds.
+    /// Index of the seed.
     pub repeat: usize,
     /// True if the ego's box overlapped another.
     pub collided: bool,
@@ -42,7 +43,7 @@ pub struct Drive {
     pub off_road: bool,
     /// Metres along the route.
     pub progress: f64,
-    /// True if no comfort bound was broken.
+    /// True if no comfort bound was exceeded.
     pub comfortable: bool,
     /// Steps made.
     pub steps: usize,
@@ -59,7 +60,7 @@ pub struct Columns {
     pub offroad_rate: f64,
     /// Mean progress of safe episodes, metres; `None` if there is none.
     pub progress: Option<f64>,
-    /// Share of safe episodes in which no comfort bound was broken; `None` if there is none.
+    /// Share of safe episodes in which no comfort bound was exceeded; `None` if there is none.
     pub comfort: Option<f64>,
 }
 
@@ -94,7 +95,7 @@ impl Drive {
 }
 
 impl Columns {
-    /// Over episodes; `None` of none.
+    /// Over episodes; `None` if there are none.
     pub fn of(drives: &[Drive]) -> Option<Self> {
         let n = drives.len() as f64;
         let share = |happened: fn(&Drive) -> bool| {
@@ -115,14 +116,14 @@ impl Columns {
     }
 }
 
-/// Lets a driver drive every course `repeats` times, `config.n_envs` side by side.
+/// Drives every course `repeats` times, `config.n_envs` in parallel.
 ///
-/// What a world does depends on the course and the repeat alone, so that drivers are compared in
-/// the same traffic; so do random actions on `seed`. The drives come in the order of the courses,
-/// repeats of a course together.
+/// The randomness of a world depends only on the course and the repeat, so all drivers are compared
+/// in the same traffic; random actions depend on `seed`. The results are in the order of the
+/// courses, with the repeats of a course together.
 ///
 /// # Errors
-/// What the environment reports; [`RlError::Shape`] for a driver of other observations or actions.
+/// Errors of the environment; [`RlError::Shape`] for a driver with other observations or actions.
 pub fn evaluate(
     courses: &Arc<[Course]>,
     traffic: Traffic<'_>,
@@ -209,8 +210,8 @@ pub fn score_by_scenario(drives: &[Drive]) -> Vec<f64> {
     driven.map(|(sum, n)| sum / n).collect()
 }
 
-/// How much better `a` is than `b` on the same scenarios, with its 95 % interval; `None` if they
-/// are not of the same scenarios, or of fewer than two.
+/// The difference of `a` and `b` on the same scenarios, with its 95 % interval; `None` if they are
+/// not of the same scenarios, or of fewer than two.
 pub fn paired_difference(a: &[f64], b: &[f64], seed: Seed) -> Option<(f64, Interval)> {
     if a.len() != b.len() {
         return None;

@@ -1,4 +1,4 @@
-//! What experts did: the log's egos as transitions to learn from.
+//! Expert demonstrations: the log's egos as transitions.
 
 use std::sync::Arc;
 
@@ -7,12 +7,11 @@ use gump_scene::Seed;
 use crate::sac::{ReplayBuffer, Transition};
 use crate::{Autoreset, Course, DrivingEnv, EnvConfig, EpisodeStart, RlError, Traffic, VectorEnv};
 
-/// Drives every course once among its log by the actions that come nearest to the log's, from the
+/// Drives every course once within its log, by the actions that come nearest to the log's, from the
 /// present to the end of the episode.
 ///
-/// The transitions are what the environment says, rewards and ends included; what comes of an
-/// action is what the dynamics make of it, so that a log that the dynamics cannot follow is
-/// followed as well as they can.
+/// The transitions are those of the environment, including rewards and ends. If the dynamics cannot
+/// follow a log exactly, it is followed as closely as they allow.
 ///
 /// # Errors
 /// [`RlError::NoScenario`] and [`RlError::Parameter`].

@@ -1,10 +1,10 @@
-//! Keys and values of tokens seen, in pages that futures share until they part; and attention
-//! over them.
+//! Keys and values of tokens in pages that futures share until they diverge; and attention over
+//! them.
 //!
-//! What lives here: [`Pages`] (one attention layer), [`Context`] (all layers of one sequence, with
-//! the slots they were computed from) and [`attend`]. What does not: where keys and values come
-//! from. Start with [`Context::reuse`], which is what makes the cache exact: an entry is kept only
-//! as long as its token and all before it stand where they stood.
+//! [`Pages`] belong to one attention layer, [`Context`] to all layers of one sequence, with the
+//! slots they were computed from; [`attend`] computes attention. Start with [`Context::reuse`],
+//! which keeps the cache exact: an entry is kept only as long as its token and all tokens before it
+//! are unchanged.
 
 use std::sync::Arc;
 
@@ -76,7 +76,7 @@ impl Pages {
     }
 }
 
-/// What one sequence has left in every layer.
+/// The cached keys and values of one sequence, in every layer.
 #[derive(Clone, Debug, Default)]
 pub struct Context {
     /// The slots whose keys and values are held.
@@ -85,25 +85,25 @@ pub struct Context {
 }
 
 impl Context {
-    /// Forgets everything but the memory it stood in.
+    /// Clears the cache but keeps its memory.
     pub(crate) fn clear(&mut self) {
         self.slots.clear();
     }
 
-    /// How many of the first tokens of `slots` are held already, in place, token by token.
+    /// How many of the first tokens of `slots` are cached, compared token by token.
     pub(crate) fn common(&self, slots: &[PlacedSlot]) -> usize {
         let pairs = self.slots.iter().zip(slots);
         pairs.take_while(|(held, wanted)| held == wanted).count()
     }
 
-    /// Keeps what is held of the first `limit` tokens of `slots`; returns how many that is.
+    /// Keeps the cached part of the first `limit` tokens of `slots`; returns its number of tokens.
     pub(super) fn reuse(&mut self, slots: &[PlacedSlot], limit: usize) -> usize {
         let n = self.common(&slots[..limit]);
         self.slots.truncate(n);
         n
     }
 
-    /// Bytes held; of a page that several hold, each has its part.
+    /// Bytes held; a shared page is divided among its owners.
     pub(crate) fn bytes(&self) -> usize {
         let pages = self.layers.iter().flat_map(|pages| &pages.0);
         let part = |page: &Arc<Vec<f32>>| 4 * page.len() / Arc::strong_count(page);

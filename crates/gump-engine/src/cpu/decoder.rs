@@ -1,8 +1,9 @@
-//! The recurrent decoder of states, for the engine: a few objects at a time through all steps.
+//! The recurrent decoder of states, for the engine: decodes a few objects at a time through all
+//! steps.
 //!
-//! The input side of the first layer is one table lookup: what it makes of every token and of
-//! every step is multiplied out once, when the engine is built. Each step multiplies only the
-//! output rows of its own field, which is exact because nothing else may be sampled.
+//! The input side of the first layer is one table lookup: its products with every token and every
+//! step are computed when the engine is built. Each step multiplies only the output rows of its own
+//! field, which is exact because no other bins may be sampled.
 
 use gump_kernels::gru::gru_row;
 use gump_kernels::panels::{Panels, Scratch};
@@ -18,7 +19,7 @@ use crate::draw::draw_field;
 use crate::request::Request;
 use crate::sampling::SamplingConfig;
 
-/// The decoder's numbers.
+/// The decoder's weights.
 #[derive(Debug)]
 pub(super) struct Decoder {
     width: usize,
@@ -100,8 +101,8 @@ impl Decoder {
         bins
     }
 
-    /// Multiplications of the first `n_steps` of decoding `n` objects whose first `given` fields are
-    /// forced.
+    /// Number of multiplications in the first `n_steps` of decoding `n` objects whose first `given`
+    /// fields are forced.
     pub(super) fn products(&self, n: usize, given: usize, n_steps: usize) -> u64 {
         let recurrent = self.hidden.iter().chain(&self.input);
         let recurrent: u64 = recurrent.map(|panels| panels.products(n)).sum();

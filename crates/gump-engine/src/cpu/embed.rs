@@ -1,7 +1,7 @@
-//! Slots as vectors, for the engine: table rows, sines and what lies under an object.
+//! Embedding of slots for the engine: table rows, sines, and the map under an object.
 //!
-//! Sines go through their layers once per distinct state, not once per token: a state stands in a
-//! value and again in the next frame's key, and in every future that has not yet parted.
+//! Sines pass through their layers once per distinct state, not once per token: a state occurs in a
+//! value and again in the next frame's key, and in every future that has not yet diverged.
 
 use std::collections::HashMap;
 
@@ -20,7 +20,7 @@ use rayon::prelude::*;
 use super::weights::{Norm, Source, numbers};
 use super::{Pool, chunk_rows};
 
-/// What turns slots into vectors.
+/// Turns slots into vectors.
 #[derive(Debug)]
 pub(super) struct Embedder {
     width: usize,
@@ -29,15 +29,16 @@ pub(super) struct Embedder {
     sine_in: Panels,
     sine_norm: Norm,
     sine_out: Panels,
-    /// One map per place an object looks at, if it does.
+    /// One map per position that an object looks at, if the network has this option.
     local: Vec<Panels>,
-    /// Two layers over what an object sees around itself, if it does.
+    /// Two layers over the local context of an object, if the network has this option.
     surroundings: Option<[Panels; 2]>,
-    /// Numbers that it is shown of them.
+    /// Number of its inputs.
     n_numbers: usize,
 }
 
-/// What an object sees of a scene at each place it looks at, `[M, C]` per place.
+/// Projected visual tokens of a scene for each position that objects look at, `[M, C]` per
+/// position.
 #[derive(Debug, Default)]
 pub(super) struct Ground(Vec<Vec<f32>>);
 
@@ -67,7 +68,7 @@ impl Embedder {
         })
     }
 
-    /// What objects will see of the visual tokens `[1, M, C]` of a scene.
+    /// Projects the visual tokens `[1, M, C]` of a scene.
     pub(super) fn ground(&self, visual: &Tensor) -> Result<Ground, ModelError> {
         let visual = numbers(visual)?;
         let see = |map: &Panels| {
@@ -80,8 +81,8 @@ impl Embedder {
         Ok(Ground(self.local.iter().map(see).collect()))
     }
 
-    /// The vectors of tokens into `x`, `[rows, C]`; `ground(row)` is the scene that a token's object
-    /// is in. Returns how many multiplications it took.
+    /// The vectors of tokens into `x`, `[rows, C]`; `ground(row)` is the scene of a token's object.
+    /// Returns the number of multiplications.
     pub(super) fn embed<'a>(
         &self,
         slots: &[&PlacedSlot],
@@ -120,7 +121,7 @@ impl Embedder {
         self.sine_in.products(n_sines) + self.sine_out.products(n_sines)
     }
 
-    /// What the objects at the keys from slot `from` on see, if this network's do.
+    /// The local contexts of the objects at the keys from slot `from` on, if the network uses them.
     pub(super) fn surroundings(
         &self,
         survey: &Survey,
@@ -133,7 +134,7 @@ impl Embedder {
         }
     }
 
-    /// Adds to rows of `x` what their objects see. Returns how many multiplications it took.
+    /// Adds the encoded local contexts to rows of `x`. Returns the number of multiplications.
     pub(super) fn add_surroundings(
         &self,
         seen: &[(usize, LocalContext)],

@@ -1,13 +1,13 @@
-//! The engine: the network's forward pass and decoder without gradients, for a CPU.
+//! The engine: the network's forward pass and decoder without gradients, for CPUs.
 //!
-//! What lives here: everything between slots and sampled bins, over weights that are packed once.
-//! Sequences of any lengths go through together, row by row, with nothing padded; the map's keys
-//! and values stand once per scene; each sequence may keep a [`Context`], whose tokens are then
-//! not computed again. What does not: the network in one sitting, which is `mct`; it is also the
-//! oracle in the tests and what other devices run. Start with [`Engine::run`].
+//! It covers everything between slots and sampled bins, over weights that are packed once.
+//! Sequences of any lengths are computed together, row by row, without padding; keys and values of
+//! the map exist once per scene; each sequence may have a [`Context`], whose tokens are not
+//! computed again. The reference implementation is `mct`, which other devices run and tests compare
+//! with. Start with [`Engine::run`].
 //!
-//! A row's arithmetic does not depend on the rows around it, so what a future becomes depends
-//! neither on its neighbours, nor on the number of threads, nor on what a context held.
+//! The arithmetic of a row does not depend on other rows, so a future does not depend on other
+//! futures, the number of threads, or the content of a context.
 //!
 //! Shapes: `R` new tokens of all sequences one after another, `C` width.
 
@@ -45,10 +45,10 @@ use crate::draw::Candidates;
 use crate::request::Request;
 use crate::sampling::SamplingConfig;
 
-/// New tokens that go through the layers together; bounds the memory of a pass.
+/// Number of new tokens that go through the layers together; bounds the memory of a pass.
 const WAVE: usize = 8 * 1024;
 
-/// A network ready to imagine on a CPU.
+/// A network with packed weights, ready to simulate on a CPU.
 #[derive(Debug)]
 pub struct Engine {
     width: usize,
@@ -63,7 +63,7 @@ pub struct Engine {
     products: AtomicU64,
 }
 
-/// What all futures of a scene share: the map's keys and values, and what lies under objects.
+/// Data shared by all futures of a scene: the map's keys and values, and the map under objects.
 #[derive(Debug, Default)]
 pub struct SceneMemory {
     /// Visual tokens.
@@ -76,17 +76,17 @@ pub struct SceneMemory {
 /// One sequence in a pass.
 #[derive(Debug)]
 pub struct Job<'a> {
-    /// The whole sequence, what the context holds included.
+    /// The whole sequence, including cached tokens.
     pub slots: &'a [PlacedSlot],
-    /// Where hidden vectors are asked for, ascending and not empty; everything after the last is
-    /// ignored.
+    /// The positions of requested hidden vectors, ascending and not empty; everything after the
+    /// last is ignored.
     pub wanted: Vec<usize>,
     /// The map of its scene.
     pub memory: &'a SceneMemory,
-    /// Tokens of the sequence that it holds are not computed again; the new ones are added if
-    /// `keep` says so, else it is left empty.
+    /// The cache. Tokens of the sequence in it are not computed again. New ones are added if `keep`
+    /// is set; otherwise it is cleared.
     pub context: &'a mut Context,
-    /// Whether what is read stays in the context.
+    /// Whether the tokens read are cached.
     pub keep: bool,
 }
 
@@ -94,10 +94,10 @@ pub struct Job<'a> {
 type Row = (usize, usize);
 
 impl Engine {
-    /// Packs the numbers of a network.
+    /// Packs the weights of a network.
     ///
     /// # Errors
-    /// What the tensor library reports.
+    /// Errors of the tensor library.
     pub(crate) fn new(network: &Network, precision: Precision) -> Result<Self, ModelError> {
         let config = network.config();
         let c = config.width;
@@ -126,7 +126,7 @@ impl Engine {
         self.width
     }
 
-    /// Multiplications made so far.
+    /// Number of multiplications so far.
     pub(crate) fn products(&self) -> u64 {
         self.products.load(Ordering::Relaxed)
     }
@@ -138,10 +138,10 @@ impl Engine {
         matrices.map(Panels::bytes).sum()
     }
 
-    /// Puts the memory of one scene into the engine's form.
+    /// Converts the memory of one scene to the engine's form.
     ///
     /// # Errors
-    /// What the tensor library reports.
+    /// Errors of the tensor library.
     pub(crate) fn remember(&self, memory: &VisualMemory) -> Result<SceneMemory, ModelError> {
         let c = self.width;
         let pages = |(k, v): &(candle_core::Tensor, candle_core::Tensor)| {
@@ -164,7 +164,7 @@ impl Engine {
         })
     }
 
-    /// The hidden vectors that all jobs ask for, one after another, `[wanted, C]`.
+    /// The hidden vectors requested by all jobs, one after another, `[wanted, C]`.
     pub fn run(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
         let mut hidden = Vec::new();
         let mut rest = jobs;
@@ -196,8 +196,7 @@ impl Engine {
             .sample(hidden, requests, config, n_steps, &self.rooms)
     }
 
-    /// As `Engine::sample`, but no more than the first state, size included; the bins of what
-    /// would come next are 0.
+    /// As `Engine::sample`, but only the first state, including its size; later bins are 0.
     pub fn sample_state(
         &self,
         hidden: &[f32],
@@ -209,7 +208,7 @@ impl Engine {
             .sample(hidden, requests, config, STATE_STEPS, &self.rooms)
     }
 
-    /// What may follow the tokens whose hidden vectors `[N, C]` are given.
+    /// Logits of the successors of the tokens whose hidden vectors `[N, C]` are given.
     pub fn say(&self, hidden: &[f32]) -> Vec<Successor> {
         let rows = hidden.len() / self.width;
         self.count(self.successors.products(rows));
@@ -268,7 +267,7 @@ impl Engine {
         hidden
     }
 
-    /// Adds to the rows of keys what their objects see. Returns how many multiplications it took.
+    /// Adds the encoded local contexts to the rows of keys. Returns the number of multiplications.
     fn encode_local_context(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut [f32]) -> u64 {
         let news = jobs
             .iter()

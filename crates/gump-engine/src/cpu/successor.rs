@@ -1,7 +1,8 @@
-//! What comes next: whose key or which mark, of which class somebody new is, what a light shows.
+//! Logits of the successor of a token: the next key or control token, the class of a new agent, the
+//! state of a light.
 //!
-//! These are rows of matrices that the network has anyway, read at control and value tokens; what
-//! is made of them is the business of `spawning` and `gump-generate`.
+//! They use rows of existing matrices of the network, applied at control and value tokens;
+//! `spawning` and `gump-generate` use the results.
 
 use gump_kernels::panels::{Panels, Precision, Scratch};
 use gump_model::ModelError;
@@ -11,7 +12,7 @@ use gump_tokenizer::{BEGIN, FIRST_LIGHT, N_CLASSES};
 
 use super::weights::Source;
 
-/// Logits over what may follow one token.
+/// Logits over the successors of one token.
 #[derive(Clone, Debug)]
 pub struct Successor {
     /// Of the keys, then BEGIN, NEWBORN and LIGHTS_END.

@@ -1,4 +1,4 @@
-//! The engine against the network in one sitting, and its caches against none.
+//! The engine compared with the reference implementation, and its caches compared with none.
 
 use gump_model::placed_slot::PlacedSlot;
 use gump_model::testing::{hidden, memory, network, scenario, slots};

@@ -1,4 +1,5 @@
-//! The network's numbers in the form the engine multiplies them.
+//! The network's weights in the form that the engine multiplies: packed layers, read by their
+//! checkpoint names.
 //!
 //! What lives here: packed layers, read by their checkpoint names. What does not: how they are
 //! applied one after another.

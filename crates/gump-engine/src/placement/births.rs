@@ -1,4 +1,4 @@
-//! Who comes next: decided from what the network says of the successor of a token.
+//! New agents: keys and departures decided from the network's logits of the successor of a token.
 
 use std::collections::BTreeSet;
 
@@ -16,9 +16,9 @@ pub const NEWBORN_AT: usize = CONTROL_KEYS + 1;
 
 /// Draws the key of a new agent, or `None` for no further one.
 ///
-/// `stop` is the mark that ends the list, `used` the ids that are taken, `last` the key before in
-/// the list. Classes ascend within a list, and ids within a class, so what may still come shrinks.
-/// The odds of a further one are multiplied by `pace`.
+/// `stop` is the mark that ends the list, `used` the ids in use, `last` the previous key in the
+/// list. Classes ascend within a list, and ids within a class, which limits the keys that may
+/// follow. The odds of a further agent are multiplied by `pace`.
 pub fn next_key(
     said: &Successor,
     stop: usize,
@@ -63,8 +63,8 @@ fn keys_of(kind: AgentKind, used: &BTreeSet<u16>, last: Option<Key>) -> Vec<Key>
         .collect()
 }
 
-/// The probability that an agent is still there, from what is said before its key: its own key
-/// against those of the tracked agents after it and the end of their list.
+/// The probability that an agent is still present, from the logits before its key: those of its own
+/// key, of the later tracked agents and of the end of their list.
 pub(crate) fn stays(said: &Successor, id: u16, later: &[u16]) -> f64 {
     let weight = |i: usize| f64::from(said.control[i]);
     let others = later.iter().map(|id| weight(usize::from(*id)));

@@ -1,8 +1,8 @@
-//! Where on a map somebody may be, and which way things go there.
+//! Positions on a map where agents may be placed, and the directions of motion there.
 //!
-//! The scene's square is cut into cells of a metre. Which cells are open to whom is a rule of
-//! thumb: vehicles on centre lines of lanes, bicycles there at the right-hand side and on lanes of
-//! their own, people on crosswalks, walkways and along the outer side of road edges.
+//! The scene's square is divided into cells of a metre. Which cells are open to a class follows
+//! simple rules: vehicles on centre lines of lanes, bicycles at their right-hand side and on
+//! bicycle lanes, pedestrians on crosswalks, walkways and along the outer side of road edges.
 
 use std::f64::consts::TAU;
 
@@ -15,23 +15,24 @@ use gump_tokenizer::Field;
 pub(crate) const CELLS: usize = 200;
 /// Half the side of the square, metres.
 const REACH: f64 = 100.0;
-/// Two ways less than this apart are one, radians.
+/// Directions closer than this are equal, radians.
 const SAME_WAY: f64 = 0.15;
-/// Whoever is nearer than this to the border of what is seen along an axis may pass it, metres.
+/// An agent nearer than this to the border of the window along an axis may cross it, metres.
 const RIM: f64 = 12.0;
-/// Whoever is nearer than this to where a map's lane begins or ends may come or leave there, metres.
+/// An agent nearer than this to the beginning or end of a lane at the end of the map may enter or
+/// leave there, metres.
 const GATE: f64 = 8.0;
-/// Slower things have no direction of motion, metres per second.
+/// Slower agents have no direction of motion, metres per second.
 pub(crate) const SLOW: f64 = 0.75;
-/// Sectors in which ways are listed.
+/// Number of sectors of directions.
 const SECTORS: usize = 64;
 
 /// The open cells of one scene for one class.
 #[derive(Clone, Debug)]
 pub struct Ground {
     cells: Vec<Cell>,
-    /// By bin of the velocity along x, then along y: whether things go that way somewhere. Empty
-    /// where any way will do.
+    /// By bin of the velocity along x, then along y: whether traffic moves in that direction
+    /// anywhere. Empty where any direction is allowed.
     velocities: Vec<bool>,
 }
 
@@ -39,15 +40,15 @@ pub struct Ground {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Cell {
     pub(crate) is_open: bool,
-    /// Headings that things have there, scene frame; none where any will do.
+    /// Headings of traffic in the cell, scene frame; none where any heading is allowed.
     pub(crate) ways: Vec<f32>,
-    /// How somebody may come there into what is seen.
+    /// How an agent may enter the window there.
     pub(crate) entry: Entry,
-    /// Whether a lane of the map ends there.
+    /// Whether a lane ends there at the end of the map.
     pub(crate) is_end: bool,
 }
 
-/// How somebody comes into what is seen.
+/// How an agent enters the window.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Entry {
     /// Not there.
@@ -55,12 +56,12 @@ pub(crate) enum Entry {
     Closed,
     /// Over the border, nearing the ego.
     Border,
-    /// From where the map ends.
+    /// From the end of the map.
     Gate,
 }
 
 impl Ground {
-    /// The ground of a class.
+    /// The open cells of a class.
     pub fn of_class(map: &MapGraph, world_from_scene: Pose, kind: AgentKind) -> Self {
         let mut ground = Self::closed();
         let scene_from_world = world_from_scene.inverse();
@@ -83,7 +84,7 @@ impl Ground {
         ground.finish()
     }
 
-    /// The part of the ground on which somebody may come into what is seen.
+    /// The open cells where agents may enter the window.
     pub(crate) fn entries(&self) -> Self {
         let cells = self.cells.iter().map(|cell| Cell {
             is_open: cell.is_open && cell.entry != Entry::Closed,
@@ -100,12 +101,12 @@ impl Ground {
         ground.finish()
     }
 
-    /// Whether a lane of the map ends around a point.
+    /// Whether a lane ends near a point at the end of the map.
     pub(crate) fn ends_at(&self, point: DVec2) -> bool {
         self.cell(point).is_some_and(|cell| cell.is_end)
     }
 
-    /// The ground of one lane; none if there is no such lane.
+    /// The open cells of one lane; `None` if there is no such lane.
     pub fn of_lane(map: &MapGraph, world_from_scene: Pose, lane: LaneId) -> Option<Self> {
         let mut ground = Self::closed();
         ground.open_lane(map.lane(lane)?, 0.0, world_from_scene.inverse());
@@ -129,7 +130,7 @@ impl Ground {
         open.map(move |(y, cell)| (centre(x, y), cell))
     }
 
-    /// True if somewhere things go the way of this velocity.
+    /// True if traffic moves in the direction of this velocity anywhere.
     pub(crate) fn admits(&self, velocity: DVec2) -> bool {
         let x = usize::from(Field::VelocityX.quantize(velocity.x).bin);
         let y = usize::from(Field::VelocityY.quantize(velocity.y).bin);
@@ -256,7 +257,7 @@ fn is_near(lane: &Lane, centre: DVec2) -> bool {
     (low - reach).cmple(centre).all() && (high + reach).cmpge(centre).all()
 }
 
-/// Whether a point of the scene frame is near the border of what is seen.
+/// Whether a point of the scene frame is near the border of the window.
 fn is_rim(point: DVec2) -> bool {
     point.abs().max_element() >= KEEP_RANGE_M - RIM
 }

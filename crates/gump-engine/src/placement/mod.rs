@@ -1,4 +1,5 @@
-//! Where objects may be put, and as what: for generating scenes and for agents that come into one.
+//! Placement of objects: valid positions and states, for generated scenes and for agents that enter
+//! a scene.
 
 pub mod births;
 pub mod ground;

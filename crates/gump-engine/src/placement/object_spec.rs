@@ -1,15 +1,15 @@
-//! What is asked of one object of a scene.
+//! Specification of one object of a scene.
 
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, LaneId, MapGraph};
 use serde::Deserialize;
 
-/// What is asked of one object; what is `None` is left to the model.
+/// Specification of one object; fields that are `None` are left to the model.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectSpec {
     /// Its name, by which others refer to it; "ego" is the ego.
     pub id: String,
-    /// What it is; the ego is a vehicle.
+    /// Its class; the ego is a vehicle.
     #[serde(default)]
     pub class: Class,
     /// Box centre ahead of the ego's pose, metres.
@@ -25,11 +25,11 @@ pub struct ObjectSpec {
     pub length: Option<Bounds>,
     /// Metres.
     pub width: Option<Bounds>,
-    /// The lane whose centre line it is on, pointing the lane's way.
+    /// The lane whose centre line it is on, with the lane's direction.
     pub lane: Option<i64>,
-    /// Whom it follows, and at what gap between the boxes.
+    /// The object it follows, and the gap between the boxes.
     pub behind: Option<Relation>,
-    /// Who follows it, and at what gap between the boxes.
+    /// The object that follows it, and the gap between the boxes.
     pub ahead_of: Option<Relation>,
 }
 
@@ -40,14 +40,14 @@ impl ObjectSpec {
     }
 }
 
-/// What an object is.
+/// The class of an object.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Class {
     /// A car, a truck, a bus.
     #[default]
     Vehicle,
-    /// Somebody on foot.
+    /// A pedestrian.
     Pedestrian,
     /// A bicycle with its rider.
     Bicycle,
@@ -68,14 +68,14 @@ impl Class {
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(from = "NumberOrPair")]
 pub struct Bounds {
-    /// The least.
+    /// The minimum.
     pub low: f64,
-    /// The most.
+    /// The maximum.
     pub high: f64,
 }
 
 impl Bounds {
-    /// From the least to the most.
+    /// From the minimum to the maximum.
     pub fn new(low: f64, high: f64) -> Self {
         Self { low, high }
     }
@@ -85,7 +85,7 @@ impl Bounds {
         self.low - slack <= value && value <= self.high + slack
     }
 
-    /// As `admit`, on the circle.
+    /// As `admit`, for angles.
     pub fn admit_angle(&self, angle: f64, slack: f64) -> bool {
         let width = self.high - self.low;
         let turn = (angle - self.low).rem_euclid(std::f64::consts::TAU);

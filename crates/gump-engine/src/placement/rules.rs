@@ -1,9 +1,8 @@
-//! The rules of one object of a scene: which bins its fields may take, and whether what came out
-//! keeps to them.
+//! Constraints on one object of a scene: the bins its fields may take, and a check of the result.
 //!
-//! Fields are drawn one after another, so a mask looks ahead: a velocity is open if somewhere
-//! things go that way, a column if it has a cell for it. What a mask cannot see (the exact box) is
-//! checked afterwards by [`Rules::broken`].
+//! Fields are drawn one after another, so masks look ahead: a velocity is allowed if traffic moves
+//! in its direction anywhere, a column if it has a valid cell. [`Rules::broken`] afterwards checks
+//! what masks cannot (the exact box).
 
 use std::sync::Arc;
 
@@ -17,56 +16,57 @@ use crate::placement::ground::{CELLS, Cell, Entry, Ground, SLOW, goes};
 use crate::placement::object_spec::{Bounds, ObjectSpec};
 use crate::request::Guide;
 
-/// Gap that boxes keep, metres.
+/// Minimum gap between boxes, metres.
 const CLEARANCE: f64 = 0.2;
-/// Whoever comes over the border nears the ego at least so fast, metres per second.
+/// Minimum speed towards the ego of an agent that crosses the border of the window, metres per
+/// second.
 const CLOSING: f64 = 0.5;
-/// How far a vehicle on a lane is typically turned from the lane's way, radians.
+/// Typical deviation of a vehicle on a lane from the lane's direction, radians.
 const LANE_KEEPING: f64 = 0.03;
-/// Whoever is this near to a lane's centre line is on it, metres.
+/// An object this near to a lane's centre line is on it, metres.
 const ON_LANE_M: f64 = 1.2;
 /// A gap in a row is met to this, metres: half a step of the grid along each axis and some turn.
 const ROW_SLACK: f64 = 0.5;
 
-/// What one object keeps to.
+/// Constraints of one object.
 #[derive(Clone, Debug)]
 pub struct Rules {
-    /// What it is.
+    /// Its class.
     pub kind: AgentKind,
-    /// What is asked of it.
+    /// Its specification.
     pub spec: ObjectSpec,
-    /// Where it may be; none where it may be anywhere.
+    /// Its valid positions; `None` if it may be anywhere.
     pub ground: Option<Arc<Ground>>,
-    /// The row it stands in: ahead (true) or behind of whom, and the gap in metres.
+    /// The row it stands in: ahead (true) or behind of which object, and the gap in metres.
     pub rows: Vec<(bool, OrientedBox, f64)>,
-    /// Boxes that are there already, scene frame.
+    /// Boxes of the objects already placed, scene frame.
     pub taken: Vec<OrientedBox>,
-    /// Where the ego is and how fast, for one that comes into what it sees; scene frame,
-    /// metres and metres per second.
+    /// Position and velocity of the ego, for an agent that enters its window; scene frame, metres
+    /// and metres per second.
     pub comes_to: Option<(DVec2, DVec2)>,
-    /// Whether sizes and speeds keep to what is common in the class.
+    /// Whether sizes and speeds stay within the usual range of the class.
     pub is_guided: bool,
-    /// How its draws differ from those of imagining.
+    /// How its draws differ from those of a rollout.
     pub manner: Manner,
 }
 
-/// How the fields of an object are drawn.
+/// Adjustments to the draws of an object's fields.
 #[derive(Clone, Debug)]
 pub struct Manner {
     /// Multiplies the temperature of widths and lengths.
     pub size_boldness: f64,
     /// Multiplies the temperature of x and y.
     pub place_boldness: f64,
-    /// What training spread the targets of velocities by, bins, if that is taken off.
+    /// Smoothing of the velocities' targets in training, bins, if it is to be removed.
     pub smoothing_bins: Option<f32>,
-    /// Whether those of sizes were spread as widely.
+    /// Whether the targets of sizes were smoothed as widely.
     pub smoothed_sizes: bool,
-    /// What decides its fields, instead of its stream.
+    /// The numbers that decide its fields, in place of its stream.
     pub numbers: Option<[f64; STATE_STEPS]>,
 }
 
 impl Default for Manner {
-    /// As the network says.
+    /// No adjustments.
     fn default() -> Self {
         Self {
             size_boldness: 1.0,
@@ -144,8 +144,8 @@ impl Guide for Rules {
 }
 
 impl Rules {
-    /// The box of a state, scene frame. On lanes the grid of headings is too coarse: who faces the
-    /// lane's way as far as its bin says, faces that.
+    /// The box of a state, scene frame. On lanes the grid of headings is too coarse: an object
+    /// whose bin contains the lane's direction gets exactly that direction.
     pub fn outline(
         &self,
         state: &QuantizedState,
@@ -172,7 +172,7 @@ impl Rules {
         own
     }
 
-    /// The first rule that a drawn state and its outline break, in words.
+    /// The first constraint that a drawn state and its box violate, as text.
     pub fn broken(
         &self,
         state: &QuantizedState,
@@ -200,14 +200,15 @@ impl Rules {
         None
     }
 
-    /// True for a state in which somebody may come into what is seen.
+    /// True for a state in which an agent may enter the window.
     pub(crate) fn enters(&self, state: &QuantizedState) -> bool {
         let at = state.pose().position;
         let cell = self.ground.as_ref().and_then(|ground| ground.cell(at));
         cell.is_some_and(|cell| cell.is_open && self.nears(at, cell, state.velocity()))
     }
 
-    /// True if some cell is open to it, whatever its size and speed; without ground all places are.
+    /// True if some cell is open to it, whatever its size and speed; without open cells every
+    /// position is valid.
     pub fn has_place(&self) -> bool {
         let Some(ground) = &self.ground else {
             return true;
@@ -216,7 +217,7 @@ impl Rules {
         columns.any(|(at, cell)| self.fits(at, cell, DVec2::ZERO, DVec2::ZERO))
     }
 
-    /// The first clause of its description that a state does not meet.
+    /// The first part of its specification that a state does not satisfy.
     fn broken_spec(&self, state: &QuantizedState, own: &OrientedBox) -> Option<String> {
         let spec = &self.spec;
         let slack = |field: Field| field.step() / 2.0 + 1e-6;

@@ -1,7 +1,7 @@
-//! The network without the tensor library: one frame of one future at a time.
+//! The relative network without the tensor library: one frame of one future at a time.
 //!
-//! Keys and values of a node never change once they are computed, so a frame costs its own nodes
-//! only. Everything a future keeps is with its agents; the map is computed once and shared.
+//! Keys and values of a node never change once they are computed, so a frame costs only its own
+//! nodes. The state of a future is stored with its agents; the map is computed once and shared.
 
 use gump_kernels::edge_attention::{Heads, attend};
 use gump_kernels::gelu::gelu_row;
@@ -19,10 +19,10 @@ use gump_scene::Seed;
 
 use crate::nucleus::{least_kept, uniform};
 
-/// Frames that are kept of an agent: the present and its past.
+/// Number of frames kept of an agent: the present and its past.
 pub(super) const KEPT: usize = PAST + 1;
 
-/// The network's numbers, packed.
+/// The network with packed weights.
 #[derive(Debug)]
 pub struct Engine {
     config: RelativeConfig,
@@ -83,7 +83,7 @@ pub struct MapMemory {
 #[derive(Clone, Debug)]
 pub(super) struct AgentMemory(Vec<f32>);
 
-/// Memory to compute in.
+/// Working memory.
 #[derive(Debug, Default)]
 pub struct Workspace {
     panels: Scratch,
@@ -97,7 +97,7 @@ pub struct Workspace {
     scores: Vec<f32>,
 }
 
-/// An agent of a frame that is computed.
+/// An agent of the frame to compute.
 pub struct Present<'a> {
     pub(super) numbers: [f32; NODE_NUMBERS],
     pub(super) past: Vec<[f32; EDGE_NUMBERS]>,
@@ -106,16 +106,16 @@ pub struct Present<'a> {
     pub(super) memory: &'a mut AgentMemory,
     /// The map that its view is of.
     pub(super) map: &'a MapMemory,
-    /// Which frame of its future it is.
+    /// Index of the frame within its future.
     pub(super) t: usize,
 }
 
-/// How draws are made.
+/// Settings of draws.
 #[derive(Clone, Copy, Debug)]
 pub struct Draw {
     /// Divides the logits.
     pub temperature: f64,
-    /// Draws are among the likeliest bins that together have this probability.
+    /// Nucleus: draws are among the most likely bins that together have this probability.
     pub top_p: f64,
 }
 
@@ -123,7 +123,7 @@ impl Engine {
     /// Packs the weights.
     ///
     /// # Errors
-    /// Weights that lack a parameter.
+    /// Weights with a missing parameter.
     pub fn new(weights: &RelativeWeights, precision: Precision) -> Result<Self, ModelError> {
         let config = weights.config().clone();
         let c = config.width;
@@ -204,7 +204,7 @@ impl Engine {
         }
     }
 
-    /// What the layers make of a map.
+    /// The keys and values of a map.
     pub fn remember(&self, map: &VectorMap) -> MapMemory {
         let (c, m) = (self.config.width, map.pieces.len());
         let mut room = Workspace::default();
@@ -227,13 +227,13 @@ impl Engine {
         }
     }
 
-    /// The memory of an agent of whom nothing has been seen.
+    /// The memory of an agent without observations.
     pub(super) fn blank(&self) -> AgentMemory {
         AgentMemory(vec![0.0; self.layers.len() * KEPT * 2 * self.config.width])
     }
 
-    /// Reads frames, of one future or of several: the hidden vectors of their agents, `[agents, C]`,
-    /// into `out`. A row does not depend on what is computed beside it, to the bit.
+    /// Computes frames, of one future or of several: the hidden vectors of their agents,
+    /// `[agents, C]`, into `out`. A row does not depend on the other rows, bit for bit.
     pub fn read(&self, agents: &mut [Present<'_>], room: &mut Workspace, out: &mut Vec<f32>) {
         let (c, f, heads) = (self.config.width, self.config.edge_width, self.heads_of());
         let n = agents.len();
@@ -337,7 +337,8 @@ impl Engine {
         self.norm.apply(&room.x, out);
     }
 
-    /// Draws the next moves of agents with these hidden vectors, `[n, C]`, each by its own stream.
+    /// Draws the next moves of agents with these hidden vectors, `[n, C]`, each from its own
+    /// stream.
     pub fn decide(
         &self,
         hidden: &[f32],
@@ -414,7 +415,8 @@ fn add(x: &mut [f32], y: &[f32]) {
     );
 }
 
-/// The bin at which the tempered distribution, without its least likely tail, exceeds `uniform`.
+/// The bin at which the cumulative tempered distribution, truncated to its nucleus, exceeds
+/// `uniform`.
 fn choose(logits: &[f32], uniform: f64, draw: Draw, weights: &mut Vec<f32>) -> u16 {
     let best = |logits: &[f32]| {
         let best = logits.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1));

@@ -1,4 +1,5 @@
-//! The relative network rolled out: its arithmetic, what is kept of agents, rules, the world.
+//! Rollouts of the relative network: CPU implementation, memory of agents, sampling rules, and the
+//! world.
 
 pub mod engine;
 pub mod rules;

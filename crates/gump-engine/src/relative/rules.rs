@@ -1,9 +1,9 @@
-//! Rules over the network's draws: what would run into somebody, off the road or over a red light is
-//! drawn again, and what no vehicle can do is held back.
+//! Sampling rules for the relative network: moves that would overlap an agent, leave the road or
+//! run a red light are redrawn, and kinematically impossible moves are limited.
 //!
-//! They are those of the sequence network (`rejection`, `kinematic_limits`). That says three poses at
-//! once; here
-//! the second half of what is looked at, a second, goes on as the move that was drawn.
+//! They are those of the sequence network (`rejection`, `kinematic_limits`). That network predicts
+//! three poses at once; here the second part of the checked horizon, one second, continues the
+//! drawn move.
 
 use gump_geometry::{Polyline, Pose, angle_difference};
 use gump_model::local_context::Survey;
@@ -16,25 +16,25 @@ use gump_scene::{
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 
-/// Slower than this nobody brakes, metres per second.
+/// Below this speed braking has no effect, metres per second.
 const CREEPING: f64 = 0.5;
-/// How far a front bumper may be over a line before it is passed, metres.
+/// How far a front bumper may be over a line before it counts as passed, metres.
 const OVER_M: f64 = 0.5;
 /// Lines of one junction lie within this, metres.
 const ONE_LINE_M: f64 = 4.0;
-/// A way that turns right by more is a right turn, radians.
+/// A path that turns right by more than this is a right turn, radians.
 const RIGHT: f64 = 0.52;
-/// Who is slower may turn right at red, metres per second.
+/// A vehicle slower than this may turn right at red, metres per second.
 const TURNS_AT_RED: f64 = 2.0;
-/// Braking for a light begins where this is enough, metres per second squared, ...
+/// Braking for a light begins where this deceleration is sufficient, metres per second squared, ...
 const GENTLY: f64 = 4.0;
-/// ... and nobody brakes harder for one.
+/// ... and never exceeds this.
 const HARDEST: f64 = 6.0;
 
-/// Draws the moves of agents, given by number, anew for an attempt.
+/// Draws the moves of agents, given by index, again for an attempt.
 pub(super) type Again<'a> = dyn FnMut(&[usize], usize) -> Vec<Pose> + 'a;
 
-/// What is held back of a move, told in the frame of the agent that makes it.
+/// The limits of a move, in the frame of the agent that makes it.
 pub(super) fn held_back(now: &Shown, step: Pose) -> Pose {
     let Some(limits) = Limits::of(now.body.kind) else {
         return step;
@@ -57,7 +57,7 @@ pub(super) struct StopLine {
     /// Its middle, heading along the lane.
     line: Pose,
     width: f64,
-    /// Whether all ways behind it turn right, which is allowed at red once one has stopped.
+    /// Whether all paths behind it turn right, which is allowed at red after a stop.
     is_right: bool,
 }
 
@@ -82,14 +82,14 @@ impl StopLine {
         lights.iter().filter_map(of).collect()
     }
 
-    /// Metres that the front bumper of somebody has before it may be no farther.
+    /// The remaining distance of a front bumper to the line, metres.
     fn room(&self, now: &Shown) -> f64 {
         let local = self.line.inverse() * now.pose.position;
         -local.x - now.body.length / 2.0 + OVER_M
     }
 
-    /// Whether the front bumper of somebody comes over the line by this move, or cannot be held before
-    /// it any more after it.
+    /// Whether an agent's front bumper crosses the line with this move, or cannot stop before it
+    /// afterwards.
     fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
         let half = now.body.length / 2.0;
         let to = now.pose * step;
@@ -102,8 +102,8 @@ impl StopLine {
     }
 }
 
-/// The lines that somebody comes over by a move: the nearest ones, since those behind them are
-/// another junction's.
+/// The lines that an agent crosses with a move: the nearest ones, since those behind them belong to
+/// another junction.
 fn crossed<'l>(
     now: &Shown,
     step: Pose,
@@ -117,7 +117,7 @@ fn crossed<'l>(
     all
 }
 
-/// The same move by somebody who brakes as hard as he has to, to stand after so many metres.
+/// The same move with the braking needed to stop after this many metres.
 fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
     let (speed, length) = (now.velocity().length(), step.position.length());
     let braking = (speed * speed / (2.0 * room.max(0.1))).min(HARDEST);
@@ -129,7 +129,7 @@ fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
     Pose::IDENTITY.interpolate(step, (metres / length).min(1.0))
 }
 
-/// Whether somebody who makes this move runs a red light: every line that he comes over is shut.
+/// Whether an agent with this move runs a red light: every line that it crosses is red.
 pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
     let stopped = now.velocity().length() < TURNS_AT_RED;
     let crossed = crossed(now, step, lines);
@@ -140,8 +140,8 @@ pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)
     first.is_some_and(|first| first && shut.all(|shut| shut))
 }
 
-/// Replaces moves of vehicles over a red light, up to `redraws` times each; who draws no other
-/// brakes, if that stops him.
+/// Redraws moves of vehicles over a red light, up to `redraws` times each; a vehicle without
+/// another move brakes, if that stops it.
 pub(super) fn heed(
     agents: &[Shown],
     driven: Option<usize>,
@@ -187,7 +187,8 @@ pub(super) fn heed(
     }
 }
 
-/// Replaces moves that are not clear, up to `redraws` times each; who finds no clear way brakes.
+/// Redraws moves that are not clear, up to `redraws` times each; an agent without a clear path
+/// brakes.
 pub fn settle(
     agents: &[Shown],
     driven: Option<usize>,
@@ -235,7 +236,7 @@ pub fn settle(
     }
 }
 
-/// The way of who goes on as in the next half second.
+/// The path of an agent that continues as in the next half second.
 fn ahead(from: Pose, step: Pose) -> Way {
     let mut at = from;
     let poses: [Pose; POSES] = std::array::from_fn(|_| {
@@ -245,7 +246,7 @@ fn ahead(from: Pose, step: Pose) -> Way {
     way(Some(from), poses)
 }
 
-/// The move of who brakes on its way, and that way.
+/// The move of an agent that brakes on its path, and that path.
 fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
     let (speed, length) = (now.velocity().length(), step.position.length());
     if speed < CREEPING || length < 1e-6 {

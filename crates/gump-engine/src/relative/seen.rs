@@ -1,4 +1,4 @@
-//! What is kept of an agent while it is rolled out: its last frames and what the network made of them.
+//! The memory of an agent during a rollout: its last frames and their keys and values.
 
 use gump_geometry::{DVec2, Pose};
 use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
@@ -6,7 +6,7 @@ use gump_model::relative::map::VectorMap;
 
 use crate::relative::engine::{AgentMemory, Engine, KEPT, MapMemory, Present};
 
-/// An agent as it has been seen.
+/// An agent with its observed frames.
 #[derive(Clone, Debug)]
 pub struct Seen {
     /// The last frames without a gap, the latest last; at least one, at most [`KEPT`].
@@ -15,7 +15,7 @@ pub struct Seen {
 }
 
 impl Seen {
-    /// An agent seen for the first time, with its stated velocity, world frame, metres per second.
+    /// An agent in its first frame, with its stated velocity, world frame, metres per second.
     pub fn first(engine: &Engine, body: Body, pose: Pose, velocity: DVec2) -> Self {
         Self {
             shown: vec![Shown::first(body, pose, velocity)],
@@ -23,19 +23,19 @@ impl Seen {
         }
     }
 
-    /// As it was seen last.
+    /// Its last state.
     pub fn now(&self) -> Shown {
         *self.shown.last().expect("an agent has been seen")
     }
 
-    /// Forgets that it has stood for longer than this, seconds.
+    /// Limits the known standing time, seconds.
     pub fn has_stood_at_most(&mut self, seconds: f64) {
         if let Some(now) = self.shown.last_mut() {
             *now = now.stood_at_most(seconds);
         }
     }
 
-    /// Half a second later it is here.
+    /// Advances by half a second to this pose.
     pub fn push(&mut self, pose: Pose) {
         self.shown.push(self.now().then(pose));
         let n = self.shown.len();
@@ -43,7 +43,7 @@ impl Seen {
     }
 }
 
-/// Adds what the network reads of the agents of a frame, frame `t` of a future.
+/// Adds the network's inputs for the agents of a frame, frame `t` of a future.
 pub fn add_presents<'a>(
     (map, memory): (&VectorMap, &'a MapMemory),
     lights: &Lights,

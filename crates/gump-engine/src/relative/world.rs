@@ -1,9 +1,9 @@
-//! The relative network as a world: scenes in, futures out.
+//! The relative network as a world model.
 //!
-//! A future keeps its agents with what the network remembers of them; the map is laid out and
-//! computed once for all futures of a scene, and laid out anew for one whose ego leaves it behind.
-//! Agents of kinds that are not predicted go on with constant velocity; lights hold unless they are
-//! shown ([`Session::show`]).
+//! A future stores its agents with their keys and values. The map around the ego is prepared and
+//! computed once for all futures of a scene, and again for a future whose ego leaves it. Agents of
+//! kinds that are not predicted continue with constant velocity; lights stay unless they are set
+//! ([`Session::show`]).
 
 mod live;
 
@@ -37,53 +37,53 @@ use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
 
-/// How far around the ego the map is laid out, metres.
+/// Radius of the map around the ego, metres.
 pub const MAP_M: f64 = 300.0;
 
-/// For how long it is known when a light changed, seconds: as long as the scenes last that the network
-/// learned from.
+/// Maximum known time since a light changed, seconds: the length of the training scenes.
 const REMEMBERED_S: f64 = 9.0;
 
-/// For how long somebody has stood in a lane as far as the network is told, seconds. Scenes that it
-/// learned from last nine: whoever stood throughout was parked, as a rule, and stayed; in a long
-/// rollout those who wait at a junction come to look like that, and would wait for ever.
+/// Maximum time for which an agent in a lane is shown as standing, seconds. Training scenes last
+/// nine seconds: vehicles that stood throughout were usually parked, and stayed. In a long rollout
+/// vehicles that wait at a junction would look like parked ones and never start.
 const WAITED_S: f64 = 4.0;
-/// Who is this near to a lane's middle, and along it, stands in the lane: metres, radians.
+/// An agent this near to a lane's centre, and this well aligned with it, stands in the lane:
+/// metres, radians.
 const IN_LANE: (f64, f64) = (1.0, 0.35);
 
-/// How far the ego may come from the middle of the map that is laid out, metres: farther than in 8 s
-/// of a city.
+/// Maximum distance of the ego from the centre of the prepared map, metres: more than in 8 s of
+/// city traffic.
 const FOLLOW_M: f64 = 180.0;
 
-/// Draws are among the likeliest bins that together have this probability, unless told otherwise.
-/// Targets are smoothed over neighbouring bins, so that what is left out is mostly smoothing: at 1
-/// somebody on foot now and then shoots off. Chosen on the tuning set (result 19).
+/// Default nucleus: draws are among the most likely bins that together have this probability.
+/// Targets are smoothed over neighbouring bins, so the truncated part is mostly smoothing: with 1,
+/// pedestrians occasionally jump. Chosen on the tuning set (result 19).
 const TOP_P: f64 = 0.95;
 
-/// Futures that are computed together at most: beyond that the weights are fetched rarely enough,
-/// and what is computed no longer fits a core's cache.
+/// Maximum number of futures that are computed together: with more, the weights are already loaded
+/// rarely enough, and the data no longer fits a core's cache.
 const TOGETHER: usize = 8;
 
 /// Separates the streams of redraws from those of fields.
 const REDRAW: u64 = 1 << 20;
-/// Separates the streams of those who watch.
+/// Separates the streams of predictive samples.
 const WATCH: u64 = 1 << 40;
 
-/// How futures are drawn.
+/// Settings of rollouts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RelativeSampling {
-    /// Divides the logits; above 1 is bolder.
+    /// Divides the logits; above 1 gives more varied draws.
     pub temperature: f64,
-    /// Draws are among the likeliest bins that together have this probability; whether to stand is
-    /// drawn from both.
+    /// Nucleus: draws are among the most likely bins that together have this probability; whether
+    /// to stand is drawn from both.
     pub top_p: f64,
-    /// How often an agent that would run into another or off the road within 1.5 s is drawn again at
-    /// most.
+    /// Maximum number of redraws of an agent that would overlap another or leave the road within
+    /// 1.5 s.
     pub redraws: usize,
-    /// Whether vehicles and bicycles are held back from turning on the spot and slipping sideways.
+    /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways.
     pub limits: bool,
-    /// In which form the weights are multiplied.
+    /// The form in which the weights are multiplied.
     pub precision: Precision,
 }
 
@@ -100,7 +100,7 @@ impl Default for RelativeSampling {
 }
 
 impl From<&SamplingConfig> for RelativeSampling {
-    /// What of the settings this network knows.
+    /// The settings that this network supports.
     fn from(config: &SamplingConfig) -> Self {
         let usual = Self::default();
         Self {
@@ -122,24 +122,24 @@ impl RelativeSampling {
     }
 }
 
-/// A trained relative network that rolls traffic out.
+/// A trained relative network as a world model.
 #[derive(Debug)]
 pub struct RelativeWorld {
     engine: Engine,
     sampling: RelativeSampling,
     /// Steps made so far, of all sessions.
     passes: AtomicU64,
-    /// What is kept of the distributions, and what was.
+    /// Settings of predictive samples, and the recorded ones.
     watch: ProbeConfig,
     outlooks: Mutex<Vec<PredictiveSamples>>,
-    /// Scenes that sessions are in: who opens one more from the same present shares it.
+    /// Scenes of open sessions: further sessions from the same present share them.
     scenes: Mutex<Vec<(Laid, Weak<Scene>)>>,
 }
 
-/// What the scene of a start depends on.
+/// The key of the scene of a start.
 #[derive(Clone, Debug, PartialEq)]
 struct Laid {
-    /// Where the map lies in memory; it does as long as the scene holds it.
+    /// The address of the map, which stays valid as long as the scene holds it.
     source: usize,
     centre: DVec2,
     ego: AgentId,
@@ -147,7 +147,7 @@ struct Laid {
 }
 
 impl RelativeWorld {
-    /// A world that draws as `sampling` says.
+    /// A world with these sampling settings.
     ///
     /// # Errors
     /// A network that is not in main memory as f32.
@@ -162,7 +162,7 @@ impl RelativeWorld {
     /// As [`Self::new`], from plain weights.
     ///
     /// # Errors
-    /// Weights that lack a parameter.
+    /// Weights with a missing parameter.
     pub fn of_weights(
         weights: &RelativeWeights,
         sampling: RelativeSampling,
@@ -177,18 +177,18 @@ impl RelativeWorld {
         })
     }
 
-    /// The same world, which keeps what its agents might have done.
+    /// The same world, recording predictive samples.
     pub fn watching(self, watch: ProbeConfig) -> Self {
         Self { watch, ..self }
     }
 
-    /// Divides the logits by this from now on; above 1 is bolder.
+    /// Sets the divisor of the logits; above 1 gives more varied draws.
     pub fn set_temperature(&mut self, temperature: f64) {
         self.sampling.temperature = temperature;
     }
 
-    /// Takes what was watched since it was last taken: step by step, futures in their order, and
-    /// agents in that of their ids.
+    /// Takes the predictive samples recorded since the last call: step by step, futures in order,
+    /// and agents in the order of their ids.
     pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
         let mut kept = self.outlooks.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::take(&mut *kept)
@@ -199,8 +199,7 @@ impl RelativeWorld {
         self.passes.load(Ordering::Relaxed)
     }
 
-    /// The map around the ego, laid out and read; that of a session from the same present, if there
-    /// is one.
+    /// The prepared map around the ego, shared with sessions from the same present.
     fn scene(&self, state: SceneState<'_>) -> Arc<Scene> {
         let (centre, lights) = Scene::place(state);
         let laid = Laid {
@@ -246,11 +245,11 @@ impl RelativeWorld {
 }
 
 impl RelativeWorld {
-    /// The numbers of the present's nodes and what they end with, agents in the order of their ids:
-    /// what training computes of the same frames, up to rounding.
+    /// The inputs of the present's nodes and their final vectors, agents in the order of their ids:
+    /// those of training for the same frames, up to rounding.
     ///
     /// # Errors
-    /// A scene that cannot be rolled out.
+    /// A scene that cannot be simulated.
     pub fn read_present(&self, scene: SceneState<'_>) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
         let shared = self.scene(scene);
         let future = Future::begin(&self.engine, &shared, scene)?;
@@ -280,7 +279,7 @@ impl WorldModel for RelativeWorld {
     }
 }
 
-/// Whether two starts show the same frames of the same map: the same slices, not equal ones.
+/// Whether two starts have the same frames and the same map: the same slices, not equal ones.
 fn is_same_scene(a: &Start<'_>, b: &Start<'_>) -> bool {
     let (a, b) = (a.scene, b.scene);
     std::ptr::eq(a.history, b.history)
@@ -288,7 +287,7 @@ fn is_same_scene(a: &Start<'_>, b: &Start<'_>) -> bool {
         && (a.ego, a.dt) == (b.ego, b.dt)
 }
 
-/// What all futures of a start share.
+/// Data shared by all futures of a start.
 #[derive(Debug)]
 pub(super) struct Scene {
     source: Arc<MapGraph>,

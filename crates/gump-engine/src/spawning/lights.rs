@@ -1,10 +1,10 @@
-//! Traffic lights of living traffic: drawn from the network, one after another, within what signals
-//! do.
+//! Traffic lights during spawning: drawn from the network, one after another, within the sequence
+//! of signals.
 //!
-//! A signal goes from green over yellow to red and back to green, and holds each for a while:
-//! yellow for 3 to 6 s (US Manual on Uniform Traffic Control Devices, 2009, 4D.26), green and red
-//! for 5 s at least, which is the least green of common practice (US Signal Timing Manual, 2008,
-//! 5.4). Lights of one stop line that show the same change together.
+//! A signal cycles from green over yellow to red and back to green, and holds each for a minimum
+//! time: yellow for 3 to 6 s (US Manual on Uniform Traffic Control Devices, 2009, 4D.26), green and
+//! red for at least 5 s, the minimum green of common practice (US Signal Timing Manual, 2008, 5.4).
+//! Lights of one stop line that show the same colour change together.
 
 use std::collections::BTreeMap;
 
@@ -120,8 +120,8 @@ fn companions(lights: &[TokenLight], scene: &Scene, now: &Frame) -> Vec<Option<u
         .collect()
 }
 
-/// Whether a light that has shown `shown` for `age` frames may show `next` in the next one. What it
-/// shows may be unknown, then anything may follow.
+/// Whether a light that has shown `shown` for `age` frames may show `next` in the next one. From an
+/// unknown state any may follow.
 fn may_show(shown: LightState, age: usize, next: LightState) -> bool {
     match (shown, next) {
         (LightState::Unknown, _) => true,

@@ -1,4 +1,4 @@
-//! What can be chosen about an environment.
+//! Configuration of an environment.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -8,17 +8,17 @@ use gump_rollout::WorldModel;
 use super::Sampling;
 use crate::{ObservationSpec, RlError, Rules};
 
-/// How many episodes, and what is seen and done in them.
+/// Number of episodes, observations and actions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EnvConfig {
-    /// Episodes side by side, > 0.
+    /// Number of parallel episodes, > 0.
     pub n_envs: usize,
-    /// What is driven, for how long and for what.
+    /// Rules of an episode.
     pub rules: Rules,
-    /// What is seen.
+    /// Observations.
     pub observation: ObservationSpec,
-    /// When a row whose episode ended gets the next one.
+    /// When a row whose episode ended gets its next one.
     pub autoreset: Autoreset,
     /// How episodes choose their scenarios.
     pub sampling: Sampling,
@@ -37,26 +37,26 @@ impl Default for EnvConfig {
     }
 }
 
-/// When a row whose episode ended gets the next one.
+/// When a row whose episode ended gets its next one.
 ///
 /// Source: the modes and names of Gymnasium 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Autoreset {
-    /// Within the step that ends it; what the step led to is in the final observations.
+    /// In the step that ends it; the result of that step is in the final observations.
     #[default]
     SameStep,
-    /// In the step after, which ignores the row's action, earns nothing and ends nothing.
+    /// In the following step, which ignores the row's action, has a reward of 0 and ends nothing.
     NextStep,
-    /// When asked; stepping a row that ended is an error.
+    /// On request; stepping a row that ended is an error.
     Disabled,
 }
 
-/// Who moves everyone but the ego.
+/// The source of the other agents' motion.
 #[derive(Clone, Copy)]
 pub enum Traffic<'w> {
-    /// The log: everyone does what was recorded, whatever the ego does. An episode is truncated
-    /// where the log ends.
+    /// The log: agents follow their recording, whatever the ego does. An episode is truncated where
+    /// the log ends.
     Log,
     /// A world, which may react to the ego.
     World(&'w dyn WorldModel),

@@ -1,7 +1,7 @@
-//! Many episodes of driving side by side, in any world.
+//! Many parallel driving episodes in any world.
 //!
-//! `config` says what can be chosen, `sampler` draws scenarios, `row` is one episode in progress,
-//! `traffic` moves the others. The rules themselves are in `crate::episode`.
+//! `config` is the configuration, `sampler` draws scenarios, `row` is one episode in progress,
+//! `traffic` moves the other agents. The rules are in `crate::episode`.
 
 mod config;
 mod row;
@@ -26,15 +26,15 @@ pub use sampler::Sampling;
 /// Rows that one thread takes at a time: a step of a row takes microseconds.
 const ROWS_PER_TASK: usize = 8;
 
-/// Episodes of driving, a row each, in buffers that are lent.
+/// Driving episodes, one per row, in borrowed buffers.
 ///
-/// The ego of every row is driven by actions, everyone else by the world, in one batched call per
-/// step. Episode `e` of row `i` depends on the seed of the row, `e` and its actions alone, unless
-/// scenarios are drawn by priority; so neither its neighbours nor the number of threads change it.
+/// Actions drive the ego of every row, and the world drives all other agents in one batched call
+/// per step. Episode `e` of row `i` depends only on the seed of the row, `e` and its actions,
+/// unless scenarios are drawn by priority; other rows and the number of threads have no effect.
 /// After [`VectorEnv::reset`] row `i` has the seed `seed.fork(i)`.
 ///
-/// With [`Autoreset::SameStep`], which is the default, it does what [`VectorEnv`] promises; the
-/// other modes are Gymnasium's. The front page of the crate has an example.
+/// With [`Autoreset::SameStep`], the default, it follows the contract of [`VectorEnv`]; the other
+/// modes are Gymnasium's. The front page of the crate has an example.
 pub struct DrivingEnv<'w> {
     courses: Arc<[Course]>,
     others: Others<'w>,
@@ -83,10 +83,10 @@ impl<'w> DrivingEnv<'w> {
         })
     }
 
-    /// Starts these episodes, one per row; to drive some again, or a fixed list.
+    /// Starts these episodes, one per row: to repeat some, or for a fixed list.
     ///
     /// # Errors
-    /// [`RlError::Count`], [`RlError::NoSuchScenario`], and what the world reports.
+    /// [`RlError::Count`], [`RlError::NoSuchScenario`], and errors of the world.
     pub fn reset_to(&mut self, starts: &[EpisodeStart]) -> Result<(), RlError> {
         let (expected, found, n) = (self.config.n_envs, starts.len(), self.courses.len());
         if expected != found {
@@ -112,13 +112,13 @@ impl<'w> DrivingEnv<'w> {
         self.open()
     }
 
-    /// Starts the next episode in the chosen rows, with fresh seeds for them if given; the way to go
-    /// on with [`Autoreset::Disabled`]. Nothing but their observations changes.
+    /// Starts the next episode in the chosen rows, with new seeds for them if given; for use with
+    /// [`Autoreset::Disabled`]. Only their observations change.
     ///
     /// Shape: `which` and `seeds` are `[n_envs]`; the seeds of other rows are ignored.
     ///
     /// # Errors
-    /// [`RlError::NotReset`], [`RlError::Count`], and what the world reports.
+    /// [`RlError::NotReset`], [`RlError::Count`], and errors of the world.
     pub fn reset_rows(&mut self, which: &[bool], seeds: Option<&[Seed]>) -> Result<(), RlError> {
         let expected = self.live()?.len();
         for (who, found) in [
@@ -148,7 +148,7 @@ impl<'w> DrivingEnv<'w> {
         Ok(())
     }
 
-    /// The actions that come nearest to what the log does next.
+    /// The actions that come nearest to the log's next states.
     ///
     /// Shape: `actions` is `[n_envs, action_len]`, row-major; it is overwritten.
     ///
@@ -177,7 +177,7 @@ impl<'w> DrivingEnv<'w> {
     }
 
     /// Rows whose observation is the first of an episode. Shape: `[n_envs]`. In a step with
-    /// [`Autoreset::NextStep`] these rows did not act: leave them out of what is learnt from.
+    /// [`Autoreset::NextStep`] these rows did not act: exclude them from training data.
     pub fn restarted(&self) -> &[bool] {
         &self.restarted
     }
@@ -187,7 +187,7 @@ impl<'w> DrivingEnv<'w> {
         self.rows.get(row).map(|row| (row.start, &row.state))
     }
 
-    /// [`VectorEnv::observations`] of rasters with a bit per pixel, for memories; empty for
+    /// [`VectorEnv::observations`] of rasters with one bit per pixel, for replay buffers; empty for
     /// vectors. Shape: `[n_envs, packed_len]`.
     pub fn packed_observations(&self) -> &[u8] {
         self.observations.packed()
@@ -203,16 +203,16 @@ impl<'w> DrivingEnv<'w> {
         &self.config
     }
 
-    /// What is driven on.
+    /// The courses.
     pub fn courses(&self) -> &Arc<[Course]> {
         &self.courses
     }
 
-    /// Starts fresh episodes in all rows, row `i` with seed `seeds[i]`, and forgets how scenarios
-    /// went.
+    /// Starts new episodes in all rows, row `i` with seed `seeds[i]`, and resets the statistics of
+    /// scenarios.
     ///
     /// # Errors
-    /// [`RlError::Count`], and what the world reports.
+    /// [`RlError::Count`], and errors of the world.
     pub fn reset_with(&mut self, seeds: &[Seed]) -> Result<(), RlError> {
         let (expected, found) = (self.config.n_envs, seeds.len());
         if expected != found {
@@ -303,7 +303,7 @@ impl<'w> DrivingEnv<'w> {
         self.finished.clear();
     }
 
-    /// Lets the rows that act arrive where their actions and the world brought them.
+    /// Moves the active rows to the states that their actions and the world give.
     fn arrive(&mut self, actions: &[f32], acts: &[bool]) {
         let (courses, config) = (&self.courses, &self.config);
         let len = config.rules.dynamics.action_len();
@@ -325,7 +325,7 @@ impl<'w> DrivingEnv<'w> {
             });
     }
 
-    /// Writes down how episodes ended; the rows in which they did.
+    /// Records outcomes of episodes; the rows in which they ended.
     fn conclude(&mut self, acts: &[bool]) -> Vec<usize> {
         let mut ended = Vec::new();
         for (i, row) in self.rows.iter().enumerate() {

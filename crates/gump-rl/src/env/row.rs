@@ -6,7 +6,7 @@ use super::sampler::Sampler;
 use crate::observation::{ObservedRow, View};
 use crate::{Course, End, EpisodeState, Failure, ObservationSpec, Rules, Totals, observe};
 
-/// What determines an episode, but for the actions in it.
+/// What determines an episode besides its actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EpisodeStart {
     /// Index of the scenario.
@@ -15,20 +15,20 @@ pub struct EpisodeStart {
     pub seed: Seed,
 }
 
-/// How an episode went.
+/// The outcome of an episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outcome {
-    /// To drive it again, see [`super::DrivingEnv::reset_to`].
+    /// Repeats it with [`super::DrivingEnv::reset_to`].
     pub start: EpisodeStart,
     /// Steps made.
     pub steps: usize,
-    /// What they brought.
+    /// Their totals.
     pub totals: Totals,
     /// How it ended.
     pub end: End,
 }
 
-/// A place in the batch.
+/// A row of the batch.
 #[derive(Clone, Debug)]
 pub(super) struct Row {
     /// Source of the seeds of its episodes.
@@ -37,14 +37,14 @@ pub(super) struct Row {
     pub(super) n_episodes: u64,
     pub(super) start: EpisodeStart,
     pub(super) state: EpisodeState,
-    /// What a world imagined last, and before that; `None` where the log is shown.
+    /// The last two frames of the world; `None` where the log is used.
     pub(super) imagined: [Option<Frame>; 2],
-    /// True if others replay the log.
+    /// True if the other agents replay the log.
     pub(super) in_log: bool,
 }
 
 impl Row {
-    /// A row without an episode; its state is of no meaning yet.
+    /// A row without an episode; its state is not meaningful yet.
     pub(super) fn new(seed: Seed, blank: &EpisodeState) -> Self {
         Self {
             seed,
@@ -66,7 +66,7 @@ impl Row {
         self.n_episodes += 1;
     }
 
-    /// Brings the episode where an action and the world lead.
+    /// Moves the episode to the result of an action and the world.
     pub(super) fn arrive(&mut self, course: &Course, rules: &Rules, action: &[f32]) {
         self.state = match &self.imagined[0] {
             Some(frame) if !self.in_log => {

@@ -1,4 +1,4 @@
-//! Which scenario an episode is about.
+//! Selection of scenarios for episodes.
 
 use gump_scene::Seed;
 use rand::Rng as _;
@@ -8,15 +8,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampling {
-    /// Each scenario as often as any other.
+    /// Uniformly at random.
     #[default]
     Uniform,
-    /// In their order, each once before any comes again: row `i` of `n` drives the scenarios `i`,
+    /// In order, each once before any is repeated: row `i` of `n` drives the scenarios `i`,
     /// `i + n`, `i + 2 n`, ... For evaluation.
     InOrder,
-    /// Scenarios that were failed lately more often: with a weight of `floor` plus the share of
-    /// failures, of which each episode forgets the share `forget`. What one row draws then depends
-    /// on how the others fared.
+    /// Scenarios with recent failures more often: the weight is `floor` plus the share of failures,
+    /// of which each episode forgets the share `forget`. Draws of one row then depend on the
+    /// outcomes of the others.
     Prioritized {
         /// Weight of a scenario that is never failed, > 0.
         floor: f64,
@@ -26,8 +26,8 @@ pub enum Sampling {
 }
 
 impl Sampling {
-    /// A scenario that is never failed still comes up a tenth as often as one that always is; half
-    /// of what is known is forgotten in seven episodes.
+    /// A scenario without failures is drawn a tenth as often as one that always fails; half of the
+    /// weight of past outcomes is gone after seven episodes.
     pub fn prioritized() -> Self {
         Self::Prioritized {
             floor: 0.1,
@@ -50,7 +50,7 @@ impl Sampling {
     }
 }
 
-/// Draws scenarios and remembers how they went.
+/// Draws scenarios and keeps their outcomes.
 #[derive(Debug)]
 pub(super) struct Sampler {
     sampling: Sampling,
@@ -90,7 +90,7 @@ impl Sampler {
         }
     }
 
-    /// Remembers how an episode went.
+    /// Records the outcome of an episode.
     pub(super) fn note(&mut self, scenario: usize, failed: bool) {
         if let Sampling::Prioritized { forget, .. } = self.sampling {
             let known = &mut self.failures[scenario];

@@ -1,4 +1,4 @@
-//! Who moves the others: the log, which costs nothing, or a session of a world.
+//! The source of the other agents: the log, at no cost, or a session of a world.
 
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 use gump_scene::{AgentState, Frame};
@@ -7,7 +7,7 @@ use super::Traffic;
 use super::row::Row;
 use crate::{Course, RlError, Rules};
 
-/// The others of all rows.
+/// The other agents of all rows.
 pub(super) struct Others<'w> {
     world: Option<&'w dyn WorldModel>,
     session: Option<Box<dyn Session + 'w>>,
@@ -64,10 +64,10 @@ impl<'w> Others<'w> {
         Ok(())
     }
 
-    /// Lets everyone but the egos move while these are driven by `actions`. Egos whose episode has
-    /// ended stay where they are.
+    /// Moves all agents except the egos, which `actions` drive. Egos whose episode has ended stay
+    /// in place.
     ///
-    /// The session is put back only if all goes well: one that failed halfway is of no use.
+    /// The session is put back only on success: one that failed halfway cannot be used.
     pub(super) fn step(
         &mut self,
         courses: &[Course],

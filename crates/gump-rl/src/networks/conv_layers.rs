@@ -1,4 +1,4 @@
-//! The layers of a convolutional network, forwards and back.
+//! Layers of convolutional networks, forward and backward.
 
 use super::convolution::Convolution;
 use super::group_norm::GroupNorm;

@@ -1,4 +1,4 @@
-//! Convolutional networks from pictures to features, with their gradients written out.
+//! Convolutional networks from images to features, with hand-written gradients.
 
 use gump_scene::Rng;
 use rand::Rng as _;
@@ -14,21 +14,21 @@ pub(super) const ROWS_PER_PIECE: usize = 16;
 /// Partial gradients of a batch, each as long as the parameters.
 const PARTIAL_SUMS: usize = 4;
 
-/// The layers between a picture and its features.
+/// The architecture of the layers between an image and its features.
 ///
-/// Group normalization stands where He et al. have batch normalization: it serves small batches
-/// and the target copy alike.
+/// Group normalization replaces the batch normalization of He et al.: it works for small batches
+/// and for the target copy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Architecture {
-    /// Four convolutions of 3 x 3, each halving the side: 16, 32, 64, 64 channels, all pixels of
-    /// the last as features. For processors without a graphics card.
+    /// Four convolutions of 3 x 3, each halving the side: 16, 32, 64, 64 channels, with all pixels
+    /// of the last as features. For CPUs.
     SmallConv,
-    /// ResNet-18 (He et al. 2015) up to its mean over pixels: 512 features. The paper's.
+    /// ResNet-18 (He et al. 2015) up to its mean over pixels: 512 features. The paper's encoder.
     Resnet18,
 }
 
-/// The shape of a picture of square layers.
+/// The shape of an image with square layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Picture {
     /// Layers, > 0.
@@ -38,7 +38,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// Numbers in a picture, `[layer, row, column]`.
+    /// Numbers in an image, `[layer, row, column]`.
     #[allow(clippy::len_without_is_empty, reason = "a picture has pixels")]
     pub fn len(&self) -> usize {
         self.layers * self.side * self.side
@@ -57,7 +57,7 @@ pub struct ConvNet {
     parameters: Vec<f32>,
 }
 
-/// What a network remembers of a batch for the way back; reused from batch to batch.
+/// Values of a forward pass that the backward pass needs; reused from batch to batch.
 #[derive(Clone, Debug, Default)]
 pub struct ConvPass {
     pieces: Vec<Piece>,
@@ -69,21 +69,21 @@ pub struct ConvPass {
 #[derive(Clone, Debug, Default)]
 struct Piece {
     rows: usize,
-    /// The pictures as `[layer, row of the batch, y, x]`.
+    /// The images as `[layer, row of the batch, y, x]`.
     input: Vec<f32>,
     layers: Vec<LayerPass>,
     columns: Vec<f32>,
 }
 
 impl ConvPass {
-    /// What the network gave. Shape: `[rows, n_features]`.
+    /// The output of the network. Shape: `[rows, n_features]`.
     pub fn output(&self) -> &[f32] {
         &self.features
     }
 }
 
 impl ConvNet {
-    /// A network for such pictures, with random parameters.
+    /// A network for such images, with random parameters.
     ///
     /// Weights are uniform with variance 2 / inputs (He et al. 2015, for ReLU); normalization
     /// changes nothing at first.
@@ -122,17 +122,17 @@ impl ConvNet {
         })
     }
 
-    /// Which layers it has.
+    /// Its architecture.
     pub fn architecture(&self) -> Architecture {
         self.architecture
     }
 
-    /// What it sees.
+    /// The shape of its input.
     pub fn picture(&self) -> Picture {
         self.picture
     }
 
-    /// Numbers that it makes of a picture.
+    /// Number of features per image.
     pub fn n_features(&self) -> usize {
         let (channels, side) = self.last_maps();
         match self.architecture {
@@ -146,12 +146,12 @@ impl ConvNet {
         &self.parameters
     }
 
-    /// All parameters, to change.
+    /// All parameters, mutably.
     pub fn parameters_mut(&mut self) -> &mut [f32] {
         &mut self.parameters
     }
 
-    /// Moves every parameter the share `tau` of the way to that of `online`.
+    /// Moves every parameter towards that of `online` by the share `tau` of the difference.
     ///
     /// # Panics
     /// If the networks differ in size.
@@ -162,7 +162,7 @@ impl ConvNet {
         }
     }
 
-    /// Runs pictures through the network; the features are in `pass`.
+    /// Runs images through the network; the features are in `pass`.
     ///
     /// Shape: `[rows, layers, side, side]`.
     ///

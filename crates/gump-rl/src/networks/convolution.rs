@@ -1,7 +1,7 @@
-//! A convolution over square maps as one product of matrices, and its way back.
+//! A convolution over square maps as one matrix product, forward and backward.
 //!
-//! Maps lie as `[channel, row of the batch, y, x]`: so the maps of many rows are one matrix, and
-//! deep layers, whose maps are a few pixels wide, multiply as fast as shallow ones.
+//! Maps are stored as `[channel, row of the batch, y, x]`. The maps of many rows are therefore one
+//! matrix, and deep layers, whose maps are a few pixels wide, multiply as fast as shallow ones.
 
 use super::product::{Matrix, add_product};
 

@@ -1,8 +1,8 @@
-//! Maps brought to mean 0 and variance 1, row by row and group of channels by group.
+//! Group normalization: maps with mean 0 and variance 1, by row and group of channels.
 //!
-//! Source: Wu and He 2018, "Group Normalization". Unlike batch normalization a row's result depends
-//! on no other row, so small batches, copies that follow slowly and acting one row at a time need
-//! no statistics of their own.
+//! Source: Wu and He 2018, "Group Normalization". Unlike in batch normalization, the result of a
+//! row does not depend on other rows, so small batches, target copies and single rows need no
+//! running statistics.
 
 /// Groups of channels, as many as fit; the paper takes 32 of much wider maps.
 const GROUPS: usize = 8;

@@ -1,4 +1,4 @@
-//! A multi-layer perceptron with its gradients written out.
+//! A multi-layer perceptron with hand-written gradients.
 
 use gump_scene::Rng;
 use rand::Rng as _;
@@ -14,18 +14,18 @@ pub struct Mlp {
     parameters: Vec<f32>,
 }
 
-/// What a network remembers of a batch for the way back; reused from batch to batch.
+/// Values of a forward pass that the backward pass needs; reused from batch to batch.
 #[derive(Clone, Debug, Default)]
 pub struct Pass {
     rows: usize,
-    /// The input, then what every layer gave.
+    /// The input, then the output of every layer.
     layers: Vec<Vec<f32>>,
     delta: Vec<f32>,
     delta_before: Vec<f32>,
 }
 
 impl Pass {
-    /// What the network gave. Shape: `[rows, outputs]`.
+    /// The output of the network. Shape: `[rows, outputs]`.
     pub fn output(&self) -> &[f32] {
         self.layers.last().map_or(&[], Vec::as_slice)
     }
@@ -92,12 +92,12 @@ impl Mlp {
         &self.parameters
     }
 
-    /// All parameters, to change.
+    /// All parameters, mutably.
     pub fn parameters_mut(&mut self) -> &mut [f32] {
         &mut self.parameters
     }
 
-    /// Moves every parameter the share `tau` of the way to that of `online`.
+    /// Moves every parameter towards that of `online` by the share `tau` of the difference.
     ///
     /// # Panics
     /// If the networks differ in size.
@@ -150,7 +150,7 @@ impl Mlp {
         self.back(output_gradient, pass, Some(gradient), false);
     }
 
-    /// [`Mlp::backward`] and [`Mlp::backward_to_input`] at once.
+    /// [`Mlp::backward`] and [`Mlp::backward_to_input`] in one pass.
     ///
     /// # Panics
     /// If the sizes do not fit the last [`Mlp::forward`] into `pass`.
@@ -158,7 +158,7 @@ impl Mlp {
         self.back(output_gradient, pass, Some(gradient), true);
     }
 
-    /// Leaves the gradient of the input in `pass`, given that of the output.
+    /// Computes the gradient of the input, given that of the output, and leaves it in `pass`.
     ///
     /// # Panics
     /// If the sizes do not fit the last [`Mlp::forward`] into `pass`.

@@ -1,9 +1,8 @@
-//! Small networks with gradients written out, their optimiser, and what stands before them.
+//! Small networks with hand-written gradients, their optimizer, and normalization of inputs.
 //!
-//! A learner's step is a dozen products of matrices of a few hundred rows; recording a graph for
-//! each would cost more than some of them. [`Mlp`] is the network, [`Pass`] its memory of one
-//! batch, [`Adam`] changes its parameters, [`Normalizer`] brings numbers to one scale, [`ConvNet`]
-//! makes numbers of pictures.
+//! A learner's step is a dozen products of matrices with a few hundred rows; recording a graph for
+//! each would cost more than some of them. [`Mlp`] is a dense network, [`Pass`] the values of one
+//! batch, [`Adam`] the optimizer, [`Normalizer`] scales inputs, [`ConvNet`] encodes images.
 
 mod adam;
 mod conv_layers;

@@ -1,21 +1,21 @@
-//! Metres, metres per second and flags brought to one scale.
+//! Normalization of observations to one scale.
 
-/// Largest size of a normalised number.
+/// Maximum absolute value of a normalized number.
 ///
 /// Source: the default of Stable-Baselines3's observation normalisation.
 const LIMIT: f32 = 10.0;
 
-/// Subtracts a mean and divides by a standard deviation, both fixed once.
+/// Subtracts a mean and divides by a standard deviation, both fixed at construction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Normalizer {
-    /// What is subtracted, per number.
+    /// Mean, per number.
     pub shift: Vec<f32>,
-    /// What the rest is multiplied by, per number, > 0.
+    /// Reciprocal standard deviation, per number, > 0.
     pub scale: Vec<f32>,
 }
 
 impl Normalizer {
-    /// Changes nothing but numbers beyond ±10, which it cuts off.
+    /// The identity, except that numbers are clipped to ±10.
     pub fn identity(len: usize) -> Self {
         Self {
             shift: vec![0.0; len],
@@ -23,7 +23,7 @@ impl Normalizer {
         }
     }
 
-    /// Brings what the `pieces` hold together to mean 0 and variance 1; numbers that never change become 0.
+    /// Scales the content of the `pieces` to mean 0 and variance 1; constant numbers become 0.
     ///
     /// Shape: `[rows, len]` each.
     pub fn fitted(len: usize, pieces: &[&[f32]]) -> Self {

@@ -1,10 +1,10 @@
-//! The only place of the crate with `unsafe`: matrix products over checked slices.
+//! Matrix products over checked slices: the only `unsafe` of the crate.
 #![allow(
     unsafe_code,
     reason = "`gemm::gemm` takes raw pointers; what they reach is checked here, once"
 )]
 
-/// A row-major matrix without gaps, perhaps seen transposed.
+/// A row-major matrix without gaps, possibly transposed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Matrix<'a> {
     data: &'a [f32],
@@ -15,7 +15,7 @@ pub(super) struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// Panics if `data` does not hold just `rows` times `cols` numbers.
+    /// Panics if `data` does not have exactly `rows` times `cols` numbers.
     pub(super) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
         assert_eq!(data.len(), rows * cols, "a matrix of {rows} x {cols}");
         Self {
@@ -27,7 +27,7 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    /// The transposed view; no number moves.
+    /// The transposed view; no data is moved.
     pub(super) fn t(self) -> Self {
         Self {
             data: self.data,
@@ -41,7 +41,7 @@ impl<'a> Matrix<'a> {
 
 /// `sum += lhs rhs` for `lhs` `[m, k]`, `rhs` `[k, n]` and a row-major `sum` `[m, n]`.
 ///
-/// On the calling thread, so that equal input gives equal bits.
+/// Runs on the calling thread, so that equal input gives equal bits.
 ///
 /// Panics if the shapes do not fit.
 pub(super) fn add_product(sum: &mut [f32], lhs: Matrix<'_>, rhs: Matrix<'_>) {

@@ -13,7 +13,7 @@ pub(crate) struct Observed {
     numbers: Vec<f32>,
     /// Empty for vectors.
     packed: Vec<u8>,
-    /// The bits as numbers, once somebody asks for them: 32 times as much to write.
+    /// The bits as numbers, expanded on first use: 32 times as much memory.
     expanded: OnceLock<Vec<f32>>,
     n_rows: usize,
 }

@@ -1,4 +1,4 @@
-//! What a policy sees of an episode: numbers (`vector`) or a picture (`raster`).
+//! Observations of an episode: numbers (`vector`) or an image (`raster`).
 
 mod buffer;
 mod raster;
@@ -15,13 +15,13 @@ pub use raster::{RASTER_LAYERS, RasterView, expand};
 pub(crate) use raster::{Texture, pack};
 pub use vector::VectorView;
 
-/// What is seen.
+/// The form of an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum ObservationSpec {
     /// A short vector of numbers in the ego's frame.
     Vector(VectorView),
-    /// A picture from above, centred on the ego, of layers that are 0 or 1.
+    /// A bird's-eye image centred on the ego, with layers that are 0 or 1.
     Raster(RasterView),
 }
 
@@ -40,7 +40,7 @@ impl ObservationSpec {
         }
     }
 
-    /// How memories keep it and networks take it in.
+    /// The form in which replay buffers store it and networks read it.
     pub fn form(&self) -> ObservationForm {
         match self {
             Self::Vector(view) => ObservationForm::Numbers(view.len()),
@@ -51,7 +51,7 @@ impl ObservationSpec {
         }
     }
 
-    /// Numbers in an observation.
+    /// Length of an observation.
     #[allow(
         clippy::len_without_is_empty,
         reason = "an observation always holds the ego"
@@ -102,13 +102,13 @@ impl ObservationSpec {
     }
 }
 
-/// What learners know of an observation.
+/// The form of observations, as far as learners need it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ObservationForm {
-    /// So many numbers of any size.
+    /// This many numbers of any size.
     Numbers(usize),
-    /// A picture of numbers that are 0 or 1.
+    /// An image of numbers that are 0 or 1.
     Bits(Picture),
 }
 
@@ -135,22 +135,22 @@ impl From<Picture> for ObservationForm {
     }
 }
 
-/// An episode at one instant, as an observer finds it.
+/// An episode at one instant, as input of an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// Where it takes place.
+    /// Its course.
     pub course: &'a Course,
-    /// How far it has come.
+    /// Its state.
     pub state: &'a EpisodeState,
-    /// Everyone now. The ego in it is ignored.
+    /// All agents now. The ego in it is ignored.
     pub now: &'a Frame,
-    /// Everyone one step ago, if known.
+    /// All agents one step ago, if known.
     pub before: Option<&'a Frame>,
 }
 
-/// Describes an episode as `spec` says.
+/// Writes the observation of an episode in the form of `spec`.
 ///
-/// Shape: `numbers` is `[spec.len()]`, or nothing where the bits of a raster are enough; `packed` is
+/// Shape: `numbers` is `[spec.len()]`, or empty where the bits of a raster suffice; `packed` is
 /// `[spec.packed_len()]`; both are overwritten.
 pub fn observe(spec: &ObservationSpec, view: &View<'_>, numbers: &mut [f32], packed: &mut [u8]) {
     match spec {

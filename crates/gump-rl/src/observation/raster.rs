@@ -1,7 +1,7 @@
-//! An episode as a picture from above, one bit per pixel and layer.
+//! Bird's-eye images of an episode, one bit per pixel and layer.
 //!
-//! The map is painted once per course, north up (`Texture`); an observation looks its pixels up
-//! there and draws what moves on top.
+//! The map is rendered once per course, north up (`Texture`); an observation samples it and draws
+//! the moving agents on top.
 
 use gump_geometry::{Canvas, DVec2, Pose, dvec2, fill_polygon, stroke_polyline};
 use gump_raster::{Layer, RasterSpec, rasterize};
@@ -21,9 +21,10 @@ pub struct RasterView {
     pub metres_per_px: f64,
 }
 
-/// The layers of a raster observation in their order. Row 0 is ahead, column 0 left.
+/// The layers of a raster observation in order. Row 0 is ahead, column 0 left.
 ///
-/// The speed is the share of pixels that are 1, from the first row on, 24 m/s for all of them.
+/// The speed layer fills a share of its pixels with 1, from the first row on; all of them at 24
+/// m/s.
 pub const RASTER_LAYERS: [&str; 8] = [
     "drivable_area",
     "baseline_paths",
@@ -35,7 +36,7 @@ pub const RASTER_LAYERS: [&str; 8] = [
     "ego_speed",
 ];
 
-/// The first layers, which are the map's.
+/// The first layers, which show the map.
 const MAP_LAYERS: [Layer; 4] = [
     Layer::DrivableArea,
     Layer::BaselinePaths,
@@ -46,7 +47,7 @@ const MAP_LAYERS: [Layer; 4] = [
 const FULL_SPEED: f64 = 24.0;
 
 impl Default for RasterView {
-    /// 64 pixels of 1.5 m, 48 m each way; 4 kB. The paper's policy sees 224 of 0.5 m.
+    /// 64 pixels of 1.5 m, 48 m each way; 4 kB. The paper's policy has 224 pixels of 0.5 m.
     fn default() -> Self {
         Self {
             side_px: 64,
@@ -179,7 +180,7 @@ const TEXEL: f64 = 0.75;
 /// can go and see in eight seconds at 30 m/s.
 const TEXTURE_SIDE: usize = 768;
 
-/// The map of a course from above, north up: per texel one bit per layer of the map.
+/// The map of a course as a bird's-eye image, north up: per texel one bit per layer of the map.
 #[derive(Debug)]
 pub(crate) struct Texture {
     /// World position of the texel (0, 0)'s lower left corner.

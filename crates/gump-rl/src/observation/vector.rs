@@ -1,4 +1,4 @@
-//! An episode as a short vector of numbers in the ego's frame.
+//! Observations as a short vector of numbers in the ego's frame.
 
 use gump_geometry::{DVec2, Polyline, angle_difference, dvec2};
 use gump_scene::{Agent, LightState};
@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::View;
 
-/// How much a vector observation tells.
+/// Extent of a vector observation.
 ///
-/// Numbers are scaled to the order of one: places in the ego frame (x ahead, y left of the box
+/// Numbers are scaled to the order of one: positions in the ego frame (x ahead, y left of the box
 /// centre) over 20 m, speeds over 10 m/s. In this order:
 /// * the ego: speed, acceleration over 4 m/s², yaw rate in rad/s, length over 5 m, width over 2 m;
 /// * the route: 1 if there is one, metres to the left of it over 2 m, its direction at the ego as
@@ -21,8 +21,8 @@ use super::View;
 /// * the next light of the route within 50 m: 1 if there is one, metres to its stop point over
 ///   50 m, then 1 for red, for yellow, for green.
 ///
-/// What is absent is zeros; rays are 1 on maps without road edges. Rays are traced through
-/// [`gump_metrics::Border::clearance`] and so are good to a few decimetres.
+/// Absent values are zeros; rays are 1 on maps without road edges. Rays are traced through
+/// [`gump_metrics::Border::clearance`] and are accurate to a few decimetres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VectorView {
@@ -30,19 +30,19 @@ pub struct VectorView {
     pub n_route_points: usize,
     /// Metres between them, > 0.
     pub route_spacing: f64,
-    /// Nearest other agents.
+    /// Number of agents, nearest first.
     pub n_agents: usize,
-    /// How far agents are seen, metres, > 0.
+    /// Maximum distance of agents, metres, > 0.
     pub agent_range: f64,
-    /// Directions in which the border of the road is looked for.
+    /// Number of directions in which the distance to the road border is measured.
     pub n_rays: usize,
-    /// How far the border is seen, metres, > 0.
+    /// Maximum distance to the border, metres, > 0.
     pub ray_range: f64,
 }
 
 impl Default for VectorView {
-    /// 50 m of route, four seconds at 45 km/h; ten agents, of which few streets have more within
-    /// reach; a ray every 22.5 degrees. Our choice: the paper's policy sees a raster.
+    /// 50 m of route, four seconds at 45 km/h; ten agents, since few streets have more within
+    /// reach; a ray every 22.5 degrees. Our choice: the paper's policy uses a raster.
     fn default() -> Self {
         Self {
             n_route_points: 10,
@@ -55,7 +55,7 @@ impl Default for VectorView {
     }
 }
 
-/// How far lights and the end of the route are seen, metres.
+/// Maximum distance of lights and of the end of the route, metres.
 const AHEAD: f64 = 50.0;
 const PLACE: f64 = 1.0 / 20.0;
 const SPEED: f64 = 1.0 / 10.0;

@@ -1,6 +1,6 @@
-//! Policies and runs as bytes: safetensors with everything else as JSON in the header.
+//! Serialization of policies and runs: safetensors, with everything else as JSON in the header.
 //!
-//! Where the bytes are kept is the caller's business.
+//! The caller stores the bytes.
 
 use std::collections::BTreeMap;
 
@@ -19,17 +19,17 @@ use crate::{Actor, ObservationForm, RlError};
 /// Version of the layout.
 const FORMAT: &str = "gump-rl-1";
 
-/// What a policy is beside its numbers.
+/// The metadata of a policy.
 #[derive(Debug, Serialize, Deserialize)]
 struct PolicyHeader {
     format: String,
     /// Layer sizes of the network, input first.
     sizes: Vec<usize>,
-    /// What stands before it if observations are pictures.
+    /// The encoder, if observations are images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     encoder: Option<EncoderHeader>,
     log_std_bounds: [f64; 2],
-    /// What the caller wants to find again.
+    /// Notes of the caller.
     notes: BTreeMap<String, String>,
 }
 
@@ -39,12 +39,12 @@ struct EncoderHeader {
     picture: Picture,
 }
 
-/// What a run is beside its numbers.
+/// The metadata of a run.
 #[derive(Debug, Serialize, Deserialize)]
 struct RunHeader {
     algorithm: Algorithm,
     seed: u64,
-    /// As TOML, which gives every float back as it was; JSON is read to the last digit but one.
+    /// As TOML, which keeps all digits of floats; JSON loses the last one.
     config: String,
     steps: usize,
     env_steps: u64,
@@ -89,7 +89,7 @@ impl BufferHeader {
 }
 
 impl Actor {
-    /// The policy alone, with notes of the caller.
+    /// The policy, with notes of the caller.
     ///
     /// # Errors
     /// [`RlError::Archive`] if it cannot be encoded.
@@ -99,7 +99,7 @@ impl Actor {
         writer.finish()
     }
 
-    /// The policy that bytes hold, of a policy or of a run, and the notes it was given.
+    /// Reads the policy of a stored policy or run, and its notes.
     ///
     /// # Errors
     /// [`RlError::Archive`] for bytes that hold none.
@@ -163,7 +163,7 @@ impl Training {
         writer.finish()
     }
 
-    /// The run that bytes hold, to go on with, and the notes it was given.
+    /// Reads a run to resume, and its notes.
     ///
     /// # Errors
     /// [`RlError::Archive`] for bytes that hold none.

@@ -1,11 +1,11 @@
-//! Transitions side by side, normalized: what one gradient step learns from.
+//! Batches of normalized transitions, the input of a gradient step.
 
 use super::replay_buffer::ReplayBuffer;
 use crate::RlError;
 use crate::networks::Normalizer;
 use gump_scene::Rng;
 
-/// Transitions as flat rows; those that experts drove come last.
+/// Transitions as flat rows; expert transitions come last.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Batch {
     /// Shape: `[n, observation_len]`.
@@ -16,9 +16,9 @@ pub struct Batch {
     pub rewards: Vec<f32>,
     /// Shape: `[n, observation_len]`.
     pub nexts: Vec<f32>,
-    /// Whether nothing comes after. Shape: `[n]`.
+    /// Whether the episode terminated. Shape: `[n]`.
     pub terminated: Vec<bool>,
-    /// How many of the last rows experts drove.
+    /// Number of expert transitions, which are the last rows.
     pub n_imitated: usize,
 }
 
@@ -28,12 +28,12 @@ impl Batch {
         self.rewards.len()
     }
 
-    /// True if there is nothing to learn from.
+    /// True if the batch is empty.
     pub fn is_empty(&self) -> bool {
         self.rewards.is_empty()
     }
 
-    /// Number of transitions that the learner drove itself.
+    /// Number of the learner's own transitions.
     pub fn n_own(&self) -> usize {
         self.len() - self.n_imitated
     }
@@ -42,7 +42,7 @@ impl Batch {
     /// drawn uniformly.
     ///
     /// # Errors
-    /// [`RlError::EmptyBuffer`] where there is nothing to draw from.
+    /// [`RlError::EmptyBuffer`] where a buffer is empty.
     pub fn draw(
         &mut self,
         (replay, n_own): (&ReplayBuffer, usize),

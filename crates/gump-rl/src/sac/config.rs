@@ -1,14 +1,14 @@
-//! Every number of the learner, with where it comes from.
+//! Hyperparameters of the learner, with their sources.
 
 use serde::{Deserialize, Serialize};
 
 use crate::networks::Architecture;
 use crate::{ObservationForm, RlError};
 
-/// How to learn.
+/// Hyperparameters.
 ///
 /// Sources: "paper" is GUMP's appendix on reinforcement learning, "ALF" the defaults of the
-/// framework that it used. Where neither says anything the choice is ours, and marked so.
+/// framework that it used. Where neither states a value the choice is ours, and marked as such.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacConfig {
@@ -18,61 +18,61 @@ pub struct SacConfig {
     pub batch: usize,
     /// Sizes of the hidden layers of actor and critics (ours: 256 twice).
     pub hidden: Vec<usize>,
-    /// What makes features of pictures for actor and critics (paper: ResNet-18); without it they
-    /// see the observation as it is.
+    /// Encoder of image observations for actor and critics (paper: ResNet-18); without one they
+    /// read the observation directly.
     pub encoder: Option<Architecture>,
-    /// Whether actor and critics have an encoder each, trained by their own loss, instead of one
-    /// that the critics' loss alone trains (ALF: one).
+    /// Whether actor and critics have separate encoders, each trained by its own loss, instead of
+    /// one trained by the critics' loss only (ALF: one).
     pub separate_encoders: bool,
-    /// Learning rate of everything at first (paper: 1e-4).
+    /// Initial learning rate (paper: 1e-4).
     pub learning_rate: f64,
     /// Learning rate after the drop (paper: 2e-5).
     pub final_learning_rate: f64,
     /// Share of the steps after which it drops, in 0..=1 (paper: 0.7).
     pub drop_at: f64,
-    /// What a reward one step later is worth (ALF: 0.99).
+    /// Discount per step (ALF: 0.99).
     pub discount: f64,
-    /// How far the target critics move towards the critics (ALF's examples: 0.005).
+    /// Rate of the target critics' updates (ALF's examples: 0.005).
     pub tau: f64,
-    /// Gradient steps between two such moves (ALF: 1).
+    /// Gradient steps between target updates (ALF: 1).
     pub target_period: usize,
     /// Steps of every environment between gradient steps (ours: 1; ALF: 8).
     pub unroll: usize,
-    /// Gradient steps in between (ALF: 1 in its examples).
+    /// Gradient steps that follow them (ALF: 1 in its examples).
     pub updates: usize,
     /// Environment steps by uniformly random actions before learning (ALF's examples: 1000 and up).
     pub initial_steps: usize,
-    /// Transitions to keep (ALF: 1024 per environment, of which the paper has 128).
+    /// Capacity of the replay buffer (ALF: 1024 per environment, of which the paper has 128).
     pub replay_capacity: usize,
-    /// Logarithm of the temperature at first (ALF: 0).
+    /// Logarithm of the initial temperature (ALF: 0).
     pub initial_log_alpha: f64,
     /// Whether the temperature is learned (ALF: yes).
     pub learn_alpha: bool,
-    /// Entropy that the temperature holds, nats per number of an action (ALF: a tenth of the
-    /// range, ln 2 + ln 0.1; Haarnoja et al.: -1).
+    /// Target entropy, nats per component of an action (ALF: a tenth of the range, ln 2 + ln 0.1;
+    /// Haarnoja et al.: -1).
     pub target_entropy: f64,
-    /// Whether entropy to come is part of a state's value (ALF: yes).
+    /// Whether future entropy is part of a state's value (ALF: yes).
     pub entropy_in_target: bool,
-    /// Whether actor and temperature also learn from what was seen next (ALF: yes, as it samples
-    /// pairs; without it the actor's part costs half).
+    /// Whether actor and temperature are also trained on the next observations (ALF: yes, as it
+    /// samples pairs; without it the actor's part costs half).
     pub actor_on_next: bool,
     /// Beyond this error the critics' loss is linear (ALF: never).
     pub huber: Option<f64>,
-    /// Longest gradient of each network (ALF: any).
+    /// Maximum gradient norm of each network (ALF: any).
     pub clip: Option<f64>,
     /// Bounds of the logarithm of the policy's standard deviation (ALF: -20 and 2).
     pub log_std_bounds: [f64; 2],
-    /// Factor of the actor's last weights at first (ALF: 0.3).
+    /// Factor of the actor's initial weights in the last layer (ALF: 0.3).
     pub head_gain: f32,
-    /// Share of a batch that experts drove (paper: 0.2).
+    /// Share of expert transitions in a batch (paper: 0.2).
     pub imitation_share: f64,
     /// Weight of the imitation loss in the actor's (ours: 1).
     pub imitation_weight: f64,
-    /// Whether observations of numbers are brought to mean 0 and variance 1, by those that are
-    /// known when learning begins (ours: yes, as they are in metres). Pictures stay as they are.
+    /// Whether vector observations are scaled to mean 0 and variance 1, by the transitions known
+    /// when learning begins (ours: yes, as they are in metres). Images are not changed.
     pub normalize: bool,
-    /// Gradient steps between checkpoints. All episodes start afresh at each, so that a run that
-    /// is resumed there goes on like one that never stopped (ours: 1000).
+    /// Gradient steps between checkpoints. All episodes start anew at each, so that a resumed run
+    /// equals an uninterrupted one (ours: 1000).
     pub segment: usize,
 }
 
@@ -113,7 +113,7 @@ impl Default for SacConfig {
 }
 
 impl SacConfig {
-    /// Refuses numbers that no run can be made with.
+    /// Checks that a run can use these values.
     ///
     /// # Errors
     /// [`RlError::Parameter`] with the first of them.
@@ -206,7 +206,7 @@ impl SacConfig {
         Ok(())
     }
 
-    /// Refuses observations that the networks cannot take in.
+    /// Checks that the networks can read these observations.
     ///
     /// # Errors
     /// [`RlError::NoPicture`].
@@ -226,7 +226,7 @@ impl SacConfig {
         }
     }
 
-    /// How many of a batch's transitions experts drove.
+    /// Number of expert transitions in a batch.
     pub fn n_imitated(&self) -> usize {
         (self.batch as f64 * self.imitation_share).round() as usize
     }

@@ -1,10 +1,10 @@
-//! A critic, its slowly following copy, and what they learn towards.
+//! A critic, its target copy, and their training targets.
 
 use gump_scene::Seed;
 
 use crate::networks::{Adam, Mlp, Pass, clip};
 
-/// What an action in a state is worth.
+/// The estimated value of an action in a state.
 #[derive(Clone, Debug)]
 pub struct Critic {
     observation_len: usize,
@@ -17,8 +17,8 @@ pub struct Critic {
     judged: Pass,
 }
 
-/// What a transition says its start is worth: the reward, and unless it ended for good what may
-/// still come. Being cut off is no end.
+/// The target of a transition: the reward, and unless it terminated the discounted value of what
+/// follows. Truncation is not termination.
 pub fn soft_target(reward: f64, terminated: bool, discount: f64, soft_value: f64) -> f64 {
     if terminated {
         reward
@@ -27,7 +27,7 @@ pub fn soft_target(reward: f64, terminated: bool, discount: f64, soft_value: f64
     }
 }
 
-/// Loss of an error and its derivative: squared, beyond `huber` linear.
+/// Loss of an error and its derivative: squared, and linear beyond `huber`.
 pub fn critic_loss(error: f64, huber: Option<f64>) -> (f64, f64) {
     match huber {
         Some(limit) if error.abs() > limit => (
@@ -39,7 +39,7 @@ pub fn critic_loss(error: f64, huber: Option<f64>) -> (f64, f64) {
 }
 
 impl Critic {
-    /// A critic that knows nothing, over rows of an observation and an action.
+    /// An untrained critic over rows of an observation and an action.
     pub(crate) fn new(
         hidden: &[usize],
         observation_len: usize,
@@ -62,7 +62,7 @@ impl Critic {
         }
     }
 
-    /// What rows of a normalized observation and an action are worth.
+    /// Values of rows of a normalized observation and an action.
     ///
     /// Shape: `[rows, observation_len]` and `[rows, action_len]` to `[rows]`.
     ///

@@ -1,8 +1,8 @@
 //! One gradient step of soft actor-critic, and of imitation, which is its last term alone.
 //!
 //! Source: Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications", with ALF's
-//! conventions: critic losses are added and not halved, all gradients are taken before anything
-//! moves. Gradients are written out; tests hold them against finite differences.
+//! conventions: critic losses are added and not halved, and all gradients are computed before any
+//! parameter changes. Gradients are hand-written; tests compare them with finite differences.
 
 use gump_scene::Seed;
 
@@ -13,7 +13,7 @@ use crate::ObservationForm;
 use crate::actor::Actor;
 use crate::networks::{Adam, Pass, clip, standard_normal};
 
-/// Everything that learns.
+/// Actor, critics and temperature with their optimizers.
 #[derive(Clone, Debug)]
 pub struct Learner {
     pub(crate) config: SacConfig,
@@ -38,20 +38,20 @@ struct Work {
     next_gradient: Vec<f32>,
 }
 
-/// What a gradient step came to; losses are those before the step.
+/// Statistics of a gradient step; losses are those before the step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateReport {
     /// Squared errors of the two critics, mean over the batch, added.
     pub critic_loss: f64,
-    /// `alpha * log density - value`, mean over what the learner drove.
+    /// `alpha * log density - value`, mean over the learner's own transitions.
     pub actor_loss: f64,
-    /// Negative log density of the experts' actions, nats, mean over what they drove.
+    /// Negative log density of the experts' actions, nats, mean over their transitions.
     pub imitation_loss: f64,
     /// Minus the log density of drawn actions, nats, mean.
     pub entropy: f64,
     /// The temperature.
     pub alpha: f64,
-    /// Mean value of what was done, by the first critic.
+    /// Mean value of the batch's actions, by the first critic.
     pub value: f64,
     /// Learning rate of the step.
     pub learning_rate: f64,
@@ -70,7 +70,7 @@ struct Draws {
 }
 
 impl Learner {
-    /// A learner that knows nothing.
+    /// An untrained learner.
     ///
     /// # Panics
     /// For a configuration without hidden layers or with empty ones, and for an encoder over
@@ -97,22 +97,22 @@ impl Learner {
         }
     }
 
-    /// The policy so far.
+    /// The policy.
     pub fn actor(&self) -> &Actor {
         &self.actor
     }
 
-    /// The policy so far, to change.
+    /// The policy, mutably.
     pub fn actor_mut(&mut self) -> &mut Actor {
         &mut self.actor
     }
 
-    /// The critics so far.
+    /// The critics.
     pub fn critics(&self) -> &[Critic; 2] {
         &self.critics
     }
 
-    /// The temperature so far.
+    /// The temperature.
     pub fn alpha(&self) -> f64 {
         f64::from(self.log_alpha).exp()
     }
@@ -122,8 +122,8 @@ impl Learner {
         self.steps
     }
 
-    /// One gradient step of actor, critics and temperature; imitated rows pull the actor towards
-    /// their actions and the critics towards their values.
+    /// One gradient step of actor, critics and temperature; expert transitions train the actor by
+    /// imitation as well as the critics.
     ///
     /// The noise of all draws comes from `seed`.
     ///
@@ -224,8 +224,8 @@ impl Learner {
         report
     }
 
-    /// One gradient step towards the experts' actions, of the actor alone; every row counts as
-    /// imitated.
+    /// One gradient step towards the experts' actions, of the actor only; every row counts as an
+    /// expert's.
     ///
     /// # Panics
     /// If the batch is empty or its rows have other lengths than the network.

@@ -1,7 +1,7 @@
-//! Soft actor-critic: a policy that earns much and stays as random as it can afford.
+//! Soft actor-critic: maximizes reward and policy entropy.
 //!
-//! Start with [`Training`], which collects and learns; [`Learner`] is one gradient step,
-//! [`SacConfig`] every number of it, [`Squashed`] the distribution of an action.
+//! Start with [`Training`], which collects transitions and learns; [`Learner`] is one gradient
+//! step, [`SacConfig`] the hyperparameters, [`Squashed`] the distribution of an action.
 
 mod archive;
 mod batch;

@@ -1,4 +1,4 @@
-//! What happened lately, to learn from again.
+//! The replay buffer.
 
 use std::borrow::Cow;
 
@@ -11,22 +11,22 @@ use crate::{ObservationForm, RlError, expand};
 /// One step of one episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Transition<'a> {
-    /// What was seen.
+    /// The observation.
     pub observation: Cow<'a, [f32]>,
-    /// What was done, in [-1, 1].
+    /// The action, in [-1, 1].
     pub action: &'a [f32],
-    /// What it earned.
+    /// The reward.
     pub reward: f32,
-    /// What was seen next, in the same episode also where that ended.
+    /// The next observation, in the same episode also where that ended.
     pub next: Cow<'a, [f32]>,
-    /// Whether it ended for good, so that no value comes after; being cut off is no such end.
+    /// Whether the episode terminated; truncation does not count.
     pub terminated: bool,
 }
 
-/// Keeps the latest transitions, the oldest giving way, and draws from them at random.
+/// Keeps the latest transitions, replacing the oldest, and samples them at random.
 ///
-/// Flat arrays that grow up to the capacity: two observations, an action and five bytes each.
-/// Observations of bits take a bit per pixel: 4 kB for eight layers of 64 x 64.
+/// Flat arrays that grow up to the capacity: two observations, an action and five bytes each. Image
+/// observations take a bit per pixel: 4 kB for eight layers of 64 x 64.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReplayBuffer {
     pub(crate) form: ObservationForm,
@@ -123,8 +123,8 @@ impl ReplayBuffer {
         })
     }
 
-    /// Adds a transition, replacing the oldest if the buffer is full. Of bits, what is not positive
-    /// is kept as 0 and the rest as 1.
+    /// Adds a transition, replacing the oldest if the buffer is full. In image observations,
+    /// positive numbers are stored as 1 and others as 0.
     ///
     /// # Panics
     /// If observations or action have another length than the buffer's.
@@ -156,7 +156,7 @@ impl ReplayBuffer {
     /// Draws the indices of `n` transitions, each uniformly and with replacement.
     ///
     /// # Errors
-    /// [`RlError::EmptyBuffer`] if there is nothing to draw from.
+    /// [`RlError::EmptyBuffer`] if the buffer is empty.
     pub fn sample(&self, n: usize, rng: &mut Rng) -> Result<Vec<usize>, RlError> {
         if self.is_empty() {
             return Err(RlError::EmptyBuffer { asked: n });
@@ -179,14 +179,13 @@ impl ReplayBuffer {
         }
     }
 
-    /// The transitions held, oldest first.
+    /// The transitions, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = Transition<'_>> {
         let newest_last = (self.head..self.len()).chain(0..self.head);
         newest_last.map(|index| self.get(index))
     }
 
-    /// All observations held, in no promised order; none if they are kept as bits. Shape:
-    /// `[len, observation_len]`.
+    /// All observations, in no guaranteed order; none for images. Shape: `[len, observation_len]`.
     pub fn numbers(&self) -> &[f32] {
         match &self.observations {
             Store::Numbers(numbers) => numbers,
@@ -194,22 +193,22 @@ impl ReplayBuffer {
         }
     }
 
-    /// What observations look like.
+    /// The form of observations.
     pub fn form(&self) -> ObservationForm {
         self.form
     }
 
-    /// Number of transitions held.
+    /// Number of transitions.
     pub fn len(&self) -> usize {
         self.rewards.len()
     }
 
-    /// True if nothing is held.
+    /// True if the buffer is empty.
     pub fn is_empty(&self) -> bool {
         self.rewards.is_empty()
     }
 
-    /// Most transitions it can hold.
+    /// Capacity.
     pub fn capacity(&self) -> usize {
         self.capacity
     }

@@ -1,14 +1,15 @@
-//! A normal number squashed into (-1, 1) by tanh: one dimension of a policy.
+//! A normal distribution squashed into (-1, 1) by tanh: one component of a policy.
 //!
-//! Densities are of the action, so they contain the stretch of tanh. Source: Haarnoja et al. 2018,
-//! appendix C; `ln(1 - tanh(u)^2) = 2 (ln 2 - u - softplus(-2u))` keeps its digits for large `u`.
+//! Densities are those of the action, so they include the Jacobian of tanh. Source: Haarnoja et al.
+//! 2018, appendix C; `ln(1 - tanh(u)^2) = 2 (ln 2 - u - softplus(-2u))` keeps its precision for
+//! large `u`.
 
 use std::f64::consts::{LN_2, PI};
 
 /// Farthest from 0 that an action may be before it is taken back through tanh.
 const EDGE: f64 = 1.0 - 1e-6;
 
-/// The distribution of one number of an action.
+/// The distribution of one component of an action.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Squashed {
     mean: f64,
@@ -17,21 +18,21 @@ pub struct Squashed {
     std_moves: f64,
 }
 
-/// A drawn number, its density, and how both move with what the network gave.
+/// A sample, its density, and their derivatives by the network's outputs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Draw {
     /// In (-1, 1).
     pub action: f64,
     /// Of the action, nats.
     pub log_density: f64,
-    /// d action / d (mean, raw log standard deviation), the noise held.
+    /// d action / d (mean, raw log standard deviation), with fixed noise.
     pub action_by: [f64; 2],
-    /// d log density / d (mean, raw log standard deviation), the noise held.
+    /// d log density / d (mean, raw log standard deviation), with fixed noise.
     pub log_density_by: [f64; 2],
 }
 
 impl Squashed {
-    /// From a network's two numbers; the second is clamped to `bounds`.
+    /// From two outputs of a network; the second is clamped to `bounds`.
     pub fn new(mean: f32, log_std: f32, bounds: [f64; 2]) -> Self {
         let raw = f64::from(log_std);
         let clamped = raw.clamp(bounds[0], bounds[1]);
@@ -42,12 +43,12 @@ impl Squashed {
         }
     }
 
-    /// What to do when not exploring.
+    /// The action without exploration: tanh of the mean.
     pub fn mode(&self) -> f64 {
         self.mean.tanh()
     }
 
-    /// The action that standard normal `noise` leads to.
+    /// The action of standard normal `noise`.
     pub fn draw(&self, noise: f64) -> Draw {
         let spread = self.log_std.exp() * noise;
         let u = self.mean + spread;

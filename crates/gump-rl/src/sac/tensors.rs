@@ -1,4 +1,4 @@
-//! Named tensors and a JSON header in one file: what an archive is written to and read from.
+//! Named tensors and a JSON header in one file: the format of archives.
 
 use std::collections::{BTreeMap, HashMap};
 

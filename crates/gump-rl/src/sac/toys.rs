@@ -1,4 +1,4 @@
-//! Small problems whose best answers are known.
+//! Small problems with known optimal answers.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 

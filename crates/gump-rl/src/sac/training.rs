@@ -1,4 +1,5 @@
-//! Collecting and learning in turns, in segments that a run can be resumed between.
+//! Training runs: collecting and learning alternate, in segments between which a run can be
+//! resumed.
 
 use std::ops::ControlFlow;
 
@@ -12,21 +13,21 @@ use crate::actor::Perception;
 use crate::networks::Normalizer;
 use crate::{Actor, ObservationForm, RlError, VectorEnv};
 
-/// What is learned from.
+/// The training signal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithm {
     /// Rewards, with a share of expert transitions.
     Sac,
-    /// Expert transitions alone; no environment is needed.
+    /// Expert transitions only; no environment is needed.
     Imitation,
 }
 
-/// A run: the learner, what it remembers, and how far it is.
+/// A run: the learner, its replay buffer and its progress.
 ///
-/// Nothing random is kept between gradient steps, everything is drawn from forks of one seed; and
-/// all episodes start afresh at the beginning of a segment. So the state between two segments is
-/// complete, and [`Training::to_bytes`] holds all of it.
+/// No random state is kept between gradient steps: everything is drawn from forks of one seed, and
+/// all episodes start anew at the beginning of a segment. The state between two segments is
+/// therefore complete, and [`Training::to_bytes`] contains all of it.
 #[derive(Clone, Debug)]
 pub struct Training {
     pub(super) algorithm: Algorithm,
@@ -48,14 +49,14 @@ pub struct Episode {
     pub total: f64,
     /// Its steps.
     pub steps: usize,
-    /// Whether it ended for good, not by being cut off.
+    /// Whether it terminated, rather than being truncated.
     pub terminated: bool,
 }
 
-/// What one gradient step came to.
+/// Progress and statistics of one gradient step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StepReport {
-    /// Gradient steps done, this one included.
+    /// Gradient steps done, including this one.
     pub step: usize,
     /// Steps of environments done.
     pub env_steps: u64,
@@ -65,7 +66,7 @@ pub struct StepReport {
     pub episodes: Vec<Episode>,
 }
 
-/// What a seed is forked for.
+/// The purposes that a seed is forked for.
 #[derive(Clone, Copy)]
 enum Purpose {
     Networks,
@@ -76,7 +77,7 @@ enum Purpose {
 }
 
 impl Training {
-    /// A run that is to begin; `expert` holds what experts did, perhaps nothing.
+    /// A new run; `expert` contains expert transitions, possibly none.
     ///
     /// # Errors
     /// [`RlError::Parameter`] for a configuration out of range; [`RlError::NoPicture`] for an
@@ -113,7 +114,7 @@ impl Training {
         Ok(training)
     }
 
-    /// A run put together from its stored parts.
+    /// A run from its stored parts.
     pub(super) fn restored(
         (algorithm, seed): (Algorithm, Seed),
         learner: Learner,
@@ -133,12 +134,12 @@ impl Training {
         }
     }
 
-    /// The policy so far.
+    /// The policy.
     pub fn actor(&self) -> &Actor {
         self.learner.actor()
     }
 
-    /// What learns.
+    /// The learner.
     pub fn learner(&self) -> &Learner {
         &self.learner
     }
@@ -148,12 +149,12 @@ impl Training {
         &self.learner.config
     }
 
-    /// What is learned from.
+    /// The training signal.
     pub fn algorithm(&self) -> Algorithm {
         self.algorithm
     }
 
-    /// Where all randomness comes from.
+    /// The seed of all randomness.
     pub fn seed(&self) -> Seed {
         self.seed
     }
@@ -168,7 +169,7 @@ impl Training {
         self.env_steps
     }
 
-    /// Steps that experts drove.
+    /// Number of expert transitions.
     pub fn n_demonstrated(&self) -> usize {
         self.expert.len()
     }
@@ -178,12 +179,12 @@ impl Training {
         self.steps() >= self.config().steps
     }
 
-    /// Goes on to the end of the segment, or until `observe` breaks: that leaves a run which can
-    /// be gone on with, but not one which is as if it had never stopped.
+    /// Continues to the end of the segment, or until `observe` breaks. A run that was broken off
+    /// can be continued, but then differs from an uninterrupted one.
     ///
     /// # Errors
-    /// What the environment reports; [`RlError::Shape`] for one of other observations or actions
-    /// than the run was begun with; [`RlError::Diverged`] once a number is not finite.
+    /// Errors of the environment; [`RlError::Shape`] for one with other observations or actions
+    /// than the run was started with; [`RlError::Diverged`] once a number is not finite.
     pub fn segment(
         &mut self,
         env: &mut dyn VectorEnv,
@@ -217,7 +218,7 @@ impl Training {
         Ok(())
     }
 
-    /// As [`Training::segment`], from the experts alone.
+    /// As [`Training::segment`], from expert transitions only.
     ///
     /// # Errors
     /// [`RlError::Diverged`] once a number is not finite.
@@ -305,7 +306,7 @@ impl Training {
         })
     }
 
-    /// Fixes the scale of observations by all that is known.
+    /// Fixes the normalization of observations from all known ones.
     fn fit_normalizer(&mut self) {
         if let (true, ObservationForm::Numbers(len)) = (self.config().normalize, self.replay.form())
         {

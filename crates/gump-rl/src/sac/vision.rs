@@ -1,8 +1,8 @@
-//! What a learner on pictures has besides: encoders, and which loss trains which.
+//! Learners on images: encoders, and the losses that train them.
 //!
-//! The actor's encoder is part of the policy. By default the critics see with it too and their loss
-//! alone trains it; with separate encoders each side trains its own. The target critics see with a
-//! slow copy of what the critics see with.
+//! The actor's encoder is part of the policy. By default the critics use it as well, and only their
+//! loss trains it; with separate encoders each side trains its own. The target critics use a slowly
+//! updated copy of the critics' encoder.
 
 use std::borrow::Cow;
 

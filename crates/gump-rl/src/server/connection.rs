@@ -1,4 +1,4 @@
-//! One client: greeting, then request by request.
+//! One client: handshake, then request by request.
 
 use std::io::{BufReader, Read, Write};
 use std::sync::Arc;
@@ -10,14 +10,14 @@ use crate::{
     RasterView, Rules, Traffic, VectorEnv, VectorView,
 };
 
-/// The version of the protocol spoken here.
+/// The protocol version.
 const VERSION: u16 = 1;
-/// Bytes of a greeting.
+/// Bytes of a handshake.
 const HELLO_LEN: usize = 13;
-/// More rows than anybody can use, fewer than fill the memory.
+/// A limit on rows, far above practical use and small enough not to exhaust the memory.
 const MAX_ROWS: u32 = 4096;
 
-/// A conversation with one client.
+/// The connection to one client.
 #[derive(Debug)]
 pub struct Connection<'a, S> {
     stream: BufReader<S>,
@@ -26,7 +26,7 @@ pub struct Connection<'a, S> {
     config: EnvConfig,
 }
 
-/// How a conversation ended.
+/// How a connection ended.
 #[derive(Debug)]
 pub struct Farewell {
     /// Episodes that ended while it lasted.
@@ -53,7 +53,7 @@ impl<'a, S: Read + Write> Connection<'a, S> {
         }
     }
 
-    /// Talks until the client leaves or makes no sense.
+    /// Handles requests until the client leaves or sends an invalid one.
     pub fn serve(mut self) -> Farewell {
         let mut farewell = Farewell {
             episodes_finished: 0,
@@ -94,7 +94,7 @@ impl<'a, S: Read + Write> Connection<'a, S> {
         farewell
     }
 
-    /// Tells the client what went wrong; false if it does not listen any more.
+    /// Sends an error to the client; false if the client is gone.
     fn answer_error(&mut self, error: &ServerError) -> bool {
         let Some(code) = error.code() else {
             return false;
@@ -148,7 +148,7 @@ impl<'a, S: Read + Write> Connection<'a, S> {
         Ok(env)
     }
 
-    /// Reads a request and does it; the answer, or `None` for a goodbye.
+    /// Reads and executes a request; the answer, or `None` for a goodbye.
     fn request(&mut self, env: &mut DrivingEnv<'_>) -> Result<Option<(u8, Vec<u8>)>, ServerError> {
         let (kind, len) = frame::read_header(&mut self.stream)?;
         match kind {
@@ -220,7 +220,7 @@ fn autoreset(found: u8) -> Result<Autoreset, ServerError> {
     }
 }
 
-/// The server's own view if it is of the kind asked for, else the default one of that kind.
+/// The server's own observation form if it is of the requested kind, else the default of that kind.
 fn observation(found: u8, own: ObservationSpec) -> Result<ObservationSpec, ServerError> {
     match (found, own) {
         (0, ObservationSpec::Vector(_)) | (1, ObservationSpec::Raster(_)) => Ok(own),
@@ -230,7 +230,7 @@ fn observation(found: u8, own: ObservationSpec) -> Result<ObservationSpec, Serve
     }
 }
 
-/// The server's own dynamics if they are of the kind asked for, else the default ones.
+/// The server's own dynamics if they are of the requested kind, else the default ones.
 fn dynamics(found: u8, own: Dynamics) -> Result<Dynamics, ServerError> {
     match (found, own) {
         (0, Dynamics::Bicycle(_)) | (1, Dynamics::NextPose(_)) | (2, Dynamics::Trajectory(_)) => {

@@ -1,4 +1,4 @@
-//! What can go wrong between a server and its clients.
+//! Errors of servers and connections.
 
 use std::io;
 use std::path::PathBuf;
@@ -11,55 +11,55 @@ pub enum ServerError {
     /// Another server listens there.
     #[error("a server listens already at {}", .0.display())]
     InUse(PathBuf),
-    /// The socket cannot be listened at.
+    /// The socket cannot be listened on.
     #[error("cannot listen: {source}: {}", path.display())]
     Listen {
-        /// What the system says.
+        /// The error of the system.
         source: io::Error,
         /// The socket.
         path: PathBuf,
     },
-    /// The client hung up without a goodbye.
+    /// The client closed the connection without a goodbye.
     #[error("the client hung up {during}")]
     Disconnected {
-        /// What it was about to say.
+        /// What was expected next.
         during: &'static str,
     },
-    /// The connection broke.
+    /// The connection failed.
     #[error("the connection broke: {0}")]
     Broken(io::Error),
-    /// The client speaks another language.
+    /// The client uses another protocol or version.
     #[error("a connection begins with the letters GUMP and version {version}")]
     Greeting {
-        /// The version spoken here.
+        /// The version of this server.
         version: u16,
     },
-    /// A request of no known kind, or out of turn.
+    /// A request of an unknown kind, or out of turn.
     #[error("expected a {expected}, found a frame of kind {found}")]
     Kind {
-        /// What may come now.
+        /// The requests allowed now.
         expected: &'static str,
-        /// What came.
+        /// The kind received.
         found: u8,
     },
-    /// A body of another length than its kind has.
+    /// A body of the wrong length.
     #[error("a {what} has {expected} bytes, found {found}")]
     Length {
         /// The request.
         what: &'static str,
-        /// What it needs.
+        /// The required length.
         expected: usize,
-        /// What the frame says.
+        /// The length in the frame.
         found: usize,
     },
-    /// A byte that stands for nothing.
+    /// An invalid byte.
     #[error("the {what} is {found}, expected at most {most}")]
     Choice {
-        /// What was to be chosen.
+        /// What it selects.
         what: &'static str,
-        /// The largest number that stands for something.
+        /// The largest valid value.
         most: u32,
-        /// What came.
+        /// The value received.
         found: u32,
     },
     /// The environment refuses or has failed.
@@ -68,7 +68,7 @@ pub enum ServerError {
 }
 
 impl ServerError {
-    /// The code of the protocol's error frame; `None` where nobody listens any more.
+    /// The code of the protocol's error frame; `None` where the client is gone.
     pub(super) fn code(&self) -> Option<u8> {
         match self {
             Self::InUse(_) | Self::Listen { .. } | Self::Disconnected { .. } | Self::Broken(_) => {

@@ -1,9 +1,9 @@
 //! Environments for other processes, over a Unix socket.
 //!
-//! [`Server::bind`], then [`Server::run`]. Every client that connects gets an environment of its
-//! own; courses and world are shared. What a client does wrong is answered, at worst it is let go:
-//! the server and the other clients live on. `python/gump_env.py` is a client, and
-//! `python/gump_sb3.py` brings it to Stable-Baselines3.
+//! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; courses and world
+//! are shared. Invalid requests are answered with an error and at worst close that connection; the
+//! server and other clients are not affected. `python/gump_env.py` is a client, and
+//! `python/gump_sb3.py` adapts it to Stable-Baselines3.
 //!
 //! # Protocol, version 1
 //! Client and server take turns: one request, one answer. A frame is
@@ -50,7 +50,7 @@ use crate::{Course, EnvConfig, Traffic};
 pub use connection::{Connection, Farewell};
 pub use error::ServerError;
 
-/// What happened between the server and a client.
+/// An event between the server and a client.
 #[derive(Debug)]
 pub enum Event {
     /// A client has connected.
@@ -58,28 +58,28 @@ pub enum Event {
         /// Its number, from 0.
         client: usize,
     },
-    /// A client is gone.
+    /// A client has disconnected.
     Left {
         /// Its number.
         client: usize,
-        /// How far it had come: no episode is lost silently.
+        /// Its progress, including unfinished episodes.
         farewell: Farewell,
     },
 }
 
-/// Lends environments to whoever connects.
+/// Provides environments to clients.
 #[derive(Debug)]
 pub struct Server {
     listener: UnixListener,
     path: PathBuf,
     stopped: AtomicBool,
     n_clients: AtomicUsize,
-    /// The clients that are there, to hang up on when it stops.
+    /// The connected clients, which are disconnected when it stops.
     clients: Mutex<Vec<(usize, UnixStream)>>,
 }
 
 impl Server {
-    /// Listens at `path`. A socket that a server left behind which is no more is replaced.
+    /// Listens at `path`. A stale socket of a server that has ended is replaced.
     ///
     /// # Errors
     /// [`ServerError::InUse`] where a server listens already, [`ServerError::Listen`].
@@ -107,13 +107,13 @@ impl Server {
         })
     }
 
-    /// Where it listens.
+    /// The path of the socket.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Serves until [`Server::stop`]. Clients choose the number of rows, the autoreset mode, what is
-    /// seen and the kind of dynamics; all else is as `config` says.
+    /// Serves until [`Server::stop`]. Clients choose the number of rows, the autoreset mode, the
+    /// observations and the kind of dynamics; everything else is as in `config`.
     ///
     /// # Errors
     /// [`ServerError::Listen`] if no client can be accepted any more.
@@ -156,7 +156,7 @@ impl Server {
         })
     }
 
-    /// Hangs up on all clients and lets [`Server::run`] return.
+    /// Disconnects all clients and lets [`Server::run`] return.
     pub fn stop(&self) {
         self.stopped.store(true, Ordering::SeqCst);
         // Wakes it up; if that fails, nobody listens any more.

@@ -1,8 +1,8 @@
-//! One future that goes on by hand, half a second at a time.
+//! One future that is advanced manually, half a second at a time.
 //!
-//! A [`Session`] learns where the ego will be before the others move. Whoever
-//! drives it himself does not know that yet: here the others decide first, on the assumption that
-//! the ego goes on as given, are shown on their way, and what the ego really did is told afterwards.
+//! A [`Session`] is given the ego's next state before the other agents move. An interactive driver
+//! does not know that state yet: here the other agents decide first, on the assumption of a given
+//! ego state, and their motion can be displayed; the actual ego state is set afterwards.
 
 use std::ops::Range;
 
@@ -18,14 +18,14 @@ use crate::predictive_samples::PredictiveSamples;
 #[cfg(doc)]
 use gump_rollout::Session;
 
-/// A future of a [`RelativeWorld`] that can be held, copied and led on in several ways.
+/// A future of a [`RelativeWorld`] that can be stored, cloned and continued in several ways.
 ///
-/// It belongs to the world that began it, and every call takes that world. Led on by the states
-/// that were assumed, it is future 0 of a session with the same seed, to the bit.
+/// It belongs to the world that started it, and every call takes that world. If the ego follows the
+/// assumed states, it equals future 0 of a session with the same seed, bit for bit.
 #[derive(Clone, Debug)]
 pub struct LiveFuture {
     future: Future,
-    /// What everyone decided to do next, each in its own frame.
+    /// The decided moves of all agents, each in its own frame.
     moves: Vec<Pose>,
 }
 
@@ -33,7 +33,7 @@ impl LiveFuture {
     /// Seconds between its frames.
     pub const DT: f64 = TOKEN_DT;
 
-    /// Begins with what a scene has seen.
+    /// Starts from the visible part of a scene.
     ///
     /// # Errors
     /// A time step that does not divide half a second.
@@ -54,10 +54,10 @@ impl LiveFuture {
         })
     }
 
-    /// Lets everyone decide on the next half second and tells where they will be.
+    /// Decides the next half second of all agents and returns their next states.
     ///
-    /// `ego` is where the ego is assumed to be then; others keep clear of it. Without it the
-    /// network decides for the ego, too.
+    /// `ego` is the assumed next state of the ego, which others avoid. Without it the network
+    /// decides for the ego as well.
     pub fn decide(&mut self, world: &RelativeWorld, ego: Option<AgentState>) -> Frame {
         let mut room = Workspace::default();
         let future = &self.future;
@@ -80,9 +80,9 @@ impl LiveFuture {
         Frame::new(agents.chain(others).collect(), future.lights.clone())
     }
 
-    /// Goes on to what was decided; an ego that is given is where it really came to be.
+    /// Advances to the decided states; an ego that is given gets this actual state.
     ///
-    /// Without a decision before it nobody moves.
+    /// Without a preceding decision no agent moves.
     pub fn go_on(&mut self, world: &RelativeWorld, ego: Option<AgentState>) -> Frame {
         let mut room = Workspace::default();
         let mut moves = std::mem::take(&mut self.moves);
@@ -93,13 +93,13 @@ impl LiveFuture {
         self.future.frame()
     }
 
-    /// Shows these lights once it has gone on. What has changed changes then.
+    /// Sets the lights of the next frame. Colours that differ count as changed at that time.
     pub fn show(&mut self, lights: &[Light]) {
         self.future.show(lights);
     }
 
-    /// What everyone but `driven` might do in the next half second, whatever was decided: these of
-    /// any number of draws for each. It changes nothing.
+    /// Predictive samples of the next half second of all agents except `driven`, independent of the
+    /// decision: this number of draws for each. The future does not change.
     pub fn outlooks(
         &self,
         world: &RelativeWorld,
@@ -111,7 +111,7 @@ impl LiveFuture {
             .outlooks(&world.engine, &world.sampling, (draws, 0, step), driven)
     }
 
-    /// The same present with other randomness ahead.
+    /// The same present with another seed for what follows.
     #[must_use]
     pub fn fork(&self, seed: Seed) -> Self {
         let mut fork = self.clone();
