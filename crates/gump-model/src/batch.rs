@@ -1,4 +1,4 @@
-//! Token sequences as tensors: here padding is born, and nowhere else.
+//! Token sequences as tensors; the only place where sequences are padded.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::local_context::{LocalContext, Survey, encode_local_context, n_numbers
 use crate::mct::{PLACES, TokenBatch};
 use crate::placed_slot::PlacedSlot;
 
-/// How tokens become the rows of a batch, for one network.
+/// Converts tokens into the rows of a batch, for one network.
 #[derive(Debug)]
 pub struct Packer {
     tables: Tables,
@@ -42,7 +42,8 @@ impl Packer {
     }
 
     /// Packs sequences side by side, without their first `from` slots; shorter ones are padded at
-    /// the end, where causality hides it. As many sequences in a row share each of the `surveys`.
+    /// the end, where causality hides the padding. The same number of consecutive sequences shares
+    /// each of the `surveys`.
     pub(crate) fn pack(
         &self,
         sequences: &[&[PlacedSlot]],
@@ -120,7 +121,7 @@ impl Packer {
         self.tables.rows(placed)
     }
 
-    /// Which sine features a token has.
+    /// The key of a token's sine features.
     pub fn sine_key(&self, placed: &PlacedSlot) -> Option<SineKey> {
         self.sines.key(placed)
     }
@@ -130,7 +131,7 @@ impl Packer {
         self.sines.append(placed, out)
     }
 
-    /// The visual tokens at the places that a token's object looks at, if it looks.
+    /// The visual tokens at the positions that a token's object looks at, if it does.
     pub fn cells(&self, placed: &PlacedSlot) -> Option<[u32; PLACES.len()]> {
         let last = placed.last.filter(|_| self.local_map)?;
         let (from, velocity) = match placed.exact {

@@ -1,7 +1,7 @@
 //! Networks and runs on disk: safetensors with the configuration in the header.
 //!
-//! A file holds everything needed to load it and is written beside its final name, then renamed, so
-//! that a crash leaves the previous one intact.
+//! A file contains everything needed to load it. It is written under a temporary name and then
+//! renamed, so that a crash leaves the previous file intact.
 
 #[cfg(test)]
 mod tests;
@@ -28,7 +28,7 @@ pub use crate::prefixes::{DRIVER, OPTIMIZER, TRAINED};
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";
 
-/// The matrix that reads what objects see around themselves, marks last.
+/// The matrix that reads local contexts, marks last.
 const SURROUNDINGS_IN: &str = "mct.surroundings.in.weight";
 
 /// How numbers are stored.
@@ -69,8 +69,8 @@ pub fn save(network: &Network, path: &Path, precision: Precision) -> Result<(), 
 /// Reads a network.
 ///
 /// # Errors
-/// A file that cannot be read, is no checkpoint, has another vocabulary, or whose tensors do not
-/// match its configuration; the sentence names the file.
+/// A file that cannot be read, is not a checkpoint, has another vocabulary, or whose tensors do not
+/// match its configuration; the message names the file.
 pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
     let archive = read(path)?;
     let config = archive.config()?;
@@ -88,11 +88,11 @@ pub fn load(path: &Path, device: &Device) -> Result<Network, ModelError> {
     })
 }
 
-/// Reads a network to train on as one of the configuration `wanted`; `None` if the file holds another
-/// model.
+/// Reads a network for further training with the configuration `wanted`; `None` if the file
+/// contains another model.
 ///
-/// A file without `unknown_marks` grows them: what a mark adds starts at zero, so that the network
-/// computes what it did.
+/// A file without `unknown_marks` gets them: the weights of a mark start at zero, so that the
+/// network computes the same as before.
 ///
 /// # Errors
 /// Those of [`load`].
@@ -248,8 +248,8 @@ struct Header {
     tensors: BTreeMap<String, Entry>,
 }
 
-/// The same file with its header in order: the library writes entries as a hash map gives them, and
-/// equal weights are to be equal bytes.
+/// The same file with its header in order: the library writes entries in the order of a hash map,
+/// and equal weights should give equal bytes.
 fn with_sorted_header(encoded: &[u8]) -> serde_json::Result<Vec<u8>> {
     let length = encoded.as_chunks::<8>().0.first().copied();
     let length = u64::from_le_bytes(length.unwrap_or_default()) as usize;

@@ -1,14 +1,14 @@
-//! The shape of a network; a checkpoint holds one and needs nothing else to load.
+//! The shape of a network; a checkpoint contains one and needs nothing else to load.
 //!
-//! The file form is TOML with every key required to be known. Presets carry the published sizes
-//! and `tiny`, which trains on a laptop.
+//! The file format is TOML, in which unknown keys are errors. Presets have the published sizes and
+//! `tiny`, which trains on a laptop.
 
 use gump_raster::{Layer, RasterSpec};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
 
-/// An agent whose surrogate leaves this range gets no tokens any more (released code), metres.
+/// An agent whose surrogate leaves this range is not tokenized any more (released code), metres.
 pub const KEEP_RANGE_M: f64 = 96.0;
 
 /// The shape of a network.
@@ -21,7 +21,7 @@ pub struct ModelConfig {
     pub layers: usize,
     /// Attention heads; must divide the width.
     pub heads: usize,
-    /// Longest token sequence, and rows of the position table.
+    /// Maximum length of a token sequence, and rows of the position table.
     pub block_size: usize,
     /// Layers of the GRU that decodes an agent's state.
     pub gru_layers: usize,
@@ -30,31 +30,32 @@ pub struct ModelConfig {
     pub trajectory_heads: Vec<usize>,
     /// How gated cross-attention is gated.
     pub gate: Gate,
-    /// True lets the two tokens of an object share what they know: the value carries the key's id
-    /// and class, and the key carries the object's last value in the window (the paper: neither),
-    /// so that an object finds its own past without learning to search for it.
+    /// Whether the two tokens of an object share their content: the value also has the key's id and
+    /// class, and the key the object's last value in the window (the paper: neither), so that
+    /// attention does not have to learn to find an object's own past.
     pub pairs_share: bool,
-    /// True adds to every bin's row of the decoder's tables a learned map of the bin's sines (the
-    /// paper: free rows), so that what is learned of one bin holds for its neighbours.
+    /// Whether every bin's row of the decoder's tables has a learned map of the bin's sines added
+    /// (the paper: free rows), so that neighbouring bins share what is learned.
     pub smooth_bins: bool,
-    /// True lets an object's key see the visual features under the object, and one and two seconds
-    /// ahead of it, directly (the paper: through cross-attention alone); needs `pairs_share`.
+    /// Whether an object's key reads the visual features under the object, and one and two seconds
+    /// ahead of it, directly (the paper: through cross-attention only); needs `pairs_share`.
     pub local_map: bool,
-    /// True says an object's chunk in the frame of its last state, in finer bins (the paper: in the
-    /// frame of the scene), so that a way of driving is learned once for all places and directions.
+    /// Whether an object's chunk is expressed in the frame of its last state, in finer bins (the
+    /// paper: in the frame of the scene), so that motion is independent of position and direction.
     #[serde(default)]
     pub anchored: bool,
-    /// True shows every object the paths ahead, road edges and neighbours in its own frame, as
-    /// numbers at its key (the paper: the raster and the tokens alone).
+    /// Whether every object gets the paths ahead, road edges and neighbours in its own frame, as
+    /// numbers at its key (the paper: the raster and the tokens only).
     #[serde(default)]
     pub surroundings: bool,
-    /// True adds to the surroundings marks of what is not known: speed limits, stop signs, lights and
-    /// sizes that the source of a scene does not state. False shows stand-ins alone.
+    /// Whether the local context contains marks of unknown inputs: speed limits, stop signs, lights
+    /// and sizes that the source of a scene does not state. Without marks there are only default
+    /// values.
     #[serde(default)]
     pub unknown_marks: bool,
     /// Probability of dropping an activation in training.
     pub dropout: f64,
-    /// True builds the decoder that reconstructs the raster from the visual features.
+    /// Whether there is a decoder that reconstructs the raster from the visual features.
     pub reconstruction: bool,
     /// The visual branch.
     pub visual: VisualConfig,
@@ -72,7 +73,7 @@ pub enum Gate {
     Released,
 }
 
-/// The visual branch: what is drawn and what reads it.
+/// The visual branch: its raster and encoder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VisualConfig {
@@ -80,7 +81,7 @@ pub struct VisualConfig {
     pub encoder: Encoder,
     /// Side of the square raster, pixels.
     pub side_px: usize,
-    /// Ground covered by a pixel, metres.
+    /// Side of a pixel on the ground, metres.
     pub metres_per_px: f64,
     /// Raster layers by name, in channel order.
     pub layers: Vec<String>,
@@ -128,7 +129,7 @@ impl ModelConfig {
         }
     }
 
-    /// The size that trains on two CPU cores: 3.5 million parameters.
+    /// The size for training on two CPU cores: 3.5 million parameters.
     pub fn tiny() -> Self {
         Self {
             width: 128,
@@ -231,7 +232,7 @@ impl ModelConfig {
         self.raster_spec().map(|_| ())
     }
 
-    /// What the raster holds.
+    /// The layers of the raster.
     ///
     /// # Errors
     /// [`ModelError::Config`] naming a layer that does not exist.

@@ -1,7 +1,8 @@
-//! From the hidden vector at a key to the agent's state: a GRU, field by field.
+//! The state decoder: a GRU that turns the hidden vector at a key into the agent's state, field by
+//! field.
 //!
 //! The sequence is width, length, v_x, v_y, then four poses x, y, θ half a second apart, the first
-//! of which is the frame the key stands in. Each step sees the tokens before it.
+//! of which belongs to the key's frame. Each step sees the tokens before it.
 //!
 //! Shapes: `K` keys, `C` width, `N` bins of a field.
 
@@ -19,10 +20,10 @@ use crate::config::ModelConfig;
 /// Poses in a chunk: the frame itself and three more, half a second apart.
 pub const CHUNK: usize = 4;
 
-/// Steps that make the first state; poses of later moments follow.
+/// Steps that decode the first state; poses of later instants follow.
 pub const STATE_STEPS: usize = 7;
 
-/// What each step of the decoder yields.
+/// The field decoded in each step.
 pub const STEPS: [Field; 4 + 3 * CHUNK] = [
     Field::Width,
     Field::Length,
@@ -42,7 +43,7 @@ pub const STEPS: [Field; 4 + 3 * CHUNK] = [
     Field::Heading,
 ];
 
-/// What the decoder says of one object: a bin per step, to be read through the object's local frame.
+/// The decoded output for one object: a bin per step, in the object's local frame.
 pub type Bins = [u16; STEPS.len()];
 
 /// A stacked GRU with one slot embedding per step and one output matrix for all fields.
@@ -52,12 +53,12 @@ pub struct StateDecoder {
     slots: Tensor,
     head: Linear,
     smooth: Option<SmoothBins>,
-    /// Rows of its own for the tokens it has said, where they do not mean what the transformer's do.
+    /// Separate input rows for the decoder's own tokens, where they differ in meaning from the
+    /// transformer's.
     table: Option<Tensor>,
 }
 
-/// What is added to the rows of a field's bins, on the way in and on the way out: a learned map of
-/// the bin's sines.
+/// Added to the rows of a field's bins, at input and output: a learned map of the bin's sines.
 #[derive(Debug)]
 struct SmoothBins {
     /// Per field in vocabulary order, [bins, 2k].
@@ -77,7 +78,7 @@ const VOCABULARY_ORDER: [Field; 7] = [
     Field::Length,
 ];
 
-/// Rows of a table that are the fields' bins.
+/// Rows of a table that belong to the fields' bins.
 fn field_rows() -> Range<usize> {
     let first = VOCABULARY_ORDER[0].first_token() as usize;
     let n: usize = VOCABULARY_ORDER.iter().map(|field| field.n_bins()).sum();
@@ -117,7 +118,7 @@ impl SmoothBins {
         Ok(smooth)
     }
 
-    /// `table` [TABLE_ROWS, C] with the fields' rows raised.
+    /// `table` [TABLE_ROWS, C] with the maps added to the fields' rows.
     fn raise(&self, table: &Tensor) -> Result<Tensor> {
         let (rows, width) = table.dims2()?;
         let flat = |rows: usize| Tensor::zeros((rows, width), table.dtype(), table.device());
@@ -130,7 +131,7 @@ impl SmoothBins {
         table + Tensor::cat(&parts, 0)?
     }
 
-    /// What is added to the rows of the output matrix for all fields, [all bins, C].
+    /// Added to the rows of the output matrix for all fields, [all bins, C].
     fn outputs(&self) -> Result<Tensor> {
         let maps = self.output.iter().zip(&self.sines);
         let parts = maps.map(|(map, sines)| map.forward(sines));
@@ -281,7 +282,7 @@ impl StateDecoder {
     }
 
     /// Logits over the bins of one field: only its rows of the shared output matrix are multiplied,
-    /// which is exact because nothing outside the field may be sampled.
+    /// which is exact because no other bins may be sampled.
     pub fn logits(&self, output: &Tensor, field: Field) -> Result<Tensor> {
         ops::linear(output, &self.output_rows(field)?, None)
     }
@@ -315,8 +316,8 @@ impl StateDecoder {
         }
     }
 
-    /// Logits over what may follow a control or value token: the 321 keys, then BEGIN, NEWBORN and
-    /// LIGHTS_END; [N, 324].
+    /// Logits over the successors of a control or value token: the 321 keys, then BEGIN, NEWBORN
+    /// and LIGHTS_END; [N, 324].
     pub fn control_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let weight = self.head.weight();
         let keys = ops::table_rows(weight, 0, CONTROL_KEYS)?;

@@ -1,4 +1,5 @@
-//! Tokens as vectors: one sum of table rows per token, plus a sine for what has coordinates.
+//! Token embeddings: one sum of table rows per token, plus a sine embedding for tokens with
+//! coordinates.
 //!
 //! All tables of the specification (tokens, classes, light indices, prompts, positions, frames)
 //! are stacked into one, so that every token of every kind is the sum of a few of its rows; the
@@ -12,7 +13,8 @@ use gump_tokenizer::{Field, N_CLASSES, N_PROMPTS, PAD, QuantizedState, Slot, TAB
 const N_FRAMES: usize = 64;
 /// Rows for light indices, 0 unused.
 const N_LIGHT_INDICES: usize = 64;
-/// Most rows a token sums: seven fields, id, class, the mark of a key, position, frame.
+/// Maximum number of rows that a token sums: seven fields, id, class, the mark of a key, position,
+/// frame.
 pub(crate) const ROWS_PER_TOKEN: usize = 12;
 
 /// Where each table starts in the stack of tables.
@@ -89,8 +91,8 @@ impl Tables {
     }
 }
 
-/// What distinguishes the sine features of one token from another's: the bins, and whether only the
-/// first three count, as for a light.
+/// What determines the sine features of a token: the bins, and whether only the first three count,
+/// as for a light.
 pub type SineKey = (QuantizedState, bool);
 
 /// Sine features of every bin of every field, computed once.
@@ -117,7 +119,7 @@ impl SineTables {
         }
     }
 
-    /// Which features a token has, if it has coordinates.
+    /// The key of a token's features, if it has coordinates.
     pub(crate) fn key(&self, placed: &PlacedSlot) -> Option<SineKey> {
         match &placed.slot {
             Slot::Value(state) => Some((*state, false)),

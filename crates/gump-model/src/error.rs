@@ -1,4 +1,4 @@
-//! What can go wrong in this crate.
+//! Errors of this crate.
 
 use std::path::PathBuf;
 
@@ -12,42 +12,42 @@ pub enum ModelError {
     /// A configuration contradicts itself.
     #[error("configuration: {0}")]
     Config(String),
-    /// A checkpoint lacks a tensor that the configuration asks for.
+    /// A checkpoint lacks a tensor that the configuration requires.
     #[error("tensor \"{name}\" is missing")]
     MissingTensor {
         /// Its name.
         name: String,
     },
-    /// A tensor of a checkpoint has another shape than the configuration asks for.
+    /// A tensor of a checkpoint has another shape than the configuration requires.
     #[error("tensor \"{name}\" has shape {found:?}, expected {expected:?}")]
     TensorShape {
         /// Its name.
         name: String,
-        /// What the configuration asks for.
+        /// The required shape.
         expected: Vec<usize>,
-        /// What the file holds.
+        /// The shape in the file.
         found: Vec<usize>,
     },
-    /// A kernel that this processor does not have, or that multiplies wrongly.
+    /// A kernel that this processor does not support, or that computes wrong results.
     #[error(transparent)]
     Kernel(#[from] gump_kernels::KernelError),
-    /// Bytes that hold no weights, or those of another network.
+    /// Bytes that are not weights, or those of another network.
     #[error("weights: {0}")]
     Weights(String),
-    /// A weight cannot be written in the form that is asked for.
+    /// A weight cannot be represented in the requested form.
     #[error("tensor \"{name}\" holds {number}, which {form} cannot express")]
     WeightNotFinite {
         /// Its name.
         name: String,
-        /// The first number at fault.
+        /// The first invalid number.
         number: f32,
         /// "bfloat16" or "8 bits".
         form: &'static str,
     },
-    /// A file is not a checkpoint of this crate, or of another vocabulary.
+    /// A file that is not a checkpoint of this crate, or has another vocabulary.
     #[error("{what}: {path}")]
     Checkpoint {
-        /// What was expected and what was found.
+        /// What was expected and found.
         what: String,
         /// The file.
         path: PathBuf,
@@ -55,9 +55,9 @@ pub enum ModelError {
     /// A file could not be read or written.
     #[error("{action}: {cause}: {path}")]
     Io {
-        /// What was being done.
+        /// The operation.
         action: &'static str,
-        /// The system's word.
+        /// The error of the system.
         cause: std::io::Error,
         /// The file.
         path: PathBuf,
@@ -78,10 +78,10 @@ pub enum ModelError {
         /// Frames a sample needs.
         frames: usize,
     },
-    /// Processes that train together lost each other.
+    /// Processes that train together lost their connection.
     #[error("processes that train together: {0}")]
     Peers(String),
-    /// A scene cannot be imagined by this model.
+    /// A scene that this model cannot simulate.
     #[error("scene: {0}")]
     Scene(String),
 }

@@ -1,8 +1,8 @@
-//! Objects as they are, beside the bins in which tokens say them.
+//! Exact states of objects, beside the bins of their tokens.
 //!
-//! A token rounds a place to 20 cm and a heading to 1.8 degrees. What an object says is read from
-//! its exact pose (`local_frame`), so what it sees around itself must be seen from there, too: the slots
-//! of a window carry both.
+//! A token rounds a position to 20 cm and a heading to 1.8 degrees. Chunks are expressed relative
+//! to the exact pose (`local_frame`), so the local context must be computed from it as well: the
+//! slots of a window carry both.
 
 use std::collections::BTreeMap;
 
@@ -12,14 +12,14 @@ use gump_tokenizer::Identities;
 
 /// An object at one instant, scene frame, metres, radians and metres per second.
 ///
-/// 32 bits tell micrometres within a scene, and hold the same numbers whether a state went through
-/// the world frame or not, so that caches know a slot again.
+/// f32 resolves micrometres within a scene, and gives the same numbers whether or not a state went
+/// through the world frame, so that caches recognise a slot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exact {
     place: [f32; 3],
     velocity: [f32; 2],
     size: [f32; 2],
-    /// False for one whose size its source does not state.
+    /// False if the source does not state the size.
     pub has_size: bool,
 }
 
@@ -66,8 +66,7 @@ impl Exact {
 pub struct ExactFrames(Vec<BTreeMap<u16, Exact>>);
 
 impl ExactFrames {
-    /// The last `n` of these frames of the world; where there are fewer, nothing is known of the
-    /// first.
+    /// The last `n` of these frames of the world; missing ones are empty.
     pub fn last(
         n: usize,
         frames: &[Frame],
@@ -92,7 +91,7 @@ impl ExactFrames {
         )
     }
 
-    /// What the object with this id was in a frame.
+    /// The exact state of the object with this id in a frame.
     pub fn of(&self, frame: usize, id: u16) -> Option<Exact> {
         self.0.get(frame)?.get(&id).copied()
     }

@@ -1,9 +1,9 @@
-//! In whose frame a chunk is said: that of the scene, as in the paper, or that of the object's last
-//! state.
+//! The frame in which a chunk is expressed: that of the scene, as in the paper, or that of the
+//! object's last state.
 //!
-//! In its own frame an object that goes straight on says the same wherever it is and whichever way
-//! it faces, and half a second covers a small part of the scene, so that the same bins are finer:
-//! 5 cm and 0.9° at the first pose instead of 20 cm and 1.8°.
+//! In its own frame, the motion of an object that goes straight on is the same at every position
+//! and in every direction, and half a second covers a small part of the scene, so that the same
+//! bins are finer: 5 cm and 0.9° at the first pose instead of 20 cm and 1.8°.
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::AgentState;
@@ -11,15 +11,15 @@ use gump_tokenizer::{Field, QuantizedState};
 
 use crate::decoder::{Bins, CHUNK, STEPS};
 
-/// How much finer the places of a chunk are told in an object's own frame, pose by pose: the first
-/// reaches 25 m, each further one 25 m more.
+/// Factor by which the positions of a chunk are finer in an object's own frame, pose by pose: the
+/// first reaches 25 m, each further one 25 m more.
 const FINER_PLACES: [f64; CHUNK] = [4.0, 2.0, 4.0 / 3.0, 1.0];
 /// Likewise for headings. The first reaches a quarter turn; beyond, opposite directions coincide.
 const FINER_HEADINGS: [f64; CHUNK] = [2.0, 1.0, 1.0, 1.0];
 /// Steps of the decoder before the first pose.
 const POSES: usize = 4;
 
-/// In whose frame a chunk is said.
+/// The frame in which a chunk is expressed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LocalFrame {
     scene_from_anchor: Pose,
@@ -47,14 +47,14 @@ impl LocalFrame {
         }
     }
 
-    /// Where the object was last; `None` if chunks are said in the scene's frame.
+    /// The object's last pose; `None` if chunks are expressed in the scene's frame.
     pub fn origin(&self) -> Option<Pose> {
         (*self != Self::SCENE).then_some(self.scene_from_anchor)
     }
 
     /// The bins of a chunk: the size of `like`, the velocity of the first state, and the poses of
     /// all, scene frame; `None` where there is no state. A later pose beyond the grid has no bins,
-    /// because the clamped ones would be a lie; the first is clamped.
+    /// because clamped ones would be wrong; the first is clamped.
     pub fn bins(
         &self,
         like: QuantizedState,
@@ -85,7 +85,7 @@ impl LocalFrame {
         bins
     }
 
-    /// The velocity that the bins of a chunk say, scene frame, metres per second.
+    /// The velocity of the bins of a chunk, scene frame, metres per second.
     pub fn velocity(&self, bins: &Bins) -> DVec2 {
         let (x, y) = (
             Field::VelocityX.dequantize(bins[2]),
@@ -94,7 +94,7 @@ impl LocalFrame {
         self.scene_from_anchor.rotate(DVec2::new(x, y))
     }
 
-    /// The poses that the bins of a chunk say, scene frame.
+    /// The poses of the bins of a chunk, scene frame.
     pub fn poses(&self, bins: &Bins) -> [Pose; CHUNK] {
         std::array::from_fn(|i| {
             let at = POSES + CHUNK_STEP * i;

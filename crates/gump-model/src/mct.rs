@@ -1,8 +1,8 @@
-//! The multimodal causal transformer: the network in one sitting.
+//! The multimodal causal transformer.
 //!
-//! Tokens become vectors, pass `layers` blocks of causal self-attention, look at the map through
-//! gated cross-attention after every third block, and leave as one hidden vector per token. The
-//! hidden vector at an agent's *key* is what [`crate::decoder`] turns into its state.
+//! Tokens are embedded, pass through `layers` blocks of causal self-attention with gated
+//! cross-attention to the map after every third block, and become one hidden vector per token.
+//! [`crate::decoder`] turns the hidden vector at an agent's *key* into its state.
 //!
 //! Shapes: `B` sequences, `T` tokens, `C` width, `M` visual tokens, `S` scenes; `B` is a multiple of
 //! `S`, and `B / S` consecutive sequences share a scene.
@@ -162,13 +162,13 @@ impl CrossBlock {
     }
 }
 
-/// What the transformer keeps of a scene's map: keys and values per cross-attention block,
-/// `[S, M, C]`; computed once and shared by all futures of the scene.
+/// The encoding of a scene's map: keys and values per cross-attention block, `[S, M, C]`; computed
+/// once and shared by all futures of the scene.
 #[derive(Clone, Debug)]
 pub struct VisualMemory {
-    /// Per scene, its map laid out for looking around.
+    /// Per scene, its prepared map for local contexts.
     pub surveys: Vec<Arc<Survey>>,
-    /// The visual tokens themselves, for looking up what lies under an object.
+    /// The visual tokens themselves, for reading the map under an object.
     pub visual: Tensor,
     /// By layer of cross-attention.
     pub key_values: Vec<(Tensor, Tensor)>,
@@ -224,7 +224,7 @@ impl Cache {
     }
 }
 
-/// What a forward pass leaves.
+/// The output of a forward pass.
 #[derive(Debug)]
 pub struct Features {
     /// After the final normalisation, [B, T, C].
@@ -244,9 +244,9 @@ pub struct Mct {
     cross: Vec<CrossBlock>,
     norm: LayerNorm,
     levels: Vec<usize>,
-    /// One map per place an object looks at, if it does.
+    /// One map per position that an object looks at, if the network has this option.
     local: Vec<Linear>,
-    /// Two layers over what an object sees around itself, if it does.
+    /// Two layers over local contexts, if the network has this option.
     surroundings: Option<(Linear, Linear)>,
 }
 
@@ -259,21 +259,21 @@ pub struct TokenBatch {
     pub(crate) sine_positions: Tensor,
     /// Their sine features, [N, C].
     pub(crate) sines: Tensor,
-    /// Flat indices of the keys that look at the map under their object, [K].
+    /// Flat indices of the keys that read the map under their object, [K].
     pub(crate) lookers: Tensor,
-    /// Per place they look at, the visual token there, counted within a scene, [K] each.
+    /// Per position they look at, the visual token there, counted within a scene, [K] each.
     pub(crate) places: [Vec<u32>; PLACES.len()],
     /// Row of the batch each of them stands in, [K].
     pub(crate) looker_rows: Vec<u32>,
-    /// Flat indices of the keys that see their surroundings, [K'].
+    /// Flat indices of the keys with a local context, [K'].
     pub(crate) seers: Tensor,
-    /// What they see, [K', n] with n the numbers that this network is shown.
+    /// Their local contexts, [K', n] with n the numbers that this network uses.
     pub(crate) surroundings: Tensor,
     /// (B, T)
     pub shape: (usize, usize),
 }
 
-/// Where an object looks: seconds ahead on its present course.
+/// Positions at which an object reads the map: seconds ahead on its present course.
 pub const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
 
 impl Mct {
@@ -336,8 +336,8 @@ impl Mct {
         self.table.narrow(0, 0, Tables::CLASS)
     }
 
-    /// Logits over the class of an agent not seen before, from the slot before its key; the rows by
-    /// which classes enter are also those by which they are told; [N, 3].
+    /// Logits over the class of an agent not seen before, from the slot before its key; the same
+    /// rows embed classes as inputs; [N, 3].
     pub fn class_logits(&self, hidden: &Tensor) -> Result<Tensor> {
         let rows = ops::table_rows(&self.table, Tables::CLASS, N_CLASSES)?;
         ops::linear(hidden, &rows, None)
@@ -352,7 +352,7 @@ impl Mct {
         self.sine_out.forward(&hidden)
     }
 
-    /// Reads the visual tokens of scenes once, [S, M, C].
+    /// Encodes the visual tokens of scenes once, [S, M, C].
     pub fn remember(&self, visual: &Tensor, surveys: Vec<Arc<Survey>>) -> Result<VisualMemory> {
         let key_values = self.cross.iter().map(|cross| cross.remember(visual));
         Ok(VisualMemory {
@@ -362,7 +362,7 @@ impl Mct {
         })
     }
 
-    /// What lies under and ahead of every object that looks, [K, C].
+    /// The map under and ahead of every object that reads it, [K, C].
     fn encode_local_context(&self, batch: &TokenBatch, memory: &VisualMemory) -> Result<Tensor> {
         let (scenes, m, c) = memory.visual.dims3()?;
         let flat = memory.visual.reshape((scenes * m, c))?;
@@ -382,8 +382,8 @@ impl Mct {
         seen.ok_or_else(|| candle_core::Error::Msg("no place to look at".into()))
     }
 
-    /// One pass over `batch`, after the tokens in `cache` if there is one; the cache then holds
-    /// the new tokens too.
+    /// One pass over `batch`, after the tokens in `cache` if there is one; the new tokens are added
+    /// to the cache.
     pub fn forward(
         &self,
         batch: &TokenBatch,

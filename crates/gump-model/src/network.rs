@@ -1,4 +1,4 @@
-//! The whole network with its parameters: what a checkpoint holds and everything else calls.
+//! The whole network with its parameters, as stored in a checkpoint.
 
 use std::sync::Arc;
 
@@ -30,12 +30,12 @@ pub struct Network {
     pub decoder: StateDecoder,
     /// The encoder of rasters.
     pub visual: Visual,
-    /// Heads that say whole trajectories, for an auxiliary loss.
+    /// Heads that predict whole trajectories, for an auxiliary loss.
     pub trajectory_heads: Vec<TrajectoryHead>,
 }
 
 impl Network {
-    /// A network that has learned nothing yet.
+    /// An untrained network.
     ///
     /// # Errors
     /// [`ModelError::Config`] if the configuration contradicts itself.
@@ -46,7 +46,7 @@ impl Network {
     /// The network that `config` describes, with the given parameters.
     ///
     /// # Errors
-    /// A tensor that is missing, too many or of another shape, by name.
+    /// A tensor that is missing, superfluous or of another shape, by name.
     pub fn build(config: ModelConfig, mut parameters: Parameters) -> Result<Self, ModelError> {
         config.validate()?;
         let raster_spec = config.raster_spec()?;
@@ -76,8 +76,8 @@ impl Network {
         })
     }
 
-    /// The same network, whose matrices are multiplied in another type; its parameters and all else
-    /// keep theirs.
+    /// The same network with matrix products in another type; parameters and everything else keep
+    /// theirs.
     pub fn multiplying_in(self, products: DType) -> Result<Self, ModelError> {
         let all = self.parameters.all();
         let tensors = all.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
@@ -90,18 +90,18 @@ impl Network {
         &self.config
     }
 
-    /// Its numbers.
+    /// Its parameters.
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
     }
 
-    /// What its rasters hold.
+    /// The layers of its rasters.
     pub fn raster_spec(&self) -> &RasterSpec {
         &self.raster_spec
     }
 
-    /// How many of `n` samples are best differentiated as one batch: a processor's threads share
-    /// them out one by one, which a device's do not, and batch statistics need all.
+    /// How many of `n` samples should be differentiated as one batch: on a CPU threads process
+    /// single samples, on a device they do not, and batch statistics need all.
     pub fn samples_together(&self, n: usize) -> usize {
         let is_free = self.parameters.statistics().next().is_none();
         if is_free && self.device().is_cpu() {
@@ -111,7 +111,7 @@ impl Network {
         }
     }
 
-    /// Where it lives.
+    /// Its device.
     pub fn device(&self) -> &Device {
         self.parameters.device()
     }
@@ -144,7 +144,7 @@ impl Network {
         features.broadcast_add(&positions.unsqueeze(0)?)
     }
 
-    /// Looks at the maps once, for any number of passes.
+    /// Encodes the maps once, for any number of passes.
     pub fn look(
         &self,
         rasters: &[Raster],

@@ -1,4 +1,4 @@
-//! Slots of a token sequence and where they stand in the presented window.
+//! Slots of a token sequence with their positions in the presented window.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use gump_tokenizer::{Key, QuantizedState, Slot, TokenSequence};
 
 use crate::exact::Exact;
 
-/// A slot and where it stands in the presented window.
+/// A slot with its position in the presented window.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlacedSlot {
     /// The slot.
@@ -18,29 +18,29 @@ pub struct PlacedSlot {
     pub frame: usize,
     /// The key before it, if it is a value.
     pub(crate) key: Option<Key>,
-    /// What its object was last seen as in the window, if it is a key.
+    /// The object's last state in the window, if it is a key.
     pub last: Option<QuantizedState>,
-    /// The same, or what its object is, if it is a value, before it was rounded; `None` where only
-    /// the token is known.
+    /// The exact state: for a key the object's last one, for a value its own; `None` where only the
+    /// token is known.
     pub exact: Option<Exact>,
 }
 
 impl PlacedSlot {
-    /// Where the object of a key was last seen in the window: where it sees from, and in whose frame
-    /// its chunk is said.
+    /// The object's last pose in the window, for a key: the origin of its local context and its
+    /// local frame.
     pub fn last_pose(&self) -> Option<Pose> {
         let last = self.last?;
         Some(self.exact.map_or(last.pose(), |exact| exact.pose()))
     }
 }
 
-/// The slots of a sequence of which only the tokens are known.
+/// The slots of a sequence without exact states.
 pub fn place(sequence: &TokenSequence) -> Vec<PlacedSlot> {
     place_exactly(sequence, |_, _| None)
 }
 
-/// The slots of a sequence with their places; prompts belong to frame 0. `exact` tells what an object
-/// was in a frame, by the index of the frame and the id.
+/// The slots of a sequence with their positions; prompts belong to frame 0. `exact` returns the
+/// exact state of an object in a frame, by the index of the frame and the id.
 pub fn place_exactly(
     sequence: &TokenSequence,
     exact: impl Fn(usize, u16) -> Option<Exact>,

@@ -1,10 +1,10 @@
-//! How the names of tensors begin that a training run keeps beside the weights.
+//! Prefixes of the names of tensors that a training run stores beside the weights.
 
-/// Before the names of the optimiser's moments.
+/// Of the optimizer's moments.
 pub const OPTIMIZER: &str = "optimizer.";
-/// Before the names of the weights that drove the scenes of closed-loop training.
+/// Of the weights that drove the scenes of closed-loop training.
 pub const DRIVER: &str = "driver.";
-/// Before the names of the weights being trained, where their moving average is what is shipped.
+/// Of the weights in training, where their moving average is the result.
 pub const TRAINED: &str = "trained.";
-/// What a run's checkpoint holds beside the weights.
+/// All of them.
 pub(crate) const PREFIXES: [&str; 3] = [OPTIMIZER, DRIVER, TRAINED];

@@ -1,12 +1,12 @@
-//! The steps of time in which the networks see and speak.
+//! Time steps of the networks.
 
 /// Seconds between token frames.
 pub const TOKEN_DT: f64 = 0.5;
 
-/// Frames of history a rollout starts from (paper: 3).
+/// Frames of history that a rollout starts from (paper: 3).
 pub const HISTORY: usize = 3;
 
-/// Frames a rollout may be away from its frame of reference: 8 s.
+/// Maximum time from the frame of reference in training: 8 s.
 pub const LONGEST_ROLLOUT: usize = 16;
 
 /// Log frames per token frame, for a log of steps of `dt` seconds.

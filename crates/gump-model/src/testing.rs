@@ -1,4 +1,4 @@
-//! A network and a scene small enough for tests of this crate and of those above.
+//! A small network and scene for tests of this crate and of those above.
 
 use std::sync::Arc;
 

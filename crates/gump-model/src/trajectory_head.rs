@@ -1,4 +1,4 @@
-//! Auxiliary heads that read a whole future at once from an agent's key and value.
+//! Auxiliary heads that predict a whole future at once from an agent's key and value.
 //!
 //! Shapes: `A` agents, `C` width. A pose is (Δx, Δy, sin θ, cos θ): displacement from the agent's
 //! present position and absolute heading, both in the scene frame.
@@ -9,11 +9,11 @@ use gump_nn::parameters::Scope;
 
 use crate::ModelError;
 
-/// Half-second steps of the past a head recalls.
+/// Half-second steps of the past that a head predicts.
 pub const PAST: usize = 6;
-/// Half-second steps of the future a head foresees.
+/// Half-second steps of the future that a head predicts.
 pub const FUTURE: usize = 16;
-/// Alternatives for the future.
+/// Number of modes of the future.
 pub const MODES: usize = 6;
 /// Numbers per pose.
 pub const POSE: usize = 4;
@@ -27,7 +27,7 @@ pub struct TrajectoryHead {
     modes: Linear,
 }
 
-/// What a head yields.
+/// The output of a head.
 #[derive(Debug)]
 pub struct Trajectories {
     /// [A, PAST, POSE], the most recent first.

@@ -232,8 +232,8 @@ impl ResNet {
     }
 }
 
-/// The largest of three neighbours along a dimension of even length, around every second: half of
-/// pooling, of which the tensor library differentiates no overlapping kind.
+/// The maximum of three neighbours along a dimension of even length, around every second: half of
+/// pooling. The tensor library does not differentiate overlapping pooling.
 ///
 /// `x` is not negative, so that zeros beyond the border are never the largest alone.
 fn largest_of_three(x: &Tensor, dim: usize) -> Result<Tensor> {
@@ -383,8 +383,8 @@ fn cell_positions(config: &ModelConfig, device: &candle_core::Device) -> Result<
     Tensor::from_vec(features, (side * side, config.width), device)
 }
 
-/// Every visual token redraws the pixels it covers: a transposed convolution whose kernel is its
-/// stride.
+/// The raster decoder: every visual token reconstructs its pixels by a transposed convolution whose
+/// kernel is its stride.
 #[derive(Debug)]
 pub struct Reconstruction {
     hidden: Linear,
@@ -405,7 +405,7 @@ impl Reconstruction {
         })
     }
 
-    /// Mean absolute difference between the redrawn raster and the raster itself.
+    /// Mean absolute difference between the reconstructed raster and the raster itself.
     ///
     /// `features` [S, M, C], `raster` [S, P, side, side].
     pub fn loss(&self, features: &Tensor, raster: &Tensor) -> Result<Tensor> {

@@ -103,7 +103,7 @@ impl Actor {
         }
     }
 
-    /// The modes of the distributions before squashing: the actions to take without exploration.
+    /// The actions without exploration: tanh of the means.
     ///
     /// Shape: `[rows, observation_len]` to `[rows, action_len]`, in (-1, 1).
     ///

@@ -1,4 +1,4 @@
-//! What is written comes back, what does not fit is refused in one sentence.
+//! Files are read back unchanged, and invalid ones are refused with one message.
 
 use gump_scene::Seed;
 

@@ -1,8 +1,8 @@
-//! Borders of the road with their sides: how far a box reaches off the road.
+//! Road edges with sides, and how far a box reaches off the road.
 //!
-//! An edge is directed, with the road on its left (`gump_scene::RoadEdge`), as in Waymo's maps and in
-//! the metric `gump_metrics::DistanceToRoadEdge`. Here it is cut into stretches of a metre and a half
-//! at most, so that those near a box are few.
+//! An edge is directed, with the road on its left (`gump_scene::RoadEdge`), as in Waymo's maps and
+//! in the metric `gump_metrics::DistanceToRoadEdge`. Here it is cut into stretches of at most a
+//! metre and a half, so that few are near a box.
 
 use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, project_on_segment};
 
@@ -17,7 +17,7 @@ pub struct Edge {
     /// Where the edge begins, metres.
     pub from: DVec2,
     pub(crate) to: DVec2,
-    /// Nothing is known of a border before its start, after its end.
+    /// True if the border is unknown before its start, after its end.
     open: [bool; 2],
 }
 
@@ -50,7 +50,7 @@ impl Edge {
         -along.perp_dot(point - self.from)
     }
 
-    /// True if the foot of a point lies beyond an end where the edge does not go on.
+    /// True if the foot of a point lies beyond an end where the edge stops.
     fn is_past_open_end(&self, point: DVec2) -> bool {
         let t = project_on_segment(point, self.from, self.to);
         (t <= 0.0 && self.open[0]) || (t >= 1.0 && self.open[1])
@@ -68,8 +68,8 @@ impl Edge {
     }
 }
 
-/// How far a box reaches over the edges that it stands across, metres; 0 if it stands across none,
-/// on whichever side of them. `reach` is half its diagonal.
+/// How far a box reaches over the edges that it crosses, metres; 0 if it crosses none, on whichever
+/// side of them it is. `reach` is half its diagonal.
 pub fn metres_across(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
     let centre = body.pose.position;
     let near = (reach + EDGE_STEP_M).powi(2);
@@ -81,8 +81,8 @@ pub fn metres_across(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// How far a box reaches off the road, metres, whether it stands across an edge or beyond it; 0 on
-/// the road, and where the nearest of the edges says nothing.
+/// How far a box reaches off the road, metres, whether it crosses an edge or is beyond it; 0 on the
+/// road, and where the nearest edge has no known side there.
 pub fn metres_off(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
     let centre = body.pose.position;
     // Two stretches are equally near beside their joint: the one that the point is farther beside

@@ -1,14 +1,15 @@
-//! What an object sees around itself, as numbers in its own frame: how it moves, the paths it may
-//! follow, what lies beside it, and who is near.
+//! Local contexts: an object's view in its own frame, as numbers: its motion, the paths it may
+//! follow, the lanes beside it, and its neighbours.
 //!
-//! The paper shows the map as a picture of the whole scene and objects by their places in it. On
-//! little data and with a small network it helps much more to tell every object what concerns it,
-//! the same wherever in the scene it is and whichever way it faces. What is seen at a key is what
-//! the window showed before: the states of the frame before and the lights of the key's own frame.
+//! In the paper the map is an image of the whole scene, and objects are given by their positions in
+//! it. With little data and a small network it is much more effective to give every object its
+//! surroundings in its own frame, independent of position and direction. The context at a key
+//! contains what the window showed before it: the states of the previous frame and the lights of
+//! the key's own frame.
 //!
-//! Lengths are divided by a typical one, so that numbers stay within a few units of zero; what is
-//! not there is zeros. What is not known is no zero: a stand-in holds its place, and a network with
-//! `unknown_marks` is shown a mark beside it.
+//! Lengths are divided by a typical one, so that numbers stay within a few units of zero; absent
+//! items are zeros. Unknown values are not zeros: they have a default value, and with
+//! `unknown_marks` a mark beside it.
 
 mod edges;
 mod survey;
@@ -28,39 +29,40 @@ use crate::placed_slot::PlacedSlot;
 pub use self::edges::{Edge, metres_across, metres_off};
 pub use self::survey::Survey;
 
-/// Points of a path that are shown, as indices: 0, 4, 8, 14, 22, 32 and 44 m ahead.
+/// Points of a path, as indices: 0, 4, 8, 14, 22, 32 and 44 m ahead.
 const SHOWN: [usize; 7] = [0, 2, 4, 7, 11, 16, 22];
-/// Per path: there it is, four numbers per point, speed limit, light, stop sign, the one ahead.
+/// Per path: whether it exists, four numbers per point, speed limit, light, stop sign, the object
+/// ahead.
 const PATH_NUMBERS: usize = 1 + 4 * SHOWN.len() + 1 + 4 + 2 + 3;
-/// Neighbours that are shown, the nearest.
+/// Number of neighbours, the nearest ones.
 const N_NEIGHBOURS: usize = 8;
-/// Per neighbour: there it is, place, direction, velocity, size, two marks of its class.
+/// Per neighbour: whether it exists, position, direction, velocity, size, two marks of its class.
 const NEIGHBOUR_NUMBERS: usize = 11;
-/// How far a neighbour may be, metres.
+/// Maximum distance of a neighbour, metres.
 const NEIGHBOUR_REACH_M: f64 = 60.0;
-/// Directions in which the nearest road edge is shown.
+/// Directions in which the distance to the nearest road edge is given.
 const SECTORS: usize = 12;
-/// How far a road edge may be, metres.
+/// Maximum distance of a road edge, metres.
 const EDGE_REACH_M: f64 = 20.0;
-/// How it moved: velocity, size, class, and the step before.
+/// Own motion: velocity, size, class, and the previous step.
 const OWN_NUMBERS: usize = 11;
-/// To the left and to the right: there is a lane, how far, in which direction.
+/// To the left and to the right: whether there is a lane, its distance and direction.
 const BESIDE_NUMBERS: usize = 6;
 
-/// Numbers that an object sees without the marks.
+/// Length of a local context without the marks.
 const N_PLAIN: usize = OWN_NUMBERS
     + N_PATHS * PATH_NUMBERS
     + BESIDE_NUMBERS
     + SECTORS
     + N_NEIGHBOURS * NEIGHBOUR_NUMBERS;
-/// Marks of what is not known, after all others: the limit of each path, stop signs, lights, its own
-/// size and that of each neighbour.
+/// Marks of unknown inputs, after all others: the limit of each path, stop signs, lights, the
+/// object's own size and that of each neighbour.
 const N_MARKS: usize = N_PATHS + 2 + 1 + N_NEIGHBOURS;
 
-/// What an object sees, the marks last.
+/// Length of a local context, including the marks.
 pub type LocalContext = [f32; N_PLAIN + N_MARKS];
 
-/// The first so many numbers of what an object sees are shown to such a network.
+/// The length of the part of a local context that such a network uses.
 pub fn n_numbers(config: &ModelConfig) -> usize {
     if config.unknown_marks {
         N_PLAIN + N_MARKS
@@ -105,8 +107,8 @@ impl Seen {
     }
 }
 
-/// What the objects at the keys from slot `from` on see, each with its slot; a key whose object the
-/// window has not shown before sees nothing and is left out.
+/// The local contexts of the objects at the keys from slot `from` on, each with its slot; a key
+/// whose object the window has not shown before has none.
 pub fn encode_local_context(
     survey: &Survey,
     slots: &[PlacedSlot],
@@ -153,7 +155,7 @@ pub fn encode_local_context(
     seen
 }
 
-/// What is around the objects of a frame.
+/// Surroundings of the objects of a frame.
 struct Around<'a> {
     survey: &'a Survey,
     others: &'a [Seen],
@@ -192,7 +194,7 @@ impl Around<'_> {
         all
     }
 
-    /// Marks what is not known.
+    /// Sets the marks of unknown inputs.
     fn mark(&self, own: &Seen, paths: &[survey::Path], near: &[&Seen], marks: &mut [f32]) {
         let mark = |is_unknown: bool| f64::from(u8::from(is_unknown));
         let mut writer = Writer(marks);

@@ -1,5 +1,5 @@
-//! A map laid out for looking around from many places: lanes as points two metres apart and road
-//! edges as short stretches, both in a grid, in the scene frame.
+//! A map prepared for queries from many positions: lanes as points two metres apart and road edges
+//! as short stretches, both in a grid, in the scene frame.
 
 use std::collections::HashMap;
 
@@ -12,10 +12,10 @@ use super::edges::Edge;
 pub(super) const LANE_STEP_M: f64 = 2.0;
 /// Points of a path ahead, the first abeam: 44 m.
 pub(super) const PATH_POINTS: usize = 23;
-/// Most paths that an object is shown.
+/// Maximum number of paths of an object.
 pub(super) const N_PATHS: usize = 3;
-/// Half of the side of the ground that is laid out, metres: the window of tokens and what its
-/// outermost objects see.
+/// Half the side of the prepared area, metres: the window of tokens and the surroundings of its
+/// outermost objects.
 const HALF_SIDE_M: f64 = 128.0;
 /// Side of a cell of the grid, metres.
 const CELL_M: f64 = 8.0;
@@ -23,13 +23,13 @@ const CELL_M: f64 = 8.0;
 const LANE_REACH_M: f64 = 4.0;
 /// And whose direction differs at most this much, radians.
 const LANE_TURN: f64 = 1.05;
-/// Metres that a radian counts for in choosing the lane that is followed.
+/// Weight of a radian, in metres, in choosing the followed lane.
 const METRES_PER_RADIAN: f64 = 3.0;
-/// A lane this much worse than the best is not an alternative any more, metres.
+/// A lane this much worse than the best is not an alternative, metres.
 const ALTERNATIVE_M: f64 = 1.0;
-/// Most lanes of a path after its first.
+/// Maximum number of lanes of a path after its first.
 const MOST_LANES: usize = 12;
-/// Most paths that are looked at before the most different ones are chosen.
+/// Maximum number of paths from which the most different ones are chosen.
 const MOST_PATHS: usize = 8;
 
 /// A point of a lane.
@@ -47,7 +47,7 @@ pub(super) struct LaneRun {
     successors: Vec<u32>,
     /// Metres per second.
     speed_limit: Option<f64>,
-    /// Where a stop sign wants traffic to stop.
+    /// Where a stop sign requires a stop.
     stop: Option<u32>,
 }
 
@@ -62,12 +62,12 @@ pub struct Survey {
     lane_cells: Cells,
     edges: Vec<Edge>,
     edge_cells: Cells,
-    /// What the map has no word for.
+    /// Information that the source of the map cannot express.
     pub(super) unstated: Unstated,
 }
 
 impl Survey {
-    /// Lays out what lies around the origin of a scene.
+    /// Prepares the map around the origin of a scene.
     pub fn new(map: &MapGraph, world_from_scene: Pose) -> Self {
         let scene_from_world = world_from_scene.inverse();
         let mut survey = Self {
@@ -146,7 +146,7 @@ impl Survey {
         &self.lanes[self.point(index).lane as usize]
     }
 
-    /// True if a path that goes through `index` has to stop there for a sign.
+    /// True if a path through `index` has to stop there for a sign.
     pub(super) fn is_stop(&self, index: u32) -> bool {
         self.lane_of(index).stop == Some(index)
     }
@@ -168,8 +168,8 @@ impl Survey {
             .map(|i| self.edges[i as usize])
     }
 
-    /// Where an object may be going: up to [`N_PATHS`] paths along the lane it follows and those
-    /// after it, as different as they can be, from the leftmost to the rightmost end.
+    /// Possible paths of an object: up to [`N_PATHS`] paths along the lane it follows and its
+    /// successors, as different as possible, from the leftmost to the rightmost end.
     pub(super) fn paths(&self, from: Pose) -> Vec<Path> {
         let mut starts: Vec<(f64, u32)> = Vec::new();
         for index in self.lanes_near(from.position, LANE_REACH_M) {

@@ -14,9 +14,9 @@ pub struct RelativeConfig {
     pub layers: usize,
     /// Attention heads; must divide the width.
     pub heads: usize,
-    /// Features of an edge that attention sees.
+    /// Features of an edge that attention uses.
     pub edge_width: usize,
-    /// Width of the layer that makes them.
+    /// Width of the layer that computes them.
     pub edge_hidden: usize,
 }
 

@@ -1,8 +1,9 @@
-//! Agents at instants as nodes, and what each of them sees as edges.
+//! The graph of the relative network: agents at frames as nodes, and edges to what each of them
+//! attends to.
 //!
 //! A node is an agent at one frame. Its edges lead to its own past, to its nearest neighbours at
-//! that frame and to pieces of the map; every edge carries numbers in the frame of the node alone.
-//! Training and imagining build nodes and edges here, so that both see the same.
+//! that frame and to pieces of the map; the numbers of an edge are in the frame of the node.
+//! Training and rollouts build nodes and edges with this module, so that both use the same inputs.
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentKind, LightState};
@@ -17,61 +18,61 @@ pub const NODE_NUMBERS: usize = 28;
 /// Numbers of an edge.
 pub const EDGE_NUMBERS: usize = 46;
 
-/// Frames of its own past that a node sees beside itself.
+/// Number of past frames of the agent that a node attends to, besides itself.
 pub const PAST: usize = 6;
-/// Neighbours that a node sees: those who are nearest now and soon.
+/// Number of neighbours of a node: the nearest ones now and soon.
 const NEIGHBOURS: usize = 16;
 /// How soon, seconds.
 const SOON_S: f64 = 2.0;
-/// How far a neighbour may be, metres.
+/// Maximum distance of a neighbour, metres.
 const NEIGHBOUR_REACH_M: f64 = 60.0;
-/// Pieces of lanes beside the paths ahead, the nearest.
+/// Number of lane pieces beside the paths ahead, the nearest ones.
 const LANES: usize = 10;
-/// Pieces of road edges, the nearest.
+/// Number of road edge pieces, the nearest ones.
 const EDGES: usize = 8;
-/// Areas, the nearest.
+/// Number of areas, the nearest ones.
 const AREAS: usize = 4;
-/// How far those may be, metres.
+/// Maximum distance of those, metres.
 const MAP_REACH_M: f64 = 40.0;
 
-/// What an agent is.
+/// Constant properties of an agent.
 #[derive(Clone, Copy, Debug)]
 pub struct Body {
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
     /// Metres.
     pub length: f64,
     /// Metres.
     pub width: f64,
-    /// False tells the network that the size is not known.
+    /// False marks the size as unknown.
     pub sized: bool,
 }
 
-/// An agent at a frame, as it is shown.
+/// An agent at a frame, as input of the network.
 #[derive(Clone, Copy, Debug)]
 pub struct Shown {
     /// Its class and size.
     pub body: Body,
-    /// Where it is, world frame.
+    /// Its pose, world frame.
     pub pose: Pose,
-    /// The last half second: this pose in the frame of the one before; from the stated velocity for
-    /// one not seen before.
+    /// Motion in the last half second: this pose in the frame of the previous one; from the stated
+    /// velocity for an agent not seen before.
     pub(super) step: Pose,
-    /// The half second before that, if it was seen.
+    /// The same for the half second before that, if it was observed.
     pub(super) earlier: Option<Pose>,
-    /// Whether `step` was seen.
+    /// Whether `step` was observed.
     pub(super) tracked: bool,
-    /// For how long it has stood, seconds.
+    /// How long it has stood, seconds.
     pub(super) stood: f64,
 }
 
 impl Shown {
-    /// For how long it has stood as far as is known, seconds.
+    /// The known standing time, seconds.
     pub fn stood(&self) -> f64 {
         self.stood
     }
 
-    /// The same agent, known to have stood for so many seconds at most.
+    /// The same agent with a limited standing time, seconds.
     #[must_use]
     pub fn stood_at_most(self, seconds: f64) -> Self {
         Self {
@@ -80,7 +81,7 @@ impl Shown {
         }
     }
 
-    /// An agent seen for the first time, with its stated velocity.
+    /// An agent in its first frame, with its stated velocity.
     pub fn first(body: Body, pose: Pose, velocity: DVec2) -> Self {
         let local = pose.inverse().rotate(velocity) * TOKEN_DT;
         Self {
@@ -151,7 +152,7 @@ impl Shown {
     }
 }
 
-/// A step that is no more than jitter is none.
+/// A step within jitter counts as none.
 fn still_or(step: Pose) -> Pose {
     match step.position.length() < STILL_M {
         true => Pose::IDENTITY,
@@ -172,10 +173,10 @@ fn put_step(writer: &mut Writer<'_>, step: Pose) {
     ]);
 }
 
-/// The lights of a frame, by piece of the map, and for how long they have shown their colour.
+/// The lights of a frame, by piece of the map, and how long they have shown their colour.
 #[derive(Clone, Debug, Default)]
 pub struct Lights {
-    /// Sorted by lane: the colour, and seconds since it changed where that was seen.
+    /// Sorted by lane: the colour, and seconds since it changed where that was observed.
     pub by_lane: Vec<(gump_scene::LaneId, LightState, Option<f64>)>,
 }
 
@@ -190,7 +191,7 @@ impl Lights {
 /// The numbers of an edge.
 pub(super) type EdgeRow = [f32; EDGE_NUMBERS];
 
-/// Relative pose, in numbers that are fine near and coarse far away.
+/// Relative pose, in numbers with high resolution near zero.
 const RELATIVE: usize = 10;
 /// Marks of the kind of an edge.
 const KINDS: usize = 5;
@@ -199,7 +200,8 @@ const OF_NEIGHBOUR: usize = OF_PAST + 1;
 const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
 const OF_GAP: usize = OF_LANE + 10;
-/// When the gap to a neighbour is looked at if both keep their velocities, seconds.
+/// The time at which the predicted gap to a neighbour is evaluated, with constant velocities,
+/// seconds.
 const GAPS_S: [f64; 4] = [0.5, 1.0, 1.5, 2.0];
 
 /// A place and a direction, whose sine and cosine are taken once for many edges.
@@ -223,13 +225,13 @@ impl Axes {
         DVec2::new(ahead, left)
     }
 
-    /// A point seen from here.
+    /// A point in these axes.
     pub(super) fn see(self, point: DVec2) -> DVec2 {
         self.turn(point - self.origin)
     }
 }
 
-/// An edge of this kind to something at `to`, seen from `from`.
+/// An edge of this kind to something at `to`, from `from`.
 fn relative(kind: usize, from: Axes, to: Axes) -> EdgeRow {
     let mut out = [0.0; EDGE_NUMBERS];
     out[kind] = 1.0;
@@ -263,23 +265,23 @@ fn fast_exp(x: f64) -> f64 {
     f64::from((x as f32).exp())
 }
 
-/// The edge to the node's own state `ago` frames before; 0 is itself.
+/// The edge to the node's own state `ago` frames before; 0 is the node itself.
 pub fn past_edge(now: &Shown, then: &Shown, ago: usize) -> EdgeRow {
     let mut out = relative(0, Axes::of(now.pose), Axes::of(then.pose));
     out[OF_PAST] = ago as f32 / PAST as f32;
     out
 }
 
-/// What a node sees beside its past.
+/// Edges of a node besides those to its past.
 #[derive(Debug, Default)]
 pub struct View {
     /// Index among the agents of the frame.
     pub neighbours: Vec<(usize, EdgeRow)>,
-    /// Pieces of the map that are seen, by index, with their edges.
+    /// Indices of pieces of the map, with their edges.
     pub pieces: Vec<(u32, EdgeRow)>,
 }
 
-/// What agent `i` of those of a frame sees.
+/// The edges of agent `i` of those of a frame.
 pub fn look(map: &VectorMap, lights: &Lights, agents: &[Shown], i: usize) -> View {
     let own = &agents[i];
     let mut view = View::default();

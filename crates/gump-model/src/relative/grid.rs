@@ -1,8 +1,8 @@
 //! The bins in which the next half second of an agent is said, in the frame of its present pose.
 //!
-//! Four fields, one after another: whether it stands, then how far it moves ahead, to the left, and
-//! how far it turns. Who stands stays exactly where it is. Bins of sideways moves and turns are fine
-//! around zero, where nearly all of them are, and coarse far out.
+//! Four fields, one after another: whether the agent stands, then how far it moves ahead, to the
+//! left, and how far it turns. A standing agent keeps its exact pose. Bins of sideways moves and
+//! turns are fine around zero, where nearly all values are, and coarse far out.
 
 use gump_geometry::{DVec2, Pose, angle_difference};
 
@@ -12,7 +12,7 @@ pub const FIELDS: usize = 4;
 pub const BINS: [usize; FIELDS] = [2, AHEAD, SIDE, TURN];
 /// Bins of all fields.
 pub const ALL_BINS: usize = 2 + AHEAD + SIDE + TURN;
-/// The bin of the first field that says that an agent stands.
+/// The bin of the first field for a standing agent.
 pub const STANDS: u16 = 1;
 
 const AHEAD: usize = 512;
@@ -21,16 +21,17 @@ const TURN: usize = 255;
 
 /// Width of a bin ahead, metres: 0.1 m/s of mean speed.
 const AHEAD_STEP_M: f64 = 0.05;
-/// Bins ahead that lie behind: 4 m, 8 m/s in reverse.
+/// Bins ahead that have negative values: 4 m, 8 m/s in reverse.
 const BEHIND: f64 = 80.0;
-/// The farthest sideways, metres.
+/// The maximum sideways move, metres.
 const SIDE_REACH_M: f64 = 3.5;
-/// How much finer the middle of sideways moves is: bins are 4 mm wide there.
+/// Stretching of sideways moves around zero: bins are 4 mm wide there.
 const SIDE_FOCUS: f64 = 4.0;
-/// How much finer the middle of turns is: bins are 1.7 mrad wide there.
+/// Stretching of turns around zero: bins are 1.7 mrad wide there.
 const TURN_FOCUS: f64 = 5.0;
 
-/// Who moves less than this in half a second, metres, stands: the jitter of recorded boxes is below.
+/// An agent that moves less than this in half a second, metres, stands: the jitter of recorded
+/// boxes is smaller.
 pub(crate) const STILL_M: f64 = 0.08;
 
 /// First bin of a field among the bins of all.
@@ -56,7 +57,7 @@ pub(crate) fn quantize(step: Pose) -> [u16; FIELDS] {
     ]
 }
 
-/// The next pose in the frame of the present one that bins say.
+/// The next pose, in the frame of the present one, of these bins.
 pub fn dequantize(bins: [u16; FIELDS]) -> Pose {
     if bins[0] == STANDS {
         return Pose::IDENTITY;

@@ -1,7 +1,7 @@
 //! The map as short pieces of lanes, road edges and areas, each with numbers in its own frame.
 //!
-//! Nothing here depends on where the scene is or which way it faces. Agents attend to the pieces of
-//! the lanes that they may follow and to what else is near.
+//! Nothing here depends on the position or direction of the scene. Agents attend to the pieces of
+//! the lanes that they may follow and to other pieces nearby.
 
 use std::collections::BTreeMap;
 
@@ -10,11 +10,11 @@ use gump_scene::{AreaKind, LaneId, LaneKind, MapGraph, RoadEdgeKind};
 
 use crate::relative::graph::Axes;
 
-/// Longest piece of a lane, metres.
+/// Maximum length of a piece of a lane, metres.
 const LANE_PIECE_M: f64 = 8.0;
-/// Longest piece of a road edge, metres.
+/// Maximum length of a piece of a road edge, metres.
 const EDGE_PIECE_M: f64 = 10.0;
-/// Points that show the shape of a piece.
+/// Points that describe the shape of a piece.
 pub(super) const SHAPE: usize = 5;
 /// Side of a cell of the grid, metres.
 const CELL_M: f64 = 16.0;
@@ -22,21 +22,21 @@ const CELL_M: f64 = 16.0;
 const LANE_REACH_M: f64 = 4.0;
 /// And whose direction differs at most this much, radians.
 const LANE_TURN: f64 = 1.05;
-/// Metres that a radian counts for in choosing the lane that is followed.
+/// Weight of a radian, in metres, in choosing the followed lane.
 const METRES_PER_RADIAN: f64 = 3.0;
-/// A lane this much worse than the best is no alternative any more, metres.
+/// A lane this much worse than the best is not an alternative, metres.
 const ALTERNATIVE_M: f64 = 1.0;
 /// How far a path ahead reaches, metres.
 const PATH_M: f64 = 64.0;
-/// Paths ahead that are told apart.
+/// Number of distinct paths ahead.
 pub(super) const PATHS: usize = 3;
-/// Paths that are followed before the most different ones are chosen.
+/// Maximum number of paths from which the most different ones are chosen.
 const MOST_PATHS: usize = 8;
 
 /// Numbers of a piece.
 pub const PIECE_NUMBERS: usize = 2 * SHAPE + 4 + 3 + 6 + 11;
 
-/// What a piece is a part of.
+/// The type of feature that a piece belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PieceKind {
     Lane,
@@ -84,7 +84,7 @@ impl Piece {
     }
 }
 
-/// What is not told of a map.
+/// Information of a map to withhold.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Hidden {
     pub(super) limits: bool,
@@ -213,7 +213,7 @@ impl VectorMap {
         columns.flat_map(|(_, pieces)| pieces.iter().copied())
     }
 
-    /// Where an agent may be going: up to [`PATHS`] paths of pieces ahead, with the metres from the
+    /// Possible paths of an agent: up to [`PATHS`] paths of pieces ahead, with the metres from the
     /// agent to the middle of each piece, from the leftmost path to the rightmost.
     pub(super) fn paths(&self, from: Pose) -> Vec<Vec<(u32, f64)>> {
         let mut starts: Vec<(f64, u32)> = Vec::new();
@@ -392,7 +392,7 @@ fn lane_index(kind: LaneKind) -> usize {
     }
 }
 
-/// The areas that are shown.
+/// The areas that are used.
 fn area_index(kind: AreaKind) -> Option<usize> {
     match kind {
         AreaKind::Crosswalk => Some(0),

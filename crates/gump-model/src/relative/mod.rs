@@ -1,13 +1,14 @@
-//! A traffic model with relative attention throughout.
+//! The relative network: a traffic model with relative attention throughout.
 //!
-//! Each agent at each frame is one node. It attends to its own past, to its nearest neighbours and to
-//! the nearest pieces of the map, by relative pose and time alone: no place of a scene's frame enters
-//! anywhere, so nothing is re-centred, and what is kept of a node stays true for as long as it is
-//! kept. What a node ends with says the next half second of its agent, in the agent's own frame.
+//! Each agent at each frame is one node. It attends to its own past, to its nearest neighbours and
+//! to the nearest pieces of the map, by relative pose and time only. No coordinates of a scene
+//! frame are used, so nothing has to be re-centred, and cached keys and values of a node stay
+//! valid. The final vector of a node predicts the next half second of its agent, in the agent's own
+//! frame.
 //!
-//! `map` cuts the map into pieces, `graph` makes nodes and edges, `grid` has the bins of a move,
-//! `sample` what is learned from, `net` the network, `weights` its numbers without a tensor library,
-//! `store` its files. Rolling it out is in `gump-engine`, training it in `gump-train`.
+//! `map` cuts the map into pieces, `graph` builds nodes and edges, `grid` has the bins of a move,
+//! `sample` the training samples, `net` the network, `weights` its parameters without a tensor
+//! library, `store` its files. Rollouts are in `gump-engine`, training is in `gump-train`.
 
 mod config;
 pub mod graph;

@@ -1,4 +1,4 @@
-//! The network: nodes attend along their edges, layer by layer, and a short recurrence says the
+//! The network: nodes attend along their edges, layer by layer, and a short recurrence predicts the
 //! next move field by field.
 //!
 //! Shapes: `N` nodes, `M` pieces of the map, `E` edges, `C` width, `F` features per edge, `H` heads.
@@ -20,10 +20,10 @@ use crate::relative::grid::{ALL_BINS, BINS, FIELDS, first_bin};
 use crate::relative::map::PIECE_NUMBERS;
 use crate::relative::sample::Sample;
 
-/// The matrices by which a layer adds to what it was given.
+/// The output matrices of a layer's residual branches.
 const ADDS: [&str; 2] = [".out.weight", ".mlp_out.weight"];
 
-/// Two layers with a smooth bend between them.
+/// Two layers with an activation between them.
 #[derive(Debug)]
 pub(super) struct Mlp {
     pub(super) first: Linear,
@@ -143,7 +143,7 @@ impl MoveDecoder {
     }
 }
 
-/// A traffic model in which everything is relative.
+/// The relative network.
 #[derive(Debug)]
 pub struct RelativeNetwork {
     config: RelativeConfig,
@@ -157,7 +157,7 @@ pub struct RelativeNetwork {
 }
 
 impl RelativeNetwork {
-    /// A network that has learned nothing yet.
+    /// An untrained network.
     ///
     /// # Errors
     /// [`ModelError::Config`] if the configuration contradicts itself.
@@ -172,7 +172,7 @@ impl RelativeNetwork {
     /// The network that `config` describes, with the given parameters.
     ///
     /// # Errors
-    /// A tensor that is missing, too many or of another shape, by name.
+    /// A tensor that is missing, superfluous or of another shape, by name.
     pub fn build(
         config: RelativeConfig,
         mut parameters: Parameters,
@@ -206,8 +206,8 @@ impl RelativeNetwork {
         })
     }
 
-    /// The same network with more layers at its end, drawn from `seed`, which add nothing yet: it says
-    /// what this one says until it is trained on.
+    /// The same network with additional final layers, drawn from `seed`, which contribute nothing
+    /// at first: its output is unchanged until it is trained further.
     ///
     /// # Errors
     /// [`ModelError::Config`] if there would be fewer layers than now.
@@ -243,12 +243,12 @@ impl RelativeNetwork {
         &self.config
     }
 
-    /// Its numbers.
+    /// Its parameters.
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
     }
 
-    /// What every node of a sample ends with, [N, C].
+    /// The final vector of every node of a sample, [N, C].
     pub fn hidden(&self, sample: &Sample) -> Result<Tensor> {
         let device = self.parameters.device();
         let tensor = |numbers: &[f32], width: usize| {
@@ -267,8 +267,8 @@ impl RelativeNetwork {
         self.norm.forward(&x)
     }
 
-    /// The mean over the weight of all moves of a batch, of which this sample has a share: to
-    /// differentiate, and the sums of the fields' cross-entropies as numbers, nats.
+    /// This sample's part of the weighted mean over all moves of a batch, for differentiation, and
+    /// the sums of the fields' cross-entropies as numbers, nats.
     ///
     /// `total` is the weight of all moves of the batch.
     pub fn loss(
@@ -281,8 +281,8 @@ impl RelativeNetwork {
         self.cross_entropy(sample, &outputs, total, smoothing_bins, |weight| weight)
     }
 
-    /// As [`Self::loss`] with weights of either sign, nothing smoothed: moves of positive weight
-    /// become likelier, those of negative weight less likely.
+    /// As [`Self::loss`] with weights of either sign, without smoothing: moves of positive weight
+    /// become more likely, those of negative weight less likely.
     pub fn preference(&self, sample: &Sample, total: f64) -> Result<(Tensor, [f64; FIELDS])> {
         let outputs = self.forced(sample)?;
         let part = |sign: f32| {
@@ -294,7 +294,7 @@ impl RelativeNetwork {
         Ok(((liked - disliked)?, sums))
     }
 
-    /// What the decoder reads the fields of the moves from, each field knowing those before it.
+    /// The decoder's inputs for the fields of the moves; each field sees those before it.
     fn forced(&self, sample: &Sample) -> Result<Tensor> {
         let device = self.parameters.device();
         let targets = &sample.targets;
@@ -313,7 +313,7 @@ impl RelativeNetwork {
         self.decoder.forced(&hidden, &rows)
     }
 
-    /// Cross-entropies of the moves, each with the weight that `weigh` makes of its own.
+    /// Cross-entropies of the moves, each with the weight that `weigh` computes.
     fn cross_entropy(
         &self,
         sample: &Sample,

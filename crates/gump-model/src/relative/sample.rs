@@ -16,27 +16,28 @@ use crate::relative::grid::{FIELDS, STILL_M, quantize};
 use crate::relative::map::{Hidden, PIECE_NUMBERS, VectorMap};
 use crate::steps::stride_of;
 
-/// How samples are drawn from scenarios.
+/// Settings of training samples.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SampleConfig {
-    /// Consecutive frames at 2 Hz, at most; shorter logs give what they have.
+    /// Maximum number of consecutive frames at 2 Hz; shorter logs give what they have.
     pub frames: usize,
-    /// Samples keep at most this many agents, those nearest to a randomly chosen one.
+    /// Maximum number of agents, those nearest to a randomly chosen one.
     pub max_agents: usize,
-    /// Probability that what drives is shown a little off its way, with the way back asked for.
+    /// Probability that moving agents are shown displaced from their path, with the return to it as
+    /// target.
     pub perturbed: f64,
-    /// The farthest that it is pushed to a side at once, metres.
+    /// Maximum sideways displacement per push, metres.
     pub push_m: f64,
-    /// Probability that a sample does not tell the speed limits of its lanes.
+    /// Probability of hiding the speed limits of lanes.
     pub hide_limits: f64,
-    /// Probability that a sample does not tell its stop signs.
+    /// Probability of hiding stop signs.
     pub hide_stop_signs: f64,
-    /// Probability that a sample does not tell its lights.
+    /// Probability of hiding lights.
     pub hide_lights: f64,
-    /// Probability that the size of an agent is not told.
+    /// Probability of hiding the size of an agent.
     pub hide_size: f64,
-    /// Probability that an agent is seen late or lost early.
+    /// Probability that an agent is observed late or lost early.
     pub cut_tracks: f64,
 }
 
@@ -57,7 +58,7 @@ impl Default for SampleConfig {
 }
 
 impl SampleConfig {
-    /// Nothing hidden and nothing pushed: to validate.
+    /// Without hiding and displacement: for validation.
     pub fn plain() -> Self {
         Self {
             perturbed: 0.0,
@@ -71,7 +72,7 @@ impl SampleConfig {
     }
 }
 
-/// A graph and what its nodes should say.
+/// A graph with the targets of its nodes.
 #[derive(Debug, Default)]
 pub struct Sample {
     /// `[nodes, NODE_NUMBERS]`
@@ -82,7 +83,7 @@ pub struct Sample {
     pub(super) edges: Arc<Edges>,
     /// `[pieces, PIECE_NUMBERS]`: those that somebody sees.
     pub(super) pieces: Vec<f32>,
-    /// The moves that are asked for.
+    /// The target moves.
     pub targets: Vec<Target>,
 }
 
@@ -94,8 +95,8 @@ impl Sample {
 }
 
 impl Sample {
-    /// Gives every move the weight that `weight` says of its agent and frame, by index; moves that
-    /// weigh nothing are left out.
+    /// Sets the weight of every move to that of `weight` for its agent and frame, by index; moves
+    /// of weight zero are dropped.
     pub fn weigh(&mut self, weight: impl Fn(usize, usize) -> f32) {
         for target in &mut self.targets {
             target.weight = weight(target.agent as usize, target.frame as usize);
@@ -104,7 +105,7 @@ impl Sample {
     }
 }
 
-/// What a node should say.
+/// The target of a node.
 #[derive(Clone, Copy, Debug)]
 pub struct Target {
     /// Index of the node.
@@ -119,50 +120,50 @@ pub struct Target {
     pub weight: f32,
 }
 
-/// Weight of the first move of somebody of whom only one instant was seen.
+/// Weight of the first move of an agent of which only one frame was observed.
 const UNTRACKED: f32 = 0.3;
-/// Share of an offset from its way that is left half a second later.
+/// Share of a sideways displacement that is left half a second later.
 const SLACK: f64 = 0.6;
-/// The same of being ahead of the log or behind it: the pace is an agent's own.
+/// The same of a displacement along the path.
 const ALONG_SLACK: f64 = 0.8;
-/// Share of its last step that an agent still moves on its way to where the log stops.
+/// Share of its last step that an agent still moves where the log stops.
 const BRAKING: f64 = 0.6;
-/// Slower agents are not pushed, metres per second: nothing moves sideways on the spot.
+/// Slower agents are not displaced, metres per second: nothing moves sideways in place.
 const SLOWEST: f64 = 2.0;
-/// Who is faster is on its way somewhere, metres per second.
+/// A faster agent counts as driving, metres per second.
 const WALKING: f64 = 0.5;
-/// Radians of turn per metre of push.
+/// Turn per metre of displacement, radians.
 const TURN: f64 = 0.1;
-/// How far the map is laid out, metres.
+/// Radius of the prepared map, metres.
 const MAP_M: f64 = 180.0;
 
 /// An agent over the frames of a sample.
 pub struct Track {
     /// Its class and size.
     pub body: Body,
-    /// By frame, where it is there.
+    /// By frame, where it is present.
     pub states: Vec<Option<State>>,
 }
 
 /// An agent at a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct State {
-    /// Where the log has it.
+    /// Its logged pose.
     pub logged: Pose,
-    /// Where it is shown.
+    /// Its displayed pose.
     pub shown: Pose,
-    /// As the log has it, world frame, metres per second.
+    /// Logged velocity, world frame, metres per second.
     pub velocity: DVec2,
     off: Off,
 }
 
 impl State {
-    /// Where it should be half a second later, given where the log has it then.
+    /// The target half a second later, given the logged pose then.
     pub fn way_back(&self, next: &Self) -> Pose {
         pushed(next.logged, self.off.then())
     }
 
-    /// The same, where it was led to instead of where the log has it.
+    /// The same, for an agent that was led away from the log.
     pub fn led_to(self, pose: Pose) -> Self {
         Self {
             logged: pose,
@@ -172,7 +173,7 @@ impl State {
         }
     }
 
-    /// The same, shown where it was driven to.
+    /// The same, for an agent that was driven.
     pub fn driven_to(self, shown: Pose) -> Self {
         let off = self.logged.inverse() * shown;
         Self {
@@ -187,7 +188,7 @@ impl State {
     }
 }
 
-/// How far an agent is shown off its way.
+/// Displacement of an agent from its path.
 #[derive(Clone, Copy, Debug, Default)]
 struct Off {
     ahead_m: f64,
@@ -195,12 +196,12 @@ struct Off {
     turn: f64,
 }
 
-/// What moves the agents of a sample away from their log.
+/// Drives the agents of a sample away from their log.
 pub trait TrackDriver {
     /// Share of samples that it drives.
     fn share(&self) -> f64;
 
-    /// Moves the tracks of a sample, which lies around `centre`, to where it drives them.
+    /// Moves the tracks of a sample, which lies around `centre`, to the driven poses.
     fn drive(
         &self,
         place: (&MapGraph, DVec2),
@@ -211,8 +212,8 @@ pub trait TrackDriver {
     );
 }
 
-/// Draws a sample; `None` for a scenario too short for one. With a driver, its agents leave the log
-/// for where that takes them.
+/// Draws a sample; `None` for a scenario that is too short. With a driver, its agents leave the log
+/// and are driven.
 pub fn draw(
     scenario: &Scenario,
     config: &SampleConfig,
@@ -259,8 +260,8 @@ pub fn draw(
     Some(assemble(&map, &tracks, &lights))
 }
 
-/// The sample of all frames of a scenario from `start` on, everything shown as it is, and the agents
-/// `ids` in their order.
+/// The sample of all frames of a scenario from `start` on, without hiding and displacement, of the
+/// agents `ids` in their order.
 pub fn whole(
     scenario: &Scenario,
     start: usize,
@@ -280,7 +281,7 @@ pub fn whole(
     Some(assemble(map, &tracks, &lights))
 }
 
-/// The agents of a sample, and the place it is about.
+/// The agents of a sample, and its centre.
 fn chosen(
     frames: &[&Frame],
     ego: AgentId,
@@ -371,7 +372,7 @@ fn track(
     }
 }
 
-/// A pose, off its way.
+/// A displaced pose.
 fn pushed(pose: Pose, off: Off) -> Pose {
     Pose {
         position: pose.position + pose.rotate(DVec2::new(off.ahead_m, off.left_m)),
@@ -380,7 +381,7 @@ fn pushed(pose: Pose, off: Off) -> Pose {
 }
 
 impl Off {
-    /// What is left of it half a second later.
+    /// The displacement that is left half a second later.
     fn then(self) -> Self {
         Self {
             ahead_m: ALONG_SLACK * self.ahead_m,
@@ -390,8 +391,8 @@ impl Off {
     }
 }
 
-/// The lights of the frames; how long they have shown their colour is told as far as the log up to
-/// then shows a change.
+/// The lights of the frames, with the time since their last change as far as the log up to then
+/// shows it.
 fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> Vec<Lights> {
     let mut known: BTreeMap<LaneId, (LightState, Option<usize>)> = BTreeMap::new();
     let mut lights = Vec::with_capacity(n_frames);
@@ -500,7 +501,7 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
     sample
 }
 
-/// What agent `a` should say at frame `t`, if it is there at the next.
+/// The target of agent `a` at frame `t`, if it is present in the next.
 fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     let states = &tracks[a].states;
     let state = states[t]?;

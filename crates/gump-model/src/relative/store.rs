@@ -10,7 +10,7 @@ use crate::ModelError;
 use crate::checkpoint::{self, Precision};
 use crate::prefixes::PREFIXES;
 
-/// Header entry that tells the two architectures apart.
+/// Header entry that distinguishes the two architectures.
 const ARCHITECTURE: (&str, &str) = ("architecture", "relative");
 
 /// Writes a network.
@@ -35,7 +35,7 @@ pub fn save(
 /// Reads a network.
 ///
 /// # Errors
-/// A file that cannot be read, is no checkpoint, or holds another kind of network.
+/// A file that cannot be read, is not a checkpoint, or contains another kind of network.
 pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError> {
     let archive = checkpoint::read(path)?;
     let config = config(&archive)?;
@@ -45,10 +45,10 @@ pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError>
     RelativeNetwork::build(config, Parameters::loaded(tensors.collect(), device))
 }
 
-/// Whether a file of weights holds a network of this kind.
+/// Whether a file of weights contains a network of this kind.
 ///
 /// # Errors
-/// A file that cannot be read or is no checkpoint.
+/// A file that cannot be read or is not a checkpoint.
 pub fn is_relative(path: &Path) -> Result<bool, ModelError> {
     let archive = checkpoint::read(path)?;
     Ok(archive.metadata.get(ARCHITECTURE.0).map(String::as_str) == Some(ARCHITECTURE.1))

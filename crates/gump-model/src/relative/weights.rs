@@ -1,4 +1,4 @@
-//! The numbers of a relative network, without a tensor library.
+//! The parameters of a relative network, without a tensor library.
 
 use std::collections::BTreeMap;
 
@@ -9,9 +9,9 @@ use super::RelativeConfig;
 use crate::ModelError;
 use crate::prefixes::PREFIXES;
 
-/// The numbers of a trained relative network by name, row-major f32, with its shape.
+/// The parameters of a trained relative network by name, row-major f32, with its shape.
 ///
-/// What rolls traffic out reads these; it needs neither tensors nor files.
+/// Used by rollouts, which then need neither tensors nor files.
 #[derive(Clone, Debug)]
 pub struct RelativeWeights {
     config: RelativeConfig,
@@ -19,10 +19,10 @@ pub struct RelativeWeights {
 }
 
 impl RelativeWeights {
-    /// Reads the bytes of a checkpoint; what a training run keeps beside the weights is left out.
+    /// Reads the bytes of a checkpoint; additional tensors of a training run are ignored.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] for bytes that are no checkpoint, or one of another network.
+    /// [`ModelError::Weights`] for bytes that are not a checkpoint, or one of another network.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
         let fail = |what: String| ModelError::Weights(what);
         let (_, header) = SafeTensors::read_metadata(bytes)
@@ -72,7 +72,7 @@ impl RelativeWeights {
         Ok(Self { config, numbers })
     }
 
-    /// The numbers of a network.
+    /// The parameters of a network.
     ///
     /// # Errors
     /// A network that is not f32.
@@ -94,7 +94,7 @@ impl RelativeWeights {
         &self.config
     }
 
-    /// The numbers of a parameter, row-major, if there is one of this name.
+    /// The values of a parameter, row-major, if there is one of this name.
     pub fn find(&self, name: &str) -> Option<&[f32]> {
         self.numbers.get(name).map(Vec::as_slice)
     }
