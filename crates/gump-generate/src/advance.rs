@@ -1,5 +1,6 @@
-//! Drafts going in step: the next key of each, one pass for all, then draws until each keeps its
-//! rules. A draft's randomness is its own, so its company does not matter.
+//! Steps of scene generation for many scenes at once: one pass for the next keys of all, then draws
+//! until each satisfies its constraints. Every scene has its own random stream, so scenes do not
+//! affect each other.
 
 use std::sync::Arc;
 
@@ -20,10 +21,10 @@ use rayon::prelude::*;
 use crate::draft::Draft;
 use crate::{GenerateError, Placement, reason};
 
-/// Draws of an object that are made at once: most objects need no more.
+/// Number of draws of an object made at once: most objects need no more.
 const VOLLEY: usize = 4;
 
-/// Gives every unfinished draft its next object; false once all are finished.
+/// Gives every unfinished scene its next object; false once all are finished.
 pub(crate) fn advance(
     world: &TransformerWorld,
     drafts: &mut [Draft<'_>],
@@ -75,8 +76,8 @@ fn rows_next<'h>(
     rows.next()
 }
 
-/// Hidden vectors at the last slot of every draft for which `last` tells what that is: the key of
-/// a further agent, or the last value.
+/// Hidden vectors at the last slot of every scene for which `last` returns it: the key of a further
+/// agent, or the last value.
 fn read(
     world: &TransformerWorld,
     engine: &Engine,
@@ -117,7 +118,7 @@ struct Query<'d, 'a> {
     broken: Vec<String>,
 }
 
-/// Draws every object until it keeps its rules or its draws are used up.
+/// Draws every object until it satisfies its constraints or its draws are used up.
 fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
     let mut drawn = 0;
     while !queries.is_empty() {
@@ -194,7 +195,7 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
 /// A state and its outline.
 type Found = (QuantizedState, OrientedBox);
 
-/// The state that was drawn, or the rule it breaks. The ego's box is given and therefore good.
+/// The drawn state, or the constraint it violates. The ego's box is given and therefore valid.
 fn judge(query: &Query<'_, '_>, bins: &Bins, is_late: bool) -> Result<Found, String> {
     let state = state_of(bins);
     let prepared = query.draft.prepared;
@@ -209,8 +210,8 @@ fn judge(query: &Query<'_, '_>, bins: &Bins, is_late: bool) -> Result<Found, Str
     }
 }
 
-/// The clause that somebody breaks who stands in traffic without a reason. An ego that prompts speak
-/// of may have theirs.
+/// The reason for rejecting a vehicle that stands in a lane without cause. An ego with prompts is
+/// exempt.
 fn stands_without(
     query: &Query<'_, '_>,
     state: &QuantizedState,

@@ -1,5 +1,5 @@
-//! What generated scenes are held against: vehicles at random along the lanes, and the traffic of
-//! another recording put onto this map.
+//! Baselines for generated scenes: vehicles at random along lanes, and the traffic of another
+//! recording moved onto this map.
 
 use gump_engine::placement::object_spec::agent_of;
 use gump_geometry::{DVec2, angle_difference};
@@ -11,12 +11,12 @@ use rand::Rng as _;
 
 /// Draws of a vehicle before it is left out.
 const TRIES: usize = 50;
-/// Moving vehicles this near to a lane's centre line are judged by its direction, metres.
+/// Moving vehicles this near to a lane's centre line are compared with its direction, metres.
 const ON_LANE_M: f64 = 2.0;
 
-/// The ego of a scene and `n` vehicles at random on lanes within `half_side` metres of it, along
-/// either axis: any place as likely as any other, the lane's way, at a speed up to its limit (15
-/// m/s where none is stated), a car's size.
+/// The ego of a scene and `n` vehicles at random on lanes within `half_side` metres of it along
+/// either axis: positions are uniform, headings are those of lanes, speeds are up to the limit (15
+/// m/s where none is stated), sizes are those of cars.
 pub fn random_along_lanes(scene: &SceneState<'_>, n: usize, half_side: f64, seed: Seed) -> Frame {
     let ego = *scene.ego_now();
     let map: &MapGraph = scene.map;
@@ -60,7 +60,8 @@ pub fn random_along_lanes(scene: &SceneState<'_>, n: usize, half_side: f64, seed
     Frame::new(agents, Vec::new())
 }
 
-/// The ego of a scene and the `n` vehicles nearest to the ego of another, as that one sees them.
+/// The ego of a scene, and the `n` vehicles nearest to the ego of another scene, at their positions
+/// relative to it.
 pub fn retrieved(scene: &SceneState<'_>, from: &SceneState<'_>, n: usize) -> Frame {
     let (ego, theirs) = (*scene.ego_now(), from.ego_now());
     let here_from_there = ego.state.pose * theirs.state.pose.inverse();
@@ -84,8 +85,8 @@ pub fn retrieved(scene: &SceneState<'_>, from: &SceneState<'_>, n: usize) -> Fra
     Frame::new(std::iter::once(ego).chain(moved).collect(), Vec::new())
 }
 
-/// Vehicles of a frame that go against their lane: moving, on a lane, and more than a right angle
-/// off the way of every lane there. Also how many were judged.
+/// Vehicles of a frame that drive against their lane: moving, on a lane, and more than a right
+/// angle off the direction of every lane there; and the number of vehicles examined.
 pub fn wrong_way(map: &MapGraph, frame: &Frame) -> (usize, usize) {
     let (mut wrong, mut judged) = (0, 0);
     let vehicles = frame.agents().iter();
@@ -106,7 +107,7 @@ pub fn wrong_way(map: &MapGraph, frame: &Frame) -> (usize, usize) {
     (wrong, judged)
 }
 
-/// How many vehicles of a frame overlap anybody, and how many there are.
+/// The number of vehicles of a frame that overlap an agent, and the number of vehicles.
 pub fn overlapping_vehicles(frame: &Frame) -> (usize, usize) {
     let vehicles = frame.agents().iter();
     let vehicles: Vec<&Agent> = vehicles.filter(|a| a.kind == AgentKind::Vehicle).collect();

@@ -1,4 +1,4 @@
-//! What is asked of single objects of a scene: a small TOML file, and whether it contradicts itself.
+//! Constraints on single objects of a scene, as a small TOML file, with a check for contradictions.
 //!
 //! ```toml
 //! [[object]]
@@ -11,8 +11,8 @@
 //! ahead_of = { object = "ego", metres = 6.0 }
 //! ```
 //!
-//! Metres, metres per second and radians; `x` ahead of and `y` left of where the ego is, headings
-//! relative to the ego's. What is fixed is met to the nearest value of the grid.
+//! Metres, metres per second and radians; `x` ahead of and `y` left of the ego, headings relative
+//! to the ego's. Fixed values are met to the nearest value of the grid.
 
 use std::collections::BTreeSet;
 
@@ -37,7 +37,7 @@ struct File {
 /// Reads the objects of a TOML file.
 ///
 /// # Errors
-/// [`GenerateError::Constraints`] for text that is not such a file or contradicts itself.
+/// [`GenerateError::Constraints`] for invalid or contradictory text.
 pub fn parse_constraints(text: &str) -> Result<Vec<ObjectSpec>, GenerateError> {
     let file: File = toml::from_str(text).map_err(|error| {
         let line = error
@@ -125,7 +125,7 @@ fn check_numbers(object: &ObjectSpec) -> Result<(), GenerateError> {
     Ok(())
 }
 
-/// Nobody may be in front of whoever is in front of them.
+/// Checks that no cycle of objects follows itself.
 fn check_rows(objects: &[ObjectSpec]) -> Result<(), GenerateError> {
     // (front, back), by every statement of either kind.
     let pairs: Vec<(&str, &str)> = objects
@@ -157,7 +157,7 @@ fn check_rows(objects: &[ObjectSpec]) -> Result<(), GenerateError> {
     Ok(())
 }
 
-/// Every relation said from both sides, so that whoever is placed later knows it.
+/// Adds the inverse of every relation, so that the object placed later knows it.
 pub(crate) fn mutual(objects: &mut [ObjectSpec]) {
     let all = objects.to_vec();
     for object in objects {

@@ -1,4 +1,4 @@
-//! One scene being made: who is there already, and who is to come.
+//! A scene during generation: objects already placed, and those to come.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -17,7 +17,7 @@ use crate::constraint::EGO;
 use crate::prepared::Prepared;
 use crate::{GenerateError, GeneratedScene, even};
 
-/// One scene in progress.
+/// One scene during generation.
 pub(crate) struct Draft<'a> {
     pub(super) prepared: &'a Prepared<'a>,
     seed: Seed,
@@ -28,7 +28,7 @@ pub(crate) struct Draft<'a> {
     named: BTreeMap<String, usize>,
     /// Keys still to come, where their number is given.
     keys: VecDeque<Key>,
-    /// Objects with wishes still to come, in canonical order.
+    /// Objects with constraints still to come, in canonical order.
     wished: VecDeque<&'a ObjectSpec>,
     pub(super) context: Context,
     pub(super) outcome: Option<Result<(), GenerateError>>,
@@ -53,7 +53,7 @@ impl<'a> Draft<'a> {
         draft
     }
 
-    /// Clears the scene for another beginning.
+    /// Clears the scene for another start.
     fn begin(&mut self) {
         self.agents.clear();
         self.boxes.clear();
@@ -76,12 +76,12 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Randomness of one decision of this scene.
+    /// Seed of one decision of this scene.
     pub(super) fn stream(&self, what: u64) -> Seed {
         self.seed.fork(self.restart as u64).fork(what)
     }
 
-    /// What the network decides of the next object, unless that is given; `None` ends the scene.
+    /// The network's decision on the next object, unless it is given; `None` ends the scene.
     pub(super) fn next_key(&mut self, said: Option<&Successor>) -> Option<Key> {
         if self.agents.is_empty() {
             let kind = AgentKind::Vehicle;
@@ -113,12 +113,12 @@ impl<'a> Draft<'a> {
         free.map(|id| Key { id, kind: due })
     }
 
-    /// Whether the network is asked who comes next.
+    /// Whether the network decides which object comes next.
     pub(super) fn asks(&self) -> bool {
         self.prepared.request.counts.is_none() && !self.agents.is_empty()
     }
 
-    /// The rules of the object with this key, which is next.
+    /// The constraints of the object with this key, which is next.
     pub(super) fn rules(&self, key: Key) -> Rules {
         let none = ObjectSpec::default();
         let spec = if key.is_ego() {
@@ -144,7 +144,7 @@ impl<'a> Draft<'a> {
         rules
     }
 
-    /// What decides the first draw of the object with this key, which is next.
+    /// The stratified numbers for the first draw of the object with this key, which is next.
     fn numbers(&self, key: Key) -> Option<[f64; STATE_STEPS]> {
         let request = self.prepared.request;
         let n = request.counts.as_ref()?.of(key.kind);
@@ -157,7 +157,7 @@ impl<'a> Draft<'a> {
         evenly.then(|| even::numbers(seed, i, n))
     }
 
-    /// What is given of the ego, per step of the decoder.
+    /// The given values of the ego, per step of the decoder.
     pub(super) fn given(&self, key: Key) -> [Option<u16>; STEPS.len()] {
         let mut forced = [None; STEPS.len()];
         if key.is_ego() {
@@ -171,7 +171,7 @@ impl<'a> Draft<'a> {
         forced
     }
 
-    /// Puts an object there, its outline as [`Rules::outline`] has it.
+    /// Adds an object, with its box as [`Rules::outline`] computes it.
     pub(super) fn accept(&mut self, key: Key, state: QuantizedState, outline: OrientedBox) {
         if !key.is_ego()
             && self
@@ -188,7 +188,7 @@ impl<'a> Draft<'a> {
         self.boxes.push(outline);
     }
 
-    /// Begins anew, or gives up with what was broken most often.
+    /// Starts again, or gives up with the most frequent violation.
     pub(super) fn fail(&mut self, key: Key, broken: &[String]) {
         let config = &self.prepared.request.config;
         if self.restart < config.restarts {

@@ -1,34 +1,34 @@
-//! A drive of the ego that a prompt is about: along lanes or over to the next one, at a speed that
-//! changes as the prompt says, whatever the others do.
+//! A planned drive of the ego that matches a prompt: along lanes or to an adjacent one, with a
+//! speed profile, regardless of other agents.
 
 use gump_geometry::{DVec2, Polyline, Pose};
 use gump_rollout::{BoxError, Command, Policy};
 use gump_scene::{AgentState, Lane, LaneId, Light, LightState, MapGraph, Rng, SceneState};
 use rand::Rng as _;
 
-/// How far ahead a drive is planned, seconds.
+/// Horizon of a planned drive, seconds.
 pub(crate) const PLANNED_S: f64 = 5.0;
-/// Speeding up lasts so long, seconds.
+/// Duration of an acceleration, seconds.
 const PULL_S: f64 = 2.0;
-/// A jolt is braking from when until when, seconds, and by how much, metres per second squared.
+/// A jolt: start and end of the braking, seconds, and deceleration, metres per second squared.
 const JOLT: ([f64; 2], f64) = ([1.0, 1.5], 6.0);
-/// The axles are so far from the middle, metres; both are on the path.
+/// Distance of the axles from the centre, metres; both are on the path.
 const AXLE_M: f64 = 1.4;
-/// So much of a drive may lie beyond the end of the road, metres.
+/// Maximum length of a drive beyond the end of the road, metres.
 const ENDS_M: f64 = 1.0;
-/// Whoever moves less than this stands, metres.
+/// A vehicle that moves less than this stands, metres.
 const STANDS_M: f64 = 1.0;
-/// Neighbouring lanes begin so far apart along the road at most, metres.
+/// Maximum distance along the road between the starts of adjacent lanes, metres.
 const BEGINS_M: f64 = 20.0;
-/// Lanes that a drive leads through at most.
+/// Maximum number of lanes of a drive.
 const MOST_LANES: usize = 24;
-/// Neighbouring lanes are so far from each other, metres.
+/// Lateral distance of adjacent lanes, metres.
 const BESIDE_M: [f64; 2] = [2.2, 5.5];
 
-/// What is done besides following lanes at a constant speed.
+/// The manoeuvre, besides following lanes at a constant speed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Maneuver {
-    /// Metres per second squared; pulling ends after a while, braking when the ego stands.
+    /// Metres per second squared; acceleration ends after a while, braking when the ego stands.
     pub(crate) acceleration: f64,
     /// Brakes hard for a moment.
     pub(crate) jolts: bool,
@@ -46,7 +46,7 @@ pub(crate) struct Change {
 }
 
 impl Maneuver {
-    /// How long it takes, or lets the world see what the ego is up to.
+    /// Duration, in seconds, or left to the world.
     pub(crate) fn seconds(&self) -> f64 {
         if self.jolts || self.acceleration > 0.0 {
             PULL_S
@@ -72,8 +72,8 @@ pub(crate) struct Drive {
 }
 
 impl Drive {
-    /// From `at` metres along a lane, `offset` metres left of its centre line, any way through the
-    /// junctions that come; `None` if the road ends before, or no lane is where to change to.
+    /// From `at` metres along a lane, `offset` metres left of its centre line, along a random path
+    /// through junctions; `None` if the road ends before, or there is no lane to change to.
     pub(crate) fn along(
         map: &MapGraph,
         (lane, at): (&Lane, f64),
@@ -129,17 +129,17 @@ impl Drive {
         }
     }
 
-    /// How long the ego is to be steered.
+    /// How long the ego is steered.
     pub(crate) fn seconds(&self) -> f64 {
         self.maneuver.seconds()
     }
 
-    /// True if the ego does something that is not there from the first moment.
+    /// True if the ego's manoeuvre starts after the first moment.
     pub(crate) fn takes_time(&self) -> bool {
         self.maneuver.jolts || self.maneuver.change.is_some()
     }
 
-    /// True if a vehicle of this length passes a red light on the way.
+    /// True if a vehicle of this length passes a red light on the path.
     pub(crate) fn runs_red(&self, lights: &[Light], length: f64) -> bool {
         let metres = self.metres_after(PLANNED_S);
         let end = self.from + length / 2.0 + metres;
@@ -174,7 +174,7 @@ impl Drive {
     }
 }
 
-/// The policy of an ego that drives so.
+/// The policy of an ego with this drive.
 pub(crate) struct Steered<'a> {
     drive: &'a Drive,
     seconds: f64,
@@ -213,8 +213,8 @@ fn neighbor<'a>(map: &'a MapGraph, lane: &Lane, is_left: bool) -> Option<&'a Lan
     (!lane.in_intersection && !there.in_intersection).then_some(there)
 }
 
-/// The points of a lane and of those after it, any way through the junctions, for so many metres or
-/// up to where the road ends; also where each that follows begins.
+/// The points of a lane and its successors, along a random path through junctions, for this many
+/// metres or up to the end of the road; and the start of each successor.
 fn way(
     map: &MapGraph,
     lane: &Lane,
@@ -236,8 +236,8 @@ fn way(
     }
 }
 
-/// The points of one line up to `at` metres along it, and then over to another beside it within so
-/// many metres; `None` if it is not beside it there.
+/// The points of one line up to `at` metres along it, and then a transition to an adjacent line
+/// within this many metres; `None` if the lines are not adjacent there.
 fn changed(own: &Polyline, other: &Polyline, at: f64, metres: f64) -> Option<Vec<DVec2>> {
     let end = at + metres;
     if metres < 1.0 || end > own.length() {

@@ -1,9 +1,8 @@
-//! Numbers that spread the draws of a scene's objects evenly.
+//! Stratified random numbers for the objects of a scene (Latin hypercube sampling).
 //!
-//! With a few objects, chance alone makes scenes of lorries only, or all on one side. Where it is
-//! known how many objects of a class there are, every field of each is decided by a number of its
-//! own stratum: each draw on its own has the distribution it would have anyway, and together they
-//! cover it.
+//! With few objects, independent draws may give scenes with lorries only, or with all agents on one
+//! side. Where the number of objects of a class is known, every field of each is decided by a
+//! number of its own stratum: each draw has its usual distribution, and together they cover it.
 //!
 //! Source: Latin hypercube sampling (McKay, Beckman and Conover 1979).
 
@@ -12,7 +11,7 @@ use gump_model::decoder::STATE_STEPS;
 use gump_scene::Seed;
 use rand::seq::SliceRandom;
 
-/// What decides the steps of object `i` of `n`; all objects of a scene and class share `seed`.
+/// The numbers for the steps of object `i` of `n`; all objects of a scene and class share `seed`.
 pub(crate) fn numbers(seed: Seed, i: usize, n: usize) -> [f64; STATE_STEPS] {
     std::array::from_fn(|step| {
         let seed = seed.fork(step as u64);

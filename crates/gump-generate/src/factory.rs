@@ -1,8 +1,8 @@
-//! Scenes that hold what was asked: put where that can be, made, imagined a little further, judged,
-//! and made again.
+//! Generation of scenes that satisfy their prompts: choose a place, generate, simulate the next
+//! seconds, check, and repeat.
 //!
-//! A prompt is looked for first in what the world makes of the scene by itself, and then in a drive
-//! of the ego that is what the prompt says (`drive`), to which the world makes the others react.
+//! A prompt may come true in the world's own rollout of the scene, or in a drive of the ego that
+//! matches the prompt (`drive`), to which the world's other agents react.
 
 use std::ops::Range;
 
@@ -18,40 +18,40 @@ use crate::stage::Stage;
 use crate::verdict::{Clause, through_time, verdict};
 use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
 
-/// What a factory makes.
+/// A job of the factory.
 #[derive(Clone, Debug)]
 pub struct GenerationJob {
-    /// What every scene is like.
+    /// The request of every scene.
     pub request: GenerateRequest,
-    /// True lets each scene have its own place on the map, within 150 m of the request's; a prompt
-    /// in guided placement may take that freedom too.
+    /// Whether each scene may have its own place on the map, within 150 m of the request's; with a
+    /// prompt in guided placement places are always searched.
     pub roams: bool,
-    /// Seconds to imagine of every scene; 0 for none.
+    /// Seconds to simulate of every scene; 0 for none.
     pub seconds: f64,
-    /// Scenes made before one is given up that does not hold.
+    /// Maximum number of attempts per scene.
     pub attempts: usize,
 }
 
-/// A scene that was ordered.
+/// A generated scene with its check.
 #[derive(Clone, Debug)]
 pub struct Made {
-    /// The scene that was made first.
+    /// The scene as generated.
     pub scene: GeneratedScene,
-    /// What was imagined of its future, at 10 Hz. The present is the moment that is what the prompts
-    /// say, at most two seconds later; up to a second before it is kept.
+    /// Its simulated future, at 10 Hz. The present is the instant at which the prompts hold, at
+    /// most two seconds later; up to a second before it is kept.
     pub scenario: Scenario,
-    /// The verdict on the present.
+    /// The check of the present.
     pub clauses: Vec<Clause>,
-    /// Scenes made until this one; it is the last, whether it holds or not.
+    /// Number of attempts; this scene is the last one, whether it satisfies the request or not.
     pub attempts: usize,
-    /// Whether the ego was driven as the prompts say, rather than by the world.
+    /// Whether the ego was steered to match the prompts, rather than driven by the world.
     pub is_steered: bool,
-    /// Seconds from the scene that was made to the present.
+    /// Seconds from the generated scene to the present.
     pub moment_s: f64,
 }
 
 impl Made {
-    /// True if no clause fails; what cannot be decided does not.
+    /// True if no clause fails; undecidable clauses do not count.
     pub fn holds(&self) -> bool {
         self.clauses
             .iter()
@@ -59,12 +59,12 @@ impl Made {
     }
 }
 
-/// Which worlds make scenes.
+/// The worlds used for generation.
 #[derive(Clone, Copy)]
 pub struct GenerationWorlds<'a> {
-    /// The network that puts agents into a scene.
+    /// The network that places agents in a scene.
     pub scenes: &'a TransformerWorld,
-    /// The world in which the scene then goes on; another one, or the same.
+    /// The world that simulates the scene; may be the same network.
     pub traffic: &'a dyn WorldModel,
 }
 
@@ -78,10 +78,10 @@ impl<'a> GenerationWorlds<'a> {
     }
 }
 
-/// Makes the scenes with these numbers; what each is depends on its number and the seed alone.
+/// Generates the scenes with these indices; each depends only on its index and the seed.
 ///
 /// # Errors
-/// What makes the order impossible.
+/// Reasons that make the whole job impossible.
 pub fn make_many(
     worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
@@ -119,10 +119,11 @@ pub fn make_many(
     Ok(made.collect())
 }
 
-/// Whether a map admits the prompts of a request: somewhere within 150 m of the request's ego, one
-/// alone with those whom the prompts are about, driving along lanes, is what they say.
+/// Whether a map admits the prompts of a request: somewhere within 150 m of the request's ego, an
+/// ego that drives along the lanes, with only the agents that the prompts are about, satisfies
+/// them.
 ///
-/// That needs no network, and says nothing of whether a scene will hold them.
+/// This needs no network, and does not mean that a generated scene will satisfy them.
 pub fn admits(request: &GenerateRequest, seed: Seed) -> bool {
     let search = Search {
         cast: &PromptSpec::of(&request.prompts),
@@ -132,10 +133,10 @@ pub fn admits(request: &GenerateRequest, seed: Seed) -> bool {
     search.anywhere(seed).is_some()
 }
 
-/// Makes scene number `number` of an order.
+/// Generates scene `number` of a job.
 ///
 /// # Errors
-/// What makes the order impossible, or the last attempt's failure if none gave a scene.
+/// Reasons that make the job impossible, or the error of the last attempt if none gave a scene.
 pub fn make(
     worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
@@ -192,11 +193,11 @@ pub fn make(
     }
 }
 
-/// Where the scenes of an order are put, attempt by attempt.
+/// Places for the scenes of a job, attempt by attempt.
 struct Place<'a> {
     order: &'a GenerationJob,
     cast: PromptSpec,
-    /// Whether places other than the one asked for may be looked for.
+    /// Whether places other than the requested one may be used.
     searches: bool,
 }
 
@@ -209,7 +210,7 @@ impl<'a> Place<'a> {
         }
     }
 
-    /// The request of an attempt, and the stage it is put on if prompts need one.
+    /// The request of an attempt, and its place if prompts need one.
     fn next(
         &mut self,
         attempt: usize,
@@ -246,7 +247,7 @@ impl<'a> Place<'a> {
     }
 }
 
-/// The scene with as much of its future as is asked for or needed to judge it, and the verdict.
+/// The scene with as much of its future as is requested or needed for the check, and the check.
 fn judged(
     world: &dyn WorldModel,
     order: &GenerationJob,

@@ -1,5 +1,5 @@
-//! What all scenes of a request share: the map as the network remembers it, the wishes, the ground,
-//! and whether all of it can go together.
+//! Data shared by all scenes of a request: the encoded map, the constraints, valid positions, and a
+//! check that the constraints are consistent.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,16 +22,16 @@ use gump_tokenizer::{
 use crate::constraint::EGO;
 use crate::{GenerateError, GenerateRequest, Placement, constraint};
 
-/// What all scenes of a request share.
+/// Data shared by all scenes of a request.
 pub(crate) struct Prepared<'a> {
     pub(super) request: &'a GenerateRequest,
     pub(super) scene: Scene,
     prompts: Vec<Option<ScenarioTag>>,
-    /// With relations known from both sides.
+    /// With relations stored on both sides.
     pub(super) objects: Vec<ObjectSpec>,
     grounds: BTreeMap<AgentKind, Arc<Ground>>,
     lanes: BTreeMap<i64, Arc<Ground>>,
-    /// Boxes of what stands around, scene frame.
+    /// Boxes of static objects, scene frame.
     pub(super) fixtures: Vec<OrientedBox>,
     pub(super) sampling: SamplingConfig,
     manner: Manner,
@@ -129,7 +129,7 @@ impl<'a> Prepared<'a> {
         Ok(())
     }
 
-    /// Every object that is not placed by others has some cell it could be on.
+    /// Checks that every object with its own constraints has some valid cell.
     fn check_places(&self) -> Result<(), GenerateError> {
         for object in self.objects.iter().filter(|object| object.id != EGO) {
             let rules = self.rules(object.class.kind(), object, &[], &BTreeMap::new());
@@ -147,7 +147,7 @@ impl<'a> Prepared<'a> {
         Ok(())
     }
 
-    /// The rules of an object among those that are there.
+    /// The constraints of an object among those already placed.
     pub(super) fn rules(
         &self,
         kind: AgentKind,
@@ -216,7 +216,7 @@ impl<'a> Prepared<'a> {
     }
 }
 
-/// The ego alone on the map, as the network will see it.
+/// The map with only the ego, as the network sees it.
 fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<Scene, ModelError> {
     if world.engine().is_none() {
         let what = "scenes are generated on a CPU only, and this world is elsewhere";
@@ -237,7 +237,7 @@ fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<S
     Scene::of_window(world, map, None, vec![frame], id, identities)
 }
 
-/// The ground of every lane that objects are to be on.
+/// Valid positions on every lane that constraints name.
 fn lane_grounds(request: &GenerateRequest) -> Result<BTreeMap<i64, Arc<Ground>>, GenerateError> {
     let lanes = request.objects.iter().filter_map(ObjectSpec::lane);
     let ground = |lane: LaneId| {

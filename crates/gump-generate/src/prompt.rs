@@ -1,8 +1,8 @@
-//! What a prompt asks for in a guided scene, beyond what the network makes of its tokens: a speed
-//! of the ego and what it is up to, who is around it, what stands at the roadside.
+//! Requirements of a prompt in guided placement, beyond the effect of its tokens on the network:
+//! the ego's speed and manoeuvre, agents around it, objects at the roadside.
 //!
-//! A tag is only made possible here; where on a map that can be is for `stage` to find, and whether
-//! it came about for `verdict` to say.
+//! This module makes a tag possible; `stage` finds places where it can hold, and `verdict` checks
+//! whether it does.
 
 use gump_engine::placement::object_spec::{Bounds, Class, ObjectSpec, Relation};
 use gump_scene::{AreaKind, Light, MapGraph, Rng, ScenarioTag};
@@ -11,7 +11,7 @@ use rand::Rng as _;
 use crate::constraint::EGO;
 use crate::drive::{Change, Maneuver};
 
-/// What tags ask for.
+/// Requirements of tags.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PromptSpec {
     /// Of the ego.
@@ -20,21 +20,21 @@ pub(crate) struct PromptSpec {
     acceleration: f64,
     jolts: bool,
     changes: Option<Changes>,
-    /// Whoever's place is known without a map.
+    /// Agents whose position is known without a map.
     pub(crate) objects: Vec<ObjectSpec>,
-    /// A person on a crosswalk.
+    /// A pedestrian on a crosswalk.
     pub(crate) crosswalk: Option<OnCrosswalk>,
-    /// Somebody who crosses ahead.
+    /// An agent that crosses ahead.
     pub(crate) crossing: Option<Class>,
-    /// Whether somebody follows in the lane that is changed to.
+    /// Whether an agent follows in the lane that is changed to.
     pub(crate) is_trailed: bool,
-    /// What stands along the road.
+    /// Objects along the road.
     pub(crate) works: Option<WorkZone>,
-    /// What a map must have somewhere.
+    /// Required features of the map.
     pub(crate) needs: Vec<Need>,
 }
 
-/// What a map may lack.
+/// A feature that a map may lack.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Need {
     /// A lane or an area of an intersection.
@@ -49,27 +49,27 @@ pub(crate) enum Need {
     Carpark,
 }
 
-/// Which changes of lanes will do.
+/// Which lane changes satisfy a tag.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Changes {
     /// To the left (true), to the right, to either side.
     Lanes(Option<bool>),
-    /// Any that is swift; a bend taken fast will do, too.
+    /// Any swift one; a curve at speed also satisfies it.
     Swift,
 }
 
-/// Where on a crosswalk a person is.
+/// Position of a pedestrian on a crosswalk.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum OnCrosswalk {
     /// Near the ego.
     Near,
     /// On the one that the ego is on.
     WithEgo,
-    /// In the ego's way.
+    /// In the ego's path.
     InTheWay,
 }
 
-/// What stands along the road.
+/// Objects along the road.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum WorkZone {
     /// Cones.
@@ -81,7 +81,7 @@ pub(crate) enum WorkZone {
 }
 
 impl PromptSpec {
-    /// What all tags ask for together; where they ask for different things the first counts.
+    /// The combined requirements of all tags; in conflicts the first tag wins.
     pub(crate) fn of(prompts: &[ScenarioTag]) -> Self {
         let mut all = Self::default();
         for (i, tag) in prompts.iter().enumerate() {
@@ -106,7 +106,7 @@ impl PromptSpec {
         all
     }
 
-    /// One of the things the ego may do.
+    /// One of the possible manoeuvres of the ego.
     pub(crate) fn maneuver(&self, rng: &mut Rng) -> Maneuver {
         let mut change = |is_left: Option<bool>, seconds: [f64; 2]| Change {
             is_left: is_left.unwrap_or_else(|| rng.random()),
@@ -128,7 +128,7 @@ impl PromptSpec {
     }
 }
 
-/// What one tag asks for.
+/// Requirements of one tag.
 fn of_tag(name: &str) -> PromptSpec {
     let acceleration = if name.starts_with("accelerating") {
         1.8
@@ -174,7 +174,7 @@ fn of_tag(name: &str) -> PromptSpec {
     }
 }
 
-/// What a map without which no tag of this name can hold must have; the words of the name say it.
+/// The features that a map must have for a tag of this name, derived from the words of the name.
 fn needs_of(name: &str) -> Vec<Need> {
     let has = |words: &[&str]| words.iter().any(|word| name.contains(word));
     let is_lit = has(&["traffic_light"]) || has(&["_protected"]);
@@ -206,7 +206,7 @@ impl Need {
     }
 }
 
-/// Whom a tag wants ahead of or around the ego.
+/// Agents that a tag requires ahead of or around the ego.
 fn objects_of(name: &str) -> Vec<ObjectSpec> {
     let bounds = |low, high| Some(Bounds::new(low, high));
     let ahead = |class, metres, speed, length| ObjectSpec {

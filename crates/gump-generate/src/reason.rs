@@ -1,27 +1,28 @@
-//! Whether somebody who stands in traffic has a reason to: a light, a sign, a junction or somebody
-//! before him.
+//! Whether a vehicle that stands in traffic has a reason to: a light, a sign, a junction or another
+//! agent ahead.
 //!
-//! A network that draws one object after another puts vehicles down in the middle of open lanes that
-//! stand there; whoever then imagines the scene lets them stand, as double-parked ones do, and half
-//! a minute later everybody stands behind them.
+//! A network that draws one object after another places standing vehicles in the middle of open
+//! lanes. Rollouts leave them there, like double-parked vehicles, and half a minute later all
+//! traffic stands behind them.
 
 use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, angle_difference};
 use gump_scene::{Lane, Light, LightState, MapGraph, stop_line};
 
-/// Slower is standing, metres per second.
+/// A slower vehicle stands, metres per second.
 const STANDS: f64 = 0.5;
-/// Whoever is this near to a lane's middle, and turned by no more, stands in traffic; farther off he
-/// is parked. Metres and radians.
+/// A vehicle this near to a lane's centre, and this well aligned with it, stands in traffic;
+/// otherwise it is parked. Metres and radians.
 const IN_LANE_M: f64 = 1.0;
 const ALONG: f64 = 0.35;
-/// How far ahead of the front bumper a reason may be, metres: a light or sign, a junction, another.
+/// How far ahead of the front bumper a reason may be, metres: a light or sign, a junction, another
+/// agent.
 const LINE_M: f64 = 25.0;
 const JUNCTION_M: f64 = 10.0;
 const NEXT_M: f64 = 12.0;
-/// How far beside the middle of the way another may be to be in it, metres.
+/// How far beside the path another agent may be to be in it, metres.
 const BESIDE_M: f64 = 1.8;
 
-/// True if a box, world frame, stands in a lane and nothing holds it back.
+/// True if a box, world frame, stands in a lane without a reason.
 pub(crate) fn stands_without(
     own: &OrientedBox,
     speed: f64,
@@ -69,7 +70,7 @@ pub(crate) fn stands_without(
     })
 }
 
-/// The lane that somebody is in the middle of, if there is one.
+/// The lane in whose middle an agent is, if there is one.
 fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
     let near = map.lanes_near(pose.position, IN_LANE_M);
     let along = near.filter(|(lane, _)| {
@@ -81,7 +82,7 @@ fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
     nearest.map(|(lane, _)| lane)
 }
 
-/// The ways ahead of a place on a lane, each with its lanes.
+/// The paths ahead of a position on a lane, each with its lanes.
 fn ways<'m>(map: &'m MapGraph, lane: &'m Lane, from: f64) -> Vec<(Vec<&'m Lane>, Polyline)> {
     let rest = lane.centerline.slice(from, lane.centerline.length());
     let mut next: Vec<&Lane> = map.successors(lane.id).collect();

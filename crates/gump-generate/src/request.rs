@@ -1,4 +1,4 @@
-//! What is asked for, what comes of it, and the making.
+//! Requests for scenes, their results, and generation.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,28 +14,28 @@ use crate::advance;
 use crate::draft::Draft;
 use crate::prepared::Prepared;
 
-/// A scene to be made.
+/// A request for a scene.
 #[derive(Clone, Debug)]
 pub struct GenerateRequest {
-    /// The road.
+    /// The map.
     pub map: Arc<MapGraph>,
-    /// Where the ego is and what of it is known.
+    /// The ego's pose and known values.
     pub ego: EgoStart,
-    /// Traffic lights as they are shown.
+    /// The states of traffic lights.
     pub lights: Vec<Light>,
-    /// What stands around without moving: cones, barriers, signs. Never drawn by the network.
+    /// Static objects: cones, barriers, signs. The network never generates them.
     pub fixtures: Vec<Agent>,
-    /// What kind of situation it is to be; at most four, none for any.
+    /// Prompts: the kind of situation; at most four, none for any.
     pub prompts: Vec<ScenarioTag>,
-    /// How many objects besides the ego; `None` leaves that to the network.
+    /// Number of objects besides the ego; `None` leaves it to the network.
     pub counts: Option<Counts>,
-    /// Wishes for single objects. They are among those counted.
+    /// Constraints on single objects, which are included in the count.
     pub objects: Vec<ObjectSpec>,
-    /// How scenes are drawn.
+    /// Sampling settings.
     pub config: GenerateConfig,
 }
 
-/// The ego of a scene to be made.
+/// The ego of a requested scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EgoStart {
     /// Box centre, world frame.
@@ -53,7 +53,7 @@ pub struct EgoStart {
 pub struct Counts {
     /// Cars, trucks, buses, the ego not counted.
     pub vehicles: usize,
-    /// People on foot.
+    /// Pedestrians.
     pub pedestrians: usize,
     /// Bicycles.
     pub bicycles: usize,
@@ -70,13 +70,13 @@ impl Counts {
         }
     }
 
-    /// All together.
+    /// Their sum.
     pub fn total(&self) -> usize {
         self.vehicles + self.pedestrians + self.bicycles
     }
 }
 
-/// How scenes are drawn.
+/// Sampling settings of scene generation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GenerateConfig {
@@ -86,31 +86,32 @@ pub struct GenerateConfig {
     pub size_boldness: f64,
     /// Multiplies the temperature of x and y (paper: 1).
     pub place_boldness: f64,
-    /// What training spread the targets of sizes and velocities by (`smoothing_bins`), to be taken
-    /// off again: a standard deviation in bins; 0 leaves it (paper).
+    /// Smoothing of the targets of sizes and velocities in training (`smoothing_bins`), which is
+    /// removed: standard deviation in bins; 0 leaves it (paper).
     pub smoothing_bins: f64,
-    /// Whether training spread the targets of sizes, too: not with `exact_standing`.
+    /// Whether training smoothed the targets of sizes as well: not with `exact_standing`.
     pub smoothed_sizes: bool,
-    /// Whether the draws of a scene's objects are spread evenly where their number is given (paper:
+    /// Whether the draws of a scene's objects are stratified where their number is given (paper:
     /// no).
     pub even: bool,
     /// Bins that may be drawn per field (paper: 200 in the text, 400 in the table).
     pub top_k: usize,
-    /// Where objects may be drawn.
+    /// Where objects may be placed.
     pub placement: Placement,
-    /// Whether who stands in a lane has a reason to: a light, a sign, a junction or somebody before
-    /// him. In guided placement only. Scenes are less like recorded ones for it, and go on better.
+    /// Whether a vehicle that stands in a lane needs a reason: a light, a sign, a junction or
+    /// another agent ahead. In guided placement only. It makes scenes less like recorded ones, but
+    /// their rollouts better.
     pub standing_has_reasons: bool,
-    /// Draws per object before the scene is begun anew.
+    /// Draws per object before the scene is started again.
     pub tries: usize,
-    /// Times a scene is begun anew before it is given up.
+    /// Restarts of a scene before it is given up.
     pub restarts: usize,
-    /// Most objects where their number is left to the network.
+    /// Maximum number of objects where the network decides it.
     pub max_agents: usize,
 }
 
 impl GenerateConfig {
-    /// Draws as the paper has them: bolder, and each on its own.
+    /// The paper's sampling: higher temperature, independent draws.
     pub fn paper() -> Self {
         Self {
             temperature: 1.25,
@@ -126,7 +127,7 @@ impl GenerateConfig {
 }
 
 impl Default for GenerateConfig {
-    /// What makes scenes most like recorded ones with the shipped weights
+    /// The settings with the scenes most similar to recorded ones, with the shipped weights
     /// (docs/results/0012-generation.md).
     fn default() -> Self {
         Self {
@@ -146,29 +147,29 @@ impl Default for GenerateConfig {
     }
 }
 
-/// Where objects may be drawn.
+/// Where objects may be placed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Placement {
-    /// Wherever the network puts them, overlaps and off-road starts excepted.
+    /// Wherever the network places them, except overlaps and off-road starts.
     Free,
-    /// Of what the network proposes, only what lies on lanes (vehicles, bicycles) or walkways, goes
-    /// the lane's way, and has a size and speed common in its class.
+    /// Only on lanes (vehicles, bicycles) or walkways, in the lane's direction, with sizes and
+    /// speeds in the usual range of their class.
     Guided,
 }
 
-/// A scene that was made.
+/// A generated scene.
 #[derive(Clone, Debug)]
 pub struct GeneratedScene {
-    /// Who is there and how the lights stand, world frame.
+    /// Its agents and lights, world frame.
     pub frame: Frame,
     /// The ego, which is in it.
     pub ego: AgentId,
-    /// Objects that were wished for, by their name.
+    /// Objects with constraints, by their names.
     pub names: BTreeMap<String, AgentId>,
-    /// Draws that broke a rule.
+    /// Number of rejected draws.
     pub redraws: usize,
-    /// Times it was begun anew.
+    /// Number of restarts.
     pub restarts: usize,
 }
 
@@ -195,10 +196,10 @@ impl GeneratedScene {
 /// Why there is no scene.
 #[derive(Debug, thiserror::Error)]
 pub enum GenerateError {
-    /// Wishes that contradict themselves, each other or the map.
+    /// Constraints that contradict themselves, each other or the map.
     #[error("constraints: {0}")]
     Constraints(String),
-    /// Nothing can drive on the map.
+    /// The map has no lane for vehicles.
     #[error("the map has no drivable lane within 100 m of the ego")]
     NoLane,
     /// Prompts for which the map has no place.
@@ -210,15 +211,15 @@ pub enum GenerateError {
         /// Their names.
         prompts: String,
     },
-    /// More objects than there are keys or room for.
+    /// More objects than there are keys or space for.
     #[error("{asked} objects are more than the {most} that a scene of this model holds")]
     TooMany {
-        /// Objects asked for.
+        /// Number requested.
         asked: usize,
-        /// The most there can be.
+        /// The maximum.
         most: usize,
     },
-    /// An object found no place.
+    /// No valid state was found for an object.
     #[error(
         "{object} found no place in {scenes} scenes begun with {tries} draws each; most often it \
          could not meet: {clause}"
@@ -226,11 +227,11 @@ pub enum GenerateError {
     NoPlace {
         /// Its id, or its class if it has none.
         object: String,
-        /// Scenes begun.
+        /// Number of restarts.
         scenes: usize,
         /// Draws in each.
         tries: usize,
-        /// The rule broken most often.
+        /// The most frequent violation.
         clause: String,
     },
     /// The network failed.
@@ -238,10 +239,10 @@ pub enum GenerateError {
     Model(#[from] ModelError),
 }
 
-/// One scene per seed, each a function of the request and its own seed alone.
+/// One scene per seed, each a function of the request and its own seed only.
 ///
 /// # Errors
-/// What makes every scene impossible; what a single scene failed at stands in its place.
+/// Reasons that make every scene impossible; the failure of a single scene is in its place.
 pub fn generate(
     world: &TransformerWorld,
     request: &GenerateRequest,

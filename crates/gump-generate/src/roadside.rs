@@ -1,5 +1,5 @@
-//! Places beside and across the road: where cones and barriers stand, where somebody is on a
-//! crosswalk, which lanes cross ahead.
+//! Places beside and across the road: for cones and barriers, for pedestrians on crosswalks, and
+//! lanes that cross ahead.
 
 use gump_engine::placement::object_spec::agent_of;
 use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, dvec2};
@@ -9,14 +9,13 @@ use crate::EgoStart;
 use crate::drive::Drive;
 use crate::prompt::WorkZone;
 
-/// What stands at the roadside begins so far ahead of the ego's front, and goes on so far apart,
-/// metres.
+/// Distance of the first roadside object from the ego's front, and spacing, metres.
 const WORKS_M: [f64; 2] = [2.5, 3.0];
 /// Metres from lane to lane centre that stay clear.
 const CLEAR_M: f64 = 1.35;
-/// A person is looked for on crosswalks up to so far from the ego's middle, metres.
+/// Maximum distance of a crosswalk with a pedestrian from the ego's centre, metres.
 const WALK_M: f64 = 9.0;
-/// The ego's line is crossed at so many metres ahead of its front.
+/// Range ahead of the ego's front in which its line may be crossed, metres.
 const CROSSED_M: [f64; 2] = [4.0, 15.0];
 
 /// Cones or barriers along the edge of the lane that is driven, ahead of the ego and clear of the
@@ -54,8 +53,8 @@ pub(super) fn put(
     })
 }
 
-/// Spots on crosswalks around the ego, in its frame, that are wanted; told with each is whether the
-/// ego is on the same crosswalk. At least a metre from the ego's box and up to 7 m.
+/// Requested positions on crosswalks around the ego, in its frame, each with whether the ego is on
+/// the same crosswalk. At least a metre from the ego's box and up to 7 m.
 pub(super) fn on_crosswalk(
     map: &MapGraph,
     ego: &EgoStart,

@@ -1,7 +1,7 @@
-//! Finding a stage on which prompts can hold: where the user asked for one, or anywhere on the map.
+//! Search for a place at which prompts can hold: the requested one, or anywhere on the map.
 //!
-//! Whether the tags hold in the trial of a stage says, without any network, whether a map admits
-//! them.
+//! Whether the tags hold in the trial of a place determines, without a network, whether a map
+//! admits them.
 
 use gump_geometry::{Pose, angle_difference};
 use gump_metrics::tags;
@@ -13,18 +13,18 @@ use crate::prompt::PromptSpec;
 use crate::stage::Stage;
 use crate::{EgoStart, GenerateRequest};
 
-/// How far from where it is asked the ego may be put, metres.
+/// Maximum distance of the ego from the requested pose, metres.
 const ROAM_M: f64 = 150.0;
-/// Metres between places along a lane.
+/// Spacing of candidate places along a lane, metres.
 const SPACING_M: f64 = 2.0;
-/// Trials of a place that is given.
+/// Trials of a given place.
 const TRIALS: usize = 60;
-/// Times every place of a map is tried, each time another way through the junctions ahead.
+/// Trials of every place of a map, each with other paths through the junctions ahead.
 const ROUNDS: usize = 2;
-/// The frames of a trial that may be the moment of the tags; later ones where that takes time.
+/// The frames of a trial at which the tags may hold; later ones for tags that take time.
 const MOMENTS: [usize; 2] = [0, 10];
 
-/// What is looked for.
+/// The search criteria.
 pub(crate) struct Search<'a> {
     pub(crate) cast: &'a PromptSpec,
     pub(crate) request: &'a GenerateRequest,
@@ -32,8 +32,8 @@ pub(crate) struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// A stage at the place the request gives, on whose lanes the ego stays as far to the side as
-    /// it is; `None` if the prompts cannot hold there.
+    /// A stage at the requested pose, on whose lanes the ego keeps its lateral offset; `None` if
+    /// the prompts cannot hold there.
     pub(crate) fn here(&self, seed: Seed) -> Option<Stage> {
         let pose = self.request.ego.pose;
         let map: &MapGraph = &self.request.map;
@@ -92,7 +92,7 @@ impl Search<'_> {
         Stage::set(self.cast, self.request, place, offset, rng)
     }
 
-    /// Whether all tags hold at one moment of the trial.
+    /// Whether all tags hold at the same instant of the trial.
     fn holds(&self, stage: &Stage) -> bool {
         if self.prompts.is_empty() {
             return true;
@@ -111,7 +111,7 @@ impl Search<'_> {
     }
 }
 
-/// A start on any lane around one, any place as likely as any other; that one if there is no lane.
+/// A start on any lane around a pose, with uniform position; the pose itself if there is no lane.
 pub(crate) fn any_start(map: &MapGraph, around: EgoStart, seed: Seed) -> EgoStart {
     let lanes = lanes_around(map, around.pose);
     let total: f64 = lanes.iter().map(|lane| lane.centerline.length()).sum();

@@ -1,5 +1,5 @@
-//! The place of a scene that prompts are about: where the ego is and what drive begins there, who
-//! else has a part, and a trial in which nobody is there but these.
+//! The site of a prompted scene: the ego's pose and drive, the other agents that the prompt needs,
+//! and a trial with only these.
 
 use std::sync::Arc;
 
@@ -16,23 +16,23 @@ use crate::{EgoStart, GenerateRequest, roadside};
 
 /// Frames of a trial per second.
 const TRIAL_HZ: f64 = 10.0;
-/// Somebody who crosses does so after so many seconds.
+/// Time at which a crossing agent crosses, seconds.
 const CROSSES_S: f64 = 1.8;
 
-/// Where a scene is to be and who has a part in it.
+/// The place of a scene, with the agents that its prompts need.
 #[derive(Clone, Debug)]
 pub(crate) struct Stage {
     pub(super) ego: EgoStart,
-    /// What the ego does if it is steered.
+    /// The ego's drive if it is steered.
     drive: Drive,
-    /// All wishes, the user's and those of the prompts.
+    /// All constraints, of the user and of the prompts.
     pub(super) objects: Vec<ObjectSpec>,
     fixtures: Vec<Agent>,
-    /// Those cast, as they are in the trial.
+    /// The agents that the prompts need, as in the trial.
     extras: Vec<Extra>,
 }
 
-/// Somebody in a trial.
+/// An agent in a trial.
 #[derive(Clone, Debug)]
 struct Extra {
     kind: AgentKind,
@@ -40,20 +40,20 @@ struct Extra {
     way: Way,
 }
 
-/// How somebody moves in a trial.
+/// The motion of an agent in a trial.
 #[derive(Clone, Debug)]
 enum Way {
-    /// Ahead of the ego by so much, from centre to centre.
+    /// At this distance ahead of the ego, centre to centre.
     Ahead(f64),
     /// At a constant velocity.
     Straight(AgentState),
-    /// As an ego would.
+    /// Along a drive, like an ego.
     Along(Drive),
 }
 
 impl Stage {
-    /// Everybody put around the ego at a place, so many metres left of the middle of a lane; `None`
-    /// where that cannot be.
+    /// Places all agents around the ego at a position, this many metres left of the middle of a
+    /// lane; `None` where that is impossible.
     pub(crate) fn set(
         cast: &PromptSpec,
         request: &GenerateRequest,
@@ -101,14 +101,14 @@ impl Stage {
         Some(stage)
     }
 
-    /// The drive of the ego as it is in a scene made here: at its own speed, if that was open.
+    /// The drive of the ego in a scene generated here: at its own speed, if that was open.
     pub(crate) fn drive_from(&self, ego: &Agent) -> Drive {
         let mut drive = self.drive.clone();
         drive.speed = ego.state.speed();
         drive
     }
 
-    /// The request for a scene here.
+    /// The request for a scene at this place.
     pub(crate) fn direct(&self, request: &GenerateRequest) -> GenerateRequest {
         let mut request = request.clone();
         request.ego = self.ego;
@@ -125,12 +125,12 @@ impl Stage {
         request
     }
 
-    /// True if the ego does something that is not there from the first moment.
+    /// True if the ego's manoeuvre starts after the first moment.
     pub(crate) fn takes_time(&self) -> bool {
         self.drive.takes_time()
     }
 
-    /// What happens here if nobody else is there.
+    /// The trial: the scenario with only these agents.
     pub(crate) fn trial(&self, request: &GenerateRequest) -> Scenario {
         let frame = |i: usize| {
             let seconds = i as f64 / TRIAL_HZ;
@@ -172,7 +172,7 @@ impl Stage {
         }
     }
 
-    /// Whoever is ahead of the ego, and those whose places the tags themselves give.
+    /// The agents ahead of the ego, and those whose positions the tags specify.
     fn put_cast(&mut self, cast: &PromptSpec, map: &MapGraph, rng: &mut Rng) -> Option<()> {
         let own = self.objects.clone();
         let leaders = leaders(&own);
@@ -207,7 +207,7 @@ impl Stage {
         Some(())
     }
 
-    /// The person on a crosswalk.
+    /// The pedestrian on a crosswalk.
     fn put_on_crosswalk(
         &mut self,
         whereabouts: OnCrosswalk,
@@ -245,7 +245,7 @@ impl Stage {
         Some(())
     }
 
-    /// Whoever crosses ahead: on a lane that crosses the line ahead, shortly before it.
+    /// The agent that crosses ahead: on a lane that crosses the line ahead, shortly before it.
     fn put_crossing(&mut self, class: Class, map: &MapGraph, rng: &mut Rng) -> Option<()> {
         let speeds = match class {
             Class::Bicycle => [3.0, 5.0],
@@ -265,7 +265,7 @@ impl Stage {
         Some(())
     }
 
-    /// Whoever follows in the lane that is changed to.
+    /// The agent that follows in the lane that is changed to.
     fn put_trail(&mut self, speed: f64, map: &MapGraph, rng: &mut Rng) -> Option<()> {
         let lane = map.lane(self.drive.neighbor?)?;
         let on = lane.centerline.project(self.ego.pose.position);
@@ -278,7 +278,7 @@ impl Stage {
         Some(())
     }
 
-    /// Somebody who drives along a lane from now on.
+    /// An agent that drives along a lane from now on.
     fn put_along(&mut self, id: &str, class: Class, lane: &Lane, drive: Drive) {
         let start = self.ego.pose.inverse() * drive.pose_ahead(0.0).position;
         // Wider than what is taken for a fixed place: the lane says the rest.
@@ -301,7 +301,7 @@ impl Stage {
     }
 }
 
-/// Those who are ahead of the ego in a row, and the gaps in metres.
+/// The agents ahead of the ego in a row, and the gaps in metres.
 fn leaders(objects: &[ObjectSpec]) -> Vec<(&ObjectSpec, f64)> {
     let ego = objects.iter().find(|object| object.id == EGO);
     let followed = ego.and_then(|ego| ego.behind.as_ref());
@@ -316,7 +316,7 @@ fn leaders(objects: &[ObjectSpec]) -> Vec<(&ObjectSpec, f64)> {
         .collect()
 }
 
-/// Somebody in a trial, in which heights do not matter.
+/// An agent in a trial, in which heights do not matter.
 fn flat(id: AgentId, kind: AgentKind, [length, width]: [f64; 2], state: AgentState) -> Agent {
     Agent {
         id,
@@ -333,7 +333,7 @@ fn drawn(bounds: Bounds, rng: &mut Rng) -> f64 {
     rng.random_range(bounds.low..=bounds.high)
 }
 
-/// The extent of somebody cast.
+/// The extent of an agent.
 fn size_of(object: &ObjectSpec) -> [f64; 2] {
     let [length, width] = match object.class {
         Class::Vehicle => [4.5, 1.9],

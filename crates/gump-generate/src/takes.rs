@@ -1,5 +1,5 @@
-//! Futures of a scene, imagined several times over, and the moment at which one is what was asked
-//! for: a tag is about an instant, so the present of a scenario may be any.
+//! Repeated rollouts of a scene, and the instant at which one of them satisfies the prompts: a tag
+//! is about an instant, so any instant may become the present of the scenario.
 
 use gump_model::ModelError;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
@@ -7,16 +7,16 @@ use gump_scene::{Rollout, Scenario, Seed};
 
 use crate::drive::{Drive, Steered};
 
-/// Futures imagined of a scene, after one that often will do.
+/// Number of futures simulated of a scene, after a first one that is often sufficient.
 pub(super) const FUTURES: usize = 4;
-/// What tags say of the future is known from so many seconds of it.
+/// Seconds of future that tags need.
 pub(super) const JUDGED_S: f64 = 4.0;
-/// The moment is found in so many seconds from the scene that was made.
+/// Maximum time from the generated scene to the instant, seconds.
 const MOMENTS_S: f64 = 2.0;
-/// Seconds before the moment that are kept, as long as recorded histories are.
+/// Seconds before the instant that are kept, as long as recorded histories.
 const HISTORY_S: f64 = 1.0;
 
-/// Some futures in which the world drives everybody, the ego too.
+/// Futures in which the world drives all agents, including the ego.
 pub(super) fn free(
     world: &dyn WorldModel,
     scene: &Scenario,
@@ -32,8 +32,8 @@ pub(super) fn free(
     Ok(rollouts.iter().map(|r| with_future(scene, r)).collect())
 }
 
-/// Some futures in which the ego is driven at first, and then by the world; those in which it
-/// meets with nobody.
+/// Futures in which the ego is steered at first and then driven by the world; only those in which
+/// it does not collide.
 pub(super) fn steered(
     world: &dyn WorldModel,
     scene: &Scenario,
@@ -65,8 +65,8 @@ pub(super) fn steered(
         .collect())
 }
 
-/// The first moment of any of these futures at which `holds` says so, as the present of that
-/// future, and in seconds from the scene; of two at once the first counts.
+/// The first instant of any of these futures at which `holds` is true, as the present of that
+/// future, and in seconds from the scene; of two at the same time the first future counts.
 pub(super) fn moment(
     mut takes: Vec<Scenario>,
     holds: impl Fn(&Scenario) -> bool,
@@ -87,7 +87,7 @@ pub(super) fn moment(
     Some((take, seconds))
 }
 
-/// Imagines on until there are so many seconds after the present.
+/// Continues the rollout until there are this many seconds after the present.
 pub(super) fn extend(
     world: &dyn WorldModel,
     scenario: &mut Scenario,

@@ -1,4 +1,4 @@
-//! Scenes of a network that has learned nothing keep their rules all the same.
+//! Scenes of an untrained network satisfy all constraints.
 
 use std::sync::Arc;
 

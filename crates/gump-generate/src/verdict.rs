@@ -1,4 +1,4 @@
-//! Whether a scene is what was asked for, clause by clause.
+//! Check of a scene against its request, clause by clause.
 
 use std::fmt;
 
@@ -7,18 +7,18 @@ use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, SceneState};
 
 use crate::Counts;
 
-/// Futures are looked at this often, seconds.
+/// Sampling interval of futures, seconds.
 const LOOK_S: f64 = 0.5;
 
-/// One thing that was asked for.
+/// One clause of a request.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clause {
-    /// In words.
+    /// As text.
     pub clause: String,
-    /// Whether it holds; `None` if states and maps do not tell.
+    /// Whether it holds; `None` if states and maps do not decide it.
     pub holds: Option<bool>,
-    /// Whether it holds at every moment after the present, too; `None` of what is about an instant,
-    /// or where nothing was imagined. See [`through_time`].
+    /// Whether it also holds at every instant after the present; `None` for clauses about an
+    /// instant, or without a rollout. See [`through_time`].
     pub holds_throughout: Option<bool>,
 }
 
@@ -43,7 +43,7 @@ impl fmt::Display for Clause {
     }
 }
 
-/// The verdict on the present of a scenario: every prompt, every count, no overlap, nobody off the
+/// The check of the present of a scenario: every prompt, every count, no overlap, no agent off the
 /// road.
 ///
 /// Prompts about what is beginning are decided by the frames after the present.
@@ -60,8 +60,8 @@ pub fn verdict(
     clauses
 }
 
-/// Says of the clauses of a [`verdict`] about numbers, overlaps and the road whether they hold
-/// throughout the scenario's future, looked at twice a second. A prompt is about an instant.
+/// Checks the clauses of a [`verdict`] about numbers, overlaps and the road throughout the
+/// scenario's future, twice a second. Prompts are about an instant and not checked.
 pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<&Counts>) {
     let stride = (LOOK_S / scenario.dt).round().max(1.0) as usize;
     for k in (scenario.now..scenario.log.len()).step_by(stride).skip(1) {
@@ -74,7 +74,7 @@ pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<
     }
 }
 
-/// Clauses that can be asked of any moment.
+/// Clauses that apply to any instant.
 fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
     let mut clauses = Vec::new();
     for kind in AgentKind::MOVING {
@@ -96,7 +96,7 @@ fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
     clauses
 }
 
-/// How many agents overlap another at the present.
+/// Number of agents that overlap another at the present.
 pub fn overlaps(scenario: &Scenario) -> usize {
     overlaps_in(scenario.present().now())
 }
@@ -106,7 +106,7 @@ fn overlaps_in(frame: &Frame) -> usize {
     frame.agents().iter().filter(hit).count()
 }
 
-/// How many vehicles have a corner off the road at the present.
+/// Number of vehicles with a corner off the road at the present.
 pub fn off_road(scenario: &Scenario) -> usize {
     off_road_in(&scenario.present())
 }

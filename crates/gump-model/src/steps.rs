@@ -6,7 +6,7 @@ pub const TOKEN_DT: f64 = 0.5;
 /// Frames of history that a rollout starts from (paper: 3).
 pub const HISTORY: usize = 3;
 
-/// Maximum time from the frame of reference in training: 8 s.
+/// Maximum number of frames that a rollout keeps its frame of reference: 8 s.
 pub const LONGEST_ROLLOUT: usize = 16;
 
 /// Log frames per token frame, for a log of steps of `dt` seconds.

@@ -1,18 +1,18 @@
-//! The quantiser: which bin and which token a number becomes in each field of a state.
+//! The quantiser: bins and tokens of the numbers of a state, field by field.
 //!
-//! Grid points are the values of the bins, `low`, `low + step`, ..., `high - step`; a value goes to
-//! the nearest, half to even. What a whole state looks like is said in `state`.
+//! Grid points are the values of the bins, `low`, `low + step`, ..., `high - step`; a value is
+//! rounded to the nearest, half to even. `state` combines the fields of a whole state.
 //!
 //! Source: the grids are the GUMP paper's (table of sub-vocabularies), with 200 bins per velocity
-//! component because the paper's range of 0..25 m/s cannot hold a velocity that has a sign. The
-//! released code lets the upper edge of every field spill into the next sub-vocabulary; here it is
+//! component because the paper's range of 0..25 m/s cannot represent signed velocities. In the
+//! released code the upper edge of every field overflows into the next sub-vocabulary; here it is
 //! clamped, and headings wrap.
 
 use std::f64::consts::PI;
 use std::ops::Range;
 
-/// How far outside its range a value still counts as its end, in steps: what stands on the end of a
-/// grid may come back from the world frame with a rounding error.
+/// Tolerance outside the range, in steps: a value at the end of a grid may come back from the world
+/// frame with a rounding error.
 pub(crate) const SLACK: f64 = 1e-6;
 
 /// A field of an object's state.
@@ -34,7 +34,7 @@ pub enum Field {
     Length,
 }
 
-/// What quantising gives.
+/// The result of quantising.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Quantized {
     /// Index of the bin, below [`Field::n_bins`].
@@ -125,9 +125,9 @@ impl Field {
 
     /// The nearest bin, half to even.
     ///
-    /// Headings wrap and are never clamped; everything else goes to the nearest end of the grid. In
-    /// the last half step of a range that does not wrap the error is up to a whole step, elsewhere
-    /// up to half of one. A value that is not a number has no bin: it gives the first, `clamped`.
+    /// Headings wrap and are never clamped; all other values outside the range go to the nearest
+    /// end of the grid. In the last half step of a range that does not wrap the error is up to a
+    /// whole step, elsewhere up to half of one. NaN has no bin: it gives the first, `clamped`.
     pub fn quantize(self, value: f64) -> Quantized {
         let n = self.n_bins() as f64;
         let bin = ((value - self.low()) / self.step()).round_ties_even();
@@ -144,7 +144,7 @@ impl Field {
         }
     }
 
-    /// The value a bin stands for, in the field's unit.
+    /// The value of a bin, in the field's unit.
     pub fn dequantize(self, bin: u16) -> f64 {
         self.low() + f64::from(bin) * self.step()
     }

@@ -1,4 +1,4 @@
-//! One frame in tokens, by part. The order of its slots is the business of `sequence`.
+//! One frame in tokens, by part. `sequence` defines the order of its slots.
 
 use std::cmp::Ordering;
 
@@ -6,12 +6,12 @@ use gump_scene::{AgentKind, LightState};
 
 use crate::{Field, QuantizedState};
 
-/// The address of an agent: who it is, and what.
+/// The key of an agent: its identity and class.
 ///
 /// Keys are ordered canonically: the ego first, then by class, then by id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Key {
-    /// 0 for the ego, 1..=320 for others; one agent's alone within a window.
+    /// 0 for the ego, 1..=320 for others; unique to one agent within a window.
     pub id: u16,
     /// Vehicle, pedestrian or bicycle: one of [`AgentKind::MOVING`].
     pub kind: AgentKind,
@@ -23,7 +23,7 @@ impl Key {
         self.id == 0
     }
 
-    /// What keys are ordered by: not the ego, class, id.
+    /// The sort order of keys: the ego first, then class, then id.
     pub fn order(self) -> (bool, AgentKind, u16) {
         (!self.is_ego(), self.kind, self.id)
     }
@@ -44,16 +44,16 @@ impl PartialOrd for Key {
 /// A key with its value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TokenAgent {
-    /// Who.
+    /// The identity.
     pub key: Key,
-    /// In which state, scene frame.
+    /// The state, scene frame.
     pub state: QuantizedState,
 }
 
 /// A traffic light: one slot, placed at the start of the lane it controls, scene frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TokenLight {
-    /// 1..=63, by distance from the centre, fixed per scene; the raster paints the same number.
+    /// 1..=63, by distance from the centre, fixed per scene; the raster uses the same number.
     pub index: u16,
     /// Bin of [`Field::X`] of the lane's first point.
     pub x: u16,
@@ -66,12 +66,12 @@ pub struct TokenLight {
 }
 
 impl TokenLight {
-    /// Where the light is, without its colour.
+    /// The position of the light, without its colour.
     pub(crate) fn place(&self) -> [u16; 3] {
         [self.x, self.y, self.heading]
     }
 
-    /// True if every bin exists.
+    /// True if every bin is valid.
     pub(crate) fn is_valid(&self) -> bool {
         let fields = [Field::X, Field::Y, Field::Heading];
         let mut bins = fields.into_iter().zip(self.place());
@@ -84,9 +84,9 @@ impl TokenLight {
 pub struct TokenFrame {
     /// Lights, by index.
     pub lights: Vec<TokenLight>,
-    /// Agents that the frame before had too, in canonical order, the ego first.
+    /// Agents that are also in the previous frame, in canonical order, the ego first.
     pub tracked: Vec<TokenAgent>,
-    /// Agents that the frame before had not, in canonical order.
+    /// Agents that are not in the previous frame, in canonical order.
     pub newborn: Vec<TokenAgent>,
 }
 

@@ -1,17 +1,18 @@
-//! What may follow what: the one definition that constructor, parser and sampler share.
+//! The grammar of token sequences, shared by constructor, parser and sampler.
 //!
 //! ```text
 //! sequence = prompt{0..4} frame* PAD*
 //! frame    = BEGIN light* LIGHTS_END (key value)+ NEWBORN (key value)*
 //! ```
 //!
-//! Beyond that shape:
+//! In addition:
 //! * prompts are one "none" or different tags;
-//! * the indices of a frame's lights ascend, and an index never denotes two places;
-//! * each of the two lists of agents is in canonical order, the ego heads the tracked ones;
-//! * whoever the frame before had is tracked or gone, whoever it had not is newborn; the first
-//!   frame has no newborn;
-//! * an id occurs once per frame and never denotes two classes;
+//! * the indices of a frame's lights ascend, and an index never stands for two places;
+//! * each of the two lists of agents is in canonical order, and the ego is the first of the tracked
+//!   ones;
+//! * an agent of the previous frame is tracked or gone, any other is newborn; the first frame has
+//!   no newborn agents;
+//! * an id occurs once per frame and never stands for two classes;
 //! * every bin lies in its field's sub-vocabulary.
 //!
 //! Source: the frame layout of the GUMP paper and its released code, which emits BEGIN once per
@@ -27,31 +28,31 @@ use crate::{
     AGENT_KEYS, BEGIN, FIRST_LIGHT, Key, LIGHTS_END, MAX_LIGHTS, NEWBORN, PAD, Slot, TokenLight,
 };
 
-/// Most prompts of a sequence.
+/// Maximum number of prompts of a sequence.
 pub const MAX_PROMPTS: usize = 4;
 
-/// Why tokens make no scene.
+/// Why tokens are not a valid scene.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GrammarError {
-    /// A slot stands where it may not.
+    /// A slot is not allowed at its position.
     #[error("slot {position}: expected {expected}, found {found}")]
     Unexpected {
         /// Index of the slot in its sequence.
         position: usize,
-        /// What could have stood there.
+        /// What would have been allowed.
         expected: String,
-        /// What stands there.
+        /// The slot found.
         found: String,
     },
-    /// A key that no agent has.
+    /// A key without an agent.
     #[error("id {0} denotes no agent of the scene")]
     UnknownId(u16),
-    /// A light index that no lane has.
+    /// A light index without a lane.
     #[error("light {0} denotes no lane of the scene")]
     UnknownLight(u16),
 }
 
-/// Reads slots one by one and knows what may come next.
+/// Reads slots one by one and determines what may come next.
 #[derive(Clone, Debug, Default)]
 pub struct Grammar {
     place: Place,
@@ -66,7 +67,7 @@ pub struct Grammar {
     lights: BTreeMap<u16, [u16; 3]>,
 }
 
-/// Which part of a sequence the next slot belongs to.
+/// The part of a sequence that the next slot belongs to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Place {
     #[default]
@@ -80,7 +81,7 @@ enum Place {
 }
 
 impl Grammar {
-    /// What may come next.
+    /// The slots that may come next.
     pub fn allowed(&self) -> Allowed<'_> {
         Allowed { grammar: self }
     }
@@ -88,7 +89,7 @@ impl Grammar {
     /// Reads the next slot.
     ///
     /// # Errors
-    /// [`GrammarError::Unexpected`] if it may not stand here; the grammar is then unchanged.
+    /// [`GrammarError::Unexpected`] if it is not allowed; the grammar is then unchanged.
     pub fn advance(&mut self, slot: &Slot) -> Result<(), GrammarError> {
         if !self.allowed().slot(slot) {
             let found = match slot {
@@ -164,7 +165,7 @@ impl Grammar {
     }
 }
 
-/// Which slots may come next; the mask of a sampler.
+/// The slots that may come next; the mask of a sampler.
 #[derive(Clone, Copy, Debug)]
 pub struct Allowed<'a> {
     grammar: &'a Grammar,
@@ -200,7 +201,7 @@ impl Allowed<'_> {
         matches!(self.grammar.place, Place::Prompts | Place::Newborn)
     }
 
-    /// The indices a light may have next; empty where none may come.
+    /// The indices that the next light may have; empty where no light may come.
     pub fn light_indices(&self) -> RangeInclusive<u16> {
         let first = match self.grammar.place {
             Place::Lights => self.grammar.last_light + 1,
@@ -284,7 +285,7 @@ impl Allowed<'_> {
     }
 }
 
-/// What may come next in words, for messages.
+/// A description of what may come next, for messages.
 impl fmt::Display for Allowed<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut words: Vec<String> = Vec::new();

@@ -1,8 +1,8 @@
-//! Which agent has which key id.
+//! The assignment of key ids to agents.
 //!
-//! An id is one agent's alone as long as any frame of the window holds it: it is never handed on
-//! when its owner leaves. Classes are not kept here; the canonical order within a frame is the
-//! grammar's.
+//! An id belongs to one agent as long as any frame of the window contains it, and is not reused
+//! while it does. Classes are not stored here; the grammar defines the canonical order within a
+//! frame.
 
 use std::collections::BTreeMap;
 
@@ -17,16 +17,17 @@ use crate::AGENT_KEYS;
 pub struct Identities {
     keys: BTreeMap<AgentId, u16>,
     agents: BTreeMap<u16, AgentId>,
-    /// Above every agent seen, so that a newborn agent can never be taken for a recorded one.
+    /// Larger than every agent id seen, so that a newborn agent never gets the id of a recorded
+    /// one.
     next_agent: i64,
 }
 
 impl Identities {
     /// Ids by rank, for inference: the same scene always has the same ids.
     ///
-    /// Every moving agent of `frames` (oldest first) has one: by class, then by distance from the
-    /// centre where the agent was last seen, then by agent id; a class is the first one seen. Of more than 320 agents the farthest
-    /// have none.
+    /// Every moving agent of `frames` (oldest first) gets one: by class, then by distance from the
+    /// centre at its last observation, then by agent id; the class is the first one observed. Of
+    /// more than 320 agents the farthest get none.
     pub fn ranked(frames: &[&Frame], ego: AgentId, world_from_scene: Pose) -> Self {
         Self::with_ids(
             frames,
@@ -36,8 +37,8 @@ impl Identities {
         )
     }
 
-    /// Ids drawn at random from 1..=320 without replacement, for training: ids by rank would leave
-    /// the high ones untrained. Who has an id is decided as in [`Self::ranked`].
+    /// Ids drawn at random from 1..=320 without replacement, for training: ranked ids would leave
+    /// the high ones untrained. The agents with an id are those of [`Self::ranked`].
     pub fn shuffled(
         frames: &[&Frame],
         ego: AgentId,
@@ -54,14 +55,14 @@ impl Identities {
         self.keys.get(&agent).copied()
     }
 
-    /// The agent of an id.
+    /// The agent with an id.
     pub fn agent(&self, id: u16) -> Option<AgentId> {
         self.agents.get(&id).copied()
     }
 
-    /// Gives an agent the lowest free id; `None` if all are taken. An agent that has one keeps it.
+    /// Gives an agent the lowest free id; `None` if all are used. An agent that has one keeps it.
     ///
-    /// Ids given one after the other ascend, as the canonical order within a class wants.
+    /// Ids given one after the other ascend, as the canonical order within a class requires.
     pub fn allocate(&mut self, agent: AgentId) -> Option<u16> {
         if let Some(id) = self.key(agent) {
             return Some(id);
@@ -72,7 +73,7 @@ impl Identities {
         Some(id)
     }
 
-    /// A new agent that no frame has had, with the lowest free id; `None` if all are taken.
+    /// A new agent id that no frame has had, with the lowest free key id; `None` if all are used.
     pub fn newborn(&mut self) -> Option<(u16, AgentId)> {
         self.newborn_after(0)
     }
@@ -86,7 +87,8 @@ impl Identities {
         Some((free, agent))
     }
 
-    /// Frees the ids for which `keep` is false. They must occur in no frame that is still read.
+    /// Frees the ids for which `keep` is false. They must not occur in any frame that is still
+    /// read.
     pub fn retain(&mut self, keep: impl Fn(u16) -> bool) {
         self.agents.retain(|id, _| *id == 0 || keep(*id));
         self.keys.retain(|_, id| *id == 0 || keep(*id));

@@ -1,4 +1,4 @@
-//! The traffic lights of a window: which have tokens, under which number, and where they stand.
+//! The traffic lights of a window: which have tokens, with which number, and at which position.
 
 use std::collections::BTreeSet;
 
@@ -11,13 +11,14 @@ use crate::{Field, TokenLight};
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Lights {
     pub(crate) lanes: Vec<LaneId>,
-    /// Lights within the radius that got no number.
+    /// Lights within the radius without a number.
     pub(crate) n_over: usize,
     places: Vec<TokenLight>,
 }
 
 impl Lights {
-    /// Numbers the lights of frame `now` as the raster does, then those only other frames have.
+    /// Numbers the lights of frame `now` as the raster does, then those that occur only in other
+    /// frames.
     pub(crate) fn number(
         map: &MapGraph,
         frames: &[&Frame],
@@ -56,7 +57,7 @@ impl Lights {
         }
     }
 
-    /// The tokens of one frame; a light it does not mention is unknown.
+    /// The tokens of one frame; a light that it does not contain is unknown.
     pub(crate) fn tokens(&self, frame: &Frame) -> Vec<TokenLight> {
         let tokens = self.lanes.iter().zip(&self.places).map(|(lane, place)| {
             let light = frame.light(*lane);

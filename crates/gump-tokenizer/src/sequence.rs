@@ -1,6 +1,6 @@
-//! A grammatical sequence of frames: building, reading, cutting.
+//! A valid sequence of frames: building, parsing, truncating.
 //!
-//! What is grammatical is said in `grammar`; how a scene becomes a sequence, in `tokenizer`.
+//! `grammar` defines which sequences are valid; `tokenizer` converts scenes.
 
 use gump_scene::ScenarioTag;
 
@@ -12,7 +12,7 @@ use crate::{
 /// One position of a sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Slot {
-    /// What kind of situation it is; `None` is the prompt "none".
+    /// A scenario tag; `None` is the prompt "none".
     Prompt(Option<ScenarioTag>),
     /// Begins a frame.
     Begin,
@@ -20,19 +20,19 @@ pub enum Slot {
     Light(TokenLight),
     /// Ends the lights.
     LightsEnd,
-    /// Whose state follows.
+    /// The agent whose state follows.
     Key(Key),
     /// The state.
     Value(QuantizedState),
     /// Begins the newborn agents.
     Newborn,
-    /// Nothing; never part of a [`TokenSequence`].
+    /// Padding; never part of a [`TokenSequence`].
     Pad,
 }
 
 impl Slot {
-    /// The slot's token: that of an id, a light state or a mark. `None` for prompts, which have a
-    /// table of their own, and values, which have a token per field.
+    /// The slot's token: that of an id, a light state or a mark. `None` for prompts, which have
+    /// their own table, and values, which have a token per field.
     pub fn token(&self) -> Option<u32> {
         match self {
             Self::Prompt(_) | Self::Value(_) => None,
@@ -53,7 +53,7 @@ pub struct TokenSequence {
     frames: Vec<TokenFrame>,
 }
 
-/// What [`TokenSequence::fit`] had to leave out.
+/// What [`TokenSequence::fit`] left out.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Overflow {
     /// Oldest whole frames.
@@ -68,7 +68,7 @@ impl TokenSequence {
     /// Checks prompts and frames against the grammar.
     ///
     /// # Errors
-    /// [`GrammarError`] at the first slot that may not stand where it does.
+    /// [`GrammarError`] at the first slot that is not allowed.
     pub fn new(
         prompts: Vec<Option<ScenarioTag>>,
         frames: Vec<TokenFrame>,
@@ -81,7 +81,7 @@ impl TokenSequence {
     /// Reads slots back into frames; PAD may follow the last.
     ///
     /// # Errors
-    /// [`GrammarError`] at the first slot that may not stand where it does.
+    /// [`GrammarError`] at the first slot that is not allowed.
     pub fn parse(slots: &[Slot]) -> Result<Self, GrammarError> {
         let mut grammar = Grammar::default();
         let mut sequence = Self::default();
@@ -117,7 +117,7 @@ impl TokenSequence {
     /// The same frames after other prompts.
     ///
     /// # Errors
-    /// [`GrammarError`] if these prompts do not go together.
+    /// [`GrammarError`] if these prompts cannot be combined.
     pub fn with_prompts(self, prompts: Vec<Option<ScenarioTag>>) -> Result<Self, GrammarError> {
         Self::new(prompts, self.frames)
     }
@@ -169,12 +169,12 @@ impl TokenSequence {
         self.frames.iter().scan(self.prompts.len(), start).collect()
     }
 
-    /// The grammar after the last slot, for whoever continues the sequence.
+    /// The grammar after the last slot, for continuing the sequence.
     pub fn grammar(&self) -> Grammar {
         read(&self.slots()).expect("a sequence in hand is grammatical")
     }
 
-    /// The prompts and the last `n_frames` frames; who was newborn in the first of them is now
+    /// The prompts and the last `n_frames` frames; newborn agents of the first of them become
     /// tracked.
     pub fn tail(&self, n_frames: usize) -> Self {
         let first = self.frames.len().saturating_sub(n_frames);
@@ -188,14 +188,15 @@ impl TokenSequence {
         }
     }
 
-    /// The most of the sequence that takes at most `block_size` slots, and what is left out.
+    /// The longest part of the sequence that takes at most `block_size` slots, and what is left
+    /// out.
     ///
-    /// The oldest whole frames go first. If the last frame alone is too long, it loses the agents
-    /// farthest from the ego, then its last lights; a frame is never cut. Prompts stay.
+    /// The oldest frames are dropped first, as a whole. If the last frame alone is too long, it
+    /// loses the agents farthest from the ego, then its last lights; other frames are never cut.
+    /// Prompts stay.
     ///
     /// # Panics
-    /// If not even the prompts and a frame of the ego alone (5 slots) fit: such a block is of no
-    /// use.
+    /// If not even the prompts and a frame with only the ego (5 slots) fit.
     pub fn fit(&self, block_size: usize) -> (Self, Overflow) {
         let lengths: Vec<usize> = self.frames.iter().map(TokenFrame::len_slots).collect();
         let mut length = self.len();

@@ -1,6 +1,6 @@
 //! An agent's state on the grid: seven bins, one per [`Field`].
 //!
-//! This is the one form in which a state enters the model and comes out of it; its numbers are
+//! This is the only representation of states at the input and output of the model; its numbers are
 //! always those of the bins.
 
 use gump_geometry::{DVec2, Pose, dvec2};
@@ -95,7 +95,7 @@ impl QuantizedState {
         field.token(self.get(field))
     }
 
-    /// What the bins stand for, in the order of [`Field::ALL`] and in its units.
+    /// The values of the bins, in the order of [`Field::ALL`] and in its units.
     pub fn values(&self) -> [f64; 7] {
         Field::ALL.map(|field| field.dequantize(self.get(field)))
     }
@@ -120,7 +120,7 @@ impl QuantizedState {
         }
     }
 
-    /// True if every bin exists, so that every token lies in its field's sub-vocabulary.
+    /// True if every bin is valid, so that every token is in its field's sub-vocabulary.
     pub fn is_valid(&self) -> bool {
         Field::ALL
             .into_iter()

@@ -1,4 +1,4 @@
-//! Tokens as text that people can read: messages, snapshots, the output of an inspection.
+//! Tokens as readable text: for messages, snapshots and inspection.
 
 use std::fmt;
 

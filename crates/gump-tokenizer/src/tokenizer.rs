@@ -1,6 +1,6 @@
-//! Scenes to tokens and back.
+//! Conversion of scenes to tokens and back.
 //!
-//! Who has which id is decided before, in `identity`; what is grammatical, in `grammar`.
+//! `identity` assigns ids beforehand; `grammar` defines valid sequences.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -15,23 +15,24 @@ use crate::{
     TokenFrame, TokenSequence,
 };
 
-/// What becomes a token.
+/// Which parts of a scene become tokens.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TokenizerConfig {
     /// An agent farther than this from the scene's origin along either axis has no token in that
     /// frame; metres, at most the grid's 100. Source: the paper's window of ±100 m.
     pub position_range_m: f64,
-    /// The same for pedestrians, metres. The released code has 40, a rule the paper does not have;
-    /// the default is no rule.
+    /// The same for pedestrians, metres. The released code has 40, a rule that is not in the paper;
+    /// the default is no such rule.
     pub pedestrian_range_m: f64,
-    /// Most agents of a frame besides the ego, 0..=320, nearest to the scene's origin first.
-    /// Source: the released code has 320 ids.
+    /// Maximum number of agents of a frame besides the ego, 0..=320, nearest to the scene's origin
+    /// first. Source: the released code has 320 ids.
     pub max_agents: usize,
     /// Lights have tokens if their lane starts within this distance of the scene's origin, metres:
-    /// by default all that the grid can place. The released code has 50, which an ego that drives on
-    /// in the frame of its start leaves behind.
+    /// by default all within the grid. The released code has 50, which an ego that keeps the frame
+    /// of its start may leave.
     pub light_radius_m: f64,
-    /// Most lights, 0..=63, nearest first. Source: 64 in the released code, 0 being "no light".
+    /// Maximum number of lights, 0..=63, nearest first. Source: 64 in the released code, 0 being
+    /// "no light".
     pub max_lights: usize,
 }
 
@@ -53,46 +54,46 @@ pub struct Tokenizer {
     config: TokenizerConfig,
 }
 
-/// A sequence, what its light indices mean, and what could not be said exactly.
+/// A sequence, the lanes of its light indices, and what the encoding lost.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Encoded {
     /// The tokens, without prompts.
     pub sequence: TokenSequence,
     /// The lane that each light controls; light index 1 first.
     pub lights: Vec<LaneId>,
-    /// What was lost.
+    /// Losses.
     pub report: EncodeReport,
 }
 
-/// What an encoding lost. An agent-frame is one agent in one frame.
+/// Losses of an encoding. An agent-frame is one agent in one frame.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct EncodeReport {
-    /// Which of the given frames were encoded: the last run that has the ego throughout.
+    /// The range of the given frames that was encoded: the last run with the ego throughout.
     pub frames: Range<usize>,
-    /// Values per field that lay outside its range and went to its nearest end.
+    /// Per field, values outside its range, which went to its nearest end.
     pub clamped: BTreeMap<Field, usize>,
     /// Agent-frames left out for being outside the position range.
     pub out_of_range: usize,
-    /// Agent-frames left out for want of an id, or beyond the most agents of a frame.
+    /// Agent-frames left out for lack of an id, or beyond the maximum number of agents of a frame.
     pub over_capacity: usize,
-    /// Agent-frames left out because a number of theirs is NaN or infinite.
+    /// Agent-frames left out because one of their numbers is NaN or infinite.
     pub not_finite: usize,
-    /// Lights left out beyond the most lights.
+    /// Lights left out beyond the maximum number of lights.
     pub lights_over_capacity: usize,
 }
 
 impl Tokenizer {
-    /// A tokenizer that follows `config`.
+    /// A tokenizer with this configuration.
     pub fn new(config: TokenizerConfig) -> Self {
         Self { config }
     }
 
-    /// What it follows.
+    /// Its configuration.
     pub fn config(&self) -> &TokenizerConfig {
         &self.config
     }
 
-    /// Encodes frames whose last is the present; see [`Self::encode_around`].
+    /// Encodes frames of which the last is the present; see [`Self::encode_around`].
     pub fn encode(
         &self,
         map: &MapGraph,
@@ -107,11 +108,11 @@ impl Tokenizer {
 
     /// Encodes frames half a second apart, oldest first; `now` is the index of the present one.
     ///
-    /// The present frame numbers the lights, as the raster of that frame does; lights only other
-    /// frames have come after. Of the frames, those from the last gap in the ego's track on are
-    /// encoded; the ego itself is never left out, its values are clamped and counted instead.
-    /// Agents of kinds that do not move are no tokens, an ego of such a kind is a vehicle. An agent
-    /// keeps the kind it first has.
+    /// The present frame determines the numbers of the lights, as in the raster of that frame;
+    /// lights of other frames follow. Frames from the last gap in the ego's track on are encoded.
+    /// The ego is never left out; its values are clamped and counted instead. Agents of kinds that
+    /// do not move have no tokens; an ego of such a kind counts as a vehicle. An agent keeps its
+    /// first kind.
     ///
     /// # Panics
     /// If `identities` were not made for this ego.
@@ -167,16 +168,16 @@ impl Tokenizer {
         }
     }
 
-    /// The frame that tokens describe: the agents and lights they name and no others.
+    /// The frame of some tokens, with the agents and lights they contain and no others.
     ///
-    /// An agent that `previous` has keeps its kind, size, height and elevation. Any other takes
+    /// An agent that is in `previous` keeps its kind, size, height and elevation. Any other takes
     /// kind and size from its tokens (at least half a step, so that a box has an extent) and the
-    /// elevation of the map; its height is not known: 0. Whatever has no token, such as static
-    /// things, is the caller's to carry over.
+    /// elevation of the map; its height is unknown: 0. The caller has to carry over agents without
+    /// tokens, such as static objects.
     ///
     /// # Errors
-    /// [`GrammarError::UnknownId`] and [`GrammarError::UnknownLight`] for what `identities` or
-    /// `lights` (as in [`Encoded::lights`]) do not have.
+    /// [`GrammarError::UnknownId`] and [`GrammarError::UnknownLight`] for ids and lights that are
+    /// not in `identities` or `lights` (as in [`Encoded::lights`]).
     pub fn decode(
         &self,
         map: &MapGraph,

@@ -1,7 +1,7 @@
-//! The vocabulary: which token means what. The tokens of state fields are in [`Field`].
+//! The vocabulary: the meaning of tokens. The tokens of state fields are in [`Field`].
 //!
 //! 1 ego key, 320 agent keys, 4 light states, 2874 field values and 3 marks make 2972 tokens, the
-//! size the GUMP paper states; PAD comes on top. Classes and prompts have tables of their own.
+//! size stated in the GUMP paper; PAD is additional. Classes and prompts have tables of their own.
 //!
 //! [`Field`]: crate::Field
 
@@ -21,15 +21,15 @@ pub const BEGIN: u32 = 2969;
 pub const NEWBORN: u32 = 2970;
 /// Ends the lights of a frame.
 pub const LIGHTS_END: u32 = 2971;
-/// Fills what a tensor has too much of.
+/// Padding of tensors.
 pub const PAD: u32 = 2972;
 /// Tokens without PAD.
 pub const VOCABULARY_SIZE: u32 = 2972;
-/// Rows of a token table, PAD included.
+/// Rows of a token table, including PAD.
 pub const TABLE_ROWS: u32 = 2973;
 /// Classes of agents, in a table of their own.
 pub const N_CLASSES: usize = AgentKind::MOVING.len();
-/// Most lights of a frame; light indices run from 1 to this.
+/// Maximum number of lights of a frame; light indices run from 1 to this.
 pub const MAX_LIGHTS: usize = gump_scene::MAX_LIGHTS;
 /// Prompts, in a table of their own: the scenario tags, then "none".
 pub const N_PROMPTS: usize = ScenarioTag::COUNT + 1;

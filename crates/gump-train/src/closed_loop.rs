@@ -1,12 +1,11 @@
-//! Driving scenarios with the network itself, close to the log: what it will meet in closed loop.
+//! Closed-loop training data: scenes driven by the network itself, close to the log.
 //!
-//! A network that only ever saw logged histories drifts away from them in its own rollouts. Here
-//! it drives recorded scenes, at every step the candidate nearest to the log is taken, agent by
-//! agent, and `sample` presents such histories while asking for the way back to the log.
+//! A network trained only on logged histories drifts away from them in its own rollouts. Here it
+//! drives recorded scenes: at every step the candidate nearest to the log is taken, agent by agent.
+//! `sample` presents these histories with the return to the log as target.
 //!
 //! Source: closest-among-samples rollouts after Zhang et al. 2025 (CAT-K); one batch of rollouts
-//! driven before training, rather than fresh ones at every step, after Garcia-Cobo et al. 2025
-//! (RoaD).
+//! before training, rather than new ones at every step, after Garcia-Cobo et al. 2025 (RoaD).
 
 use gump_engine::SamplingConfig;
 use gump_engine::TransformerWorld;
@@ -22,23 +21,23 @@ use serde::{Deserialize, Serialize};
 
 use crate::scenes::ScenarioSource;
 
-/// Metres that a radian of heading error counts for, when candidates are compared.
+/// Weight of a radian of heading error, in metres, when candidates are compared.
 const METRES_PER_RADIAN: f64 = 2.0;
 
-/// How a network drives the scenes it goes on to learn from.
+/// Settings of closed-loop training data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClosedLoopConfig {
     /// Scenes driven before the first step, for up to 8 s each.
     pub drives: usize,
-    /// Draws per agent and step, of which the nearest to the log is taken.
+    /// Draws per agent and step, of which the nearest to the log is used.
     pub candidates: usize,
     /// Temperature of the draws.
     pub temperature: f64,
     /// Probability that a sample shows a driven history.
     pub share: f64,
-    /// Share of an agent's distance from the log that is left after half a second of the way back:
-    /// 0 asks for the logged state itself, however far.
+    /// Share of an agent's distance from the log that is left in the target half a second later: 0
+    /// means the logged state itself, however far.
     pub slack: f64,
 }
 
@@ -54,16 +53,16 @@ impl Default for ClosedLoopConfig {
     }
 }
 
-/// A scenario as the network drove it.
+/// A scenario as driven by the network.
 #[derive(Clone, Debug)]
 pub(crate) struct Drive {
     /// Index of the scenario.
     pub(crate) scenario: usize,
-    /// Index of the log frame it set out from.
+    /// Index of the log frame from which it starts.
     pub(crate) present: usize,
     /// Log frames per driven frame.
     pub(crate) stride: usize,
-    /// Driven frames after the present, with the agents of the log at that time.
+    /// Driven frames after the present, with the agents of the log at those times.
     pub(crate) frames: Vec<Frame>,
 }
 
@@ -79,10 +78,10 @@ impl Drive {
     }
 }
 
-/// Drives scenes drawn by `seed`; fewer than asked for where a scene is too short.
+/// Drives scenes drawn by `seed`; fewer than requested where scenes are too short.
 ///
 /// # Errors
-/// Those of the world.
+/// Errors of the world.
 pub(crate) fn drive(
     network: Network,
     scenarios: &dyn ScenarioSource,
@@ -170,7 +169,7 @@ fn drive_one(
     }))
 }
 
-/// The logged frame with every agent where the nearest of the draws has it.
+/// The logged frame with the pose of every agent replaced by the nearest of its draws.
 fn nearest(draws: &[Frame], logged: &Frame) -> Frame {
     let off = |agent: &Agent, truth: &Agent| {
         let turn = angle_difference(agent.state.pose.heading, truth.state.pose.heading);

@@ -1,4 +1,4 @@
-//! How a run is described: its file, and what `--resume` finds in a checkpoint.
+//! Configuration of a run: its file, and the part stored in a checkpoint.
 
 use gump_model::ModelError;
 use gump_model::config::ModelConfig;
@@ -9,7 +9,7 @@ use crate::closed_loop::ClosedLoopConfig;
 use crate::loss::LossConfig;
 use crate::sample::SampleConfig;
 
-/// How to train.
+/// Training settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
@@ -17,27 +17,29 @@ pub struct TrainConfig {
     pub steps: usize,
     /// Samples per step, over all processes.
     pub batch: usize,
-    /// Parts that a process cuts its samples of a step into, one after the other in memory. What is
-    /// learned does not depend on it, but for a ResNet's batch statistics and dropout.
+    /// Number of parts that a process divides its samples of a step into, processed one after
+    /// another to save memory. Results do not depend on it, except for a ResNet's batch statistics
+    /// and dropout.
     pub accumulate: usize,
-    /// Where all randomness comes from.
+    /// The seed of all randomness.
     pub seed: u64,
-    /// Share of the old in a moving average of the weights, which is then what is validated and
-    /// shipped; none trains without. At step t it is at most (1 + t) / (10 + t), so that the average
-    /// forgets where it began.
+    /// Decay of a moving average of the weights, which is then the network to validate and ship;
+    /// `None` trains without. At step t it is at most (1 + t) / (10 + t), so that the initial
+    /// weights are forgotten.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema: Option<f64>,
-    /// Whether matrices are multiplied in bfloat16, forward and backward; parameters, sums, norms and
-    /// the optimiser stay in 32 bits. On a processor without a unit for bfloat16 it saves no time.
+    /// Whether matrices are multiplied in bfloat16, forward and backward; parameters, sums, norms
+    /// and the optimizer stay in 32 bits. On a processor without bfloat16 instructions it saves no
+    /// time.
     pub mixed_precision: bool,
-    /// How samples are drawn.
+    /// Settings of samples.
     pub sample: SampleConfig,
-    /// What is minimised.
+    /// Settings of the loss.
     pub loss: LossConfig,
-    /// How.
+    /// Settings of the optimizer.
     pub optimizer: OptimizerConfig,
-    /// Learning from scenes the network drove itself before the first step; for a run that
-    /// continues a network, because one that knows nothing drives nowhere.
+    /// Closed-loop training data, generated before the first step; for runs that continue a trained
+    /// network, because an untrained one does not drive usefully.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub closed_loop: Option<ClosedLoopConfig>,
 }
@@ -60,7 +62,7 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// Checks that the numbers fit together, for so many processes.
+    /// Checks that the values are consistent, for this number of processes.
     ///
     /// # Errors
     /// [`ModelError::Config`] naming the first contradiction.
@@ -83,24 +85,24 @@ impl TrainConfig {
     }
 }
 
-/// A run as its file states it: which model, and how it is trained.
+/// The content of a run's file: the model and the training settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// A preset by name, or a whole [`ModelConfig`].
+    /// A preset by name, or a complete [`ModelConfig`].
     pub model: ModelChoice,
-    /// How it is trained.
+    /// Training settings.
     #[serde(default)]
     pub train: TrainConfig,
 }
 
-/// A preset by name, or every number spelled out.
+/// A preset by name, or all values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ModelChoice {
     /// One of [`ModelConfig::PRESETS`].
     Preset(String),
-    /// Spelled out.
+    /// All values.
     Config(Box<ModelConfig>),
 }
 

@@ -1,4 +1,4 @@
-//! What the parts of a batch found, added up over parts and processes.
+//! Losses and gradients of the parts of a batch, summed over parts and processes.
 
 use std::collections::BTreeMap;
 
@@ -12,10 +12,10 @@ use rayon::prelude::*;
 use super::peers::ProcessGroup;
 use crate::loss::LossParts;
 
-/// Gradients by the names of their parameters; one that nothing reached is not there.
+/// Gradients by the names of their parameters; parameters without a gradient are absent.
 pub(crate) type Gradients = BTreeMap<String, Tensor>;
 
-/// The loss of a batch, its gradients, and how much was presented.
+/// The loss of a batch, its gradients, and the amount of data.
 #[derive(Default)]
 pub(super) struct BatchGradients {
     pub(super) gradients: Gradients,
@@ -23,17 +23,17 @@ pub(super) struct BatchGradients {
     pub(super) tokens: usize,
 }
 
-/// What a part of the batch found.
+/// The result for a part of the batch.
 pub(super) struct Part {
     pub(super) gradients: GradStore,
-    /// Gradients of matrices that are still to be computed.
+    /// Gradients of matrices that are not yet multiplied out.
     pub(super) deferred: Deferred,
     pub(super) loss: LossParts,
     pub(super) tokens: usize,
 }
 
 impl BatchGradients {
-    /// Adds what parts of the batch found, in their order.
+    /// Adds the results of parts of the batch, in their order.
     pub(super) fn add(&mut self, parameters: &Parameters, parts: &[Part]) -> Result<()> {
         let trainable: Vec<_> = parameters.trainable().collect();
         let sums = trainable.into_par_iter().map(|(name, var)| {
@@ -59,7 +59,7 @@ impl BatchGradients {
         Ok(())
     }
 
-    /// Sums what all processes found, and lets their running statistics meet in the middle.
+    /// Sums the results of all processes, and averages their running statistics.
     pub(super) fn share(
         &mut self,
         parameters: &Parameters,

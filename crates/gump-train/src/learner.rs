@@ -1,4 +1,4 @@
-//! What learns, and what a checkpoint of a run holds.
+//! The state of a training run, and its representation in a checkpoint.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,17 +14,18 @@ use gump_nn::parameters::Parameters;
 use super::config::TrainConfig;
 use super::gradients::Gradients;
 
-/// A network on its way.
+/// A network in training.
 pub(super) struct TrainState {
     pub(super) network: Network,
-    /// The moving average of the network, where one is kept.
+    /// The moving average of the network, if there is one.
     average: Option<Network>,
     optimizer: AdamW,
     /// Steps done.
     pub(super) step: usize,
-    /// In which form a processor's products take their operands; a device's network knows itself.
+    /// Type of the operands of matrix products on a CPU; on a device the network decides it.
     pub(super) operands: Operands,
-    /// The weights that drove, for a resumed run to drive the same; empty without closed loop.
+    /// The weights that drove, so that a resumed run can repeat the drives; empty without closed
+    /// loop.
     drivers: BTreeMap<String, Tensor>,
 }
 
@@ -49,7 +50,7 @@ impl TrainState {
         })
     }
 
-    /// As a checkpoint holds it, with how it is trained.
+    /// From a checkpoint, with the training settings.
     pub(super) fn restore(path: &Path, device: &Device) -> Result<(Self, TrainConfig), ModelError> {
         let mut archive = checkpoint::read(path)?;
         let model = archive.config()?;
@@ -89,8 +90,8 @@ impl TrainState {
         Ok((learner, config))
     }
 
-    /// Writes everything a resumed run needs. What serves as weights has the plain names, so that
-    /// the file can be loaded as a network too.
+    /// Writes everything a resumed run needs. The weights to use have the plain names, so that the
+    /// file can also be loaded as a network.
     pub(super) fn save(&self, path: &Path, config: &TrainConfig) -> Result<(), ModelError> {
         let mut tensors = named("", self.shipped());
         if self.average.is_some() {
@@ -113,17 +114,17 @@ impl TrainState {
         checkpoint::write(path, tensors, header, Precision::Full)
     }
 
-    /// The network to validate and to ship: the average where one is kept.
+    /// The network to validate and to ship: the moving average if there is one.
     pub(super) fn shipped(&self) -> &Network {
         self.average.as_ref().unwrap_or(&self.network)
     }
 
-    /// Ends the run and keeps the network to ship.
+    /// Ends the run and returns the network to ship.
     pub(super) fn into_shipped(self) -> Network {
         self.average.unwrap_or(self.network)
     }
 
-    /// Lets products take operands of fewer bits, if the run is to.
+    /// Switches matrix products to operands with fewer bits, if the run uses them.
     ///
     /// Error: a tensor error.
     pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, ModelError> {
@@ -180,7 +181,7 @@ fn named(prefix: &str, network: &Network) -> BTreeMap<String, Tensor> {
         .collect()
 }
 
-/// The weights as they are now, whatever becomes of them.
+/// A copy of the present weights.
 fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, ModelError> {
     let all = network.parameters().all();
     all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))

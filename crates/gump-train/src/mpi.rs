@@ -1,4 +1,4 @@
-//! Processes that `mpirun` started, which sum by MPI.
+//! Process groups started by `mpirun`, with sums by MPI.
 
 use std::rc::Rc;
 
@@ -10,14 +10,14 @@ use mpi::traits::Communicator as _;
 
 use super::peers::ProcessGroup;
 
-/// The processes that `mpirun` started.
+/// The processes started by `mpirun`.
 #[derive(Clone)]
 pub struct Mpi {
     universe: Rc<Universe>,
 }
 
 impl Mpi {
-    /// Joins the others; a process that `mpirun` did not start is alone.
+    /// Joins the group; a process that `mpirun` did not start is alone.
     ///
     /// # Errors
     /// [`ModelError::Peers`] if this process has joined before.
@@ -32,8 +32,8 @@ impl Mpi {
         })
     }
 
-    /// Never takes leave of the others, so that `mpirun` stops them when this process ends: for one
-    /// that failed while they may not have.
+    /// Skips MPI's finalization, so that `mpirun` stops the other processes when this one ends: for
+    /// a process that failed while others may not have.
     pub fn desert(&self) {
         std::mem::forget(self.clone());
     }

@@ -1,22 +1,22 @@
-//! Processes that train one network together: each learns from its share of every batch, and what
-//! they found is summed.
+//! Process groups: processes that train one network together. Each processes its share of every
+//! batch, and results are summed.
 
 use gump_model::ModelError;
 
-/// The processes of a run, as one of them sees them.
+/// The group of processes of a run, as seen by one of them.
 ///
-/// All call [`ProcessGroup::sum`] equally often and in the same order.
+/// All processes must call [`ProcessGroup::sum`] equally often and in the same order.
 pub trait ProcessGroup {
-    /// Which one this is, from 0; the first one writes what the run writes.
+    /// Rank of this process, from 0; rank 0 writes the files of the run.
     fn rank(&self) -> usize;
 
-    /// How many there are.
+    /// Number of processes.
     fn size(&self) -> usize;
 
-    /// Replaces every number by its sum over all processes, equal to the bit on each.
+    /// Replaces every number by its sum over all processes, with equal bits on each.
     ///
     /// # Errors
-    /// [`ModelError::Peers`] if another one is gone.
+    /// [`ModelError::Peers`] if the connection to another process is lost.
     fn sum(&self, numbers: &mut [f32]) -> Result<(), ModelError>;
 }
 

@@ -1,10 +1,11 @@
-//! Showing objects a little off their way, so that a network learns the way back.
+//! Perturbation: objects are displaced from their path in samples, so that the network learns to
+//! return to it.
 //!
-//! In a log every driver is where drivers want to be; in its own rollouts a network is soon a
-//! little beside, and one that never saw that goes on straight, off the road. Here what moves along
-//! a lane sways: at every frame it is pushed sideways and turned a little, and asked to take back a
-//! share of what it is off by. How far off it is can be read off the lane, so this is no noise to
-//! the network, unlike being ahead of or behind the log, which nobody can see.
+//! In a log every vehicle is where its driver wants it to be. In its own rollouts a network is soon
+//! slightly displaced, and one that never saw displacements continues straight on, off the road.
+//! Here objects that move along a lane are pushed sideways and turned a little at every frame, with
+//! targets that take back a share of the displacement. The displacement is visible from the lane,
+//! so it is not noise to the network, unlike a displacement along the path, which is not visible.
 
 use std::collections::BTreeMap;
 
@@ -14,15 +15,15 @@ use rand::Rng as _;
 
 use crate::closed_loop::Drive;
 
-/// Share of the distance from its way that is left half a second later.
+/// Share of the displacement that is left half a second later.
 pub(crate) const SLACK: f64 = 0.7;
-/// Slower objects do not sway, metres per second: nothing moves sideways on the spot.
+/// Slower objects are not displaced, metres per second: nothing moves sideways in place.
 const SLOWEST: f64 = 2.0;
-/// Radians of turn per metre of push.
+/// Turn per metre of displacement, radians.
 const TURN: f64 = 0.12;
 
-/// The `frames` token frames of a log from index `start` on, swaying after the first; a push is up
-/// to `reach_m` metres to either side.
+/// The `frames` token frames of a log from index `start` on, perturbed after the first; a push is
+/// up to `reach_m` metres to either side.
 pub(crate) fn sway(
     scenario: &Scenario,
     start: usize,
@@ -62,17 +63,17 @@ pub(crate) fn sway(
     }
 }
 
-/// How far an object is off its way.
+/// Displacement of an object from its path.
 #[derive(Clone, Copy, Debug, Default)]
 struct Off {
     left_m: f64,
     turn: f64,
-    /// The farthest it is pushed at once.
+    /// Maximum push at one frame.
     reach_m: f64,
 }
 
 impl Off {
-    /// Half a second on: part of the way back, and another push.
+    /// Half a second later: part of the displacement is taken back, and another push is added.
     fn push(&mut self, rng: &mut Rng) {
         let mut within = |bound: f64| bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0);
         self.left_m = SLACK * self.left_m + within(self.reach_m);

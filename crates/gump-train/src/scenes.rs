@@ -1,15 +1,15 @@
-//! Where training takes its scenarios from: memory, or files that are larger than memory.
+//! Sources of training scenarios: memory, or files larger than memory.
 
 use std::borrow::Cow;
 
 use gump_model::ModelError;
 use gump_scene::Scenario;
 
-/// Scenarios by number, asked for from many threads at once.
+/// Scenarios by index, read from many threads at once.
 ///
-/// What a number stands for must not change: samples are drawn by it, in a resumed run too.
+/// The scenario of an index must not change: samples are drawn by index, in resumed runs as well.
 pub trait ScenarioSource: Send + Sync {
-    /// How many there are.
+    /// Number of scenarios.
     fn len(&self) -> usize;
 
     /// True if there are none.
@@ -17,19 +17,19 @@ pub trait ScenarioSource: Send + Sync {
         self.len() == 0
     }
 
-    /// The scenario that a sample of a training step shows, told from a number drawn at random.
+    /// The index of the scenario for a sample of a training step, from a random number.
     ///
-    /// Collections that change over time answer for the time of the step; [`ScenarioSource::get`] must know
-    /// every answer, however long ago the step was.
+    /// Collections that change over time answer for the time of the step; [`ScenarioSource::get`]
+    /// must accept every index ever returned, however long ago the step was.
     fn pick(&self, step: usize, draw: u64) -> usize {
         let _ = step;
         (draw % self.len() as u64) as usize
     }
 
-    /// Scenario `index`, which is below [`ScenarioSource::len`] or was picked.
+    /// Scenario `index`, which is below [`ScenarioSource::len`] or was returned by `pick`.
     ///
     /// # Errors
-    /// [`ModelError::Scene`] for one that cannot be fetched.
+    /// [`ModelError::Scene`] for one that cannot be read.
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError>;
 }
 

@@ -1,4 +1,4 @@
-//! Where samples come from: drawn ahead of the step that learns from them.
+//! The source of samples, drawn ahead of the step that uses them.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
@@ -12,10 +12,10 @@ use crate::closed_loop::{ClosedLoopConfig, Drive};
 use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 
-/// Where samples come from; shared with the threads that draw them.
+/// The source of samples, shared with the threads that draw them.
 pub(super) struct Source {
     pub(super) scenarios: Box<dyn ScenarioSource>,
-    /// Scenes as the network drove them.
+    /// Scenes as driven by the network.
     pub(super) drives: Vec<Drive>,
     pub(super) closed_loop: ClosedLoopConfig,
     pub(super) reader: Reader,
@@ -71,7 +71,7 @@ impl Source {
     }
 }
 
-/// Frames must be at hand every half second; how often else may differ from scenario to scenario.
+/// Frames must be available every half second; time steps may differ between scenarios.
 ///
 /// Error: [`ModelError::Scene`] naming the scenario.
 pub(super) fn check_rate(scenario: &Scenario) -> Result<(), ModelError> {
@@ -85,12 +85,13 @@ pub(super) fn check_rate(scenario: &Scenario) -> Result<(), ModelError> {
     )))
 }
 
-/// The samples of a step, or why there are none.
+/// The samples of a step, or the error of drawing them.
 pub(super) type SampleReceiver = Receiver<Result<Vec<Sample>, ModelError>>;
 
-/// Draws the samples of a step with these numbers while the present step is computed.
+/// Draws the samples of a step in the background, while the present step is computed.
 ///
-/// On a thread of its own: a job of the pool could wait for ever behind the step that waits for it.
+/// On its own thread: a job of the thread pool could wait for ever behind the step that waits for
+/// it.
 pub(super) fn prefetch(source: &Arc<Source>, step: usize, numbers: Vec<usize>) -> SampleReceiver {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);

@@ -1,8 +1,9 @@
-//! Training: draw samples, differentiate, step, save; interrupted anywhere, it resumes exactly.
+//! The trainer: draws samples, differentiates, updates, saves; interrupted anywhere, it resumes
+//! exactly.
 //!
-//! Sample `i` of step `s` depends on the seed, `s` and `i` alone, so neither threads, processes nor
-//! a restart change what is learned. What is run is in `config`, where samples come from in
-//! `source`, how parts of a batch add up in `gradients` and `peers`, what is saved in `learner`.
+//! Sample `i` of step `s` depends only on the seed, `s` and `i`, so results do not depend on
+//! threads, processes or restarts. Settings are in `config`, samples come from `source`, parts of a
+//! batch are summed in `gradients` and `peers`, and `learner` defines what is saved.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -28,10 +29,10 @@ use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 use crate::source::{SampleReceiver, Source, check_rate, prefetch};
 
-/// What one step did.
+/// The result of one step.
 #[derive(Clone, Debug, Serialize)]
 pub struct StepReport {
-    /// Steps done, this one included.
+    /// Number of steps done, including this one.
     pub step: usize,
     /// The loss before the step.
     pub loss: LossParts,
@@ -41,7 +42,7 @@ pub struct StepReport {
     pub gradient_norm: f64,
     /// Tokens presented.
     pub tokens: usize,
-    /// Realism of the rollouts that were learned from, if any were.
+    /// Realism of the rollouts used in the step, if any.
     pub rollouts: Option<f64>,
 }
 
@@ -70,7 +71,7 @@ impl Trainer {
         Self::continuing(network, config, scenarios)
     }
 
-    /// Starts a run on a network that has learned something already, with a fresh optimiser.
+    /// Starts a run on a trained network, with a new optimizer.
     ///
     /// # Errors
     /// A configuration that contradicts itself, or no scenario to train on.
@@ -86,7 +87,7 @@ impl Trainer {
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
     ///
     /// # Errors
-    /// A file that is not a run's checkpoint, or no scenario to train on.
+    /// A file that is not the checkpoint of a run, or no scenario to train on.
     pub fn resume(
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
@@ -133,7 +134,7 @@ impl Trainer {
         })
     }
 
-    /// The same run, shared with other processes that have begun it with the same arguments.
+    /// The same run, shared with other processes that have started it with the same arguments.
     ///
     /// # Errors
     /// A batch that is too small to be shared.
@@ -150,8 +151,9 @@ impl Trainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`ModelError::LossNotFinite`] before anything is changed, [`ModelError::Scene`] for a scenario
-    /// that cannot be fetched, [`ModelError::Peers`] if another process failed, or a tensor error.
+    /// [`ModelError::LossNotFinite`] before anything is changed, [`ModelError::Scene`] for a
+    /// scenario that cannot be read, [`ModelError::Peers`] if another process failed, or a tensor
+    /// error.
     pub fn step(&mut self) -> Result<StepReport, ModelError> {
         let no_data = ModelError::NoData {
             frames: self.config.sample.frames,
@@ -181,7 +183,7 @@ impl Trainer {
         })
     }
 
-    /// Loss and gradients of a batch, of which these are this process's samples.
+    /// Loss and gradients of a batch, given this process's samples.
     pub(crate) fn differentiate(&self, samples: &[Sample]) -> Result<BatchGradients, ModelError> {
         let (network, config) = (&self.learner.network, &self.config.loss);
         let operands = self.learner.operands;
@@ -213,7 +215,8 @@ impl Trainer {
         Ok(found)
     }
 
-    /// The loss on up to `limit` samples of other scenarios, the ego as centre, no augmentation.
+    /// The loss on up to `limit` samples of other scenarios, with the ego as centre and without
+    /// augmentation.
     ///
     /// # Errors
     /// No scenario long enough, or a tensor error.
@@ -255,7 +258,7 @@ impl Trainer {
 
     /// Targets over all processes.
     ///
-    /// Error: there are none at all.
+    /// Error: there are no targets.
     fn total(&self, own: Counts) -> Result<Counts, ModelError> {
         let mut whole = own;
         if self.peers.size() > 1 {
@@ -270,10 +273,10 @@ impl Trainer {
         Ok(whole)
     }
 
-    /// True if any process says so.
+    /// True if it is true in any process.
     ///
     /// # Errors
-    /// [`ModelError::Peers`] if another process is gone.
+    /// [`ModelError::Peers`] if the connection to another process is lost.
     pub fn any(&self, said: bool) -> Result<bool, ModelError> {
         let mut number = [f32::from(u8::from(said))];
         self.peers.sum(&mut number)?;
@@ -293,17 +296,17 @@ impl Trainer {
         self.learner.step
     }
 
-    /// How it trains.
+    /// Its settings.
     pub fn config(&self) -> &TrainConfig {
         &self.config
     }
 
-    /// The network to use, as it is now: the moving average where one is kept.
+    /// The network to use, in its present state: the moving average if there is one.
     pub fn network(&self) -> &Network {
         self.learner.shipped()
     }
 
-    /// A copy of that network, for a world that imagines while training goes on.
+    /// A copy of that network, for a world that is used while training continues.
     ///
     /// # Errors
     /// A tensor error.
@@ -311,7 +314,7 @@ impl Trainer {
         self.learner.snapshot()
     }
 
-    /// Ends the run and keeps the network to use.
+    /// Ends the run and returns the network to use.
     pub fn into_network(self) -> Network {
         self.learner.into_shipped()
     }

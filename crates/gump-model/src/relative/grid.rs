@@ -1,4 +1,4 @@
-//! The bins in which the next half second of an agent is said, in the frame of its present pose.
+//! Bins for an agent's motion in the next half second, in the frame of its present pose.
 //!
 //! Four fields, one after another: whether the agent stands, then how far it moves ahead, to the
 //! left, and how far it turns. A standing agent keeps its exact pose. Bins of sideways moves and

@@ -1,4 +1,4 @@
-//! How many targets a batch has: what its means are over.
+//! Numbers of targets in a batch, the denominators of its means.
 
 use gump_model::decoder::STEPS;
 
@@ -35,12 +35,12 @@ impl Counts {
         }
     }
 
-    /// States over all steps, weighted; not 0, to be divided by.
+    /// States over all steps, weighted; never 0, because it is a divisor.
     pub(super) fn states(&self) -> f64 {
         self.steps.iter().sum::<f64>().max(f64::MIN_POSITIVE)
     }
 
-    /// All numbers in a row, for another process.
+    /// All values in a row, for another process.
     pub(crate) fn numbers(&self) -> Vec<f32> {
         let others = [
             self.control,
@@ -53,7 +53,7 @@ impl Counts {
         all.map(|&number| number as f32).collect()
     }
 
-    /// What [`Self::numbers`] told.
+    /// From the values of [`Self::numbers`].
     pub(crate) fn of_numbers(numbers: &[f32]) -> Self {
         let number = |i: usize| f64::from(numbers[i]);
         Self {
@@ -67,7 +67,7 @@ impl Counts {
     }
 }
 
-/// What a state target counts at a decoder step.
+/// Weight of a state target at a decoder step.
 pub(super) fn weight(target: &StateTarget, step: usize, config: &LossConfig) -> f64 {
     match target.bins[step] {
         None => 0.0,

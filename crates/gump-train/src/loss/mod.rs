@@ -1,8 +1,8 @@
-//! What training minimises: cross-entropy of states and successors, trajectories, reconstruction.
+//! The training loss: cross-entropy of states and successors, trajectories, reconstruction.
 //!
-//! Every mean is over valid targets only; an ignored target has no value and no gradient. A batch
-//! may come in parts: each mean is over the targets of the whole batch, so the parts' losses and
-//! gradients add up to those of the batch.
+//! Every mean is over valid targets only; ignored targets have no effect on value and gradient. A
+//! batch may come in parts: each mean is over the targets of the whole batch, so the parts' losses
+//! and gradients add up to those of the batch.
 //!
 //! Source: GUMP's loss with separate means for values and keys, winner-takes-all trajectories.
 
@@ -27,7 +27,7 @@ use self::counts::weight;
 use self::trajectory::{at_agents, trajectory_loss, trajectory_targets};
 use crate::sample::{ControlTarget, Sample};
 
-/// Steps of the decoder that say a size.
+/// Decoder steps of sizes.
 const SIZES: usize = 2;
 
 /// Weights of the parts.
@@ -43,20 +43,21 @@ pub struct LossConfig {
     /// Weights of the trajectory heads, shallow to deep (paper: 0.25, 0.25, 0.5, 0.5); a network
     /// with fewer heads uses the last ones.
     pub trajectory: [f64; 4],
-    /// Weight of recalling the past in the trajectory heads, relative to the future.
+    /// Weight of the past in the trajectory heads, relative to the future.
     pub past: f64,
     /// Weight of reconstructing the raster (paper: 1).
     pub reconstruction: f64,
     /// Weight of objects that the window has not shown before, relative to the others (paper: 1);
-    /// where they are is nearly all chance.
+    /// their position is mostly random.
     pub unknown: f64,
     /// Width of the label smoothing over neighbouring bins, as a standard deviation in bins; 0 is
     /// none (paper).
     pub smoothing_bins: f64,
-    /// True leaves out of the smoothing what must be exact: sizes, and objects that stand (below
-    /// 0.3 m/s). A smoothed target gives a parked car a chance to pull out at every step.
+    /// Whether targets that must be exact are excluded from the smoothing: sizes, and objects that
+    /// stand (below 0.3 m/s). A smoothed target gives a parked car a probability of starting at
+    /// every step.
     pub exact_standing: bool,
-    /// Most agents per sample that a trajectory head is asked about (released code: 512 per batch).
+    /// Maximum number of agents per sample for a trajectory head (released code: 512 per batch).
     pub max_trajectories: usize,
 }
 
@@ -80,7 +81,7 @@ impl Default for LossConfig {
 /// The parts of a loss as numbers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LossParts {
-    /// What was minimised.
+    /// The total, which is minimised.
     pub total: f64,
     /// Mean cross-entropy over all state targets, nats.
     pub state: f64,
@@ -129,7 +130,7 @@ impl LossParts {
         fields.for_each(|(sum, part)| *sum += part);
     }
 
-    /// All numbers in a row, for another process.
+    /// All values in a row, for another process.
     pub(crate) fn numbers(&self) -> Vec<f32> {
         let parts = [
             self.total,
@@ -144,7 +145,7 @@ impl LossParts {
         all.map(|&number| number as f32).collect()
     }
 
-    /// What [`Self::numbers`] told.
+    /// From the values of [`Self::numbers`].
     pub(crate) fn of_numbers(numbers: &[f32]) -> Self {
         let number = |i: usize| f64::from(numbers[i]);
         Self {
@@ -181,8 +182,8 @@ impl LossParts {
     }
 }
 
-/// One forward pass over samples of a batch that has `whole` targets: their part of its loss, to
-/// differentiate, and as numbers.
+/// One forward pass over samples of a batch that has `whole` targets: their part of its loss, for
+/// differentiation, and as numbers.
 ///
 /// With `dropout` the pass is a training pass; without, an evaluation.
 pub(crate) fn loss(
@@ -356,7 +357,7 @@ fn state_loss(
     Ok(Some((means * shares)?.sum_all()?))
 }
 
-/// Mean cross-entropy of what is said of the successors of some slots.
+/// Mean cross-entropy of the successors of some slots.
 fn successor_loss(
     samples: &[Sample],
     targets: impl Fn(&Sample) -> &Vec<ControlTarget>,

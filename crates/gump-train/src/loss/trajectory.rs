@@ -1,4 +1,5 @@
-//! The loss of the trajectory heads: the best of several futures, which one that is, and the past.
+//! The loss of the trajectory heads: best-of-modes regression, classification of the best mode, and
+//! the past.
 
 use candle_core::{D, Device, Tensor};
 use gump_model::trajectory_head::{FUTURE, MODES, PAST, POSE, Trajectories};
@@ -18,7 +19,7 @@ pub(super) fn trajectory_targets(
     .collect()
 }
 
-/// The targets of a sample that the heads are asked about.
+/// The targets of the heads in a sample.
 pub(super) fn asked(sample: &Sample, limit: usize) -> impl Iterator<Item = &TrajectoryTarget> {
     let stride = sample.trajectories.len().div_ceil(limit.max(1)).max(1);
     sample.trajectories.iter().step_by(stride)
@@ -37,7 +38,7 @@ pub(super) fn at_agents(
     Tensor::cat(&[pick(0)?, pick(1)?], 1)
 }
 
-/// Best-of-modes regression plus classification of the best mode, plus recalling the past.
+/// Best-of-modes regression, classification of the best mode, and regression of the past.
 pub(super) fn trajectory_loss(
     predicted: &Trajectories,
     targets: &[(u32, &TrajectoryTarget)],

@@ -1,14 +1,14 @@
-//! Drives in training: agents leave the log for where the network's own draws take them, and learn
-//! the way back.
+//! Drives in training: the network's own draws lead agents away from the log, and the targets lead
+//! back.
 //!
-//! A network that learns from logs alone meets its own small errors for the first time when it is
-//! rolled out. Here it draws several next moves of every agent and takes the one nearest to the log
-//! (as CAT-K does, Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models",
-//! 2024), so that agents stay near enough to the log for its next states to be their targets.
+//! A network trained on logs only does not see its own small errors until it is rolled out. Here it
+//! draws several next moves of every agent and takes the one nearest to the log (as CAT-K does,
+//! Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models", 2024), so that
+//! agents stay near enough to the log for its next states to be their targets.
 //!
-//! In a share of drives agents go their own ways instead, under the rules of
-//! `gump_engine::relative::rules`: what would run into somebody or off the road is drawn again. What they then did is what the network should say,
-//! so that it comes to keep the rules by itself.
+//! In a share of drives the agents move freely instead, under the rules of
+//! `gump_engine::relative::rules`: draws that would overlap an agent or leave the road are redrawn.
+//! The resulting motion is the target, so that the network learns to follow the rules itself.
 
 use gump_engine::relative::engine::{Draw, Engine, Workspace};
 use gump_engine::relative::rules::settle;
@@ -28,36 +28,37 @@ use serde::{Deserialize, Serialize};
 
 /// Frames that are shown as logged before the network drives.
 const WARM_UP: usize = 2;
-/// Metres that a radian counts for in choosing the move nearest to the log.
+/// Weight of a radian, in metres, in choosing the move nearest to the log.
 const METRES_PER_RADIAN: f64 = 2.0;
 
-/// How far around a sample edges of the road are looked at, metres.
+/// Radius around a sample in which road edges are considered, metres.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
 const RULED: u64 = 1 << 32;
 
-/// How agents are driven by the network that learns.
+/// Settings of drives by the network in training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RelativeDrives {
     /// Share of samples whose agents are driven; the others show the log.
     pub share: f64,
-    /// Draws per agent and step, of which the nearest to the log is taken.
+    /// Draws per agent and step, of which the nearest to the log is used.
     pub candidates: usize,
-    /// Where even the nearest draw is farther than this from the way back to the log, metres, an
-    /// agent moves along that way instead: a driver who stays at a light that has turned green says
-    /// nothing of how to catch up.
+    /// If even the nearest draw is farther than this from the target path back to the log, metres,
+    /// the agent moves along that path instead: a vehicle that stays at a light that has turned
+    /// green gives no information on how to catch up.
     pub tolerance_m: f64,
     /// Divides the logits of the draws.
     pub temperature: f64,
-    /// Steps after which the network drives as it is then.
+    /// Steps after which the driving network is updated.
     pub refresh: usize,
-    /// Share of the driven samples whose agents go their own ways under the rules.
+    /// Share of the driven samples whose agents move freely under the rules.
     pub ruled: f64,
-    /// Of those, how often a move is drawn again at most.
+    /// Maximum number of redraws of a move in those samples.
     pub redraws: usize,
-    /// Of those, draws are among the likeliest bins that together have this probability: targets are
-    /// smoothed, and without the tail cut off draws would spread a little more with each refresh.
+    /// Nucleus of the draws in those samples: the most likely bins that together have this
+    /// probability. Targets are smoothed, and without truncation draws would spread a little more
+    /// with each update.
     pub top_p: f64,
 }
 
@@ -101,7 +102,7 @@ impl RelativeDrives {
     }
 }
 
-/// A network as it was at a step, that drives.
+/// A snapshot of the network at a step, which drives.
 pub(crate) struct Driver {
     engine: Engine,
     config: RelativeDrives,
@@ -124,7 +125,8 @@ impl TrackDriver for Driver {
         self.config.share
     }
 
-    /// Moves the agents of a sample, which lies around `centre`, to where the network drives them.
+    /// Moves the agents of a sample, which lies around `centre`, to the poses that the network
+    /// drives to.
     fn drive(
         &self,
         (streets, centre): (&MapGraph, DVec2),
@@ -191,7 +193,7 @@ impl TrackDriver for Driver {
 }
 
 impl Driver {
-    /// A move of every agent in its own frame, drawn again where the rules forbid it.
+    /// A move of every agent in its own frame, redrawn where the rules forbid it.
     fn moves_by_the_rules(
         &self,
         agents: &[Shown],
@@ -240,7 +242,7 @@ impl Driver {
     }
 }
 
-/// How far a pose is from another, metres.
+/// Distance between two poses, metres.
 fn far(a: Pose, b: Pose) -> f64 {
     a.position.distance(b.position)
         + METRES_PER_RADIAN * angle_difference(a.heading, b.heading).abs()

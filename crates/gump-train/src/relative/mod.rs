@@ -1,4 +1,4 @@
-//! Training of the relative network: drives of its own, rewards by realism, the trainer.
+//! Training of the relative network: drives, rewards from realism, and the trainer.
 
 mod drives;
 mod rewards;

@@ -1,11 +1,12 @@
-//! Learning from one's own rollouts: what a rollout adds to the realism of a group of them.
+//! Reinforcement learning from rollouts: the contribution of a rollout to the realism of its group
+//! is the reward.
 //!
-//! Futures of a scene are drawn by the network alone and compared with the log by the metric of
-//! Waymo's Sim Agents Challenge. What each of them adds (its leave-one-out value) is the reward, as in
-//! RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent Traffic Simulation via
-//! Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and step: a move earns what
-//! came after it. Moves that earned more than those of the other futures become likelier, the others
-//! less likely.
+//! Futures of a scene are drawn by the network without rules and compared with the log by the
+//! metric of Waymo's Sim Agents Challenge. The contribution of each (its leave-one-out value) is
+//! the reward, as in RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent
+//! Traffic Simulation via Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and
+//! step: the return of a move is the sum of later rewards. Moves with a higher return than those of
+//! the other futures become more likely, the others less likely.
 
 use gump_engine::relative::{MAP_M, RelativeSampling, RelativeWorld};
 use gump_model::ModelError;
@@ -18,22 +19,23 @@ use gump_scene::{AgentId, Frame, Rollout, Scenario, Seed};
 use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Year};
 use serde::{Deserialize, Serialize};
 
-/// Rewards beyond this many standard deviations count as that many.
+/// Returns are clipped to this many standard deviations.
 const MOST: f64 = 3.0;
-/// Rewards that differ less than this say nothing, in units of the meta metric.
+/// Differences of returns smaller than this are ignored, in units of the metametric.
 const LEAST: f64 = 1e-9;
 
-/// How a network learns from its own rollouts.
+/// Settings of learning from rollouts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RelativeRewards {
     /// Futures of a scene, at least 2: each is compared with the others.
     pub rollouts: usize,
-    /// Agents of a scene at most, those nearest to the ego.
+    /// Maximum number of agents of a scene, those nearest to the ego.
     pub agents: usize,
-    /// Weight of the rewarded moves beside the moves of the batch, which anchor the network.
+    /// Weight of the rewarded moves relative to the moves of the batch, which keep the network near
+    /// the data.
     pub weight: f64,
-    /// Steps after which the network that drives is the one that has learned.
+    /// Steps after which the network that is rolled out is updated.
     pub refresh: usize,
 }
 
@@ -65,14 +67,14 @@ impl RelativeRewards {
     }
 }
 
-/// Futures of one scene with what their moves earned.
+/// Futures of one scene with the returns of their moves.
 pub(super) struct Group {
     pub(super) samples: Vec<Sample>,
-    /// Meta metric of all of them together.
+    /// Metametric of all of them together.
     pub(super) realism: f64,
 }
 
-/// A network as it was at a step, whose rollouts are judged.
+/// A snapshot of the network at a step, which is rolled out.
 pub(super) struct Judged {
     world: RelativeWorld,
     config: RelativeRewards,
@@ -91,10 +93,11 @@ impl Judged {
         })
     }
 
-    /// Rolls a scene out and judges the moves; `None` for a scene on which realism is not defined
-    /// (too short, without road edges, of another clock) or on which all futures are worth the same.
+    /// Rolls a scene out and computes returns; `None` for a scene for which realism is not defined
+    /// (too short, without road edges, with another time step) or in which all futures have equal
+    /// rewards.
     ///
-    /// Error: what rolling out reports.
+    /// Error: errors of the rollout.
     pub(super) fn group(
         &self,
         scenario: &Scenario,
@@ -130,7 +133,7 @@ impl Judged {
     }
 }
 
-/// A scene of the agents nearest to its ego, all of which are to be scored.
+/// A scene with only the agents nearest to its ego, all of which are scored.
 fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     let now = &scenario.log[scenario.now];
     let ego = now.agent(scenario.ego).map(|ego| ego.state.pose.position);
@@ -157,7 +160,8 @@ fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     }
 }
 
-/// Each future as a sample whose moves weigh what they earned; `None` if all earned the same.
+/// Each future as a sample whose moves are weighted by their returns; `None` if all returns are
+/// equal.
 fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Option<Vec<Sample>> {
     let per_move = (TOKEN_DT / scenario.dt).round() as usize;
     let n_moves = worth.n_steps / per_move;
@@ -190,7 +194,7 @@ fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Opti
     samples.collect()
 }
 
-/// What is earned from each move on, given what is earned at each step.
+/// The return of each move, given the reward at each step.
 fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
     let mut earned: Vec<f64> = credit
         .chunks_exact(per_move)
@@ -202,8 +206,8 @@ fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
     earned
 }
 
-/// What each future earned beyond the mean of all, in standard deviations of the group; `None` if
-/// that says nothing.
+/// The advantage of each future: its return minus the mean of all, in standard deviations of the
+/// group; `None` if the differences are negligible.
 fn standardized(credit: &[Vec<f64>], earned: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Vec<f64>>> {
     let mut all: Vec<Vec<f64>> = credit.iter().map(|credit| earned(credit)).collect();
     let n = all.len() as f64;

@@ -1,4 +1,4 @@
-//! The relative network against itself: in training and rolled out, resumed and unbroken.
+//! The relative network: training against rollouts, resumed against uninterrupted runs.
 
 use candle_core::Device;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};

@@ -25,12 +25,12 @@ use crate::relative::drives::{Driver, RelativeDrives};
 use crate::relative::rewards::{Group, Judged, RelativeRewards};
 use crate::scenes::ScenarioSource;
 
-/// How many scenes are tried for a sample.
+/// Maximum number of scenes tried for a sample.
 const ATTEMPTS: u64 = 64;
-/// Separates the scenes that are rolled out from those of the samples.
+/// Separates the scenes to roll out from those of the samples.
 const GROUP: u64 = 1 << 40;
 
-/// How to train.
+/// Training settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RelativeTrainConfig {
@@ -38,24 +38,24 @@ pub struct RelativeTrainConfig {
     pub steps: usize,
     /// Samples per step.
     pub batch: usize,
-    /// Where all randomness comes from.
+    /// The seed of all randomness.
     pub seed: u64,
-    /// Share of the old in a moving average of the weights, which is what is validated and shipped.
+    /// Decay of a moving average of the weights, which is the network to validate and ship.
     pub ema: f64,
     /// Width of the smoothing of targets over neighbouring bins of moves, standard deviation in bins;
     /// standing is never smoothed.
     pub smoothing_bins: f64,
     /// Whether matrix products take their operands in bfloat16; sums and weights stay f32.
     pub mixed_precision: bool,
-    /// Whether agents are driven by the network that learns, and how; without it samples show logs.
+    /// Drives by the network in training; without them samples show logs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub closed_loop: Option<RelativeDrives>,
-    /// Whether the network learns from what its own rollouts add to realism beside that, and how.
+    /// Learning from rollouts with rewards, in addition to the samples.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub realism: Option<RelativeRewards>,
-    /// How samples are drawn.
+    /// Settings of samples.
     pub sample: SampleConfig,
-    /// How steps are taken.
+    /// Settings of the optimizer.
     pub optimizer: OptimizerConfig,
 }
 
@@ -81,14 +81,14 @@ impl Default for RelativeTrainConfig {
 }
 
 impl RelativeTrainConfig {
-    /// Steps after which the network that drives is brought up to date, if one drives.
+    /// Number of steps between updates of the driving network, if there is one.
     fn refresh(&self) -> Option<usize> {
         let drives = self.closed_loop.as_ref().map(|drives| drives.refresh);
         let rewards = self.realism.as_ref().map(|rewards| rewards.refresh);
         drives.into_iter().chain(rewards).min()
     }
 
-    /// Checks that the numbers are in their ranges.
+    /// Checks that the values are in their ranges.
     ///
     /// # Errors
     /// [`ModelError::Config`] naming the first that is not.
@@ -107,10 +107,10 @@ impl RelativeTrainConfig {
     }
 }
 
-/// What one step did.
+/// The result of one step.
 #[derive(Clone, Debug, Serialize)]
 pub struct RelativeStep {
-    /// Steps done, this one included.
+    /// Number of steps done, including this one.
     pub step: usize,
     /// Mean over moves, nats: all fields together.
     pub loss: f64,
@@ -120,9 +120,9 @@ pub struct RelativeStep {
     pub gradient_norm: f64,
     /// Learning rate of the step.
     pub learning_rate: f64,
-    /// Agents at frames that were presented.
+    /// Agent-frames presented.
     pub nodes: usize,
-    /// Realism of the rollouts that were learned from, if any were.
+    /// Realism of the rollouts used in the step, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rollouts: Option<f64>,
 }
@@ -135,18 +135,18 @@ pub struct RelativeTrainer {
     config: RelativeTrainConfig,
     step: usize,
     source: Arc<Source>,
-    /// The network that drives the agents of samples, as it was at the last refresh.
+    /// The network that drives the agents of samples, as of the last update.
     driving: Option<RelativeNetwork>,
     next: Receiver<Result<Batch, ModelError>>,
 }
 
-/// What a step learns from.
+/// The data of a step.
 struct Batch {
     samples: Vec<Sample>,
     group: Option<Group>,
 }
 
-/// The network that drives, in both of its roles.
+/// The driving network, for drives and for rewards.
 #[derive(Default)]
 struct Drivers {
     driver: Option<Driver>,
@@ -238,7 +238,7 @@ impl RelativeTrainer {
         Self::continuing(network, config, scenarios)
     }
 
-    /// Starts a run on a network that has learned something already, with a fresh optimiser.
+    /// Starts a run on a trained network, with a new optimizer.
     ///
     /// # Errors
     /// A configuration that contradicts itself, or no scenario to train on.
@@ -257,7 +257,7 @@ impl RelativeTrainer {
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
     ///
     /// # Errors
-    /// A file that is not a run's checkpoint, or no scenario to train on.
+    /// A file that is not the checkpoint of a run, or no scenario to train on.
     pub fn resume(
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
@@ -323,7 +323,7 @@ impl RelativeTrainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`ModelError::LossNotFinite`] before anything is changed, or what drawing samples reports.
+    /// [`ModelError::LossNotFinite`] before anything is changed, or errors of drawing samples.
     pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
         let drawn = self.next.recv();
         let Batch { samples, group } = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
@@ -407,7 +407,7 @@ impl RelativeTrainer {
         })
     }
 
-    /// The loss on other scenarios, nothing hidden, nothing smoothed; by field, nats.
+    /// The loss on other scenarios, without hiding and smoothing; by field, nats.
     ///
     /// # Errors
     /// No scenario long enough, or a tensor error.
@@ -434,7 +434,7 @@ impl RelativeTrainer {
         Ok(mean_fields(sums.iter(), total))
     }
 
-    /// Writes everything a resumed run needs; it can be loaded as a network, too.
+    /// Writes everything a resumed run needs; the file can also be loaded as a network.
     ///
     /// # Errors
     /// [`ModelError::Io`]; the previous file is intact.
@@ -459,7 +459,7 @@ impl RelativeTrainer {
         checkpoint::write(path, tensors, header, Precision::Full)
     }
 
-    /// Ends the run and keeps the network to use.
+    /// Ends the run and returns the network to use.
     pub fn into_network(self) -> RelativeNetwork {
         self.average
     }
@@ -469,17 +469,17 @@ impl RelativeTrainer {
         self.step
     }
 
-    /// How it trains.
+    /// Its settings.
     pub fn config(&self) -> &RelativeTrainConfig {
         &self.config
     }
 
-    /// The network to use, as it is now: the moving average.
+    /// The network to use, in its present state: the moving average.
     pub fn network(&self) -> &RelativeNetwork {
         &self.average
     }
 
-    /// A copy of it, for a world that imagines while training goes on.
+    /// A copy of it, for a world that is used while training continues.
     ///
     /// # Errors
     /// A tensor error.
@@ -512,10 +512,10 @@ fn drivers(
     })
 }
 
-/// What one sample of a step found.
+/// The result for one sample of a step.
 struct Part {
     gradients: GradStore,
-    /// Gradients of matrices that are still to be computed.
+    /// Gradients of matrices that are not yet multiplied out.
     deferred: Deferred,
     /// Sums of the fields' cross-entropies, nats.
     sums: [f64; FIELDS],

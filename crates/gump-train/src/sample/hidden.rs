@@ -1,9 +1,9 @@
-//! What a sample keeps from the network that its scene states, so that it learns to do without.
+//! Hiding of inputs that a scene states, so that the network learns to work without them.
 //!
-//! Formats differ in what they state; a network that only ever saw maps with limits and signs would
-//! take their absence for a fact. Some samples are therefore shown as from a source that has no word
-//! for limits, for stop signs, for lights or for sizes: map, raster, tokens and surroundings alike.
-//! What the objects do, and with it what is asked, stays what it was.
+//! Formats differ in what they state; a network that only saw maps with limits and signs would take
+//! their absence for a fact. Some samples are therefore presented as from a source without limits,
+//! stop signs, lights or sizes: map, raster, tokens and local contexts alike. Motion and targets
+//! are not changed.
 
 use std::sync::Arc;
 
@@ -12,18 +12,18 @@ use rand::Rng as _;
 
 use super::SampleConfig;
 
-/// What is hidden in one sample.
+/// The inputs hidden in one sample.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Hidden {
     limits: bool,
     stop_signs: bool,
     lights: bool,
-    /// True shows every object in the usual size of its kind.
+    /// Whether every object gets the usual size of its kind.
     pub(super) sizes: bool,
 }
 
 impl Hidden {
-    /// Draws what to hide.
+    /// Draws which inputs to hide.
     pub(super) fn draw(config: &SampleConfig, rng: &mut Rng) -> Self {
         Self {
             limits: rng.random_bool(config.hide_limits),
@@ -33,7 +33,7 @@ impl Hidden {
         }
     }
 
-    /// The map as a source without the hidden would state it.
+    /// The map without the hidden inputs.
     pub(super) fn map(self, map: &Arc<MapGraph>) -> Arc<MapGraph> {
         let hides_limits = self.limits && map.lanes().iter().any(|l| l.speed_limit.is_some());
         let unstated = map.unstated();
@@ -55,7 +55,7 @@ impl Hidden {
         Arc::new(MapGraph::new(parts).expect("a map with less on it"))
     }
 
-    /// Likewise a frame.
+    /// The frame without the hidden inputs.
     pub(super) fn frame(self, frame: &Frame) -> Frame {
         let lights = match self.lights {
             true => Vec::new(),
@@ -65,7 +65,7 @@ impl Hidden {
         Frame::new(agents.collect(), lights)
     }
 
-    /// True if frames are shown as they are.
+    /// True if frames are not changed.
     pub(super) fn shows_frames(self) -> bool {
         !self.lights && !self.sizes
     }

@@ -1,8 +1,8 @@
-//! One training sample: a random centre, a random run of frames, and what should be said of it.
+//! One training sample: a random centre, a random run of frames, and their targets.
 //!
-//! Augmentation moves and turns the *pose* everything is expressed in, before anything is drawn or
-//! tokenized, so that map and agents cannot fall out of register. Which frames are shown is said in
-//! `window`, what is asked in `targets`.
+//! Augmentation moves and turns the *pose* that everything is expressed in, before anything is
+//! drawn or tokenized, so that map and agents stay aligned. `window` selects the frames, `targets`
+//! computes the targets.
 
 #[cfg(test)]
 mod driving_tests;
@@ -35,53 +35,54 @@ pub(crate) use self::window::Driven;
 use self::window::{Window, choose_window};
 use crate::perturbation as drift;
 
-/// Separates the stream of what is hidden from those of other choices.
+/// Separates the random stream of hiding from those of other choices.
 const HIDDEN: u64 = 1 << 32;
 
-/// How samples are drawn from scenarios.
+/// Settings of training samples.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SampleConfig {
-    /// Consecutive frames at 2 Hz a sample presents.
+    /// Number of consecutive frames at 2 Hz in a sample.
     pub frames: usize,
-    /// Samples keep at most this many agents, those nearest to the centre, and fewer where the
-    /// frames would not fit the network's block.
+    /// Maximum number of agents, those nearest to the centre; fewer where the frames would not fit
+    /// the network's block.
     pub max_agents: usize,
-    /// True takes any frame of the log as the present, not only the scenario's own.
+    /// Whether any frame of the log may be the present, not only the scenario's own.
     pub any_present: bool,
-    /// Probability that another vehicle than the ego is the centre (the paper re-centres too).
+    /// Probability that a vehicle other than the ego is the centre (the paper re-centres too).
     pub other_centre: f64,
     /// Probability of moving and turning the frame of reference.
     pub augment: f64,
-    /// Largest turn, radians (paper: π/2).
+    /// Maximum turn, radians (paper: π/2).
     pub rotation: f64,
-    /// Largest move along each axis, metres (paper: 5).
+    /// Maximum move along each axis, metres (paper: 5).
     pub translation_m: f64,
     /// Probability of removing a track for a part of the window (paper: 0.1).
     pub agent_dropout: f64,
     /// Probability of blanking a frame (paper: 0.1).
     pub frame_dropout: f64,
-    /// Probability that what drives is shown a little off its way, with the way back asked for.
+    /// Probability that moving objects are displaced from their path, with the return to it as
+    /// target.
     pub sway: f64,
-    /// The farthest that it is pushed to a side at once, metres.
+    /// Maximum sideways displacement per push, metres.
     pub sway_m: f64,
-    /// Probability that the last frame's values are seen perturbed, as partial-AR decoding sees
-    /// surrogates; the targets stay true.
+    /// Probability that the last frame's values are perturbed, like surrogates in partial-AR
+    /// decoding; the targets are not changed.
     pub surrogate_noise: f64,
-    /// True draws the ids of each sample at random, so that every id is learned; false ranks them as
-    /// inference does.
+    /// Whether the ids of each sample are drawn at random, so that every id is trained; otherwise
+    /// they are ranked as in inference.
     pub shuffle_ids: bool,
     /// Probability of leaving out the prompts.
     pub prompt_dropout: f64,
-    /// Probability of showing no speed limit of the map, as of a source that states none.
+    /// Probability of hiding the speed limits of the map, as for a source that states none.
     pub hide_limits: f64,
     /// Likewise of stop signs.
     pub hide_stop_signs: f64,
     /// Likewise of lights.
     pub hide_lights: f64,
-    /// Likewise of sizes: all objects have the usual ones of their kinds.
+    /// Likewise of sizes: all objects have the usual size of their kind.
     pub hide_sizes: f64,
-    /// Probability that the window begins with the frame of reference, as a scene to generate does.
+    /// Probability that the window begins with the frame of reference, as in scene generation.
     pub from_reference: f64,
 }
 
@@ -112,7 +113,7 @@ impl Default for SampleConfig {
 }
 
 impl SampleConfig {
-    /// No augmentation, no dropout, the ego as centre: to overfit or to validate.
+    /// No augmentation, no dropout, the ego as centre: for overfitting or validation.
     pub fn plain(frames: usize) -> Self {
         Self {
             frames,
@@ -149,13 +150,13 @@ pub(crate) struct Sample {
     pub(crate) trajectories: Vec<TrajectoryTarget>,
 }
 
-/// What samples are made for.
+/// The shapes that samples are made for.
 pub(crate) struct Reader {
     pub(crate) spec: RasterSpec,
     pub(crate) tokenizer: Tokenizer,
-    /// True asks for chunks in the frames of their objects.
+    /// Whether chunks are expressed in the local frames of objects.
     pub(crate) anchored: bool,
-    /// Longest sequence of tokens.
+    /// Maximum number of tokens.
     pub(crate) block_size: usize,
 }
 
@@ -179,7 +180,7 @@ impl Reader {
 }
 
 /// Draws a sample, from a drive of the scenario if there is one; `None` if the scenario is too
-/// short for one.
+/// short.
 pub(crate) fn draw(
     scenario: &Scenario,
     driven: Option<Driven<'_>>,
@@ -281,7 +282,7 @@ fn thin(frame: &Frame, window: &Window<'_>, most: usize) -> Frame {
     Frame::new(agents, frame.lights().to_vec())
 }
 
-/// Removes whole tracks for a random part of the window, which makes births and disappearances.
+/// Removes whole tracks for a random part of the window, which creates arrivals and departures.
 fn drop_agents(frames: &[Frame], centre: AgentId, probability: f64, rng: &mut Rng) -> Vec<Frame> {
     let mut ids: Vec<AgentId> = frames
         .iter()
@@ -315,8 +316,8 @@ fn drop_agents(frames: &[Frame], centre: AgentId, probability: f64, rng: &mut Rn
     kept.collect()
 }
 
-/// Some of the tags that hold for the centre in the first presented frame, which is what prompts of
-/// a scene to generate are about.
+/// Some of the tags that apply to the centre in the first presented frame, as prompts do in scene
+/// generation.
 fn prompts(window: &Window<'_>, config: &SampleConfig, rng: &mut Rng) -> Vec<Option<ScenarioTag>> {
     if rng.random_bool(config.prompt_dropout) {
         return Vec::new();
@@ -366,7 +367,7 @@ fn draw_raster(
     rasterize(spec, &scene, window.world_from_scene)
 }
 
-/// Replaces the last frame's values by what a surrogate might have said: off by a few bins.
+/// Perturbs the last frame's values like surrogates: by a few bins.
 fn perturb_last_frame(slots: &mut [PlacedSlot], frames: &[TokenFrame], rng: &mut Rng) {
     let last = frames.len() - 1;
     let scale = rng.random_range(0.0..1.0);
@@ -392,7 +393,7 @@ fn perturb(state: QuantizedState, scale: f64, rng: &mut Rng) -> QuantizedState {
     moved
 }
 
-/// Blanks whole frames (never the first, which everything builds on) and forgets their targets.
+/// Blanks whole frames (never the first, which all others depend on) and drops their targets.
 fn blank_frames(sample: &mut Sample, config: &SampleConfig, rng: &mut Rng) {
     let blanked: Vec<bool> = (0..config.frames)
         .map(|frame| rng.random_bool(config.frame_dropout) && frame > 0)

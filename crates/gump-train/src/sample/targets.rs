@@ -1,4 +1,4 @@
-//! What should be said at the slots of a sample.
+//! Targets at the slots of a sample.
 
 use gump_model::decoder::{CONTROL_KEYS, STEPS};
 use gump_model::local_frame::LocalFrame;
@@ -12,40 +12,40 @@ use super::window::Window;
 /// Slower objects stand, metres per second: above the jitter of recorded boxes.
 const STANDING_M_PER_S: f64 = 0.3;
 
-/// What the decoder should say at a key.
+/// The target of the decoder at a key.
 #[derive(Clone, Debug)]
 pub(crate) struct StateTarget {
     /// Index of the key in the slots.
     pub(crate) key: usize,
-    /// Bin per step, in the object's anchor; `None` where the log has nothing.
+    /// Bin per step, in the object's local frame; `None` where the log has no state.
     pub(crate) bins: [Option<u16>; STEPS.len()],
-    /// False if the window has not shown the object before, so that it could be anywhere.
+    /// False if the window has not shown the object before, so that its position is open.
     pub(crate) is_known: bool,
-    /// True of an object that the log shows slower than 0.3 m/s.
+    /// True if the object is slower than 0.3 m/s in the log.
     pub(crate) stands: bool,
 }
 
 impl StateTarget {
-    /// Asks for no size.
+    /// Removes the targets of sizes.
     pub(crate) fn forget_size(&mut self) {
         self.bins[..2].fill(None);
     }
 
-    /// The token of a step, PAD where the log has nothing.
+    /// The token of a step, PAD where the log has no state.
     pub(crate) fn token(&self, step: usize) -> u32 {
         self.bins[step].map_or(PAD, |bin| STEPS[step].token(bin))
     }
 }
 
-/// What should be said of the successor at a slot: an index into the control alphabet, a light's
-/// state or a class.
+/// The target of the successor at a slot: an index into the control alphabet, a light's state or a
+/// class.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ControlTarget {
     pub(crate) slot: usize,
     pub(crate) successor: u32,
 }
 
-/// What a trajectory head should say of an agent.
+/// The target of a trajectory head for an agent.
 #[derive(Clone, Debug)]
 pub(crate) struct TrajectoryTarget {
     /// Index of the key in the slots; the value follows it.
@@ -111,7 +111,7 @@ pub(super) fn targets(
     (states, trajectories)
 }
 
-/// At every control or value slot, what follows it (model.md 10.1).
+/// At every control or value slot, its successor (model.md 10.1).
 pub(super) fn control_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     let mut targets = Vec::new();
     for (slot, placed) in slots.iter().enumerate() {
@@ -130,8 +130,7 @@ pub(super) fn control_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     targets
 }
 
-/// Before every light, the state it will have: of those of the same frame, the ones before it are
-/// seen.
+/// Before every light, its state; of the same frame the earlier lights are visible.
 pub(super) fn light_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     let successor = |next: &PlacedSlot| match next.slot {
         Slot::Light(light) => Some(light_token(light.state) - FIRST_LIGHT),
@@ -140,7 +139,7 @@ pub(super) fn light_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     successors(slots, successor)
 }
 
-/// Before every agent that the window has not had yet, its class; the ego's is known.
+/// Before every agent new to the window, its class; the ego's is known.
 pub(super) fn class_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     let successor = |next: &PlacedSlot| match next.slot {
         Slot::Key(key) if !key.is_ego() && next.last.is_none() => {
@@ -151,7 +150,7 @@ pub(super) fn class_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     successors(slots, successor)
 }
 
-/// A target at every slot for whose successor `say` has a word.
+/// A target at every slot for whose successor `say` returns one.
 fn successors(
     slots: &[PlacedSlot],
     say: impl Fn(&PlacedSlot) -> Option<u32>,

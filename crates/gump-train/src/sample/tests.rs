@@ -1,4 +1,4 @@
-//! What samples show and what they ask for.
+//! Inputs and targets of samples.
 
 use gump_model::decoder::STEPS;
 use gump_model::steps::{HISTORY, stride_of};

@@ -1,5 +1,4 @@
-//! The frames that a sample is drawn from: which run of them, around whom, and what stands in place
-//! of the log.
+//! The frames of a sample: their range, their centre, and drives in place of the log.
 
 use gump_geometry::{Pose, angle_difference, wrap_angle};
 use gump_model::steps::{HISTORY, LONGEST_ROLLOUT, stride_of};
@@ -9,10 +8,10 @@ use rand::Rng as _;
 use super::SampleConfig;
 use crate::closed_loop::Drive;
 
-/// How far the centre may be from its own reference pose, metres; a rollout re-centres before.
+/// Maximum distance of the centre from its reference pose, metres; a rollout re-centres before.
 const CENTRE_REACH_M: f64 = 85.0;
 
-/// A drive to present in place of the log, and how fast it is to come back to it.
+/// A drive to present in place of the log, and the rate of the return to the log.
 #[derive(Clone, Copy)]
 pub(crate) struct Driven<'a> {
     pub(crate) drive: &'a Drive,
@@ -23,7 +22,7 @@ pub(crate) struct Driven<'a> {
 /// The frames a sample is drawn from.
 pub(super) struct Window<'a> {
     pub(super) scenario: &'a Scenario,
-    /// What is presented in place of the log.
+    /// The drive to present in place of the log.
     pub(super) driven: Option<Driven<'a>>,
     pub(super) centre: AgentId,
     /// Log index of the frame of reference, which the raster shows.
@@ -42,15 +41,16 @@ impl Window<'_> {
         usize::try_from(index).ok()
     }
 
-    /// What is presented `offset` token frames after presented frame `frame`.
+    /// The presented frame, `offset` token frames after presented frame `frame`.
     pub(super) fn seen(&self, frame: usize, offset: isize) -> Option<&Frame> {
         let index = self.index(frame, offset)?;
         let driven = self.driven.and_then(|driven| driven.drive.frame(index));
         driven.or_else(|| self.scenario.log.get(index))
     }
 
-    /// Where `id` should be `ahead` frames after presented frame `frame` plus `offset`, in scene
-    /// coordinates: the log, plus what is left by then of the agent's distance from it.
+    /// The target pose of `id`, `ahead` frames after presented frame `frame` plus `offset`, in
+    /// scene coordinates: the log, plus the part of the agent's distance from it that is left by
+    /// then.
     pub(super) fn expected(
         &self,
         frame: usize,
@@ -88,7 +88,7 @@ impl Window<'_> {
 /// A frame of reference and a run of frames expressed in it.
 ///
 /// The run starts up to [`LONGEST_ROLLOUT`] frames after the reference, because a rollout keeps the
-/// frame of reference (and the raster) of its start while its window slides on.
+/// frame of reference (and the raster) of its start while its window advances.
 pub(super) fn choose_window<'a>(
     scenario: &'a Scenario,
     driven: Option<Driven<'a>>,
