@@ -1,10 +1,10 @@
-//! How large, how long and how busy made-up scenes are.
+//! Size, duration and density of synthetic scenes.
 
 use std::ops::RangeInclusive;
 
 use crate::RoadFamily;
 
-/// What [`crate::synthesize`] is asked for; everything else is drawn from the seed.
+/// Configuration of [`crate::synthesize`]; everything else is drawn from the seed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthesisConfig {
     /// Logged seconds before the present.
@@ -19,19 +19,19 @@ pub struct SynthesisConfig {
     pub density: f64,
     /// Distance from the centre of the scene to where its roads end, metres.
     pub extent_m: f64,
-    /// Vehicles a scene aims at, parked ones included.
+    /// Target number of vehicles, including parked ones.
     pub vehicles: RangeInclusive<usize>,
-    /// People on foot a scene aims at.
+    /// Target number of pedestrians.
     pub pedestrians: RangeInclusive<usize>,
-    /// Bicycles a scene aims at.
+    /// Target number of bicycles.
     pub bicycles: RangeInclusive<usize>,
     /// The kind of road; `None` draws one of [`RoadFamily::ALL`] per scene.
     pub family: Option<RoadFamily>,
 }
 
 impl SynthesisConfig {
-    /// Nine seconds at 10 Hz with the present at one second, as the Waymo Open Motion Dataset has
-    /// them, and 10 to 50 vehicles within about 100 m.
+    /// Nine seconds at 10 Hz with the present at one second, as in the Waymo Open Motion Dataset,
+    /// and 10 to 50 vehicles within about 100 m.
     pub fn standard() -> Self {
         Self {
             history_s: 1.0,
@@ -47,8 +47,8 @@ impl SynthesisConfig {
         }
     }
 
-    /// What a version of the generator asked for, field by field: it stays as it is when
-    /// [`Self::standard`] moves on. `None` for a version that does not exist.
+    /// The configuration of a version of the generator, field by field: it does not change when
+    /// [`Self::standard`] does. `None` for a version that does not exist.
     pub fn of_version(version: u32) -> Option<Self> {
         (version == 1).then_some(Self {
             history_s: 1.0,

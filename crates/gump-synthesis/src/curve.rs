@@ -1,6 +1,6 @@
-//! Smooth curves that a vehicle can drive: bends, turns, and tracks measured by arc length.
+//! Smooth drivable curves: bends, turns, and tracks by arc length.
 //!
-//! Nothing here knows about lanes. Start with [`Track`], then [`connect`].
+//! Independent of lanes. Start with [`Track`], then [`connect`].
 
 use gump_geometry::{DVec2, Pose, angle_difference, dvec2, wrap_angle};
 

@@ -1,4 +1,4 @@
-//! The kinds of road a scene can have.
+//! The kinds of road of a scene.
 
 use std::fmt;
 
@@ -19,7 +19,7 @@ pub enum RoadFamily {
     CurvedRoad,
     /// A ramp joins a one-way road of several lanes.
     OnRamp,
-    /// People cross a street away from any junction.
+    /// A pedestrian crossing away from any junction.
     MidBlockCrosswalk,
     /// Four junctions around a block.
     Grid,

@@ -1,4 +1,4 @@
-//! The plans of the road families: which roads meet where, with dimensions drawn at random.
+//! Plans of the road families: which roads meet where, with random dimensions.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -324,7 +324,7 @@ fn crosswalk_node(control: Control) -> NodePlan {
     }
 }
 
-/// A road style without a course yet: `n` lanes each way and what usually goes with them.
+/// A road style without geometry yet: `n` lanes each way and the usual other values.
 pub(crate) fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
     let median = match n {
         1 => 0.0,

@@ -1,4 +1,4 @@
-//! From a network to a map in the world frame.
+//! Conversion of a network to a map in the world frame.
 
 use gump_geometry::{DVec2, DVec3, Polygon, Polyline, Pose};
 use gump_scene::{
@@ -7,7 +7,7 @@ use gump_scene::{
 
 use crate::network::{LaneIdx, Network, NetworkLane};
 
-/// Where a scene lies in the world: a pose and a plane with a gentle slope.
+/// Position of a scene in the world: a pose and a plane with a gentle slope.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Placement {
     /// Scene frame to world frame.

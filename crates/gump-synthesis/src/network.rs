@@ -1,7 +1,7 @@
-//! Roads as traffic sees them: lanes with conflicts, crosswalks, signals, sidewalks, and paint.
+//! The road network for traffic: lanes with conflicts, crosswalks, signals, sidewalks, and paint.
 //!
-//! Everything is in the scene's own frame (centre at the origin); [`crate::map`] places it in the
-//! world. Building starts in [`Network::new`]; who may go when is decided in the traffic modules.
+//! Coordinates are in the scene's own frame (centre at the origin); [`crate::map`] places it in the
+//! world. [`Network::new`] builds a network; the traffic modules decide the right of way.
 
 mod build;
 mod conflict;
@@ -33,7 +33,7 @@ pub(crate) struct Network {
     pub(crate) junctions: Vec<Junction>,
     /// Crosswalks of all junctions.
     pub(crate) crosswalks: Vec<Crosswalk>,
-    /// Where people walk.
+    /// Lines along which pedestrians walk.
     pub(crate) walks: Vec<Walk>,
     /// Number of points where walks meet.
     pub(crate) n_walk_nodes: usize,
@@ -41,13 +41,13 @@ pub(crate) struct Network {
     pub(crate) parking: Vec<Track>,
     /// Middles of strips where cars park at right angles, in the direction of the lane beside them.
     pub(crate) bays: Vec<Track>,
-    /// Places of parking lots, as a car would stand in them.
+    /// Places of parking lots, as poses of parked cars.
     pub(crate) lot_places: Vec<Pose>,
-    /// What is only drawn.
+    /// Features that are only drawn.
     pub(crate) furniture: Furniture,
-    /// The map states no speed limits, though vehicles keep to them.
+    /// Whether the map states no speed limits, though vehicles comply with them.
     pub(crate) hides_limits: bool,
-    /// Lanes that are not on the map, as those of car parks often are.
+    /// Lanes that are not on the map, often those of car parks.
     pub(crate) unmapped: BTreeSet<LaneIdx>,
 }
 
@@ -62,11 +62,11 @@ pub(crate) struct Furniture {
     pub(crate) areas: Vec<(AreaKind, Vec<DVec2>)>,
     /// Surfaces vehicles may be on.
     pub(crate) drivable: Vec<Vec<DVec2>>,
-    /// Stop signs: where they stand and the connectors they rule.
+    /// Stop signs: positions and the connectors they apply to.
     pub(crate) stop_signs: Vec<(DVec2, Vec<LaneIdx>)>,
 }
 
-/// Which way a connector turns.
+/// The direction of a connector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Turn {
     /// To the left.
@@ -128,16 +128,17 @@ impl NetworkLane {
     }
 }
 
-/// What makes a lane a way through a junction. Vehicles wait for it at its start.
+/// Data of a lane that is a path through a junction. Vehicles wait for it at its start.
 #[derive(Debug)]
 pub(crate) struct Connector {
     /// The junction.
     pub(crate) junction: usize,
     /// The leg it comes from.
     pub(crate) from_leg: usize,
-    /// Which way.
+    /// Its direction.
     pub(crate) turn: Turn,
-    /// Of two that conflict, the one of higher rank goes first; equal ranks in order of arrival.
+    /// Of two that conflict, the one with the higher rank goes first; equal ranks in order of
+    /// arrival.
     pub(crate) rank: u8,
     /// Vehicles stop before they enter.
     pub(crate) must_stop: bool,
@@ -145,7 +146,7 @@ pub(crate) struct Connector {
     pub(crate) signal: Option<usize>,
     /// Connectors that cross or join this one.
     pub(crate) conflicts: Vec<Conflict>,
-    /// Crosswalks on the way.
+    /// Crosswalks on the path.
     pub(crate) crossings: Vec<Crossing>,
     /// Largest curvature, radians per metre.
     pub(crate) sharpest: f64,
@@ -187,7 +188,7 @@ pub(crate) struct Overlap {
 /// A junction.
 #[derive(Debug)]
 pub(crate) struct Junction {
-    /// Its rule.
+    /// Its right-of-way rule.
     pub(crate) control: Control,
     /// Light phases, if it has lights.
     pub(crate) cycle: Option<Cycle>,
@@ -210,7 +211,7 @@ pub(crate) struct Crosswalk {
     pub(crate) passed_by: Vec<(LaneIdx, usize)>,
 }
 
-/// A line people walk along, both ways.
+/// A line along which pedestrians walk, in both directions.
 #[derive(Debug)]
 pub(crate) struct Walk {
     /// The line.

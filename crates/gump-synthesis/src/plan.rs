@@ -1,7 +1,7 @@
-//! What a road network is built from: junctions, and roads with their cross-section.
+//! Plans of road networks: junctions, and roads with their cross-section.
 //!
-//! A plan is a drawing on a napkin; [`crate::network`] turns it into lanes. The plans of the road
-//! families are in [`crate::layout`].
+//! A plan has no lanes yet; [`crate::network`] adds them. The plans of the road families are in
+//! [`crate::layout`].
 
 use crate::curve::Track;
 
@@ -26,7 +26,7 @@ pub(crate) struct Plan {
 /// A place where roads meet.
 #[derive(Clone, Debug)]
 pub(crate) struct NodePlan {
-    /// Who goes first.
+    /// The right of way.
     pub(crate) control: Control,
     /// Whether every leg has a crosswalk.
     pub(crate) crosswalks: bool,
@@ -36,14 +36,14 @@ pub(crate) struct NodePlan {
     pub(crate) min_setback: f64,
 }
 
-/// The rule of a junction.
+/// The right-of-way rule of a junction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Control {
     /// Nobody waits: lanes join or end without crossing.
     Free,
     /// Traffic lights.
     Signals,
-    /// Everybody stops, first come first served.
+    /// All-way stop, first come first served.
     AllWayStop,
     /// Minor roads stop and give way.
     MinorStop,

@@ -1,4 +1,4 @@
-//! What made-up scenes are to be like.
+//! Profiles: the style of synthetic scenes.
 
 use std::fmt;
 
@@ -7,19 +7,19 @@ use gump_scene::{Scenario, Seed};
 use crate::tracker::{Tracker, track};
 use crate::{SynthesisConfig, recorded, synthesize};
 
-/// Draws of a scene before giving up: half of them succeed in the worst of families.
+/// Maximum number of draws of a scene: in the worst of families half of them succeed.
 const ATTEMPTS: u64 = 64;
 
-/// What made-up scenes are to be like.
+/// The style of synthetic scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Profile {
-    /// Tidy traffic on tidy roads, every agent seen all the time: [`synthesize`].
+    /// Idealised traffic on regular roads, with every agent observed all the time: [`synthesize`].
     #[default]
     Plain,
-    /// Like recordings of a vehicle with sensors in a town: rows of parked vehicles, car parks,
-    /// driveways, side roads without signs, people in groups and off the crosswalks, drivers of
-    /// every temper, limits and lights that nobody noted; and a tracker that sees what can be seen
-    /// from the ego, with its noise. Fitted to `configs/targets/waymo-like.toml`.
+    /// The statistics of recordings by a vehicle with sensors in a town: rows of parked vehicles,
+    /// car parks, driveways, side roads without signs, pedestrians in groups and off the
+    /// crosswalks, all driving styles, limits and lights that are not recorded; and a tracker with
+    /// limited view and noise on the ego. Fitted to `configs/targets/waymo-like.toml`.
     RecordedLike,
 }
 
@@ -40,7 +40,7 @@ impl Profile {
         Self::ALL.into_iter().find(|profile| profile.name() == name)
     }
 
-    /// How many of what, how long and how far, for [`Self::synthesize`].
+    /// The standard configuration, for [`Self::synthesize`].
     pub fn config(self) -> SynthesisConfig {
         match self {
             Self::Plain => SynthesisConfig::standard(),
@@ -48,7 +48,7 @@ impl Profile {
         }
     }
 
-    /// Makes up one scenario; the same profile, config and seed always give the same one.
+    /// Generates one scenario; the same profile, config and seed always give the same one.
     ///
     /// # Panics
     /// If the extent leaves no room for a vehicle to drive through for the logged time.
@@ -64,8 +64,8 @@ impl Profile {
         scenario
     }
 
-    /// The same scenario as [`Self::synthesize`] makes up, as it was and not as a tracker saw it:
-    /// everybody is there, in their true places.
+    /// The scenario of [`Self::synthesize`] without the tracker: all agents are present, with their
+    /// true states.
     ///
     /// # Panics
     /// If the extent leaves no room for a vehicle to drive through for the logged time.

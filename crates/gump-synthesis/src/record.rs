@@ -1,4 +1,4 @@
-//! What was seen of running traffic, frame by frame and track by track.
+//! Recording of simulated traffic, frame by frame and track by track.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,14 +20,14 @@ pub(crate) struct Recording {
 /// One body over all snapshots.
 #[derive(Debug)]
 pub(crate) struct Track {
-    /// The body as it was last seen.
+    /// The body in its last snapshot.
     pub(crate) body: Body,
     poses: Vec<Option<Pose>>,
     places: Vec<(LaneIdx, f64)>,
 }
 
 impl Recording {
-    /// Runs `traffic` on for `n_frames` frames and records them.
+    /// Continues `traffic` for `n_frames` frames and records them.
     pub(crate) fn make(traffic: &mut Traffic<'_>, n_frames: usize) -> Self {
         let mut recording = Self {
             n_frames,
@@ -67,7 +67,7 @@ impl Recording {
         self.n_frames + 2
     }
 
-    /// Lets a body that stood move through these poses, one per snapshot.
+    /// Moves a standing body through these poses, one per snapshot.
     pub(crate) fn move_along(&mut self, id: i64, poses: Vec<Option<Pose>>) {
         debug_assert_eq!(poses.len(), self.n_snapshots());
         if let Some(track) = self.tracks.get_mut(&id) {
@@ -76,12 +76,12 @@ impl Recording {
         }
     }
 
-    /// An id that nobody has.
+    /// An unused id.
     pub(crate) fn new_id(&self) -> i64 {
         self.tracks.keys().next_back().map_or(0, |last| last + 1)
     }
 
-    /// Adds a body with its poses, one per snapshot while it is there.
+    /// Adds a body with its poses, one per snapshot while it is present.
     pub(crate) fn add(&mut self, body: Body, poses: Vec<Option<Pose>>) {
         debug_assert_eq!(poses.len(), self.n_snapshots());
         let places = Vec::new();
@@ -105,12 +105,12 @@ impl Recording {
         &self.lights[frame]
     }
 
-    /// Nobody saw the lights.
+    /// Removes all lights.
     pub(crate) fn forget_lights(&mut self) {
         self.lights.iter_mut().for_each(Vec::clear);
     }
 
-    /// Takes out people and parked vehicles whose boxes overlap others; false if two boxes of
+    /// Removes pedestrians and parked vehicles whose boxes overlap others; false if two boxes of
     /// traffic overlap.
     pub(crate) fn part_bodies(&mut self) -> bool {
         let mut out = BTreeSet::new();
@@ -193,7 +193,7 @@ impl Track {
         2 * after.iter().flatten().count() >= after.len()
     }
 
-    /// Metres between the first and the last place, as the crow flies.
+    /// Distance between the first and the last position, metres.
     pub(crate) fn distance_driven(&self) -> f64 {
         let mut seen = self.poses.iter().flatten();
         match (seen.next(), seen.next_back()) {

@@ -1,4 +1,5 @@
-//! From a seed to a scenario: draw roads, let traffic run, record it, choose the ego.
+//! Generation of a scenario from a seed: draws roads, simulates traffic, records it, chooses the
+//! ego.
 
 use std::sync::Arc;
 
@@ -14,14 +15,14 @@ use crate::record::{Recording, Track};
 use crate::traffic::{Demand, Scenery, Traffic};
 use crate::{RoadFamily, SynthesisConfig};
 
-/// Draws of roads and traffic before giving up; a few suffice, see the test of this module.
+/// Maximum number of draws of roads and traffic; a few suffice, see the test of this module.
 const ATTEMPTS: u64 = 64;
-/// Agents asked to predict, at most.
+/// Maximum number of prediction targets.
 const MAX_TARGETS: usize = 8;
-/// Metres around the ego in which agents are worth predicting.
+/// Distance from the ego within which agents may be targets, metres.
 const TARGET_RANGE: f64 = 60.0;
 
-/// Makes up one scenario; the same seed and config always give the same one.
+/// Generates one scenario; the same seed and config always give the same one.
 ///
 /// # Panics
 /// If the extent leaves no room for a vehicle to drive through for the logged time.
@@ -29,7 +30,7 @@ pub fn synthesize(config: &SynthesisConfig, seed: Seed) -> Scenario {
     try_synthesize(config, seed).expect("the extent leaves room for a vehicle to drive through")
 }
 
-/// As [`synthesize`], but `None` if nobody drives through for the logged time: a matter of luck
+/// As [`synthesize`], but `None` if no vehicle drives through for the logged time: this is random
 /// where it takes about as long as the extent allows.
 pub fn try_synthesize(config: &SynthesisConfig, seed: Seed) -> Option<Scenario> {
     let family = config
@@ -39,8 +40,8 @@ pub fn try_synthesize(config: &SynthesisConfig, seed: Seed) -> Option<Scenario> 
     (0..ATTEMPTS).find_map(|attempt| draw_scenario(config, family, seed, attempt))
 }
 
-/// Makes up `n` scenarios on all threads of the pool; scenario `k` comes from `seed.fork(k)`, so
-/// the number of threads changes nothing.
+/// Generates `n` scenarios on all threads of the pool; scenario `k` comes from `seed.fork(k)`, so
+/// results do not depend on the number of threads.
 pub fn synthesize_many(config: &SynthesisConfig, seed: Seed, n: usize) -> Vec<Scenario> {
     (0..n as u64)
         .into_par_iter()
@@ -141,7 +142,7 @@ pub(crate) fn draw_placement(rng: &mut gump_scene::Rng) -> Placement {
     }
 }
 
-/// A car that is there all the time, drives, and is near the centre.
+/// A car that is present all the time, drives, and is near the centre.
 fn choose_ego<'a>(
     recording: &'a Recording,
     now: usize,
@@ -167,7 +168,7 @@ fn choose_ego<'a>(
     best.map(|(_, track)| track)
 }
 
-/// The moving agents nearest to the ego, itself included, sorted by id.
+/// The moving agents nearest to the ego, including itself, sorted by id.
 pub(crate) fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<AgentId> {
     let here = ego.pose(now).map_or(DVec2::ZERO, |pose| pose.position);
     let mut near: Vec<(f64, i64)> = recording
@@ -186,7 +187,7 @@ pub(crate) fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<Age
     ids
 }
 
-/// The lanes the ego drove, then those it had in mind, and the path along them.
+/// The lanes the ego drove, then those it planned, and the path along them.
 pub(crate) fn route(
     network: &Network,
     ego: &Track,

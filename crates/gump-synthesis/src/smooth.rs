@@ -1,7 +1,7 @@
-//! Motion without corners: what a simulator moves along polylines, as a vehicle would drive it.
+//! Smoothing of simulated motion along polylines to drivable motion.
 //!
-//! A simulator's vehicles turn at the corners of their lanes' lines. Here positions and headings
-//! are averaged over a few tenths of a second, and velocities follow from the positions.
+//! Vehicles of a simulator turn at the corners of their lanes' lines. Here positions and headings
+//! are averaged over a few tenths of a second, and velocities are derived from the positions.
 
 use std::collections::BTreeMap;
 
@@ -15,8 +15,8 @@ const REACH: f64 = 3.0;
 
 /// Averages the motion of vehicles and bicycles over time and derives their velocities from it.
 ///
-/// Straight motion at constant speed stays exactly as it is, and so does what stands; each
-/// stretch of uninterrupted presence is treated alone.
+/// Straight motion at constant speed and standing stay exactly unchanged; each stretch of
+/// uninterrupted presence is processed separately.
 pub fn smooth_motion(scenario: &mut Scenario) {
     let mut tracks: BTreeMap<AgentId, Vec<(usize, Agent)>> = BTreeMap::new();
     for (step, frame) in scenario.log.iter().enumerate() {

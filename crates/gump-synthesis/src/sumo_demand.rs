@@ -1,4 +1,4 @@
-//! Who drives where in a SUMO run, drawn from a seed.
+//! Random traffic demand for SUMO runs.
 //!
 //! Traffic is drawn within a part of the network, so that it is dense where scenes are cut out,
 //! whatever the size of the city.
@@ -10,18 +10,18 @@ use gump_geometry::{DVec2, dvec2};
 use gump_scene::{Rng, Seed};
 use rand::Rng as _;
 
-/// How much traffic to draw.
+/// Amount of traffic.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SumoDemand {
     /// Seconds in which trips begin.
     pub until_s: f64,
     /// Radius of the part of the network that has traffic, metres.
     pub radius_m: f64,
-    /// Vehicles on the road at a time, about.
+    /// Approximate number of vehicles on the road at a time.
     pub vehicles: RangeInclusive<usize>,
     /// Bicycles per vehicle.
     pub bicycles: f64,
-    /// People on foot per vehicle.
+    /// Pedestrians per vehicle.
     pub people: f64,
     /// Multiplies all numbers.
     pub density: f64,
@@ -40,8 +40,8 @@ impl SumoDemand {
         }
     }
 
-    /// What a version of the generator asked for, field by field: it stays as it is when
-    /// [`Self::standard`] moves on. `None` for a version that does not exist.
+    /// The configuration of a version of the generator, field by field: it does not change when
+    /// [`Self::standard`] does. `None` for a version that does not exist.
     pub fn of_version(version: u32) -> Option<Self> {
         (version == 1).then_some(Self {
             until_s: 150.0,
@@ -54,7 +54,7 @@ impl SumoDemand {
     }
 }
 
-/// Metres of lane per vehicle at least: more vehicles than that stand.
+/// Minimum metres of lane per vehicle: with more vehicles traffic stands.
 const METRES_PER_VEHICLE: f64 = 45.0;
 /// Share of the trips that begin in the first seconds, to fill empty streets.
 const FIRST_SHARE: f64 = 0.5;
@@ -146,7 +146,7 @@ const FAMILIES: [Family; 5] = [
     },
 ];
 
-/// Draws types and trips for a run on a network; the same for the same seed.
+/// Draws types and trips for a run on a network; the same seed gives the same ones.
 pub fn draw_sumo_demand(network: &Network, config: &SumoDemand, seed: Seed) -> Demand {
     let mut rng = seed.rng();
     let mut demand = Demand::default();

@@ -1,8 +1,8 @@
-//! A small microscopic traffic simulation on a [`Network`]: vehicles, bicycles and people.
+//! A small microscopic traffic simulation on a [`Network`]: vehicles, bicycles and pedestrians.
 //!
-//! Vehicles follow lane centres by arc length; where a body is in the plane follows from that.
-//! Who may enter a junction is settled by claims ([`right_of_way`]): a vehicle that has claimed a
-//! connector shares no part of it with another claim, which is why boxes do not overlap.
+//! Vehicles follow lane centres by arc length, which determines their poses in the plane. Claims
+//! decide who may enter a junction ([`right_of_way`]): a vehicle that has claimed a connector
+//! shares no part of it with another claim, so boxes do not overlap.
 
 mod crosser;
 mod demand;
@@ -27,18 +27,18 @@ use occupancy::Occupancy;
 use people::Person;
 use vehicle::Vehicle;
 
-/// What a body looks like and where it is, in the scene's frame.
+/// Size and pose of a body, in the scene's frame.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Body {
     /// Unique in the simulation.
     pub(crate) id: i64,
-    /// What it is.
+    /// Its kind.
     pub(crate) kind: AgentKind,
     /// Length, width and height, metres.
     pub(crate) size: [f64; 3],
     /// Box centre and heading.
     pub(crate) pose: Pose,
-    /// Moves in this simulation, as parked vehicles do not.
+    /// Moves in this simulation; parked vehicles do not.
     pub(crate) is_mobile: bool,
     /// Lane of the centre and arc length on it, for vehicles in traffic.
     pub(crate) place: Option<(LaneIdx, f64)>,
@@ -62,7 +62,7 @@ pub(crate) struct Traffic<'a> {
 }
 
 impl<'a> Traffic<'a> {
-    /// Puts the first vehicles and people on the network.
+    /// Adds the initial vehicles and pedestrians to the network.
     pub(crate) fn new(network: &'a Network, demand: Demand, dt: f64, rng: Rng) -> Self {
         let mut traffic = Self {
             network,

@@ -1,4 +1,4 @@
-//! From a plan to lanes and the connectors that join them.
+//! Builds lanes and connectors from a plan.
 
 use gump_geometry::{angle_difference, wrap_angle};
 use gump_scene::{LaneKind, Rng};
@@ -200,7 +200,7 @@ impl Network {
     }
 }
 
-/// A way from an incoming lane to an outgoing lane of another leg.
+/// A path from an incoming lane to an outgoing lane of another leg.
 #[derive(Clone, Copy, Debug)]
 struct Link {
     from: LaneIdx,

@@ -12,7 +12,7 @@ use crate::plan::{BIKE_LANE_WIDTH, Control, Plan, RoadPlan};
 const CURBED_MEDIAN: f64 = 1.2;
 
 impl Network {
-    /// Adds everything that is seen but not driven along.
+    /// Adds the features that are drawn but not driven along.
     pub(crate) fn furnish(&mut self, plan: &Plan, legs: &[Vec<Leg>], trimmed: &[Track]) {
         for (road, track) in plan.roads.iter().zip(trimmed) {
             self.furnish_road(road, track);

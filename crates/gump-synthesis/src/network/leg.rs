@@ -1,4 +1,4 @@
-//! The legs of a junction: where its roads stop and the space inside begins.
+//! The legs of a junction: the ends of its roads, where the space inside begins.
 
 use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 
@@ -29,7 +29,7 @@ pub(crate) struct Leg {
     pub(crate) left: f64,
     /// From the reference to the right curb (traffic away from it), metres.
     pub(crate) right: f64,
-    /// Nobody waits where it ends.
+    /// Nobody waits at its end.
     pub(crate) is_open: bool,
     /// Joins the road beyond on its outside, as a ramp does.
     pub(crate) joins: bool,

@@ -1,4 +1,4 @@
-//! Light phases: which groups are green when.
+//! Phases of lights: which groups are green when.
 
 use gump_geometry::angle_difference;
 use gump_scene::{LightState, Rng};
@@ -8,7 +8,7 @@ use crate::network::leg::Leg;
 
 /// Seconds of yellow.
 const YELLOW_S: f64 = 3.6;
-/// Seconds in which everything is red between two phases.
+/// Seconds of all-red between two phases.
 const ALL_RED_S: f64 = 1.6;
 
 /// One phase: the groups that may go, and how long.
@@ -58,7 +58,7 @@ impl Cycle {
         }
     }
 
-    /// Seconds for which people may still start across `leg`, and finish before traffic starts.
+    /// Seconds for which pedestrians may still start across `leg` and finish before traffic starts.
     pub(crate) fn walk_time(&self, leg: usize, time: f64) -> f64 {
         let (phase, into) = self.at(time);
         let phase = &self.phases[phase];
@@ -83,8 +83,8 @@ impl Cycle {
     }
 }
 
-/// Phases for these legs: opposite legs share one, left turns with a lane of their own
-/// (`left_only`) mostly go before the rest.
+/// Phases for these legs: opposite legs share one, left turns with their own lane (`left_only`)
+/// usually precede the others.
 pub(crate) fn plan_cycle(legs: &[Leg], left_only: &[bool], rng: &mut Rng) -> Cycle {
     let mut phases = Vec::new();
     let mut seen = vec![false; legs.len()];

@@ -1,4 +1,4 @@
-//! What a plan gets besides its main roads: side roads, car parks, and where one may park.
+//! Additions to a plan besides its main roads: side roads, car parks, and where parking is allowed.
 
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_2;
@@ -69,7 +69,7 @@ fn add_some(plan: &mut Plan, extent: f64, n: usize, add: Adds, rng: &mut Rng) {
     }
 }
 
-/// A minor road that leaves another one, without any sign in many places.
+/// A minor road that leaves another one, in many cases without any sign.
 fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
     let style = RoadPlan {
         speed_limit: rng.random_range(8.0..12.0),

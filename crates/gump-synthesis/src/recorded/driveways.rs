@@ -1,4 +1,4 @@
-//! Driveways: where vehicles cross the sidewalk to a yard, with or without one that stands there.
+//! Driveways: where vehicles cross the sidewalk to a yard, with or without a parked vehicle.
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AgentKind, AreaKind, Rng};

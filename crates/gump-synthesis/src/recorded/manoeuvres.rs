@@ -1,8 +1,8 @@
-//! Vehicles that leave a car park or a driveway, or come in: slowly, often backwards, on no lane.
+//! Vehicles that leave or enter a car park or a driveway: slowly, often in reverse, off lanes.
 //!
-//! Traffic follows lanes, so these are laid into what was recorded of it: a parked vehicle gets a
-//! path out of its place, or the same path backwards in time, if that stays clear of everybody all
-//! the while. Nobody reacts to them, and they keep off the roads.
+//! Simulated traffic follows lanes, so these are added to the recording of it: a parked vehicle
+//! gets a path out of its place, or the same path backwards in time, if the path stays clear of all
+//! other agents. Others do not react, and the paths stay off the roads.
 
 use gump_geometry::{DVec2, OrientedBox, Pose, wrap_angle};
 use gump_scene::{AgentKind, Rng};
@@ -12,9 +12,9 @@ use crate::network::Network;
 use crate::record::Recording;
 use crate::traffic::Body;
 
-/// Vehicles that move so in a scene, at most.
+/// Maximum number of such vehicles in a scene.
 const MOST: usize = 5;
-/// Parked vehicles that are tried, and paths for each.
+/// Number of parked vehicles tried, and paths for each.
 const TRIED: usize = 40;
 const PATHS: usize = 5;
 /// Only vehicles this near to the centre of the scene are tried, metres.
@@ -23,14 +23,14 @@ const REACH_M: f64 = 70.0;
 const OFF_ROAD_M: f64 = 3.4;
 /// Lanes with a lower limit are those of car parks, m/s.
 const CAR_PARK_SPEED: f64 = 6.0;
-/// Room that is kept to what stands and to what moves, metres.
+/// Distance kept to standing and to moving agents, metres.
 const ROOM_M: [f64; 2] = [0.15, 0.8];
 /// From the middle of a vehicle to its rear axle, as a share of its length.
 const REAR_AXLE: f64 = 0.28;
 /// Tightest turn, 1/m.
 const CURVATURE: f64 = 0.2;
 
-/// Lets some parked vehicles leave or arrive.
+/// Makes some parked vehicles leave or arrive.
 pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &mut Rng) {
     let wanted = (rng.random_range(0.0_f64..1.0).powi(2) * (MOST as f64 + 0.99)) as usize;
     if wanted == 0 {
@@ -140,8 +140,8 @@ pub(super) fn is_off_road(network: &Network, pose: Pose, far: f64) -> bool {
     })
 }
 
-/// True if a body of this length and width on this path, one pose per snapshot, keeps room to
-/// everybody else: to what stands, and to what moves.
+/// True if a body of this length and width on this path, one pose per snapshot, keeps its distance
+/// to all other agents, standing and moving.
 pub(super) fn is_clear(
     recording: &Recording,
     id: i64,

@@ -1,8 +1,9 @@
-//! Scenes like recorded ones: the plain families of roads, dressed with what recordings show.
+//! Scenes with the statistics of recorded ones: the road families with additional features.
 //!
-//! `dress` adds side roads, car parks and parking to a plan; `scenery` puts parked vehicles,
-//! people who stand and people who cross anywhere on the network; `manoeuvres` and `walkers` are what
-//! goes on in car parks; here all is put together. How many of what there are is fitted to `configs/targets/waymo-like.toml`.
+//! `dress` adds side roads, car parks and parking to a plan; `scenery` adds parked vehicles,
+//! standing pedestrians and crossing ones anywhere on the network; `manoeuvres` and `walkers` add
+//! motion in car parks; this module combines them. Numbers are fitted to
+//! `configs/targets/waymo-like.toml`.
 
 mod dress;
 mod driveways;
@@ -25,7 +26,7 @@ use crate::scenario::{draw_placement, frames, route, targets};
 use crate::traffic::{Demand, Traffic};
 use crate::{RoadFamily, SynthesisConfig};
 
-/// How often a family is drawn: recordings are made in towns, rarely on motorways.
+/// Weights of the families: recordings are made in towns, rarely on motorways.
 const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::SignalizedCrossing, 16),
     (RoadFamily::StopCrossing, 8),
@@ -39,7 +40,7 @@ const FAMILIES: [(RoadFamily, u32); 9] = [
 ];
 /// Share of scenes whose map states no speed limits.
 const NO_LIMITS: f64 = 0.5;
-/// Share of scenes whose map states no stop signs, though drivers keep to the rule.
+/// Share of scenes whose map states no stop signs, though drivers comply with them.
 const NO_SIGNS: f64 = 0.12;
 /// Share of scenes with lights whose lights are not recorded.
 const NO_LIGHTS: f64 = 0.3;
@@ -52,7 +53,7 @@ const WIDE_ROAD_SPEED: f64 = 15.0;
 /// Metres from the centre of the scene within which the ego is chosen.
 const EGO_REACH: f64 = 60.0;
 
-/// What a scene like a recorded one aims at.
+/// Targets of a scene with the statistics of recorded ones.
 pub(crate) fn config() -> SynthesisConfig {
     SynthesisConfig {
         extent_m: 150.0,
@@ -63,7 +64,7 @@ pub(crate) fn config() -> SynthesisConfig {
     }
 }
 
-/// A family, as often as recordings show it.
+/// A random family, with these weights.
 pub(crate) fn draw_family(rng: &mut Rng) -> RoadFamily {
     let total = FAMILIES.iter().map(|(_, weight)| weight).sum();
     let mut draw = rng.random_range(0..total);
@@ -76,7 +77,7 @@ pub(crate) fn draw_family(rng: &mut Rng) -> RoadFamily {
     RoadFamily::Grid
 }
 
-/// One draw of a scene; `None` if vehicles touched or nobody can be the ego.
+/// One draw of a scene; `None` if vehicles touch or there is no suitable ego.
 pub(crate) fn draw_scenario(
     config: &SynthesisConfig,
     family: RoadFamily,
@@ -173,7 +174,7 @@ fn draw_demand(
     }
 }
 
-/// A number of the range, small ones more often than large ones, the more so the higher `skew`.
+/// A random number of the range, with small ones more frequent the higher `skew` is.
 fn draw_skewed(range: &RangeInclusive<usize>, skew: f64, density: f64, rng: &mut Rng) -> usize {
     let part: f64 = rng.random_range(0.0..1.0);
     let (low, high) = (*range.start() as f64, *range.end() as f64);
@@ -193,7 +194,7 @@ fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
     }
 }
 
-/// Any car in traffic that is there all the time and near the centre, standing or not.
+/// Any car in traffic that is present all the time and near the centre, standing or not.
 fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option<&'a Track> {
     let suits = |track: &&Track| {
         let body = track.body;

@@ -1,4 +1,5 @@
-//! What stands about: parked vehicles, people who wait, vehicles that load, ways people cross.
+//! Standing agents and crossing places: parked vehicles, waiting pedestrians, loading vehicles,
+//! places where pedestrians cross.
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AgentKind, LaneKind, Rng};
@@ -27,7 +28,7 @@ const HELD: f64 = 0.12;
 /// Parked vehicles of a scene, at most, before density.
 const MOST_PARKED: f64 = 190.0;
 
-/// Draws what stands about; `bustle` of 0 to 1 says how lively the place is.
+/// Draws standing agents and crossing places; `bustle` from 0 to 1 sets the activity of the scene.
 pub(crate) fn draw(
     network: &Network,
     config: &SynthesisConfig,
@@ -170,7 +171,7 @@ fn in_bay(middle: Pose, rng: &mut Rng) -> Standing {
     }
 }
 
-/// People who stand beside a sidewalk, alone or in groups.
+/// Pedestrians that stand beside a sidewalk, alone or in groups.
 fn waiting_people(network: &Network, bustle: f64, rng: &mut Rng) -> Vec<Standing> {
     let walks: Vec<&Track> = network
         .walks

@@ -1,8 +1,8 @@
-//! People who walk where vehicles are parked: between them, along aisles and the road, to one or
-//! away from one.
+//! Pedestrians among parked vehicles: between them, along aisles and the road, to and from a
+//! vehicle.
 //!
-//! Like manoeuvres of parking they are laid into what was recorded of traffic, and only if they stay
-//! clear of everybody all the while.
+//! Like parking manoeuvres they are added to the recording of traffic, and only if they stay clear
+//! of all other agents.
 
 use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, wrap_angle};
 use gump_scene::{AgentKind, Rng};
@@ -13,22 +13,22 @@ use crate::network::Network;
 use crate::record::Recording;
 use crate::traffic::{Body, draw_person_size};
 
-/// People who walk so in a scene, or pairs of them, at most.
+/// Maximum number of such pedestrians, or pairs of them, in a scene.
 const MOST: f64 = 16.0;
-/// Ways that are tried for each.
+/// Number of paths tried for each.
 const TRIED: usize = 8;
 /// Scenes with fewer parked vehicles near the centre have none.
 const LEAST_PARKED: usize = 6;
 /// Only vehicles this near to the centre of the scene are walked to, metres.
 const REACH_M: f64 = 70.0;
-/// How far somebody walks, metres.
+/// Maximum length of a walk, metres.
 const WAY_M: std::ops::Range<f64> = 6.0..45.0;
 /// From the centre of a lane of a road, metres: where people are off it, and where they may stand,
 /// as at the door of a vehicle beside the lane.
 const OFF_ROAD_M: f64 = 2.4;
 const ASIDE_ROAD_M: f64 = 1.3;
-/// Room that is kept to what stands and to what moves, metres: off the road, and on it, where
-/// nobody makes way for them.
+/// Distance kept to standing and to moving agents, metres: off the road, and on it, where nobody
+/// gives way to them.
 const ROOM_M: [[f64; 2]; 2] = [[0.05, 0.5], [0.05, 2.5]];
 /// Within this of a vehicle people step aside, metres.
 const ASIDE_M: f64 = 1.0;
@@ -37,7 +37,7 @@ const TURN_RATE: f64 = 1.8;
 /// Change of walking speed, m/s².
 const CHANGE: f64 = 1.2;
 
-/// Lets people walk between the parked vehicles of a scene.
+/// Adds pedestrians that walk between the parked vehicles of a scene.
 pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &mut Rng) {
     let stands = |body: &Body| body.kind == AgentKind::Vehicle && !body.is_mobile;
     let bodies = recording.tracks().map(|track| track.body);
@@ -102,8 +102,8 @@ fn person(id: i64, size: [f64; 3], pose: Pose) -> Body {
     }
 }
 
-/// Poses of somebody who walks from or to the side of a parked vehicle, one per snapshot while he is
-/// there; `None` if he gets stuck.
+/// Poses of a pedestrian that walks from or to the side of a parked vehicle, one per snapshot while
+/// present; `None` if the path is blocked.
 fn way(parked: &[OrientedBox], n: usize, dt: f64, rng: &mut Rng) -> Option<Vec<Option<Pose>>> {
     let door = |rng: &mut Rng| {
         let vehicle = &parked[rng.random_range(0..parked.len())];

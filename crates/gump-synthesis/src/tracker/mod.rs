@@ -1,8 +1,9 @@
-//! What a tracker on the ego would have recorded of a scene: what is out of sight is missing,
-//! tracks begin late and end early, and what is there is a little off.
+//! Simulation of a tracker on the ego: hidden agents are missing, tracks begin late and end early,
+//! and states have errors.
 //!
-//! Start with [`track`]. Who can be seen is in `sight`, errors of what is seen in `noise`. Both are
-//! drawn per agent from the seed and the agent's id, so nobody's errors depend on who else is there.
+//! Start with [`track`]. `sight` determines which agents are visible, `noise` the errors of their
+//! states. Both are drawn per agent from the seed and the agent's id, so the errors of an agent do
+//! not depend on other agents.
 
 mod noise;
 mod sight;
@@ -15,28 +16,29 @@ use rand::Rng as _;
 use self::noise::Noise;
 use self::sight::Sight;
 
-/// How good a tracker is.
+/// Quality of a tracker.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tracker {
-    /// Metres from the ego beyond which nobody is seen; `None` has no limit and nothing in the way.
+    /// Maximum distance of visible agents from the ego, metres; `None` means no limit and no
+    /// occlusion.
     pub range_m: Option<f64>,
-    /// Share of an agent's outline that must be in sight.
+    /// Share of an agent's outline that must be visible.
     pub visible_share: f64,
-    /// Metres beside the road that are open; behind are buildings, which nobody sees through.
+    /// Metres beside the road that are open; behind are buildings, which block the view.
     pub open_m: std::ops::Range<f64>,
-    /// Seconds in sight before a track begins.
+    /// Time in view before a track begins, seconds.
     pub begins_after_s: std::ops::Range<f64>,
-    /// Seconds out of sight before a track is given up.
+    /// Time out of view before a track ends, seconds.
     pub coasts_s: std::ops::Range<f64>,
-    /// How often a vehicle in sight is lost all the same, per second, at the end of the range.
-    /// People and bicycles are lost more often, see `sight`.
+    /// Rate at which a visible vehicle is lost anyway, per second, at the end of the range.
+    /// Pedestrians and bicycles are lost more often, see `sight`.
     pub misses_per_s: f64,
-    /// Multiplies all errors of pose, velocity and size; 0 shows everybody where they are.
+    /// Multiplies all errors of pose, velocity and size; 0 gives true states.
     pub noise: f64,
 }
 
 impl Tracker {
-    /// As good as what `configs/targets/waymo-like.toml` was measured with.
+    /// The quality of the recordings from which `configs/targets/waymo-like.toml` was measured.
     pub fn recorded_like() -> Self {
         Self {
             range_m: Some(79.0),
@@ -49,7 +51,7 @@ impl Tracker {
         }
     }
 
-    /// Sees everybody as they are.
+    /// A perfect tracker.
     pub fn perfect() -> Self {
         Self {
             range_m: None,
@@ -59,11 +61,11 @@ impl Tracker {
     }
 }
 
-/// Replaces the log of a scenario by what the tracker saw of it.
+/// Replaces the log of a scenario by the tracker's recording of it.
 ///
-/// The ego is always there, without errors but for those of its own motion; agents that only stand
-/// in the way (cones, signs) stay as they are. Targets and objects of interest that are not seen at
-/// the present are dropped.
+/// The ego is always present, with the errors of its own motion only; static agents (cones, signs)
+/// are not changed. Targets and objects of interest that are not visible at the present are
+/// dropped.
 pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
     let seen = Sight::of(scenario, tracker, seed.fork(0));
     let mut noises: BTreeMap<AgentId, Noise> = BTreeMap::new();
@@ -101,7 +103,7 @@ pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
     scenario.objects_of_interest.retain(is_there);
 }
 
-/// Lights are read from farther than boxes are tracked, for they face the traffic.
+/// Lights are visible from farther than boxes, because they face the traffic.
 fn is_light_seen(light: &Light, ego: Option<gump_geometry::DVec2>, tracker: &Tracker) -> bool {
     match (light.stop_point, ego, tracker.range_m) {
         (Some(at), Some(ego), Some(range)) => at.distance(ego) < 1.1 * range,

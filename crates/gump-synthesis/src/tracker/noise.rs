@@ -6,7 +6,7 @@ use rand::Rng as _;
 
 use super::{normal, stands};
 
-/// Seconds after which errors of position and heading are forgotten.
+/// Correlation time of errors of position and heading, seconds.
 const MEMORY_S: f64 = 0.6;
 /// The same for errors of velocity.
 const VELOCITY_MEMORY_S: f64 = 0.18;
@@ -14,10 +14,10 @@ const VELOCITY_MEMORY_S: f64 = 0.18;
 const MOST_VELOCITY: f64 = 1.2;
 /// Largest error of a heading, radians.
 const MOST_HEADING: f64 = 0.5;
-/// Share of standing vehicles whose boxes are not quite still.
+/// Share of standing vehicles whose boxes are not exactly still.
 const RESTLESS: f64 = 0.05;
 
-/// Deviations of the errors of a kind that moves: of what a recording shows of those in the middle.
+/// Standard deviations of the errors of a kind that moves, for a typical agent.
 struct Level {
     /// Metres.
     position: f64,
@@ -25,7 +25,8 @@ struct Level {
     heading: f64,
     /// Metres per second.
     velocity: f64,
-    /// Deviation of the logarithm of all these over agents: a few are much worse than most.
+    /// Standard deviation of the logarithm of all these over agents: a few are much worse than
+    /// most.
     spread: f64,
 }
 

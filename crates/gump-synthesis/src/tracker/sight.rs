@@ -1,8 +1,8 @@
-//! Who can be seen from the ego: within range, not behind buildings, not behind others.
+//! Visibility from the ego: within range, not behind buildings, not behind other agents.
 //!
-//! Directions around the sensor are bins. Of every box the bins it spans are looked at; a bin is
-//! hidden by a nearer box that reaches above the line from the sensor to the top of the farther
-//! one, and by ground that is not open.
+//! Directions around the sensor are divided into bins. For every box the bins it spans are
+//! examined; a bin is hidden by a nearer box that reaches above the line from the sensor to the top
+//! of the farther one, and by ground that is not open.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,7 +18,7 @@ const BINS: usize = 720;
 const SENSOR: f64 = 2.1;
 /// Side of the squares into which open ground is divided, metres.
 const CELL: f64 = 3.0;
-/// Seconds between two looks.
+/// Interval of visibility checks, seconds.
 const LOOK_S: f64 = 0.1;
 /// Ground is open this far around everybody, metres.
 const AROUND: f64 = 5.0;
@@ -93,8 +93,8 @@ impl Sight {
     }
 }
 
-/// How easily a kind is tracked: the share of the range in which it is, and how many times as often
-/// as a vehicle it is lost.
+/// Trackability of a kind: the share of the range in which it is tracked, and its loss rate
+/// relative to a vehicle's.
 fn ease(kind: AgentKind) -> (f64, f64) {
     match kind {
         AgentKind::Pedestrian => (0.92, 5.0),
@@ -103,7 +103,7 @@ fn ease(kind: AgentKind) -> (f64, f64) {
     }
 }
 
-/// Turns what is in sight into a track: it begins after a while, and ends after a while.
+/// Turns visibility into a track, with delays at its beginning and end.
 fn keep_track(
     shares: &[f64],
     distance: impl Fn(usize) -> f64,

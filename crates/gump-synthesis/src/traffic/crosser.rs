@@ -1,7 +1,8 @@
-//! People who cross the road where there is no crosswalk: they wait for a gap and go straight over.
+//! Pedestrians that cross the road where there is no crosswalk: they wait for a gap and walk
+//! straight across.
 //!
-//! Nobody has to let them, so they start only when everybody who comes is far enough away; once
-//! they are on the road, vehicles stop for them like for anything that stands in the way.
+//! Vehicles do not have to yield, so pedestrians start only when all approaching vehicles are far
+//! enough away; once they are on the road, vehicles stop for them as for any obstacle.
 
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::AgentKind;
@@ -13,7 +14,7 @@ use crate::network::{LaneIdx, Network};
 
 /// Seconds left between a person who has crossed a lane and the next vehicle.
 const SPARE_S: f64 = 2.0;
-/// Vehicles slower than this could set off at any time: they are taken to drive so fast, m/s.
+/// Vehicles slower than this could start at any time: they are assumed to drive at this speed, m/s.
 const AT_LEAST: f64 = 3.0;
 /// Metres before and behind a lane in which a person is in the way.
 const IN_THE_WAY: f64 = 0.9;

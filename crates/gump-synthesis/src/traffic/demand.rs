@@ -1,4 +1,4 @@
-//! How many of what there are, where they appear and where they want to go.
+//! Numbers of agents, where they enter and where they go.
 
 use gump_geometry::{Pose, wrap_angle};
 use gump_scene::AgentKind;
@@ -17,7 +17,7 @@ const LONGEST_PATH: usize = 40;
 /// Sideways metres that a long vehicle may sweep beside its centre line.
 const SWEEP: f64 = 0.55;
 
-/// How many of what a scene should hold.
+/// Numbers of agents in a scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Demand {
     /// Vehicles in motion (or in a queue).
@@ -30,26 +30,26 @@ pub(crate) struct Demand {
     pub(crate) bicycles: usize,
     /// Vehicles that want to enter, per second and entry lane.
     pub(crate) arrivals: f64,
-    /// What stands about; set for scenes like recorded ones.
+    /// Additional content of scenes with the statistics of recorded ones.
     pub(crate) scenery: Scenery,
 }
 
-/// What a scene like a recorded one has besides traffic in its lanes.
+/// Additional content of scenes with the statistics of recorded ones.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Scenery {
-    /// Drivers of every temper and vehicles of the sizes that are met on the road.
+    /// All driving styles, and realistic sizes of vehicles.
     pub(crate) is_real: bool,
-    /// Parked vehicles and people who stand.
+    /// Parked vehicles and standing pedestrians.
     pub(crate) standing: Vec<Standing>,
     /// Vehicles that have stopped in their lane: the lane and the arc length of their centre.
     pub(crate) held: Vec<(LaneIdx, f64)>,
     /// Ways across the road away from crosswalks.
     pub(crate) jaywalks: Vec<Jaywalk>,
-    /// Who takes which of them, and from which second of the simulation on.
+    /// Which pedestrians use them, and from which second of the simulation on.
     pub(crate) crossers: Vec<(usize, f64)>,
 }
 
-/// Something that stays where it is.
+/// A body that stays in place.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Standing {
     pub(crate) kind: AgentKind,
@@ -104,7 +104,7 @@ impl Traffic<'_> {
         }
     }
 
-    /// Puts what stands about where it stands, and people at the curbs they will leave.
+    /// Adds static bodies, and the pedestrians at the curbs from which they will cross.
     fn set_scenery(&mut self) {
         for body in std::mem::take(&mut self.demand.scenery.standing) {
             let id = self.new_id();
@@ -152,7 +152,7 @@ impl Traffic<'_> {
         self.next_id - 1
     }
 
-    /// Lets newcomers in at the border.
+    /// Adds new agents at the border.
     pub(super) fn replenish(&mut self) {
         let entries = (0..self.network.lanes.len()).filter(|&l| self.network.lanes[l].is_entry);
         for lane in entries.collect::<Vec<_>>() {
@@ -174,7 +174,7 @@ impl Traffic<'_> {
         }
     }
 
-    /// Drawn: the faster a lane, the more use it; everywhere alike in plain scenes.
+    /// Random: faster lanes are used more; uniform in plain scenes.
     fn is_used(&mut self, lane: LaneIdx) -> bool {
         let share = self.network.lanes[lane].speed_limit / FAST_LANE;
         !self.demand.scenery.is_real || self.rng.random_bool(share.powi(3).clamp(0.04, 1.0))

@@ -1,4 +1,4 @@
-//! How one driver follows, brakes and accelerates.
+//! The driver model: following, braking and accelerating.
 
 use gump_scene::Rng;
 use rand::Rng as _;
@@ -6,7 +6,7 @@ use rand::Rng as _;
 /// Strongest deceleration of any vehicle, m/s².
 pub(crate) const HARDEST_BRAKING: f64 = 7.0;
 
-/// What is in the way: the free gap to it and how fast it moves along the own path.
+/// The leader: the free gap to it and its speed along the follower's path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Leader {
     /// Metres from front to rear.
@@ -15,7 +15,7 @@ pub(crate) struct Leader {
     pub(crate) speed: f64,
 }
 
-/// A driver's habits; they differ from driver to driver.
+/// Parameters of a driver, which vary between drivers.
 #[derive(Clone, Debug)]
 pub(crate) struct Driver {
     /// Desired speed as a multiple of the limit.
@@ -46,7 +46,7 @@ pub(crate) struct Driver {
     pub(crate) rolling_stop: f64,
     /// Half the width within which the driver wanders in the lane, metres.
     pub(crate) wander: f64,
-    /// Deviation of the random part of the acceleration, as a multiple of the usual one.
+    /// Standard deviation of the random part of the acceleration, as a multiple of the usual one.
     pub(crate) unrest: f64,
 }
 
@@ -72,8 +72,8 @@ impl Driver {
         }
     }
 
-    /// A car driver of any temper, as they are met on the road: from the timid to those who roll
-    /// through stop signs and over the line when the light has just turned red.
+    /// A driver with a random driving style: from the timid to those who roll through stop signs
+    /// and over the line when the light has just turned red.
     pub(crate) fn of_any_temper(rng: &mut Rng) -> Self {
         // One number for how much of a hurry somebody is in, and the rest around it.
         let hurry: f64 = f64::midpoint(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0));
@@ -137,8 +137,8 @@ impl Driver {
         }
     }
 
-    /// Acceleration for a present and a desired speed, with perhaps something ahead and perhaps a
-    /// distance after which to stand, m/s².
+    /// Acceleration for a present and a desired speed, optionally with a leader and a distance at
+    /// which to stop, m/s².
     ///
     /// Source: the improved intelligent driver model of Treiber and Kesting, *Traffic Flow
     /// Dynamics*, 2013, section 11.3.7.
@@ -179,7 +179,7 @@ impl Driver {
         chosen.clamp(-HARDEST_BRAKING, self.acceleration)
     }
 
-    /// The gap this driver would keep, metres.
+    /// The desired gap, metres.
     pub(crate) fn wanted_gap(&self, speed: f64, leader_speed: f64) -> f64 {
         let closing = speed * (speed - leader_speed);
         let dynamic = closing / (2.0 * (self.acceleration * self.braking).sqrt());

@@ -1,4 +1,4 @@
-//! When vehicles change lanes, and when they move over for a bicycle.
+//! Lane changes, and moving over for a bicycle.
 
 use gump_scene::AgentKind;
 use rand::Rng as _;

@@ -1,4 +1,4 @@
-//! Which stretch of which lane is taken by whom, and what is ahead.
+//! Occupied stretches of lanes, and the leader of a vehicle.
 
 use gump_scene::AgentKind;
 
@@ -60,7 +60,7 @@ impl Occupancy {
         }
     }
 
-    /// Lets nobody pass a place on a lane until the lanes are filled again.
+    /// Blocks a position on a lane until the lanes are filled again.
     pub(crate) fn block(&mut self, lane: LaneIdx, at: f64) {
         self.blocks.push((lane, at));
     }
@@ -132,7 +132,7 @@ impl Occupancy {
         }
     }
 
-    /// What `vehicle` has to follow or to stop behind.
+    /// What `vehicle` has to follow, or where it has to stop.
     pub(crate) fn leader(&self, network: &Network, vehicle: &Vehicle) -> Option<Leader> {
         let sides = {
             let (a, b) = (vehicle.offset(), vehicle.lateral);

@@ -1,4 +1,4 @@
-//! People on foot: along sidewalks, around corners, and across the road when it is safe.
+//! Pedestrians: along sidewalks, around corners, and across the road when it is safe.
 
 use std::f64::consts::TAU;
 

@@ -1,8 +1,9 @@
-//! Who may enter a junction, and where the others stop.
+//! Right of way at junctions, and where waiting vehicles stop.
 //!
 //! A vehicle claims the connector it wants before it gets so near that it could no longer stop
-//! comfortably. It is refused while another claim, a person on a crosswalk, a light, a stop sign,
-//! traffic with priority or a full exit is in the way. Claims end when the rear is clear.
+//! comfortably. The claim is refused while another claim, a pedestrian on a crosswalk, a light, a
+//! stop sign, traffic with priority or a full exit is in the way. Claims end when the rear is
+//! clear.
 
 use gump_scene::LightState;
 

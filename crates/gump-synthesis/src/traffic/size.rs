@@ -1,4 +1,4 @@
-//! How large vehicles, bicycles and people are.
+//! Sizes of vehicles, bicycles and pedestrians.
 
 use gump_scene::Rng;
 use rand::Rng as _;

@@ -1,4 +1,4 @@
-//! One vehicle or bicycle: where it is on its path and how it moves along and across it.
+//! One vehicle or bicycle: its position on its path and its motion along and across it.
 
 use gump_geometry::{Pose, wrap_angle};
 use gump_scene::{AgentKind, Rng};
@@ -65,7 +65,7 @@ pub(crate) struct Vehicle {
     pub(crate) change: Option<LaneChange>,
     /// Seconds until it thinks of changing lanes again.
     pub(crate) patience: f64,
-    /// Stays where it is, as a vehicle that stopped in the lane to load does.
+    /// Stays in place, like a vehicle that has stopped in the lane to load.
     pub(crate) is_held: bool,
 }
 
