@@ -1,7 +1,7 @@
-//! From any format that is read to any that is written, file by file.
+//! Conversion from any readable format to any writable one, file by file.
 //!
-//! Start with [`convert`]; [`groups`] divides many files into pieces for it. What cannot be read
-//! or written is named and the rest is delivered.
+//! Start with [`convert`]; [`groups`] divides many files into groups for it. Records that cannot be
+//! read or written are listed, and the rest is converted.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -22,22 +22,22 @@ use crate::io::tfrecord;
 use crate::tracks::TrackTable;
 use crate::{DataError, ReadOptions, ReadReport, Reader, open_files, write_atomically};
 
-/// What is written.
+/// The output format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OutputFormat {
-    /// The cache that training reads from: everything, to the bit.
+    /// The cache that training reads: everything, bit for bit.
     Cache,
     /// Waymo's `Scenario` messages as TFRecord.
     Waymo,
-    /// JSON for people's own programs, packed, a file per scenario.
+    /// JSON for other programs, compressed, a file per scenario.
     ScenarioJson,
     /// Tables of tracks, without maps.
     #[cfg(feature = "parquet")]
     Parquet,
 }
 
-/// What a conversion did.
+/// The result of a conversion.
 #[derive(Debug, Default)]
 pub struct Converted {
     /// Scenarios written.
@@ -46,22 +46,22 @@ pub struct Converted {
     pub files: Vec<PathBuf>,
     /// Their bytes.
     pub bytes: u64,
-    /// What could not be read or written, each with its place.
+    /// Records that could not be read or written, with their places.
     pub refused: Vec<DataError>,
-    /// Files without scenarios, by what they are.
+    /// Files without scenarios, by kind.
     pub skipped: BTreeMap<&'static str, usize>,
-    /// What was left out and what was added, in reading and in writing.
+    /// Dropped and inferred items, in reading and in writing.
     pub report: ReadReport,
 }
 
 /// Input bytes that make an output file: large enough to read in one go, small enough to lose.
 const GROUP_BYTES: u64 = 64 << 20;
-/// About so many groups at least, as long as there are files: work for many threads.
+/// Minimum number of groups, if there are as many files: work for many threads.
 const MIN_GROUPS: u64 = 16;
 
 /// Divides files into consecutive groups, one for each output file.
 ///
-/// Depends on the files and their sizes alone, so that a conversion can be taken up again.
+/// Depends only on the files and their sizes, so that a conversion can be resumed.
 pub fn groups(files: &[PathBuf]) -> Vec<Range<usize>> {
     let size = |file: &PathBuf| fs::metadata(file).map_or(0, |metadata| metadata.len());
     let sizes: Vec<u64> = files.iter().map(size).collect();
@@ -80,12 +80,12 @@ pub fn groups(files: &[PathBuf]) -> Vec<Range<usize>> {
 /// Converts files into one file `STEM.ENDING` (of [`OutputFormat::ScenarioJson`]: one per scenario,
 /// `STEM-00000.json.gz` and so on), which appears when it is complete; no scenarios make no file.
 ///
-/// `each` sees every scenario that was written and may end the work by an error. Waymo's messages
-/// state the lights as they were seen, without [`ReadOptions::infer_light_gaps`].
+/// `each` is called for every scenario written and may stop the conversion with an error. Waymo's
+/// messages contain the lights as observed, without [`ReadOptions::infer_light_gaps`].
 ///
 /// # Errors
-/// Whatever `each` returns, and [`DataError::Io`] for the output. What is wrong with the input is
-/// in [`Converted::refused`].
+/// Errors of `each`, and [`DataError::Io`] for the output. Errors of the input are in
+/// [`Converted::refused`].
 pub fn convert<E: From<DataError>>(
     files: &[PathBuf],
     options: ReadOptions,
@@ -127,7 +127,7 @@ fn with_ending(stem: &Path, ending: &str) -> PathBuf {
 
 /// A file that takes scenarios one by one.
 trait Sink {
-    /// Adds a scenario; says what the format has no room for.
+    /// Adds a scenario; returns what the format cannot represent.
     ///
     /// Error: [`DataError::Unwritable`], after which others can be added, or [`DataError::Io`].
     fn add(&mut self, scenario: &Scenario) -> Result<ReadReport, DataError>;
@@ -136,7 +136,7 @@ trait Sink {
     fn close(self: Box<Self>) -> Result<(), DataError>;
 }
 
-/// A file to add scenarios to, or why there is none.
+/// A file for scenarios, or why there is none.
 type Begun<'f> = Result<Box<dyn Sink + 'f>, DataError>;
 
 fn new_shard<'f>(file: &'f mut BufWriter<File>, path: &'f Path) -> Begun<'f> {
@@ -211,7 +211,7 @@ impl<F> Conversion<F> {
         }
     }
 
-    /// Takes note of what came of writing a scenario.
+    /// Records the result of writing a scenario.
     fn note<E: From<DataError>>(
         &mut self,
         scenario: &Scenario,

@@ -1,4 +1,5 @@
-//! What can be wrong with data, as one enum; sentences put the context first and the path last.
+//! Errors of reading and writing, as one enum; messages begin with the context and end with the
+//! path.
 
 use std::fmt;
 use std::io;
@@ -28,19 +29,19 @@ impl fmt::Display for Place {
     }
 }
 
-/// Name of the file that marks a folder whose making was begun and not finished: what is there is
-/// sound, but it is not all. No reader takes such a folder.
+/// Name of the file that marks a folder whose creation has not finished: its files are valid but
+/// not complete. Readers refuse such a folder.
 pub const INCOMPLETE: &str = "CACHE-INCOMPLETE";
 
 /// Why data could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("could not {doing}: {source}: {}", path.display())]
     Io {
-        /// What was tried: "open", "read", "create", ...
+        /// The operation: "open", "read", "create", ...
         doing: &'static str,
-        /// Its answer.
+        /// The error of the system.
         source: io::Error,
         /// The file.
         path: PathBuf,
@@ -51,47 +52,47 @@ pub enum DataError {
         /// The file.
         path: PathBuf,
     },
-    /// The file holds nothing.
+    /// The file is empty.
     #[error("expected at least one record, found an empty file: {}", path.display())]
     Empty {
         /// The file.
         path: PathBuf,
     },
-    /// A directory holds no file of a known kind.
+    /// A directory contains no file of a known kind.
     #[error(
         "expected scenario files, found {others} files of other kinds in the directory {}",
         path.display()
     )]
     NoFiles {
-        /// How many files there are that hold no scenarios.
+        /// Number of files without scenarios.
         others: usize,
         /// The directory.
         path: PathBuf,
     },
-    /// A file is of a known kind that holds no scenarios.
+    /// A file is of a known kind without scenarios.
     #[error("expected scenarios, found {what}: {}", path.display())]
     NotScenarios {
-        /// What it is.
+        /// Its kind.
         what: &'static str,
         /// The file.
         path: PathBuf,
     },
-    /// A document is longer than any that is read whole.
+    /// A document is longer than the limit for reading it as a whole.
     #[error("expected at most {limit} bytes of {what}, found more: {}", path.display())]
     TooLarge {
-        /// What it holds.
+        /// Its content.
         what: &'static str,
-        /// The most that is accepted, bytes after unpacking.
+        /// The limit, bytes after decompression.
         limit: u64,
         /// The file.
         path: PathBuf,
     },
-    /// A document is not JSON, or not of the right shape.
+    /// A document is not JSON, or has the wrong structure.
     #[error("expected {what}: {source}: {}", path.display())]
     Json {
-        /// What it should be.
+        /// What was expected.
         what: &'static str,
-        /// What the parser says, with line and column.
+        /// The parser's message, with line and column.
         source: serde_json::Error,
         /// The file.
         path: PathBuf,
@@ -99,14 +100,14 @@ pub enum DataError {
     /// A table is damaged or lacks a column.
     #[error("expected {expected}, found {found}: {}", path.display())]
     Table {
-        /// What should be there.
+        /// What was expected.
         expected: String,
-        /// What is there.
+        /// What was found.
         found: String,
         /// The file.
         path: PathBuf,
     },
-    /// A file needs another one beside it.
+    /// A file that is needed beside another one is missing.
     #[error("expected {expected} beside it, found none: {}", path.display())]
     NoCompanion {
         /// The missing file.
@@ -114,23 +115,23 @@ pub enum DataError {
         /// The file that needs it.
         path: PathBuf,
     },
-    /// A sound file holds nothing that a scenario can be taken from.
+    /// A valid file contains nothing that a scenario can be made from.
     #[error("expected {expected}, found {found}: {}", path.display())]
     NoScenarios {
-        /// What a scenario is taken from.
+        /// What scenarios are made from.
         expected: &'static str,
-        /// What is there.
+        /// What was found.
         found: String,
         /// The file.
         path: PathBuf,
     },
-    /// A database cannot be read, or holds a value of another type.
+    /// A database cannot be read, or has a value of another type.
     #[cfg(feature = "nuplan")]
     #[error("could not {doing}: {source}: {}", path.display())]
     Sqlite {
-        /// What was tried.
+        /// The operation.
         doing: &'static str,
-        /// What SQLite says.
+        /// SQLite's message.
         source: rusqlite::Error,
         /// The file.
         path: PathBuf,
@@ -138,7 +139,7 @@ pub enum DataError {
     /// The content is of no known format.
     #[error("expected {expected}, found a file that starts with {found}: {}", path.display())]
     UnknownFormat {
-        /// The formats that would have been understood.
+        /// The supported formats.
         expected: String,
         /// The first bytes found.
         found: String,
@@ -150,9 +151,9 @@ pub enum DataError {
     Truncated {
         /// What was being read.
         part: &'static str,
-        /// Bytes wanted.
+        /// Bytes required.
         expected: u64,
-        /// Bytes there.
+        /// Bytes present.
         found: u64,
         /// Where.
         place: Place,
@@ -160,41 +161,41 @@ pub enum DataError {
     /// A checksum does not match.
     #[error("expected checksum {expected:#010x} of {part}, found {found:#010x}: {place}")]
     Checksum {
-        /// What was checked.
+        /// The checked part.
         part: &'static str,
-        /// The checksum stored in the file.
+        /// The stored checksum.
         expected: u32,
-        /// The checksum of what was read.
+        /// The computed checksum.
         found: u32,
         /// Where.
         place: Place,
     },
-    /// A record claims an absurd length.
+    /// A record has an implausible length.
     #[error("expected a record of at most {limit} bytes, found a length of {length}: {place}")]
     TooLong {
-        /// The most that is accepted, bytes.
+        /// The limit, bytes.
         limit: u64,
         /// The length found, bytes.
         length: u64,
         /// Where.
         place: Place,
     },
-    /// A file of the cache is damaged, cut off or of another version.
+    /// A file of the cache is damaged, truncated or of another version.
     #[error("expected {expected}, found {found}: at byte {offset} of {}", path.display())]
     Cache {
-        /// What should be there.
+        /// What was expected.
         expected: String,
-        /// What is there.
+        /// What was found.
         found: String,
         /// Where, bytes from the start of the file.
         offset: u64,
         /// The file.
         path: PathBuf,
     },
-    /// An XML file is not well formed, or does not say what it should.
+    /// An XML file is not well formed, or has unexpected content.
     #[error("{problem}: at byte {offset} of {}", path.display())]
     Xml {
-        /// What is wrong.
+        /// The problem.
         problem: String,
         /// Where, bytes from the start of the (uncompressed) content.
         offset: u64,
@@ -207,22 +208,22 @@ pub enum DataError {
         /// The recording.
         path: PathBuf,
     },
-    /// A record is not the message it should be.
+    /// A record is not a valid message.
     #[error("expected a {message} message: {source}: {place}")]
     Proto {
         /// The message's name.
         message: &'static str,
-        /// What the decoder says.
+        /// The decoder's message.
         source: prost::DecodeError,
         /// Where.
         place: Place,
     },
-    /// A message holds something that cannot be in it.
+    /// A message contains an invalid value.
     #[error("expected {expected}, found {found}: {place}")]
     Field {
-        /// What can be there.
+        /// What was expected.
         expected: &'static str,
-        /// What is there.
+        /// What was found.
         found: String,
         /// Where.
         place: Place,
@@ -232,7 +233,7 @@ pub enum DataError {
     Scenario {
         /// The scenario's own id.
         id: String,
-        /// What is wrong.
+        /// The problem.
         problem: Problem,
         /// Where.
         place: Place,
@@ -242,20 +243,20 @@ pub enum DataError {
     Unwritable {
         /// The scenario's id.
         id: String,
-        /// Why not.
+        /// The reason.
         problem: String,
     },
-    /// A name like `FILE#ID` names nothing.
+    /// A name like `FILE#ID` without a matching scenario.
     #[error("{}: {}", no_such_scenario(wanted, *found), path.display())]
     NoSuchScenario {
-        /// The index or id asked for.
+        /// The requested index or id.
         wanted: String,
-        /// How many scenarios there are.
+        /// Number of scenarios.
         found: usize,
         /// The file or directory.
         path: PathBuf,
     },
-    /// A folder of several files stands where one scenario is meant.
+    /// A folder with several files where one scenario is expected.
     #[error(
         "expected one scenario, found a folder with {files} files of scenarios: name a file such \
          as {}, or a scenario by its number or id as in {}#0",
@@ -263,14 +264,14 @@ pub enum DataError {
         path.display()
     )]
     SeveralFiles {
-        /// How many of its files hold scenarios.
+        /// Number of its files with scenarios.
         files: usize,
         /// The first of them.
         first: PathBuf,
         /// The folder.
         path: PathBuf,
     },
-    /// A folder whose making was cut short.
+    /// A folder whose creation was interrupted.
     #[error(
         "expected a finished data set, found {} in {}: the conversion that made it was stopped; \
          the same command finishes it",
@@ -283,7 +284,7 @@ pub enum DataError {
     },
 }
 
-/// What was asked for after `#`, and what there is instead.
+/// The request after `#`, and what there is instead.
 fn no_such_scenario(wanted: &str, found: usize) -> String {
     let is_number = wanted.parse::<usize>().is_ok();
     match found {
@@ -305,20 +306,21 @@ fn no_such_scenario(wanted: &str, found: usize) -> String {
     }
 }
 
-/// The largest number accepted in a state or a map, in SI units.
+/// The largest magnitude accepted in a state or a map, in SI units.
 ///
-/// Map projections stay below 2e7 m (half the circumference of the Earth); more is damage.
+/// Map projections stay below 2e7 m (half the circumference of the Earth); larger values are
+/// damage.
 pub(crate) const MAX_COORDINATE: f64 = 1e8;
 
 /// Why a decoded record is not a usable scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Problem {
-    /// Bytes are not the message they should be.
+    /// Bytes are not a valid message.
     #[error("expected a {message} message, found bytes that are none: {source}")]
     Message {
         /// The message's name.
         message: &'static str,
-        /// What the decoder says.
+        /// The decoder's message.
         source: prost::DecodeError,
     },
     /// It has no map.
@@ -327,13 +329,13 @@ pub enum Problem {
     /// It has no agents.
     #[error("expected at least one track, found a map alone or nothing")]
     NoAgents,
-    /// It does not say who the ego is.
+    /// The ego is not stated.
     #[error("expected the index of the ego's track, found none")]
     NoEgo,
     /// An index points past the end of its list.
     #[error("expected {what} below {len}, found {index}")]
     Index {
-        /// What the index is.
+        /// What it indexes.
         what: &'static str,
         /// Length of the list.
         len: usize,
@@ -350,7 +352,7 @@ pub enum Problem {
         /// Number of states.
         found: usize,
     },
-    /// Traffic lights are given for another number of steps than there are.
+    /// Traffic lights have another number of steps than the scenario.
     #[error("expected traffic lights for {expected} steps or none, found {found}")]
     LightCount {
         /// Number of time stamps.
@@ -358,10 +360,10 @@ pub enum Problem {
         /// Number of steps with lights.
         found: usize,
     },
-    /// Two tracks have one id.
+    /// Two tracks have the same id.
     #[error("expected unique track ids, found {0} twice")]
     DuplicateTrack(i64),
-    /// A state that claims to be valid is not a number, or beyond any place on Earth.
+    /// A state marked valid is not finite, or beyond any place on Earth.
     #[error(
         "expected numbers within {MAX_COORDINATE} in track {track} at step {step}, \
          found {field} = {value}"
@@ -371,12 +373,12 @@ pub enum Problem {
         track: i64,
         /// The step.
         step: usize,
-        /// The first field at fault.
+        /// The first invalid field.
         field: &'static str,
-        /// What it holds.
+        /// Its value.
         value: f64,
     },
-    /// A map coordinate is not a number, or beyond any place on Earth.
+    /// A map coordinate is not finite, or beyond any place on Earth.
     #[error(
         "expected coordinates within {MAX_COORDINATE} m in map feature {feature}, \
          found {value} at point {point}"
@@ -386,7 +388,7 @@ pub enum Problem {
         feature: i64,
         /// Index of the point.
         point: usize,
-        /// What it holds.
+        /// Its value.
         value: f64,
     },
     /// The time stamps are not one time step apart.
@@ -399,17 +401,17 @@ pub enum Problem {
         /// The later step.
         step: usize,
     },
-    /// A value is not what the format promises.
+    /// A value violates the format.
     #[error("expected {expected}, found {found} in {place}")]
     Unexpected {
-        /// What should be there.
+        /// What was expected.
         expected: &'static str,
-        /// What is there.
+        /// What was found.
         found: Box<str>,
         /// Which part of the record.
         place: Box<str>,
     },
-    /// Imagined futures do not fit their scenario.
+    /// Rollouts do not fit their scenario.
     #[error("{0}")]
     Rollouts(String),
     /// A message of predictions is inconsistent.
@@ -418,7 +420,7 @@ pub enum Problem {
     /// The map is inconsistent.
     #[error(transparent)]
     Map(#[from] MapError),
-    /// The result breaks a promise of every scenario.
+    /// The result violates an invariant of scenarios.
     #[error(transparent)]
     Scenario(#[from] ScenarioError),
 }

@@ -1,4 +1,4 @@
-//! What is in a file or directory, as numbers; how it looks on a terminal is the driver's affair.
+//! Summary statistics of a file or directory; `xtask` prints them.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,14 +8,14 @@ use serde::Serialize;
 
 use crate::{DataError, ReadOptions, ReadReport, open_with};
 
-/// What a file or directory holds.
+/// Content of a file or directory.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Summary {
-    /// The format's name.
+    /// The name of the format.
     pub format: String,
-    /// Scenarios that could be read.
+    /// Number of readable scenarios.
     pub scenarios: usize,
-    /// Records that could not, each as a sentence.
+    /// Errors of unreadable records, as sentences.
     pub unreadable: Vec<String>,
     /// The id of the first scenario.
     pub first_id: Option<String>,
@@ -23,7 +23,7 @@ pub struct Summary {
     pub tracks: BTreeMap<&'static str, usize>,
     /// Agents present at the present step by class, over all scenarios.
     pub agents_now: BTreeMap<&'static str, usize>,
-    /// Agents that a benchmark asks to predict.
+    /// Number of prediction targets.
     pub targets: usize,
     /// Shortest and longest scenario, seconds from first to last frame.
     pub duration_s: Option<[f64; 2]>,
@@ -43,23 +43,24 @@ pub struct Summary {
     pub with_route: usize,
     /// Scenarios by tag.
     pub tags: BTreeMap<&'static str, usize>,
-    /// What was left out and what was added, over all scenarios.
+    /// Dropped and inferred items, over all scenarios.
     #[serde(flatten)]
     pub report: ReadReport,
 }
 
-/// Reads every record and counts what is there; unreadable records are listed, not fatal.
+/// Reads every record and counts its content; unreadable records are listed, not fatal.
 ///
 /// # Errors
-/// Those of [`crate::open`].
+/// Errors of [`crate::open`].
 pub fn inspect(path: &Path, options: ReadOptions) -> Result<Summary, DataError> {
     inspect_with(path, options, |_| {})
 }
 
-/// As [`inspect`], with something added to every scenario before it is counted, for instance tags.
+/// As [`inspect`], with a function that modifies every scenario before it is counted, for instance
+/// to add tags.
 ///
 /// # Errors
-/// Those of [`crate::open`].
+/// Errors of [`crate::open`].
 pub fn inspect_with(
     path: &Path,
     options: ReadOptions,
@@ -83,7 +84,7 @@ pub fn inspect_with(
 }
 
 impl Summary {
-    /// Counts one scenario in.
+    /// Adds one scenario to the counts.
     pub fn add(&mut self, scenario: &Scenario, report: &ReadReport) {
         self.scenarios += 1;
         self.first_id.get_or_insert_with(|| scenario.id.clone());

@@ -25,13 +25,13 @@ pub fn open(path: &Path) -> Result<Reader, DataError> {
 /// Opens a file, or every file of a directory and its subdirectories that holds scenarios.
 ///
 /// In a directory, files of other kinds are skipped and counted in [`Reader::skipped`]; files that
-/// should hold scenarios by their name or beginning but cannot be opened are errors of the reader,
-/// which goes on with the next.
+/// should contain scenarios by their name or beginning but cannot be opened are errors of the
+/// reader, which continues with the next.
 ///
 /// # Errors
 /// [`DataError::Missing`], [`DataError::NoFiles`], and for a single file [`DataError::Empty`],
 /// [`DataError::UnknownFormat`], [`DataError::NotScenarios`] and [`DataError::Io`]; of several
-/// files the reader tells them.
+/// files the reader reports them.
 pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError> {
     let is_folder = path.is_dir();
     let files = if is_folder {
@@ -58,8 +58,8 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
     }
 }
 
-/// Reads files one after another like those of a directory: what holds no scenarios is skipped and
-/// counted, what cannot be opened is an error of the reader.
+/// Reads files one after another like those of a directory: files without scenarios are skipped and
+/// counted, files that cannot be opened are errors of the reader.
 pub fn open_files(files: Vec<PathBuf>, options: ReadOptions) -> Reader {
     Reader {
         source: Box::new(NoRecords),
@@ -74,7 +74,7 @@ pub fn open_files(files: Vec<PathBuf>, options: ReadOptions) -> Reader {
 
 /// An iterator over the scenarios of a file or directory; holds one record at a time.
 ///
-/// After an error it goes on with the next record, or the next file, where that is possible.
+/// After an error it continues with the next record, or the next file, where that is possible.
 pub struct Reader {
     source: BoxedSource,
     format: &'static str,
@@ -92,7 +92,7 @@ impl Reader {
         self.format
     }
 
-    /// Files of a directory passed over so far, by what they are.
+    /// Files of a directory skipped so far, by kind.
     pub fn skipped(&self) -> &BTreeMap<&'static str, usize> {
         &self.skipped
     }
@@ -160,20 +160,20 @@ impl Source for NoRecords {
     }
 }
 
-/// Reads one scenario by name: `PATH` (the first of a file, the one file of a folder),
-/// `PATH#INDEX` (from 0) or `PATH#SCENARIO_ID`.
+/// Reads one scenario by name: `PATH` (the first of a file, the one file of a folder), `PATH#INDEX`
+/// (from 0) or `PATH#SCENARIO_ID`.
 ///
-/// An index wins over an id of the same digits. A path that itself contains `#` is taken whole if
-/// it exists.
+/// An index takes precedence over an id of the same digits. A path that itself contains `#` is used
+/// as a whole if it exists.
 ///
 /// # Errors
 /// [`DataError::NoSuchScenario`], [`DataError::SeveralFiles`] for a folder of several files of
-/// scenarios without an index, those of [`open`], and those of the record asked for.
+/// scenarios without an index, the errors of [`open`], and those of the requested record.
 pub fn find(source: &str) -> Result<Scenario, DataError> {
     find_record(source).map(|record| record.scenario)
 }
 
-/// As [`find`], with the account of what was left out and added.
+/// As [`find`], with the report of dropped and inferred items.
 ///
 /// # Errors
 /// As [`find`].
@@ -181,8 +181,8 @@ pub fn find_record(source: &str) -> Result<ScenarioRecord, DataError> {
     find_with(source, ReadOptions::ALL)
 }
 
-/// As [`find`], for who needs the map alone: a recording without agents, and a SUMO network, has a
-/// parked ego on the longest of its lanes.
+/// As [`find`], for callers that need only the map: a recording without agents, or a SUMO network,
+/// gets a parked ego on its longest lane.
 ///
 /// # Errors
 /// As [`find`].

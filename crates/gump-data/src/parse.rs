@@ -1,6 +1,7 @@
-//! One scenario from bytes, for where there are no files: a page in a browser, a message.
+//! Reading of one scenario from bytes, where there are no files: in a browser, or from a message.
 //!
-//! Formats that are one document or a stream of records; what needs files beside it is not here.
+//! Supports formats that are one document or a stream of records, not those that need several
+//! files.
 
 use std::io::{BufRead as _, Read as _};
 use std::path::Path;
@@ -18,13 +19,13 @@ use crate::{DataError, Place, ReadOptions, ReadReport};
 /// Bytes of the beginning that tell formats apart.
 const HEAD_BYTES: usize = 64 << 10;
 
-/// Reads the first scenario of a file's bytes: Waymo's TFRecord, a scenario as JSON or GPUDrive's
-/// JSON, told apart by content, plain or gzip. Gaps are filled with [`ReadOptions::ALL`].
+/// Reads the first scenario of a file's bytes: Waymo's TFRecord, Scenario-JSON or GPUDrive's JSON,
+/// detected from content, plain or gzip. Gaps are filled with [`ReadOptions::ALL`].
 ///
-/// `name` stands for the file in errors, and is the id of a scenario that states none.
+/// `name` stands for the file in errors, and is the id of a scenario without one.
 ///
 /// # Errors
-/// As [`open`](crate::open) and reading the first record.
+/// As for [`open`](crate::open) and reading the first record.
 pub fn parse(bytes: &[u8], name: &str) -> Result<Scenario, DataError> {
     let path = Path::new(name);
     let mut content = stream::of_bytes(bytes, path)?;
@@ -40,7 +41,8 @@ pub fn parse(bytes: &[u8], name: &str) -> Result<Scenario, DataError> {
     Ok(first?.scenario)
 }
 
-/// Reads a scenario of a JSON document's bytes, ours or GPUDrive's, plain or gzip; see [`parse`].
+/// Reads a scenario of a JSON document's bytes, Scenario-JSON or GPUDrive's, plain or gzip; see
+/// [`parse`].
 ///
 /// # Errors
 /// [`DataError::UnknownFormat`] for a document of another kind, and those of reading a file.

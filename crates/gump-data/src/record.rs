@@ -1,4 +1,4 @@
-//! What a reader yields: a scenario, and an account of what was left out and what was added.
+//! The output of a reader: a scenario, and a report of dropped and inferred items.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use serde::Serialize;
 pub struct ScenarioRecord {
     /// The scenario, validated.
     pub scenario: Scenario,
-    /// What was left out and what was added.
+    /// Dropped and inferred items.
     pub report: ReadReport,
     /// Where its record starts, bytes from the start of the (uncompressed) content.
     pub offset: u64,
@@ -20,40 +20,40 @@ pub struct ScenarioRecord {
     pub path: Arc<PathBuf>,
 }
 
-/// Boxes may interpenetrate this much before it counts, metres: the precision of annotation.
+/// Boxes may overlap this much before it counts, metres: the precision of annotation.
 pub(crate) const OVERLAP_TOLERANCE: f64 = 0.1;
 
-/// What a reader left out and what it added, by reason, with counts.
+/// Items that a reader dropped and inferred, by reason, with counts.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ReadReport {
     /// Stated by the format but not in the scenario.
     pub dropped: BTreeMap<&'static str, usize>,
     /// In the scenario but not stated by the format.
     pub inferred: BTreeMap<&'static str, usize>,
-    /// Single damaged things that were left out, each with its place; at most [`MAX_NOTES`].
+    /// Single damaged items that were dropped, each with its place; at most [`MAX_NOTES`].
     #[serde(skip)]
     pub notes: Vec<Note>,
 }
 
-/// One damaged thing that was left out.
+/// One damaged item that was dropped.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Note {
     /// The reason, a key of [`ReadReport::dropped`].
     pub reason: &'static str,
-    /// Which one, and what is wrong with it.
+    /// Its identity, and the problem.
     pub detail: String,
 }
 
-/// So many damaged things are named one by one; all are counted. Damage may be everywhere.
+/// Maximum number of damaged items that are listed one by one; all are counted.
 pub const MAX_NOTES: usize = 200;
 
 impl ReadReport {
-    /// Counts `n` things left out; zero counts leave no entry.
+    /// Counts `n` dropped items; zero counts leave no entry.
     pub fn drop(&mut self, reason: &'static str, n: usize) {
         add(&mut self.dropped, reason, n);
     }
 
-    /// Counts one damaged thing left out and says which.
+    /// Counts one damaged item as dropped and lists it.
     pub fn drop_damaged(&mut self, reason: &'static str, detail: impl FnOnce() -> String) {
         self.drop(reason, 1);
         if self.notes.len() < MAX_NOTES {
@@ -62,12 +62,12 @@ impl ReadReport {
         }
     }
 
-    /// Counts `n` things added; zero counts leave no entry.
+    /// Counts `n` inferred items; zero counts leave no entry.
     pub fn infer(&mut self, what: &'static str, n: usize) {
         add(&mut self.inferred, what, n);
     }
 
-    /// Adds the counts of another report; its notes stay with their scenario.
+    /// Adds the counts of another report, without its notes.
     pub fn merge(&mut self, other: &Self) {
         for (reason, n) in &other.dropped {
             self.drop(reason, *n);
@@ -84,71 +84,68 @@ fn add(counts: &mut BTreeMap<&'static str, usize>, key: &'static str, n: usize) 
     }
 }
 
-/// Which gaps of a format a reader may fill by inference.
+/// Which gaps of a format a reader fills by inference.
 ///
 /// The default fills all of them: planners need routes and drivable surfaces. Smoothing changes
-/// what a format states and is off unless asked for.
+/// stated values and is off by default.
 ///
 /// # What the present tells of the future
 ///
-/// States, sizes and lights up to the present are filled in from frames up to the present alone:
-/// two recordings that are equal until then have equal pasts. Four things do look ahead, each by
-/// its own option: the route ([`gump_scene::SceneState::unguided`] hides it from an actor), whom to
-/// predict (which no actor sees), which vehicle is the ego where a format does not say (a choice of
-/// scene, not of what is seen in it), and smoothing. What a file states is taken as it is stated,
-/// whatever its makers knew: a map that is cut out along the ego's way, a size that is the same in
-/// all frames.
+/// States, sizes and lights up to the present are inferred only from frames up to the present: two
+/// recordings that are equal until then have equal pasts. Four items do use the future, each with
+/// its own option: the route ([`gump_scene::SceneState::unguided`] removes it), the prediction
+/// targets (not part of a scene), the choice of the ego where a format does not state it, and
+/// smoothing. Stated values are kept, even if their authors used the future: a map that is cut out
+/// along the ego's path, or a size that is the same in all frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Which lane leads to which, which lie side by side, from the centre lines, where a format
-    /// states no links at all.
+    /// Links and neighbours of lanes, from the centre lines, where a format states no links at all.
     pub infer_lane_graph: bool,
-    /// Speed limits of lanes without one from the lanes before, after and beside.
+    /// Speed limits of lanes without one, from the lanes before, after and beside.
     pub infer_speed_limits: bool,
     /// Lane widths from the lines and lanes beside them; otherwise every lane has the default.
     pub infer_widths: bool,
-    /// Which lanes lie inside an intersection, from the lanes they cross, fork from and join.
+    /// Lanes inside intersections, from the lanes they cross, fork from and join.
     pub infer_intersections: bool,
     /// Drivable surfaces from lanes and road edges; otherwise a map without stated surfaces has
-    /// none, which means that nothing is off-road.
+    /// none, so that nothing counts as off-road.
     pub infer_drivable: bool,
     /// Road edges along the border of the drivable surface, where a format states none.
     pub infer_edges: bool,
-    /// The lane of a light that states only where it is.
+    /// The lane of a light with a stated position only.
     pub infer_light_lanes: bool,
-    /// The lanes of stop signs, where a format states only where they stand.
+    /// The lanes of stop signs, where a format states only their positions.
     pub infer_stop_sign_lanes: bool,
-    /// Colours of lights for up to four seconds between two sightings of the same colour, in
-    /// recordings that lose sight of lights (Waymo's); up to the present, between two sightings up
-    /// to the present. Official metrics read what was recorded.
+    /// Colours of lights for up to four seconds between two observations of the same colour, in
+    /// recordings that lose sight of lights (Waymo's); up to the present, between two observations
+    /// up to the present. Official metrics use the recorded values.
     pub infer_light_gaps: bool,
-    /// The ego's route from its logged path, **future included**: it tells where the ego went,
-    /// as a navigation system would; it does not tell when or how.
+    /// The ego's route from its logged path, **including the future**: it reveals where the ego
+    /// went, as a navigation system would, but not when or how.
     pub infer_route: bool,
-    /// Who the ego is, where a format does not say; otherwise such a record has no ego and is
-    /// refused.
+    /// The ego, where a format does not state it; otherwise such a record is refused.
     pub infer_ego: bool,
-    /// Whom to predict, in formats that have no such list: up to eight moving agents near the ego
-    /// that stay for at least half of the future; otherwise nobody.
+    /// Prediction targets, in formats without them: up to eight moving agents near the ego that are
+    /// present for at least half of the future; otherwise none.
     pub infer_targets: bool,
-    /// Sizes of agents by their class; otherwise agents without a size are left out.
+    /// Sizes of agents by their class; otherwise agents without a size are dropped.
     pub infer_sizes: bool,
     /// Velocities from positions and headings from velocities; otherwise states without them are
-    /// left out.
+    /// dropped.
     pub infer_motion: bool,
     /// Elevations of agents from the map; otherwise 0.
     pub infer_elevation: bool,
-    /// Replaces tracks by a smoothed version, with velocities and headings that fit: for noisy
-    /// recordings such as NGSIM. Looks 0.3 s to both sides, **at the present too**. Never on by
+    /// Replaces tracks by a smoothed version, with consistent velocities and headings: for noisy
+    /// recordings such as NGSIM. Uses 0.3 s on both sides, **at the present too**. Never on by
     /// default.
     pub smooth: bool,
-    /// Gives a recording without agents, a map alone, one parked vehicle on its longest lane as
-    /// the ego; otherwise it is refused. Never on by default.
+    /// Gives a recording without agents (a map alone) one parked vehicle on its longest lane as the
+    /// ego; otherwise it is refused. Never on by default.
     pub park_an_ego: bool,
 }
 
 impl ReadOptions {
-    /// Takes only what a format states.
+    /// No inference.
     pub const STATED: Self = Self {
         infer_lane_graph: false,
         infer_speed_limits: false,
@@ -168,7 +165,7 @@ impl ReadOptions {
         smooth: false,
         park_an_ego: false,
     };
-    /// Fills every gap that can be filled; smooths nothing.
+    /// Fills every gap; no smoothing.
     pub const ALL: Self = Self {
         infer_lane_graph: true,
         infer_speed_limits: true,

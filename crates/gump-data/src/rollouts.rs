@@ -18,8 +18,8 @@
 //! | `event` | text | `birth` at the first step of an agent that comes after the present, `departure` at the first step without it |
 //!
 //! The table is a full grid: as many rows per rollout and track as there are steps, sorted in this
-//! order. So `x` of a table is an array of shape [rollout, track, step] once it is reshaped. A track
-//! that any rollout of a scenario has stands in all of them.
+//! order, so that a column can be reshaped to [rollout, track, step]. A track that is in any
+//! rollout of a scenario has rows in all of them.
 
 use std::collections::BTreeMap;
 use std::path::Path;

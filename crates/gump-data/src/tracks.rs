@@ -1,4 +1,4 @@
-//! Tracks as a Parquet table, one row per agent and step: for looking at data with other tools.
+//! Tracks as a Parquet table, one row per agent and step, for analysis with other tools.
 //!
 //! | column | type | what |
 //! |---|---|---|
@@ -12,8 +12,8 @@
 //! | `vx`, `vy` | f64 | world frame, metres per second |
 //! | `length`, `width` | f64 | metres |
 //!
-//! Rows are sorted by track and time, scenarios come in the order given. Maps and lights have no
-//! place here, so a table is not read back as scenarios.
+//! Rows are sorted by track and time, scenarios come in the order given. Maps and lights are not
+//! included, so a table is not read back as scenarios.
 
 use std::borrow::Borrow;
 use std::collections::BTreeMap;

@@ -1,7 +1,8 @@
-//! Whether every record of a file or directory is sound.
+//! Verification of every record of a file or directory.
 //!
-//! What breaks a promise of the format or of [`Scenario`] is **broken**. What is legal but odd (two
-//! cars that overlap, a car that jumps) is **suspicious**: real recordings have some of it.
+//! A violation of the format or of the invariants of [`Scenario`] is **broken**. Valid but unusual
+//! content (two cars that overlap, a car that jumps) is **suspicious**: real recordings contain
+//! some of it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -15,22 +16,22 @@ use crate::io::files;
 use crate::record::OVERLAP_TOLERANCE;
 use crate::{DataError, ReadOptions, ReadReport, ScenarioRecord, open_with};
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Legal but odd.
+    /// Valid but unusual.
     Suspicious,
-    /// Unusable as it is.
+    /// Unusable.
     Broken,
 }
 
-/// One thing that is wrong.
+/// One problem.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// How bad it is.
+    /// Its severity.
     pub severity: Severity,
-    /// What kind of problem, the key in [`Verification::counts`].
+    /// The kind of problem, the key in [`Verification::counts`].
     pub problem: &'static str,
     /// The scenario's id; empty if the record could not be read.
     pub scenario: String,
@@ -38,25 +39,25 @@ pub struct Finding {
     pub detail: String,
 }
 
-/// What a check of files found.
+/// The result of a verification.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Verification {
-    /// Scenarios that could be read.
+    /// Number of readable scenarios.
     pub scenarios: usize,
     /// Findings by kind of problem.
     pub counts: BTreeMap<&'static str, usize>,
     /// The findings, in file order; at most [`MAX_FINDINGS`].
     pub findings: Vec<Finding>,
-    /// What each format holds, by its name.
+    /// Content by format name.
     pub formats: BTreeMap<&'static str, FormatCounts>,
-    /// Files that hold no scenarios, by what they are.
+    /// Files without scenarios, by kind.
     pub skipped: BTreeMap<&'static str, usize>,
-    /// What was left out and what was added, over all scenarios.
+    /// Dropped and inferred items, over all scenarios.
     #[serde(flatten)]
     pub report: ReadReport,
 }
 
-/// What the files of one format hold.
+/// Content of the files of one format.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct FormatCounts {
     /// Files.
@@ -75,17 +76,17 @@ pub struct FormatCounts {
     pub with_lights: usize,
     /// Scenarios with a route, stated or inferred.
     pub with_route: usize,
-    /// Things left out.
+    /// Dropped items.
     pub dropped: usize,
-    /// Things added.
+    /// Inferred items.
     pub inferred: usize,
-    /// Findings that make something unusable.
+    /// Findings of severity broken.
     pub broken: usize,
-    /// Findings that are odd.
+    /// Findings of severity suspicious.
     pub suspicious: usize,
 }
 
-/// So many findings are kept one by one; all are counted.
+/// Maximum number of findings that are listed; all are counted.
 pub const MAX_FINDINGS: usize = 20_000;
 
 impl Verification {
@@ -94,7 +95,7 @@ impl Verification {
         self.formats.values().any(|counts| counts.broken > 0)
     }
 
-    /// Adds what another check found.
+    /// Adds the result of another verification.
     pub fn merge(&mut self, other: Self) {
         self.scenarios += other.scenarios;
         for (problem, n) in other.counts {
@@ -155,8 +156,8 @@ impl FormatCounts {
     }
 }
 
-/// Reads every record of a file, or of every file of a directory and its subdirectories, checksums
-/// included, and checks each scenario.
+/// Reads every record of a file, or of every file of a directory and its subdirectories, including
+/// checksums, and checks each scenario.
 ///
 /// # Errors
 /// Those of [`crate::open`] for a file; in a directory files that cannot be opened are findings.
@@ -177,8 +178,8 @@ pub fn verify(path: &Path) -> Result<Verification, DataError> {
     Ok(result)
 }
 
-/// Checks one file among others: what cannot be opened is a finding, what holds no scenarios is
-/// counted.
+/// Checks one file among others: a file that cannot be opened is a finding, one without scenarios
+/// is counted.
 pub fn verify_one_of_many(file: &Path) -> Verification {
     let mut result = Verification::default();
     match registry::role(file) {
@@ -264,7 +265,7 @@ fn found(severity: Severity, problem: &'static str, detail: String) -> Finding {
     }
 }
 
-/// Everything odd about one scenario, without its id.
+/// All unusual properties of one scenario, without its id.
 fn scenario_findings(record: &ScenarioRecord) -> Vec<Finding> {
     let scenario = &record.scenario;
     let mut findings = Vec::new();

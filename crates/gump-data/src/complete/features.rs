@@ -1,7 +1,7 @@
-//! Map features from plain points: lanes, lines, edges and areas that are well-formed or dropped.
+//! Map features from plain points: lanes, lines, edges and areas, valid or dropped.
 //!
-//! Every reader whose format lists points builds its map here, so that damage is treated and
-//! counted alike. Nothing is inferred.
+//! Every reader whose format lists points builds its map here, so that damage is handled and
+//! counted in the same way. Nothing is inferred.
 
 use gump_geometry::{DVec2, DVec3, Polygon, Polyline};
 use gump_scene::{
@@ -13,7 +13,7 @@ use super::infer;
 use crate::ReadReport;
 use crate::error::MAX_COORDINATE;
 
-/// Points of a line in the plane and their heights; unsound points are left out and named.
+/// Points of a line in the plane and their heights; invalid points are dropped and listed.
 ///
 /// `None` and a count if no point remains.
 pub(crate) fn line(
@@ -82,8 +82,8 @@ pub(crate) fn add_road_edge(
         }));
 }
 
-/// Adds an area; outlines that cross themselves are kept, for their inside is still told by the
-/// even-odd rule, and counted.
+/// Adds an area. Outlines that cross themselves are kept, because the even-odd rule still defines
+/// their inside, and counted.
 pub(crate) fn add_area(
     parts: &mut MapParts,
     id: i64,
@@ -123,7 +123,7 @@ pub(crate) fn polygon(id: i64, points: &[DVec3], report: &mut ReadReport) -> Opt
     polygon
 }
 
-/// The points that are places; a height that is none becomes that of the point before.
+/// The valid points; an invalid height is replaced by that of the previous point.
 pub(crate) fn sound_points(id: i64, points: &[DVec3], report: &mut ReadReport) -> Vec<DVec3> {
     let sound = |v: f64| v.abs() <= MAX_COORDINATE;
     let mut kept: Vec<DVec3> = Vec::with_capacity(points.len());

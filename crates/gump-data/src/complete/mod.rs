@@ -1,5 +1,5 @@
-//! From what a format states to a whole scenario: gaps of tracks and maps filled by one set of
-//! rules for all formats. Start with `recording`.
+//! Completion of scenarios: gaps of tracks and maps are filled by one set of rules for all formats.
+//! Start with `recording`.
 
 pub(crate) mod features;
 pub(crate) mod infer;

@@ -1,7 +1,7 @@
-//! Velocities and headings that a format leaves out, and smoother ones where it is noisy.
+//! Velocities and headings that a format lacks, and smoothing of noisy ones.
 //!
-//! What is filled in up to the present comes from states up to the present; smoothing, which is off
-//! unless asked for, looks ahead.
+//! Values up to the present are computed from states up to the present; smoothing, which is off by
+//! default, uses later ones.
 
 use std::f64::consts::PI;
 
@@ -10,18 +10,18 @@ use gump_geometry::{DVec2, angle_difference, interpolate_angle};
 use super::track::{State, Track};
 use crate::{ReadOptions, ReadReport};
 
-/// No state moves faster, metres per second: beyond twice the speed record of cars.
+/// A faster state is invalid, metres per second: beyond twice the speed record of cars.
 const MAX_SPEED: f64 = 1000.0;
-/// Slower than this, metres per second, the direction of motion says nothing about the heading.
+/// Below this speed, metres per second, the direction of motion does not determine the heading.
 const MIN_SPEED: f64 = 0.5;
-/// States further apart than this many steps do not tell a velocity.
+/// States farther apart than this number of steps give no velocity.
 const MAX_GAP: usize = 10;
 /// Standard deviation of the smoothing window, seconds: passes 0.5 Hz, at which drivers act, by
 /// 95 % and takes away what changes faster than once in half a second.
 const SMOOTHING: f64 = 0.1;
 
-/// Fills in velocities from positions, then headings from velocities; states for which that cannot
-/// be done are left out. `now` is the present step, `dt` the seconds between steps.
+/// Fills in velocities from positions, then headings from velocities; states without either are
+/// dropped. `now` is the present step, `dt` the seconds between steps.
 pub(crate) fn complete(
     track: &mut Track,
     now: usize,
@@ -85,7 +85,7 @@ fn velocities(states: &[State], past: usize, dt: f64) -> Vec<DVec2> {
     (0..states.len()).map(velocity).collect()
 }
 
-/// Headings from the direction of motion; where there is little, the one known before, at first
+/// Headings from the direction of motion; where there is little, the last one known, initially
 /// `last` or else the first that is known. Returns the last one, if any is known.
 fn complete_headings(states: &mut [State], last: Option<f64>) -> Option<f64> {
     let known: Vec<Option<f64>> = states

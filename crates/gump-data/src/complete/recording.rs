@@ -1,8 +1,8 @@
-//! Tracks as formats state them become the frames of a [`Scenario`].
+//! Conversion of tracks as stated by formats to the frames of a [`Scenario`].
 //!
-//! Formats differ in what they leave out; here are the rules for all that is missing or damaged:
-//! single states and tracks that are unusable are left out, counted and named, the rest is kept.
-//! Maps are built elsewhere (`features`, `infer`). Start with [`assemble`].
+//! This module has the rules for missing and damaged data of tracks: unusable states and tracks are
+//! dropped, counted and listed, and the rest is kept. Maps are built elsewhere (`features`,
+//! `infer`). Start with [`assemble`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -18,8 +18,8 @@ use super::{infer, motion};
 use crate::error::MAX_COORDINATE;
 use crate::{Problem, ReadOptions, ReadReport};
 
-/// The most frames a recording may have: an hour at 50 Hz. A false time stamp would otherwise ask
-/// for any amount of memory.
+/// Maximum number of frames of a recording: an hour at 50 Hz. An invalid time stamp could otherwise
+/// require any amount of memory.
 pub(crate) const MAX_STEPS: usize = 180_000;
 
 /// Everything but the map of one scenario.
@@ -27,7 +27,7 @@ pub(crate) struct Recording {
     pub(crate) id: String,
     /// Seconds between steps.
     pub(crate) dt: f64,
-    /// How many steps there are; states beyond are left out.
+    /// Number of steps; states beyond are dropped.
     pub(crate) steps: usize,
     /// Index of the present step.
     pub(crate) now: usize,
@@ -36,7 +36,7 @@ pub(crate) struct Recording {
     pub(crate) tracks: Vec<Track>,
     /// Lights with their step.
     pub(crate) lights: Vec<(usize, Light)>,
-    /// Whom to predict; `None` where the format has no list of them.
+    /// Prediction targets; `None` where the format has no list of them.
     pub(crate) targets: Option<Vec<i64>>,
     pub(crate) objects_of_interest: Vec<i64>,
     pub(crate) tags: Vec<ScenarioTag>,
@@ -44,7 +44,7 @@ pub(crate) struct Recording {
 }
 
 impl Recording {
-    /// A recording of nobody: what a map alone is.
+    /// A recording without agents, for a map alone.
     pub(crate) fn of_nobody(id: String) -> Self {
         Self {
             id,
@@ -62,11 +62,11 @@ impl Recording {
     }
 }
 
-/// No agent on a road is longer, metres: a road train measures 54 m.
+/// Maximum length of an agent, metres: a road train measures 54 m.
 const MAX_SIZE: f64 = 100.0;
 
-/// Which track to take for the ego where none is stated: the vehicle present now that is seen
-/// longest, of several the one that drives furthest.
+/// The track to use as the ego where none is stated: the vehicle present now that is observed
+/// longest; of several, the one that drives farthest.
 pub(crate) fn best_covered(tracks: &[Track], now: usize) -> Option<i64> {
     let driven = |track: &Track| {
         let (first, last) = (track.states.first(), track.states.last());
@@ -90,7 +90,7 @@ pub(crate) fn best_covered(tracks: &[Track], now: usize) -> Option<i64> {
     best.map(|track| track.id)
 }
 
-/// Builds the map and the frames, fills what is missing, and checks the result.
+/// Builds the map and the frames, fills gaps, and checks the result.
 ///
 /// Error: the first [`Problem`] that concerns the recording as a whole.
 pub(crate) fn assemble(
@@ -190,7 +190,7 @@ fn parked(map: &MapGraph) -> Option<Track> {
     })
 }
 
-/// Leaves out tracks and states that cannot be used; sorts states by step.
+/// Drops tracks and states that cannot be used; sorts states by step.
 fn sound_tracks(recording: &mut Recording, report: &mut ReadReport) {
     let (steps, mut ids) = (recording.steps, BTreeSet::new());
     recording.tracks.retain_mut(|track| {
@@ -237,8 +237,8 @@ fn sound_tracks(recording: &mut Recording, report: &mut ReadReport) {
     });
 }
 
-/// Gives every state a size that is one: the first that is stated, up to the present the first that
-/// is stated up to then, or else that of the class.
+/// Gives every state a valid size: the first stated one, up to the present the first stated up to
+/// then, or else the default of the class.
 fn complete_sizes(track: &mut Track, now: usize, options: ReadOptions, report: &mut ReadReport) {
     let unstated = |size: &[f64; 3]| size[..2].iter().all(|extent| extent.is_nan());
     let mut states = track.states.iter();
@@ -294,7 +294,7 @@ fn fill_sizes(states: &mut [State], fallback: Option<[f64; 3]>, options: ReadOpt
 /// Metres between two looks at the map's height: it changes slowly.
 const ELEVATION_SPACING: f64 = 3.0;
 
-/// Puts agents of unstated elevation onto the map.
+/// Sets the elevation of agents without one to that of the map.
 fn complete_elevations(
     track: &mut Track,
     map: &MapGraph,

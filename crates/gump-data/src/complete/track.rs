@@ -1,4 +1,4 @@
-//! A track: what a format states of one agent over time.
+//! A track: the states of one agent as stated by a format.
 
 use gump_geometry::{DVec2, DVec3};
 use gump_scene::AgentKind;
@@ -9,7 +9,7 @@ pub(crate) struct Track {
     pub(crate) kind: AgentKind,
     /// Length, width, height in metres where the format states none for this one.
     pub(crate) usual_size: [f64; 3],
-    /// Where it is present; need not be sorted.
+    /// States where it is present; need not be sorted.
     pub(crate) states: Vec<State>,
 }
 

@@ -1,4 +1,4 @@
-//! Formats with one scenario a file, read whole.
+//! Formats with one scenario per file, read as a whole.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -1,11 +1,12 @@
-//! GPUDrive's and Nocturne's JSON: Waymo scenarios, one a file, plain or gzip.
+//! GPUDrive's and Nocturne's JSON: Waymo scenarios, one per file, plain or gzip.
 //!
-//! Three generations exist: Nocturne's (no ids, headings in degrees), one with traffic lights, and
-//! GPUDrive's with `metadata`. What they lack is inferred: the lane graph, and in the older ones
-//! the ego. Headings are in degrees if that agrees better with the motion. Only `valid` says whether a state counts; the values of invalid ones
-//! (-10000, 0) are never looked at, because real places share them.
+//! There are three generations: Nocturne's (no ids, headings in degrees), one with traffic lights,
+//! and GPUDrive's with `metadata`. The lane graph is inferred, and in the older ones the ego.
+//! Headings are in degrees if that agrees better with the motion. Only `valid` determines whether a
+//! state counts; the values of invalid ones (-10000, 0) are never used, because real places have
+//! them too.
 //!
-//! Source: the files themselves; 201 of them were looked through.
+//! Source: the files themselves; 201 of them were examined.
 
 use std::collections::BTreeMap;
 use std::path::Path;

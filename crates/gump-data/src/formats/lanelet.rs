@@ -1,6 +1,6 @@
-//! Lanes given by their left and right bound: centre line, width and outline.
+//! Lanes given by their left and right bounds: centre line, width and outline.
 //!
-//! Argoverse 2, CommonRoad and Lanelet2 describe lanes like this.
+//! Used by Argoverse 2, CommonRoad and Lanelet2.
 
 use gump_geometry::{DVec2, DVec3, Polygon, Polyline};
 use gump_scene::{Lane, LaneKind};

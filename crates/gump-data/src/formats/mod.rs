@@ -1,7 +1,7 @@
-//! The formats: a file or a folder for each, and the table of them.
+//! The formats: a file or a folder for each, and their registry.
 //!
-//! A format tells what a file states. What it leaves out is filled in by `complete`, bytes come
-//! from `io`. Start with `registry`; `womd` is the format that most others are measured by.
+//! A format reads what a file states. `complete` fills gaps, `io` reads bytes. Start with
+//! `registry`; `womd` is the reference for most others.
 
 #[cfg(feature = "argoverse2")]
 pub(crate) mod argoverse2;

@@ -1,8 +1,8 @@
-//! What a file is, told from content.
+//! Detection of formats from content.
 //!
-//! The table of formats is here: a new one is one line in [`FORMATS`]. Files that belong to a
-//! format without holding scenarios (maps, calibrations, recordings of lights) are in
-//! [`COMPANIONS`]. How a file is read is its format's affair.
+//! The table of formats: a new one is one line in [`FORMATS`]. Files that belong to a format
+//! without containing scenarios (maps, calibrations, recordings of lights) are in [`COMPANIONS`].
+//! Each format reads its own files.
 
 use std::path::Path;
 
@@ -75,17 +75,17 @@ static COMPANIONS: &[Companion] = &[
 /// is not recognised is damaged rather than something else.
 const BINARY_NAMES: [&str; 4] = [".tfrecord", ".parquet", ".feather", ".db"];
 
-/// What a file is.
+/// The kind of a file.
 pub(crate) enum Role {
-    /// It holds scenarios.
+    /// It contains scenarios.
     Scenarios(&'static Format),
-    /// It belongs to a format but holds no scenarios.
+    /// It belongs to a format but contains no scenarios.
     Companion(&'static str),
-    /// It is of no known kind: what can be said of it, and the error if it is asked for.
+    /// It is of no known kind: a description, and the error for opening it.
     Unknown(&'static str, DataError),
 }
 
-/// Looks at the beginning of a file.
+/// Examines the beginning of a file.
 ///
 /// Error: those of opening it, [`DataError::Empty`], and [`DataError::UnknownFormat`] for content
 /// of no known kind under a name that promises scenarios, or for bytes that are no text.

@@ -1,4 +1,4 @@
-//! Which files there are: those of a folder and its subfolders, in one order everywhere.
+//! Lists of files: those of a folder and its subfolders, in a fixed order.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::stream::io_error;
 use crate::error::{DataError, INCOMPLETE};
 
-/// Every file that `open` would look at: the file itself, or those of a directory and its
+/// Every file that `open` would read: the file itself, or those of a directory and its
 /// subdirectories in order of their paths. Files being written (`*.partial`) and hidden ones are
 /// left out; links are followed, but into no directory twice.
 ///
@@ -29,8 +29,8 @@ fn is_mark(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name == INCOMPLETE)
 }
 
-/// As [`list`], in folders that are being made too: for who makes them. The mark is among the
-/// files.
+/// As [`list`], but also in folders whose creation has not finished, for the code that creates
+/// them. The mark is among the files.
 ///
 /// # Errors
 /// [`DataError::Missing`], and [`DataError::Io`] for a directory that cannot be listed.

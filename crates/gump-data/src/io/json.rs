@@ -1,4 +1,5 @@
-//! What the JSON formats share: bounded reading, numbers that may be missing, keys of a beginning.
+//! Shared code of the JSON formats: bounded reading, numbers that may be missing, keys at the
+//! beginning of a document.
 
 use std::fmt;
 use std::path::Path;

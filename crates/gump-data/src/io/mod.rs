@@ -1,4 +1,4 @@
-//! Bytes in and out: streams, documents, tables, folders. Nothing here knows of traffic.
+//! Input and output of bytes: streams, documents, tables, folders; independent of traffic.
 
 #[cfg(feature = "parquet")]
 pub(crate) mod columns;

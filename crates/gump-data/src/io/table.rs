@@ -1,7 +1,7 @@
-//! Tables as Parquet files, for pandas, polars and whoever else reads them.
+//! Tables as Parquet files, for pandas, polars and similar libraries.
 //!
-//! Start with [`Table`]: named columns of text, integers, numbers or truths, all equally long. What
-//! a table of tracks or of rollouts looks like is the business of `tracks` and `rollouts`.
+//! Start with [`Table`]: named columns of text, integers, numbers or booleans of equal length.
+//! `tracks` and `rollouts` define their tables.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -56,14 +56,14 @@ impl Table {
         self.column(name, DataType::Int64, Arc::new(values))
     }
 
-    /// Adds a column of 64-bit floating-point numbers; what is not a number is missing.
+    /// Adds a column of 64-bit floating-point numbers; values that are not finite are missing.
     pub fn number(self, name: &str, values: impl IntoIterator<Item = Option<f64>>) -> Self {
         let numbers = values.into_iter().map(|v| v.filter(|v| !v.is_nan()));
         let values = Float64Array::from_iter(numbers);
         self.column(name, DataType::Float64, Arc::new(values))
     }
 
-    /// Adds a column of what is true or false.
+    /// Adds a column of booleans.
     pub fn truth(self, name: &str, values: impl IntoIterator<Item = Option<bool>>) -> Self {
         let values = BooleanArray::from_iter(values);
         self.column(name, DataType::Boolean, Arc::new(values))
@@ -87,7 +87,7 @@ impl Table {
         self.fields.iter().map(|field| field.name().as_str())
     }
 
-    /// What the columns hold, in their order: `text`, `integer`, `number` or `truth`.
+    /// Types of the columns, in order: `text`, `integer`, `number` or `truth`.
     pub fn kinds(&self) -> impl Iterator<Item = &'static str> {
         self.fields.iter().map(|field| match field.data_type() {
             DataType::Utf8 => "text",
@@ -97,7 +97,7 @@ impl Table {
         })
     }
 
-    /// Rows of the table.
+    /// Number of rows.
     pub fn n_rows(&self) -> usize {
         self.columns.first().map_or(0, |column| column.len())
     }
@@ -111,7 +111,7 @@ impl Table {
     }
 }
 
-/// Writes tables with the columns of `like` as one, below one another.
+/// Writes several tables with the columns of `like` as one, one below the other.
 ///
 /// # Errors
 /// [`DataError::Io`].

@@ -1,6 +1,6 @@
 //! TFRecord framing: length, masked CRC-32C of the length, payload, masked CRC-32C of the payload.
 //!
-//! Nothing here knows what a payload means. Start with [`TfRecordReader`].
+//! Payloads are not interpreted. Start with [`TfRecordReader`].
 //!
 //! Source: section "TFRecords format details" of the TensorFlow documentation; checked against
 //! the checksums of real files.
@@ -11,10 +11,10 @@ use std::path::PathBuf;
 use super::stream::{Stream, io_error};
 use crate::{DataError, Place};
 
-/// The longest payload accepted, bytes.
+/// The maximum length of a payload, bytes.
 ///
-/// Scenario records measure about 1 MB without and 25 MB with lidar; a length beyond this is
-/// taken for damage rather than obeyed.
+/// Scenario records have about 1 MB without and 25 MB with lidar; a length beyond this is treated
+/// as damage.
 pub const MAX_RECORD_BYTES: u64 = 256 << 20;
 
 /// Bytes of a record's header: length and its checksum.
@@ -35,7 +35,7 @@ pub fn is_tfrecord(head: &[u8]) -> bool {
 
 /// Reads payloads one at a time; memory is bounded by one record.
 ///
-/// After a broken payload checksum reading goes on with the next record; after any other error
+/// After an invalid payload checksum, reading continues with the next record; after any other error
 /// the position is lost and the iterator ends.
 pub struct TfRecordReader {
     stream: Stream,
@@ -82,7 +82,7 @@ impl TfRecordReader {
         }
     }
 
-    /// Passes over the next record: its payload is not looked at and may be damaged.
+    /// Skips the next record without checking its payload.
     ///
     /// # Errors
     /// Those of reading, without that of the payload's checksum.

@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all.
+//! Atomic writing of files.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -8,13 +8,13 @@ use std::path::Path;
 use super::stream::io_error;
 use crate::DataError;
 
-/// Writes a file beside `path` as `NAME.partial` and renames it once it is complete.
+/// Writes a file as `NAME.partial` beside `path` and renames it once it is complete.
 ///
-/// Missing directories are created. If `write` fails the partial file is removed and whatever was
-/// at `path` before stays.
+/// Missing directories are created. If `write` fails, the partial file is removed and an existing
+/// file at `path` is kept.
 ///
 /// # Errors
-/// Whatever `write` returns, and [`DataError::Io`] for the file itself.
+/// Errors of `write`, and [`DataError::Io`] for the file itself.
 pub fn write_atomically<T, E: From<DataError>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<T, E>,

@@ -1,7 +1,7 @@
-//! XML as a tree, for formats whose files are one document.
+//! XML documents as a tree.
 //!
-//! Only elements, attributes and plain text: what the formats here use. Bounded in bytes, elements
-//! and depth.
+//! Supports elements, attributes and plain text only, which the formats here use. Size, number of
+//! elements and depth are bounded.
 
 use std::path::Path;
 

@@ -1,7 +1,7 @@
-//! The archive that the sim agents challenge takes: shards in a gzipped tar.
+//! The archive of a sim agents submission: shards in a gzipped tar.
 //!
-//! Start with [`ArchiveWriter`]; [`check_archive`] reads one back against the rules. Scenarios pass
-//! through one at a time, whatever the size.
+//! Start with [`ArchiveWriter`]; [`check_archive`] checks one against the rules. Scenarios are
+//! processed one at a time.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -19,17 +19,17 @@ use crate::io::stream::{self, io_error};
 use crate::{DataError, write_atomically};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 
-/// A shard is closed once it holds this much; protobuf ends at 2 GB.
+/// A shard is closed at this size; protobuf has a limit of 2 GB.
 const SHARD_BYTES: u64 = 1 << 30;
-/// Problems kept as sentences; beyond this they are only counted.
+/// Maximum number of problems kept as sentences; further ones are only counted.
 const MAX_SENTENCES: usize = 1000;
 /// What the names of shards start with.
 const SHARD_STEM: &str = "submission.binproto";
 
-/// Packs the futures of many scenarios.
+/// Writes an archive with the futures of many scenarios.
 ///
-/// Shards wait in unnamed files beside the archive, which appears under its name only when it is
-/// whole; dropping the writer leaves nothing behind.
+/// Shards are kept in unnamed files beside the archive, which appears under its name only when it
+/// is complete; dropping the writer leaves nothing behind.
 pub struct ArchiveWriter {
     path: PathBuf,
     metadata: SimAgentsChallengeSubmission,
@@ -39,7 +39,7 @@ pub struct ArchiveWriter {
 }
 
 impl ArchiveWriter {
-    /// Begins an archive; `metadata` says who made it and holds no futures.
+    /// Begins an archive; `metadata` states the authors and contains no futures.
     pub fn create(path: &Path, metadata: SimAgentsChallengeSubmission) -> Self {
         Self {
             path: path.into(),
@@ -128,18 +128,18 @@ impl ArchiveWriter {
     }
 }
 
-/// The scenarios a submission must hold, and the agents of each; a few bytes per agent.
+/// The scenarios that a submission must contain, and the agents of each; a few bytes per agent.
 #[derive(Clone, Debug, Default)]
 pub struct ExpectedScenarios(BTreeMap<String, BTreeSet<AgentId>>);
 
 impl ExpectedScenarios {
-    /// Adds a scenario; who is present now must be simulated.
+    /// Adds a scenario; all its agents in the present must be simulated.
     pub fn add(&mut self, scenario: &Scenario) {
         let agents = super::present_agents(scenario);
         self.0.insert(scenario.id.clone(), agents);
     }
 
-    /// How many there are.
+    /// Number of scenarios.
     pub fn len(&self) -> usize {
         self.0.len()
     }
@@ -150,12 +150,12 @@ impl ExpectedScenarios {
     }
 }
 
-/// What is wrong with a submission, as sentences.
+/// Problems of a submission, as sentences.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SubmissionCheck {
-    /// Scenarios looked at.
+    /// Number of scenarios checked.
     pub scenarios: usize,
-    /// All problems found.
+    /// Number of problems.
     pub n_problems: usize,
     /// The first of them, at most a thousand.
     pub problems: Vec<String>,
@@ -163,7 +163,7 @@ pub struct SubmissionCheck {
 }
 
 impl SubmissionCheck {
-    /// Checks the futures of one scenario; true if nothing is wrong with them.
+    /// Checks the futures of one scenario; true if there is no problem.
     pub fn add(&mut self, rollouts: &ScenarioRollouts, expected: &ExpectedScenarios) -> bool {
         let before = self.n_problems;
         self.scenarios += 1;
@@ -182,7 +182,7 @@ impl SubmissionCheck {
         self.n_problems == before
     }
 
-    /// Adds what is missing, once all scenarios have been added.
+    /// Adds missing scenarios, once all others have been checked.
     pub fn finish(&mut self, expected: &ExpectedScenarios) {
         let missing = expected.0.keys().filter(|id| !self.seen.contains(*id));
         for id in missing.cloned().collect::<Vec<_>>() {
@@ -198,9 +198,9 @@ impl SubmissionCheck {
     }
 }
 
-/// Everything in which the metadata of a submission breaks the rules.
+/// All violations of the rules in the metadata of a submission.
 ///
-/// Source: the comments of the published message, which say what the server requires since 2024.
+/// Source: the comments of the published message, which state the server's requirements since 2024.
 pub fn metadata_problems(metadata: &SimAgentsChallengeSubmission) -> Vec<String> {
     let mut problems = Vec::new();
     let mut require = |holds: bool, problem: &str| {
@@ -256,9 +256,9 @@ fn is_parameter_count(text: &str) -> bool {
     is_number && suffix.is_some_and(|letter| letter.is_ascii_uppercase())
 }
 
-/// Reads an archive back and tells everything in which it breaks the rules of the challenge:
-/// names of shards, who made it, scenarios and agents that are missing, unknown or doubled, wrong
-/// counts, numbers that are not finite.
+/// Reads an archive and lists all violations of the challenge's rules: names of shards, metadata,
+/// scenarios and agents that are missing, unknown or duplicated, wrong counts, numbers that are not
+/// finite.
 ///
 /// # Errors
 /// [`DataError`] if it cannot be read as an archive of shards.

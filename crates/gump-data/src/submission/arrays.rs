@@ -6,7 +6,7 @@
 //! | `.npy` | one array of four axes, which `NAME.json` beside it explains: `scenario`, `axes`, `numbers`, `agents` |
 //! | `.parquet` | [`crate::write_rollouts`] |
 //!
-//! An agent that is missing from some step on stays where it was last, as the challenge has it; one
+//! An agent that is missing from some step on stays at its last position, as in the challenge; one
 //! that is missing in the first step of a rollout is left out of it. Where heights are not stated
 //! the column of heights is empty.
 //!

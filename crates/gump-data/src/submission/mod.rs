@@ -1,8 +1,7 @@
-//! What the Waymo challenges exchange: rollouts of the sim agents challenge (here), the archive
-//! they are submitted in ([`ArchiveWriter`]), predictions of the motion challenge
-//! ([`read_predictions`]).
+//! Files of the Waymo challenges: rollouts of the sim agents challenge (here), the archive of a
+//! submission ([`ArchiveWriter`]), predictions of the motion challenge ([`read_predictions`]).
 //!
-//! Start with [`write_rollouts`] and [`read_rollouts`]; [`submission_problems`] knows the rules.
+//! Start with [`write_rollouts`] and [`read_rollouts`]; [`submission_problems`] checks the rules.
 
 mod archive;
 mod arrays;
@@ -29,13 +28,13 @@ pub use motion::{
     read_predictions, write_predictions,
 };
 
-/// Futures the challenge asks for, per scenario.
+/// Number of futures that the challenge requires, per scenario.
 pub const N_FUTURES: usize = 32;
-/// Steps the challenge asks for, per future: 8 s at 10 Hz.
+/// Number of steps that the challenge requires, per future: 8 s at 10 Hz.
 pub const N_STEPS: usize = 80;
 
-/// Writes one scenario's futures as a binary `ScenarioRollouts` message and returns how many
-/// missing states were filled in, see [`rollouts_to_proto`].
+/// Writes one scenario's futures as a binary `ScenarioRollouts` message and returns the number of
+/// missing states that were filled in, see [`rollouts_to_proto`].
 ///
 /// # Errors
 /// Those of [`rollouts_to_proto`], and [`DataError::Io`].
@@ -53,11 +52,11 @@ pub fn write_rollouts(
     Ok(n_held)
 }
 
-/// Turns futures into a message: every agent present at the start, every imagined step.
+/// Converts futures to a message: every agent present at the start, every simulated step.
 ///
-/// z is the agent's elevation. The challenge knows no absence, so an agent that a world has
-/// removed stays where it was last; the number of such states is returned beside the message.
-/// Agents that appear later are left out, as the challenge has them.
+/// z is the agent's elevation. The challenge has no absent agents, so an agent that a world has
+/// removed stays at its last position; the number of such states is returned with the message.
+/// Agents that appear later are left out, as in the challenge.
 ///
 /// # Errors
 /// [`DataError::Unwritable`] if an agent's id exceeds 32 bits.
@@ -111,11 +110,11 @@ fn trajectory(rollout: &Rollout, id: AgentId, object_id: i32) -> (SimulatedTraje
 }
 
 /// Reads a file of rollouts, plain or gzip: one `ScenarioRollouts` message, one shard of a
-/// submission, or arrays (`.npz`, `.npy` with the JSON beside it that says what its axes are,
-/// `.parquet` as [`crate::write_rollouts`] writes it). What a file is shows in its content.
+/// submission, or arrays (`.npz`, `.npy` with the JSON beside it that describes its axes,
+/// `.parquet` as [`crate::write_rollouts`] writes it). The kind is detected from the content.
 ///
-/// In arrays an agent that is missing from some step on stays where it was last. Where they state no
-/// heights, the columns of heights are empty.
+/// In arrays an agent that is missing from some step on stays at its last position. Where they have
+/// no heights, the columns of heights are empty.
 ///
 /// # Errors
 /// [`DataError::Missing`], [`DataError::Empty`], [`DataError::Io`], [`DataError::Proto`], and
@@ -162,14 +161,14 @@ pub fn encode_rollouts(message: &ScenarioRollouts) -> Vec<u8> {
     message.encode_to_vec()
 }
 
-/// Turns a message into rollouts of `scenario`: its history, then one frame per step.
+/// Converts a message to rollouts of `scenario`: its history, then one frame per step.
 ///
 /// Sizes and kinds are those at the present, velocities are differences of positions, headings
 /// are wrapped to [-π, π), lights stay as they are at the present.
 ///
 /// # Errors
 /// [`Problem::Rollouts`] if the message does not fit the scenario: another id, agents that are
-/// missing, unknown or doubled, columns of different lengths, numbers that are not finite.
+/// missing, unknown or duplicated, columns of different lengths, numbers that are not finite.
 pub fn rollouts_from_proto(
     message: &ScenarioRollouts,
     scenario: &Scenario,
@@ -221,7 +220,7 @@ fn rollout(scene: &JointScene, scenario: &Scenario) -> Rollout {
     rollout
 }
 
-/// Everything in which a message breaks the rules of the challenge; empty if it may be submitted.
+/// All violations of the challenge's rules in a message; empty if it may be submitted.
 ///
 /// Source: the published submission checks of the Waymo sim agents challenge.
 pub fn submission_problems(message: &ScenarioRollouts, scenario: &Scenario) -> Vec<String> {
@@ -243,7 +242,7 @@ fn present_agents(scenario: &Scenario) -> BTreeSet<AgentId> {
     present.iter().map(|agent| agent.id).collect()
 }
 
-/// What is wrong with the futures of a scenario in which these agents are present now.
+/// Problems in the futures of a scenario with these agents in the present.
 fn rollouts_problems(message: &ScenarioRollouts, present: &BTreeSet<AgentId>) -> Vec<String> {
     let mut problems = Vec::new();
     let n_futures = message.joint_scenes.len();

@@ -1,7 +1,7 @@
-//! Predictions as the Waymo motion prediction challenge exchanges them.
+//! Predictions in the messages of the Waymo motion prediction challenge.
 //!
-//! Start with [`read_predictions`] and [`predictions_from_proto`]; measuring them is the business
-//! of `gump_wosac::motion`.
+//! Start with [`read_predictions`] and [`predictions_from_proto`]; `gump_wosac::motion` scores
+//! them.
 
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
@@ -19,7 +19,7 @@ use gump_proto::motion::{
     Trajectory,
 };
 
-/// Positions the challenge asks for, per path: 8 s at 2 Hz.
+/// Number of positions that the challenge requires, per path: 8 s at 2 Hz.
 pub const N_POSITIONS: usize = 16;
 /// Agents of an interaction prediction.
 const N_INTERACTING: usize = 2;
@@ -58,13 +58,13 @@ pub fn write_predictions(
     })
 }
 
-/// Turns the message of one scenario into predictions: one per object, or a single joint one.
+/// Converts the message of one scenario to predictions: one per object, or a single joint one.
 ///
-/// The paths of a joint prediction are put into the order of its first mode. Whether they fit a
-/// scenario is not looked at, see [`prediction_problems`].
+/// The paths of a joint prediction are put into the order of its first mode. Consistency with a
+/// scenario is not checked here, see [`prediction_problems`].
 ///
 /// # Errors
-/// [`Problem::Predictions`] if the message holds no predictions, a path has more positions in one
+/// [`Problem::Predictions`] if the message has no predictions, a path has more positions in one
 /// direction than in the other, or the modes of a joint prediction are of different objects.
 pub fn predictions_from_proto(
     message: &ChallengeScenarioPredictions,
@@ -144,7 +144,7 @@ fn path(
     Ok(x.iter().zip(y).map(point).collect())
 }
 
-/// Turns the predictions of one scenario into a message: a joint one if one prediction is of
+/// Converts the predictions of one scenario to a message: a joint one if one prediction is of
 /// several agents.
 ///
 /// # Errors
@@ -225,7 +225,7 @@ fn trajectory(path: &[DVec2]) -> Trajectory {
     }
 }
 
-/// Everything in which a message breaks the rules of the challenge; empty if it may be submitted.
+/// All violations of the challenge's rules in a message; empty if it may be submitted.
 ///
 /// Source: the published validation of the Waymo motion prediction challenge.
 pub fn prediction_problems(

@@ -1,7 +1,7 @@
-//! A shard of a sim agents submission, one scenario at a time.
+//! A shard of a sim agents submission, read and written one scenario at a time.
 //!
-//! A shard may hold gigabytes, so it is never decoded whole: its scenarios are fields of one
-//! message, and fields can be read and written one after another.
+//! A shard may have gigabytes, so it is never decoded as a whole: its scenarios are fields of one
+//! message, which can be read and written one after another.
 
 use std::io::{self, BufRead, Read, Write};
 use std::path::PathBuf;
@@ -31,7 +31,8 @@ pub(crate) fn write_scenario(out: &mut impl Write, rollouts: &ScenarioRollouts) 
     Ok((head.len() + payload.len()) as u64)
 }
 
-/// Reads the scenarios of a shard in order; what else there is, who made it, comes at the end.
+/// Reads the scenarios of a shard in order; other fields, such as metadata, are available at the
+/// end.
 pub(crate) struct ShardReader<R> {
     content: R,
     path: PathBuf,

@@ -1,7 +1,8 @@
-//! Surfaces a vehicle may be on, where a format states none.
+//! Drivable surfaces, where a format states none.
 //!
 //! One polygon per lane: from its centre half its width to both sides, but never beyond a road
-//! edge, and out to the road edge where only a shoulder lies between. Driveways count as they are.
+//! edge, and out to the road edge where only a shoulder lies between. Driveways are added
+//! unchanged.
 
 use gump_geometry::{BoxIndex, DVec2, Polygon};
 use gump_scene::{AreaKind, Lane, MapParts};
@@ -9,17 +10,17 @@ use gump_scene::{AreaKind, Lane, MapParts};
 use super::simplify::simplify;
 use crate::ReadReport;
 
-/// How far a lane's outline may stray from its centre line moved sideways, metres.
+/// Maximum deviation of a lane's outline from its offset centre line, metres.
 const TOLERANCE: f64 = 0.05;
 /// Metres between two cross sections at most: road edges bend where lanes are straight.
 const SPACING: f64 = 4.0;
-/// At most so many cross sections between two corners of a lane: a damaged file may claim lanes
+/// Maximum number of cross sections between two corners of a lane: a damaged file may have lanes
 /// around the world.
 const MAX_SECTIONS: f64 = 1000.0;
 /// A strip up to this wide between a lane and the road edge is shoulder or parking bay: a parked
 /// car (2 m) and room for its door.
 const MAX_SHOULDER: f64 = 3.0;
-/// Surfaces overlap their neighbours by this much, metres: estimated widths must leave no slits.
+/// Overlap of neighbouring surfaces, metres, so that errors of estimated widths leave no gaps.
 const OVERLAP: f64 = 0.1;
 /// Edges further above or below the lane than this belong to another level.
 const MAX_STEP: f64 = 2.5;

@@ -10,7 +10,7 @@ use gump_scene::{MapParts, RoadEdge, RoadEdgeKind};
 use super::simplify::simplify;
 use crate::ReadReport;
 
-/// How far outside another surface is looked for, metres: slits are narrower, medians wider.
+/// How far outside other surfaces are searched, metres: gaps are narrower, medians wider.
 const OUTSIDE: f64 = 0.4;
 /// Pieces are at most this long, metres.
 const PIECE: f64 = 2.0;

@@ -1,8 +1,8 @@
-//! Which lanes lie inside an intersection.
+//! Lanes inside intersections.
 //!
-//! A lane does if its centre line crosses that of another lane at the same level, or if it forks
-//! from or joins with a lane that does: a right turn crosses nothing, but shares its start with
-//! the way straight on. Forks and merges alone are no intersection; freeways have them.
+//! A lane is inside one if its centre line crosses that of another lane at the same level, or if it
+//! forks from or joins with a lane that is: a right turn crosses nothing, but shares its start with
+//! the straight lane. Forks and merges alone are no intersections; freeways have them.
 
 use std::collections::BTreeMap;
 

@@ -1,8 +1,8 @@
-//! Which lane leads to which, which lie side by side, and speed limits along the way.
+//! Links and neighbours of lanes, and speed limits along links.
 //!
-//! For formats that state no links at all. A lane leads to those that start where it ends and go
-//! on in about its direction; two lanes are neighbours where they run side by side, a lane's width
-//! apart, in one direction.
+//! For formats that state no links at all. A lane leads to lanes that start at its end and continue
+//! in about its direction; two lanes are neighbours where they run side by side, a lane's width
+//! apart, in the same direction.
 
 use std::collections::BTreeMap;
 
@@ -142,13 +142,12 @@ impl Beside {
     }
 }
 
-/// Nobody changes between a lane for bicycles and one for cars.
+/// Bicycle lanes and car lanes are not neighbours.
 fn alike(a: LaneKind, b: LaneKind) -> bool {
     (a == LaneKind::BikeLane) == (b == LaneKind::BikeLane)
 }
 
-/// Gives lanes without a speed limit the mean of the lanes before, after and beside, as far as
-/// that spreads.
+/// Gives lanes without a speed limit the mean of the lanes before, after and beside, repeatedly.
 pub(super) fn speed_limits(parts: &mut MapParts, report: &mut ReadReport) {
     let stated = parts
         .lanes

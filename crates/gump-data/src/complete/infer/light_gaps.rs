@@ -1,12 +1,12 @@
-//! The colours of lights while they are not seen.
+//! Colours of lights while they are not observed.
 //!
-//! A recording car loses sight of a light for moments: a truck passes, the sun stands behind it.
-//! Who takes such a moment for "nobody says stop" drives into a red light. A colour is held only
-//! between two sightings of the same colour; between different ones the light changed at a moment
-//! that nobody saw, and nothing is filled in.
+//! A recording car loses sight of a light for moments: a truck passes, the sun is low. A policy
+//! that takes a missing light for permission would drive through red. A colour is held only between
+//! two observations of the same colour; between different ones the time of the change is unknown,
+//! and nothing is filled in.
 //!
-//! What an actor sees up to the present comes from sightings up to the present: a later one fills
-//! gaps after it alone.
+//! Frames up to the present are filled only from observations up to the present; later ones fill
+//! gaps after it.
 
 use std::collections::BTreeMap;
 
@@ -14,8 +14,8 @@ use gump_scene::{Frame, LaneId, Light, LightState};
 
 use crate::ReadReport;
 
-/// Who looks away for so many seconds misses no change and back again: the shortest green (2 s, of
-/// a left turn) and the shortest yellow (3 s) take longer.
+/// Maximum gap, seconds, in which a light cannot change and change back: the shortest green (2 s,
+/// of a left turn) and the shortest yellow (3 s) take longer.
 ///
 /// Source: minimum greens in table 5-3 of FHWA's Traffic Signal Timing Manual (2008); yellow
 /// intervals of 3 to 6 s in the Manual on Uniform Traffic Control Devices.
@@ -24,7 +24,7 @@ const MAX_GAP_S: f64 = 4.0;
 /// Fills gaps of unknown or absent lights; `now` is the index of the present, `dt` the seconds
 /// between frames.
 ///
-/// Filling twice fills nothing more: whatever is filled lies between what was seen.
+/// A second call changes nothing: only gaps between observations are filled.
 pub(super) fn infer(log: &mut [Frame], now: usize, dt: f64, report: &mut ReadReport) {
     let longest = (MAX_GAP_S / dt).round() as usize;
     let mut seen: BTreeMap<LaneId, (usize, Light)> = BTreeMap::new();

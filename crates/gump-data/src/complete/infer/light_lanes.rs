@@ -1,4 +1,4 @@
-//! Which lane a light controls, where a format states only where it is.
+//! Lanes controlled by lights, where a format states only positions.
 
 use gump_geometry::{DVec2, PointIndex};
 use gump_scene::{LaneId, Light, MapGraph};

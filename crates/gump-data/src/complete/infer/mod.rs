@@ -1,7 +1,7 @@
-//! What formats leave out, inferred by one set of rules for all of them.
+//! Inference of what formats lack, by the same rules for all of them.
 //!
-//! Every rule looks only at what a [`Scenario`] itself holds, so a scenario that is written and
-//! read again is inferred the same. Start with [`map`] and [`route`].
+//! Every rule uses only the [`Scenario`] itself, so a scenario that is written and read again gets
+//! the same inferred values. Start with [`map`] and [`route`].
 
 mod drivable;
 mod edges;
@@ -22,7 +22,7 @@ use gump_scene::{Frame, LaneKind, Light, MapGraph, MapParts, Scenario};
 use crate::{ReadOptions, ReadReport};
 pub(crate) use targets::choose as choose_targets;
 
-/// The width of a lane of this kind about which nothing is known, metres.
+/// The default width of a lane of this kind, metres.
 ///
 /// Source: lanes of 10 to 12 feet (3.0 to 3.7 m) are the rule in AASHTO's "A Policy on Geometric
 /// Design of Highways and Streets"; bicycle lanes of 5 feet (1.5 m) in its "Guide for the
@@ -50,7 +50,7 @@ pub(crate) fn map(parts: &mut MapParts, options: ReadOptions, report: &mut ReadR
     }
 }
 
-/// Links lanes of a format that states no links; call it before [`map`], which looks at links.
+/// Links lanes of a format that states no links; call it before [`map`], which uses links.
 pub(crate) fn lane_graph(parts: &mut MapParts, options: ReadOptions, report: &mut ReadReport) {
     if options.infer_lane_graph {
         lane_graph::infer(parts, report);
@@ -83,8 +83,7 @@ pub(crate) fn light_lanes(
     }
 }
 
-/// Holds the colours of lights across moments in which they were not seen; `now` is the index of
-/// the present.
+/// Holds the colours of lights across gaps in observations; `now` is the index of the present.
 pub(crate) fn light_gaps(
     log: &mut [Frame],
     now: usize,
@@ -97,7 +96,7 @@ pub(crate) fn light_gaps(
     }
 }
 
-/// Chooses whom to predict, for a format that does not say.
+/// Chooses prediction targets, for a format without them.
 pub(crate) fn targets(scenario: &mut Scenario, options: ReadOptions, report: &mut ReadReport) {
     if options.infer_targets {
         scenario.targets = choose_targets(&scenario.log, scenario.now, scenario.ego);
@@ -105,7 +104,7 @@ pub(crate) fn targets(scenario: &mut Scenario, options: ReadOptions, report: &mu
     }
 }
 
-/// Fills in the ego's route if none is stated.
+/// Infers the ego's route if none is stated.
 pub(crate) fn route(scenario: &mut Scenario, options: ReadOptions, report: &mut ReadReport) {
     if !options.infer_route || scenario.route.is_some() {
         return;

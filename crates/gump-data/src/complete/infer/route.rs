@@ -1,8 +1,8 @@
-//! The ego's route, read off its logged path.
+//! The ego's route, from its logged path.
 //!
-//! The log is matched to the lane graph as a whole: every few metres the ego is on one of the
-//! lanes near it, and the cheapest sequence of lanes wins, where distance, difference in heading
-//! and lane changes cost and leaving the graph costs much.
+//! The log is matched to the lane graph as a whole: every few metres the ego is assigned to one of
+//! the lanes near it, and the sequence of lanes with the lowest cost wins. Distance, difference in
+//! heading and lane changes have costs, and leaving the graph has a high one.
 //!
 //! Source: map matching by a hidden Markov model after Newson and Krumm 2009, solved by Viterbi's
 //! algorithm; the costs are ours.
@@ -14,7 +14,7 @@ use gump_scene::{Lane, LaneId, MapGraph, Route, Scenario};
 const SPACING: f64 = 2.0;
 /// Lanes further away than this are not driven on, metres.
 const MAX_DISTANCE: f64 = 4.0;
-/// Nor are lanes that point elsewhere, radians.
+/// Nor are lanes in another direction, radians.
 const MAX_TURN: f64 = 1.2;
 /// Cost of one radian beside the lane's direction, in square metres beside its centre.
 const TURN_COST: f64 = 8.0;
@@ -103,8 +103,8 @@ struct Candidate<'a> {
     from: Option<(usize, usize)>,
 }
 
-/// The lanes along the ego's way. An index of the whole map would take longer to build than all
-/// else that is inferred.
+/// The lanes near the ego's path. An index of the whole map would take longer to build than all
+/// other inference.
 struct Along<'a> {
     lanes: &'a [Lane],
     segments: SegmentIndex<usize>,

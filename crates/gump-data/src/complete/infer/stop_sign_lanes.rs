@@ -1,7 +1,7 @@
-//! Which lanes a stop sign rules, where a format states only where it stands.
+//! Lanes that a stop sign applies to, where a format states only its position.
 //!
-//! Waymo's maps, which state it, name the lanes of an intersection that begin abeam of the sign,
-//! where vehicles come to a stop; the sign stands on either side of them.
+//! In Waymo's maps, which state them, these are lanes of an intersection that begin abeam of the
+//! sign, where vehicles stop; the sign stands on either side of them.
 
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::{Lane, MapParts};

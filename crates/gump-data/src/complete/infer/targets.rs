@@ -1,16 +1,16 @@
-//! Whom to predict, in formats that do not ask.
+//! Prediction targets, in formats without them.
 
 use std::collections::BTreeMap;
 
 use gump_scene::{AgentId, Frame};
 
-/// Agents asked to predict, at most; as many as Waymo's benchmark has.
+/// Maximum number of targets, as in Waymo's benchmark.
 const MAX_TARGETS: usize = 8;
-/// Metres around the ego in which agents are worth predicting.
+/// Maximum distance of targets from the ego, metres.
 const RANGE: f64 = 60.0;
 
-/// The moving agents nearest to the ego that stay for at least half of the future, itself
-/// included, sorted by id.
+/// The moving agents nearest to the ego that are present for at least half of the future, including
+/// the ego, sorted by id.
 pub(crate) fn choose(log: &[Frame], now: usize, ego: AgentId) -> Vec<AgentId> {
     let mut stays: BTreeMap<AgentId, usize> = BTreeMap::new();
     for agent in log[now..].iter().flat_map(|frame| frame.agents()) {

@@ -1,9 +1,9 @@
-//! How wide a lane is.
+//! Widths of lanes.
 //!
-//! The rules, in order: the distance to what bounds the lane on the left plus that on the right,
+//! The rules, in order: the distance to the bound of the lane on the left plus that on the right,
 //! where bounds are painted lines, road edges, and the middle between two centre lines of
 //! neighbours; inside an intersection, or without bounds, the mean of the lanes before and after,
-//! as far as that spreads; else the default. Lanes with an outline have the width it says.
+//! repeatedly; else the default. Lanes with an outline have its width.
 
 use std::collections::BTreeMap;
 

@@ -1,8 +1,9 @@
-//! Argoverse 2: motion-forecasting scenarios (Parquet with a map beside) and annotated sensor logs
-//! (Feather with ego poses and a map beside).
+//! Argoverse 2: motion-forecasting scenarios (Parquet with a map) and annotated sensor logs
+//! (Feather with ego poses and a map).
 //!
-//! Neither states traffic lights or speed limits; forecasting scenarios have no sizes either.
-//! `map` reads the road, `forecasting` and `sensor_log` the traffic, `columns` of the crate the tables of both.
+//! Neither states traffic lights or speed limits; forecasting scenarios have no sizes either. `map`
+//! reads the map, `forecasting` and `sensor_log` the traffic, `columns` of the crate the tables of
+//! both.
 //!
 //! Source: the formats' descriptions in the Argoverse 2 API documentation, checked on its samples.
 

@@ -1,7 +1,7 @@
 //! Annotated sensor logs: boxes in the ego's frame ten times a second, ego poses in the city's.
 //!
-//! The recognised file is `annotations*.feather`; `city_SE3_egovehicle.feather` and the map lie
-//! beside it. Boxes are those of the annotators; images and point clouds are not looked at.
+//! The recognised file is `annotations*.feather`; `city_SE3_egovehicle.feather` and the map must be
+//! beside it. Boxes are those of the annotators; images and point clouds are not read.
 
 use std::collections::{BTreeMap, btree_map::Entry};
 use std::path::Path;

@@ -1,7 +1,7 @@
-//! Numbers, texts and columns as bytes, little-endian, and back.
+//! Encoding of numbers, texts and columns as bytes, little-endian, and decoding.
 //!
-//! What they mean is the affair of `log` and `map`. A [`Decoder`] trusts nothing: it asks for no
-//! memory that the bytes at hand do not account for.
+//! `log` and `map` define their meaning. A [`Decoder`] does not trust its input: it never allocates
+//! more memory than the bytes present justify.
 
 use std::fmt::Display;
 

@@ -1,6 +1,6 @@
-//! A scenario's log, roles and route as bytes; the map is in `map`.
+//! Encoding of a scenario's log, roles and route; the map is in `map`.
 //!
-//! Agents are stored by track: when it is there, then a column per quantity.
+//! Agents are stored by track: the steps at which it is present, then a column per quantity.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

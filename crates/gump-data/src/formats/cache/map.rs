@@ -1,6 +1,6 @@
-//! The parts of a map as bytes.
+//! Encoding of the parts of a map.
 //!
-//! Each type has its writer and its reader next to each other: their order is the format.
+//! The writer and reader of each type are next to each other; their order defines the format.
 
 use gump_geometry::dvec3;
 use gump_scene::{

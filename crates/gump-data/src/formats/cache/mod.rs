@@ -1,17 +1,17 @@
-//! The cache: scenarios as they are after reading, in files made for training.
+//! The cache: scenarios as they are after reading, in files for training.
 //!
 //! A cache is a folder of shards (or one of them), each with its own index, so that shards can be
-//! copied, joined and deleted like any file. Opening reads the indices alone; a scenario is fetched
-//! by its number without touching the others, from many threads at once. What is stored is what a
-//! reader made, inference included, to the bit: [`ReadOptions`] change nothing here. That holds for
-//! the ego's route too, which is usually taken from its future: see
+//! copied, combined and deleted like any file. Opening reads only the indices; a scenario is read
+//! by its index without touching the others, from many threads at once. The stored scenarios are
+//! those of a reader, including inferred values, bit for bit: [`ReadOptions`] have no effect here.
+//! This includes the ego's route, which is usually derived from its future: see
 //! [`gump_scene::SceneState::unguided`].
 //!
 //! Start with [`write_shard`] and [`Cache::open`]; [`crate::open`] reads a cache like any format.
 //!
-//! Files are read at positions, not mapped: a mapped file that another program cuts short ends the
-//! process, which no check can prevent. The operating system keeps hot pages either way, and most
-//! of the time to fetch a scenario goes into the indices of its map.
+//! Files are read at positions, not memory-mapped: truncation of a mapped file by another program
+//! ends the process, which no check can prevent. The operating system caches hot pages either way,
+//! and most of the time to read a scenario is spent on the indices of its map.
 
 mod bytes;
 mod log;
@@ -39,7 +39,7 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
-/// An open cache. Holds the indices; every fetch opens its file anew.
+/// An open cache. Holds the indices; every read opens its file anew.
 pub struct Cache {
     shards: Vec<Shard>,
     /// The number of the first scenario after each shard.
@@ -48,11 +48,11 @@ pub struct Cache {
 
 impl Cache {
     /// Opens a shard, or every shard of a directory and its subdirectories in order of their paths;
-    /// files of other kinds are passed over.
+    /// files of other kinds are ignored.
     ///
     /// # Errors
-    /// [`DataError::Cache`] for a file that is damaged, cut off, of another version or, given
-    /// alone, no shard; [`DataError::NoFiles`] for a directory without shards;
+    /// [`DataError::Cache`] for a file that is damaged, truncated, of another version or, given
+    /// alone, not a shard; [`DataError::NoFiles`] for a directory without shards;
     /// [`DataError::Missing`], [`DataError::Io`].
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let mut files = files::list(path)?;
@@ -79,7 +79,7 @@ impl Cache {
         })
     }
 
-    /// How many scenarios there are.
+    /// Number of scenarios.
     pub fn len(&self) -> usize {
         self.ends.last().copied().unwrap_or(0)
     }
@@ -99,7 +99,7 @@ impl Cache {
     ///
     /// # Errors
     /// [`DataError::Checksum`] and [`DataError::Cache`] for damage, [`DataError::Scenario`] for a
-    /// record that is no valid scenario, [`DataError::Io`].
+    /// record that is not a valid scenario, [`DataError::Io`].
     pub fn get(&self, index: usize) -> Result<Option<Scenario>, DataError> {
         self.place(index)
             .map(|(shard, record)| shard.read(record))

@@ -23,7 +23,7 @@ use crate::{DataError, Place, write_atomically};
 
 /// What every shard starts with.
 pub(super) const MAGIC: &[u8; 8] = b"GUMPDATA";
-/// The layout's version; other versions are refused, convert the source again.
+/// The version of the layout; other versions are refused, and the source has to be converted again.
 const VERSION: u32 = 1;
 
 const HEADER_BYTES: u64 = 12;
@@ -50,7 +50,7 @@ pub(super) struct Entry {
 /// Writes scenarios as one shard and returns its bytes; the file appears when it is complete.
 ///
 /// # Errors
-/// [`DataError::Unwritable`] for a log longer than any that is read (180,000 frames),
+/// [`DataError::Unwritable`] for a log beyond the maximum length (180,000 frames),
 /// [`DataError::Io`].
 pub fn write_shard<S: Borrow<Scenario>>(
     path: &Path,

@@ -1,8 +1,8 @@
 //! CommonRoad XML, versions 2018b and 2020a: lanelets, recorded obstacles, a planning problem.
 //!
-//! The road is in `road`, moving things are in `traffic`. The planning problem states where a
-//! planner starts, but no track of its vehicle. The ego is therefore the obstacle that starts
-//! there if one does, or else the vehicle seen longest; the report says which.
+//! The map is in `road`, traffic in `traffic`. The planning problem states where a planner starts,
+//! but no track of its vehicle. The ego is therefore the obstacle that starts there if there is
+//! one, or else the vehicle observed longest; the report states which.
 //!
 //! Source: "CommonRoad: XML format", versions 2018b and 2020a, of the Technical University of
 //! Munich.

@@ -1,4 +1,4 @@
-//! Lanelets become lanes with outlines, links, markings and speed limits.
+//! Conversion of lanelets to lanes with outlines, links, markings and speed limits.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,4 +1,5 @@
-//! Obstacles become tracks, cycles of signals become lights, a start becomes the ego.
+//! Conversion of obstacles to tracks, of signal cycles to lights, and of the planning problem's
+//! start to the ego.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::FRAC_PI_4;

@@ -1,6 +1,6 @@
-//! A SQLite file that is asked but never changed.
+//! Read-only access to an SQLite file.
 //!
-//! What its tables mean is the affair of `log` and `geopackage`.
+//! `log` and `geopackage` define the meaning of its tables.
 
 use std::fs::File;
 use std::io::Read;

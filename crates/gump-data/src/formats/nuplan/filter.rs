@@ -1,4 +1,4 @@
-//! Which of many events become scenarios: by type, token, number and distance in time.
+//! Selection of events as scenarios: by type, token, number and distance in time.
 //!
 //! The published selections are in [`Split`]. Start with [`ScenarioFilter`].
 
@@ -9,33 +9,33 @@ use super::Token;
 use super::log::{Census, Event, Log};
 use crate::DataError;
 
-/// Which events to take. The default takes every tagged event.
+/// Which events to select. The default selects every tagged event.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ScenarioFilter {
     /// Only events of one of these types.
     pub types: Option<Vec<String>>,
     /// Only these events.
     pub tokens: Option<BTreeSet<Token>>,
-    /// At most so many of each type, spread evenly.
+    /// Maximum number of each type, spread evenly.
     pub per_type: Option<usize>,
-    /// At most so many in all, spread evenly.
+    /// Maximum number in total, spread evenly.
     pub limit: Option<usize>,
-    /// Events of one type at least so many seconds apart.
+    /// Minimum time between events of the same type, seconds.
     pub min_gap_s: Option<f64>,
-    /// Only events whose scene states where to go.
+    /// Only events whose scene states a goal.
     pub with_goal: bool,
-    /// Events without a tag too.
+    /// Also events without a tag.
     pub untagged: bool,
 }
 
-/// An event with the index of its log and what it is counted as.
+/// An event with the index of its log and the type it is counted as.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Selected {
     /// Index into the logs given.
     pub log: usize,
     /// The event.
     pub event: Event,
-    /// What it is counted as.
+    /// The type it is counted as.
     pub scenario_type: String,
 }
 
@@ -89,7 +89,7 @@ impl ScenarioFilter {
         Ok(selected)
     }
 
-    /// Why so many or so few events of a log pass, as a sentence.
+    /// Explains how many events of a log pass, as a sentence.
     pub fn explain(&self, census: &Census) -> String {
         let Census {
             rows,

@@ -1,6 +1,6 @@
-//! A GeoPackage map as rows: the layers of nuPlan's roads, projected to the plane.
+//! Access to a GeoPackage map as rows: the layers of nuPlan's maps, projected to the plane.
 //!
-//! How layers hang together is the affair of `map`. Start with [`GeoPackage::open`].
+//! `map` combines the layers. Start with [`GeoPackage::open`].
 
 use std::path::Path;
 

@@ -1,9 +1,9 @@
-//! A nuPlan log, asked by query: what happened when, who was where.
+//! Queries on a nuPlan log.
 //!
-//! A log may be of gigabytes; no call here reads more than the rows it returns. What a scenario is
-//! made of is the affair of `scenario`. Start with [`Log::open`] and [`Log::events`].
+//! Logs may have gigabytes; calls read only the rows they return. `scenario` combines them into
+//! scenarios. Start with [`Log::open`] and [`Log::events`].
 //!
-//! Everything is restricted to rows of the merged lidar, which pace the log at 20 Hz.
+//! All queries are restricted to rows of the merged lidar, which occur at 20 Hz.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -87,22 +87,22 @@ pub struct Log {
     map_name: String,
 }
 
-/// A moment of a log that a scenario can be taken from.
+/// An instant of a log at which a scenario can be based.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Event {
-    /// The moment's row; the name of the scenario.
+    /// Its row; the name of the scenario.
     pub token: Token,
-    /// When, microseconds since 1970.
+    /// Its time, microseconds since 1970.
     pub time_us: i64,
-    /// What kinds of situation it is tagged as, sorted; empty if untagged.
+    /// Its scenario tags, sorted; empty if untagged.
     pub types: Vec<String>,
 }
 
 impl Event {
-    /// The kind of situation nuPlan counts it as when asked for these kinds: the last of them by
-    /// name, "unknown" if there is none. `None` as filter stands for all kinds.
+    /// The scenario type that nuPlan counts it as when these types are requested: the last of them
+    /// by name, "unknown" if there is none. `None` as filter stands for all types.
     ///
-    /// Source: nuplan-devkit, which takes the largest of the rows that its filter leaves.
+    /// Source: nuplan-devkit, which takes the largest of the rows that remain after its filter.
     pub fn scenario_type(&self, wanted: Option<&[String]>) -> &str {
         let counts = |kind: &&String| wanted.is_none_or(|wanted| wanted.contains(kind));
         self.types
@@ -112,7 +112,7 @@ impl Event {
     }
 }
 
-/// What a log holds, to explain why it yields few scenarios or none.
+/// Counts of a log's content, to explain why it yields few scenarios or none.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Census {
     /// Rows of the merged lidar.
@@ -139,9 +139,9 @@ pub struct LogRow {
 /// A box of one row, as recorded.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LogBox {
-    /// Which track it belongs to.
+    /// Its track.
     pub track: Token,
-    /// What it is.
+    /// Its kind.
     pub kind: AgentKind,
     /// Centre and heading, world frame.
     pub pose: Pose,
@@ -209,9 +209,9 @@ impl Log {
         Ok(codes.into_iter().next().flatten())
     }
 
-    /// Moments that scenarios can be taken from, in order of time: those with a tag, and with
-    /// `untagged` all others too. The first two and last two scenes are left out as in nuPlan: they
-    /// may lack past or future.
+    /// Instants at which scenarios can be based, in order of time: those with a tag, and with
+    /// `untagged` all others too. The first two and last two scenes are left out as in nuPlan,
+    /// because they may lack past or future.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].
@@ -243,7 +243,7 @@ impl Log {
         Ok(events)
     }
 
-    /// The moment with this token, tagged or not, in whatever scene; `None` if there is none.
+    /// The instant with this token, tagged or not, in any scene; `None` if there is none.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].
@@ -267,7 +267,7 @@ impl Log {
         }))
     }
 
-    /// Counts what there is.
+    /// Counts the content of the log.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].
@@ -346,7 +346,7 @@ impl Log {
             })
     }
 
-    /// The boxes of a row as nuPlan orders them: by kind, else as they lie in the table.
+    /// The boxes of a row in nuPlan's order: by kind, within a kind as in the table.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].
@@ -402,7 +402,7 @@ impl Log {
             })
     }
 
-    /// Where the ego of the row's scene is to go, rear axle; `None` if the scene has no goal.
+    /// The goal of the ego in the row's scene, rear axle; `None` if the scene has none.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].
@@ -417,8 +417,8 @@ impl Log {
         Ok(goals.into_iter().next())
     }
 
-    /// The roadblocks that the ego of the row's scene is to follow, as stated: there may be repeats
-    /// and gaps. Words that are no ids are left out.
+    /// The roadblocks of the ego's route in the row's scene, as stated, with repeats and gaps.
+    /// Invalid ids are dropped.
     ///
     /// # Errors
     /// [`DataError::Sqlite`].

@@ -1,8 +1,9 @@
-//! A city's GeoPackage becomes a [`MapGraph`]: lanes, connectors, roadblocks, areas, surfaces.
+//! Conversion of a city's GeoPackage to a [`MapGraph`]: lanes, connectors, roadblocks, areas,
+//! surfaces.
 //!
 //! Lane connectors are lanes with `in_intersection`, roadblock connectors roadblocks with it. The
-//! widths of lanes are their areas over their lengths; heights are 0, the format has none. Where
-//! map files lie is the affair of `maps`. Start with [`read_map`].
+//! widths of lanes are their areas divided by their lengths; heights are 0, because the format has
+//! none. `maps` finds map files. Start with [`read_map`].
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,14 +19,14 @@ use rusqlite::Row;
 use super::geopackage::{Feature, GeoPackage};
 use crate::{DataError, Problem, ReadReport};
 
-/// A city's roads.
+/// The map of a city.
 #[derive(Clone, Debug)]
 pub struct CityMap {
-    /// The roads themselves, in the plane of the projection.
+    /// The map, in the plane of the projection.
     pub graph: Arc<MapGraph>,
     /// EPSG code of the projection.
     pub epsg: i64,
-    /// What was left out and what was added.
+    /// Dropped and inferred items.
     pub report: ReadReport,
 }
 
@@ -43,11 +44,12 @@ const TURN_STOP: i64 = 3;
 
 /// Reads a map.
 ///
-/// A feature that is damaged is left out, counted and named in the report; links to it are dropped.
+/// A damaged feature is dropped, counted and listed in the report; links to it are dropped.
 ///
 /// # Errors
-/// [`DataError::Missing`], [`DataError::Io`], [`DataError::Sqlite`]; [`DataError::Table`] for a file
-/// that is no map, a missing layer or column, an unknown projection, and parts that make no map.
+/// [`DataError::Missing`], [`DataError::Io`], [`DataError::Sqlite`]; [`DataError::Table`] for a
+/// file that is not a map, a missing layer or column, an unknown projection, and parts that are not
+/// a valid map.
 pub fn read_map(path: &Path) -> Result<CityMap, DataError> {
     let package = GeoPackage::open(path)?;
     let mut report = ReadReport::default();

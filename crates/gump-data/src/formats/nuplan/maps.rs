@@ -1,4 +1,4 @@
-//! Where the map of a log lies, and maps already read.
+//! Finding the map of a log, and caching maps.
 //!
 //! nuPlan keeps maps as `LOCATION/VERSION/map.gpkg` beside a list of versions. Start with
 //! [`find_map`] for one log, or [`Maps`] for many.
@@ -36,10 +36,10 @@ const MAX_LEVELS: usize = 6;
 
 /// Finds the map of a log.
 ///
-/// Looked for are, in this order: `map.gpkg` and `LOCATION.gpkg` beside the log; in each folder
-/// above it (six at most), in `maps` and `nuplan-maps-v1.0` in each, and in the folder that the
-/// environment variable `NUPLAN_MAPS_ROOT` names: `LOCATION/VERSION/map.gpkg`. The version is that of
-/// the list `nuplan-maps-v1.0.json` there, else the published one, else the only one there is.
+/// The search order: `map.gpkg` and `LOCATION.gpkg` beside the log; then in each folder above it
+/// (six at most), in `maps` and `nuplan-maps-v1.0` in each, and in the folder given by the
+/// environment variable `NUPLAN_MAPS_ROOT`: `LOCATION/VERSION/map.gpkg`. The version is that of the
+/// list `nuplan-maps-v1.0.json` there, else the published one, else the only one there is.
 ///
 /// # Errors
 /// [`DataError::NoCompanion`] if there is none; [`DataError::Table`] if there are only other
@@ -149,14 +149,14 @@ fn listed_version(root: &Path, location: &str) -> Result<Option<String>, DataErr
         })
 }
 
-/// Maps by file, each read once: cities are large.
+/// Maps by file, each read once.
 #[derive(Debug, Default)]
 pub struct Maps {
     read: BTreeMap<PathBuf, Arc<CityMap>>,
 }
 
 impl Maps {
-    /// The map of a log, read or remembered, and checked to be of the same place.
+    /// The map of a log, read or cached, and checked to cover the same place.
     ///
     /// # Errors
     /// Those of [`find_map`] and [`read_map`]; [`DataError::Table`] if map and log are in different

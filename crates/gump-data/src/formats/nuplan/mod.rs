@@ -1,9 +1,9 @@
 //! nuPlan: logs in SQLite, maps in GeoPackage, scenarios by query.
 //!
-//! A log of gigabytes is never loaded: [`Log`] asks for the rows it needs. A scenario is the 15 s
-//! around a tagged event, at 10 Hz, with 2.2 s of history. As any format, [`crate::open`] reads it as
-//! [`gump_scene::Scenario`]; a simulation in nuPlan's sense wants [`NuplanScenario`], which keeps
-//! exact times, the ego at its rear axle and the expert's future.
+//! A log of gigabytes is never loaded: [`Log`] queries the rows it needs. A scenario is the 15 s
+//! around a tagged event, at 10 Hz, with 2.2 s of history. Like any format, [`crate::open`] reads
+//! it as [`gump_scene::Scenario`]; a simulation in nuPlan's sense needs [`NuplanScenario`], which
+//! keeps exact times, the ego at its rear axle and the expert's future.
 //!
 //! ```no_run
 //! use std::path::Path;
@@ -24,7 +24,7 @@
 //! ```
 //!
 //! # Terms
-//! * **row**: one sweep of the merged lidar, every 50 ms; **event**: a row that is tagged.
+//! * **row**: one sweep of the merged lidar, every 50 ms. **Event**: a row that is tagged.
 //! * **iteration**: a frame of the simulation, every second row; iteration 0 lies 3 s before the
 //!   event that names the scenario.
 //! * **connector**: a lane or roadblock inside an intersection.

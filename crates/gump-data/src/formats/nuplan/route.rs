@@ -1,4 +1,4 @@
-//! From the roadblocks that a log states to lanes and a path.
+//! Lanes and a path from the roadblocks that a log states.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -17,8 +17,8 @@ const MAX_TURN: f64 = 1.2;
 /// One radian beside the lane's direction counts as so many metres beside its centre.
 const TURN_COST: f64 = 4.0;
 
-/// Gives the scenario its route: along the stated roadblocks from where the ego is now, else, if
-/// `options` allow, along its log.
+/// Gives the scenario its route: along the stated roadblocks from the ego's present position, else,
+/// if `options` allow, along its log.
 ///
 /// Error: [`Problem::Unexpected`] if roadblocks are stated and none of them is in the map.
 pub(super) fn fill(

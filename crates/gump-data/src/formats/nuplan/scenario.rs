@@ -1,8 +1,8 @@
-//! Fifteen seconds of a log as a nuPlan scenario, and as one of ours.
+//! Fifteen seconds of a log as a nuPlan scenario, and as a [`Scenario`].
 //!
-//! [`NuplanScenario`] keeps what nuPlan's simulation needs and a [`Scenario`] has no room for: exact
-//! times, the ego at its rear axle, boxes in nuPlan's order, the expert's states beyond the end.
-//! Queries are the affair of `log`. Start with [`NuplanScenario::read`].
+//! [`NuplanScenario`] keeps what nuPlan's simulation needs and a [`Scenario`] cannot represent:
+//! exact times, the ego at its rear axle, boxes in nuPlan's order, the expert's states beyond the
+//! end. `log` has the queries. Start with [`NuplanScenario::read`].
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -31,10 +31,10 @@ const STRIDE: usize = 2;
 /// would be 50 %.
 const TIME_STEP_TOLERANCE: f64 = 0.4;
 
-/// Which part of the log around an event is the scenario.
+/// The part of a log around an event that becomes the scenario.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extraction {
-    /// Where iteration 0 lies relative to the event, seconds.
+    /// Time of iteration 0 relative to the event, seconds.
     pub offset_s: f64,
     /// From iteration 0 to the last, seconds.
     pub duration_s: f64,
@@ -45,8 +45,8 @@ pub struct Extraction {
 }
 
 impl Default for Extraction {
-    /// What nuPlan's challenges use: 15 s from 3 s before the event, 2.2 s of history (22 frames),
-    /// and its longest open-loop horizon of 8 s.
+    /// The values of nuPlan's challenges: 15 s from 3 s before the event, 2.2 s of history (22
+    /// frames), and the longest open-loop horizon of 8 s.
     ///
     /// Source: the scenario mapping and history buffer of nuplan-devkit.
     fn default() -> Self {
@@ -66,14 +66,14 @@ pub struct LogFrame {
     pub token: Token,
     /// The ego at its rear axle, with the time stamp of the frame.
     pub ego: EgoState,
-    /// All others in nuPlan's order: by kind, else as recorded. Velocities that were not recorded
-    /// are NaN here (and 0 in a [`Scenario`]).
+    /// All other agents in nuPlan's order: by kind, within a kind as recorded. Velocities that were
+    /// not recorded are NaN here (and 0 in a [`Scenario`]).
     pub objects: Vec<Agent>,
-    /// The lights that are known, by lane connector.
+    /// The known lights, by lane connector.
     pub lights: Vec<Light>,
 }
 
-/// A scenario as nuPlan's simulation sees it.
+/// A scenario for nuPlan's simulation.
 #[derive(Clone, Debug)]
 pub struct NuplanScenario {
     /// The event's row, which names the scenario.
@@ -82,11 +82,11 @@ pub struct NuplanScenario {
     pub log_name: String,
     /// The location.
     pub map_name: String,
-    /// What nuPlan counts it as; "unknown" if untagged.
+    /// The type that nuPlan counts it as; "unknown" if untagged.
     pub scenario_type: String,
     /// All tags of the event, sorted.
     pub types: Vec<String>,
-    /// The whole city.
+    /// The map of the whole city.
     pub map: Arc<MapGraph>,
     /// Frames before iteration 0, oldest first; fewer at the beginning of a log.
     pub history: Vec<LogFrame>,
@@ -94,16 +94,16 @@ pub struct NuplanScenario {
     pub iterations: Vec<LogFrame>,
     /// The ego after the last iteration, [`DT`] apart; fewer at the end of a log.
     pub ego_after: Vec<EgoState>,
-    /// The roadblocks to follow, as stated.
+    /// The roadblocks of the route, as stated.
     pub roadblocks: Vec<RoadblockId>,
-    /// Where to go, rear axle.
+    /// The goal, rear axle.
     pub goal: Option<Pose>,
     /// The recorded identity of each track: that of agent `AgentId(i)` is at `i - 1`.
     pub tracks: Vec<Token>,
 }
 
 impl NuplanScenario {
-    /// Reads the frames around an event; `scenario_type` is what it is to be counted as.
+    /// Reads the frames around an event; `scenario_type` is the type to count it as.
     ///
     /// # Errors
     /// [`DataError::Sqlite`]; [`DataError::Scenario`] if the log has no row there or a state is not
@@ -165,7 +165,8 @@ impl NuplanScenario {
         self.tracks.get(index).copied()
     }
 
-    /// What every user relies on: finite poses and sizes, frames one time step apart.
+    /// Checks the invariants that users rely on: finite poses and sizes, frames one time step
+    /// apart.
     fn check(&self) -> Result<(), Problem> {
         let frames = || self.history.iter().chain(&self.iterations);
         for (step, frame) in frames().enumerate() {
@@ -193,7 +194,7 @@ impl NuplanScenario {
         Ok(())
     }
 
-    /// The same as one of our scenarios: the present is iteration 0, the ego a box like the others.
+    /// The same as a [`Scenario`]: the present is iteration 0, the ego a box like other agents.
     ///
     /// The route follows the stated roadblocks from lane to lane; where that is not possible it is
     /// read off the log if `options` allow. Elevations are 0: the map has none.

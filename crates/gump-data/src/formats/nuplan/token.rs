@@ -1,4 +1,4 @@
-//! The identities of nuPlan's rows: binary in the database, hexadecimal on paper.
+//! Identities of nuPlan's rows: binary in the database, hexadecimal as text.
 
 use std::fmt;
 use std::str::FromStr;

@@ -1,4 +1,4 @@
-//! From longitude and latitude to the plane in which nuPlan's logs are given.
+//! Projection from longitude and latitude to the plane of nuPlan's logs.
 
 use gump_geometry::{DVec2, dvec2};
 

@@ -1,6 +1,6 @@
-//! Shapes as GeoPackage stores them: a header, then well-known binary.
+//! Decoding of shapes in a GeoPackage: a header, then well-known binary.
 //!
-//! Coordinates are taken as they are; what they mean is the map's affair. Start with [`parse`].
+//! Coordinates are not interpreted. Start with [`parse`].
 //!
 //! Source: OGC 12-128r19 (GeoPackage 1.4), clause 2.1.3; OGC 06-103r4 (simple features), clause 8.
 

@@ -1,8 +1,8 @@
-//! One scenario as JSON, for people's own data: the layout of ScenarioNet's scenario descriptions.
+//! One scenario as JSON, for your own data: the layout of ScenarioNet's scenario descriptions.
 //!
-//! Whoever has such a description in Python can write it with `json.dump` (arrays as lists).
-//! `schema/scenario.schema.json` beside this crate's sources states the layout; what it leaves out
-//! is inferred as for every format. [`write_scenario`] writes what the reader reads.
+//! In Python such a description can be written with `json.dump` (arrays as lists).
+//! `schema/scenario.schema.json` beside this crate's sources defines the layout; what it lacks is
+//! inferred as for every format. [`write_scenario`] is the inverse of the reader.
 
 mod map;
 mod names;

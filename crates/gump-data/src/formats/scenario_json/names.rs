@@ -1,4 +1,4 @@
-//! What fields and map features are read with: names as ids, and places.
+//! Helpers for fields and map features: names as ids, and coordinates.
 
 use std::collections::BTreeMap;
 

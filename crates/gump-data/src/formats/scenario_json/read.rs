@@ -1,4 +1,4 @@
-//! The document's own fields, tracks and lights.
+//! Reads the document's own fields, tracks and lights.
 
 use std::collections::BTreeMap;
 use std::path::Path;

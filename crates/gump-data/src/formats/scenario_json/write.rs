@@ -1,4 +1,4 @@
-//! Writes what the reader reads.
+//! Writes scenarios in the layout of the reader.
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
@@ -15,10 +15,10 @@ use super::{NAME, VERSION};
 use crate::io::stream::io_error;
 use crate::{DataError, write_atomically};
 
-/// Writes a scenario to a file, packed if its name ends in `.gz`.
+/// Writes a scenario to a file, compressed if its name ends in `.gz`.
 ///
-/// Routes, tags, roadblocks, outlines of lanes, stop lines and areas of intersections have no
-/// place in the layout and are left out.
+/// The layout cannot represent routes, tags, roadblocks, outlines of lanes, stop lines and areas of
+/// intersections; they are dropped.
 ///
 /// # Errors
 /// [`DataError::Io`].

@@ -1,4 +1,4 @@
-//! What a SUMO run is told: vehicle types, trips, and which signals to log.
+//! Input of a SUMO run: vehicle types, trips, and the signals to log.
 
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -9,7 +9,7 @@ use quick_xml::escape::escape;
 use crate::io::stream::io_error;
 use crate::{DataError, write_atomically};
 
-/// Who drives and walks when, from where to where.
+/// Trips of vehicles and pedestrians with their times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Demand {
     /// The types that trips refer to.
@@ -46,14 +46,14 @@ pub struct Trip {
     pub to: String,
     /// Index into [`Demand::types`].
     pub kind: usize,
-    /// On wheels or on foot.
+    /// By vehicle or on foot.
     pub on: TripKind,
 }
 
-/// How somebody gets about.
+/// The mode of a trip.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TripKind {
-    /// With a vehicle.
+    /// In a vehicle.
     Wheels,
     /// On foot.
     Foot,

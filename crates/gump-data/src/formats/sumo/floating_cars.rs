@@ -1,4 +1,4 @@
-//! Floating-car data: who is where, time step by time step, read as a stream.
+//! Floating-car data: positions of all agents, time step by time step, read as a stream.
 
 use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_2;
@@ -43,7 +43,7 @@ pub(super) struct FloatingCars {
     /// The next snapshot's time, already read.
     ahead: Option<f64>,
     is_done: bool,
-    /// What was left out so far.
+    /// Items dropped so far.
     pub(super) report: ReadReport,
 }
 
@@ -113,7 +113,7 @@ impl FloatingCars {
         Ok(snapshot)
     }
 
-    /// Where reading has come to, bytes.
+    /// The reading position, bytes.
     pub(super) fn offset(&self) -> u64 {
         self.xml.offset()
     }

@@ -1,13 +1,13 @@
 //! SUMO: a network, floating-car data and signal states in one folder.
 //!
-//! A recording is `fcd-output` beside the network it ran on (`net.xml`), and, where there are
-//! such, signal states (`SaveTLSSwitchStates`) and vehicle types; all recognised by content, plain
-//! or gzip. [`crate::open`] takes the floating-car file or its folder and cuts scenarios of nine
-//! seconds; [`open_recording`] cuts as asked. What SUMO reads (demand, signal logging) is written
-//! by [`Demand`].
+//! A recording is `fcd-output` beside its network (`net.xml`), and, where present, signal states
+//! (`SaveTLSSwitchStates`) and vehicle types; all are recognised by content, plain or gzip.
+//! [`crate::open`] takes the floating-car file or its folder and cuts scenarios of nine seconds;
+//! [`open_recording`] has settings. [`Demand`] writes SUMO's inputs (demand, signal logging).
 //!
-//! Traps: `x, y` is the front bumper, `angle` is clockwise from north, sizes are in the vehicle
-//! types, people are elements of their own. SUMO's shapes are flat: bridges cross like streets.
+//! Notes on the format: `x, y` is the front bumper, `angle` is clockwise from north, sizes are in
+//! the vehicle types, pedestrians are separate elements. SUMO's shapes are flat: bridges cross like
+//! streets.
 
 mod demand;
 mod floating_cars;
@@ -57,7 +57,7 @@ struct Folder {
     types: Vec<PathBuf>,
 }
 
-/// Opens a recording beside its network and cuts scenarios as asked.
+/// Opens a recording beside its network and cuts scenarios with these settings.
 ///
 /// # Errors
 /// [`DataError::NoNetwork`] where the folder holds no network, [`DataError::Xml`], and those of

@@ -1,6 +1,6 @@
-//! A SUMO network file (`*.net.xml`, also `.gz`) as it is written: edges, connections, junctions.
+//! A SUMO network file (`*.net.xml`, also `.gz`): edges, connections, junctions.
 //!
-//! What the lanes and shapes mean as a road is in `roads`. Start with [`Network::read`].
+//! `roads` converts lanes and shapes to a map. Start with [`Network::read`].
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,16 +25,16 @@ pub struct Network {
     pub junctions: Vec<Junction>,
 }
 
-/// What an edge is for.
+/// The function of an edge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EdgeFunction {
     /// A road between two junctions.
     Normal,
-    /// A way through a junction.
+    /// A path through a junction.
     Internal,
-    /// Where people cross.
+    /// A pedestrian crossing.
     Crossing,
-    /// Where people walk at a junction.
+    /// A walking area at a junction.
     WalkingArea,
 }
 
@@ -43,7 +43,7 @@ pub enum EdgeFunction {
 pub struct Edge {
     /// Its name.
     pub id: String,
-    /// What it is for.
+    /// Its function.
     pub function: EdgeFunction,
     /// The junction it comes from; empty for an edge inside a junction.
     pub from: String,
@@ -72,7 +72,7 @@ pub struct NetworkLane {
     pub shape: Vec<[f64; 3]>,
 }
 
-/// Who may use a lane, as far as it matters here.
+/// The users of a lane, as far as needed here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Access {
     /// Passenger cars.
@@ -83,7 +83,7 @@ pub struct Access {
     pub motor: bool,
     /// Bicycles.
     pub bicycles: bool,
-    /// People on foot.
+    /// Pedestrians.
     pub pedestrians: bool,
 }
 

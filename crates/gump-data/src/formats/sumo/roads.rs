@@ -1,7 +1,7 @@
-//! A network as a road: lanes with their graph, borders and paint, crossings, signals.
+//! Conversion of a network to a map: lanes with their graph, borders and paint, crossings, signals.
 //!
-//! Everything is known for the whole network; a scenario gets what lies around it
-//! ([`Roads::around`]), because a city is larger than anybody's sight.
+//! The whole network is converted once; a scenario gets the part around it ([`Roads::around`]),
+//! because a city is larger than any field of view.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,4 +1,4 @@
-//! Cutting scenarios out of a long recording: a window of time, an ego, what is around it.
+//! Cutting of scenarios from a long recording: a time window, an ego, and its surroundings.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -30,7 +30,7 @@ const TIME_TOLERANCE: f64 = 0.011;
 /// A recording may reach this far beyond its network, metres: sidewalks and long vehicles.
 const MARGIN: f64 = 50.0;
 
-/// How scenarios are cut out of a recording.
+/// Settings of cutting scenarios from a recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CutOptions {
     /// Seconds before the present.
@@ -51,7 +51,7 @@ pub struct CutOptions {
     pub standing_one_in: u32,
     /// Leave out scenarios in which boxes overlap by more than 0.1 m at the present.
     pub without_overlaps: bool,
-    /// Where the choice of egos comes from.
+    /// The seed of the choice of egos.
     pub seed: Seed,
 }
 

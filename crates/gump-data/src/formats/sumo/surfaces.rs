@@ -1,4 +1,4 @@
-//! The drivable surface as overlapping polygons, and where its border runs.
+//! The drivable surface as overlapping polygons, and its border.
 //!
 //! A network states every lane and junction as a shape of its own. The border of their union is
 //! found without clipping polygons: a candidate line is cut into short pieces, and a piece belongs

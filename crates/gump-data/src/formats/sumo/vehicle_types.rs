@@ -1,4 +1,4 @@
-//! Vehicle types: how large what drives is, and what it is.
+//! Vehicle types: sizes and kinds of vehicles.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -55,7 +55,7 @@ impl VehicleTypes {
     }
 }
 
-/// What a vehicle class is like where a type states nothing else.
+/// The default kind and size of a vehicle class.
 ///
 /// Source: the table of defaults in SUMO's documentation of vehicle classes. People are drawn
 /// larger than SUMO's 0.2 x 0.5 m, which is a body without its limbs.

@@ -1,7 +1,7 @@
-//! The elements of an XML file one after another, with attributes by name.
+//! Reading of an XML file element by element, with attributes by name.
 //!
-//! Ends of elements and text are skipped: SUMO says everything in attributes, and what belongs to
-//! what follows from the order.
+//! Ends of elements and text are skipped: SUMO states everything in attributes, and the order of
+//! elements determines what belongs together.
 
 use std::borrow::Cow;
 use std::io::BufReader;

@@ -1,4 +1,4 @@
-//! Rows of a table become tracks.
+//! Conversion of rows of a table to tracks.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! Waymo map features become [`MapParts`]: what they state, nothing inferred.
+//! Conversion of Waymo map features to [`MapParts`], without inference.
 
 use std::collections::BTreeSet;
 

@@ -33,7 +33,7 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
     }))
 }
 
-/// The scenarios of content that has been opened.
+/// The scenarios of an opened stream.
 pub(crate) fn records(content: Stream, path: &Path, options: ReadOptions) -> impl Source {
     Scenarios {
         records: TfRecordReader::of(content, path.to_path_buf()),
@@ -42,7 +42,7 @@ pub(crate) fn records(content: Stream, path: &Path, options: ReadOptions) -> imp
     }
 }
 
-/// Decodes the bytes of a `Scenario` message, for those who read more of it than
+/// Decodes the bytes of a `Scenario` message, for callers that need more of it than
 /// [`scenario_from_proto`] keeps.
 ///
 /// # Errors

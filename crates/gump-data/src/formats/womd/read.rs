@@ -1,4 +1,4 @@
-//! A Waymo scenario message becomes a [`Scenario`]: tracks, lights, roles.
+//! Conversion of a Waymo scenario message to a [`Scenario`]: tracks, lights, roles.
 //!
 //! The map is in `map`. Start with [`scenario_from_proto`].
 
@@ -21,7 +21,7 @@ use gump_proto::{self as proto, ObjectType, SignalState};
 /// 0.5 %, and a lost step would be 100 %.
 const TIME_STEP_TOLERANCE: f64 = 0.1;
 
-/// Turns a decoded message into a validated scenario and says what was dropped and inferred.
+/// Converts a decoded message to a validated scenario and reports what was dropped and inferred.
 ///
 /// An invalid state means that the agent is absent at that step. Headings are wrapped to [-π, π);
 /// the time step is the mean of the stamps, rounded to a millisecond (the nominal rate, which is

@@ -1,4 +1,4 @@
-//! A [`Scenario`] becomes a Waymo scenario message: the inverse of `read` and `map`.
+//! Conversion of a [`Scenario`] to a Waymo scenario message: the inverse of `read` and `map`.
 //!
 //! Start with [`write_scenarios`] for a file, [`scenario_to_proto`] for one message.
 
@@ -19,8 +19,8 @@ use crate::io::tfrecord::write_record;
 use crate::{DataError, ReadReport, write_atomically};
 use gump_proto::{self as proto, ObjectType, SignalState};
 
-/// Writes scenarios as TFRecord, gzip if the name ends in `.gz`, and says what Waymo's messages
-/// have no room for.
+/// Writes scenarios as TFRecord, gzip if the name ends in `.gz`, and reports what Waymo's messages
+/// cannot represent.
 ///
 /// The file appears under its name only when it is complete.
 ///
@@ -58,11 +58,11 @@ fn write_all<S: Borrow<Scenario>, W: Write>(
     Ok(report)
 }
 
-/// Turns a scenario into a message that reads back as the same scenario, and says what it has no
-/// room for.
+/// Converts a scenario to a message that reads back as the same scenario, and reports what it
+/// cannot represent.
 ///
-/// Sizes, headings and velocities are rounded to f32. What readers infer (lane widths, drivable
-/// surfaces, the route) is dropped: it comes back by inference, from the same map and log.
+/// Sizes, headings and velocities are rounded to f32. Values that readers infer (lane widths,
+/// drivable surfaces, the route) are dropped: they are inferred again from the same map and log.
 ///
 /// # Errors
 /// [`DataError::Unwritable`] for ids beyond 32 bits and roles without a track.

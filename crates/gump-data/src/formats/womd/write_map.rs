@@ -1,4 +1,4 @@
-//! A [`MapGraph`] becomes Waymo map features: the inverse of `map`.
+//! Conversion of a [`MapGraph`] to Waymo map features: the inverse of `map`.
 
 use gump_geometry::DVec2;
 use gump_scene::{
