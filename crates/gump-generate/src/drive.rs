@@ -46,7 +46,8 @@ pub(crate) struct Change {
 }
 
 impl Maneuver {
-    /// Duration, in seconds, or left to the world.
+    /// How long the ego is steered, seconds: the duration of the manoeuvre, or long enough to show
+    /// the world the ego's intention.
     pub(crate) fn seconds(&self) -> f64 {
         if self.jolts || self.acceleration > 0.0 {
             PULL_S

@@ -24,7 +24,7 @@ pub struct GenerationJob {
     /// The request of every scene.
     pub request: GenerateRequest,
     /// Whether each scene may have its own place on the map, within 150 m of the request's; with a
-    /// prompt in guided placement places are always searched.
+    /// prompt in guided placement the place may be moved in any case.
     pub roams: bool,
     /// Seconds to simulate of every scene; 0 for none.
     pub seconds: f64,

@@ -56,7 +56,7 @@ impl Table {
         self.column(name, DataType::Int64, Arc::new(values))
     }
 
-    /// Adds a column of 64-bit floating-point numbers; values that are not finite are missing.
+    /// Adds a column of 64-bit floating-point numbers; NaN values are missing.
     pub fn number(self, name: &str, values: impl IntoIterator<Item = Option<f64>>) -> Self {
         let numbers = values.into_iter().map(|v| v.filter(|v| !v.is_nan()));
         let values = Float64Array::from_iter(numbers);

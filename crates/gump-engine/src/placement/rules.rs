@@ -440,8 +440,8 @@ impl Rules {
     }
 }
 
-/// The state that the bins of an object say which was nowhere before, and is told in the scene's
-/// frame therefore.
+/// The state of an object's bins, for an object without a previous state, whose chunk is therefore
+/// expressed in the scene's frame.
 pub fn state_of(bins: &Bins) -> QuantizedState {
     let mut state = QuantizedState::default();
     for (field, bin) in STEPS.iter().zip(bins).take(7) {

@@ -364,7 +364,7 @@ fn gap(own: Body, other: Body, place: DVec2, direction: DVec2) -> f64 {
     here.max(there).max_element()
 }
 
-/// Marks on which paths somebody is, and how far ahead.
+/// Marks the paths that an agent is on, and how far ahead.
 fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
     for (k, path) in paths.iter().enumerate().take(PATHS) {
         let at = path.iter().find_map(|&(i, away)| {

@@ -1,4 +1,4 @@
-//! What is scored: a finished drive, the expert's drive and the road.
+//! Inputs of scoring: a drive, the expert's drive and the map.
 
 use gump_geometry::{DVec2, OrientedBox};
 use gump_scene::{Agent, AgentId, EgoState, Frame, MapGraph, Rollout, Scenario, VehicleParameters};
@@ -8,27 +8,27 @@ use super::comfort::Motion;
 /// One executed step of a simulation.
 #[derive(Clone, Debug, Default)]
 pub struct Sample {
-    /// The ego when the step began, and the time.
+    /// The ego at the start of the step, and the time.
     pub ego: EgoState,
-    /// The others and the lights at that time. The ego may be among the agents, see
+    /// The other agents and the lights at that time. The ego may be among the agents, see
     /// [`Drive::ego`].
     pub frame: Frame,
-    /// What was planned in this step, times increasing; only open-loop scores look at it, so it may
-    /// be empty otherwise.
+    /// The plan of this step, with increasing times; only open-loop scores use it, so it may be
+    /// empty otherwise.
     pub plan: Vec<EgoState>,
 }
 
-/// A drive to score, beside that of the expert.
+/// A drive to score, with that of the expert.
 ///
-/// A simulation of N iterations has N - 1 samples (the last state is never acted from) and N states
-/// of the expert; nothing depends on that.
+/// A simulation of N iterations has N - 1 samples (no action follows the last state) and N states
+/// of the expert; the metrics do not depend on that.
 #[derive(Clone, Copy, Debug)]
 pub struct Drive<'a> {
     /// Executed steps in order of time.
     pub samples: &'a [Sample],
-    /// What the recorded driver did over the same time, from the same start.
+    /// The recorded driver's states over the same time, from the same start.
     pub expert: &'a [EgoState],
-    /// The road. Roadblocks, outlines, limits are used where there are any; see [`super::score`].
+    /// The map. Roadblocks, outlines and limits are used where there are any; see [`super::score`].
     pub map: &'a MapGraph,
     /// The ego's id, if the frames contain it; it does not collide with itself.
     pub ego: Option<AgentId>,
@@ -58,21 +58,21 @@ impl<'a> Drive<'a> {
         centres(&self.vehicle, self.expert)
     }
 
-    /// Everybody but the ego in one sample.
+    /// All agents except the ego in one sample.
     pub(crate) fn others(&self, sample: &'a Sample) -> impl Iterator<Item = &'a Agent> {
         let ego = self.ego;
         let agents = sample.frame.agents().iter();
         agents.filter(move |agent| Some(agent.id) != ego)
     }
 
-    /// What comfort is judged by.
+    /// The motion that comfort is evaluated on.
     pub(crate) fn motion(&self) -> Motion {
         let states: Vec<EgoState> = self.samples.iter().map(|s| s.ego).collect();
         Motion::of(&self.vehicle, &states)
     }
 }
 
-/// What comfort is judged by of an agent in frames `dt` apart, as far as it is present.
+/// The motion of an agent in frames `dt` apart, as far as it is present, for comfort.
 pub(crate) fn motion_of<'a>(
     frames: impl Iterator<Item = &'a Frame>,
     agent: AgentId,
@@ -82,7 +82,7 @@ pub(crate) fn motion_of<'a>(
     Motion::of(&vehicle, &ego_states(&vehicle, agent, dt, None, frames))
 }
 
-/// An imagined drive and the logged one in the form that is scored; see [`RolloutDrive::new`].
+/// A simulated drive and the logged one as inputs of scoring; see [`RolloutDrive::new`].
 #[derive(Clone, Debug)]
 pub struct RolloutDrive {
     samples: Vec<Sample>,
@@ -92,12 +92,12 @@ pub struct RolloutDrive {
 }
 
 impl RolloutDrive {
-    /// Prepares a rollout and the log it started from for scoring, the start included, as far as
+    /// Prepares a rollout and the log it started from for scoring, including the start, as far as
     /// the ego is present.
     ///
-    /// Box centres become rear axles by the proportions of nuPlan's car. Accelerations are backward
-    /// differences of velocities, turning rates 0, as where nuPlan reads a log; comfort smooths the
-    /// former and derives the latter from headings itself.
+    /// Box centres are converted to rear axles by the proportions of nuPlan's car. Accelerations
+    /// are backward differences of velocities, and yaw rates are 0, as where nuPlan reads a log;
+    /// comfort smooths the former and derives the latter from headings.
     pub fn new(rollout: &Rollout, scenario: &Scenario) -> Self {
         let ego = rollout.ego();
         let vehicle = rollout

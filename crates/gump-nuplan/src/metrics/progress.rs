@@ -11,7 +11,7 @@ use gump_metrics::gained;
 ///
 /// Source: nuPlan's challenges (the devkit's prose says 0.1).
 const LEAST: f64 = 2.0;
-/// The minimum ratio for a score of 1.
+/// The minimum ratio that counts as making progress.
 ///
 /// Source: nuPlan's challenges and the paper.
 const MAKING_PROGRESS: f64 = 0.2;

@@ -212,8 +212,8 @@ pub struct Decision {
 /// the simulated agents and drives on, and the world reacts within the same frame. A plan is thus
 /// not a fixed line, and the motion of other agents is not a fixed forecast.
 ///
-/// A future in which a gate of the score has closed for good has a value of 0, so the world is not
-/// asked for the rest of it. This bound is exact.
+/// A future in which a gate of the score has closed for good can gain no further value, so the
+/// world is not asked for the rest of it. This bound is exact.
 ///
 /// Ties of values (within 1e-6) are broken by fewer collisions, more progress, the previous choice,
 /// the lower index. If no candidate has a value above 0, the one that collides last is followed; if

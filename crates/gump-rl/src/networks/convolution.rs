@@ -33,7 +33,7 @@ impl Convolution {
         (self.side - 1) / self.stride + 1
     }
 
-    /// Weights, `[output, input, y, x]`; biases are the business of what normalizes.
+    /// Weights, `[output, input, y, x]`; biases are left to the normalization.
     pub(super) fn n_weights(&self) -> usize {
         self.outputs * self.taps()
     }

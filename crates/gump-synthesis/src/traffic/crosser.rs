@@ -43,7 +43,7 @@ pub(crate) struct Span {
     pub(crate) across: (f64, f64),
 }
 
-/// Somebody on the way across, or waiting for a gap.
+/// A pedestrian on the way across, or waiting for a gap.
 #[derive(Clone, Debug)]
 pub(crate) struct Crosser {
     pub(crate) id: i64,
@@ -63,7 +63,7 @@ pub(crate) struct Crosser {
 }
 
 impl Crosser {
-    /// Somebody who waits at the beginning of a way.
+    /// A pedestrian waiting at the beginning of a crossing path.
     pub(crate) fn new(
         id: i64,
         size: [f64; 3],

@@ -53,7 +53,7 @@ pub(crate) struct Person {
     sway: (f64, f64),
 }
 
-/// Somebody who walks with a person, about at the same place beside or behind.
+/// A companion of a pedestrian, at about the same place beside or behind.
 #[derive(Clone, Copy, Debug)]
 struct Companion {
     id: i64,
@@ -224,7 +224,7 @@ impl Person {
 }
 
 impl Traffic<'_> {
-    /// Moves everybody on foot by one step.
+    /// Moves all pedestrians by one step.
     pub(super) fn step_people(&mut self) {
         for i in 0..self.people.len() {
             let mut person = self.people[i].clone();
@@ -277,7 +277,7 @@ impl Traffic<'_> {
         self.limit_behind_others(person, i)
     }
 
-    /// Slows behind somebody slower ahead; of two who meet, the one who came first goes first.
+    /// Slows down behind a slower pedestrian; of two who meet, the one who came first goes first.
     fn limit_behind_others(&self, person: &Person, i: usize) -> f64 {
         let mut limit = f64::INFINITY;
         for (j, other) in self.people.iter().enumerate() {

@@ -175,7 +175,7 @@ impl Traffic<'_> {
         !enters || self.vehicles.iter().filter(on_it).count() < capacity
     }
 
-    /// True if nobody between the vehicle and the line is still undecided.
+    /// True if all vehicles between the vehicle and the line have decided.
     fn is_first_in_line(&self, vehicle: &Vehicle, leg: usize) -> bool {
         vehicle.path[vehicle.leg..leg]
             .iter()
@@ -245,7 +245,7 @@ impl Traffic<'_> {
             .any(|other| undecided(other) && yields_to(other))
     }
 
-    /// True if nobody is, or is politely to be let, on the crosswalks on the way.
+    /// True if no pedestrian is on the crosswalks on the path, or waits there and is given way.
     fn is_free_of_people(&self, vehicle: &Vehicle, connector: &Connector) -> bool {
         connector.crossings.iter().all(|crossing| {
             let signalled = connector.signal.is_some();

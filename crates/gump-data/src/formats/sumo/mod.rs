@@ -114,7 +114,7 @@ fn is_floating_cars(head: &[u8]) -> bool {
     root(head).is_some_and(|root| root == "fcd-export")
 }
 
-/// A network as a scenario of nobody, if `options` park an ego there.
+/// A network as a scenario with only a parked ego, if `options` allow it.
 ///
 /// Error: those of reading a network, and of one without lanes for vehicles.
 pub(crate) fn map_alone(path: &Path, options: ReadOptions) -> Result<Scenario, DataError> {

@@ -33,7 +33,7 @@ pub struct Roads {
 }
 
 impl Roads {
-    /// Interprets a network. Lanes for nobody but people and rails are left out and counted.
+    /// Interprets a network. Lanes for pedestrians or rails only are dropped and counted.
     pub fn new(network: &Network) -> Self {
         let mut report = ReadReport::default();
         let draft = Draft::new(network, &mut report);

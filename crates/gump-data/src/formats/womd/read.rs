@@ -82,7 +82,7 @@ pub fn scenario_from_proto(
     Ok((scenario, report))
 }
 
-/// A message that holds a map and nobody on it.
+/// A message with a map and no agents.
 fn map_alone(
     proto: &proto::Scenario,
     options: ReadOptions,
