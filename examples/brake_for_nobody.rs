@@ -1,4 +1,4 @@
-//! A policy of one's own drives the ego through two worlds: does traffic answer it?
+//! Your own policy drives the ego in two worlds, to see whether traffic reacts to it.
 //!
 //! `cargo run -p examples --example brake_for_nobody [FILE#INDEX]`
 

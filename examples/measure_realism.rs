@@ -1,4 +1,4 @@
-//! How real a world is, by Waymo's measure, and what costs it most: `gump-metrics` on scenes.
+//! Realism of a world by Waymo's metric, and its largest penalties.
 //!
 //! `cargo run -p examples --example measure_realism [FILE]`
 

@@ -1,4 +1,4 @@
-//! A recorded scene, 32 imagined futures of it, how good they are, and a picture.
+//! Simulates 32 futures of a recorded scene, scores them and draws a picture.
 //!
 //! `cargo run -p examples --example quickstart [FILE#INDEX]` writes `out/quickstart.png`.
 

@@ -1,4 +1,4 @@
-//! What a network sees of the map, as letters: `gump-raster` on a shipped scene.
+//! Prints the raster of a shipped scene, the input of the network, as text.
 //!
 //! `cargo run -p examples --example raster_as_text [FILE#INDEX]`
 

@@ -1,8 +1,8 @@
-//! A planner of one's own, judged in three worlds: the log, reactive rules and learned agents.
+//! Scores your own planner in three worlds: the log, reactive rules and learned agents.
 //!
-//! `cargo run -p examples --example score_a_planner [FILE]`. Exchange `Cruise` for
-//! `gump_planner::PdmClosed::default()`, or for `InteractiveDriver::new(&learned, ...)?`, which
-//! imagines before it drives.
+//! `cargo run -p examples --example score_a_planner [FILE]`. Replace `Cruise` by
+//! `gump_planner::PdmClosed::default()`, or by `InteractiveDriver::new(&learned, ...)?`, which uses
+//! rollouts.
 
 use gump_engine::SamplingConfig;
 use gump_engine::TransformerWorld;

@@ -1,7 +1,7 @@
-//! Futures of a scene in a learned world, as a film.
+//! Simulates futures of a scene in a learned world and writes them as a film.
 //!
 //! `cargo run -p examples --example simulate [WEIGHTS] [FILE#INDEX]` writes `out/simulate.gif`.
-//! Weights are what `cargo xtask train` writes; the shipped ones unless told otherwise.
+//! Weights are a file written by `cargo xtask train`; the default are the shipped ones.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! How long scenes are in tokens and what tokens lose: `gump-tokenizer` on a whole file.
+//! Lengths of scenes in tokens, and losses of tokenization, over a whole file.
 //!
 //! `cargo run -p examples --example tokens_of_a_dataset [FILE]`
 

@@ -1,7 +1,7 @@
 //! Trains the network with relative attention: `train_relative [DATA OUT STEPS WIDTH LAYERS]`.
 //!
-//! Without arguments it takes a few steps on shipped scenes, to be seen at work. A run whose file is
-//! there goes on; `model:OUT` is then a world for `cargo xtask simulate` and `evaluate`.
+//! Without arguments it runs a few steps on shipped scenes as a demonstration. If the file of a run
+//! exists the run continues; `model:OUT` is then a world for `cargo xtask simulate` and `evaluate`.
 
 use std::path::PathBuf;
 

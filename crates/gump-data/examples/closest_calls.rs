@@ -1,6 +1,6 @@
-//! Which scenes of a file or folder are worth a look: where the ego comes closest to somebody.
+//! Finds the scenes of a file or folder in which the ego comes closest to another agent.
 //!
-//! `cargo run -p gump-data --example closest_calls [PATH]`, of any format that is read.
+//! `cargo run -p gump-data --example closest_calls [PATH]`, in any readable format.
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! Whose future is open: how far apart the network imagines each agent after some seconds.
+//! The network's uncertainty: the spread of each agent's simulated positions after some seconds.
 //!
 //! `cargo run -p gump-engine --example how_sure [WEIGHTS] [FILE#INDEX]`
 

@@ -1,4 +1,4 @@
-//! Every candidate of a planner in one scene, and why it chose what it chose.
+//! Prints every candidate of a planner in one scene with its score, and the choice.
 //!
 //! `cargo run -p gump-planner --example explain_a_choice [FILE#INDEX]`
 

@@ -1,5 +1,5 @@
-//! A vectorised environment for one's own learner: eight cars among reactive traffic, that
-//! coast, and then do what the log did.
+//! A vectorised environment for your own learner: eight egos in reactive traffic, which coast and
+//! then follow the log.
 //!
 //! `cargo run -p gump-rl --example drive_in_traffic [FILE]`
 

@@ -1,4 +1,4 @@
-//! A scenario from one's own numbers: a lane, two tracks, and a question about them.
+//! Builds a scenario from your own numbers: a lane and two tracks, with a query on them.
 //!
 //! `cargo run -p gump-scene --example build_a_scenario`
 

@@ -1,4 +1,4 @@
-//! Scenes of the kind one needs, made up: here busy roundabouts, written in Waymo's format.
+//! Generates synthetic scenes of a chosen kind: busy roundabouts, written in Waymo's format.
 //!
 //! `cargo run -p gump-synthesis --example make_scenes` writes `out/roundabouts.tfrecord`.
 

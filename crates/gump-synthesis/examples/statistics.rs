@@ -1,5 +1,5 @@
-//! Prints what procedural scenes are like: sizes, speeds, turns, accelerations, and how fast they
-//! are made. `cargo run -p gump-synthesis --example statistics -- [SCENES] [SEED]`, or the same of
+//! Prints statistics of procedural scenes: sizes, speeds, turns, accelerations, and the speed of
+//! generation. `cargo run -p gump-synthesis --example statistics -- [SCENES] [SEED]`, or the same of
 //! the scenes in a file: `... -- FILE`
 
 use std::collections::BTreeMap;
