@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct SamplingConfig {
     /// The order in which the objects of a frame are decoded.
     pub mode: Mode,
-    /// What is cached between passes.
+    /// Caching between passes.
     pub cache: CacheMode,
     /// Divides the logits (paper, simulation: 1.1); above 1 gives more varied draws. The default
     /// depends on the network: 0.5 for the sequence network, whose targets were smoothed, and 1 for
@@ -33,7 +33,7 @@ pub struct SamplingConfig {
     /// Whether agents enter and leave; otherwise the set of agents is fixed. A sequence network
     /// decides this itself (on a CPU), as well as the states of lights.
     pub life: bool,
-    /// What lights show, where the network does not decide it.
+    /// Source of the lights, where the network does not decide them.
     pub lights: LightSource,
     /// Factors on the rates of arrivals and of changes of lights.
     pub pace: RateScale,
@@ -128,7 +128,7 @@ impl Default for RateScale {
     }
 }
 
-/// What traffic lights show after the present.
+/// Source of traffic lights after the present.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LightSource {
@@ -151,7 +151,7 @@ pub enum Mode {
     FullAr,
 }
 
-/// What is cached between passes, and how far back the window reaches.
+/// Caching between passes, and the length of the window.
 ///
 /// Keys and values are cached token by token as long as the token and all tokens before it are
 /// unchanged, so every cache is exact: the result is that of computing the same window anew.

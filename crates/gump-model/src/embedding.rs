@@ -91,8 +91,8 @@ impl Tables {
     }
 }
 
-/// What determines the sine features of a token: the bins, and whether only the first three count,
-/// as for a light.
+/// The key of the sine features of a token: the bins, and whether only the first three count, as
+/// for a light.
 pub type SineKey = (QuantizedState, bool);
 
 /// Sine features of every bin of every field, computed once.

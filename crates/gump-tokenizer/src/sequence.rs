@@ -53,7 +53,7 @@ pub struct TokenSequence {
     frames: Vec<TokenFrame>,
 }
 
-/// What [`TokenSequence::fit`] left out.
+/// Frames, agents and lights that [`TokenSequence::fit`] left out.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Overflow {
     /// Oldest whole frames.

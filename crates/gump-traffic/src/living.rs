@@ -16,7 +16,7 @@ use crate::signals::{SignalPlan, Signals};
 const SIGNALS: u64 = 1 << 56;
 const ARRIVALS: u64 = 1 << 57;
 
-/// What lights show after the present.
+/// Source of the lights after the present.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum LightControl {
     /// The same as at the present.
@@ -56,7 +56,7 @@ impl RecordedLights {
 /// Settings of lights and of arrivals and departures.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LivingConfig {
-    /// What lights show.
+    /// Source of the lights.
     pub lights: LightControl,
     /// Whether and where agents enter and leave.
     pub arrivals: Option<Arrivals>,

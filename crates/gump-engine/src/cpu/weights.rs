@@ -1,8 +1,7 @@
 //! The network's weights in the form that the engine multiplies: packed layers, read by their
 //! checkpoint names.
 //!
-//! What lives here: packed layers, read by their checkpoint names. What does not: how they are
-//! applied one after another.
+//! `mod.rs` applies the layers.
 
 use candle_core::Tensor;
 use gump_kernels::norm::NORM_EPS;

@@ -1,4 +1,4 @@
-//! Who is drawn again: on small hand-made roads.
+//! Choice of objects to redraw, on small hand-made roads.
 
 use gump_geometry::{Polyline, dvec2};
 

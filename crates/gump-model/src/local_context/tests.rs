@@ -1,4 +1,4 @@
-//! What objects of small hand-made scenes see.
+//! Local contexts of small hand-made scenes.
 
 use gump_geometry::dvec2;
 use gump_scene::{Scenario, fixture};

@@ -43,8 +43,8 @@ impl SavitzkyGolay {
         Some((0..n).map(read_off).collect())
     }
 
-    /// What each sample of a window contributes to the derivative at position `at`, counted in
-    /// samples from the window's first.
+    /// The weight of each sample of a window in the derivative at position `at`, counted in samples
+    /// from the window's first.
     pub fn weights(&self, at: f64) -> Vec<f64> {
         let middle = (self.window - 1) as f64 / 2.0;
         // Positions scaled to [-1, 1] keep the normal equations well conditioned.

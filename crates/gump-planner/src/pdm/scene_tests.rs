@@ -1,4 +1,4 @@
-//! What the rules come to in scenes that one can judge by eye; `tests` holds every number.
+//! Behaviour of the rules in simple scenes; `tests` compares every number.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! What each layer shows, one file per theme. A new layer is a variant of [`Layer`](crate::Layer),
+//! Drawing of the layers, one file per theme. A new layer is a variant of [`Layer`](crate::Layer),
 //! a function here and an arm in `rasterize`.
 
 pub(crate) mod agents;

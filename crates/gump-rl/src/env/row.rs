@@ -6,7 +6,7 @@ use super::sampler::Sampler;
 use crate::observation::{ObservedRow, View};
 use crate::{Course, End, EpisodeState, Failure, ObservationSpec, Rules, Totals, observe};
 
-/// What determines an episode besides its actions.
+/// The start of an episode, which together with its actions determines it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EpisodeStart {
     /// Index of the scenario.

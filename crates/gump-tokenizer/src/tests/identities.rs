@@ -1,4 +1,4 @@
-//! Who has which id.
+//! Assignment of ids.
 
 use std::collections::BTreeSet;
 

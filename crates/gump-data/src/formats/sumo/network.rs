@@ -66,7 +66,7 @@ pub struct NetworkLane {
     pub width: f64,
     /// Length as simulated, metres.
     pub length: f64,
-    /// Who may use it.
+    /// Permitted users.
     pub access: Access,
     /// Centre line, x, y and z in metres.
     pub shape: Vec<[f64; 3]>,

@@ -24,7 +24,7 @@ const FREEWAY_SPEED: f64 = 25.0;
 /// Height of a stop sign, metres.
 const SIGN_HEIGHT: f64 = 2.0;
 
-/// What a network says, ready to be cut out of.
+/// A converted network, from which maps of scenarios are cut.
 #[derive(Debug)]
 pub struct Roads {
     parts: MapParts,
@@ -60,7 +60,7 @@ impl Roads {
         Some((points().reduce(DVec2::min)?, points().reduce(DVec2::max)?))
     }
 
-    /// What was left out.
+    /// Items dropped in the conversion.
     pub fn report(&self) -> &ReadReport {
         &self.report
     }
