@@ -1,13 +1,11 @@
-//! Futures as files: an array for analysis, the challenge's message, pictures and a film.
+//! Futures as files: an array for analysis, and a picture.
 
 use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
 use gump_scene::{Agent, AgentId, Rollout, Scenario};
-use gump_viz::{
-    Camera, Film, FilmSpec, Picture, PictureSpec, Take, draw_futures, grid_film, log_as_rollout,
-};
+use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -136,40 +134,10 @@ pub(crate) fn picture(scenario: &Scenario, rollouts: &[Rollout], label: &str) ->
     draw_futures(&scene, &futures, &spec)
 }
 
-/// What happened, as far as it is known, beside futures with their names.
-pub(crate) fn film(scenario: &Scenario, futures: &[(&str, &Rollout)]) -> anyhow::Result<Film> {
-    let log = log_as_rollout(scenario);
-    let known = (log.steps() > 0).then_some(("log", &log));
-    let takes: Vec<_> = known
-        .into_iter()
-        .chain(futures.iter().copied())
-        .map(|(label, rollout)| Take {
-            rollout,
-            label: label.into(),
-        })
-        .collect();
-    let scene = scenario.present();
-    let spec = FilmSpec {
-        columns: if takes.len() == 4 {
-            2
-        } else {
-            takes.len().min(3)
-        },
-        ..FilmSpec::new(Camera::on_ego(&scene, 90.0, 400, 400))
-    };
-    Ok(grid_film(&takes, &spec)?)
-}
-
-/// The first few futures with their numbers, for a film.
-pub(crate) fn first_few(rollouts: &[Rollout]) -> Vec<(&'static str, &Rollout)> {
-    ["future 1", "future 2", "future 3"]
-        .into_iter()
-        .zip(rollouts)
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
+    use gump_viz::log_as_rollout;
+
     use super::*;
 
     fn rollouts() -> (Scenario, Vec<Rollout>) {

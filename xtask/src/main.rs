@@ -16,6 +16,7 @@ mod cli;
 mod config;
 mod dataset;
 mod decoding;
+mod films;
 mod fresh;
 mod futures;
 mod imagine;

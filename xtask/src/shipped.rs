@@ -18,6 +18,12 @@ pub(crate) fn scenario() -> String {
     format!("{}#20", data().join("procedural.tfrecord.gz").display())
 }
 
+/// The scene of the demo: a signalized crossing with turns and people, of no split.
+pub(crate) fn demo() -> String {
+    let path = repository().join("datasets/demo/crossing.tfrecord.gz");
+    format!("{}#0", from_here(&path).display())
+}
+
 /// The shipped weights of the sequence network, which generates scenes and says who comes and leaves.
 pub(crate) fn weights() -> PathBuf {
     from_here(&repository().join("datasets/weights/gump-tiny.safetensors"))

@@ -67,8 +67,11 @@ const DECODING: [&str; 14] = [
 ];
 
 /// How planners that imagine do it.
-const THINKING: [&str; 6] = [
+const THINKING: [&str; 9] = [
     "futures",
+    "allocation",
+    "aggregate",
+    "hysteresis",
     "nearest",
     "horizon",
     "think_ms",

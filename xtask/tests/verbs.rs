@@ -667,14 +667,15 @@ fn demo_tells_its_stages_or_what_is_missing() {
         return;
     }
     if std::env::var_os("RUN_SLOW_TESTS").is_none() {
-        eprintln!("skipped: the demo takes a minute, set RUN_SLOW_TESTS to run it");
+        eprintln!("skipped: the demo takes half a minute, set RUN_SLOW_TESTS to run it");
         return;
     }
     let report = place.report("demo");
     let results = report["results"].as_object().unwrap();
     let stages: Vec<_> = results.keys().map(String::as_str).collect();
     let expected = [
-        "read", "picture", "raster", "tokens", "network", "train", "imagine", "plan", "page",
+        "read", "imagine", "plan", "generate", "train", "picture", "raster", "tokens", "network",
+        "page",
     ];
     assert_eq!(stages, expected);
     for stage in expected {
@@ -682,6 +683,8 @@ fn demo_tells_its_stages_or_what_is_missing() {
     }
     let page = fs::read_to_string(place.path("out/index.html")).unwrap();
     assert!(page.contains("data:image/gif;base64,") && !page.contains("src=\"http"));
+    assert!(page.len() < 2_000_000, "{} bytes", page.len());
+    assert_eq!(results["generate"]["holds"], true);
     let viewer = fs::read_to_string(place.path("out/viewer.html")).unwrap();
     assert!(page.contains("href=\"viewer.html\"") && viewer.contains("\"chosen\":true"));
 }
@@ -749,10 +752,23 @@ fn a_decision_is_explained() {
     );
     assert!(decision["milliseconds"]["frames"].as_f64().unwrap() > 0.0);
     let page = fs::read_to_string(place.path("out/explain.html")).unwrap();
-    assert_eq!(page.matches("data:image/gif;base64,").count(), 20);
-    for part in ["What the others did", "time_to_collision", "vehicle 1"] {
+    // One film and one picture: what was chosen beside the best that was not.
+    assert_eq!(page.matches("data:image/gif;base64,").count(), 1);
+    assert_eq!(page.matches("data:image/png;base64,").count(), 1);
+    for part in [
+        "is worth",
+        "What the others did",
+        "time to collision",
+        "vehicle 1",
+    ] {
         assert!(page.contains(part), "{part}");
     }
+    assert_eq!(results["decision_step"], 5);
+    // Between two decisions the older one counts; without a number the one that mattered most does.
+    let between = place.report(&format!("{plan} --explain 7"));
+    assert_eq!(between["results"]["decision_step"], 5);
+    let decisive = place.report(&format!("{plan} --explain"))["results"]["decision_step"].clone();
+    assert!([0, 5].map(Value::from).contains(&decisive), "{decisive}");
     let viewer = fs::read_to_string(place.path("out/viewer.html")).unwrap();
     assert!(viewer.contains("\"chosen\":true"));
     let blind = format!("{plan} --planner pdm-closed --explain 5");

@@ -1,7 +1,9 @@
 //! Which part of the world is seen.
 
+use std::ops::RangeInclusive;
+
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_scene::{Rollout, SceneState};
+use gump_scene::{Agent, Rollout, SceneState};
 
 /// A view from straight above.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,6 +80,39 @@ impl Camera {
         Self::framing(positions, heading, min_metres, size_px)
     }
 
+    /// Shows the ego's way and everyone who moves near it in any of these futures, the ego's present
+    /// heading up; fixed, so that the road need be drawn only once per film.
+    ///
+    /// Units: `metres` are the least and the most that may be visible across the width.
+    /// Error: none; `None` if the ego's own way takes more than that, so that the camera had better
+    /// go along.
+    pub fn on_movement(
+        rollouts: &[&Rollout],
+        metres: RangeInclusive<f64>,
+        size_px: (u32, u32),
+    ) -> Option<Self> {
+        let (least, most) = (*metres.start(), *metres.end());
+        let way = Self::on_futures(rollouts, least, size_px);
+        if way.metres > most {
+            return None;
+        }
+        let heading = way.world_from_camera.heading;
+        let points = rollouts.iter().flat_map(|rollout| moving(rollout));
+        let all = Self::framing(points, heading, least, size_px);
+        if all.metres <= most {
+            return Some(all);
+        }
+        Some(Self {
+            metres: most,
+            ..way
+        })
+    }
+
+    /// This view from where the ego is, its heading up.
+    pub(crate) fn with_ego(&self, scene: &SceneState<'_>) -> Self {
+        Self::on_ego(scene, self.metres, self.width_px, self.height_px)
+    }
+
     /// Pixels per metre.
     pub fn scale(&self) -> f64 {
         f64::from(self.width_px) / self.metres
@@ -98,6 +133,32 @@ impl Camera {
         let reach = half + radius;
         self.world_from_camera.position.distance_squared(point) <= reach * reach
     }
+}
+
+/// How near to the ego, metres, movement is worth seeing.
+const NEAR: f64 = 45.0;
+/// How far an agent goes at least that counts as moving, metres.
+const MOVES: f64 = 2.0;
+
+/// Where the ego is, and everyone else while they are near it and have moved.
+fn moving(rollout: &Rollout) -> Vec<DVec2> {
+    let start = rollout.start();
+    let mut points = Vec::new();
+    for frame in std::iter::once(start).chain(rollout.imagined()) {
+        let Some(ego) = frame.agent(rollout.ego()) else {
+            continue;
+        };
+        let ego = ego.state.pose.position;
+        points.push(ego);
+        for agent in frame.agents() {
+            let at = agent.state.pose.position;
+            let moves = |before: &Agent| before.state.pose.position.distance(at) > MOVES;
+            if at.distance(ego) < NEAR && start.agent(agent.id).is_some_and(moves) {
+                points.push(at);
+            }
+        }
+    }
+    points
 }
 
 #[cfg(test)]

@@ -23,6 +23,14 @@ pub enum VizError {
     /// A film does not fit the format of animated PNGs.
     #[error("could not encode an animated PNG")]
     Apng(#[from] png::EncodingError),
+    /// Videos are encoded by another program.
+    #[error(
+        "expected ffmpeg on the path to encode an MP4, found none; GIFs and animated PNGs need nothing"
+    )]
+    NoFfmpeg,
+    /// The video's encoder refused.
+    #[error("ffmpeg could not encode the MP4: {0}")]
+    Ffmpeg(String),
     /// A side of a picture or film is zero or beyond what its format can hold.
     #[error("{width} x {height} px is not a size of a picture or film")]
     Size {

@@ -11,19 +11,37 @@ use crate::VizError;
 /// # Errors
 /// [`VizError::Write`] with the path; nothing is left beside it.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), VizError> {
+    write_beside(path, |beside| {
+        fs::write(beside, bytes).map_err(|source| VizError::Write {
+            source,
+            path: path.to_path_buf(),
+        })
+    })
+}
+
+/// Lets `write` fill a file beside `path` and renames it onto it.
+///
+/// # Errors
+/// Those of `write`, [`VizError::Write`] with the path; nothing is left beside it.
+pub(crate) fn write_beside(
+    path: &Path,
+    write: impl FnOnce(&Path) -> Result<(), VizError>,
+) -> Result<(), VizError> {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
     name.push(format!(".{}.part", std::process::id()));
     let beside = path.with_file_name(name);
-    let written = fs::write(&beside, bytes).and_then(|()| fs::rename(&beside, path));
-    written.map_err(|source| {
-        // The first error is the one to report; there may be nothing to remove.
-        let _ = fs::remove_file(&beside);
-        VizError::Write {
+    let renamed = write(&beside).and_then(|()| {
+        fs::rename(&beside, path).map_err(|source| VizError::Write {
             source,
             path: path.to_path_buf(),
-        }
-    })
+        })
+    });
+    if renamed.is_err() {
+        // The first error is the one to report; there may be nothing to remove.
+        let _ = fs::remove_file(&beside);
+    }
+    renamed
 }
 
 #[cfg(test)]

@@ -1,29 +1,34 @@
-//! Films of futures, as animated GIFs or PNGs.
+//! Films of futures, as animated GIFs or PNGs, and as MP4 where `ffmpeg` is installed.
 //!
-//! The road is drawn once; a frame draws only what moves, and stores only the pixels that differ
-//! from the frame before.
+//! The road is drawn once unless the camera goes along with the ego; a frame stores only the pixels
+//! that differ from the frame before.
 
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::sync::Arc;
 
 use gif::{DisposalMethod, Encoder, Frame as GifFrame, Repeat};
+use gump_geometry::Pose;
 use gump_scene::{Rollout, Scenario};
 use tiny_skia::Pixmap;
 
 use crate::draw_agents::{draw_agents, draw_lights, draw_past};
 use crate::draw_map::draw_backdrop;
-use crate::files::write_whole;
+use crate::files::{write_beside, write_whole};
 use crate::indexed::{Palette, UNCHANGED};
 use crate::pen::Pen;
 use crate::picture::{draw_label, draw_rectangle, recent};
 use crate::theme::{Colours, mix};
-use crate::{Camera, Theme, VizError, lettering};
+use crate::{Camera, Theme, VizError, lettering, video};
 
 /// What a film shows and how.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmSpec {
-    /// What one panel shows; fixed in the world.
+    /// What one panel shows.
     pub camera: Camera,
+    /// Whether the camera goes along with the ego of a panel's first rollout, its heading up, and
+    /// only the size of `camera` counts; otherwise it is fixed in the world.
+    pub follow: bool,
     /// On which ground.
     pub theme: Theme,
     /// Panels side by side, > 0; an overlay has one panel.
@@ -37,18 +42,59 @@ pub struct FilmSpec {
 }
 
 impl FilmSpec {
-    /// A light film in real time, five frames a second, two panels wide.
+    /// A light film in real time, ten frames a second, two panels wide, the camera fixed.
     pub fn new(camera: Camera) -> Self {
         Self {
             camera,
+            follow: false,
             theme: Theme::Light,
             columns: 2,
-            frame_s: 0.2,
+            frame_s: 0.1,
             speed: 1.0,
             past_s: 1.5,
         }
     }
+
+    /// As [`FilmSpec::framing`], or as [`FilmSpec::following`] where the ego goes further than fits
+    /// into 140 m.
+    pub fn of_rollouts(rollouts: &[&Rollout], size_px: (u32, u32)) -> Self {
+        match Camera::on_movement(rollouts, FRAMED, size_px) {
+            Some(camera) => Self::new(camera),
+            None => Self::following(size_px),
+        }
+    }
+
+    /// As [`FilmSpec::new`], from a camera that shows all the way of the ego in these rollouts and,
+    /// as far as they fit into 140 m, those who move near it.
+    ///
+    /// Units: `size_px` is width and height of a panel.
+    pub fn framing(rollouts: &[&Rollout], size_px: (u32, u32)) -> Self {
+        let framed = Camera::on_movement(rollouts, FRAMED, size_px);
+        let whole = || Camera::on_futures(rollouts, *FRAMED.end(), size_px);
+        Self::new(framed.unwrap_or_else(whole))
+    }
+
+    /// As [`FilmSpec::new`], from a camera that goes along with the ego and shows 90 m.
+    ///
+    /// Units: `size_px` is width and height of a panel.
+    pub fn following((width_px, height_px): (u32, u32)) -> Self {
+        let camera = Camera {
+            world_from_camera: Pose::IDENTITY,
+            metres: FOLLOWED,
+            width_px,
+            height_px,
+        };
+        Self {
+            follow: true,
+            ..Self::new(camera)
+        }
+    }
 }
+
+/// Metres across a panel whose camera is fixed.
+const FRAMED: RangeInclusive<f64> = 50.0..=140.0;
+/// Metres across a panel whose camera goes along with the ego.
+const FOLLOWED: f64 = 90.0;
 
 /// A rollout and the words in the corner of its panel.
 #[derive(Clone, Debug)]
@@ -130,15 +176,18 @@ pub fn log_as_rollout(scenario: &Scenario) -> Rollout {
 }
 
 impl Film {
-    /// Writes the film, as an animated PNG if the file is named so (`.png`, `.apng`), else as a GIF;
-    /// a reader finds the old file or the new one, never half of one.
+    /// Writes the film, as an animated PNG if the file is named so (`.png`, `.apng`), as a video if
+    /// it is named `.mp4`, else as a GIF; a reader finds the old file or the new one, never half of
+    /// one.
     ///
     /// # Errors
-    /// [`VizError::Write`] with the path, and those of [`Film::to_apng`].
+    /// [`VizError::Write`] with the path, and those of [`Film::to_apng`];
+    /// [`VizError::NoFfmpeg`] and [`VizError::Ffmpeg`] for videos.
     pub fn save(&self, path: &Path) -> Result<(), VizError> {
         let ending = path.extension().and_then(|ending| ending.to_str());
         match ending {
             Some("png" | "apng") => write_whole(path, &self.to_apng()?),
+            Some("mp4") => write_beside(path, |beside| self.save_mp4(beside)),
             _ => write_whole(path, &self.gif),
         }
     }
@@ -173,7 +222,39 @@ impl Film {
     }
 }
 
+impl Film {
+    /// Writes the frames of the GIF as video, encoded by `ffmpeg`.
+    ///
+    /// # Errors
+    /// [`VizError::NoFfmpeg`] if that is not on the path, [`VizError::Ffmpeg`] with what it says.
+    fn save_mp4(&self, path: &Path) -> Result<(), VizError> {
+        let delay = self.patches.first().map_or(10, |patch| patch.delay);
+        let mut canvas = vec![0; self.width * self.height];
+        let frames = self.patches.iter().flat_map(|patch| {
+            patch.apply(&mut canvas, self.width);
+            let colour = |&i: &u8| &self.palette[usize::from(i) * 3..][..3];
+            let frame: Vec<u8> = canvas.iter().flat_map(colour).copied().collect();
+            // The last frame stays longer: it is repeated.
+            std::iter::repeat_n(frame, usize::from((patch.delay / delay).max(1)))
+        });
+        video::encode(path, (self.width, self.height), delay, frames)
+    }
+}
+
 impl Patch {
+    /// Writes what differs into the frame before, whose rows are `stride` long.
+    fn apply(&self, canvas: &mut [u8], stride: usize) {
+        for (row, pixels) in self.pixels.chunks_exact(self.width).enumerate() {
+            let start = (self.top + row) * stride + self.left;
+            let shown = canvas[start..start + self.width].iter_mut();
+            for (shown, &pixel) in shown.zip(pixels) {
+                if pixel != UNCHANGED {
+                    *shown = pixel;
+                }
+            }
+        }
+    }
+
     fn as_gif(&self) -> GifFrame<'_> {
         GifFrame {
             left: self.left as u16,
@@ -206,7 +287,10 @@ const LAST_DELAY: u16 = 120;
 fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
     let layout = Layout::new(panels.len(), spec)?;
     let colours = spec.theme.colours();
-    let backdrops = backdrops(panels, spec, colours);
+    let backdrops = match spec.follow {
+        true => Vec::new(),
+        false => backdrops(panels, spec, colours),
+    };
     let mut palette = Palette::new(colours);
     let duration = panels
         .iter()
@@ -224,9 +308,8 @@ fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
     let mut shown: Option<Vec<u8>> = None;
     for i in 0..n_frames {
         let time = i as f64 * spec.frame_s;
-        for (number, (panel, backdrop)) in panels.iter().zip(&backdrops).enumerate() {
-            let mut pixmap = Pixmap::clone(backdrop);
-            draw_panel(&mut pixmap, panel, time, spec, colours);
+        for (number, panel) in panels.iter().enumerate() {
+            let pixmap = draw_panel(panel, backdrops.get(number), time, spec, colours);
             let place = layout.panel(number);
             palette.blit(&pixmap, &mut canvas, layout.width, place);
         }
@@ -330,18 +413,27 @@ fn backdrops(panels: &[Panel<'_>], spec: &FilmSpec, colours: &Colours) -> Vec<Ar
     drawn
 }
 
+/// One view at one time, on the road that was drawn before if the camera is fixed.
 fn draw_panel(
-    pixmap: &mut Pixmap,
     panel: &Panel<'_>,
+    backdrop: Option<&Arc<Pixmap>>,
     time: f64,
     spec: &FilmSpec,
     colours: &Colours,
-) {
-    let mut pen = Pen::new(pixmap, spec.camera);
+) -> Pixmap {
+    let (camera, mut pixmap) = match backdrop {
+        Some(backdrop) => (spec.camera, Pixmap::clone(backdrop)),
+        None => {
+            let first = panel.rollouts[0];
+            let scene = first.at(step_at(first, time));
+            let camera = spec.camera.with_ego(&scene);
+            let backdrop = draw_backdrop(scene.map, scene.route, camera, colours);
+            (camera, backdrop)
+        }
+    };
+    let mut pen = Pen::new(&mut pixmap, camera);
     for (i, rollout) in panel.rollouts.iter().enumerate() {
-        // A rollout that is over stays as it ended.
-        let step = ((time / rollout.dt()).round() as usize).min(rollout.steps());
-        let scene = rollout.at(step);
+        let scene = rollout.at(step_at(rollout, time));
         if i == 0 {
             draw_lights(&mut pen, scene.now(), scene.map, colours);
         }
@@ -351,7 +443,13 @@ fn draw_panel(
         }
         draw_agents(&mut pen, scene.now(), scene.ego, colours, panel.opacity);
     }
-    draw_label(pixmap, panel.label, colours);
+    draw_label(&mut pixmap, panel.label, colours);
+    pixmap
+}
+
+/// The step at a time; a rollout that is over stays as it ended.
+fn step_at(rollout: &Rollout, time: f64) -> usize {
+    ((time / rollout.dt()).round() as usize).min(rollout.steps())
 }
 
 /// A clock and a bar that grows; `None` only for a film without width.

@@ -62,6 +62,21 @@ pub(crate) fn width(text: &str, height: f64) -> f64 {
     (units - GAP).max(0.0) * height / 6.0
 }
 
+/// A line of text cut so that it is at most `most` pixels wide, with two dots where it was cut.
+pub(crate) fn fitted(text: &str, height: f64, most: f64) -> String {
+    if width(text, height) <= most {
+        return text.to_owned();
+    }
+    let mut cut = text.to_owned();
+    while cut.pop().is_some() {
+        let dotted = format!("{}..", cut.trim_end());
+        if width(&dotted, height) <= most {
+            return dotted;
+        }
+    }
+    String::new()
+}
+
 /// Strokes with their smoothness, and the leftmost and rightmost coordinate.
 type Glyph = (Vec<(bool, Vec<DVec2>)>, f64, f64);
 
@@ -214,5 +229,16 @@ mod tests {
         assert_eq!(ink(" \u{1F600}"), 0);
         assert!(width("20 m", 12.0) > width("20", 12.0));
         assert_eq!(width("", 12.0), 0.0);
+    }
+
+    #[test]
+    fn text_that_does_not_fit_is_cut_and_says_so() {
+        let text = "interactive among model:weights";
+        assert_eq!(fitted(text, 12.0, 1e4), text);
+        let most = width(text, 12.0) / 2.0;
+        let cut = fitted(text, 12.0, most);
+        assert!(cut.ends_with("..") && text.starts_with(cut.trim_end_matches('.')));
+        assert!(width(&cut, 12.0) <= most && cut.len() > 6);
+        assert_eq!(fitted(text, 12.0, 1.0), "");
     }
 }

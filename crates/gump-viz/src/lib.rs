@@ -46,6 +46,7 @@ mod pen;
 mod picture;
 mod plot;
 mod theme;
+mod video;
 mod viewer;
 
 #[cfg(test)]
@@ -57,6 +58,9 @@ pub use chart::{Chart, Series};
 pub use error::VizError;
 pub use film::{Film, FilmSpec, Take, grid_film, log_as_rollout, overlay_film};
 pub use page::{Page, Section};
-pub use picture::{Picture, PictureSpec, draw_futures, draw_raster_layer, draw_scene};
+pub use picture::{
+    Picture, PictureSpec, draw_candidates, draw_futures, draw_raster_layer, draw_scene,
+};
 pub use theme::Theme;
+pub use video::can_encode_mp4;
 pub use viewer::{CandidatePath, HeatMap, MetricTrack, Viewer};

@@ -11,9 +11,9 @@ use tiny_skia::{Pixmap, Transform};
 use crate::draw_agents::{draw_agents, draw_lights, draw_past, draw_trails_of_futures};
 use crate::draw_map::draw_backdrop;
 use crate::files::write_whole;
-use crate::pen::{Pen, paint};
+use crate::pen::{Pen, Shape, paint};
 use crate::theme::{Colours, Rgb, mix};
-use crate::{Camera, Theme, VizError, lettering};
+use crate::{Camera, CandidatePath, Theme, VizError, lettering};
 
 /// What a picture shows and how.
 #[derive(Clone, Debug, PartialEq)]
@@ -92,14 +92,58 @@ pub fn draw_futures(scene: &SceneState<'_>, futures: &[&[Frame]], spec: &Picture
     let past = recent(scene.history, spec.past_s, scene.dt);
     draw_past(&mut pen, past, scene.ego, colours, 8);
     draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
+    finish(&mut pixmap, spec, colours)
+}
+
+/// Adds what lies over the scene.
+fn finish(pixmap: &mut Pixmap, spec: &PictureSpec, colours: &Colours) -> Picture {
     if spec.scale_bar {
-        draw_scale_bar(&mut pixmap, spec.camera.scale(), colours);
+        draw_scale_bar(pixmap, spec.camera.scale(), colours);
     }
     if spec.legend {
-        draw_legend(&mut pixmap, colours);
+        draw_legend(pixmap, colours);
     }
-    draw_label(&mut pixmap, &spec.label, colours);
-    Picture::from_pixmap(&pixmap)
+    draw_label(pixmap, &spec.label, colours);
+    Picture::from_pixmap(pixmap)
+}
+
+/// Draws a scene as it is now, and the lines of a planner's candidates with a dot at the end of each:
+/// the chosen one in the ego's colour and on top, the others dark and the fainter the more there are.
+///
+/// # Panics
+/// If the camera's size is zero or beyond memory.
+pub fn draw_candidates(
+    scene: &SceneState<'_>,
+    candidates: &[CandidatePath],
+    spec: &PictureSpec,
+) -> Picture {
+    let colours = spec.theme.colours();
+    let mut pixmap = draw_backdrop(scene.map, scene.route, spec.camera, colours);
+    let mut pen = Pen::new(&mut pixmap, spec.camera);
+    draw_lights(&mut pen, scene.now(), scene.map, colours);
+    let past = recent(scene.history, spec.past_s, scene.dt);
+    draw_past(&mut pen, past, scene.ego, colours, 8);
+    let n_others = candidates.iter().filter(|path| !path.is_chosen).count();
+    let faint = (3.0 / n_others.max(1) as f32).clamp(0.25, 0.8);
+    for chosen in [false, true] {
+        let (colour, opacity) = match chosen {
+            true => (colours.ego, 1.0),
+            false => (colours.text, faint),
+        };
+        let width = pen.px(0.4, 2.0).min(4.0);
+        for path in candidates.iter().filter(|path| path.is_chosen == chosen) {
+            let mut line = Shape::new(&pen.camera);
+            line.line(path.path.iter().copied());
+            pen.stroke(line, colour, opacity, width);
+            if let Some(&end) = path.path.last() {
+                let mut dot = Shape::new(&pen.camera);
+                dot.disc(end, width * 1.6);
+                pen.fill(dot, colour, opacity);
+            }
+        }
+    }
+    draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
+    finish(&mut pixmap, spec, colours)
 }
 
 /// Draws one layer of a raster, each value a square of `zoom` pixels: 0 is the ground, 1 the
@@ -258,10 +302,12 @@ pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
     if label.is_empty() {
         return;
     }
-    let size = (f64::from(pixmap.width()) / 50.0).clamp(6.0, 12.0);
-    let patch = (lettering::width(label, size) + size * 1.4, size * 2.4);
+    let width = f64::from(pixmap.width());
+    let size = (width / 50.0).clamp(9.0, 12.0);
+    let label = lettering::fitted(label, size, width - size * 1.4);
+    let patch = (lettering::width(&label, size) + size * 1.4, size * 2.4);
     draw_patch(pixmap, (0.0, 0.0), patch, colours);
-    lettering::write(pixmap, label, (size * 0.7, size * 1.7), size, colours.text);
+    lettering::write(pixmap, &label, (size * 0.7, size * 1.7), size, colours.text);
 }
 
 /// A piece of ground under words, so that they can be read over anything.

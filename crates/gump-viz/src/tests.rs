@@ -6,8 +6,9 @@ use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario, fixture};
 
 use crate::theme::{Rgb, mix};
 use crate::{
-    Camera, Chart, FilmSpec, Page, Picture, PictureSpec, Series, Take, Theme, VizError,
-    draw_futures, draw_raster_layer, draw_scene, grid_film, log_as_rollout, overlay_film,
+    Camera, CandidatePath, Chart, FilmSpec, Page, Picture, PictureSpec, Series, Take, Theme,
+    VizError, draw_candidates, draw_futures, draw_raster_layer, draw_scene, grid_film,
+    log_as_rollout, overlay_film,
 };
 
 fn street() -> Scenario {
@@ -210,7 +211,7 @@ fn a_film_of_two_futures_plays_side_by_side() {
     let scenario = street();
     let (log, swerve) = (log_as_rollout(&scenario), swerving(&scenario));
     let mut spec = FilmSpec::new(camera(&scenario));
-    spec.speed = 2.0;
+    (spec.frame_s, spec.speed) = (0.2, 2.0);
     spec.past_s = 0.0;
     let take = |rollout, label: &str| Take {
         rollout,
@@ -286,6 +287,108 @@ fn both_formats_play_the_same_film() {
         film.save(&path).unwrap();
         assert!(std::fs::read(&path).unwrap().starts_with(start), "{name}");
     }
+}
+
+#[test]
+fn a_camera_that_goes_along_keeps_the_ego_in_the_middle() {
+    let scenario = street();
+    let log = log_as_rollout(&scenario);
+    let fixed = FilmSpec {
+        past_s: 0.0,
+        ..FilmSpec::new(camera(&scenario))
+    };
+    let follow = FilmSpec {
+        follow: true,
+        ..fixed.clone()
+    };
+    let ego = Theme::Light.colours().ego;
+    for (spec, stays) in [(&fixed, false), (&follow, true)] {
+        let film = overlay_film(&[&log], spec).unwrap();
+        let (_, screen) = play(&film.gif);
+        let (width, height) = (
+            spec.camera.width_px as usize,
+            spec.camera.height_px as usize,
+        );
+        assert_eq!(screen[height / 2 * width + width / 2] == ego, stays);
+    }
+}
+
+#[test]
+fn a_film_frames_who_moves_and_follows_whom_it_cannot_frame() {
+    let scenario = street();
+    let log = log_as_rollout(&scenario);
+    let framed = FilmSpec::of_rollouts(&[&log], (200, 200));
+    assert!(!framed.follow);
+    let seen = |point| {
+        let pixel = framed.camera.pixel(point);
+        (0.0..200.0).contains(&pixel.x) && (0.0..200.0).contains(&pixel.y)
+    };
+    for frame in std::iter::once(log.start()).chain(log.imagined()) {
+        assert!(seen(frame.agent(log.ego()).unwrap().state.pose.position));
+    }
+    // At 40 m/s nobody can be framed for 8 s.
+    let fast = fixture::scenario(
+        "lane 1: 0,0 600,0\nego vehicle 0: 0,0 velocity 40,0\nhistory 1 future 8 dt 0.1",
+    )
+    .unwrap();
+    let spec = FilmSpec::of_rollouts(&[&log_as_rollout(&fast)], (200, 200));
+    assert!(spec.follow && spec.camera.metres < 140.0);
+}
+
+#[test]
+fn a_video_is_written_by_ffmpeg_or_refused() {
+    let scenario = street();
+    let log = log_as_rollout(&scenario);
+    let film = overlay_film(&[&log], &FilmSpec::new(camera(&scenario))).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("film.mp4");
+    let saved = film.save(&path);
+    if crate::can_encode_mp4() {
+        saved.unwrap();
+        assert_eq!(&std::fs::read(&path).unwrap()[4..8], b"ftyp");
+    } else {
+        eprintln!("SKIPPED: writing a video wants ffmpeg on the path");
+        assert!(matches!(saved, Err(VizError::NoFfmpeg)));
+    }
+    let n_files = std::fs::read_dir(folder.path()).unwrap().count();
+    assert_eq!(
+        n_files,
+        usize::from(path.is_file()),
+        "nothing is left beside it"
+    );
+}
+
+#[test]
+fn candidates_are_drawn_with_the_chosen_one_on_top() {
+    let scenario = street();
+    let scene = scenario.present();
+    let line = |name: &str, y: f64, is_chosen| CandidatePath {
+        name: name.into(),
+        score: Some(0.5),
+        parts: Vec::new(),
+        is_chosen,
+        path: vec![dvec2(0.0, 0.0), dvec2(8.0, y)],
+    };
+    let spec = PictureSpec {
+        scale_bar: false,
+        past_s: 0.0,
+        ..PictureSpec::new(camera(&scenario))
+    };
+    let paths = [
+        line("a", 0.0, true),
+        line("b", 0.0, false),
+        line("c", 4.0, false),
+    ];
+    let picture = draw_candidates(&scene, &paths, &spec);
+    let colour = |x, y| {
+        let at = spec.camera.pixel(dvec2(x, y));
+        let start = (at.y as usize * picture.width + at.x as usize) * 4;
+        [0, 1, 2].map(|i| picture.rgba[start + i])
+    };
+    let bare = draw_candidates(&scene, &[], &spec);
+    assert_eq!(colour(8.0, 0.0), Theme::Light.colours().ego);
+    assert_ne!(colour(8.0, 4.0), Theme::Light.colours().ego);
+    assert_ne!(picture, bare);
 }
 
 #[test]

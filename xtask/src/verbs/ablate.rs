@@ -23,7 +23,7 @@ use crate::decoding::Decoding;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
 use crate::sampling::Draw;
-use crate::{futures, shipped};
+use crate::{films, futures, shipped};
 
 /// Which ablation.
 #[derive(Debug, clap::Subcommand)]
@@ -123,7 +123,7 @@ impl Args {
                 .iter()
                 .filter_map(|(name, rollouts)| Some((*name, rollouts.first()?)))
                 .collect();
-            futures::film(&scenario, &firsts)?.save(&run.path("film.gif"))?;
+            films::film(&scenario, &firsts)?.save(&run.path("film.gif"))?;
             Ok(())
         })
     }

@@ -21,9 +21,10 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
+use crate::films::FilmArgs;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::LightsName;
-use crate::{futures, shipped};
+use crate::shipped;
 
 /// Scenes made together.
 const BATCH: u64 = 32;
@@ -92,6 +93,9 @@ pub(crate) struct Args {
     attempts: NonZeroUsize,
     #[command(flatten)]
     #[serde(flatten)]
+    film: FilmArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
     pub(crate) common: Common,
 }
 
@@ -126,6 +130,7 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let prompts = tags(&self.prompt)?;
         self.check_numbers()?;
+        self.film.check()?;
         let objects = self.objects()?;
         let recorded = run.phase("read", |_| Ok(find_map(&self.map)?))?;
         let world = run.phase("load", |run| {
@@ -156,7 +161,7 @@ impl Args {
             attempts: self.attempts.get(),
         };
         let (made, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
-        run.phase("write", |run| write(run, &made))?;
+        run.phase("write", |run| write(run, &made, &self.film))?;
         tell(run, &made, elapsed)
     }
 
@@ -297,7 +302,7 @@ pub(crate) fn request(recorded: &Scenario) -> GenerateRequest {
 }
 
 /// All scenes as Waymo records, the first as JSON, as a picture, and as a film if it moves.
-fn write(run: &Run, made: &[Made]) -> anyhow::Result<()> {
+fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
     let scenarios: Vec<&Scenario> = made.iter().map(|made| &made.scenario).collect();
     gump_data::womd::write_scenarios(&run.path("scenes.tfrecord"), scenarios.iter().copied())?;
     let Some(&first) = scenarios.first() else {
@@ -316,7 +321,7 @@ fn write(run: &Run, made: &[Made]) -> anyhow::Result<()> {
             log: first.log[..=first.now].to_vec(),
             ..first.clone()
         };
-        futures::film(&alone, &[("generated", &rollout)])?.save(&run.path("film.gif"))?;
+        film.write(run, &alone, &[("generated", &rollout)])?;
         let mut viewer = Viewer::new(&alone);
         viewer
             .note("a generated scene and its imagined future")

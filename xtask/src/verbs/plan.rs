@@ -1,5 +1,8 @@
 //! `plan`: one planner through one scenario, with everything it considered.
 
+use std::fmt;
+use std::str::FromStr;
+
 use gump_eval::planners::{PlannerName, PlanningWorld, TimedDriver};
 use gump_eval::recordings;
 use gump_eval::recordings::Case;
@@ -9,14 +12,14 @@ use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{Candidate, Decision, Explain};
 use gump_rollout::BoxError;
-use gump_scene::{Frame, Scenario};
+use gump_scene::{Frame, Rollout, Scenario};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::evaluate::Driving;
 use super::explain;
 use crate::cli::WrongArguments;
-use crate::futures;
+use crate::films::FilmArgs;
 use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -33,9 +36,12 @@ pub(crate) struct Args {
     /// Whom it meets, and what it imagines in: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
-    /// Write a page on the decision of a step [default: the first]
-    #[arg(long, value_name = "STEP", num_args = 0..=1, default_missing_value = "0")]
-    explain: Option<usize>,
+    /// Write a page on the decision of a step [default: the one that mattered most]
+    #[arg(long, value_name = "STEP", num_args = 0..=1, default_missing_value = "decisive")]
+    explain: Option<Step>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    film: FilmArgs,
     #[command(flatten)]
     #[serde(flatten)]
     driving: Driving,
@@ -50,13 +56,91 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
+/// Which decision to explain.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(into = "String")]
+enum Step {
+    /// The one by which the choice was worth most more than what else there was.
+    Decisive,
+    /// The one that the ego followed at a step of the drive.
+    Number(usize),
+}
+
+impl FromStr for Step {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "decisive" => Ok(Self::Decisive),
+            _ => text
+                .parse()
+                .map(Self::Number)
+                .map_err(|_| "expected a step of the drive, or decisive".into()),
+        }
+    }
+}
+
+impl fmt::Display for Step {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Decisive => f.write_str("decisive"),
+            Self::Number(step) => write!(f, "{step}"),
+        }
+    }
+}
+
+impl From<Step> for String {
+    fn from(step: Step) -> Self {
+        step.to_string()
+    }
+}
+
 /// A driver that notes what it considered.
 struct Noted<'a> {
     inner: Box<dyn Explain + 'a>,
     steps: Vec<Vec<Candidate>>,
-    /// The step to explain, and then its past with the decision.
-    explain: Option<usize>,
-    explained: Option<(Vec<Frame>, Decision)>,
+    explain: Option<Step>,
+    /// The decision to explain as far as the drive has come.
+    explained: Option<Noteworthy>,
+}
+
+/// A decision and when it was made.
+struct Noteworthy {
+    step: usize,
+    past: Vec<Frame>,
+    decision: Decision,
+    /// How much it mattered.
+    weight: f64,
+}
+
+impl Noted<'_> {
+    /// Keeps the decision of this moment if it is the one to explain so far.
+    fn note(&mut self, moment: &Moment<'_>) {
+        let (Some(explain), Some(decision)) = (self.explain, self.inner.decision()) else {
+            return;
+        };
+        // Between two decisions the ego follows the older one.
+        let now = moment.scene.ego_now().state;
+        let begins = |future: &Rollout| future.start().agent(future.ego()).map(|ego| ego.state);
+        let is_new = decision.prospects[decision.chosen]
+            .futures
+            .first()
+            .and_then(begins)
+            .is_some_and(|then| then.pose.position.distance(now.pose.position) < 1e-6);
+        let weight = explain::weight(decision);
+        let is_asked = match explain {
+            Step::Number(step) => moment.iteration <= step,
+            Step::Decisive => self.explained.as_ref().is_none_or(|e| weight > e.weight),
+        };
+        if is_asked && (is_new || self.explained.is_none()) {
+            self.explained = Some(Noteworthy {
+                step: moment.iteration,
+                past: moment.scene.history.to_vec(),
+                decision: decision.clone(),
+                weight,
+            });
+        }
+    }
 }
 
 impl Driver for Noted<'_> {
@@ -71,11 +155,7 @@ impl Driver for Noted<'_> {
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let plan = self.inner.drive(moment)?;
         self.steps.push(self.inner.candidates());
-        if self.explain == Some(moment.iteration) {
-            let past = moment.scene.history.to_vec();
-            let decision = self.inner.decision().cloned();
-            self.explained = decision.map(|decision| (past, decision));
-        }
+        self.note(moment);
         Ok(plan)
     }
 }
@@ -83,6 +163,7 @@ impl Driver for Noted<'_> {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
+        self.film.check()?;
         let sampling = self.sampling.resolve()?;
         self.check_explain(None)?;
         let case = run.phase("read", |_| Ok(recordings::find(&self.scenario)?))?;
@@ -125,8 +206,8 @@ impl Args {
         let scenario = case.recording.scenario();
         run.phase("write", |run| {
             let label = format!("{} among {}", self.planner.name(), self.world);
-            let film = futures::film(scenario, &[(&label, &scored.driven.rollout)])?;
-            film.save(&run.path("film.gif"))?;
+            self.film
+                .write(run, scenario, &[(&label, &scored.driven.rollout)])?;
             write_candidates(run, &noted.steps)?;
             self.explain(run, &case, &noted)
         })?;
@@ -147,16 +228,16 @@ impl Args {
     /// Error: [`WrongArguments`] for a planner that imagines nothing, and for a step beyond the
     /// drive through a scenario.
     fn check_explain(&self, scenario: Option<&Scenario>) -> anyhow::Result<()> {
-        let Some(step) = self.explain else {
+        let Some(asked) = self.explain else {
             return Ok(());
         };
         let wrong = if self.planner != PlannerName::Interactive {
             format!(
-                "--explain {step}: expected a planner that imagines before it decides, \
+                "--explain {asked}: expected a planner that imagines before it decides, \
                  interactive, found {}",
                 self.planner.name()
             )
-        } else if let Some(scenario) = scenario {
+        } else if let (Some(scenario), Step::Number(step)) = (scenario, asked) {
             let recorded = scenario.log.len() - scenario.now - 1;
             let steps = recorded.min((self.driving.seconds / scenario.dt).round() as usize);
             if step < steps {
@@ -174,14 +255,20 @@ impl Args {
 
     /// Writes the page of the decision that was asked for.
     ///
-    /// Error: a planner that imagines nothing, a step that is no decision's.
+    /// Error: a planner that imagines nothing, a drive without a step.
     fn explain(&self, run: &mut Run, case: &Case, noted: &Noted<'_>) -> anyhow::Result<()> {
-        let Some(step) = self.explain else {
+        let Some(asked) = self.explain else {
             return Ok(());
         };
-        let Some((past, decision)) = &noted.explained else {
+        let Some(Noteworthy {
+            step,
+            past,
+            decision,
+            ..
+        }) = &noted.explained
+        else {
             let wrong = format!(
-                "--explain {step}: expected a step of the drive and a planner that imagines, \
+                "--explain {asked}: expected a step of the drive and a planner that imagines, \
                  found {} steps of {}",
                 noted.steps.len(),
                 self.planner.name()
@@ -193,7 +280,14 @@ impl Args {
             log: past.clone(),
             ..case.recording.scenario().clone()
         };
-        explain::write(run, &scenario, case.recording.vehicle(), decision)?;
+        let explained = explain::Explained {
+            scenario: &scenario,
+            vehicle: case.recording.vehicle(),
+            decision,
+            time: *step as f64 * scenario.dt,
+        };
+        explained.write(run)?;
+        run.result("decision_step", step)?;
         run.result("decision", explain::summary(decision))
     }
 }

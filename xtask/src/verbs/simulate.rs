@@ -12,6 +12,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
+use crate::films::{self, FilmArgs};
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -38,6 +39,9 @@ pub(crate) struct Args {
     /// Show in the viewer what a learned world drew from, for the first N futures [default N: 1]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]
     heat: Option<NonZeroUsize>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    film: FilmArgs,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -79,6 +83,7 @@ impl Args {
                          use cargo run -p xtask --features rerun -- simulate";
             return Err(WrongArguments(wrong.into()).into());
         }
+        self.film.check()?;
         let decoding = self.sampling.decoding(&self.world)?;
         let config = decoding.frames(self.seconds);
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;
@@ -137,11 +142,9 @@ impl Args {
         }
         let label = format!("{} in the world {}", scenario.id, self.world);
         futures::picture(scenario, rollouts, &label).save_png(&run.path("picture.png"))?;
-        let film = futures::film(scenario, &futures::first_few(rollouts))?;
-        film.save(&run.path("film.gif"))?;
-        if wanted(Format::Apng) {
-            film.save(&run.path("film.png"))?;
-        }
+        let apng = wanted(Format::Apng);
+        let shown = films::first_few(rollouts);
+        self.film.and(apng).write(run, scenario, &shown)?;
         viewer
             .note(format!(
                 "{} simulated future{} in the world {}",

@@ -1,4 +1,4 @@
-//! What comes of it: futures in every world, their metrics, and a plan.
+//! Futures in every world, their metrics, and a plan.
 
 use anyhow::Context as _;
 use gump_eval::recordings;
@@ -7,7 +7,7 @@ use gump_metrics::summarize;
 use gump_planner::closed_loop::plan_once;
 use gump_planner::{Explain as _, InteractiveDriver, InteractiveDriverConfig, ProposalKind};
 use gump_scene::{Rollout, Scenario};
-use gump_viz::{Camera, FilmSpec, overlay_film};
+use gump_viz::{Camera, CandidatePath, FilmSpec, PictureSpec, draw_candidates, overlay_film};
 use gump_wosac::realism::{Config, Log, Rollouts, Year, score};
 use serde_json::{Value, json};
 
@@ -17,7 +17,7 @@ use crate::imagine::imagine;
 use crate::run::Run;
 use crate::table::decimal;
 use crate::verbs::explain;
-use crate::{futures, shipped};
+use crate::{films, futures, shipped};
 
 /// Futures per world.
 const FUTURES: usize = 32;
@@ -25,6 +25,8 @@ const FUTURES: usize = 32;
 pub(super) const SECONDS: f64 = 8.0;
 /// Futures per proposal of the planner.
 const PLANNED: usize = 2;
+/// Candidates of the planner on the page; the viewer has all.
+const LISTED: usize = 5;
 
 pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let scenario = &demo.scenario;
@@ -82,9 +84,8 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     demo.page
         .section("How good they are")
         .prose(
-            "One scene says little: the benchmarks of the README are over hundreds. This one was \
-             made up, and its recording was driven by rules close to those of idm, which helps idm \
-             here.",
+            "One scene says little: the benchmarks in the README are over hundreds. The scene is \
+             synthetic, and rules close to those of idm drove its recording, which helps idm here.",
         )
         .table(
             &[
@@ -158,25 +159,23 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
     let label = format!("{} futures", rollouts.len());
     let picture = futures::picture(scenario, rollouts, &label);
     picture.save_png(&run.path("picture.png"))?;
-    let film = futures::film(scenario, &futures::first_few(rollouts))?;
+    let film = films::film(scenario, &films::first_few(rollouts))?;
     film.save(&run.path("film.gif"))?;
-    let spec = FilmSpec::new(Camera::on_ego(&scenario.present(), 90.0, 640, 640));
     let all: Vec<_> = rollouts.iter().collect();
-    let overlay = overlay_film(&all, &spec)?;
+    let overlay = overlay_film(&all, &FilmSpec::of_rollouts(&all, (640, 640)))?;
     overlay.save(&run.path("overlay.gif"))?;
     demo.page
         .section("Futures")
-        .prose("From the present on, the shipped network drives everyone, the ego too.")
-        .link("viewer.html", "Play them all in the viewer")
+        .prose(
+            "From the present on, the shipped network drives everyone, the ego too. Beside the \
+             recording, three of its futures:",
+        )
         .film(
             &film,
-            "What was recorded, and three of the simulated futures.",
+            "Top left the recording, then three simulated futures.",
         )
-        .film(
-            &overlay,
-            "All futures over one another: what they agree on is solid.",
-        )
-        .picture(&picture, "Where everyone goes in all of them.")?;
+        .link("viewer.html", "Play all of them in the viewer")
+        .link("overlay.gif", "Watch all of them over one another");
     Ok(())
 }
 
@@ -204,22 +203,35 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     demo.candidates = paths
         .map(|&i| explain::path(case.recording.vehicle(), decision, i))
         .collect();
-    let table: Vec<_> = demo
-        .candidates
-        .iter()
-        .map(|candidate| {
-            let chosen = if candidate.is_chosen { "chosen" } else { "" };
-            let score = candidate.score.map_or("-".into(), decimal);
-            vec![candidate.name.clone(), score, chosen.to_owned()]
-        })
-        .collect();
+    let row = |candidate: &CandidatePath| {
+        let score = candidate.score.map_or("-".into(), decimal);
+        vec![candidate.name.clone(), score]
+    };
+    let table: Vec<_> = demo.candidates.iter().take(LISTED).map(row).collect();
+    let scene = demo.scenario.present();
+    let points = demo.candidates.iter().flat_map(|c| c.path.iter().copied());
+    let heading = scene.ego_now().state.pose.heading;
+    let spec = PictureSpec {
+        legend: true,
+        ..PictureSpec::new(Camera::framing(points, heading, 80.0, (960, 640)))
+    };
+    let picture = draw_candidates(&scene, &demo.candidates, &spec);
+    picture.save_png(&run.path("plan.png"))?;
     demo.page
         .section("A plan")
         .prose(&format!(
-            "What should the ego do? Each proposal was driven in {PLANNED} imagined futures, in \
-             which the others react, and scored."
+            "What should the ego do? {} candidates were driven in up to {PLANNED} futures of the \
+             learned world, in which the others react, and scored as nuPlan scores a drive. The best \
+             {} of them, the chosen one first:",
+            decision.prospects.len(),
+            table.len(),
         ))
-        .table(&["proposal", "mean score", ""], &table);
+        .table(&["candidate", "mean score"], &table)
+        .picture(
+            &picture,
+            "All candidates, the chosen one in the ego's colour; a dot where each ends after four \
+             seconds.",
+        )?;
     let choice = &decision.prospects[decision.chosen];
     let (kind, score) = if decision.brakes {
         (ProposalKind::EmergencyBrake, None)

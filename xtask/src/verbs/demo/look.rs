@@ -3,6 +3,7 @@
 use gump_data::{ReadReport, Summary};
 use gump_model::ModelConfig;
 use gump_raster::{Layer, rasterize};
+use gump_scene::Scenario;
 use gump_tokenizer::{Encoded, Identities, Tokenizer, TokenizerConfig};
 use gump_viz::{Picture, Theme, draw_raster_layer};
 use serde_json::{Value, json};
@@ -22,18 +23,28 @@ const SHOWN: [Layer; 6] = [
 ];
 
 /// Lines of the token listing on the page.
-const LISTED: usize = 40;
+const LISTED: usize = 16;
 
 pub(super) fn read(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
     let scenario = &demo.scenario;
+    Ok(json!({
+        "scenario": scenario.id,
+        "agents": scenario.present().now().agents().len(),
+        "frames": scenario.log.len(),
+        "lanes": scenario.map.lanes().len(),
+    }))
+}
+
+/// What the scenario holds, as (name, value).
+fn facts(scenario: &Scenario) -> Vec<(String, String)> {
     let mut summary = Summary::default();
     summary.add(scenario, &ReadReport::default());
     let mut facts = vec![
         ("scenario".to_owned(), scenario.id.clone()),
         (
-            "recorded".to_owned(),
+            "frames".to_owned(),
             format!(
-                "{:.1} s of past, {:.1} s of future, a frame every {} s",
+                "{:.1} s of past, {:.1} s of future, one every {} s",
                 scenario.now as f64 * scenario.dt,
                 scenario.future().len() as f64 * scenario.dt,
                 scenario.dt
@@ -49,16 +60,7 @@ pub(super) fn read(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
     if !summary.lights_now.is_empty() {
         facts.push(("lights now".to_owned(), counts(&summary.lights_now)));
     }
-    let section = demo.page.section("A scenario");
-    section
-        .prose("A scenario is recorded traffic: a map, and every agent at every instant.")
-        .key_values(&facts);
-    Ok(json!({
-        "scenario": scenario.id,
-        "agents": scenario.present().now().agents().len(),
-        "frames": scenario.log.len(),
-        "lanes": scenario.map.lanes().len(),
-    }))
+    facts
 }
 
 fn counts(counts: &std::collections::BTreeMap<&'static str, usize>) -> String {
@@ -73,8 +75,12 @@ pub(super) fn picture(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let picture = data::picture(&demo.scenario);
     let path = run.path("scene.png");
     picture.save_png(&path)?;
-    let caption = "The present, where agents came from, and where they really went.";
-    demo.page.section("The scene").picture(&picture, caption)?;
+    let caption = "The present, where agents came from, and where they went in the recording.";
+    demo.page
+        .section("The scene")
+        .prose("A scenario is a map, traffic lights, and every agent at every instant.")
+        .picture(&picture, caption)?
+        .key_values(&facts(&demo.scenario));
     Ok(json!({ "file": path }))
 }
 

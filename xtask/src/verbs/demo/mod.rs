@@ -1,11 +1,13 @@
 //! `demo`: the whole road on what the repository ships, and a page that shows it.
 //!
-//! The stages are in [`look`] (what a scenario is), [`learn`] (what the network is) and
-//! [`imagine`] (what comes of it); this file puts them in a row.
+//! The stages are in [`imagine`] (futures and a plan), [`make`] (a scene from a prompt), [`learn`]
+//! (what the network is and how it learns) and [`look`] (what a scenario is); this file puts them in
+//! a row.
 
 mod imagine;
 mod learn;
 mod look;
+mod make;
 
 use gump_data::find;
 use gump_engine::SamplingConfig;
@@ -48,19 +50,25 @@ type Stage = (
     fn(&mut Demo, &mut Run) -> anyhow::Result<Value>,
 );
 
-const STAGES: [Stage; 9] = [
+/// In the order in which the page shows what comes of them.
+const STAGES: [Stage; 10] = [
     ("read", "reading the scenario", look::read),
-    ("picture", "drawing it", look::picture),
-    ("raster", "drawing what the network sees", look::raster),
-    ("tokens", "writing it as tokens", look::tokens),
-    ("network", "opening the shipped network", learn::network),
-    ("train", "training a new one for a few steps", learn::train),
     (
         "imagine",
-        "imagining futures in every world",
+        "simulating futures in every world",
         imagine::worlds,
     ),
     ("plan", "planning inside the learned world", imagine::plan),
+    ("generate", "generating a scene from a prompt", make::scene),
+    (
+        "train",
+        "training a new network for a few steps",
+        learn::train,
+    ),
+    ("picture", "drawing the scenario", look::picture),
+    ("raster", "drawing what the network sees", look::raster),
+    ("tokens", "writing it as tokens", look::tokens),
+    ("network", "opening the shipped network", learn::network),
     ("page", "writing the page", page),
 ];
 
@@ -69,7 +77,7 @@ impl Args {
         shipped::check_weights()?;
         let name = match &self.scenario {
             Some(name) => name.clone(),
-            None => shipped::scenario(),
+            None => shipped::demo(),
         };
         run.setting("scenario", &name)?;
         let mut demo = Demo {
@@ -80,8 +88,9 @@ impl Args {
             candidates: Vec::new(),
         };
         demo.page.lede(format!(
-            "Everything below was made from the scenario {} in {name} by one command, offline.",
-            demo.scenario.id
+            "What a generative world model does with one traffic scene: simulate it, plan in it, make \
+             others like it. Everything below was made from {name} by one command, offline, with \
+             weights trained on synthetic scenes alone."
         ));
         for (number, (name, doing, stage)) in STAGES.into_iter().enumerate() {
             run.say(&format!("{} of {}: {doing}", number + 1, STAGES.len()));

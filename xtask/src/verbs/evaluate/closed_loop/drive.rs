@@ -12,7 +12,7 @@ use gump_rollout::WorldModel;
 use gump_scene::Seed;
 
 use super::{Args, Driven, Finished, Outcome};
-use crate::futures;
+use crate::films;
 use crate::planners::Chosen;
 use crate::run::{Run, interrupted};
 
@@ -209,7 +209,7 @@ fn file_name(name: &str) -> String {
 fn film(run: &Run, case: &Case, scored: &Scored, label: &str, name: &str) -> anyhow::Result<()> {
     let folder = run.path("films");
     std::fs::create_dir_all(&folder)?;
-    let film = futures::film(
+    let film = films::film(
         case.recording.scenario(),
         &[(label, &scored.driven.rollout)],
     )?;

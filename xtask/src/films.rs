@@ -1,0 +1,153 @@
+//! Films of what was simulated: formats, cameras, panels.
+
+use std::path::PathBuf;
+
+use gump_scene::{Rollout, Scenario};
+use gump_viz::{Film, FilmSpec, Take, can_encode_mp4, grid_film, log_as_rollout};
+use serde::Serialize;
+
+use crate::cli::WrongArguments;
+use crate::run::Run;
+
+/// Arguments of verbs that film.
+#[derive(Clone, Debug, Serialize, clap::Args)]
+pub(crate) struct FilmArgs {
+    /// Formats of the film; mp4 needs ffmpeg
+    #[arg(
+        long,
+        value_enum,
+        value_name = "F",
+        value_delimiter = ',',
+        default_value = "gif"
+    )]
+    video: Vec<Video>,
+    /// What the film's camera does [default: frame, or follow where that is over 140 m across]
+    #[arg(long, value_enum, value_name = "C")]
+    camera: Option<CameraName>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Video {
+    /// film.gif
+    Gif,
+    /// film.mp4
+    Mp4,
+    /// An animated PNG, film.png
+    Apng,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum CameraName {
+    /// Stays where it shows everyone who moves near the ego
+    Frame,
+    /// Goes along with the ego
+    Follow,
+}
+
+impl FilmArgs {
+    /// Refuses what cannot be written here, before anything is simulated.
+    ///
+    /// Error: [`WrongArguments`] for mp4 without ffmpeg.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        if self.video.contains(&Video::Mp4) && !can_encode_mp4() {
+            let wrong =
+                "--video mp4: expected ffmpeg on the path, found none; gif and apng need nothing";
+            return Err(WrongArguments(wrong.into()).into());
+        }
+        Ok(())
+    }
+
+    /// These and, if `apng` is asked for in another way, animated PNGs.
+    pub(crate) fn and(&self, apng: bool) -> Self {
+        let mut this = self.clone();
+        if apng && !this.video.contains(&Video::Apng) {
+            this.video.push(Video::Apng);
+        }
+        this
+    }
+
+    /// Writes a film of the log, as far as it is known, beside futures with their names.
+    ///
+    /// Error: files that cannot be written.
+    pub(crate) fn write(
+        &self,
+        run: &Run,
+        scenario: &Scenario,
+        futures: &[(&str, &Rollout)],
+    ) -> anyhow::Result<()> {
+        let film = self.film(scenario, futures)?;
+        for video in &self.video {
+            film.save(&video.path(run))?;
+        }
+        Ok(())
+    }
+
+    fn film(&self, scenario: &Scenario, futures: &[(&str, &Rollout)]) -> anyhow::Result<Film> {
+        beside_log(
+            scenario,
+            futures,
+            match self.camera {
+                None => FilmSpec::of_rollouts,
+                Some(CameraName::Frame) => FilmSpec::framing,
+                Some(CameraName::Follow) => |_, size| FilmSpec::following(size),
+            },
+        )
+    }
+}
+
+impl Video {
+    fn path(self, run: &Run) -> PathBuf {
+        run.path(match self {
+            Self::Gif => "film.gif",
+            Self::Mp4 => "film.mp4",
+            Self::Apng => "film.png",
+        })
+    }
+}
+
+/// The log, as far as it is known, beside futures with their names.
+///
+/// Error: a film that cannot be encoded.
+pub(crate) fn film(scenario: &Scenario, futures: &[(&str, &Rollout)]) -> anyhow::Result<Film> {
+    beside_log(scenario, futures, FilmSpec::of_rollouts)
+}
+
+fn beside_log(
+    scenario: &Scenario,
+    futures: &[(&str, &Rollout)],
+    spec: fn(&[&Rollout], (u32, u32)) -> FilmSpec,
+) -> anyhow::Result<Film> {
+    let log = log_as_rollout(scenario);
+    let known = (log.steps() > 0).then_some(("log", &log));
+    let takes: Vec<_> = known
+        .into_iter()
+        .chain(futures.iter().copied())
+        .map(|(label, rollout)| Take {
+            rollout,
+            label: label.into(),
+        })
+        .collect();
+    let rollouts: Vec<&Rollout> = takes.iter().map(|take| take.rollout).collect();
+    // About a thousand pixels wide, as most pages are.
+    let (columns, side) = match takes.len() {
+        0 | 1 => (1, 720),
+        2 => (2, 540),
+        3 => (3, 400),
+        _ => (2, 480),
+    };
+    let spec = FilmSpec {
+        columns,
+        ..spec(&rollouts, (side, side))
+    };
+    Ok(grid_film(&takes, &spec)?)
+}
+
+/// The first few futures with their numbers, for a film.
+pub(crate) fn first_few(rollouts: &[Rollout]) -> Vec<(&'static str, &Rollout)> {
+    ["future 1", "future 2", "future 3"]
+        .into_iter()
+        .zip(rollouts)
+        .collect()
+}

@@ -1,0 +1,96 @@
+//! A scene from a prompt, on the scenario's map.
+
+use gump_eval::worlds::World;
+use gump_generate::factory::{GenerationJob, GenerationWorlds, make_many};
+use gump_generate::verdict::{off_road, overlaps};
+use gump_generate::{Counts, GenerateConfig, GenerateRequest};
+use gump_model::Device;
+use gump_scene::ScenarioTag;
+use gump_viz::{Camera, PictureSpec, draw_scene, log_as_rollout};
+use serde_json::{Value, json};
+
+use super::Demo;
+use crate::run::Run;
+use crate::verbs::generate;
+use crate::{films, shipped};
+
+/// What the scene is to be.
+const PROMPT: &str = "near_multiple_vehicles";
+const COUNTS: Counts = Counts {
+    vehicles: 14,
+    pedestrians: 4,
+    bicycles: 2,
+};
+/// How far it goes on in the learned world, seconds.
+const SECONDS: f64 = 6.0;
+/// Scenes made before one is shown that is not what the prompt says.
+const ATTEMPTS: usize = 20;
+
+pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
+    let prompt: ScenarioTag = PROMPT.parse().map_err(anyhow::Error::msg)?;
+    let network = generate::world(&Device::Cpu, None, false)?;
+    let traffic = World::without_log(run.device(), &shipped::world(), &demo.sampling)?;
+    let worlds = GenerationWorlds {
+        scenes: &network,
+        traffic: traffic.model(),
+    };
+    let order = GenerationJob {
+        request: GenerateRequest {
+            prompts: vec![prompt],
+            counts: Some(COUNTS),
+            config: GenerateConfig {
+                standing_has_reasons: true,
+                ..GenerateConfig::default()
+            },
+            ..generate::request(&demo.scenario)
+        },
+        roams: false,
+        seconds: SECONDS,
+        attempts: ATTEMPTS,
+    };
+    let mut made = make_many(worlds, &order, 0..1, run.seed())?;
+    let made = made.remove(0)?;
+    let scene = &made.scenario;
+    let spec = PictureSpec {
+        legend: true,
+        ..PictureSpec::new(Camera::on_ego(&scene.present(), 100.0, 960, 640))
+    };
+    let picture = draw_scene(&scene.present(), &spec);
+    picture.save_png(&run.path("generated.png"))?;
+    let alone = gump_scene::Scenario {
+        log: scene.log[..=scene.now].to_vec(),
+        ..scene.clone()
+    };
+    let film = films::film(&alone, &[("generated", &log_as_rollout(scene))])?;
+    film.save(&run.path("generated.gif"))?;
+    let table: Vec<Vec<String>> = made
+        .clauses
+        .iter()
+        .map(|clause| {
+            let verdict = match clause.holds {
+                Some(true) => "yes",
+                Some(false) => "no",
+                None => "cannot be decided",
+            };
+            vec![clause.clause.clone(), verdict.to_owned()]
+        })
+        .collect();
+    let present = scene.present();
+    demo.page
+        .section("A scene from a prompt")
+        .prose(&format!(
+            "On the same map, the sequence network placed {} vehicles, {} pedestrians and {} bicycles \
+             so that \"{PROMPT}\" holds; the tag is one of nuPlan's 73.",
+            COUNTS.vehicles, COUNTS.pedestrians, COUNTS.bicycles
+        ))
+        .picture(&picture, "The generated scene.")?
+        .table(&["the scene was to satisfy", "holds"], &table)
+        .link("generated.gif", "Watch it go on in the learned world");
+    Ok(json!({
+        "agents": present.now().agents().len(),
+        "attempts": made.attempts,
+        "overlaps": overlaps(scene),
+        "offroad": off_road(scene),
+        "holds": made.holds(),
+    }))
+}

@@ -1,0 +1,152 @@
+//! What separates two candidates, in words.
+
+use gump_planner::{Decision, ProposalKind, Prospect};
+use gump_scene::{Agent, Rollout};
+
+use super::{Deed, deed};
+use crate::table::decimal;
+
+/// Ends nearer than this are the same place, metres.
+const SAME_PLACE: f64 = 2.0;
+/// Parts of a score that differ by less are equal.
+const SAME_PART: f64 = 0.005;
+/// The closest distances to an agent that differ by less do not tell, metres.
+const SAME_GAP: f64 = 1.0;
+/// Differences told of.
+const TOLD: usize = 3;
+
+/// The best candidate that was not chosen and is not the same drive under another name: one that
+/// ends more than 2 m from the chosen one, or that is worth something else.
+pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
+    let chosen = &decision.prospects[decision.chosen];
+    let differs = |prospect: &Prospect| match (end(prospect), end(chosen)) {
+        (Some(a), Some(b)) => a.distance(b) > SAME_PLACE,
+        _ => (prospect.value - chosen.value).abs() > SAME_PART,
+    };
+    let others = (0..decision.prospects.len()).filter(|&i| i != decision.chosen);
+    let different = others.filter(|&i| differs(&decision.prospects[i]));
+    different.max_by(|&a, &b| {
+        let (a, b) = (&decision.prospects[a], &decision.prospects[b]);
+        // Values of fewer futures do not compare.
+        let futures = a.futures.len().cmp(&b.futures.len());
+        futures.then(a.value.total_cmp(&b.value))
+    })
+}
+
+/// The driver who imagines nothing: the Intelligent Driver Model at the limit in the middle of the
+/// way.
+pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
+    decision.prospects.iter().position(|prospect| {
+        matches!(
+            prospect.kind,
+            ProposalKind::Idm { speed_fraction, lateral_offset }
+                if speed_fraction == 1.0 && lateral_offset == 0.0
+        )
+    })
+}
+
+/// How much a decision mattered: by how much the chosen candidate is worth more than the ordinary
+/// driver and, far less, than the best that was rejected.
+pub(crate) fn weight(decision: &Decision) -> f64 {
+    let chosen = decision.prospects[decision.chosen].value;
+    let margin = |other: Option<usize>| {
+        other.map_or(0.0, |i| (chosen - decision.prospects[i].value).max(0.0))
+    };
+    margin(ordinary(decision)) + 0.1 * margin(best_rejected(decision))
+}
+
+fn end(prospect: &Prospect) -> Option<gump_geometry::DVec2> {
+    let last = prospect.drives.first()?.last()?;
+    Some(last.rear_axle.position)
+}
+
+/// Sentences on why `chosen` is worth more than `other`, the weightiest first. `near` are agents to
+/// look at.
+pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<String> {
+    let mut told = Vec::new();
+    let (mine, theirs) = (chosen.collisions, other.collisions);
+    if mine != theirs {
+        told.push(format!(
+            "With \"{}\" the ego is at fault in a collision in {theirs} of {} futures, with \"{}\" \
+             in {mine} of {}.",
+            other.kind,
+            other.futures.len(),
+            chosen.kind,
+            chosen.futures.len(),
+        ));
+    }
+    let parts = differing_parts(chosen, other);
+    if !parts.is_empty() {
+        told.push(format!("Of the score's parts, {}.", parts.join("; ")));
+    }
+    let (mine, theirs) = (chosen.progress_m, other.progress_m);
+    if (mine - theirs).abs() > SAME_GAP {
+        told.push(format!(
+            "It drives {} m along the way, the other {} m.",
+            decimal(mine),
+            decimal(theirs)
+        ));
+    }
+    told.extend(approaches(chosen, other, near));
+    if told.is_empty() {
+        told.push("Nothing: both are worth the same, and ties go to more progress.".into());
+    }
+    told
+}
+
+/// The parts that differ, those by most first.
+fn differing_parts(chosen: &Prospect, other: &Prospect) -> Vec<String> {
+    let pairs = chosen.score.parts().into_iter().zip(other.score.parts());
+    let mut parts: Vec<(&str, f64, f64)> = pairs
+        .map(|((name, mine), (_, theirs))| (name, mine, theirs))
+        .filter(|(_, mine, theirs)| (mine - theirs).abs() > SAME_PART)
+        .collect();
+    let by = |part: &(&str, f64, f64)| (part.1 - part.2).abs();
+    parts.sort_by(|a, b| by(b).total_cmp(&by(a)));
+    let tell = |(name, mine, theirs): &(&str, f64, f64)| {
+        format!("{} is {mine:.2} instead of {theirs:.2}", words(name))
+    };
+    parts.iter().take(TOLD).map(tell).collect()
+}
+
+/// Agents to which the ego comes much closer with one than with the other.
+fn approaches(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<String> {
+    let closest = |prospect: &Prospect, agent: &Agent| {
+        let deeds = prospect
+            .futures
+            .iter()
+            .filter_map(|f: &Rollout| deed(f, agent));
+        let gaps = deeds.map(|deed: Deed| deed.closest);
+        gaps.fold(f64::INFINITY, f64::min)
+    };
+    let mut told: Vec<(f64, String)> = Vec::new();
+    for agent in near {
+        let (mine, theirs) = (closest(chosen, agent), closest(other, agent));
+        // Centres of cars that touch are at most 5 m apart; what is far from both decides nothing.
+        if (mine - theirs).abs() > SAME_GAP && mine.min(theirs) < 12.0 {
+            told.push((
+                mine.min(theirs),
+                format!(
+                    "{} {} comes within {mine:.1} m of the ego, with the other within {theirs:.1} m \
+                     (between centres).",
+                    capital(agent.kind.name()),
+                    agent.id,
+                ),
+            ));
+        }
+    }
+    told.sort_by(|a, b| a.0.total_cmp(&b.0));
+    told.into_iter().take(2).map(|(_, text)| text).collect()
+}
+
+/// A part's name as words.
+pub(super) fn words(name: &str) -> String {
+    name.replace('_', " ")
+}
+
+fn capital(word: &str) -> String {
+    let mut characters = word.chars();
+    characters.next().map_or_else(String::new, |first| {
+        first.to_uppercase().chain(characters).collect()
+    })
+}
