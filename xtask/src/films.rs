@@ -21,7 +21,7 @@ pub(crate) struct FilmArgs {
         default_value = "gif"
     )]
     video: Vec<Video>,
-    /// What the film's camera does [default: frame, or follow where that is over 140 m across]
+    /// What the film's camera does [default: frame, or follow where that is over 110 m across]
     #[arg(long, value_enum, value_name = "C")]
     camera: Option<CameraName>,
 }

@@ -136,7 +136,7 @@ impl Camera {
 }
 
 /// How near to the ego, metres, movement is worth seeing.
-const NEAR: f64 = 45.0;
+const NEAR: f64 = 30.0;
 /// How far an agent goes at least that counts as moving, metres.
 const MOVES: f64 = 2.0;
 

@@ -56,7 +56,7 @@ impl FilmSpec {
     }
 
     /// As [`FilmSpec::framing`], or as [`FilmSpec::following`] where the ego goes further than fits
-    /// into 140 m.
+    /// into 110 m.
     pub fn of_rollouts(rollouts: &[&Rollout], size_px: (u32, u32)) -> Self {
         match Camera::on_movement(rollouts, FRAMED, size_px) {
             Some(camera) => Self::new(camera),
@@ -65,7 +65,7 @@ impl FilmSpec {
     }
 
     /// As [`FilmSpec::new`], from a camera that shows all the way of the ego in these rollouts and,
-    /// as far as they fit into 140 m, those who move near it.
+    /// as far as they fit into 110 m, those who move near it.
     ///
     /// Units: `size_px` is width and height of a panel.
     pub fn framing(rollouts: &[&Rollout], size_px: (u32, u32)) -> Self {
@@ -92,7 +92,7 @@ impl FilmSpec {
 }
 
 /// Metres across a panel whose camera is fixed.
-const FRAMED: RangeInclusive<f64> = 50.0..=140.0;
+const FRAMED: RangeInclusive<f64> = 50.0..=110.0;
 /// Metres across a panel whose camera goes along with the ego.
 const FOLLOWED: f64 = 90.0;
 
