@@ -3,7 +3,8 @@
 //! One file per verb under `verbs/`, each a thin layer over the crates: it reads its arguments,
 //! shows progress, calls crates and fills a report. What every verb shares is in [`run`] (output
 //! folder, seed, threads, phases), [`report`] (`report.json` and the table on the terminal),
-//! [`config`] (TOML files as flags), [`words`] (other names of flags) and [`progress`]. Start with [`cli`].
+//! [`config`] (TOML files as flags), [`words`] (other names of flags) and [`progress`]; [`installed`] is what differs
+//! outside of a checkout. Start with [`cli`].
 #![allow(
     clippy::disallowed_methods,
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
@@ -20,6 +21,7 @@ mod films;
 mod fresh;
 mod futures;
 mod imagine;
+mod installed;
 mod losses;
 mod machine;
 mod peers;
@@ -46,6 +48,7 @@ use std::process::ExitCode;
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
+    installed::settle();
     run::catch_interrupts();
     let arguments = std::env::args_os().collect();
     match cli::parse(arguments).and_then(cli::Cli::execute) {

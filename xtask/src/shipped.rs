@@ -1,15 +1,15 @@
-//! What the repository ships: a small data set and small weights.
+//! What comes with the driver: a small data set and small weights.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_eval::worlds::WorldName;
 
-use crate::machine::repository;
+use crate::installed::home;
 
 /// The folder of the shipped data set.
 pub(crate) fn data() -> PathBuf {
-    from_here(&repository().join("datasets/mini"))
+    from_here(&home().join("datasets/mini"))
 }
 
 /// The shipped scenario that verbs use unless told otherwise: a crossing with traffic lights, which
@@ -26,12 +26,12 @@ pub(crate) fn demo() -> String {
 
 /// The shipped weights of the sequence network, which generates scenes and says who comes and leaves.
 pub(crate) fn weights() -> PathBuf {
-    from_here(&repository().join("datasets/weights/gump-tiny.safetensors"))
+    from_here(&home().join("datasets/weights/gump-tiny.safetensors"))
 }
 
 /// The shipped weights of the relative network, which drives whoever is there.
 pub(crate) fn traffic() -> PathBuf {
-    from_here(&repository().join("datasets/weights/gump-relative.safetensors"))
+    from_here(&home().join("datasets/weights/gump-relative.safetensors"))
 }
 
 /// The shipped learned world.
@@ -53,6 +53,7 @@ pub(crate) fn check_weights() -> anyhow::Result<()> {
         std::fs::metadata(&path).map(drop).with_context(|| {
             format!(
                 "expected the shipped weights at {}; \
+                 GUMP_HOME names the folder that holds datasets, and \
                  `cargo xtask train --data datasets/mini` makes others",
                 path.display()
             )
@@ -62,7 +63,7 @@ pub(crate) fn check_weights() -> anyhow::Result<()> {
 }
 
 /// The path as seen from the working directory where that is shorter: reports stay the same
-/// wherever the checkout lies.
+/// wherever the files lie.
 fn from_here(path: &Path) -> PathBuf {
     let here = std::env::current_dir().unwrap_or_default();
     path.strip_prefix(here).unwrap_or(path).to_owned()

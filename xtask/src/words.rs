@@ -13,7 +13,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, ArgMatches, Command};
 
 use crate::cli::WrongArguments;
-use crate::machine;
+use crate::{installed, machine};
 
 /// Other names of a flag. The first one of a list that the verb does not use otherwise is shown in
 /// its help, if the list is of a flag that has another word for the same thing.
@@ -99,6 +99,10 @@ const NOTHING_COMPUTES: [&str; 11] = [
 
 /// The command line with everything that verbs share.
 pub(crate) fn dressed(root: Command) -> Command {
+    let root = match installed::is_installed() {
+        true => root.name(installed::name()).bin_name(installed::name()),
+        false => root,
+    };
     let root = root.version(version()).after_help(
         "A scenario is PATH, PATH#INDEX or PATH#SCENARIO_ID; the format is detected from content.\n\
          Exit status: 0 done, 1 the work failed, 2 the arguments are wrong, 130 stopped by Ctrl-C.",

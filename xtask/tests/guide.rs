@@ -128,8 +128,11 @@ fn commands_that_are_not_run_have_flags_that_exist() {
 fn commands(block: &Block) -> Vec<String> {
     let text = block.lines.join("\n").replace("\\\n", " ");
     let (text, starts) = match &*block.info {
-        "yaml" => (text.replace('\n', " "), vec![" xtask "]),
-        _ => (text, vec!["cargo xtask ", "\"$XTASK\" "]),
+        "yaml" => (text.replace('\n', " "), vec![" gump "]),
+        _ => (
+            text,
+            vec!["cargo xtask ", "\"$XTASK\" ", "./gump ", " gump "],
+        ),
     };
     let mut commands = Vec::new();
     for start in starts {

@@ -18,6 +18,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::Split;
+use crate::installed::home;
 use crate::machine::repository;
 
 pub(crate) use draw::{Draw, Rule, worst_scores};
@@ -236,11 +237,11 @@ impl<'a> RecordedScene<'a> {
 }
 
 /// Ids of the scenes that nothing may learn from, each with its set: those of the tune and test
-/// splits of the lists in this repository; none where there is no repository.
+/// splits of the lists that come with the driver; none where there are no lists.
 ///
 /// Error: a list that cannot be read.
 pub(crate) fn frozen_ids() -> anyhow::Result<BTreeMap<String, String>> {
-    let folder = repository().join("datasets/benchmarks");
+    let folder = home().join("datasets/benchmarks");
     let mut ids = BTreeMap::new();
     let Ok(entries) = std::fs::read_dir(&folder) else {
         return Ok(ids);

@@ -25,7 +25,7 @@ const TEXT: [&str; 8] = ["rs", "toml", "md", "txt", "css", "html", "yml", "run"]
 /// A rule looks at one file and tells what is wrong with it, a sentence per offence.
 type Rule = fn(&File) -> Vec<String>;
 
-const RULES: [(&str, Rule); 7] = [
+const RULES: [(&str, Rule); 8] = [
     ("small files", small_files),
     ("clean lines", clean_lines),
     ("module docs", module_docs),
@@ -33,6 +33,7 @@ const RULES: [(&str, Rule); 7] = [
     ("no unwrap", no_unwrap),
     ("no machine paths", no_machine_paths),
     ("links lead somewhere", links),
+    ("examples are tested", examples_are_tested),
 ];
 
 /// A file of the repository.
@@ -217,6 +218,35 @@ fn links(file: &File) -> Vec<String> {
     found
 }
 
+/// What a crate's page shows in Rust stands in the crate's first documentation too, where it is tested.
+fn examples_are_tested(file: &File) -> Vec<String> {
+    let Some(of_crate) = file.path.strip_suffix("/README.md") else {
+        return Vec::new();
+    };
+    let library = file.root.join(of_crate).join("src/lib.rs");
+    let (true, Ok(library)) = (
+        of_crate.starts_with("crates/"),
+        std::fs::read_to_string(library),
+    ) else {
+        return Vec::new();
+    };
+    let documented = library.lines().map_while(|line| line.strip_prefix("//!"));
+    let documented = documented.map(|line| line.strip_prefix(' ').unwrap_or(line));
+    // Lines that rustdoc hides.
+    let is_shown = |line: &&str| *line != "#" && !line.starts_with("# ");
+    let documented: Vec<&str> = documented.filter(is_shown).collect();
+    let documented = documented.join("\n");
+    let shown = file.text.split("```rust\n").skip(1);
+    let shown = shown.filter_map(|rest| rest.split_once("\n```"));
+    let untested = shown.filter(|(code, _)| !documented.contains(&format!("```\n{code}\n```")));
+    untested
+        .map(|(code, _)| {
+            let first = code.lines().next().unwrap_or_default();
+            format!("expected the example in the documentation of src/lib.rs, found {first}")
+        })
+        .collect()
+}
+
 fn occurrences<'a>(lines: impl Iterator<Item = (usize, &'a str)>, words: &[&str]) -> Vec<String> {
     let mut found = Vec::new();
     for (number, line) in lines {
@@ -285,6 +315,22 @@ mod tests {
         );
         let large = "a".repeat(5 << 20);
         check("a.bin", &large, "expected at most 4 MB, found 5.0 MB");
+    }
+
+    #[test]
+    fn a_page_shows_what_is_tested() {
+        let folder = tempfile::tempdir().unwrap();
+        let library = "//! A.\n//!\n//! ```\n//! # hidden();\n//! shown();\n//! ```\n";
+        let of = |shown: &str| format!("# a\n\n```rust\n{shown}\n```\n");
+        let write = |path: &str, text: &str| std::fs::write(folder.path().join(path), text);
+        std::fs::create_dir_all(folder.path().join("crates/a/src")).unwrap();
+        write("crates/a/src/lib.rs", library).unwrap();
+        write("crates/a/README.md", &of("shown();")).unwrap();
+        assert_eq!(check(folder.path()).unwrap().problems, [""; 0]);
+        write("crates/a/README.md", &of("other();")).unwrap();
+        let problem = "crates/a/README.md: expected the example in the documentation of \
+                       src/lib.rs, found other();";
+        assert_eq!(check(folder.path()).unwrap().problems, [problem]);
     }
 
     #[test]

@@ -7,6 +7,8 @@ use anyhow::Context as _;
 use clap::Command;
 use clap_complete::Shell;
 
+use crate::installed;
+
 /// Arguments of `completions`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Completions {
@@ -15,12 +17,12 @@ pub(crate) struct Completions {
 }
 
 impl Completions {
-    /// Prints the script that completes words of `xtask`.
+    /// Prints the script that completes words of the driver.
     ///
     /// Error: nobody who listens.
     pub(crate) fn execute(&self, mut root: Command) -> anyhow::Result<()> {
         let mut script = Vec::new();
-        clap_complete::generate(self.shell, &mut root, "xtask", &mut script);
+        clap_complete::generate(self.shell, &mut root, installed::name(), &mut script);
         std::io::stdout()
             .write_all(&script)
             .context("cannot print the completions")
@@ -44,10 +46,11 @@ impl Manual {
         std::fs::create_dir_all(out)
             .with_context(|| format!("cannot create the folder {}", out.display()))?;
         // Pages are named after the program, which is one word where it is installed.
-        let root = root.name("xtask").bin_name("xtask");
+        let name = installed::name();
+        let root = root.name(name).bin_name(name);
         clap_mangen::generate_to(root, out)
             .with_context(|| format!("cannot write pages into {}", out.display()))?;
-        println!("pages: {0}, read one with man {0}/xtask.1", out.display());
+        println!("pages: {0}, read one with man {0}/{name}.1", out.display());
         Ok(())
     }
 }

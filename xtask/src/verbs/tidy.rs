@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::checks::{layers, tidy};
+use crate::checks::{layers, rust_version, tidy};
 use crate::machine::repository;
 use crate::run::{Common, Run};
 
@@ -18,7 +18,9 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let tidied = run.phase("files", |_| tidy::check(&repository()))?;
         let layers = run.phase("layers", |_| layers::problems(&repository()))?;
-        let problems: Vec<_> = tidied.problems.into_iter().chain(layers).collect();
+        let rust = run.phase("rust version", |_| rust_version::problems(&repository()))?;
+        let problems = tidied.problems.into_iter().chain(layers).chain(rust);
+        let problems: Vec<_> = problems.collect();
         for problem in &problems {
             run.say(problem);
         }
