@@ -76,6 +76,8 @@ fn check_ruler(said: &Value, scenario: &Scenario) {
     );
     assert_eq!(said["agents"], expected);
     assert_eq!(said["taps"], expected);
+    let address = said["address"].as_str().expect("a text");
+    assert!(address.ends_with("ruler=0%2C9"), "{address}");
     let later = said["later"].as_str().expect("a text");
     assert!(later.contains("gap") && later != expected, "{later}");
     let starts = |key: &str, with: &str| said[key].as_str().is_some_and(|t| t.starts_with(with));

@@ -98,7 +98,7 @@ function buildScenes() {
   }));
 }
 
-// The address says what is shown: viewer.html#scene=ID&t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north.
+// The address says what is shown: viewer.html#scene=ID&t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north&ruler=3,5.
 const address = () => new URLSearchParams(location.hash.slice(1));
 
 function written() {
@@ -111,6 +111,8 @@ function written() {
   if (ui.selected >= 0) said.set('agent', facts.agents[ui.selected].id);
   if (ui.follow >= 0) said.set('follow', 1);
   if (ui.up !== 'ego') said.set('up', ui.up);
+  // Places are not worth their digits.
+  if (ui.ends.length > 1 && ui.ends.every(end => end.agent !== undefined)) said.set('ruler', ui.ends.map(end => facts.agents[end.agent].id).join());
   return String(said);
 }
 
@@ -133,6 +135,8 @@ function restore() {
   if (beside === 'all' ? n > 2 : said.has('beside') && world.takes[Number(beside)]) ui.left = beside === 'all' ? 'all' : Number(beside);
   if (said.has('up')) { ui.up = said.get('up') === 'north' ? 'north' : 'ego'; scene.camera.angle = upright(); }
   if (said.has('agent')) ui.selected = facts.agents.findIndex(agent => agent.id === said.get('agent'));
+  const ends = (said.get('ruler') || '').split(',').map(id => ({ agent: facts.agents.findIndex(agent => agent.id === id) }));
+  if (ends.length === 2 && ends.every(end => end.agent >= 0)) ui.ends = ends;
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
 
@@ -332,14 +336,15 @@ function dressAgent() {
   const all = quantities(world, ui.selected);
   if (world.takes.length > 1) {
     const key = document.createElement('p');
-    key.textContent = ui.shown === 0 ? 'Solid: recorded. The upright line is now.' : 'Dashed: recorded. Solid: simulated. The upright line is now.';
+    const beside = ui.left > 0 && ui.left !== ui.shown ? ` Dotted: ${takeName(world, ui.left)}, at the left.` : '';
+    key.textContent = `${ui.shown === 0 ? 'Solid: recorded.' : 'Dashed: recorded. Solid: simulated.'}${beside} The upright line is now.`;
     box.append(key);
   }
-  for (const { name, of } of all) {
+  for (const { name, unit, of } of all) {
     // The recording is nowhere away from itself: no empty chart of that.
-    if (ui.shown === 0 && !of(0).length) continue;
+    if (ui.shown === 0 && !(ui.left > 0) && !of(0).length) continue;
     const figure = document.createElement('figure'), caption = document.createElement('figcaption'), canvas = document.createElement('canvas');
-    caption.textContent = name;
+    caption.textContent = unit ? `${name}, ${unit}` : name;
     canvas.dataset.name = name;
     canvas.onpointerdown = canvas.onpointermove = event => {
       if (!event.buttons) return;
@@ -407,6 +412,7 @@ function drawAgentPanel() {
     if (!canvas) return;
     const curves = [{ points: of(0), colour: colours().text, width: 1.5, alpha: takes[0] === 0 ? 0.9 : 0.5, dash: takes[0] === 0 ? [] : [4, 3] }];
     for (const k of takes) if (k > 0) curves.push({ points: of(k), colour: ink, width: takes.length > 1 ? 1 : 2, alpha: takes.length > 1 ? Math.max(0.15, 1 / Math.sqrt(takes.length)) : 1 });
+    if (ui.left > 0 && ui.left !== ui.shown) curves.push({ points: of(ui.left), colour: ink, width: 1.5, alpha: 1, dash: [1.5, 2.5] });
     drawChart(canvas, curves, span, ui.t, colours(), quantity);
   });
 }

@@ -74,6 +74,7 @@ if (location.hash === '#check') {
     drag(ego, other);
     found.agents = said();
     found.drawn = picture() !== plain;
+    found.address = written();
     seek(1); found.later = said(); seek(0);
     press('Escape');
     found.cleared = said();
