@@ -569,7 +569,7 @@ function buildMarks() {
     [has('lane'), 'way of travel', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
     [has('edge'), 'road edge', line(c.edge)],
     [['brokenWhite', 'solidWhite', 'brokenYellow', 'solidYellow'].some(has), 'lane marking', box(c.road) + line(c.whiteLine, 'stroke-dasharray="5 3"')],
-    [has('crosswalk'), 'crosswalk', [3, 9, 15].map(x => `<rect x="${x}" y="2" width="4" height="10" fill="${c.crosswalk}"/>`).join('')],
+    [has('crosswalk'), 'crosswalk', box(c.road) + [4, 10, 16].map(x => `<rect x="${x}" y="3" width="3" height="8" fill="${c.crosswalk}"/>`).join('')],
     [has('bump'), 'speed bump', box(c.yellowLine, 'opacity="0.5"')],
     [has('stopLine'), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
     [has('stopSign'), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
