@@ -7,6 +7,8 @@ import * as link from './link.js';
 
 const $ = id => document.getElementById(id);
 const TICK_MS = 100;
+/** Numbers of an input: driver, pedal, wheel, temperature, gear. */
+const INPUT = 5;
 /** Draws of what others may do; one is made anew in each tenth of a second. */
 const DRAWS = 5;
 const ALL_DRAWS = Array.from({ length: DRAWS }, (_, k) => k);
@@ -38,7 +40,7 @@ const state = {
   driven: 0,
   shown: 0,
   script: null,
-  input: [0, 0, 0, 20],
+  input: [0, 0, 0, 20, 0],
   futures: null,
   watched: null,
   watchedFrom: 0,
@@ -90,7 +92,7 @@ async function begin() {
   await openShipped(id);
   if (asked.drive) {
     const numbers = await engine.ask('inputs', { code: asked.drive });
-    state.script = Array.from({ length: numbers.length / 4 }, (_, i) => [...numbers.subarray(4 * i, 4 * i + 4)]);
+    state.script = Array.from({ length: numbers.length / INPUT }, (_, i) => [...numbers.subarray(INPUT * i, INPUT * (i + 1))]);
     $('go').textContent = 'Watch this drive';
   }
   performance.mark('ready');
@@ -141,6 +143,8 @@ async function open(scene) {
   $('score').hidden = true;
   $('driver').value = '0';
   state.fans = [];
+  state.input = [0, 0, 0, 20, 0];
+  hands.takeOver(0);
   view.lay(picture.road);
   take(picture);
   state.before = null;
@@ -169,7 +173,21 @@ function take(picture) {
   $('time').max = String(picture.driven);
   $('time').value = String(picture.frame);
   $('time-told').textContent = `${(picture.frame / 10).toFixed(1)} s`;
-  $('speed').textContent = String(Math.round(picture.numbers[1] * 3.6));
+  tellSpeed();
+}
+
+/** The ego's speed, metres per second, negative backwards. */
+const speed = () => state.now?.[1] ?? 0;
+
+function tellSpeed() {
+  $('speed').textContent = String(Math.round(Math.abs(speed()) * 3.6));
+  const reverse = Boolean(state.mode === 'driving' ? state.input[4] : speed() < 0);
+  $('gear').textContent = reverse ? 'R' : 'D';
+  $('gear').title = $('gear').ariaLabel = reverse ? 'Reverse gear' : 'Forward gear';
+  $('gear').classList.toggle('reverse', reverse);
+  // On a touch screen the pedals say what they do next.
+  $('touch-brake').textContent = hands.backs(speed()) ? 'Reverse' : 'Brake';
+  $('touch-gas').textContent = speed() < 0 && reverse ? 'Brake' : 'Gas';
 }
 
 function setMode(mode) {
@@ -195,6 +213,7 @@ function go() {
 
 function input() {
   const { wheel, pedal } = hands.move(TICK_MS / 1000);
+  const reverse = Number(hands.shift(speed()));
   const stirred = hands.hasStirred();
   if (state.script) {
     const next = stirred ? null : state.script[state.driven];
@@ -217,7 +236,7 @@ function input() {
     tell('You drive now');
   }
   const temperature = Math.round(Number($('temperature').value) * 20);
-  return [Number($('driver').value), Math.round(pedal * 100), Math.round(wheel * 100), temperature];
+  return [Number($('driver').value), Math.round(pedal * 100), Math.round(wheel * 100), temperature, $('driver').value === '0' ? reverse : 0];
 }
 
 async function tick() {
@@ -276,6 +295,7 @@ async function resume() {
   if (state.shown < state.driven) {
     // A link's drive goes on as it was, whatever was looked at in between.
     take(await engine.ask('rewind', { frame: state.shown, fans: fans(ALL_DRAWS) }));
+    hands.takeOver(speed());
   }
   state.before = null;
 }

@@ -79,7 +79,8 @@ const doing = {
 
   tick({ input, fans }) {
     const began = performance.now();
-    game.tick(...input);
+    const [driver, pedal, wheel, temperature, reverse] = input;
+    game.tick(driver, pedal, wheel, temperature, Boolean(reverse));
     return { ...picture(game.driven(), { fans }), ms: performance.now() - began };
   },
 
@@ -122,7 +123,7 @@ const doing = {
     const times = [];
     for (let i = 0; i < halfSeconds; i += 1) {
       const began = performance.now();
-      for (let k = 0; k < 5; k += 1) game.tick(1, 0, 0, 20);
+      for (let k = 0; k < 5; k += 1) game.tick(1, 0, 0, 20, false);
       times.push(performance.now() - began);
     }
     return { times, memory: memory.buffer.byteLength, fingerprint: game.fingerprint() };

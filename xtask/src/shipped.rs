@@ -20,7 +20,7 @@ pub(crate) fn scenario() -> String {
 
 /// The scene of the demo: a signalized crossing with turns and people, of no split.
 pub(crate) fn demo() -> String {
-    let path = repository().join("datasets/demo/crossing.tfrecord.gz");
+    let path = home().join("datasets/demo/crossing.tfrecord.gz");
     format!("{}#0", from_here(&path).display())
 }
 

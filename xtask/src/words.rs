@@ -39,7 +39,7 @@ const SHORT: [(char, &[&str]); 7] = [
     ('p', &["planner"]),
     (
         'n',
-        &["rollouts_per_scenario", "count", "scenes", "futures"],
+        &["rollouts_per_scenario", "futures", "count", "scenes"],
     ),
 ];
 

@@ -486,6 +486,44 @@ fn simulate_writes_futures_in_every_world() {
 }
 
 #[test]
+fn scenes_of_a_file_are_simulated_into_one_viewer() {
+    let place = Workplace::new();
+    let words = format!(
+        "simulate --world idm -n 2 --scenario {}",
+        two_scenes(&place)
+    );
+    let report = place.report(&format!("{words} --scenes 5"));
+    let results = &report["results"];
+    assert_eq!(
+        (&results["scenes"], &results["agents"]),
+        (&2.into(), &6.into())
+    );
+    let files = [
+        "by_class.parquet",
+        "report.json",
+        "rows.parquet",
+        "viewer.html",
+    ];
+    assert_eq!(place.files(), files);
+    let viewer = fs::read_to_string(place.path("out/viewer.html")).unwrap();
+    assert!(viewer.contains("scene 8") && viewer.contains("id=\"facts-2\""));
+    // Each is simulated as it would be alone.
+    let second = place.report(&format!("{words}#1"));
+    assert_eq!(results["rows"][1]["digest"], second["results"]["digest"]);
+    assert_eq!(second["results"]["futures"], 2);
+    place.fails(
+        &format!("{words}#1 --scenes 2"),
+        2,
+        &["--scenes", "file or folder"],
+    );
+    place.fails(
+        &format!("{words} --scenes 2 --format apng"),
+        2,
+        &["--format"],
+    );
+}
+
+#[test]
 fn the_same_seed_imagines_the_same_on_any_number_of_threads() {
     let place = Workplace::new();
     let (scene, weights) = (place.scene(), place.weights());

@@ -2,7 +2,8 @@
 //!
 //! Start with [`draw_scene`] for a still, [`grid_film`] and [`overlay_film`] for futures in
 //! motion, [`Chart`] for curves, [`Bars`] for tables and [`Page`] to put them all into one file that needs no network.
-//! [`Viewer`] writes a page of another sort: a scene to play, turn over and click into.
+//! [`Viewer`] writes a page of another sort: a scene to play, turn over and click into; [`Gallery`] one of
+//! several scenes.
 //!
 //! # Terms
 //! * **camera**: which part of the world is seen, from above, and which way is up.
@@ -63,4 +64,4 @@ pub use picture::{
 };
 pub use theme::Theme;
 pub use video::can_encode_mp4;
-pub use viewer::{CandidatePath, HeatMap, MetricTrack, Viewer};
+pub use viewer::{CandidatePath, Gallery, HeatMap, MetricTrack, Viewer};

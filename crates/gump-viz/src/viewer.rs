@@ -1,10 +1,11 @@
-//! The viewer: one HTML file in which to play a scene, its log and any number of futures.
+//! The viewer: one HTML file in which to play scenes, their logs and any number of futures.
 //!
-//! [`Viewer`] gathers what is to be seen, `viewer/told.rs` what is told of agents beside it;
-//! `viewer/pack.rs` makes it small; the page itself is
-//! `viewer/*.js`, plain script without libraries, put together here. How a page looks is in
+//! [`Viewer`] gathers what is to be seen of a scene, `viewer/told.rs` what is told of agents beside
+//! it; `viewer/pack.rs` makes it small; `viewer/gallery.rs` puts scenes and page together. The page
+//! itself is `viewer/*.js` and `traffic.js`, plain script without libraries. How a page looks is in
 //! `theme.rs` and `palette.css`, which it shares with pictures and pages.
 
+mod gallery;
 mod pack;
 #[cfg(feature = "rerun")]
 mod recording;
@@ -13,22 +14,15 @@ mod tests;
 mod told;
 
 use std::collections::BTreeMap;
-use std::io::Write as _;
 use std::path::Path;
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD as BASE64;
-use flate2::Compression;
-use flate2::write::DeflateEncoder;
 use gump_geometry::DVec2;
 use gump_scene::{Agent, AgentId, AreaKind, Frame, Light, MapGraph, Rollout, Scenario};
 use serde_json::{Value, json};
 
+use crate::VizError;
 use crate::draw_map::{is_for_cars, style};
-use crate::files::write_whole;
-use crate::page::escape;
-use crate::theme::{Colours, Rgb};
-use crate::{Theme, VizError};
+pub use gallery::Gallery;
 use pack::{CENTI, Class, HEADINGS, Packer, units};
 use told::{CELL, SPEED, TURN_DEG};
 pub use told::{CandidatePath, HeatMap, MetricTrack};
@@ -130,23 +124,7 @@ impl<'a> Viewer<'a> {
 
     /// The whole page; it refers to nothing outside itself.
     pub fn to_html(&self) -> String {
-        let (facts, bytes) = self.pack();
-        // Inside a script nothing but "<" could end it; JSON may write it as an escape anywhere.
-        let facts = facts.to_string().replace('<', "\\u003c");
-        let parts = [
-            ("title", escape(&self.scenario.id)),
-            ("palette", include_str!("palette.css").to_owned()),
-            ("style", include_str!("viewer/viewer.css").to_owned()),
-            ("facts", facts),
-            ("data", BASE64.encode(deflate(&bytes))),
-            ("unpack", include_str!("viewer/unpack.js").to_owned()),
-            ("draw", include_str!("viewer/draw.js").to_owned()),
-            ("heat", include_str!("viewer/heat.js").to_owned()),
-            ("chart", include_str!("viewer/chart.js").to_owned()),
-            ("app", include_str!("viewer/app.js").to_owned()),
-            ("check", include_str!("viewer/check.js").to_owned()),
-        ];
-        fill(include_str!("viewer/viewer.html"), &parts)
+        self.gallery().to_html()
     }
 
     /// Writes the page; a reader finds the old file or the new one, never half of one.
@@ -154,7 +132,14 @@ impl<'a> Viewer<'a> {
     /// # Errors
     /// [`VizError::Write`] with the path.
     pub fn save(&self, path: &Path) -> Result<(), VizError> {
-        write_whole(path, self.to_html().as_bytes())
+        self.gallery().save(path)
+    }
+
+    /// This scene alone.
+    fn gallery(&self) -> Gallery {
+        let mut gallery = Gallery::default();
+        gallery.add(self);
+        gallery
     }
 
     /// What the page reads as JSON, and the bytes of road and traffic.
@@ -188,10 +173,6 @@ impl<'a> Viewer<'a> {
             "centi": CENTI,
             "headings": HEADINGS,
             "features": n_features,
-            "themes": {
-                "light": theme(Theme::Light.colours()),
-                "dark": theme(Theme::Dark.colours()),
-            },
             "agents": agents.iter().map(|a| json!({
                 "id": a.id.to_string(),
                 "kind": a.kind.name(),
@@ -380,52 +361,7 @@ fn meets(points: &[DVec2], (low, high): (DVec2, DVec2)) -> bool {
     least.cmple(high).all() && most.cmpge(low).all()
 }
 
-fn theme(colours: &Colours) -> Value {
-    let hex = |[r, g, b]: Rgb| format!("#{r:02x}{g:02x}{b:02x}");
-    json!({
-        "ground": hex(colours.ground),
-        "road": hex(colours.road),
-        "route": hex(colours.route),
-        "crosswalk": hex(colours.crosswalk),
-        "direction": hex(colours.direction),
-        "whiteLine": hex(colours.white_line),
-        "yellowLine": hex(colours.yellow_line),
-        "edge": hex(colours.edge),
-        "text": hex(colours.text),
-        "ego": hex(colours.ego),
-        "vehicle": hex(colours.vehicle),
-        "pedestrian": hex(colours.pedestrian),
-        "bicycle": hex(colours.bicycle),
-        "other": hex(colours.other),
-        "outline": hex(colours.outline),
-        "wedge": hex(colours.wedge),
-        "red": hex(colours.red),
-        "yellow": hex(colours.yellow),
-        "green": hex(colours.green),
-    })
-}
-
 /// To three decimals, which is what a chart can show.
 fn rounded(x: f64) -> f64 {
     (x * 1000.0).round() / 1000.0
-}
-
-fn deflate(bytes: &[u8]) -> Vec<u8> {
-    let mut encoder = DeflateEncoder::new(Vec::new(), Compression::best());
-    let written = encoder.write_all(bytes).and_then(|()| encoder.finish());
-    written.expect("writing to memory cannot fail")
-}
-
-/// Puts the parts where the template names them, as `@@name@@`; what the parts say is not read.
-fn fill(template: &str, parts: &[(&str, String)]) -> String {
-    let pieces = template.split("@@").enumerate().map(|(i, piece)| {
-        if i % 2 == 0 {
-            return piece;
-        }
-        let part = parts.iter().find(|(name, _)| *name == piece);
-        part.expect("the template names only parts there are")
-            .1
-            .as_str()
-    });
-    pieces.collect()
 }

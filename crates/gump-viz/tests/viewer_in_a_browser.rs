@@ -9,7 +9,7 @@ use std::process::Command;
 
 use gump_geometry::{dvec2, wrap_angle};
 use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario, fixture};
-use gump_viz::{CandidatePath, HeatMap, MetricTrack, Viewer};
+use gump_viz::{CandidatePath, Gallery, HeatMap, MetricTrack, Viewer};
 use serde_json::Value;
 
 const BROWSERS: [&str; 5] = [
@@ -46,6 +46,60 @@ fn scenario() -> Scenario {
          history 1 future 4 dt 0.1",
     )
     .expect("a scene in the language of the fixture")
+}
+
+/// A scene to choose beside it.
+fn other() -> Scenario {
+    let scene = fixture::scenario(
+        "lane 1: 0,0 100,0
+         ego vehicle 0: 10,0 velocity 8,0
+         history 1 future 2 dt 0.1",
+    );
+    let mut scenario = scene.expect("a scene in the language of the fixture");
+    scenario.id = "another scene".into();
+    scenario
+}
+
+/// Gaps that the ruler tells of, against those of boxes along the x axis.
+fn check_ruler(said: &Value, scenario: &Scenario) {
+    let agent = |id| {
+        let found = scenario.log[scenario.now].agent(AgentId(id));
+        *found.expect("an agent of the scene")
+    };
+    let (ego, other) = (agent(0), agent(9));
+    let between = other.state.pose.position - ego.state.pose.position;
+    let sides = dvec2(ego.length + other.length, ego.width + other.width) / 2.0;
+    let gap = (between.abs() - sides).max(dvec2(0.0, 0.0)).length();
+    let expected = format!(
+        "ego, vehicle 0 to vehicle 9: gap {gap:.2} m, centres {:.2} m",
+        between.length()
+    );
+    assert_eq!(said["agents"], expected);
+    assert_eq!(said["taps"], expected);
+    let address = said["address"].as_str().expect("a text");
+    assert!(address.ends_with("ruler=0%2C9"), "{address}");
+    let later = said["later"].as_str().expect("a text");
+    assert!(later.contains("gap") && later != expected, "{later}");
+    let starts = |key: &str, with: &str| said[key].as_str().is_some_and(|t| t.starts_with(with));
+    assert!(starts("asks", "Drag") && starts("half", "Now"), "{said}");
+    let places = said["places"].as_str().expect("a text");
+    let metres: f64 = places.trim_end_matches(" m").parse().expect("metres");
+    assert!((metres - 10.0).abs() < 0.3, "{places}");
+    assert_eq!(
+        (&said["cleared"], &said["drawn"], &said["still"]),
+        (&"".into(), &true.into(), &true.into())
+    );
+}
+
+/// The second scene, by the list, the first, the second and the first again.
+fn check_scenes(said: &Value, first: &Scenario, second: &Scenario) {
+    let [first, second] = [(first, 4), (second, 1)]
+        .map(|(scenario, n_agents)| serde_json::json!([scenario.id, n_agents, scenario.id]));
+    let names = serde_json::json!([second, first, second, first]);
+    assert_eq!(said["names"], names);
+    assert_eq!((&said["listed"], &said["pressed"]), (&2.into(), &1.into()));
+    let address = said["address"].as_str().expect("a text");
+    assert!(address.starts_with("scene="), "{address}");
 }
 
 /// Futures in which everybody turns, each in another way.
@@ -154,7 +208,10 @@ fn the_viewer_plays_and_switches_in_a_browser() {
     }
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("viewer.html");
-    viewer.save(&path).expect("a file can be written there");
+    let other = other();
+    let mut gallery = Gallery::default();
+    gallery.add(&viewer).add(&Viewer::new(&other));
+    gallery.save(&path).expect("a file can be written there");
     let windows = ["1280,800", "390,844"].map(|size| [false, true].map(|dark| (size, dark)));
     for (size, dark) in windows.into_iter().flatten() {
         let profile = folder.path().join(format!("{size} {dark}"));
@@ -215,6 +272,8 @@ fn the_viewer_plays_and_switches_in_a_browser() {
             "{address}"
         );
         assert_eq!(report["panel_in_sight"], true, "{report}");
+        check_ruler(&report["ruler"], &scenario);
+        check_scenes(&report["scenes"], &scenario, &other);
         assert_eq!(report["wide"], false, "the page is wider than its window");
         let ends = report["ends"].as_array().expect("one state per take");
         let last = std::iter::once(&scenario.log[scenario.log.len() - 1])

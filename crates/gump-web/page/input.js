@@ -1,5 +1,5 @@
 // Hands: keys, a gamepad, a wheel and pedals on a touch screen. Out come a pedal and a wheel, each
-// from -1 to 1, the wheel positive to the left.
+// from -1 to 1, the wheel positive to the left, and a gear.
 
 const KEYS = {
   ArrowUp: 'gas', KeyW: 'gas', ArrowDown: 'brake', KeyS: 'brake',
@@ -11,6 +11,8 @@ const BACK = 3.2;
 /** Shares of the whole way that a key presses a pedal in a second. */
 const PRESS = 4;
 const DEAD = 0.12;
+/** A car that is slower than this stands, metres per second. */
+const STANDS = 0.05;
 
 export class Hands {
   constructor(touch) {
@@ -18,6 +20,8 @@ export class Hands {
     this.wheel = 0;
     this.pedal = 0;
     this.touch = { wheel: null, gas: false, brake: false };
+    this.reverse = false;
+    this.braked = false;
     /** Whether anything has been touched since it was last asked. */
     this.stirred = false;
     addEventListener('keydown', event => this.key(event, true));
@@ -98,6 +102,30 @@ export class Hands {
     this.pedal = pedal === 0 ? 0 : this.pedal + Math.max(-press, Math.min(press, pedal - this.pedal));
     if (pad) [this.wheel, this.pedal] = [pad.wheel, pad.pedal];
     return { wheel: this.wheel, pedal: this.pedal };
+  }
+
+  /**
+   * The gear of a car with this speed, negative backwards: true for reverse. The brake pressed anew
+   * in a car that stands puts it into reverse, so that holding the brake at a light does not; gas
+   * puts it back once the car has stopped.
+   */
+  shift(speed) {
+    const brakes = this.pedal < 0;
+    if (Math.abs(speed) < STANDS && brakes && !this.braked) this.reverse = true;
+    else if (speed > STANDS || (speed > -STANDS && this.pedal > 0)) this.reverse = false;
+    this.braked = brakes;
+    return this.reverse;
+  }
+
+  /** The gear of a car that somebody else has driven until now. */
+  takeOver(speed) {
+    this.reverse = speed < -STANDS;
+    this.braked = true;
+  }
+
+  /** What the left pedal does next: it brakes a car that drives forwards. */
+  backs(speed) {
+    return this.reverse || Math.abs(speed) < STANDS;
   }
 
   /** Whether anything was touched since it was last asked. */

@@ -7,6 +7,9 @@
 //!
 //! Start with [`Game::open`], then [`Game::tick`].
 
+use std::f64::consts::PI;
+
+use gump_geometry::{Pose, wrap_angle};
 use gump_metrics::{Metric as _, OffRoad, RedLight, overlapping};
 use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
 use gump_rollout::{SimulateConfig, dynamics, fill};
@@ -42,6 +45,9 @@ const MAX_CURVATURE: f64 = 0.2;
 const MAX_LATERAL: f64 = 6.0;
 /// Nobody is faster, metres per second.
 const MAX_SPEED: f64 = 40.0;
+/// Hardest acceleration backwards, metres per second squared, and the fastest, metres per second
+/// (18 km/h): what reverse gear and a look over the shoulder allow.
+const REVERSE: (f64, f64) = (2.0, 5.0);
 /// What a car loses per second when no pedal is pressed, metres per second squared.
 const ROLLING: f64 = 0.3;
 
@@ -563,6 +569,10 @@ pub(crate) fn is_off_road(scene: &SceneState<'_>) -> bool {
 /// Where pedal and wheel lead in `dt` seconds.
 fn by_hand(now: &AgentState, input: Input, dt: f64) -> AgentState {
     let speed = now.velocity.dot(now.pose.direction());
+    // A car that still rolls forwards is braked first, whatever the gear.
+    if input.reverse && speed <= 0.0 {
+        return backwards(now, -speed, input, dt);
+    }
     let share = f64::from(input.pedal) / 100.0;
     let wanted = match input.pedal {
         0 => -ROLLING,
@@ -572,9 +582,35 @@ fn by_hand(now: &AgentState, input: Input, dt: f64) -> AgentState {
     // A car that rolls backwards, as some recorded ones do, comes to rest first.
     let wanted = if speed < 0.0 { PEDAL[1] } else { wanted };
     let acceleration = wanted.min((MAX_SPEED - speed) / dt);
+    dynamics::drive(now, acceleration, curvature(speed, input), dt)
+}
+
+/// The same in reverse gear for a car that stands or drives backwards at `speed`.
+fn backwards(now: &AgentState, speed: f64, input: Input, dt: f64) -> AgentState {
+    let share = f64::from(input.pedal) / 100.0;
+    let wanted = match input.pedal {
+        0 => -ROLLING,
+        1.. => share * PEDAL[0],
+        _ => -share * REVERSE.0,
+    };
+    let acceleration = wanted.min((REVERSE.1 - speed) / dt);
+    // The dynamics know no car that sets off backwards: one that is turned round sets off, and the
+    // same wheel bends its way to the other side.
+    let turned = |state: &AgentState| AgentState {
+        pose: Pose {
+            heading: wrap_angle(state.pose.heading + PI),
+            ..state.pose
+        },
+        ..*state
+    };
+    let bend = -curvature(speed, input);
+    turned(&dynamics::drive(&turned(now), acceleration, bend, dt))
+}
+
+/// How sharply the wheel turns the car at a speed, radians per metre, to the left.
+fn curvature(speed: f64, input: Input) -> f64 {
     let sharpest = (MAX_LATERAL / (speed * speed).max(1e-6)).min(MAX_CURVATURE);
-    let curvature = f64::from(input.wheel) / 100.0 * sharpest;
-    dynamics::drive(now, acceleration, curvature, dt)
+    f64::from(input.wheel) / 100.0 * sharpest
 }
 
 fn check(scenario: &Scenario, settings: Settings) -> Result<(), GameError> {

@@ -1,7 +1,8 @@
 //! What was asked of the ego, tenth of a second by tenth of a second, and how it travels in a link.
 //!
 //! The code is base64 without padding for addresses: a version, then runs of equal inputs, each as
-//! its length (two bytes, low first), the driver, the pedal, the wheel and the temperature.
+//! its length (two bytes, low first), the driver, the pedal, the wheel and the temperature. Version
+//! 2 adds the gear, 1 for reverse; drives without it are written as version 1.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -42,12 +43,15 @@ impl Driver {
 pub struct Input {
     /// Who drives; a change counts from the next half second on.
     pub driver: Driver,
-    /// From -100, the hardest braking, to 100, the hardest acceleration.
+    /// From -100, the hardest braking, to 100, the hardest acceleration; in reverse, from -100, the
+    /// hardest acceleration backwards, to 100, the hardest braking.
     pub pedal: i8,
     /// From -100, the sharpest turn to the right, to 100, to the left.
     pub wheel: i8,
     /// The temperature of the world in twentieths; a change counts from the next half second on.
     pub temperature: u8,
+    /// Whether the car is in reverse gear.
+    pub reverse: bool,
 }
 
 impl Default for Input {
@@ -57,6 +61,7 @@ impl Default for Input {
             pedal: 0,
             wheel: 0,
             temperature: Self::PER_UNIT as u8,
+            reverse: false,
         }
     }
 }
@@ -76,13 +81,15 @@ impl Input {
     }
 }
 
-const VERSION: u8 = 1;
-/// Bytes of a run.
-const RUN: usize = 6;
+/// Versions without and with a gear, and the bytes of a run in each.
+const FORWARD: (u8, usize) = (1, 6);
+const GEARED: (u8, usize) = (2, 7);
 
 /// The inputs as a code for a link.
 pub fn encode(inputs: &[Input]) -> String {
-    let mut bytes = vec![VERSION];
+    let is_geared = inputs.iter().any(|input| input.reverse);
+    let (version, _) = if is_geared { GEARED } else { FORWARD };
+    let mut bytes = vec![version];
     for run in inputs.chunk_by(|a, b| a == b) {
         for part in run.chunks(usize::from(u16::MAX)) {
             let input = part[0];
@@ -93,6 +100,7 @@ pub fn encode(inputs: &[Input]) -> String {
                 input.wheel as u8,
                 input.temperature,
             ]);
+            bytes.extend(is_geared.then_some(u8::from(input.reverse)));
         }
     }
     URL_SAFE_NO_PAD.encode(bytes)
@@ -106,29 +114,46 @@ pub fn decode(code: &str, limit: usize) -> Result<Vec<Input>, GameError> {
     let bytes = URL_SAFE_NO_PAD
         .decode(code.trim())
         .map_err(|_| GameError::Link("it was cut off or changed on its way"))?;
-    let Some((&VERSION, runs)) = bytes.split_first() else {
-        return Err(GameError::Link("it is of another version of this page"));
-    };
-    let (runs, []) = runs.as_chunks::<RUN>() else {
+    let versions = [FORWARD, GEARED];
+    let known = bytes.split_first().and_then(|(version, runs)| {
+        let found = versions.iter().find(|(known, _)| known == version);
+        Some((runs, found?.1))
+    });
+    let (runs, n_bytes) = known.ok_or(GameError::Link("it is of another version of this page"))?;
+    if !runs.len().is_multiple_of(n_bytes) {
         return Err(GameError::Link("it was cut off"));
-    };
+    }
     let mut inputs = Vec::new();
-    for &[low, high, driver, pedal, wheel, temperature] in runs {
-        let n = usize::from(u16::from_le_bytes([low, high]));
-        let driver = Driver::ALL.get(usize::from(driver));
-        let driver = *driver.ok_or(GameError::Link("it names a driver that there is not"))?;
+    for run in runs.chunks(n_bytes) {
+        let (n, input) = decode_run(run)?;
         if inputs.len() + n > limit {
             return Err(GameError::Link("it is longer than a drive can be"));
         }
-        let input = Input {
-            driver,
-            pedal: pedal as i8,
-            wheel: wheel as i8,
-            temperature,
-        };
-        inputs.extend(std::iter::repeat_n(input.held(), n));
+        inputs.extend(std::iter::repeat_n(input, n));
     }
     Ok(inputs)
+}
+
+/// How often an input is repeated, and the input.
+fn decode_run(run: &[u8]) -> Result<(usize, Input), GameError> {
+    let &[low, high, driver, pedal, wheel, temperature, ref gear @ ..] = run else {
+        return Err(GameError::Link("it was cut off"));
+    };
+    let driver = Driver::ALL.get(usize::from(driver));
+    let driver = *driver.ok_or(GameError::Link("it names a driver that there is not"))?;
+    let reverse = match gear {
+        [] | [0] => false,
+        [1] => true,
+        _ => return Err(GameError::Link("it names a gear that there is not")),
+    };
+    let input = Input {
+        driver,
+        pedal: pedal as i8,
+        wheel: wheel as i8,
+        temperature,
+        reverse,
+    };
+    Ok((usize::from(u16::from_le_bytes([low, high])), input.held()))
 }
 
 #[cfg(test)]
@@ -155,6 +180,15 @@ mod tests {
         assert_eq!(code.len(), 26);
         assert_eq!(decode(&code, 74).unwrap(), inputs());
         assert_eq!(decode(&encode(&[]), 0).unwrap(), []);
+    }
+
+    #[test]
+    fn a_gear_costs_a_byte_where_there_is_one() {
+        let mut inputs = inputs();
+        inputs[73].reverse = true;
+        let geared = encode(&inputs);
+        assert_eq!(decode(&geared, 74).unwrap(), inputs);
+        assert_eq!(geared.len(), 30);
     }
 
     #[test]

@@ -11,8 +11,8 @@ use crate::branches::Branches;
 use crate::game::{DT, EventKind, FAN_STEPS, Game};
 use crate::{GameError, tape};
 
-/// Numbers before the agents of a frame: the frame, the ego's speed, its row, how many agents and
-/// how many lights follow.
+/// Numbers before the agents of a frame: the frame, the ego's speed (negative backwards), its row,
+/// how many agents and how many lights follow.
 pub const HEAD: usize = 5;
 /// Numbers of an agent: x, y, heading, length, width, kind, speed, id.
 pub const AGENT: usize = 8;
@@ -101,6 +101,7 @@ impl Game {
                     points: flat(lane.centerline.points()),
                     width: lane.width as f32,
                     kind: match lane.kind {
+                        _ if lane.in_intersection => "turn",
                         LaneKind::BikeLane => "bike",
                         _ => "lane",
                     },
@@ -172,7 +173,8 @@ impl Game {
         let origin = self.origin();
         let agents = scene.now().agents();
         let row = agents.iter().position(|agent| agent.id == scene.ego);
-        let speed = scene.ego_now().state.speed();
+        let ego = scene.ego_now().state;
+        let speed = ego.velocity.dot(ego.pose.direction());
         let lights = scene.now().lights();
         let mut numbers = vec![
             frame as f32,

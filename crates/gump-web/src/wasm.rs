@@ -52,6 +52,7 @@ impl WebGame {
         pedal: i8,
         wheel: i8,
         temperature: u8,
+        reverse: bool,
     ) -> Result<(), JsError> {
         let driver = Driver::ALL.get(usize::from(driver)).copied();
         let input = Input {
@@ -59,11 +60,12 @@ impl WebGame {
             pedal,
             wheel,
             temperature,
+            reverse,
         };
         self.game.tick(input).map_err(sentence)
     }
 
-    /// The inputs of a link, four numbers for each tenth of a second.
+    /// The inputs of a link, five numbers for each tenth of a second.
     pub fn inputs_of(code: &str) -> Result<Vec<i16>, JsError> {
         let inputs = decode(code, MAX_FRAMES).map_err(sentence)?;
         let numbers = inputs.iter().flat_map(|input| {
@@ -72,6 +74,7 @@ impl WebGame {
                 i16::from(input.pedal),
                 i16::from(input.wheel),
                 i16::from(input.temperature),
+                i16::from(input.reverse),
             ]
         });
         Ok(numbers.collect())

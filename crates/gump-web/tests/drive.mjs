@@ -14,7 +14,7 @@ const weights = readFileSync(join(folder, 'gump-relative.safetensors'));
 const game = new Game(scene, 'crossing', weights, 1, 1);
 const answers = [];
 for (let i = 0; i < halfSeconds; i += 1) {
-  for (let k = 0; k < 5; k += 1) game.tick(1, 0, 0, 20);
+  for (let k = 0; k < 5; k += 1) game.tick(1, 0, 0, 20, false);
   answers.push([...game.numbers(game.driven())]);
 }
 console.log(`ANSWERS ${JSON.stringify(answers)}`);

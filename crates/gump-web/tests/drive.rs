@@ -34,6 +34,7 @@ fn inputs(n: usize) -> Vec<Input> {
         pedal: if i < 15 { 80 } else { -30 },
         wheel: (i % 7) as i8 * 5 - 15,
         temperature: if i < 40 { 20 } else { 26 },
+        reverse: false,
     };
     (0..n).map(input).collect()
 }
@@ -108,6 +109,43 @@ fn a_link_gives_the_same_drive_to_the_bit() {
     });
     drive(&mut other, &inputs(47));
     assert_ne!(other.fingerprint(), first.fingerprint());
+}
+
+#[test]
+fn reverse_gear_brakes_stands_and_drives_backwards() {
+    let mut game = game(Settings::default());
+    let press = |pedal: i8, wheel: i8, reverse: bool| Input {
+        pedal,
+        wheel,
+        reverse,
+        ..Input::default()
+    };
+    let ego = |game: &Game| game.scene().ego_now().state;
+    let forward = |game: &Game| ego(game).velocity.dot(ego(game).pose.direction());
+    drive(&mut game, &[press(100, 0, false); 10]);
+    // The brake alone stands still for as long as it is held.
+    drive(&mut game, &[press(-100, 0, false); 40]);
+    assert_eq!(forward(&game), 0.0);
+    let stood = ego(&game).pose;
+    drive(&mut game, &[press(-100, 0, true); 40]);
+    assert!((forward(&game) + 5.0).abs() < 1e-9, "{}", forward(&game));
+    let off = stood.inverse() * ego(&game).pose;
+    assert!(off.position.x < -10.0 && off.position.y.abs() < 1e-6);
+    // The wheel to the left takes the rear to the left.
+    drive(&mut game, &[press(-50, 60, true); 10]);
+    let off = stood.inverse() * ego(&game).pose;
+    assert!(off.position.y > 0.1 && off.heading < 0.0, "{off:?}");
+    // Gas in reverse brakes; without the gear it drives on forwards.
+    drive(&mut game, &[press(100, 0, true); 15]);
+    assert_eq!(forward(&game), 0.0);
+    assert!(game.numbers(90).unwrap()[1] < 0.0);
+    drive(&mut game, &[press(100, 0, false); 10]);
+    assert!(forward(&game) > 1.0);
+    // A link tells of the gear, and of nothing new where there was none.
+    let mut again = self::game(Settings::default());
+    drive(&mut again, &decode(&game.code(), MAX_FRAMES).unwrap());
+    assert_eq!(again.fingerprint(), game.fingerprint());
+    assert!(game.code().starts_with("Ag") && encode(&inputs(47)).starts_with("AQ"));
 }
 
 #[test]
@@ -246,25 +284,22 @@ fn what_the_page_cannot_take_is_told_in_a_sentence() {
 /// The page that is served is built from the sources that lie beside this test.
 #[test]
 fn the_page_that_is_served_is_that_of_the_sources() {
-    let (page, live) = (
-        root().join("crates/gump-web/page"),
-        root().join("docs/live"),
-    );
-    let mut n = 0;
-    for entry in fs::read_dir(&page).unwrap() {
-        let name = entry.unwrap().file_name();
-        if name == "scenes.json" {
-            continue;
-        }
-        let (source, served) = (fs::read(page.join(&name)), fs::read(live.join(&name)));
-        let is_same = served.ok() == source.ok();
+    let live = root().join("docs/live");
+    let page = fs::read_dir(root().join("crates/gump-web/page")).unwrap();
+    let mut sources: Vec<_> = page.map(|entry| entry.unwrap().path()).collect();
+    sources.retain(|path| !path.ends_with("scenes.json"));
+    // What the page shares with the viewer.
+    sources.push(root().join("crates/gump-viz/src/traffic.js"));
+    assert!(sources.len() >= 8, "only {} files", sources.len());
+    for source in sources {
+        let served = live.join(source.file_name().unwrap());
+        let is_same = fs::read(&served).ok() == Some(fs::read(&source).unwrap());
         assert!(
             is_same,
-            "{name:?} differs: run `cargo xtask web --keep-engine`"
+            "{} differs: run `cargo xtask web --keep-engine`",
+            served.display()
         );
-        n += 1;
     }
-    assert!(n >= 7, "only {n} files");
     let manifest = fs::read(live.join("manifest.json")).unwrap();
     let manifest: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     let scenes = manifest["scenes"].as_array().unwrap();

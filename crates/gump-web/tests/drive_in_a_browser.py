@@ -1,4 +1,5 @@
-"""Drives the page in a headless Chromium: by key for 20 s, by link, by touch, with what goes wrong.
+"""Drives the page in a headless Chromium: by key for 20 s, backwards, by link, by touch, with what
+goes wrong.
 
     python drive_in_a_browser.py [--pictures FOLDER] [--bench FILE]
 
@@ -10,6 +11,7 @@ import argparse
 import functools
 import http.server
 import json
+import math
 import os
 import pathlib
 import shutil
@@ -140,6 +142,41 @@ def steer_for_twenty_seconds(browser, address, picture):
     return link, told
 
 
+def reverse_gear(browser, address, picture):
+    visit = Visit(browser, address, viewport={"width": 1280, "height": 800}).open().ready()
+    keys = visit.page.keyboard
+    visit.page.click("#go")
+    # Held, the brake stops the car and keeps it there.
+    keys.down("ArrowDown")
+    visit.page.wait_for_function("gump.state.driven > 20 && gump.state.now[1] === 0")
+    visit.page.wait_for_timeout(800)
+    assert visit.state("now[1]") == 0 and visit.page.inner_text("#gear") == "D"
+    keys.up("ArrowDown")
+    visit.page.wait_for_timeout(300)
+    stood = visit.ego()
+    # Pressed anew it drives backwards, not too fast.
+    keys.down("s")
+    visit.page.wait_for_function("gump.state.now[1] < -4.9")
+    assert visit.page.inner_text("#gear") == "R" and visit.page.inner_text("#speed") == "18"
+    picture(visit, "desktop-reverse")
+    keys.up("s")
+    x, y, heading = stood
+    now = visit.ego()
+    ahead = (now[0] - x) * math.cos(heading) + (now[1] - y) * math.sin(heading)
+    assert ahead < -3, f"the ego went {ahead:.1f} m ahead"
+    # Gas stops it, then drives on.
+    keys.down("w")
+    visit.page.wait_for_function("gump.state.now[1] > 2")
+    assert visit.page.inner_text("#gear") == "D"
+    keys.up("w")
+    visit.page.click("#pause")
+    visit.page.wait_for_function("!gump.state.busy")
+    told = visit.page.evaluate("gump.engine.ask('code')")
+    assert visit.errors == [], visit.errors
+    visit.close()
+    a_link_replays_the_drive(browser, address, f"#scene=crossing&seed=1&density=1&drive={told['code']}", told)
+
+
 def a_link_replays_the_drive(browser, address, link, told):
     visit = Visit(browser, address, viewport={"width": 1280, "height": 800}, color_scheme="dark")
     visit.open(link).ready()
@@ -177,6 +214,19 @@ def every_scene_opens(browser, address):
     visit.close()
 
 
+def nothing_is_cut(visit):
+    """Wheel and pedals are whole, large enough for thumbs, and on nothing else that is pressed."""
+    size = visit.page.viewport_size
+    box = lambda name: visit.page.locator(name).bounding_box()
+    over = lambda a, b: a["x"] < b["x"] + b["width"] and b["x"] < a["x"] + a["width"] and a["y"] < b["y"] + b["height"] and b["y"] < a["y"] + a["height"]
+    hands = {name: box(name) for name in ["#touch-wheel", "#touch-brake", "#touch-gas"]}
+    for name, one in hands.items():
+        assert min(one["width"], one["height"]) >= 72, f"{name} is {one}"
+        assert one["x"] >= 0 and one["x"] + one["width"] <= size["width"], f"{name} is {one}"
+        for other in ["#dash", "#pause", "#end", "#time", *hands]:
+            assert other == name or not over(one, box(other)), f"{name} lies on {other}"
+
+
 def on_a_phone(browser, address, picture):
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True, "device_scale_factor": 2}
     visit = Visit(browser, address, **phone, color_scheme="dark").open().ready()
@@ -202,6 +252,20 @@ def on_a_phone(browser, address, picture):
     assert pedal > 50 and turn > 10, f"the pedal is at {pedal}, the wheel at {turn}"
     picture(visit, "phone-driving")
     touch("touchEnd")
+    # The pedals say what they do next: the brake of a car that stands drives backwards.
+    brake = middle("#touch-brake")
+    assert visit.page.inner_text("#touch-brake") == "Brake"
+    touch("touchStart", brake)
+    visit.page.wait_for_function("gump.state.now[1] === 0", timeout=60_000)
+    touch("touchEnd")
+    visit.page.wait_for_timeout(300)
+    assert visit.page.inner_text("#touch-brake") == "Reverse"
+    touch("touchStart", brake)
+    visit.page.wait_for_function("gump.state.now[1] < -2", timeout=60_000)
+    assert visit.page.inner_text("#touch-gas") == "Brake"
+    picture(visit, "phone-reverse")
+    touch("touchEnd")
+    nothing_is_cut(visit)
     assert visit.errors == [], visit.errors
     assert visit.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "the page is wider than the phone"
     visit.page.tap("#end")
@@ -210,6 +274,12 @@ def on_a_phone(browser, address, picture):
     visit.close()
     visit = Visit(browser, address, **phone, color_scheme="light").open().ready()
     picture(visit, "phone-start-light")
+    visit.page.tap("#go")
+    # On its side.
+    visit.page.set_viewport_size({"width": 844, "height": 390})
+    visit.page.wait_for_timeout(500)
+    nothing_is_cut(visit)
+    picture(visit, "phone-on-its-side")
     visit.close()
 
 
@@ -309,6 +379,7 @@ def main():
         else:
             link, told = steer_for_twenty_seconds(browser, address, picture)
             a_link_replays_the_drive(browser, address, link, told)
+            reverse_gear(browser, address, picture)
             drivers_by_rule_drive(browser, address)
             every_scene_opens(browser, address)
             on_a_phone(browser, address, picture)

@@ -1,4 +1,6 @@
-//! `simulate`: futures of a recorded scene, in any world.
+//! `simulate`: futures of a recorded scene, or of several for the viewer, in any world.
+
+mod scenes;
 
 use std::num::NonZeroUsize;
 
@@ -24,6 +26,9 @@ pub(crate) struct Args {
     /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     scenario: String,
+    /// Simulate the first N scenes of the file or folder, into one viewer with a list of them
+    #[arg(long, value_name = "N")]
+    scenes: Option<NonZeroUsize>,
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W")]
     world: WorldName,
@@ -84,6 +89,14 @@ impl Args {
             return Err(WrongArguments(wrong.into()).into());
         }
         self.film.check()?;
+        match self.scenes {
+            Some(n) => scenes::execute(self, n.get(), run),
+            None => self.execute_one(run),
+        }
+    }
+
+    /// One scene, and all that is written of it.
+    fn execute_one(&self, run: &mut Run) -> anyhow::Result<()> {
         let decoding = self.sampling.decoding(&self.world)?;
         let config = decoding.frames(self.seconds);
         let scenario = run.phase("read", |_| Ok(find(&self.scenario)?))?;

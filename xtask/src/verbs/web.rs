@@ -1,7 +1,8 @@
 //! `web`: the page that lets one drive inside the learned world, as static files.
 //!
 //! What is made lies in `docs/live` and is committed, so that it can be served as it is. The page's
-//! sources are `crates/gump-web/page`, copied unchanged; a test of that crate compares them.
+//! sources are `crates/gump-web/page`, and what it shares with the viewer of `gump-viz`, copied
+//! unchanged; a test of `gump-web` compares them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,6 +22,8 @@ const TARGET: &str = "wasm32-unknown-unknown";
 const BINDGEN: &str = "0.2.130";
 /// The most that the page may weigh, bytes.
 const MOST: u64 = 12_000_000;
+/// How roads and agents are drawn, in pages of `gump-viz` too.
+const DRAWING: &str = "crates/gump-viz/src/traffic.js";
 /// The list of scenes, of which the page sees what the manifest says.
 const SCENES: &str = "scenes.json";
 
@@ -194,7 +197,9 @@ fn copy_page(root: &Path, live: &Path) -> anyhow::Result<()> {
             fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
         }
     }
-    for path in files_of(&root.join("crates/gump-web/page"))? {
+    let mut sources = files_of(&root.join("crates/gump-web/page"))?;
+    sources.push(root.join(DRAWING));
+    for path in sources {
         let name = path.file_name().unwrap_or_default();
         if name != SCENES {
             write(&live.join(name), &read(&path)?)?;

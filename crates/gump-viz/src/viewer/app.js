@@ -6,42 +6,104 @@ window.addEventListener('error', event => errors.push(String(event.message)));
 window.addEventListener('unhandledrejection', event => errors.push(String(event.reason)));
 
 const dark = window.matchMedia('(prefers-color-scheme: dark)');
-const ui = { t: 0, playing: false, speed: 1, shown: 0, colour: 'class', follow: -1, heading: false, trails: true, selected: -1, hovered: -1, pane: 0, left: null, up: 'ego', candidate: -1, dark: dark.matches };
+const ui = { t: 0, playing: false, speed: 1, shown: 0, colour: 'class', follow: -1, heading: false, trails: true, selected: -1, hovered: -1, pane: 0, left: null, up: 'ego', candidate: -1, ruling: false, ends: [], dark: dark.matches };
 let world, scene, span, stale = true, charted = '';
+// Which scene is shown, and which was asked for last.
+let at = -1, asked = 0;
+// Ways of colouring that this scene has numbers for.
+let ways = [];
 
-// Ways of colouring that this page has numbers for.
-const COLOURS = ['class', 'speed', ...(facts.agents.some(agent => agent.realism !== null) ? ['realism'] : [])];
-
-const colours = () => facts.themes[ui.dark ? 'dark' : 'light'];
+const colours = () => PALETTES[ui.dark ? 'dark' : 'light'];
 const redraw = () => { stale = true; };
 const plural = (n, what) => `${n} ${what}${n === 1 ? '' : 's'}`;
 
-function begin(unpacked) {
-  world = unpacked;
-  scene = new Scene($('view'), world);
-  const ends = world.takes.map(take => take.first + (take.frames - 1) * take.dt);
-  span = [world.takes[0].first, Math.max(...ends, 0)];
-  Object.assign($('time'), { min: span[0], max: span[1], step: 'any', value: 0 });
-  $('present').style.left = `${100 * (0 - span[0]) / Math.max(span[1] - span[0], 1e-9)}%`;
-  const n = world.takes.length - 1;
-  $('note').textContent = facts.note || `${plural(facts.agents.length, 'agent')}, ${n ? plural(n, 'simulated future') : 'recorded'}`;
-  buildTakes(n);
-  buildCandidates();
-  for (const b of document.querySelectorAll('[data-colour]')) b.hidden = !COLOURS.includes(b.dataset.colour);
-  $('pair').hidden = !n;
-  buildMarks();
+async function begin() {
+  if (!SCENES.length) { $('note').textContent = 'There are no scenes in this file.'; return; }
+  buildScenes();
   listen();
-  if (n) ui.shown = 1;
-  fit();
+  ui.shown = SCENES[sceneOf(address())].facts.takes.length > 1 ? 1 : 0;
+  await open(sceneOf(address()));
   restore();
   dress();
-  window.addEventListener('hashchange', () => { if (location.hash.slice(1) !== remembered) { restore(); dress(); } });
+  window.addEventListener('hashchange', async () => {
+    if (location.hash.slice(1) === remembered) return;
+    await open(sceneOf(address()));
+    restore();
+    dress();
+  });
   requestAnimationFrame(tick);
 }
 
-// The address says what is shown: viewer.html#t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north.
-function address() {
+// Shows a scene; scenes are unpacked when they are first asked for.
+async function open(k) {
+  asked = k;
+  const found = SCENES[k];
+  found.world = found.world || unpack(await inflate(fromBase64(found.data)), found.facts);
+  if (asked === k && at !== k) enter(k);
+}
+
+function enter(k) {
+  at = k;
+  ({ facts, world } = SCENES[k]);
+  scene = new Scene($('view'), world);
+  const n = world.takes.length - 1, ends = world.takes.map(take => take.first + (take.frames - 1) * take.dt);
+  span = [world.takes[0].first, Math.max(...ends, 0)];
+  // What is shown stays, where this scene has it too.
+  if (ui.shown === 'all' ? n < 2 : ui.shown > n) ui.shown = Math.min(n, 1);
+  Object.assign(ui, { t: 0, selected: -1, hovered: -1, left: null, candidate: -1, ends: [] });
+  ways = ['class', 'speed', ...(facts.agents.some(agent => agent.realism !== null) ? ['realism'] : [])];
+  if (!ways.includes(ui.colour)) ui.colour = 'class';
+  Object.assign($('time'), { min: span[0], max: span[1], step: 'any', value: 0 });
+  $('present').style.left = `${100 * (0 - span[0]) / Math.max(span[1] - span[0], 1e-9)}%`;
+  document.title = document.querySelector('h1').textContent = facts.id;
+  $('note').textContent = facts.note || `${plural(facts.agents.length, 'agent')}, ${n ? plural(n, 'simulated future') : 'recorded'}`;
+  buildTakes(n);
+  buildCandidates();
+  for (const b of document.querySelectorAll('[data-colour]')) b.hidden = !ways.includes(b.dataset.colour);
+  $('pair').hidden = !n;
+  buildMarks();
+  fit();
+}
+
+// What the address calls a scene: its id, or its number where ids repeat.
+function sceneName(k) {
+  const { id } = SCENES[k].facts;
+  return SCENES.filter(other => other.facts.id === id).length > 1 ? String(k + 1) : id;
+}
+
+const sceneOf = said => Math.max(SCENES.findIndex((_, k) => sceneName(k) === said.get('scene')), 0);
+
+function nextScene(by) {
+  const n = SCENES.length;
+  if (n < 2) return;
+  play(false);
+  open((asked + by + n) % n).then(dress).catch(fail);
+}
+
+// The list of scenes: each with what is told of it, or with who is in it where all are told alike.
+function buildScenes() {
+  const n = SCENES.length, notes = new Set(SCENES.map(({ facts }) => facts.note));
+  $('scenes').hidden = $('turn').hidden = n < 2;
+  if (n < 2) return;
+  $('scenes').querySelector('h2').textContent = plural(n, 'scene');
+  $('scenes').querySelector('ol').append(...SCENES.map(({ facts: { id, note, agents, takes } }, k) => {
+    const item = document.createElement('li'), b = button('', '', () => { play(false); open(k).then(dress).catch(fail); });
+    const name = document.createElement('span'), more = document.createElement('small');
+    name.textContent = id;
+    more.textContent = notes.size > 1 && note ? note : `${plural(agents.length, 'agent')}, ${plural(takes.length - 1, 'future')}`;
+    b.dataset.scene = k;
+    b.append(name, more);
+    item.append(b);
+    return item;
+  }));
+}
+
+// The address says what is shown: viewer.html#scene=ID&t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north&ruler=3,5.
+const address = () => new URLSearchParams(location.hash.slice(1));
+
+function written() {
   const said = new URLSearchParams();
+  if (SCENES.length > 1) said.set('scene', sceneName(at));
   if (Math.abs(ui.t) > 0.049) said.set('t', ui.t.toFixed(1));
   said.set('shown', ui.shown);
   if (ui.left !== null) said.set('beside', ui.left);
@@ -49,11 +111,13 @@ function address() {
   if (ui.selected >= 0) said.set('agent', facts.agents[ui.selected].id);
   if (ui.follow >= 0) said.set('follow', 1);
   if (ui.up !== 'ego') said.set('up', ui.up);
+  // Places are not worth their digits.
+  if (ui.ends.length > 1 && ui.ends.every(end => end.agent !== undefined)) said.set('ruler', ui.ends.map(end => facts.agents[end.agent].id).join());
   return String(said);
 }
 
 function remember() {
-  const said = address();
+  const said = written();
   if (remembered === said || location.hash === '#check') return;
   remembered = said;
   // Browsers refuse pages that write their address too often.
@@ -62,15 +126,17 @@ function remember() {
 let remembered = '', rememberAt = 0;
 
 function restore() {
-  const said = new URLSearchParams(location.hash.slice(1)), n = world.takes.length;
+  const said = address(), n = world.takes.length;
   if (Number.isFinite(Number(said.get('t')))) seek(Number(said.get('t')));
   if (said.get('shown') === 'all' && n > 2) ui.shown = 'all';
   else if (said.has('shown') && world.takes[Number(said.get('shown'))]) ui.shown = Number(said.get('shown'));
-  if (COLOURS.includes(said.get('colour'))) ui.colour = said.get('colour');
+  if (ways.includes(said.get('colour'))) ui.colour = said.get('colour');
   const beside = said.get('beside');
   if (beside === 'all' ? n > 2 : said.has('beside') && world.takes[Number(beside)]) ui.left = beside === 'all' ? 'all' : Number(beside);
   if (said.has('up')) { ui.up = said.get('up') === 'north' ? 'north' : 'ego'; scene.camera.angle = upright(); }
   if (said.has('agent')) ui.selected = facts.agents.findIndex(agent => agent.id === said.get('agent'));
+  const ends = (said.get('ruler') || '').split(',').map(id => ({ agent: facts.agents.findIndex(agent => agent.id === id) }));
+  if (ends.length === 2 && ends.every(end => end.agent >= 0)) ui.ends = ends;
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
 
@@ -88,6 +154,7 @@ function buildTakes(n) {
     b.dataset.shown = shown;
     $(where).append(b);
   };
+  $('shown').replaceChildren(); $('futures').replaceChildren();
   add('shown', 'recorded', 'The recording (L)', 0);
   if (n) add('shown', n > 1 ? `all ${n} simulated` : 'simulated', n > 1 ? 'All over one another (A)' : 'The future (A)', n > 1 ? 'all' : 1);
   $('futures-title').hidden = $('futures').hidden = n < 2;
@@ -97,6 +164,7 @@ function buildTakes(n) {
 
 function buildCandidates() {
   $('candidates').hidden = !facts.candidates.length;
+  $('candidates').querySelector('ol').replaceChildren();
   const best = facts.candidates.map((c, i) => ({ ...c, i })).sort((a, b) => (b.score ?? -Infinity) - (a.score ?? -Infinity));
   for (const { name, score, chosen, i } of best) {
     const item = document.createElement('li'), b = button('', 'Show it on the road', () => chooseCandidate(i));
@@ -181,15 +249,24 @@ const actions = {
     dress();
   },
   trails: () => { ui.trails = !ui.trails; dress(); },
+  ruler: () => { ui.ruling = !ui.ruling; ui.ends = []; dress(); },
+  earlier: () => nextScene(-1),
+  later: () => nextScene(1),
 };
 
 // Everything but the canvas follows the state.
 function dress() {
   for (const b of document.querySelectorAll('[data-shown]')) press(b, b.dataset.shown === String(ui.shown));
   for (const b of document.querySelectorAll('[data-colour]')) press(b, b.dataset.colour === ui.colour);
+  for (const b of document.querySelectorAll('[data-scene]')) {
+    const isShown = b.dataset.scene === String(at);
+    if (isShown && b.getAttribute('aria-pressed') === 'false') reveal(b);
+    press(b, isShown);
+  }
+  $('turn').querySelector('span').textContent = `${at + 1} of ${SCENES.length}`;
   for (const b of document.querySelectorAll('[data-candidate]')) press(b, b.dataset.candidate === String(ui.candidate));
   for (const made of document.querySelectorAll('[data-parts]')) made.hidden = made.dataset.parts !== String(ui.candidate) || !made.children.length;
-  for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails], ['up', ui.up === 'ego'], ['beside', ui.left !== null]]) press(document.querySelector(`[data-do=${name}]`), on);
+  for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails], ['up', ui.up === 'ego'], ['beside', ui.left !== null], ['ruler', ui.ruling]]) press(document.querySelector(`[data-do=${name}]`), on);
   const named = ui.shown > 0 && isLong(world.takes[ui.shown].name);
   $('futures-title').textContent = named ? `Futures: ${world.takes[ui.shown].name}` : 'Futures';
   $('panes').classList.toggle('two', ui.left !== null);
@@ -203,6 +280,12 @@ function dress() {
   dressAgent();
   charted = '';
   redraw();
+}
+
+// Scrolls a list to one of its buttons, and nothing else: the page stays where it is on a phone.
+function reveal(b) {
+  const list = b.closest('ol'), top = b.offsetTop;
+  if (top < list.scrollTop || top + b.offsetHeight > list.scrollTop + list.clientHeight) list.scrollTop = top - list.clientHeight / 2;
 }
 
 function press(b, on) { b.setAttribute('aria-pressed', on); }
@@ -253,14 +336,15 @@ function dressAgent() {
   const all = quantities(world, ui.selected);
   if (world.takes.length > 1) {
     const key = document.createElement('p');
-    key.textContent = ui.shown === 0 ? 'Solid: recorded. The upright line is now.' : 'Dashed: recorded. Solid: simulated. The upright line is now.';
+    const beside = ui.left > 0 && ui.left !== ui.shown ? ` Dotted: ${takeName(world, ui.left)}, at the left.` : '';
+    key.textContent = `${ui.shown === 0 ? 'Solid: recorded.' : 'Dashed: recorded. Solid: simulated.'}${beside} The upright line is now.`;
     box.append(key);
   }
-  for (const { name, of } of all) {
+  for (const { name, unit, of } of all) {
     // The recording is nowhere away from itself: no empty chart of that.
-    if (ui.shown === 0 && !of(0).length) continue;
+    if (ui.shown === 0 && !(ui.left > 0) && !of(0).length) continue;
     const figure = document.createElement('figure'), caption = document.createElement('figcaption'), canvas = document.createElement('canvas');
-    caption.textContent = name;
+    caption.textContent = unit ? `${name}, ${unit}` : name;
     canvas.dataset.name = name;
     canvas.onpointerdown = canvas.onpointermove = event => {
       if (!event.buttons) return;
@@ -328,6 +412,7 @@ function drawAgentPanel() {
     if (!canvas) return;
     const curves = [{ points: of(0), colour: colours().text, width: 1.5, alpha: takes[0] === 0 ? 0.9 : 0.5, dash: takes[0] === 0 ? [] : [4, 3] }];
     for (const k of takes) if (k > 0) curves.push({ points: of(k), colour: ink, width: takes.length > 1 ? 1 : 2, alpha: takes.length > 1 ? Math.max(0.15, 1 / Math.sqrt(takes.length)) : 1 });
+    if (ui.left > 0 && ui.left !== ui.shown) curves.push({ points: of(ui.left), colour: ink, width: 1.5, alpha: 1, dash: [1.5, 2.5] });
     drawChart(canvas, curves, span, ui.t, colours(), quantity);
   });
 }
@@ -357,10 +442,10 @@ function faster(by) {
 const KEYS = {
   ' ': actions.play, ArrowLeft: e => step(e.shiftKey ? -1 / world.takes[0].dt : -1), ArrowRight: e => step(e.shiftKey ? 1 / world.takes[0].dt : 1),
   Home: () => seek(span[0]), End: () => seek(span[1]), ArrowUp: () => nextFuture(-1), ArrowDown: () => nextFuture(1),
-  l: () => show(0), a: () => show(world.takes.length > 2 ? 'all' : world.takes.length - 1), c: () => { ui.colour = COLOURS[(COLOURS.indexOf(ui.colour) + 1) % COLOURS.length]; dress(); },
-  n: () => nextAgent(1), p: () => nextAgent(-1), e: () => choose(facts.ego), f: actions.follow, h: actions.heading, t: actions.trails, u: actions.up, b: () => { if (world.takes.length > 1) actions.beside(); },
+  l: () => show(0), a: () => show(world.takes.length > 2 ? 'all' : world.takes.length - 1), c: () => { ui.colour = ways[(ways.indexOf(ui.colour) + 1) % ways.length]; dress(); },
+  n: () => nextAgent(1), p: () => nextAgent(-1), e: () => choose(facts.ego), f: actions.follow, h: actions.heading, t: actions.trails, u: actions.up, r: actions.ruler, PageUp: actions.earlier, PageDown: actions.later, b: () => { if (world.takes.length > 1) actions.beside(); },
   '+': actions.nearer, '=': actions.nearer, '-': actions.farther, 0: actions.fit, ',': () => faster(-1), '.': () => faster(1),
-  Escape: () => choose(-1), '?': () => { $('keys').open = !$('keys').open; },
+  Escape: () => { if (ui.ruling || ui.ends.length) { ui.ruling = false; ui.ends = []; dress(); } else choose(-1); }, '?': () => { $('keys').open = !$('keys').open; },
 };
 
 function onKey(event) {
@@ -387,25 +472,32 @@ function listen() {
   listenToPointers($('view'));
 }
 
-// One finger or the mouse moves the ground, two zoom; a press without a move chooses.
+// One finger or the mouse moves the ground, two zoom; a press without a move chooses. With the ruler,
+// or with shift, one finger or the mouse measures instead.
 function listenToPointers(canvas) {
   const held = new Map();
-  let moved = 0;
+  let moved = 0, start = null;
   // Both panes show the same ground: a point of the right one is as far from its own left edge.
   const at = event => { scene.resize(panes()); ui.pane = panes() > 1 && event.offsetX > scene.width ? 1 : 0; return [event.offsetX - ui.pane * scene.width, event.offsetY]; };
   const apart = () => { const [a, b] = [...held.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
-  canvas.onpointerdown = event => { canvas.setPointerCapture(event.pointerId); held.set(event.pointerId, at(event)); if (held.size === 1) moved = 0; };
+  canvas.onpointerdown = event => {
+    canvas.setPointerCapture(event.pointerId);
+    held.set(event.pointerId, at(event));
+    if (held.size === 1) moved = 0;
+    start = held.size === 1 && (ui.ruling || event.shiftKey) ? endAt(event, at(event)) : null;
+  };
   canvas.onpointermove = event => {
     const before = held.get(event.pointerId);
     const under = held.size ? -1 : pickAt(...at(event));
     if (event.pointerType === 'mouse' && under !== ui.hovered) { ui.hovered = under; redraw(); }
-    canvas.style.cursor = held.size ? 'grabbing' : under < 0 ? 'grab' : 'pointer';
+    canvas.style.cursor = ui.ruling || start ? 'crosshair' : held.size ? 'grabbing' : under < 0 ? 'grab' : 'pointer';
     if (!before) return;
     const now = at(event), old = held.size === 2 ? apart() : 0;
     held.set(event.pointerId, now);
     moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
     if (moved < 5) return;
     if (held.size === 2) { const [a, b] = [...held.values()]; zoom(apart() / Math.max(old, 1), (a[0] + b[0]) / 2, (a[1] + b[1]) / 2); return; }
+    if (start) { ui.ends = [start, endAt(event, now)]; redraw(); return; }
     const [from, to] = [scene.worldAt(...before), scene.worldAt(...now)];
     if (ui.follow >= 0) { ui.follow = -1; dress(); }
     scene.camera.x += from[0] - to[0]; scene.camera.y += from[1] - to[1];
@@ -413,26 +505,43 @@ function listenToPointers(canvas) {
   };
   canvas.onpointerup = canvas.onpointercancel = event => {
     held.delete(event.pointerId);
-    if (event.type === 'pointerup' && !held.size && moved < 5) choose(pickAt(...at(event)));
+    if (event.type !== 'pointerup' || held.size || moved >= 5) return;
+    // Two presses measure like a drag from the one to the other.
+    if (start) { ui.ends = ui.ends.length === 1 ? [...ui.ends, start] : [start]; redraw(); } else choose(pickAt(...at(event)));
   };
   canvas.onpointerleave = () => { ui.hovered = -1; redraw(); };
   canvas.addEventListener('wheel', event => { event.preventDefault(); zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at(event)); }, { passive: false });
 }
 
+// An end of the ruler: the agent there, or the place; fingers are less exact than a mouse.
+function endAt(event, [px, py]) {
+  const agent = pickAt(px, py, event.pointerType === 'mouse' ? 4 : 14), [x, y] = scene.worldAt(px, py);
+  return agent < 0 ? { x, y } : { agent };
+}
+
+// What the ruler says, in words, of the take at the right.
+function tellRuler() {
+  const found = ui.ends.length > 1 ? measure(world, heatTake(ui, world), ui.ends, ui.t) : null;
+  const asks = ui.ends.length ? 'Now the other end.' : 'Drag from a place or an agent to another.';
+  $('measure').hidden = !ui.ruling && !ui.ends.length;
+  $('measure').textContent = found ? found.words : ui.ends.length > 1 ? 'One of the agents is not there at this time.' : asks;
+}
+
 const panes = () => (ui.left === null ? 1 : 2);
 
 // The agent at a point of the pane that was touched.
-function pickAt(px, py) { return scene.pick({ ...ui, shown: ui.pane || ui.left === null ? ui.shown : ui.left }, px, py); }
+function pickAt(px, py, reach) { return scene.pick({ ...ui, shown: ui.pane || ui.left === null ? ui.shown : ui.left }, px, py, reach); }
 
 // What an agent is, beside it: of the one under the mouse, or else of the chosen one.
 function drawTip() {
-  const tip = $('tip'), a = ui.hovered >= 0 ? ui.hovered : ui.selected;
+  // Beside a ruler it would cover what is measured.
+  const tip = $('tip'), isRuled = ui.ruling || ui.ends.length, a = isRuled ? -1 : ui.hovered >= 0 ? ui.hovered : ui.selected;
   const right = panes() > 1 && ui.pane === 1, shown = right || ui.left === null ? ui.shown : ui.left, take = shown === 'all' ? Math.min(1, world.takes.length - 1) : shown;
   const s = a < 0 ? null : stateAt(world, take, a, ui.t);
   tip.hidden = !s;
   if (!s) return;
-  const { id, kind, realism } = facts.agents[a], title = document.createElement('b');
-  title.textContent = `${a === facts.ego ? 'ego, ' : ''}${kind.replace('_', ' ')} ${id}`;
+  const { realism } = facts.agents[a], title = document.createElement('b');
+  title.textContent = agentName(a);
   const lines = [`${s.speed.toFixed(1)} m/s, ${ui.t < 0 || take === 0 ? 'recorded' : takeName(world, take)}`, ...(realism === null ? [] : [`realism ${realism.toFixed(2)}`])];
   tip.replaceChildren(title, lines.join(', '));
   if (a === ui.selected && matchMedia('(max-width: 46rem)').matches) {
@@ -456,14 +565,14 @@ function buildMarks() {
   const n = world.takes.length - 1;
   const rows = [
     [true, 'road', box(c.road)],
-    [has(KIND.route), "the ego's route", box(c.route)],
-    [has(KIND.lane), 'way of travel', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
-    [has(KIND.edge), 'road edge', line(c.edge)],
-    [[6, 7, 8, 9].some(has), 'lane marking', box(c.road) + line(c.whiteLine, 'stroke-dasharray="5 3"')],
-    [has(KIND.crosswalk), 'crosswalk', [3, 9, 15].map(x => `<rect x="${x}" y="2" width="4" height="10" fill="${c.crosswalk}"/>`).join('')],
-    [has(KIND.bump), 'speed bump', box(c.yellowLine, 'opacity="0.5"')],
-    [has(KIND.stopLine), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
-    [has(KIND.stopSign), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
+    [has('route'), "the ego's route", box(c.route)],
+    [has('lane'), 'way of travel', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
+    [has('edge'), 'road edge', line(c.edge)],
+    [['brokenWhite', 'solidWhite', 'brokenYellow', 'solidYellow'].some(has), 'lane marking', box(c.road) + line(c.whiteLine, 'stroke-dasharray="5 3"')],
+    [has('crosswalk'), 'crosswalk', box(c.road) + [4, 10, 16].map(x => `<rect x="${x}" y="3" width="3" height="8" fill="${c.crosswalk}"/>`).join('')],
+    [has('bump'), 'speed bump', box(c.yellowLine, 'opacity="0.5"')],
+    [has('stopLine'), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
+    [has('stopSign'), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
     [facts.lights.length, 'traffic light', spot(c.red)],
     [true, 'the ego has a rim', box('none', `stroke="${c.ego}" stroke-width="3"`)],
     [true, 'front', `<path d="M8 3l10 4-10 4z" fill="${c.text}" opacity="0.7"/>`],
@@ -508,14 +617,17 @@ function paint() {
   }
   scene.draw(ui, colours());
   drawTip();
+  tellRuler();
   $('time').value = ui.t;
   $('clock').textContent = `${ui.t < -0.0001 ? '\u2212' : '+'}${Math.abs(ui.t).toFixed(1)} s`;
   const key = `${ui.t.toFixed(3)},${$('agent').clientWidth}`;
   if (key !== charted) { charted = key; drawAgentPanel(); }
 }
 
-inflate(fromBase64($('data').textContent)).then(unpack).then(begin).catch(error => {
+function fail(error) {
   errors.push(String(error));
   $('note').textContent = `This page cannot be shown: ${error}`;
   console.error(error);
-});
+}
+
+begin().catch(fail);

@@ -11,7 +11,7 @@ if (location.hash === '#check') {
 
   const check = async () => {
     await ready();
-    const packed = fromBase64($('data').textContent), report = {};
+    const packed = fromBase64(SCENES[0].data), report = {};
     report.inflates_alike = !differs(await inflate(packed), inflateHere(packed));
     report.takes = world.takes.length;
     report.dark = ui.dark;
@@ -35,8 +35,8 @@ if (location.hash === '#check') {
     world.heat = []; report.heat_on_road = picture() !== hot; world.heat = kept;
     show(2); paint(); report.heat_elsewhere = !$('heat').hidden;
     show(1);
-    const looks = COLOURS.map(colour => { ui.colour = colour; dress(); return picture(); });
-    report.colours = [COLOURS, new Set(looks).size];
+    const looks = ways.map(colour => { ui.colour = colour; dress(); return picture(); });
+    report.colours = [ways, new Set(looks).size];
     press('c'); paint();
     report.charts = $('agent').querySelectorAll(':scope > figure canvas').length;
     $('candidates').querySelector('button').click();
@@ -46,12 +46,60 @@ if (location.hash === '#check') {
     report.marks = $('marks').querySelectorAll('li').length;
     seek(1.5); choose(facts.ego); paint();
     report.tip = $('tip').hidden ? '' : $('tip').textContent;
-    report.address = address();
+    report.address = written();
     // Where the chosen agent is told of can be seen without scrolling, on a phone too.
     report.panel_in_sight = $('agent').getBoundingClientRect().top < window.innerHeight - 40;
+    report.ruler = checkRuler(picture);
+    report.scenes = await checkScenes();
     report.wide = document.documentElement.scrollWidth > window.innerWidth;
     return report;
   };
+  // A pointer of the browser is not there to be captured: the canvas gets events alone.
+  const point = (kind, pointerType, [x, y], more = {}) => {
+    const { left, top } = scene.canvas.getBoundingClientRect();
+    scene.canvas.dispatchEvent(new PointerEvent(`pointer${kind}`, { pointerId: 1, pointerType, clientX: left + x, clientY: top + y, bubbles: true, ...more }));
+  };
+  const tap = (...at) => { point('down', 'touch', at); point('up', 'touch', at); };
+  const drag = (from, to, more) => { point('down', 'mouse', from, more); point('move', 'mouse', to, more); point('up', 'mouse', to, more); };
+
+  // By a drag from agent to agent, by taps, with shift from place to place; Escape clears.
+  const checkRuler = picture => {
+    scene.canvas.setPointerCapture = () => {};
+    press('Escape'); show(0); seek(0); fit(); zoom(0.6); paint();
+    const said = () => { paint(); return $('measure').hidden ? '' : $('measure').textContent; };
+    const where = id => { const s = stateAt(world, 0, facts.agents.findIndex(agent => agent.id === id), 0); return scene.onCanvas(s.x, s.y); };
+    const [ego, other] = [where('0'), where('9')], plain = picture(), found = {};
+    document.querySelector('[data-do=ruler]').click();
+    found.asks = said();
+    drag(ego, other);
+    found.agents = said();
+    found.drawn = picture() !== plain;
+    found.address = written();
+    seek(1); found.later = said(); seek(0);
+    press('Escape');
+    found.cleared = said();
+    press('r');
+    tap(...ego); found.half = said();
+    tap(...other); found.taps = said();
+    press('Escape');
+    const place = [ego[0] + 80, ego[1]];
+    drag(place, [place[0] + 10 * scene.camera.scale, place[1]], { shiftKey: true });
+    found.places = said();
+    press('Escape');
+    found.still = picture() === plain && ui.selected < 0;
+    return found;
+  };
+
+  // From the list, by key and by the buttons over the road; each scene has a name in the address.
+  const checkScenes = async () => {
+    const names = [], shown = async () => { await wait(50); paint(); remember(); names.push([document.querySelector('h1').textContent, facts.agents.length, sceneName(at)]); };
+    $('scenes').querySelectorAll('button')[1].click(); await shown();
+    press('PageDown'); await shown();
+    document.querySelector('[data-do=earlier]').click(); await shown();
+    press('PageUp'); await shown();
+    return { listed: $('scenes').querySelectorAll('button').length, pressed: $('scenes').querySelectorAll('[aria-pressed=true]').length, names, address: written() };
+  };
+
   check().catch(error => ({ error: String(error.stack || error) })).then(report => {
     const out = document.createElement('pre');
     out.id = 'report';

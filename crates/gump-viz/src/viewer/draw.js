@@ -1,6 +1,6 @@
-// Drawing: the camera, the road, the traffic of one take or of all.
+// Drawing: the camera, the traffic of one take or of all. How a road and an agent look is in
+// traffic.js.
 
-const KIND = { surface: 0, lane: 1, route: 2, crosswalk: 3, bump: 4, stopLine: 5, brokenWhite: 6, solidWhite: 7, brokenYellow: 8, solidYellow: 9, edge: 10, stopSign: 11, turn: 12 };
 const LIGHTS = [null, 'green', 'yellow', 'red', 'other'];
 const FAST = 20; // m/s, the end of the scale of speeds
 const UNLIKE = 0.5; // the start of the scale of realism, which few agents fall below
@@ -58,77 +58,9 @@ function lightAt(world, takeIndex, light, t) {
   return LIGHTS[take.lights[light * take.frames + i]];
 }
 
-// One path per way of drawing, in metres.
-function roadPaths(features) {
-  const road = { surface: new Path2D(), lanes: new Map(), routes: new Map(), zebras: [], bumps: new Path2D(), stops: new Path2D(), lines: [6, 7, 8, 9, 10].map(() => new Path2D()), signs: [], chevrons: [] };
-  const trace = (path, { xs, ys }, close) => {
-    // All rings run one way, or overlapping ones would cut holes into each other.
-    const order = close && ringArea(xs, ys) < 0 ? [...xs.keys()].reverse() : xs.keys();
-    let first = true;
-    for (const i of order) { if (first) path.moveTo(xs[i], ys[i]); else path.lineTo(xs[i], ys[i]); first = false; }
-    if (close) path.closePath();
-    return path;
-  };
-  const byWidth = (map, feature) => {
-    if (!map.has(feature.width)) map.set(feature.width, new Path2D());
-    trace(map.get(feature.width), feature, false);
-  };
-  for (const feature of features) {
-    const { kind, xs, ys } = feature;
-    if (kind === KIND.surface) trace(road.surface, feature, true);
-    else if (kind === KIND.lane || kind === KIND.turn) {
-      byWidth(road.lanes, feature);
-      if (kind === KIND.lane) road.chevrons.push(...along(xs, ys, 18));
-    } else if (kind === KIND.route) byWidth(road.routes, feature);
-    else if (kind === KIND.crosswalk) road.zebras.push({ outline: trace(new Path2D(), feature, true), bars: zebraBars(xs, ys) });
-    else if (kind === KIND.bump) trace(road.bumps, feature, true);
-    else if (kind === KIND.stopLine) trace(road.stops, feature, true);
-    else if (kind === KIND.stopSign) road.signs.push([xs[0], ys[0]]);
-    else trace(road.lines[kind - KIND.brokenWhite], feature, false);
-  }
-  return road;
-}
-
-function ringArea(xs, ys) {
-  let area = 0;
-  for (let i = 0, j = xs.length - 1; i < xs.length; j = i++) area += xs[j] * ys[i] - xs[i] * ys[j];
-  return area;
-}
-
-// Bars across the way people walk, which is the longest side.
-function zebraBars(xs, ys) {
-  let longest = [1, 0], best = 0;
-  for (let i = 0, j = xs.length - 1; i < xs.length; j = i++) {
-    const d = [xs[i] - xs[j], ys[i] - ys[j]], n = Math.hypot(...d);
-    if (n > best) { best = n; longest = [d[0] / n, d[1] / n]; }
-  }
-  const [ux, uy] = longest, s = xs.map((x, i) => x * ux + ys[i] * uy), w = xs.map((x, i) => ys[i] * ux - x * uy);
-  const low = Math.min(...w), high = Math.max(...w), bars = new Path2D(), point = (a, b) => [a * ux - b * uy, a * uy + b * ux];
-  for (let a = Math.min(...s); a < Math.max(...s); a += 1.2) {
-    bars.moveTo(...point(a, low)); bars.lineTo(...point(a, high)); bars.lineTo(...point(a + 0.6, high)); bars.lineTo(...point(a + 0.6, low));
-    bars.closePath();
-  }
-  return bars;
-}
-
-// Points with directions, evenly along a line.
-function along(xs, ys, spacing) {
-  const length = xs.slice(1).reduce((sum, x, i) => sum + Math.hypot(x - xs[i], ys[i + 1] - ys[i]), 0);
-  const n = Math.floor(length / spacing), found = [];
-  for (let i = 1, done = 0; i < xs.length; i++) {
-    const dx = xs[i] - xs[i - 1], dy = ys[i] - ys[i - 1], step = Math.hypot(dx, dy);
-    while (found.length < n && (found.length + 0.5) * length / n <= done + step && step > 0) {
-      const s = ((found.length + 0.5) * length / n - done) / step;
-      found.push([xs[i - 1] + dx * s, ys[i - 1] + dy * s, dx / step, dy / step]);
-    }
-    done += step;
-  }
-  return found;
-}
-
 class Scene {
   constructor(canvas, world) {
-    Object.assign(this, { canvas, world, road: roadPaths(world.features), camera: { x: 0, y: 0, scale: 5, angle: 0 } });
+    Object.assign(this, { canvas, world, road: layRoad(world.features), camera: { x: 0, y: 0, scale: 5, angle: 0 } });
     this.context = canvas.getContext('2d', { alpha: false });
     this.candidates = facts.candidates.map(({ path }) => path.map(p => p.map(c => c * facts.centi)));
     this.overlay = { key: '', canvas: document.createElement('canvas') };
@@ -142,10 +74,8 @@ class Scene {
     if (this.canvas.width !== pw || this.canvas.height !== ph) Object.assign(this.canvas, { width: pw, height: ph });
   }
 
-  // World metres, y up, to device pixels; angle is the heading that points up, less a quarter turn.
   aim(context) {
-    const { x, y, scale, angle } = this.camera, k = scale * this.ratio, c = Math.cos(angle) * k, s = Math.sin(angle) * k;
-    context.setTransform(c, s, s, -c, (this.left + this.width / 2) * this.ratio - c * x - s * y, this.height * this.ratio / 2 - s * x + c * y);
+    aim(context, this.camera, this.camera.scale * this.ratio, (this.left + this.width / 2) * this.ratio, this.height * this.ratio / 2);
   }
 
   worldAt(px, py) {
@@ -154,7 +84,8 @@ class Scene {
     return [x + c * dx + s * dy, y + s * dx - c * dy];
   }
 
-  px(metres, least) { return Math.max(metres, least / this.camera.scale); }
+  // A length in metres that is shown with so many pixels at least.
+  get px() { return (metres, least) => Math.max(metres, least / this.camera.scale); }
 
   sees(x, y) { return Math.hypot(x - this.camera.x, y - this.camera.y) < Math.hypot(this.width, this.height) / 2 / this.camera.scale + 12; }
 
@@ -189,7 +120,7 @@ class Scene {
     const c = this.context;
     this.aim(c);
     c.lineJoin = c.lineCap = 'round';
-    this.drawRoad(c, colours);
+    drawRoad(c, this.road, colours, this.px, this.camera.scale > 2.5 ? (x, y) => this.sees(x, y) : null);
     const shown = this.shown(ui);
     if (ui.trails) {
       if (ui.shown === 'all') this.drawOverlay(ui, colours);
@@ -201,47 +132,10 @@ class Scene {
     else this.drawAgents(c, ui, shown[0], colours);
     const heat = heatAt(this.world, heatTake(ui, this.world), ui.selected, ui.t);
     if (heat) drawHeat(c, heat, ui.dark);
+    if (ui.ends.length) drawRuler(c, this, ui.ends, ui.ends.length > 1 ? measure(this.world, shown[0], ui.ends, ui.t) : null, colours);
   }
 
   shown(ui) { return ui.shown === 'all' ? this.world.takes.map((_, i) => i).slice(1) : [ui.shown]; }
-
-  drawRoad(c, colours) {
-    const { road } = this, widths = (map, colour) => {
-      c.strokeStyle = colour;
-      for (const [width, path] of map) { c.lineWidth = this.px(width, 1); c.stroke(path); }
-    };
-    c.fillStyle = colours.road;
-    c.fill(road.surface);
-    c.lineCap = 'butt';
-    widths(road.lanes, colours.road);
-    widths(road.routes, colours.route);
-    c.fillStyle = colours.crosswalk;
-    for (const { outline, bars } of road.zebras) { c.save(); c.clip(outline); c.fill(bars); c.restore(); }
-    c.globalAlpha = 0.5; c.fillStyle = colours.yellowLine; c.fill(road.bumps);
-    c.globalAlpha = 0.7; c.fillStyle = colours.whiteLine; c.fill(road.stops);
-    c.globalAlpha = 1;
-    if (this.camera.scale > 2.5) this.drawChevrons(c, colours);
-    [[0, colours.whiteLine, [2, 3]], [1, colours.whiteLine, []], [2, colours.yellowLine, [2, 3]], [3, colours.yellowLine, []]].forEach(([i, colour, dash]) => {
-      c.strokeStyle = colour; c.lineWidth = this.px(0.16, 0.9); c.setLineDash(dash); c.stroke(road.lines[i]);
-    });
-    c.setLineDash([]);
-    c.strokeStyle = colours.edge; c.lineWidth = this.px(0.22, 1.1); c.stroke(road.lines[4]);
-    c.lineCap = 'round';
-    for (const [x, y] of road.signs) for (const [r, colour] of [[1.35, colours.wedge], [1, colours.red]]) {
-      c.fillStyle = colour; c.beginPath();
-      for (let i = 0; i < 8; i++) { const a = (i + 0.5) * Math.PI / 4, m = this.px(0.8, 3) * r; c.lineTo(x + m * Math.cos(a), y + m * Math.sin(a)); }
-      c.fill();
-    }
-  }
-
-  drawChevrons(c, colours) {
-    c.strokeStyle = colours.direction; c.lineWidth = this.px(0.18, 1); c.beginPath();
-    for (const [x, y, dx, dy] of this.road.chevrons) {
-      if (!this.sees(x, y)) continue;
-      c.moveTo(x - 0.7 * dx - 0.7 * dy, y - 0.7 * dy + 0.7 * dx); c.lineTo(x, y); c.lineTo(x - 0.7 * dx + 0.7 * dy, y - 0.7 * dy - 0.7 * dx);
-    }
-    c.stroke();
-  }
 
   // The last two seconds fade, what comes is a thin line.
   drawTrails(c, ui, takeIndex, colours) {
@@ -309,18 +203,14 @@ class Scene {
 
   // The ego is told by its rim, whatever its colour says.
   rim(c, agent, s, colours) {
-    this.box(c, facts.agents[agent], s, 1.5 / this.camera.scale);
+    outline(c, facts.agents[agent], s, this.px, 1.5 / this.camera.scale);
     c.strokeStyle = colours.ego; c.lineWidth = this.px(0.35, 2.5); c.stroke();
   }
 
   drawLights(c, ui, takeIndex, colours) {
-    const r = Math.min(this.px(0.55, 2), 9 / this.camera.scale);
-    facts.lights.forEach((at, l) => {
+    facts.lights.forEach(([x, y], l) => {
       const colour = lightAt(this.world, takeIndex, l, ui.t);
-      if (!colour) return;
-      for (const [k, fill] of [[1.4, colours.outline], [1, colours[colour]]]) {
-        c.fillStyle = fill; c.beginPath(); c.arc(at[0] * facts.centi, at[1] * facts.centi, r * k, 0, 2 * Math.PI); c.fill();
-      }
+      if (colour) drawLight(c, { x: x * facts.centi, y: y * facts.centi }, colours[colour], colours, this.px);
     });
   }
 
@@ -328,13 +218,9 @@ class Scene {
     facts.agents.forEach((agent, a) => {
       const s = stateAt(this.world, takeIndex, a, ui.t);
       if (!s || !this.sees(s.x, s.y)) return;
-      this.box(c, agent, s, 0);
-      c.fillStyle = agentColour(ui, a, s.speed, colours);
-      c.fill();
-      c.strokeStyle = colours.outline; c.lineWidth = this.px(0.08, 0.8); c.stroke();
-      this.wedge(c, agent, s, colours);
+      drawAgent(c, agent, s, agentColour(ui, a, s.speed, colours), colours, this.px);
       if (a === facts.ego) this.rim(c, a, s, colours);
-      if (a === ui.selected) { this.box(c, agent, s, 5 / this.camera.scale); c.strokeStyle = colours.text; c.lineWidth = 2 / this.camera.scale; c.stroke(); }
+      if (a === ui.selected) { outline(c, agent, s, this.px, 5 / this.camera.scale); c.strokeStyle = colours.text; c.lineWidth = 2 / this.camera.scale; c.stroke(); }
     });
   }
 
@@ -345,36 +231,21 @@ class Scene {
       for (const take of shown) {
         const s = stateAt(this.world, take, a, ui.t);
         if (!s || !this.sees(s.x, s.y)) continue;
-        this.box(c, agent, s, 0);
+        outline(c, agent, s, this.px);
         c.globalAlpha = fade;
         c.fillStyle = agentColour(ui, a, s.speed, colours);
         c.fill();
         if (a === facts.ego && ui.colour !== 'class') { c.globalAlpha = Math.min(1, 2 * fade); this.rim(c, a, s, colours); }
-        if (a === ui.selected) { this.box(c, agent, s, 0); c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
+        if (a === ui.selected) { outline(c, agent, s, this.px); c.globalAlpha = 0.8; c.strokeStyle = colours.text; c.lineWidth = 1 / this.camera.scale; c.stroke(); }
       }
     });
     c.globalAlpha = 1;
   }
 
-  box(c, { length, width }, { x, y, heading }, margin) {
-    const l = this.px(length, 3) / 2 + margin, w = this.px(width, 3) / 2 + margin, ux = Math.cos(heading), uy = Math.sin(heading);
-    c.beginPath();
-    for (const [a, b] of [[l, w], [-l, w], [-l, -w], [l, -w]]) c.lineTo(x + a * ux - b * uy, y + a * uy + b * ux);
-    c.closePath();
-  }
-
-  wedge(c, { length, width }, { x, y, heading }, colours) {
-    if (length * this.camera.scale < 8) return;
-    const ux = Math.cos(heading), uy = Math.sin(heading), p = (a, b) => [x + a * ux - b * uy, y + a * uy + b * ux];
-    c.fillStyle = colours.wedge; c.globalAlpha = 0.75; c.beginPath();
-    c.moveTo(...p(length * 0.42, 0)); c.lineTo(...p(length * 0.12, width * 0.3)); c.lineTo(...p(length * 0.12, -width * 0.3)); c.fill();
-    c.globalAlpha = 1;
-  }
-
   // The agent at a point of the canvas, or the nearest within reach of a finger; -1 if none.
-  pick(ui, px, py) {
-    const [x, y] = this.worldAt(px, py), reach = 14 / this.camera.scale;
-    let found = -1, best = reach;
+  pick(ui, px, py, reach = 14) {
+    const [x, y] = this.worldAt(px, py);
+    let found = -1, best = reach / this.camera.scale;
     for (const take of ui.t < 0 ? [0] : this.shown(ui)) facts.agents.forEach(({ length, width }, a) => {
       const s = stateAt(this.world, take, a, ui.t);
       if (!s) return;

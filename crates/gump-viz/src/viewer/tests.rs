@@ -2,13 +2,16 @@
 
 use std::io::Read as _;
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
 use flate2::read::DeflateDecoder;
 use gump_geometry::{Pose, dvec2, wrap_angle};
 use gump_scene::{Agent, AgentKind, AgentState, LightState, Seed, fixture};
 use std::f64::consts::TAU;
 
 use super::*;
-use crate::log_as_rollout;
+use crate::theme::{Colours, Rgb};
+use crate::{Theme, log_as_rollout};
 use pack::tests::Reader;
 
 fn crossing() -> Scenario {
@@ -240,6 +243,66 @@ fn the_page_knows_takes_lights_metrics_and_the_road_nearby() {
     let found: Vec<u64> = tail.iter().map(|_| reader.unsigned()).collect();
     assert_eq!(found, tail);
     assert!(reader.0.is_empty());
+}
+
+#[test]
+fn a_gallery_holds_a_block_for_each_scene() {
+    let (first, mut second) = (crossing(), crossing());
+    second.id = "a & b".into();
+    second.log.truncate(second.now + 1);
+    let mut gallery = Gallery::default();
+    assert!(gallery.is_empty() && gallery.to_html().contains("<title>0 scenes</title>"));
+    gallery.add(&Viewer::new(&first)).add(&Viewer::new(&second));
+    assert_eq!(gallery.len(), 2);
+    let html = gallery.to_html();
+    assert!(html.contains("<title>2 scenes</title>"));
+    let facts: Value = serde_json::from_str(element(&html, "facts-2")).unwrap();
+    assert_eq!(facts["id"], "a & b");
+    assert_eq!(facts["takes"][0]["frames"], 11);
+    // The first one is as it would be alone.
+    let alone = Viewer::new(&first).to_html();
+    for id in ["facts", "data"] {
+        assert_eq!(element(&html, id), element(&alone, id));
+    }
+    assert!(html.len() < alone.len() + 4000, "the page is there once");
+}
+
+#[test]
+fn scripts_and_pictures_have_the_same_colours() {
+    let script = include_str!("../traffic.js");
+    let (light, dark) = script.split_once("dark: {").unwrap();
+    for (theme, text) in [(Theme::Light, light), (Theme::Dark, dark)] {
+        let palette = text.split_once("};").map_or(text, |(palette, _)| palette);
+        for (name, [r, g, b]) in named(theme.colours()) {
+            let entry = format!("{name}: '#{r:02x}{g:02x}{b:02x}'");
+            assert!(palette.contains(&entry), "{theme:?}: {entry}");
+        }
+    }
+}
+
+/// The colours by their names in scripts.
+fn named(colours: &Colours) -> [(&'static str, Rgb); 19] {
+    [
+        ("ground", colours.ground),
+        ("road", colours.road),
+        ("route", colours.route),
+        ("crosswalk", colours.crosswalk),
+        ("direction", colours.direction),
+        ("whiteLine", colours.white_line),
+        ("yellowLine", colours.yellow_line),
+        ("edge", colours.edge),
+        ("text", colours.text),
+        ("ego", colours.ego),
+        ("vehicle", colours.vehicle),
+        ("pedestrian", colours.pedestrian),
+        ("bicycle", colours.bicycle),
+        ("other", colours.other),
+        ("outline", colours.outline),
+        ("wedge", colours.wedge),
+        ("red", colours.red),
+        ("yellow", colours.yellow),
+        ("green", colours.green),
+    ]
 }
 
 #[test]

@@ -1,6 +1,9 @@
 // Reading what pack.rs wrote.
 
-const facts = JSON.parse(document.getElementById('facts').textContent);
+// The scenes of this file: what each says of itself, and its bytes as text.
+const SCENES = [...document.querySelectorAll('script[type="application/json"]')].map(said => ({ facts: JSON.parse(said.textContent), data: said.nextElementSibling.textContent }));
+// What the scene that is shown says of itself.
+let { facts } = SCENES[0] || { facts: null };
 
 function fromBase64(text) {
   const letters = atob(text.trim());
@@ -85,9 +88,12 @@ function inflateHere(bytes) {
   return out.slice(0, length);
 }
 
-// Road and traffic: features [{class, width, xs, ys}], takes with one row of frames per agent
+// What features are, by the number that pack.rs gives them.
+const KINDS = ['surface', 'lane', 'route', 'crosswalk', 'bump', 'stopLine', 'brokenWhite', 'solidWhite', 'brokenYellow', 'solidYellow', 'edge', 'stopSign', 'turn'];
+
+// Road and traffic: features [{kind, width, xs, ys}], takes with one row of frames per agent
 // (NaN where it is absent) and per light, metrics over time, and what agents might do next.
-function unpack(bytes) {
+function unpack(bytes, facts) {
   let at = 0;
   // Products instead of shifts: numbers may have more than 32 bits.
   const unsigned = () => {
@@ -109,7 +115,7 @@ function unpack(bytes) {
   const features = [];
   for (let i = 0; i < facts.features; i++) {
     const kind = unsigned(), width = unsigned() * facts.centi, n = unsigned();
-    features.push({ kind, width, xs: line([], 0, n, facts.centi), ys: line([], 0, n, facts.centi) });
+    features.push({ kind: KINDS[kind], width, xs: line([], 0, n, facts.centi), ys: line([], 0, n, facts.centi) });
   }
   const nAgents = facts.agents.length, nLights = facts.lights.length;
   const takes = facts.takes.map(({ name, first, dt, frames }) => {
