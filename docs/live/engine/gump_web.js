@@ -152,7 +152,7 @@ export class Game {
         }
     }
     /**
-     * The inputs of a link, four numbers for each tenth of a second.
+     * The inputs of a link, five numbers for each tenth of a second.
      * @param {string} code
      * @returns {Int16Array}
      */
@@ -246,9 +246,10 @@ export class Game {
      * @param {number} pedal
      * @param {number} wheel
      * @param {number} temperature
+     * @param {boolean} reverse
      */
-    tick(driver, pedal, wheel, temperature) {
-        const ret = wasm.game_tick(this.__wbg_ptr, driver, pedal, wheel, temperature);
+    tick(driver, pedal, wheel, temperature, reverse) {
+        const ret = wasm.game_tick(this.__wbg_ptr, driver, pedal, wheel, temperature, reverse);
         if (ret[1]) {
             throw takeFromExternrefTable0(ret[0]);
         }
