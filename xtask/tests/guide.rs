@@ -262,6 +262,103 @@ fn links_stay_inside_the_book() {
     assert!(n_links >= 12, "only {n_links} links found");
 }
 
+/// Every number of a paragraph or cell of the README that links to results stands in these results,
+/// perhaps with more digits or in another unit.
+#[test]
+fn numbers_of_the_readme_are_those_of_the_results() {
+    let readme = fs::read_to_string(root().join("README.md")).unwrap();
+    let cells = readme.lines().flat_map(|line| match line.starts_with('|') {
+        true => line.split(['|', ';']).collect(),
+        false => vec![line],
+    });
+    let mut n_checked = 0;
+    for cell in cells {
+        let (text, targets) = without_links(cell);
+        let results = targets
+            .iter()
+            .filter(|target| target.starts_with("docs/results/"));
+        let pages = results.map(|target| {
+            let file = target.split('#').next().unwrap();
+            fs::read_to_string(root().join(file)).unwrap()
+        });
+        let measured: Vec<f64> = pages
+            .flat_map(|page| numbers(&page))
+            .filter_map(|number| number.parse().ok())
+            .collect();
+        if measured.is_empty() {
+            continue;
+        }
+        for quoted in numbers(&text) {
+            let stands = measured.iter().any(|&value| is_quoted_as(value, &quoted));
+            assert!(
+                stands,
+                "README.md: {quoted} is in none of {targets:?}: {}",
+                text.trim()
+            );
+            n_checked += 1;
+        }
+    }
+    assert!(n_checked > 40, "only {n_checked} numbers");
+    assert!(is_quoted_as(0.7204, "0.720") && !is_quoted_as(0.7212, "0.720"));
+    assert!(is_quoted_as(19.6, "0.02") && is_quoted_as(4632.0, "4600"));
+    assert!(!is_quoted_as(4732.0, "4600") && !is_quoted_as(2.2, "2.3"));
+}
+
+/// The text with the words of its links, and where these lead.
+fn without_links(text: &str) -> (String, Vec<String>) {
+    let (mut plain, mut targets) = (String::new(), Vec::new());
+    let mut rest = text;
+    while let Some((before, after)) = rest.split_once("](") {
+        let Some((target, after)) = after.split_once(')') else {
+            break;
+        };
+        plain.push_str(before);
+        targets.push(target.to_owned());
+        rest = after;
+    }
+    plain.push_str(rest);
+    (plain, targets)
+}
+
+/// The numbers of a text, without separators of thousands; not those in names.
+fn numbers(text: &str) -> Vec<String> {
+    let is_part = |c: char| c.is_ascii_digit() || ",.".contains(c);
+    let mut found = Vec::new();
+    let mut before = ' ';
+    let mut rest = text;
+    while let Some(first) = rest.chars().next() {
+        let end = rest.find(|c| !is_part(c)).unwrap_or(rest.len());
+        if first.is_ascii_digit() {
+            let is_name = before.is_alphanumeric() || "_.`#/-".contains(before);
+            // The x of "x38" multiplies.
+            if !is_name || before == 'x' {
+                let number = rest[..end].trim_end_matches(['.', ',']);
+                found.push(number.replace(',', ""));
+            }
+            before = '0';
+            rest = &rest[end..];
+        } else {
+            before = first;
+            rest = &rest[first.len_utf8()..];
+        }
+    }
+    found
+}
+
+/// True if a value has these digits once it is rounded to them, in its unit, in one a thousand times
+/// larger or smaller, or in percent.
+fn is_quoted_as(value: f64, quoted: &str) -> bool {
+    let decimals = match quoted.split_once('.') {
+        Some((_, fraction)) => fraction.len() as i32,
+        None => -((quoted.len() - quoted.trim_end_matches('0').len()) as i32),
+    };
+    let unit = 10f64.powi(decimals);
+    let number: f64 = quoted.parse().unwrap();
+    [1.0, 1e3, 1e-3, 100.0]
+        .iter()
+        .any(|scale| ((value * scale * unit).round() - number * unit).abs() < 1e-6)
+}
+
 #[test]
 fn every_chapter_is_in_the_summary() {
     let listed: BTreeSet<PathBuf> = chapters().into_iter().collect();

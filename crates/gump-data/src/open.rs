@@ -22,7 +22,8 @@ pub fn open(path: &Path) -> Result<Reader, DataError> {
     open_with(path, ReadOptions::ALL)
 }
 
-/// Opens a file, or every file of a directory and its subdirectories that holds scenarios.
+/// Opens a file, or every file of a directory and its subdirectories that holds scenarios, or one
+/// scenario named as in [`find`]: `PATH#INDEX` or `PATH#SCENARIO_ID`.
 ///
 /// In a directory, files of other kinds are skipped and counted in [`Reader::skipped`]; files that
 /// should contain scenarios by their name or beginning but cannot be opened are errors of the
@@ -33,6 +34,9 @@ pub fn open(path: &Path) -> Result<Reader, DataError> {
 /// [`DataError::UnknownFormat`], [`DataError::NotScenarios`] and [`DataError::Io`]; of several
 /// files the reader reports them.
 pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError> {
+    if let Some(one) = one_of_a_file(path, options) {
+        return one;
+    }
     let is_folder = path.is_dir();
     let files = if is_folder {
         files::list(path)?
@@ -56,6 +60,24 @@ pub fn open_with(path: &Path, options: ReadOptions) -> Result<Reader, DataError>
             path: path.into(),
         }),
     }
+}
+
+/// The one scenario that a path with `#` names; `None` for a path that exists as it is, or without.
+fn one_of_a_file(path: &Path, options: ReadOptions) -> Option<Result<Reader, DataError>> {
+    let (file, _) = path.to_str()?.rsplit_once('#')?;
+    if path.exists() {
+        return None;
+    }
+    let one = find_with(path.to_str()?, options).and_then(|record| {
+        let reader = open_with(Path::new(file), options)?;
+        Ok(Reader {
+            source: Box::new(OneRecord(Some(record))),
+            files: VecDeque::new(),
+            unopened: None,
+            ..reader
+        })
+    });
+    Some(one)
 }
 
 /// Reads files one after another like those of a directory: files without scenarios are skipped and
@@ -146,6 +168,21 @@ impl Iterator for Reader {
 
     fn next(&mut self) -> Option<Self::Item> {
         self.first_of(|source| source.next_wanted(&mut |_| true))
+    }
+}
+
+/// A record that has been read.
+struct OneRecord(Option<ScenarioRecord>);
+
+impl Source for OneRecord {
+    fn next_wanted(
+        &mut self,
+        wanted: &mut dyn FnMut(&str) -> bool,
+    ) -> Option<Result<ScenarioRecord, DataError>> {
+        self.0
+            .take()
+            .filter(|record| wanted(&record.scenario.id))
+            .map(Ok)
     }
 }
 

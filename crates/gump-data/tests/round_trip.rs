@@ -134,6 +134,24 @@ fn scenarios_are_found_by_index_and_by_id() {
 }
 
 #[test]
+fn a_reader_of_one_scenario_reads_that_alone() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("many.tfrecord");
+    write_scenarios(&path, ["a", "b", "c"].map(named)).unwrap();
+    let open = |what: &str| open(Path::new(&format!("{}{what}", path.display())));
+    for (what, expected) in [("#1", "b"), ("#c", "c")] {
+        let reader = open(what).unwrap();
+        assert_eq!(reader.format(), open("").unwrap().format());
+        let ids: Vec<String> = reader.map(|record| record.unwrap().scenario.id).collect();
+        assert_eq!(ids, [expected]);
+    }
+    assert!(matches!(
+        open("#nobody").map(drop),
+        Err(DataError::NoSuchScenario { found: 3, .. })
+    ));
+}
+
+#[test]
 fn earlier_records_are_passed_over_unseen_and_keep_their_index() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("many.tfrecord");
