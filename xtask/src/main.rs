@@ -27,8 +27,6 @@ mod machine;
 mod peers;
 mod planners;
 mod progress;
-#[cfg(feature = "grpc")]
-mod remote;
 mod report;
 mod run;
 mod sampling;

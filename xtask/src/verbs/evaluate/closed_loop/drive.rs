@@ -178,7 +178,7 @@ impl Drives<'_> {
     #[cfg(feature = "grpc")]
     fn remote(&self, case: &Case, address: &str) -> anyhow::Result<Box<dyn Explain + '_>> {
         let limit = self.args.driving.budget();
-        let driver = crate::remote::RemoteDriver::new(address, &case.map_name, limit);
+        let driver = gump_grpc::RemoteDriver::new(address, &case.map_name, limit);
         Ok(Box::new(driver))
     }
 

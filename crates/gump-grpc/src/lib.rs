@@ -1,10 +1,22 @@
-//! A planner in another process, by nuPlan's planner protocol: `grpc:HOST:PORT`.
+//! Planners in other processes, by nuPlan's planner protocol.
 //!
-//! The protocol is the one that nuPlan's challenges called planners by (service
-//! `DetectionTracksChallenge`): where to go is told once per drive, and at every step a trajectory
-//! is asked for. A server plans for one drive at a time, so whoever uses [`RemoteDriver`] lets one
-//! drive end before the next begins. The bytes of the history are in `pickle.rs`, the connection in
-//! `client.rs`.
+//! [`RemoteDriver`] drives as a server at `HOST:PORT` says. The protocol is the one that nuPlan's
+//! challenges called planners by (gRPC service `DetectionTracksChallenge`): the mission is sent once
+//! per drive, and at every step a trajectory is requested. A server plans for one drive at a time, so
+//! one drive has to end before the next begins. nuplan-devkit's own servicer and
+//! `python/nuplan_planner.py` are such servers.
+//!
+//! The history is sent as pickled objects of nuplan-devkit, which open wherever the devkit is
+//! installed.
+//!
+//! ```no_run
+//! use gump_grpc::RemoteDriver;
+//! use gump_nuplan::closed_loop::Driver;
+//!
+//! // On a map that is not nuPlan's; a step may take 30 s.
+//! let driver = RemoteDriver::new("127.0.0.1:50051", "", None);
+//! assert_eq!(driver.name(), "grpc:127.0.0.1:50051");
+//! ```
 
 mod client;
 mod pickle;
@@ -21,7 +33,7 @@ use gump_proto::nuplan as proto;
 use gump_rollout::BoxError;
 use gump_scene::{EgoState, LightState, VehicleParameters};
 
-use client::Client;
+use self::client::Client;
 
 /// How long a planner may load maps and weights before it drives.
 const TO_INITIALIZE: Duration = Duration::from_secs(60);
@@ -32,7 +44,7 @@ const BUFFER: usize = 22;
 
 /// Why a planner elsewhere has no plan.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum RemoteError {
+pub enum RemoteError {
     /// Nobody is there.
     #[error("expected a planner at {address}, found none: {what}")]
     Unreachable {
@@ -90,7 +102,7 @@ pub(crate) enum RemoteError {
 }
 
 /// Drives as a planner in another process says.
-pub(crate) struct RemoteDriver {
+pub struct RemoteDriver {
     name: String,
     address: String,
     map_name: String,
@@ -101,7 +113,7 @@ pub(crate) struct RemoteDriver {
 impl RemoteDriver {
     /// The planner at `HOST:PORT`, for a drive on nuPlan's map of that name (empty for maps that are
     /// not nuPlan's); a step may take `limit`, 30 s without one.
-    pub(crate) fn new(address: &str, map_name: &str, limit: Option<Duration>) -> Self {
+    pub fn new(address: &str, map_name: &str, limit: Option<Duration>) -> Self {
         Self {
             name: format!("grpc:{address}"),
             address: address.into(),
