@@ -9,7 +9,7 @@ use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use gump_data::DataError;
 use gump_eval::EvalError;
 
-use crate::run::{self, Run};
+use crate::run::{self, Run, print_error};
 use crate::verbs::ablate::Knob;
 use crate::verbs::{
     ablate, bench, ci, data, demo, evaluate, generate, manual, plan, rl, simulate, submit, tidy,
@@ -236,7 +236,7 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
             ExitCode::from(2)
         };
     }
-    eprintln!("error: {error:#}");
+    print_error(&format!("error: {error:#}"));
     ExitCode::from(match error {
         // As shells tell of a program that a signal ended: 128 and the signal's number.
         _ if run::interrupted() => 130,

@@ -119,7 +119,7 @@ fn beside_log(
     futures: &[(&str, &Rollout)],
     spec: fn(&[&Rollout], (u32, u32)) -> FilmSpec,
 ) -> anyhow::Result<Film> {
-    let log = log_as_rollout(scenario);
+    let log = log_until(scenario, futures);
     let known = (log.steps() > 0).then_some(("log", &log));
     let takes: Vec<_> = known
         .into_iter()
@@ -142,6 +142,23 @@ fn beside_log(
         ..spec(&rollouts, (side, side))
     };
     Ok(grid_film(&takes, &spec)?)
+}
+
+/// The log for as long as the futures last: where they end, nothing is left to compare.
+fn log_until(scenario: &Scenario, futures: &[(&str, &Rollout)]) -> Rollout {
+    let seconds = |rollout: &Rollout| rollout.steps() as f64 * rollout.dt();
+    let longest = futures.iter().map(|(_, rollout)| seconds(rollout));
+    let longest = longest.fold(0.0, f64::max);
+    let log = log_as_rollout(scenario);
+    if futures.is_empty() || seconds(&log) <= longest {
+        return log;
+    }
+    let n = (longest / scenario.dt).round() as usize;
+    let mut cut = Rollout::begin(scenario.present());
+    for frame in log.imagined().iter().take(n) {
+        cut.push(frame.clone());
+    }
+    cut
 }
 
 /// The first few futures with their numbers, for a film.

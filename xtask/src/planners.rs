@@ -193,7 +193,7 @@ pub(crate) struct ImaginationArgs {
 impl ImaginationArgs {
     /// The same for a library.
     ///
-    /// Error: a limit that is no time.
+    /// Error: a limit that is no time, counts of none.
     pub(crate) fn config(&self) -> anyhow::Result<PlannerConfig> {
         let wall = match self.think_ms {
             Some(ms) if !(ms > 0.0 && ms.is_finite()) => {
@@ -202,6 +202,16 @@ impl ImaginationArgs {
             }
             ms => ms.map(|ms| Duration::from_secs_f64(ms * 1e-3)),
         };
+        for (flag, number) in [
+            ("--futures", self.futures),
+            ("--nearest", self.nearest),
+            ("--replan-every", self.replan_every),
+        ] {
+            if number == 0 {
+                let wrong = format!("{flag}: expected at least 1, found 0");
+                return Err(WrongArguments(wrong).into());
+            }
+        }
         Ok(PlannerConfig {
             futures: self.futures,
             allocation: match self.allocation {

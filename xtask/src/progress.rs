@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::run::print_error;
+
 /// Seconds between lines where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
@@ -69,7 +71,7 @@ impl Progress {
                 lines.done += n;
                 if lines.printed.elapsed() >= LINE_EVERY {
                     lines.printed = Instant::now();
-                    eprintln!("{}", lines.text(lines.began.elapsed()));
+                    print_error(&lines.text(lines.began.elapsed()));
                 }
             }
         }

@@ -257,8 +257,13 @@ impl Run {
 }
 
 /// Prints a line; whether anybody still listens is not the work's business.
-fn print_line(line: &str) {
+pub(crate) fn print_line(line: &str) {
     let _ = writeln!(std::io::stdout(), "{line}");
+}
+
+/// A line beside the results; who reads them may have left.
+pub(crate) fn print_error(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
@@ -282,9 +287,9 @@ pub(crate) fn catch_interrupts() {
         if INTERRUPTED.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("\nstopping soon; press Ctrl-C again to stop now");
+        print_error("\nstopping soon; press Ctrl-C again to stop now");
     });
     if caught.is_err() {
-        eprintln!("warning: Ctrl-C cannot be caught and stops at once");
+        print_error("warning: Ctrl-C cannot be caught and stops at once");
     }
 }

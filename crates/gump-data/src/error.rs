@@ -3,7 +3,7 @@
 
 use std::fmt;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use gump_scene::{MapError, ScenarioError};
 
@@ -47,7 +47,7 @@ pub enum DataError {
         path: PathBuf,
     },
     /// There is no such file.
-    #[error("expected a file or directory, found none: {}", path.display())]
+    #[error("{}: {}", missing(path), path.display())]
     Missing {
         /// The file.
         path: PathBuf,
@@ -282,6 +282,18 @@ pub enum DataError {
         /// The folder.
         path: PathBuf,
     },
+}
+
+/// What was expected of a path that is not there; one scenario's name may be where files are.
+fn missing(path: &Path) -> &'static str {
+    let names_one = |text: &str| {
+        text.rsplit_once('#')
+            .is_some_and(|(file, _)| Path::new(file).exists())
+    };
+    match path.to_str().is_some_and(names_one) {
+        true => "expected a whole file or directory, found the name of one scenario",
+        false => "expected a file or directory, found none",
+    }
 }
 
 /// The request after `#`, and what there is instead.

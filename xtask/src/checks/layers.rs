@@ -19,8 +19,8 @@ const CONFINED: [(&str, &[&str], &str); 5] = [
     ),
     (
         "prost",
-        &["gump-proto", "gump-data", "xtask"],
-        "only messages, gump-data and the driver know a file layout",
+        &["gump-proto", "gump-data", "gump-grpc", "xtask"],
+        "only messages, gump-data, planners in other processes and the driver know a layout of bytes",
     ),
     ("clap", &["xtask"], "only the driver reads a command line"),
     (

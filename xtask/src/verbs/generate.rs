@@ -13,7 +13,7 @@ use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::constraint::parse_constraints;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
 use gump_generate::verdict::{off_road, overlaps};
-use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateError, GenerateRequest, Placement};
 use gump_model::{Device, checkpoint};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
 use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
@@ -28,6 +28,9 @@ use crate::shipped;
 
 /// Scenes made together.
 const BATCH: u64 = 32;
+
+/// Prompts that a scene can be asked to satisfy.
+const MOST_PROMPTS: usize = 4;
 
 /// Slower is standing, metres per second.
 const STANDS: f64 = 0.5;
@@ -224,11 +227,16 @@ impl Args {
         let progress = run.progress("generating", n, "scenes");
         let began = Instant::now();
         let mut all = Vec::new();
-        for first in (0..n).step_by(BATCH as usize) {
+        // With a prompt every scene is made on its own, and Ctrl-C need not wait for many.
+        let batch = match order.request.prompts.is_empty() && !order.roams {
+            true => BATCH,
+            false => rayon::current_num_threads() as u64,
+        };
+        for first in (0..n).step_by(batch as usize) {
             stop_if_interrupted()?;
-            let numbers = first..(first + BATCH).min(n);
-            for made in make_many(worlds, order, numbers, run.seed())? {
-                all.push(made?);
+            let numbers = first..(first + batch).min(n);
+            for made in make_many(worlds, order, numbers, run.seed()).map_err(too_many)? {
+                all.push(made.map_err(too_many)?);
                 progress.advance(1);
             }
         }
@@ -236,10 +244,27 @@ impl Args {
     }
 }
 
+/// What is asked of a scene that cannot hold it is wrong arguments.
+fn too_many(error: GenerateError) -> anyhow::Error {
+    match error {
+        GenerateError::TooMany { asked, most } => WrongArguments(format!(
+            "--vehicles, --bicycles, --pedestrians: expected at most {most} objects with the ego and \
+             what stands on the map, found {asked}"
+        ))
+        .into(),
+        other => other.into(),
+    }
+}
+
 /// The tags with these names.
 ///
-/// Error: [`WrongArguments`] with the nearest name there is.
+/// Error: [`WrongArguments`] with the nearest name there is, or for more than four.
 pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
+    if names.len() > MOST_PROMPTS {
+        let n = names.len();
+        let wrong = format!("--prompt: expected at most {MOST_PROMPTS}, found {n}");
+        return Err(WrongArguments(wrong).into());
+    }
     let tag = |name: &String| {
         name.parse::<ScenarioTag>().map_err(|why| {
             let nearness = |tag: &ScenarioTag| strsim::jaro_winkler(tag.name(), name);

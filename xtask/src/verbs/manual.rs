@@ -8,6 +8,7 @@ use clap::Command;
 use clap_complete::Shell;
 
 use crate::installed;
+use crate::run::print_line;
 
 /// Arguments of `completions`.
 #[derive(Debug, clap::Args)]
@@ -50,7 +51,10 @@ impl Manual {
         let root = root.name(name).bin_name(name);
         clap_mangen::generate_to(root, out)
             .with_context(|| format!("cannot write pages into {}", out.display()))?;
-        println!("pages: {0}, read one with man {0}/{name}.1", out.display());
+        print_line(&format!(
+            "pages: {0}, read one with man {0}/{name}.1",
+            out.display()
+        ));
         Ok(())
     }
 }

@@ -21,7 +21,7 @@ use super::explain;
 use crate::cli::WrongArguments;
 use crate::films::FilmArgs;
 use crate::planners::{ImaginationArgs, PlannerParser};
-use crate::run::{Common, Run};
+use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
 
 /// Arguments of `plan`.
@@ -153,6 +153,8 @@ impl Driver for Noted<'_> {
     }
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        // A drive takes a minute, and what is left of it is of no use to who has stopped it.
+        stop_if_interrupted()?;
         let plan = self.inner.drive(moment)?;
         self.steps.push(self.inner.candidates());
         self.note(moment);
@@ -205,7 +207,11 @@ impl Args {
         let milliseconds = timed.milliseconds_per_step();
         let scenario = case.recording.scenario();
         run.phase("write", |run| {
-            let label = format!("{} among {}", self.planner.name(), self.world);
+            let traffic = match &self.world {
+                WorldName::Model(_) => "learned traffic".to_owned(),
+                other => other.to_string(),
+            };
+            let label = format!("{} among {traffic}", self.planner.name());
             self.film
                 .write(run, scenario, &[(&label, &scored.driven.rollout)])?;
             write_candidates(run, &noted.steps)?;
@@ -217,8 +223,21 @@ impl Args {
         run.result("steps", scored.driven.ego.len())?;
         run.result("milliseconds_per_step", milliseconds)?;
         tell(run, &scored)?;
-        let first = noted.steps.first().map_or(&[][..], |step| step);
-        run.result("candidates", first.iter().map(row).collect::<Vec<_>>())
+        let step = noted
+            .explained
+            .as_ref()
+            .map_or(0, |explained| explained.step);
+        let shown = noted.steps.get(step).map_or(&[][..], |step| step);
+        run.result("candidates_step", step)?;
+        run.result("candidates", shown.iter().map(row).collect::<Vec<_>>())?;
+        let page = match self.explain {
+            Some(_) => "explain.html",
+            None => "film.gif",
+        };
+        if run.path(page).is_file() {
+            run.say(&format!("open {}", run.path(page).display()));
+        }
+        Ok(())
     }
 }
 
@@ -300,7 +319,8 @@ fn tell(run: &mut Run, scored: &Scored) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A candidate as a row of the table: the first step's are shown, the file has all.
+/// A candidate as a row of the table: those of the first step are shown, or of the one explained;
+/// the file has all.
 fn row(candidate: &Candidate) -> Value {
     let mut row = json!({
         "candidate": candidate.name,

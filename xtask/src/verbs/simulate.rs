@@ -20,6 +20,9 @@ use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::{futures, tables, told};
 
+/// The most futures of one run: they are held in memory until they are written.
+const MOST_FUTURES: usize = 65_536;
+
 /// Arguments of `simulate`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
@@ -70,10 +73,14 @@ enum Format {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        if !(self.seconds > 0.0 && self.seconds <= 3600.0) {
+        if !(0.1..=3600.0).contains(&self.seconds) {
             let found = self.seconds;
-            let wrong =
-                format!("--seconds: expected a number above 0 and at most 3600, found {found}");
+            let wrong = format!("--seconds: expected a number from 0.1 to 3600, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
+        if self.futures.get() > MOST_FUTURES {
+            let found = self.futures;
+            let wrong = format!("--futures: expected at most {MOST_FUTURES}, found {found}");
             return Err(WrongArguments(wrong).into());
         }
         if self.heat.is_some() && !matches!(self.world, WorldName::Model(_)) {

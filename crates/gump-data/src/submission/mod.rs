@@ -8,6 +8,7 @@ mod arrays;
 mod motion;
 mod shard;
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
 use std::path::Path;
@@ -161,7 +162,32 @@ pub fn encode_rollouts(message: &ScenarioRollouts) -> Vec<u8> {
     message.encode_to_vec()
 }
 
-/// Converts a message to rollouts of `scenario`: its history, then one frame per step.
+/// A message in which agents without heights, as of [`read_rollouts`] from arrays, keep those that
+/// they have at the present of `scenario`, as every world here simulates them.
+pub fn with_heights<'a>(
+    message: &'a ScenarioRollouts,
+    scenario: &Scenario,
+) -> Cow<'a, ScenarioRollouts> {
+    let has_none = |t: &SimulatedTrajectory| t.center_z.is_empty() && !t.center_x.is_empty();
+    let mut scenes = message.joint_scenes.iter();
+    if !scenes.any(|scene| scene.simulated_trajectories.iter().any(has_none)) {
+        return Cow::Borrowed(message);
+    }
+    let present = scenario.present();
+    let mut filled = message.clone();
+    for scene in &mut filled.joint_scenes {
+        let bare = scene.simulated_trajectories.iter_mut();
+        for trajectory in bare.filter(|trajectory| has_none(trajectory)) {
+            let id = AgentId(trajectory.object_id().into());
+            let height = present.now().agent(id).map_or(0.0, |agent| agent.elevation);
+            trajectory.center_z = vec![height as f32; trajectory.center_x.len()];
+        }
+    }
+    Cow::Owned(filled)
+}
+
+/// Converts a message to rollouts of `scenario`: its history, then one frame per step. Heights that
+/// are missing are those of [`with_heights`].
 ///
 /// Sizes and kinds are those at the present, velocities are differences of positions, headings
 /// are wrapped to [-π, π), lights stay as they are at the present.
@@ -182,6 +208,7 @@ pub fn rollouts_from_proto(
         return Err(Problem::Rollouts(problem));
     }
     let present = present_agents(scenario);
+    let message = with_heights(message, scenario);
     let futures = message.joint_scenes.iter().enumerate();
     futures
         .map(|(k, scene)| {

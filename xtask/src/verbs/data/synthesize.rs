@@ -102,6 +102,11 @@ impl Args {
             let wrong = format!("--seconds: expected 1 to 600, found {found}");
             return Err(WrongArguments(wrong).into());
         }
+        if !(0.1..=3.0).contains(&self.density) {
+            let found = self.density;
+            let wrong = format!("--density: expected 0.1 to 3, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
         let why = match self.kind {
             Kind::Procedural if self.network.is_some() => "--network is for --kind sumo",
             // In few drawn places anybody drives on for longer, so the ego could leave its scene.

@@ -16,6 +16,7 @@ use serde_json::{Value, json};
 use super::closed_loop::mean;
 use crate::benchmark::{Found, Scenes};
 use crate::charts;
+use crate::cli::WrongArguments;
 use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -53,6 +54,12 @@ type Outcome = (String, anyhow::Result<OpenLoop>);
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        if matches!(self.world, WorldName::Log | WorldName::ConstantVelocity) {
+            let found = &self.world;
+            let wrong =
+                format!("--world: expected idm or model:WEIGHTS to imagine in, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
         let sampling = self.sampling.resolve()?;
         let surroundings = run.phase("load", |run| {
             Ok(PlanningWorld::load_imagination(

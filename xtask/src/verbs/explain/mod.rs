@@ -16,7 +16,6 @@ use serde_json::{Value, json};
 
 pub(crate) use self::reasons::weight;
 use crate::run::Run;
-use crate::table::decimal;
 
 /// Agents told about, those nearest to the ego.
 const OTHERS: usize = 8;
@@ -82,9 +81,9 @@ impl Explained<'_> {
             section.prose(&format!(
                 "\"{}\" is worth {}; \"{}\", {what}, {}. {}",
                 chosen.kind,
-                decimal(chosen.value),
+                rounded(chosen.value),
                 other.kind,
-                decimal(other.value),
+                rounded(other.value),
                 reasons::between(chosen, other, &near).join(" ")
             ));
         }
@@ -119,6 +118,11 @@ impl Explained<'_> {
         };
         draw_candidates(&scene, &paths, &spec)
     }
+}
+
+/// A score as the page shows it.
+fn rounded(score: f64) -> String {
+    format!("{score:.3}")
 }
 
 /// Agents nearest to the ego at the decision, the nearest first.
@@ -162,22 +166,21 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
     });
     let words: Vec<String> = telling
         .iter()
-        .map(|&part| reasons::words(names[part]))
+        .map(|&part| reasons::short(names[part]))
         .collect();
-    let mut columns = vec!["candidate", "value", "futures"];
+    let mut columns = vec!["candidate", "score", "futures"];
     columns.extend(words.iter().map(String::as_str));
-    columns.extend(["collisions", "metres"]);
+    columns.push("metres");
     let rows: Vec<Vec<String>> = order
         .iter()
         .map(|&i| {
             let prospect = &decision.prospects[i];
             let mut row = vec![
                 prospect.kind.to_string(),
-                decimal(prospect.value),
+                format!("{:.3}", prospect.value),
                 prospect.futures.len().to_string(),
             ];
             row.extend(telling.iter().map(|&part| format!("{:.2}", value(i, part))));
-            row.push(prospect.collisions.to_string());
             row.push(format!("{:.1}", prospect.progress_m));
             row
         })

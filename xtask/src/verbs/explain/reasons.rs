@@ -139,6 +139,17 @@ fn approaches(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<Strin
     told.into_iter().take(2).map(|(_, text)| text).collect()
 }
 
+/// A part's name as a column of a table.
+pub(super) fn short(name: &str) -> String {
+    match name {
+        "no_at_fault_collisions" => "no collision".into(),
+        "drivable_area" => "on the road".into(),
+        "driving_direction" => "direction".into(),
+        "time_to_collision" => "TTC".into(),
+        other => words(other),
+    }
+}
+
 /// A part's name as words.
 pub(super) fn words(name: &str) -> String {
     name.replace('_', " ")

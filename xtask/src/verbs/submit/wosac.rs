@@ -116,6 +116,24 @@ impl Maker {
     }
 }
 
+/// Fields of the submission by the flags that state them.
+fn as_flags(problems: &str) -> String {
+    [
+        ("account_name", "--account"),
+        ("unique_method_name", "--method"),
+        ("authors", "--authors"),
+        ("num_model_parameters", "--parameters"),
+        (
+            "acknowledge_complies_with_closed_loop_requirement",
+            "--complies-with-closed-loop",
+        ),
+    ]
+    .iter()
+    .fold(problems.to_owned(), |text, (field, flag)| {
+        text.replace(field, flag)
+    })
+}
+
 fn names(text: &str) -> Vec<String> {
     let names = text.split(',').map(str::trim);
     names
@@ -130,7 +148,7 @@ impl Args {
         if self.source.archive.is_none() {
             let problems = metadata_problems(&metadata);
             if !problems.is_empty() {
-                return Err(WrongArguments(problems.join("; ")).into());
+                return Err(WrongArguments(as_flags(&problems.join("; "))).into());
             }
         }
         let expected = run.phase("index", |run| self.expected(run))?;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_model::checkpoint::Precision;
-use gump_model::{Device, Network, checkpoint};
+use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
 use gump_train::{LossParts, ProcessGroup as _, RunConfig, StepReport, Trainer};
@@ -86,8 +86,18 @@ enum Begin {
     Resume,
 }
 
+/// Whether a run to resume has been in a folder, or in that of a stage within it.
+fn was_trained_in(out: &Path) -> bool {
+    let folders = std::fs::read_dir(out).into_iter().flatten().flatten();
+    let inside = folders.map(|entry| entry.path());
+    std::iter::once(out.to_owned())
+        .chain(inside)
+        .any(|folder| folder.join(CHECKPOINT).is_file())
+}
+
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        self.check(run)?;
         if relative::is_asked(self)? {
             return together(|processes| relative::execute(self, run, processes));
         }
@@ -98,6 +108,29 @@ impl Args {
             }
             self.learn_in(&stages, run, processes)
         })
+    }
+
+    /// Refuses what no training can be made of, before anything is read.
+    ///
+    /// Error: [`WrongArguments`].
+    fn check(&self, run: &Run) -> anyhow::Result<()> {
+        let known = ModelConfig::PRESETS.iter().copied().chain([relative::NAME]);
+        let wrong = match (&self.model, self.steps) {
+            (Some(name), _) if !known.clone().any(|known| known == name) => {
+                let known: Vec<&str> = known.collect();
+                format!(
+                    "--model: expected one of {}, found {name}",
+                    known.join(", ")
+                )
+            }
+            (_, Some(0)) => "--steps: expected at least 1, found 0".into(),
+            _ if self.resume && !was_trained_in(run.out()) => format!(
+                "--resume: expected a run in {}, found none",
+                run.out().display()
+            ),
+            _ => return Ok(()),
+        };
+        Err(WrongArguments(wrong).into())
     }
 
     /// One stage after the other; a resumed run begins with the last that was begun.

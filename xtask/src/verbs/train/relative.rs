@@ -24,7 +24,7 @@ use crate::peers::Processes;
 use crate::run::Run;
 
 /// The name of the architecture in `--model`.
-const NAME: &str = "relative";
+pub(super) const NAME: &str = "relative";
 
 /// Separates the stream of layers that are added.
 const DEEPER: u64 = 11;

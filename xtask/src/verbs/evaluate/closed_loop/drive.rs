@@ -6,15 +6,17 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use gump_eval::planners::{PlannerConfig, PlannerName, PlanningWorld, TimedDriver};
 use gump_eval::recordings::{Case, Named};
 use gump_eval::worlds::WorldName;
+use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
-use gump_rollout::WorldModel;
+use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
 
 use super::{Args, Driven, Finished, Outcome};
 use crate::films;
 use crate::planners::Chosen;
-use crate::run::{Run, interrupted};
+use crate::run::{Run, interrupted, stop_if_interrupted};
 
 /// What the drives of all scenarios share.
 pub(super) struct Drives<'a> {
@@ -125,7 +127,8 @@ impl Drives<'_> {
     ) -> Result<(Scored, f64), String> {
         let drive = || {
             let mut driver = self.build(planner, case, seed)?;
-            let mut timed = TimedDriver::new(&mut *driver, self.args.driving.budget());
+            let mut stoppable = Stoppable(&mut *driver);
+            let mut timed = TimedDriver::new(&mut stoppable, self.args.driving.budget());
             let scored = drive_and_score(
                 &case.recording,
                 &case.map,
@@ -186,6 +189,24 @@ impl Drives<'_> {
     fn remote(&self, _: &Case, address: &str) -> anyhow::Result<Box<dyn Explain + '_>> {
         Chosen::Remote(address.into()).check()?;
         anyhow::bail!("this build cannot call {address}")
+    }
+}
+
+/// A driver that ends its drive after Ctrl-C.
+struct Stoppable<'a>(&'a mut dyn Driver);
+
+impl Driver for Stoppable<'_> {
+    fn name(&self) -> &str {
+        self.0.name()
+    }
+
+    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+        self.0.start(mission)
+    }
+
+    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+        stop_if_interrupted()?;
+        self.0.drive(moment)
     }
 }
 

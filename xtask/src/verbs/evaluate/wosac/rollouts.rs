@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
-use gump_data::submission::read_rollouts;
+use gump_data::submission::{read_rollouts, with_heights};
 use gump_eval::worlds::{World, WorldName};
 use gump_proto::ScenarioRollouts;
 use gump_scene::Seed;
@@ -177,7 +177,7 @@ impl Source {
                     .find(|message| message.scenario_id() == scenario.id)
                     .with_context(|| format!("the file has changed: {}", file.display()))?;
                 Ok(Found {
-                    rollouts: Rollouts::of_message(message, mode),
+                    rollouts: Rollouts::of_message(&with_heights(message, scenario), mode),
                     digest: None,
                 })
             }
