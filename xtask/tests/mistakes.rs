@@ -258,8 +258,8 @@ fn a_version_is_told_and_a_device_only_asked_for_where_something_computes() {
     let simulate = help("simulate --help");
     for part in [
         "--device",
-        "How a learned world decodes:",
-        "Of every run:",
+        "Decoding of a learned world:",
+        "Common options:",
         "-s, --scenario",
     ] {
         assert!(simulate.contains(part), "expected {part} in: {simulate}");

@@ -12,7 +12,7 @@ use crate::installed;
 /// Arguments of `completions`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Completions {
-    /// For which shell
+    /// Shell
     shell: Shell,
 }
 

@@ -25,10 +25,10 @@ pub(crate) struct Args {
     /// A file or directory of any readable format
     #[arg(long, value_name = "PATH")]
     from: PathBuf,
-    /// Folder for the converted files; an interrupted conversion goes on there
+    /// Folder for the converted files; an interrupted conversion resumes there
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
-    /// What to write
+    /// Output format
     #[arg(long, value_enum, default_value_t = Format::Cache)]
     format: Format,
     /// Smooth the tracks of noisy recordings, such as NGSIM's, with velocities that fit; those of

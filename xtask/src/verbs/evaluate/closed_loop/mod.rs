@@ -39,13 +39,13 @@ pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// Who plans; several, apart by commas, for several rows
+    /// Planners to evaluate, comma-separated, one row each
     #[arg(long, value_parser = ChosenParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<Chosen>,
-    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, for several tables
+    /// log, idm, constant-velocity or model:WEIGHTS; comma-separated, one table each
     #[arg(long, value_name = "W", default_value = "idm", num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
-    /// What planners imagine in [default: the learned world of --world, else idm]
+    /// Traffic model of planners' rollouts [default: the learned world of --world, else idm]
     #[arg(long, value_name = "W")]
     imagination: Option<WorldName>,
     #[command(flatten)]
@@ -75,13 +75,13 @@ pub(crate) struct Args {
 /// How a planner is let drive.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Driving {
-    /// How far to drive; a recording may be shorter
+    /// Seconds to drive; a recording may be shorter
     #[arg(long, value_name = "S", default_value_t = 15.0)]
     pub(crate) seconds: f64,
-    /// How the ego follows its plans
+    /// Controller that tracks the plans
     #[arg(long, value_enum, default_value_t = TrackingName::TwoStage)]
     controller: TrackingName,
-    /// A planner that takes longer for a step has failed [default: no limit]
+    /// Time limit per planning step; a planner that exceeds it fails [default: no limit]
     #[arg(long, value_name = "MS")]
     budget_ms: Option<f64>,
 }
@@ -89,9 +89,9 @@ pub(crate) struct Driving {
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum TrackingName {
-    /// An LQR tracker steers a kinematic bicycle
+    /// LQR tracker with a kinematic bicycle model
     TwoStage,
-    /// It is where the plan says
+    /// Perfect tracking of the plan
     Perfect,
 }
 

@@ -38,16 +38,16 @@ pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, side by side
+    /// log, idm, constant-velocity or model:WEIGHTS; comma-separated
     #[arg(long, value_name = "W", default_values_t = worlds(), num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
-    /// log, brake, stop, speed-up, change-lane or run-light; several, apart by commas [default: all]
+    /// log, brake, stop, speed-up, change-lane or run-light; comma-separated [default: all]
     #[arg(long, value_name = "M", num_args = 1.., value_delimiter = ',', value_parser = manoeuvre)]
     manoeuvre: Vec<&'static str>,
-    /// How far to look; the log must go on for as long
+    /// Seconds to evaluate; the log must be as long
     #[arg(long, value_name = "S", default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=60))]
     seconds: u32,
-    /// Futures of each manoeuvre; worlds without chance have one
+    /// Futures of each manoeuvre; deterministic worlds have one
     #[arg(long, value_name = "N", default_value = "4")]
     futures: NonZeroUsize,
     /// At most so many scenarios, the first [default: all]
