@@ -109,13 +109,13 @@ fn columns() -> Vec<(String, String)> {
     let said = [
         (
             "learned",
-            "the shipped network, under rules that draw again what would collide or leave the road \
-             and hold back what a body cannot do",
+            "the shipped network, with rejection of collisions and off-road samples, and kinematic \
+             limits",
         ),
         ("learned (raw)", "the same network alone"),
         (
             "idm",
-            "everyone follows their lane and who is ahead, and yields",
+            "everyone follows their lane and the leader, and yields",
         ),
         ("constant-velocity", "everyone goes straight on"),
         (
@@ -175,7 +175,7 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
             "Top left the recording, then three simulated futures.",
         )
         .link("viewer.html", "Play all of them in the viewer")
-        .link("overlay.gif", "Watch all of them over one another");
+        .link("overlay.gif", "Overlay all futures");
     Ok(())
 }
 
