@@ -28,7 +28,10 @@ const METRICS: [(Component, &str); 3] = [
         Component::DistanceToNearestObject,
         "distance to the nearest agent, m",
     ),
-    (Component::TimeToCollision, "time to collision, s (capped at 5 s)"),
+    (
+        Component::TimeToCollision,
+        "time to collision, s (capped at 5 s)",
+    ),
     (Component::DistanceToRoadEdge, "beyond the road edge, m"),
 ];
 
@@ -78,7 +81,10 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
 fn deeds(judged: &Judged) -> String {
     let deeds = judged.conduct.deeds.iter();
     let words = deeds.map(|(deed, share)| {
-        let name = deed.name().replace("slip", "lateral slip").replace('_', " ");
+        let name = deed
+            .name()
+            .replace("slip", "lateral slip")
+            .replace('_', " ");
         format!("{name} in {:.0} % of futures", 100.0 * share)
     });
     words.collect::<Vec<_>>().join(", ")

@@ -303,7 +303,7 @@ fn a_conversion_that_was_stopped_is_no_data_set() {
     let output = running.wait_with_output().unwrap();
     let error = text(&output.stderr);
     assert_eq!(output.status.code(), Some(130), "{error}");
-    assert!(error.contains("the same command goes on"), "{error}");
+    assert!(error.contains("the same command resumes"), "{error}");
     for reader in [
         "data inspect cache",
         "data stats cache",

@@ -324,7 +324,7 @@ fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
         film.write(run, &alone, &[("generated", &rollout)])?;
         let mut viewer = Viewer::new(&alone);
         viewer
-            .note("a generated scene and its imagined future")
+            .note("a generated scene and its simulated future")
             .future("generated", &rollout);
         viewer.save(&run.path("viewer.html"))?;
     }

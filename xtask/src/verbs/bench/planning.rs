@@ -38,7 +38,7 @@ pub(crate) struct Args {
     /// Vehicles besides the ego
     #[arg(long, value_name = "N", default_value_t = 50)]
     agents: usize,
-    /// Decisions of the interactive planner among learned drivers to take the time of
+    /// Decisions of the interactive planner among learned drivers to time
     #[arg(long, value_name = "N", default_value = "5")]
     decisions: NonZeroUsize,
     /// Number format of the learned drivers' weights

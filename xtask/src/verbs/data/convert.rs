@@ -150,7 +150,7 @@ impl Args {
         run.result("problems", &all.refused)?;
         if run::interrupted() && converted.is_err() {
             anyhow::bail!(
-                "stopped by Ctrl-C; the same command goes on, and until it is done {} says that \
+                "stopped by Ctrl-C; the same command resumes, and until it is done {} says that \
                  the data set is not whole",
                 mark.display()
             );

@@ -43,10 +43,10 @@ pub(crate) struct Args {
     /// the shipped data that are for training]
     #[arg(long, value_name = "PATH")]
     bank: Option<PathBuf>,
-    /// At most so many scenarios that take part [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
-    /// Recorded vehicles within 50 m that a scenario needs to take part
+    /// Recorded vehicles within 50 m that a scenario needs at least
     #[arg(long, value_name = "N", default_value_t = 8)]
     min_vehicles: usize,
     /// Maps per prompt tag, among those that admit it; 0 leaves prompts out

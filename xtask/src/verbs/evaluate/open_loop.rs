@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// Traffic model of planners' rollouts: idm or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
-    /// At most so many scenarios [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
     #[command(flatten)]

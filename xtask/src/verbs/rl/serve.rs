@@ -27,7 +27,7 @@ pub(crate) struct Args {
     /// Traffic model: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "log")]
     world: WorldName,
-    /// At most so many scenarios
+    /// Maximum number of scenarios
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
     /// Seconds until an episode is truncated

@@ -270,7 +270,7 @@ impl Job<'_> {
             }
             anyhow::ensure!(
                 !run::interrupted(),
-                "stopped by Ctrl-C after step {} of {total}, go on with --resume from the last \
+                "stopped by Ctrl-C after step {} of {total}, continue with --resume from the last \
                  checkpoint",
                 training.steps()
             );

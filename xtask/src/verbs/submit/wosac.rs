@@ -71,7 +71,7 @@ struct Maker {
     /// Their affiliation
     #[arg(long, value_name = "TEXT")]
     affiliation: Option<String>,
-    /// The method in a few words
+    /// Short description of the method
     #[arg(long, value_name = "TEXT")]
     description: Option<String>,
     /// Where the method is described

@@ -387,7 +387,7 @@ fn learn(
         let step = trainer.steps_done();
         anyhow::ensure!(
             !trainer.any(run::interrupted())?,
-            "stopped by Ctrl-C after step {step} of {total}, go on with --resume"
+            "stopped by Ctrl-C after step {step} of {total}, continue with --resume"
         );
         let report = trainer.step()?;
         progress.message(&format!("training, loss {:.3}", report.loss.total));

@@ -54,14 +54,14 @@ pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
     thinking: ImaginationArgs,
-    /// At most so many scenarios [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
-    /// Films of the first so many scenarios
+    /// Films of the first N scenarios
     #[arg(long, value_name = "N", default_value_t = 2)]
     films: usize,
     #[command(flatten)]
@@ -269,7 +269,7 @@ impl Args {
         done.into_iter().collect::<anyhow::Result<()>>()?;
         anyhow::ensure!(
             !interrupted(),
-            "stopped by Ctrl-C; the same command goes on where this one stopped"
+            "stopped by Ctrl-C; the same command resumes where this one stopped"
         );
         let ledger = ledger.into_inner().expect("nobody panics while holding it");
         Ok(ledger.close()?)

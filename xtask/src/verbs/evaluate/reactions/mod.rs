@@ -50,11 +50,11 @@ pub(crate) struct Args {
     /// Futures of each manoeuvre; deterministic worlds have one
     #[arg(long, value_name = "N", default_value = "4")]
     futures: NonZeroUsize,
-    /// At most so many scenarios, the first [default: all]
+    /// Use only the first N scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
     #[command(flatten)]
@@ -113,7 +113,7 @@ impl Args {
                 progress.advance(1);
                 anyhow::ensure!(
                     !interrupted(),
-                    "stopped by Ctrl-C; the same command goes on after scenario {index}"
+                    "stopped by Ctrl-C; the same command resumes after scenario {index}"
                 );
             }
             Ok(())

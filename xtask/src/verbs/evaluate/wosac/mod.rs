@@ -57,8 +57,8 @@ pub(crate) struct Args {
     /// Rollouts of each scenario
     #[arg(long, value_name = "N", default_value = "32")]
     rollouts_per_scenario: NonZeroUsize,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", value_parser = shard)]
     shard: Option<Shard>,
     /// Also report what lowered the scores of the first row and when, in explain.jsonl,
@@ -217,7 +217,7 @@ impl Args {
                 progress.advance(1);
                 anyhow::ensure!(
                     !interrupted(),
-                    "stopped by Ctrl-C; the same command goes on after scenario {}",
+                    "stopped by Ctrl-C; the same command resumes after scenario {}",
                     recorded.index
                 );
             }
