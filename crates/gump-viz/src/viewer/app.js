@@ -526,7 +526,7 @@ function endAt(event, [px, py]) {
 // What the ruler says, in words, of the take at the right.
 function tellRuler() {
   const found = ui.ends.length > 1 ? measure(world, heatTake(ui, world), ui.ends, ui.t) : null;
-  const asks = ui.ends.length ? 'Now the other end.' : 'Drag from a place or an agent to another.';
+  const asks = ui.ends.length ? 'Now the other end.' : 'Drag from one place or agent to another.';
   $('measure').hidden = !ui.ruling && !ui.ends.length;
   $('measure').textContent = found ? found.words : ui.ends.length > 1 ? 'One of the agents is not there at this time.' : asks;
 }

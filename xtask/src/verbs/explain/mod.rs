@@ -239,7 +239,7 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
     page.section("What the others did")
         .prose(&format!(
             "Means over the futures, with the chosen candidate (\"{}\") and with the best rejected \
-             one (\"{}\"). Who drives less far with the one than with the other gives way to it.",
+             one (\"{}\"). An agent that drives less far with one of them yields to it.",
             shown[0].kind, shown[1].kind
         ))
         .table(
