@@ -813,7 +813,7 @@ fn a_decision_is_explained() {
     place.fails(
         &blind,
         2,
-        &["--explain 5", "planner that imagines", "pdm-closed"],
+        &["--explain 5", "--planner interactive", "pdm-closed"],
     );
 }
 

@@ -234,8 +234,8 @@ impl Args {
         };
         let wrong = if self.planner != PlannerName::Interactive {
             format!(
-                "--explain {asked}: expected a planner that imagines before it decides, \
-                 interactive, found {}",
+                "--explain {asked}: expected --planner interactive, which decides by rollouts, \
+                 found {}",
                 self.planner.name()
             )
         } else if let (Some(scenario), Step::Number(step)) = (scenario, asked) {
@@ -269,7 +269,7 @@ impl Args {
         }) = &noted.explained
         else {
             let wrong = format!(
-                "--explain {asked}: expected a step of the drive and a planner that imagines, \
+                "--explain {asked}: expected a step of the drive and --planner interactive, \
                  found {} steps of {}",
                 noted.steps.len(),
                 self.planner.name()
