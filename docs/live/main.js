@@ -15,11 +15,11 @@ const ALL_DRAWS = Array.from({ length: DRAWS }, (_, k) => k);
 /** A scene as JSON is a few megabytes; more than this would not fit beside the engine. */
 const LARGEST_FILE = 64 << 20;
 const PARTS = {
-  no_ego_at_fault_collisions: 'No collision of one’s own fault',
+  no_ego_at_fault_collisions: 'No at-fault collision',
   drivable_area_compliance: 'Stays on the road',
   driving_direction_compliance: 'Drives with the traffic',
   ego_is_making_progress: 'Makes progress',
-  ego_progress_along_expert_route: 'Progress beside the recorded driver',
+  ego_progress_along_expert_route: 'Progress compared with the recorded driver',
   time_to_collision_within_bound: 'Keeps time to collision',
   speed_limit_compliance: 'Keeps the speed limit',
   ego_is_comfortable: 'Is comfortable',
@@ -197,7 +197,7 @@ function setMode(mode) {
   $('go').disabled = mode !== 'ready';
   for (const id of ['scene', 'open']) $(id).disabled = mode === 'loading' || mode === 'opening';
   $('pause').disabled = !started || mode === 'ended';
-  $('pause').textContent = mode === 'driving' ? 'Pause' : 'Go on';
+  $('pause').textContent = !started || mode === 'driving' ? 'Pause' : 'Resume';
   for (const id of ['time', 'branch', 'end']) $(id).disabled = !started;
   document.body.dataset.mode = mode;
 }

@@ -17,7 +17,7 @@ use crate::verbs::{
 };
 use crate::{config, words};
 
-/// The generative world model for driving: every pipeline as a verb.
+/// The generative world model for driving: train, simulate, plan and evaluate.
 #[derive(Debug, Parser)]
 #[command(
     name = "cargo xtask",
@@ -31,43 +31,43 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
-    /// Start here: one scene through everything, offline, and a page to look at.
+    /// Start here: the whole pipeline on one scene, offline, and a page of results.
     Demo(demo::Args),
-    /// Look into scenario files, check, count and convert them, make new ones.
+    /// Inspect, verify, convert and generate scenario files.
     #[command(subcommand)]
     Data(data::Verb),
     /// Train a world model.
     Train(train::Args),
-    /// Simulate how a recorded scene goes on: joint rollouts of all agents.
+    /// Roll out a recorded scene: joint futures of all agents.
     Simulate(simulate::Args),
     /// Generate a scene on a map from a prompt and constraints.
     Generate(generate::Args),
-    /// Let a planner drive through a scene and see everything it considered.
+    /// Drive a planner through a scene and explain its decisions.
     Plan(plan::Args),
     /// Measure on the benchmarks of the field.
     #[command(subcommand)]
     Evaluate(evaluate::Verb),
-    /// Learn to drive in a world, and see how well that went.
+    /// Train and evaluate driving policies by reinforcement learning.
     #[command(subcommand)]
     Rl(rl::Verb),
     /// Pack results for a challenge, checked against its rules.
     #[command(subcommand)]
     Submit(submit::Verb),
-    /// Leave a part out or swap it, and measure what it did.
+    /// Ablations: leave out or swap a part and measure the effect.
     #[command(subcommand)]
     Ablate(ablate::Verb),
-    /// Measure speed, side by side.
+    /// Benchmark speed.
     #[command(subcommand)]
     Bench(bench::Verb),
-    /// Build the page that lets one drive inside the learned world.
+    /// Build the web page for driving inside the learned world.
     Web(web::Args),
     /// Everything CI runs: format, lints, tests, docs, layers, house rules.
     Ci(ci::Args),
     /// Check the house rules of the repository.
     Tidy(tidy::Args),
-    /// Print what a shell needs to complete the words of a command.
+    /// Print a shell completion script.
     Completions(manual::Completions),
-    /// Write the pages of the manual for `man`.
+    /// Write the manual pages for `man`.
     Manual(manual::Manual),
 }
 

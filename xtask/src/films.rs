@@ -21,7 +21,7 @@ pub(crate) struct FilmArgs {
         default_value = "gif"
     )]
     video: Vec<Video>,
-    /// What the film's camera does [default: frame, or follow where that is over 110 m across]
+    /// Camera of the film [default: frame, or follow where that is over 110 m across]
     #[arg(long, value_enum, value_name = "C")]
     camera: Option<CameraName>,
 }
@@ -40,9 +40,9 @@ enum Video {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum CameraName {
-    /// Stays where it shows everyone who moves near the ego
+    /// Fixed view of all moving agents near the ego
     Frame,
-    /// Goes along with the ego
+    /// Follows the ego
     Follow,
 }
 

@@ -74,7 +74,7 @@ pub(crate) fn imagine_around(
     let watched = Watched {
         world,
         // Advanced in units of the scene's step, since the world's own is not known yet.
-        progress: run.progress("imagining", steps as u64 * n_futures as u64, "frames"),
+        progress: run.progress("simulating", steps as u64 * n_futures as u64, "frames"),
         scene_dt: scene.dt,
         cost: Mutex::new(Cost::default()),
     };

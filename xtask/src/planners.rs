@@ -161,31 +161,31 @@ enum AggregateName {
 /// How planners that imagine do it.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct ImaginationArgs {
-    /// Futures that imagining planners see
+    /// Futures that planners with rollouts simulate
     #[arg(long, value_name = "N", default_value_t = 4)]
     futures: usize,
-    /// Which candidates the interactive planner imagines how often
+    /// How the interactive planner allocates futures to candidates
     #[arg(long, value_enum, default_value_t = AllocationName::Halving)]
     allocation: AllocationName,
-    /// What a candidate of the interactive planner is worth
+    /// How a candidate's scores over its futures are aggregated
     #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
     aggregate: AggregateName,
-    /// What the interactive planner gives its previous choice on top of its value, 0 to 1
+    /// Bonus on the score of the previous choice, 0 to 1
     #[arg(long, value_name = "X", default_value_t = PlannerConfig::default().hysteresis)]
     hysteresis: f64,
-    /// Agents that are imagined, those nearest to the ego
+    /// Agents that are simulated, those nearest to the ego
     #[arg(long, value_name = "N", default_value_t = 12)]
     nearest: usize,
-    /// Seconds that the interactive planner imagines
+    /// Length of the interactive planner's rollouts, seconds
     #[arg(long, value_name = "S", default_value_t = 4.0)]
     horizon: f64,
-    /// The interactive planner stops imagining after so long [default: no limit]
+    /// Time limit of the interactive planner's rollouts [default: no limit]
     #[arg(long, value_name = "MS")]
     think_ms: Option<f64>,
-    /// Planners that imagine decide at every N-th step
+    /// Planners with rollouts decide at every N-th step
     #[arg(long, value_name = "N", default_value_t = 5)]
     replan_every: usize,
-    /// Discount per half second; without it a future is worth the score of the whole drive
+    /// Discount per half second; without it a future's score is that of the whole drive
     #[arg(long, value_name = "X")]
     discount: Option<f64>,
 }

@@ -22,26 +22,26 @@ pub(crate) struct Common {
     /// Folder for the results [default: out/VERB]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Where all randomness comes from [default: 0]
+    /// Random seed [default: 0]
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
-    /// Flags from a file; those on the command line win
+    /// Read flags from a file; the command line overrides them
     #[arg(long, value_name = "FILE.toml")]
     pub(crate) config: Option<PathBuf>,
     /// Threads to use [default: all cores]
     #[arg(long, value_name = "N")]
     threads: Option<NonZeroUsize>,
-    /// Where tensors live
+    /// Compute device
     #[arg(long, value_enum, default_value_t = Device::Cpu)]
     device: Device,
-    /// What multiplies matrices: amx, avx512-bf16, avx512, avx2 or portable [default: the best that
-    /// the processor has and that passes its test]
+    /// Matrix-product kernel: amx, avx512-bf16, avx512, avx2 or portable [default: the
+    /// fastest that the processor has and that passes its test]
     #[arg(long, value_name = "NAME")]
     kernel: Option<String>,
-    /// No progress and no table, errors only
+    /// Print only errors, no progress and no table
     #[arg(long)]
     quiet: bool,
-    /// Whole tables on the terminal, however wide; report.json has them anyway
+    /// Print tables in full width; report.json always has them in full
     #[arg(long)]
     #[serde(skip)]
     wide: bool,

@@ -10,7 +10,7 @@ use crate::decoding::Decoding;
 /// How a learned world decodes.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Sampling {
-    /// Decode all agents of a frame at once, or one after another
+    /// Decode all agents of a frame at once or one after another
     #[arg(long, value_enum, default_value_t = ModeName::PartialAr)]
     mode: ModeName,
     #[command(flatten)]
@@ -21,43 +21,45 @@ pub(crate) struct Sampling {
 /// How a learned world decodes, whatever the order.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Draw {
-    /// What is kept between the passes of a frame
+    /// Key/value cache of the network
     #[arg(long, value_enum, default_value_t = CacheName::Window)]
     cache: CacheName,
-    /// In which form the weights are multiplied
+    /// Number format of the weights
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
-    /// Divides the logits; above 1 is bolder [default: 0.5, and 1 of a relative network]
+    /// Divides the logits; above 1 is more diverse [default: 0.5, and 1 of a relative network]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
-    /// Bins that may be drawn per field [default: 40]
+    /// Top-k sampling: bins per field that may be sampled [default: 40]
     #[arg(long, value_name = "N")]
     top_k: Option<usize>,
-    /// Draws among the likeliest bins that together have this probability [default: 1, and 0.95 of a relative network]
+    /// Nucleus sampling: only the likeliest bins that together have this probability [default: 1,
+    /// and 0.95 of a relative network]
     #[arg(long, value_name = "X")]
     top_p: Option<f64>,
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]
     #[arg(long, value_name = "X")]
     decay: Option<f64>,
-    /// Draws again at most that often what would run into something or off the road, 0 for never [default: 12]
+    /// Resample colliding or off-road samples up to N times, 0 for never [default: 12]
     #[arg(long, value_name = "N")]
     redraws: Option<usize>,
-    /// Vehicles and bicycles may turn on the spot and slip sideways as the model says
+    /// No kinematic limits: vehicles and bicycles may turn on the spot and slip sideways
     #[arg(long)]
     no_limits: bool,
-    /// The network alone: nothing is drawn again, nothing held back
+    /// The network alone: no rejection sampling, no kinematic limits
     #[arg(long)]
     raw: bool,
-    /// The paper's decoding: temperature 1.1, decay 1.2, no rules; straight lines between frames, smoothed
+    /// The paper's decoding: temperature 1.1, decay 1.2, no rejection or limits; linear
+    /// interpolation between frames, smoothed
     #[arg(long)]
     paper: bool,
-    /// With rules alone, where tables show the network alone beside it
+    /// Only with rejection and limits, where tables otherwise show the network alone as well
     #[arg(long)]
     ruled: bool,
-    /// Agents come and leave, as many as at the start
+    /// Spawn and remove agents at the scene's boundary, as many as at the start
     #[arg(long, visible_alias = "spawn")]
     life: bool,
-    /// What traffic lights show after the present
+    /// Traffic lights after the present
     #[arg(long, value_enum, default_value_t = LightsName::Model)]
     lights: LightsName,
 }
@@ -72,22 +74,22 @@ enum ModeName {
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum CacheName {
-    /// Every pass reads the whole window
+    /// No key/value cache: every pass recomputes the whole window
     None,
-    /// The window slides; within a frame nothing is read twice
+    /// Sliding window; nothing is recomputed within a frame
     Window,
-    /// The window grows as far as it fits; between frames nothing is read twice either
+    /// Growing window, as far as it fits; nothing is recomputed between frames either
     Growing,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum LightsName {
-    /// What signals of such junctions do
+    /// Simulated signal phases
     Model,
-    /// What they show at the present
+    /// As at the present
     Hold,
-    /// What was recorded, which no actor could know
+    /// As recorded (uses the future)
     Log,
 }
 

@@ -28,7 +28,10 @@ const METRICS: [(Component, &str); 3] = [
         Component::DistanceToNearestObject,
         "distance to the nearest agent, m",
     ),
-    (Component::TimeToCollision, "time to collision, s"),
+    (
+        Component::TimeToCollision,
+        "time to collision, s (capped at 5 s)",
+    ),
     (Component::DistanceToRoadEdge, "beyond the road edge, m"),
 ];
 
@@ -78,8 +81,11 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
 fn deeds(judged: &Judged) -> String {
     let deeds = judged.conduct.deeds.iter();
     let words = deeds.map(|(deed, share)| {
-        let name = deed.name().replace('_', " ");
-        format!("{name} {:.0} %", 100.0 * share)
+        let name = deed
+            .name()
+            .replace("slip", "lateral slip")
+            .replace('_', " ");
+        format!("{name} in {:.0} % of futures", 100.0 * share)
     });
     words.collect::<Vec<_>>().join(", ")
 }
@@ -209,7 +215,7 @@ mod tests {
         viewer.futures(&futures);
         realism(&mut viewer, &scenario, &futures);
         let html = viewer.to_html();
-        assert!(html.contains("\"deeds\":\"parked move 100 %\""));
+        assert!(html.contains("\"deeds\":\"parked move in 100 % of futures\""));
         assert_eq!(html.matches("\"realism\":0.0").count(), 1);
     }
 

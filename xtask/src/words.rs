@@ -49,7 +49,7 @@ const OF_THE_RUN: [&str; 8] = [
 ];
 
 /// How a network decodes.
-const DECODING: [&str; 14] = [
+const DECODING: [&str; 12] = [
     "mode",
     "cache",
     "precision",
@@ -62,11 +62,12 @@ const DECODING: [&str; 14] = [
     "raw",
     "paper",
     "ruled",
-    "life",
-    "lights",
 ];
 
-/// How planners that imagine do it.
+/// What traffic does after the present, in every world.
+const TRAFFIC: [&str; 2] = ["life", "lights"];
+
+/// How the interactive planner simulates and chooses.
 const THINKING: [&str; 9] = [
     "futures",
     "allocation",
@@ -174,11 +175,15 @@ fn dress(mut command: Command, verb: &str) -> Command {
         if is(&["device", "kernel"]) && !computes {
             arg.hide(true)
         } else if is(&OF_THE_RUN) {
-            arg.help_heading("Of every run")
+            arg.help_heading("Common options")
+        } else if is(&["ruled"]) && ["simulate", "plan"].contains(&verb) {
+            arg.hide(true)
+        } else if decodes && is(&TRAFFIC) {
+            arg.help_heading("Traffic after the present")
         } else if decodes && is(&DECODING) {
-            arg.help_heading("How a learned world decodes")
+            arg.help_heading("Decoding of a learned world")
         } else if plans && is(&THINKING) {
-            arg.help_heading("How planners that imagine do it")
+            arg.help_heading("Interactive planner")
         } else if drives && is(&DRIVING) {
             arg.help_heading("The drive")
         } else {

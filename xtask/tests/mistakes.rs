@@ -258,8 +258,8 @@ fn a_version_is_told_and_a_device_only_asked_for_where_something_computes() {
     let simulate = help("simulate --help");
     for part in [
         "--device",
-        "How a learned world decodes:",
-        "Of every run:",
+        "Decoding of a learned world:",
+        "Common options:",
         "-s, --scenario",
     ] {
         assert!(simulate.contains(part), "expected {part} in: {simulate}");
@@ -303,7 +303,7 @@ fn a_conversion_that_was_stopped_is_no_data_set() {
     let output = running.wait_with_output().unwrap();
     let error = text(&output.stderr);
     assert_eq!(output.status.code(), Some(130), "{error}");
-    assert!(error.contains("the same command goes on"), "{error}");
+    assert!(error.contains("the same command resumes"), "{error}");
     for reader in [
         "data inspect cache",
         "data stats cache",

@@ -794,7 +794,7 @@ fn a_decision_is_explained() {
     assert_eq!(page.matches("data:image/gif;base64,").count(), 1);
     assert_eq!(page.matches("data:image/png;base64,").count(), 1);
     for part in [
-        "is worth",
+        " scores ",
         "What the others did",
         "time to collision",
         "vehicle 1",
@@ -813,7 +813,7 @@ fn a_decision_is_explained() {
     place.fails(
         &blind,
         2,
-        &["--explain 5", "planner that imagines", "pdm-closed"],
+        &["--explain 5", "--planner interactive", "pdm-closed"],
     );
 }
 

@@ -74,13 +74,11 @@ impl PlannerName {
     pub fn description(self) -> &'static str {
         match self {
             Self::Log => "The recorded driver: an oracle",
-            Self::Idm => "nuPlan's IDM planner: the route, at the limit, behind whoever is ahead",
+            Self::Idm => "nuPlan's IDM planner: the route at the speed limit, following the leader",
             Self::Simple => "Straight on",
             Self::PdmClosed => "PDM-Closed: 15 proposals against a constant-velocity forecast",
-            Self::Imitation => {
-                "What the imagined world has the ego do: the mean of several futures"
-            }
-            Self::Interactive => "19 policies and imitation, each imagined among others who react",
+            Self::Imitation => "Mean ego trajectory of the world model over several futures",
+            Self::Interactive => "19 policies and imitation, each rolled out among reactive agents",
             Self::Proposals => {
                 "PDM's 15 proposals, each alone to the end: two rows, the best of them and the best \
                  in each scenario, an oracle"

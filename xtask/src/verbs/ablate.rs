@@ -55,10 +55,10 @@ pub(crate) struct Args {
     /// model:WEIGHTS [default: the shipped weights]
     #[arg(long, value_name = "W")]
     world: Option<WorldName>,
-    /// How many futures
+    /// Number of futures
     #[arg(long, value_name = "N", default_value = "8")]
     futures: NonZeroUsize,
-    /// How far to imagine
+    /// Simulated seconds
     #[arg(long, value_name = "S", default_value_t = 8.0)]
     seconds: f64,
     #[command(flatten)]

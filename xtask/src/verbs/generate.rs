@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     map: String,
-    /// What kind of situation it is to be: one of nuPlan's 73 scenario tags, at most four times
+    /// Kind of situation: one of nuPlan's 73 scenario tags, may be given up to four times
     #[arg(long, value_name = "TAG")]
     prompt: Vec<String>,
     /// Vehicles besides the ego; with no number given the model decides
@@ -51,47 +51,47 @@ pub(crate) struct Args {
     /// Bicycles
     #[arg(long, value_name = "N")]
     bicycles: Option<usize>,
-    /// People on foot
+    /// Pedestrians
     #[arg(long, value_name = "N")]
     pedestrians: Option<usize>,
-    /// Wishes for single objects
+    /// Constraints on single objects
     #[arg(long, value_name = "FILE.toml")]
     fix: Option<PathBuf>,
-    /// How many scenes
+    /// Number of scenes
     #[arg(long, value_name = "N", default_value = "1")]
     count: NonZeroUsize,
-    /// How far to imagine every scene's future
+    /// Simulated seconds of every scene's future
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     simulate: f64,
-    /// In imagined futures agents come and leave, as many as there are at first
+    /// Spawn and remove agents at the scene's boundary, as many as at the start
     #[arg(long, visible_alias = "spawn")]
     life: bool,
-    /// In which world scenes go on
+    /// Traffic model of the simulated future
     #[arg(long, value_name = "WORLD", default_value_t = shipped::world())]
     world: WorldName,
-    /// What traffic lights show in it
+    /// Traffic lights after the present
     #[arg(long, value_enum, default_value_t = LightsName::Model)]
     lights: LightsName,
-    /// Where the ego starts
+    /// Start of the ego
     #[arg(long, value_enum, default_value_t = StartName::Recorded)]
     start: StartName,
-    /// Where objects may be drawn
+    /// Placement of objects
     #[arg(long, value_enum, default_value_t = PlacementName::Guided)]
     placement: PlacementName,
     /// Weights of the model [default: the shipped ones]
     #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
     weights: Option<PathBuf>,
-    /// Divides the logits; above 1 is bolder [default: 1, with --paper 1.25]
+    /// Divides the logits; above 1 is more diverse [default: 1, with --paper 1.25]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
-    /// Bins that may be drawn per field [default: all, with --paper 400]
+    /// Top-k sampling: bins per field that may be sampled [default: all, with --paper 400]
     #[arg(long, value_name = "N")]
     top_k: Option<NonZeroUsize>,
-    /// Draw as the paper does: every field from the network's distribution as it is, every object
-    /// on its own
+    /// Sample as the paper does: every field from the network's unmodified distribution, every
+    /// object independently
     #[arg(long)]
     paper: bool,
-    /// Scenes made before one is written that is not what the prompt says
+    /// Attempts before a scene that misses the prompt is written
     #[arg(long, value_name = "N", default_value = "20")]
     attempts: NonZeroUsize,
     #[command(flatten)]
@@ -116,7 +116,7 @@ enum StartName {
 pub(crate) enum PlacementName {
     /// Wherever the model puts them
     Free,
-    /// Of what the model proposes, only what is on lanes and walkways
+    /// Only the model's proposals on lanes and walkways
     Guided,
 }
 
@@ -349,7 +349,7 @@ fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
         film.write(run, &alone, &[("generated", &rollout)])?;
         let mut viewer = Viewer::new(&alone);
         viewer
-            .note("a generated scene and its imagined future")
+            .note("a generated scene and its simulated future")
             .future("generated", &rollout);
         viewer.save(&run.path("viewer.html"))?;
     }

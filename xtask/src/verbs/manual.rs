@@ -13,7 +13,7 @@ use crate::run::print_line;
 /// Arguments of `completions`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Completions {
-    /// For which shell
+    /// Shell
     shell: Shell,
 }
 

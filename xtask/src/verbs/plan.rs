@@ -30,13 +30,14 @@ pub(crate) struct Args {
     /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     scenario: String,
-    /// Who plans
+    /// Planner that drives
     #[arg(long, value_parser = PlannerParser, value_name = "P", default_value_t = PlannerName::Interactive)]
     planner: PlannerName,
-    /// Whom it meets, and what it imagines in: log, idm, constant-velocity or model:WEIGHTS
+    /// Traffic model of the drive and of the planner's rollouts: log, idm, constant-velocity or
+    /// model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
-    /// Write a page on the decision of a step [default: the one that mattered most]
+    /// Write a page that explains the decision of a step [default: the most decisive one]
     #[arg(long, value_name = "STEP", num_args = 0..=1, default_missing_value = "decisive")]
     explain: Option<Step>,
     #[command(flatten)]
@@ -252,8 +253,8 @@ impl Args {
         };
         let wrong = if self.planner != PlannerName::Interactive {
             format!(
-                "--explain {asked}: expected a planner that imagines before it decides, \
-                 interactive, found {}",
+                "--explain {asked}: expected --planner interactive, which decides by rollouts, \
+                 found {}",
                 self.planner.name()
             )
         } else if let (Some(scenario), Step::Number(step)) = (scenario, asked) {
@@ -287,7 +288,7 @@ impl Args {
         }) = &noted.explained
         else {
             let wrong = format!(
-                "--explain {asked}: expected a step of the drive and a planner that imagines, \
+                "--explain {asked}: expected a step of the drive and --planner interactive, \
                  found {} steps of {}",
                 noted.steps.len(),
                 self.planner.name()

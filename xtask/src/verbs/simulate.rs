@@ -29,22 +29,23 @@ pub(crate) struct Args {
     /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     scenario: String,
-    /// Simulate the first N scenes of the file or folder, into one viewer with a list of them
+    /// Simulate the first N scenes of the file or folder, into one viewer with a scene list
     #[arg(long, value_name = "N")]
     scenes: Option<NonZeroUsize>,
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W")]
     world: WorldName,
-    /// How many futures
+    /// Number of futures
     #[arg(long, value_name = "N", default_value = "32")]
     futures: NonZeroUsize,
-    /// How far to imagine
+    /// Simulated seconds
     #[arg(long, value_name = "S", default_value_t = 8.0)]
     seconds: f64,
     /// Also write the futures in these formats
     #[arg(long, value_enum, value_name = "F", value_delimiter = ',')]
     format: Vec<Format>,
-    /// Show in the viewer what a learned world drew from, for the first N futures [default N: 1]
+    /// Show in the viewer the distributions the model sampled from, for the first N futures
+    /// [default N: 1]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]
     heat: Option<NonZeroUsize>,
     #[command(flatten)]

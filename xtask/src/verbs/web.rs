@@ -30,7 +30,7 @@ const SCENES: &str = "scenes.json";
 /// Arguments of `web`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Keep the engine that is there: copy the page, the weights and the scenes alone.
+    /// Keep the existing engine; copy only the page, the weights and the scenes.
     #[arg(long)]
     keep_engine: bool,
     #[command(flatten)]

@@ -39,7 +39,7 @@ class PdmClosed(_Planner):
 
 
 class Idm(_Planner):
-    """nuPlan's IDM planner: the route, at the limit, behind whoever is ahead."""
+    """nuPlan's IDM planner: the route at the speed limit, following the leader."""
 
     _gump_planner = "idm"
 
@@ -54,6 +54,6 @@ class Imitation(_Planner):
 
 
 class Interactive(_Planner):
-    """19 policies and imitation, each imagined among others who react."""
+    """19 policies and imitation, each rolled out among reactive agents."""
 
     _gump_planner = "interactive"

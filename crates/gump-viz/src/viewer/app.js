@@ -148,6 +148,9 @@ function button(text, title, act) {
   return b;
 }
 
+// Whether every future is that of a planner's candidate.
+const isPlanned = () => facts.candidates.length > 0 && world.takes.slice(1).every(take => facts.candidates.some(c => c.name === take.name));
+
 function buildTakes(n) {
   const add = (where, text, title, shown) => {
     const b = button(text, title, () => show(shown));
@@ -156,10 +159,10 @@ function buildTakes(n) {
   };
   $('shown').replaceChildren(); $('futures').replaceChildren();
   add('shown', 'recorded', 'The recording (L)', 0);
-  if (n) add('shown', n > 1 ? `all ${n} simulated` : 'simulated', n > 1 ? 'All over one another (A)' : 'The future (A)', n > 1 ? 'all' : 1);
+  if (n) add('shown', n > 1 ? `all ${n} ${isPlanned() ? 'candidates' : 'simulated'}` : 'simulated', n > 1 ? 'Overlay all (A)' : 'The future (A)', n > 1 ? 'all' : 1);
   $('futures-title').hidden = $('futures').hidden = n < 2;
   // A long name is told of when it is shown; its button has its number.
-  if (n > 1) for (let i = 1; i <= n; i++) add('futures', isLong(world.takes[i].name) ? i : world.takes[i].name, `Future ${world.takes[i].name}`, i);
+  if (n > 1) for (let i = 1; i <= n; i++) add('futures', isLong(world.takes[i].name) ? i : world.takes[i].name, `${isPlanned() ? 'Candidate' : 'Future'} ${world.takes[i].name}`, i);
 }
 
 function buildCandidates() {
@@ -268,7 +271,8 @@ function dress() {
   for (const made of document.querySelectorAll('[data-parts]')) made.hidden = made.dataset.parts !== String(ui.candidate) || !made.children.length;
   for (const [name, on] of [['follow', ui.follow >= 0], ['heading', ui.heading], ['trails', ui.trails], ['up', ui.up === 'ego'], ['beside', ui.left !== null], ['ruler', ui.ruling]]) press(document.querySelector(`[data-do=${name}]`), on);
   const named = ui.shown > 0 && isLong(world.takes[ui.shown].name);
-  $('futures-title').textContent = named ? `Futures: ${world.takes[ui.shown].name}` : 'Futures';
+  const title = isPlanned() ? 'Candidates' : 'Futures';
+  $('futures-title').textContent = named ? `${title}: ${world.takes[ui.shown].name}` : title;
   $('panes').classList.toggle('two', ui.left !== null);
   const [one, other] = $('panes').children;
   one.textContent = ui.left === null ? '' : takeName(world, ui.left);
@@ -360,7 +364,7 @@ function dressAgent() {
 function buildHeat(box) {
   const title = document.createElement('h3'), none = document.createElement('p'), holder = document.createElement('div');
   title.id = 'heat-title'; none.id = 'heat-none'; holder.id = 'heat';
-  for (const name of ['where: + is what came out', 'speed, m/s: the line is what came out', 'turn, degrees, left is +']) {
+  for (const name of ['position: + marks the sample drawn', 'speed, m/s: the line marks the sample drawn', 'turn, degrees, left is +']) {
     const figure = document.createElement('figure'), caption = document.createElement('figcaption');
     caption.textContent = name;
     figure.append(caption, document.createElement('canvas'));
@@ -376,12 +380,12 @@ function drawHeatPanel() {
   holder.hidden = !map; $('heat-none').hidden = Boolean(map);
   if (!map) {
     const kept = world.heat.filter(map => map.agent === ui.selected), takes = [...new Set(kept.map(map => world.takes[map.take].name))];
-    $('heat-title').textContent = 'What it might do next';
+    $('heat-title').textContent = 'Predictive samples';
     $('heat-none').textContent = `Kept for simulated future ${takes.join(', ')} from the present on.`;
     return;
   }
   const where = ui.shown === 'all' ? `future ${world.takes[take].name}, ` : '';
-  $('heat-title').textContent = `What it might do by +${(map.from + map.ahead).toFixed(1)} s: ${where}${map.draws} draws`;
+  $('heat-title').textContent = `Predictive samples for +${(map.from + map.ahead).toFixed(1)} s: ${where}${map.draws} samples`;
   const [place, speed, turn] = holder.querySelectorAll('canvas'), went = stateAt(world, take, ui.selected, map.from + map.ahead);
   const degrees = went ? ((went.heading - map.heading) * 180 / Math.PI % 360 + 540) % 360 - 180 : NaN;
   drawHeatMap(place, map, went, colours(), ui.dark);
@@ -398,7 +402,7 @@ function drawAgentPanel() {
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
     ['position', `${(s.x + facts.origin[0]).toFixed(1)}, ${(s.y + facts.origin[1]).toFixed(1)} m`], ['size', `${length.toFixed(1)} \u00d7 ${width.toFixed(1)} m`],
     ...(realism === null ? [] : [['realism', `${realism.toFixed(2)} of 1`]]),
-    ...(deeds === null ? [] : [['in futures', deeds]]),
+    ...(deeds === null ? [] : [['implausible', deeds]]),
   ] : [['', 'not there at this time']];
   $('state').replaceChildren(...rows.flatMap(([name, value]) => {
     const dt = document.createElement('dt'), dd = document.createElement('dd');
@@ -522,7 +526,7 @@ function endAt(event, [px, py]) {
 // What the ruler says, in words, of the take at the right.
 function tellRuler() {
   const found = ui.ends.length > 1 ? measure(world, heatTake(ui, world), ui.ends, ui.t) : null;
-  const asks = ui.ends.length ? 'Now the other end.' : 'Drag from a place or an agent to another.';
+  const asks = ui.ends.length ? 'Now the other end.' : 'Drag from one place or agent to another.';
   $('measure').hidden = !ui.ruling && !ui.ends.length;
   $('measure').textContent = found ? found.words : ui.ends.length > 1 ? 'One of the agents is not there at this time.' : asks;
 }
@@ -566,7 +570,7 @@ function buildMarks() {
   const rows = [
     [true, 'road', box(c.road)],
     [has('route'), "the ego's route", box(c.route)],
-    [has('lane'), 'way of travel', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
+    [has('lane'), 'driving direction', `<path d="M8 3l6 4-6 4" stroke="${c.direction}" stroke-width="2" fill="none"/>`],
     [has('edge'), 'road edge', line(c.edge)],
     [['brokenWhite', 'solidWhite', 'brokenYellow', 'solidYellow'].some(has), 'lane marking', box(c.road) + line(c.whiteLine, 'stroke-dasharray="5 3"')],
     [has('crosswalk'), 'crosswalk', box(c.road) + [4, 10, 16].map(x => `<rect x="${x}" y="3" width="3" height="8" fill="${c.crosswalk}"/>`).join('')],
@@ -574,14 +578,14 @@ function buildMarks() {
     [has('stopLine'), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
     [has('stopSign'), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
     [facts.lights.length, 'traffic light', spot(c.red)],
-    [true, 'the ego has a rim', box('none', `stroke="${c.ego}" stroke-width="3"`)],
+    [true, 'ego (outlined)', box('none', `stroke="${c.ego}" stroke-width="3"`)],
     [true, 'front', `<path d="M8 3l10 4-10 4z" fill="${c.text}" opacity="0.7"/>`],
     [true, 'chosen agent', box('none', `stroke="${c.text}" stroke-width="1.6"`)],
     [true, 'fading: last 2 s', line(c.vehicle, 'stroke-width="4" opacity="0.6"')],
-    [true, 'thin: way to come', line(c.vehicle, 'opacity="0.6"')],
+    [true, 'thin: future path', line(c.vehicle, 'opacity="0.6"')],
     [n > 1, 'pale boxes: one per future', box(c.vehicle, 'opacity="0.3"')],
     [facts.candidates.length, "planner's candidate; bold: chosen", line(c.text)],
-    [world.heat.length, 'where it may be next', spot(scaled(0.7, ui.dark))],
+    [world.heat.length, 'predicted positions', spot(scaled(0.7, ui.dark))],
   ];
   list.replaceChildren(...rows.filter(([is]) => is).map(([, name, drawn]) => {
     const item = document.createElement('li');

@@ -2,11 +2,12 @@
 
 // What a chart shows of its curves: from a round number to a round number, and the step they are
 // multiples of.
-function rangeOf(curves, { range, base, fixed }) {
+function rangeOf(curves, { range, base, fixed, zero }) {
   if (fixed) return [...fixed, (fixed[1] - fixed[0]) / 2];
   let low = Infinity, high = -Infinity;
   for (const { points } of curves) for (const [, y] of points) if (Number.isFinite(y)) { low = Math.min(low, y); high = Math.max(high, y); }
   if (!(low <= high)) [low, high] = [0, range];
+  if (zero) [low, high] = [Math.min(low, 0), Math.max(high, 0)];
   // Noise is not to fill the chart: it shows so many units at least, and from zero where that is near.
   if (base === 0 && low >= 0 && low < 2 * range) low = 0;
   if (high - low < range) {
@@ -30,8 +31,8 @@ function drawChart(canvas, curves, [from, to], now, colours, quantity) {
   c.fillStyle = c.strokeStyle = colours.text;
   c.globalAlpha = 0.75; c.textAlign = 'right'; c.textBaseline = 'middle';
   c.fillText(high.toFixed(digits), left - 5, top + 3);
-  // Zero has a line of its own where the curve crosses it.
-  if (low < 0 && high > 0) {
+  // Zero has a line of its own where the curve crosses it, or where it means something.
+  if (quantity.zero ? low <= 0 && high >= 0 : low < 0 && high > 0) {
     if (Math.min(py(0) - top, h - bottom - py(0)) > 12) c.fillText('0', left - 5, py(0));
     c.globalAlpha = 0.35; c.fillRect(left, py(0), w - left - right, 1); c.globalAlpha = 0.75;
   }
@@ -82,7 +83,7 @@ function quantities(world, agent) {
   });
   const own = world.metrics.filter(track => track.agent === agent);
   for (const name of facts.metrics.filter(name => own.some(track => track.name === name))) list.push({
-    name: name.split(', ')[0], unit: name.split(', ')[1] || '', range: 2, fixed: name.endsWith(', 0 to 1') ? [0, 1] : null, of: take => {
+    name: name.split(', ')[0], unit: name.split(', ')[1] || '', range: 2, zero: name.startsWith('beyond '), fixed: name.endsWith(', 0 to 1') ? [0, 1] : null, of: take => {
       const track = own.find(track => track.name === name && track.take === take), { first, dt } = world.takes[take];
       return track ? track.values.map((v, i) => [first + (track.first + i) * dt, v]) : [];
     },

@@ -30,7 +30,7 @@ pub(crate) struct Args {
     /// Agents in the scene
     #[arg(long, value_name = "N", default_value_t = 32)]
     agents: usize,
-    /// Futures imagined together
+    /// Futures simulated together
     #[arg(long, value_name = "N", default_value_t = 32)]
     futures: usize,
     /// Frames per measurement, half a second each

@@ -38,7 +38,7 @@ pub(crate) struct Args {
         default_value = "32"
     )]
     agents: Vec<usize>,
-    /// Futures imagined together
+    /// Futures simulated together
     #[arg(
         long,
         value_name = "N,...",
@@ -50,7 +50,7 @@ pub(crate) struct Args {
     /// others are left out
     #[arg(long, value_name = "WAY,...", value_delimiter = ',')]
     only: Vec<String>,
-    /// In which form the weights are multiplied
+    /// Number format of the weights
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
     /// Frames per measurement of partial autoregression, half a second each

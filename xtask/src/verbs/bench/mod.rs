@@ -13,9 +13,9 @@ use gump_scene::{Scenario, fixture};
 /// What is measured.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
-    /// Imagining: orders of decoding, caches, batches and sizes, against the machine's own rate
+    /// Simulation: decoding orders, caches, batches and sizes, against the machine's own rate
     Engine(engine::Args),
-    /// The chosen device against the CPU: do they say the same, and how fast
+    /// The chosen device against the CPU: agreement and speed
     Device(device::Args),
     /// Scoring the realism of 32 rollouts, against the official evaluator
     Wosac(wosac::Args),

@@ -38,10 +38,10 @@ pub(crate) struct Args {
     /// Vehicles besides the ego
     #[arg(long, value_name = "N", default_value_t = 50)]
     agents: usize,
-    /// Decisions of the interactive planner among learned drivers to take the time of
+    /// Decisions of the interactive planner among learned drivers to time
     #[arg(long, value_name = "N", default_value = "5")]
     decisions: NonZeroUsize,
-    /// In which form the weights of the learned drivers are multiplied
+    /// Number format of the learned drivers' weights
     #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
     precision: PrecisionName,
     #[command(flatten)]

@@ -25,7 +25,7 @@ pub(crate) struct Args {
     /// Rollouts to score
     #[arg(long, value_name = "N", default_value = "32")]
     rollouts: NonZeroUsize,
-    /// Times to repeat; the median counts
+    /// Repetitions; the median is reported
     #[arg(long, value_name = "N", default_value = "7")]
     repeat: NonZeroUsize,
     #[command(flatten)]

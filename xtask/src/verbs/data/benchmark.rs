@@ -17,19 +17,20 @@ pub(crate) struct Args {
     /// A list of scenes, for instance datasets/benchmarks/synthetic-tune.toml
     #[arg(long, value_name = "LIST.toml")]
     list: PathBuf,
-    /// Make nothing: hold what is in this folder to the list [default: make into --out]
+    /// Only verify this folder against the list [default: generate into --out]
     #[arg(long, value_name = "DIR")]
     check: Option<PathBuf>,
     /// Folder of recorded data [default: GUMP_RECORDED, else shared/data beside the checkout]
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Write the sums of what is made into the list: for a new list, never for a published one
+    /// Write the checksums of generated scenes into the list: for a new list, never for a
+    /// published one
     #[arg(long, conflicts_with = "check")]
     freeze: bool,
-    /// Make nothing: draw a new list from this one, of at most so many scenes of each split
+    /// Only draw a new list from this one, with at most so many scenes of each split
     #[arg(long, value_name = "N", requires = "into", conflicts_with_all = ["check", "freeze"])]
     draw: Option<NonZeroUsize>,
-    /// Where the new list goes; its name is the file's
+    /// File of the new list, which is named after it
     #[arg(long, value_name = "LIST.toml", requires = "draw")]
     into: Option<PathBuf>,
     /// Draw only scenes in which a planner of --report scored below this in some world, 0 to 1

@@ -25,10 +25,10 @@ pub(crate) struct Args {
     /// A file or directory of any readable format
     #[arg(long, value_name = "PATH")]
     from: PathBuf,
-    /// Folder for the converted files; an interrupted conversion goes on there
+    /// Folder for the converted files; an interrupted conversion resumes there
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
-    /// What to write
+    /// Output format
     #[arg(long, value_enum, default_value_t = Format::Cache)]
     format: Format,
     /// Smooth the tracks of noisy recordings, such as NGSIM's, with velocities that fit; those of
@@ -150,7 +150,7 @@ impl Args {
         run.result("problems", &all.refused)?;
         if run::interrupted() && converted.is_err() {
             anyhow::bail!(
-                "stopped by Ctrl-C; the same command goes on, and until it is done {} says that \
+                "stopped by Ctrl-C; the same command resumes, and until it is done {} says that \
                  the data set is not whole",
                 mark.display()
             );

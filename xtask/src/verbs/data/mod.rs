@@ -12,16 +12,16 @@ pub(crate) use inspect::picture;
 /// What to do with data.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
-    /// What is in a file or directory
+    /// Show what is in a file or directory
     Inspect(inspect::Args),
     /// Check every record; exit status 1 if anything is broken
     Verify(verify::Args),
-    /// What scenes consist of, as a table: agents, speeds, roads, lights, kinds of situation
+    /// Statistics of scenes: agents, speeds, roads, lights, kinds of situation
     Stats(stats::Args),
-    /// Turn any readable format into the cache that training reads from, or into another format
+    /// Convert any readable format into the training cache or another format
     Convert(convert::Args),
-    /// Make up scenarios that are free of any recording's licence
+    /// Generate synthetic scenarios, free of any recording's licence
     Synthesize(synthesize::Args),
-    /// The scenes of a frozen list, made anew or looked for, and held to its sums
+    /// Regenerate or find a frozen list's scenes and verify checksums
     Benchmark(benchmark::Args),
 }

@@ -31,36 +31,36 @@ const BARREN_RUNS: u64 = 8;
 /// Arguments of `data synthesize`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// How scenes come about
+    /// Generator of the scenes
     #[arg(long, value_enum, default_value_t = Kind::Procedural)]
     kind: Kind,
-    /// How many scenes
+    /// Number of scenes
     #[arg(long, value_name = "N")]
     scenes: NonZeroUsize,
     /// Multiplies the number of agents, 0.1 to 3
     #[arg(long, value_name = "X", default_value_t = 1.0)]
     density: f64,
-    /// For --kind sumo: how long scenes go on after their present, seconds, 1 to 600
+    /// For --kind sumo: seconds of future in each scene, 1 to 600
     #[arg(long, value_name = "X", default_value_t = FUTURE_S)]
     seconds: f64,
     /// The kind of road, for instance "roundabout" [default: any]
     #[arg(long, value_name = "NAME", value_parser = road_family)]
     #[serde(serialize_with = "as_name")]
     family: Option<RoadFamily>,
-    /// What scenes are like: plain, or recorded-like
+    /// Profile of the scenes: plain, or recorded-like
     #[arg(long, value_name = "NAME", value_parser = profile_of_name, default_value = "plain")]
     #[serde(serialize_with = "profile_name")]
     profile: Profile,
-    /// Show scenes of a profile as they are, without what a tracker misses and gets wrong
+    /// Ground truth of a profile's scenes, without simulated tracker errors
     #[arg(long)]
     clean: bool,
-    /// Write the cache that training reads from instead of Waymo's format
+    /// Write the training cache instead of Waymo's format
     #[arg(long)]
     cache: bool,
     /// Files to spread the scenes over [default: 8, or one per scene if those are fewer]
     #[arg(long, value_name = "N")]
     shards: Option<NonZeroUsize>,
-    /// For --kind sumo: a network, or a folder of networks to take in turn [default: made anew]
+    /// For --kind sumo: a network, or a folder of networks to take in turn [default: generated]
     #[arg(long, value_name = "FILE_OR_DIR")]
     network: Option<PathBuf>,
     #[command(flatten)]

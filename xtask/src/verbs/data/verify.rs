@@ -15,7 +15,7 @@ pub(crate) struct Args {
     /// Files or directories
     #[arg(value_name = "PATH", required = true)]
     paths: Vec<PathBuf>,
-    /// Tell what is odd one by one, not only in counts
+    /// List every suspicious item, not only counts
     #[arg(long)]
     list: bool,
     #[command(flatten)]

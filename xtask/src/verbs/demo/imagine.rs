@@ -82,9 +82,9 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     show(demo, run, &learned)?;
     demo.futures = learned;
     demo.page
-        .section("How good they are")
+        .section("Metrics of the futures")
         .prose(
-            "One scene says little: the benchmarks in the README are over hundreds. The scene is \
+            "One scene says little; the benchmarks in the README use hundreds. The scene is \
              synthetic, and rules close to those of idm drove its recording, which helps idm here.",
         )
         .table(
@@ -109,15 +109,15 @@ fn columns() -> Vec<(String, String)> {
     let said = [
         (
             "learned",
-            "the shipped network, under rules that draw again what would collide or leave the road \
-             and hold back what a body cannot do",
+            "the shipped network, with rejection of collisions and off-road samples, and kinematic \
+             limits",
         ),
         ("learned (raw)", "the same network alone"),
         (
             "idm",
-            "everyone follows their lane and who is ahead, and yields",
+            "every agent follows its lane and its leader, and yields",
         ),
-        ("constant-velocity", "everyone goes straight on"),
+        ("constant-velocity", "every agent keeps its velocity"),
         (
             "log",
             "the recording itself: what a perfect world would score",
@@ -167,7 +167,7 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
     demo.page
         .section("Futures")
         .prose(
-            "From the present on, the shipped network drives everyone, the ego too. Beside the \
+            "From the present on, the shipped network drives all agents, the ego too. Beside the \
              recording, three of its futures:",
         )
         .film(
@@ -175,7 +175,7 @@ fn show(demo: &mut Demo, run: &Run, rollouts: &[Rollout]) -> anyhow::Result<()> 
             "Top left the recording, then three simulated futures.",
         )
         .link("viewer.html", "Play all of them in the viewer")
-        .link("overlay.gif", "Watch all of them over one another");
+        .link("overlay.gif", "Overlay all futures");
     Ok(())
 }
 

@@ -80,12 +80,12 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         .section("A scene from a prompt")
         .prose(&format!(
             "On the same map, the sequence network placed {} vehicles, {} pedestrians and {} bicycles \
-             so that \"{PROMPT}\" holds; the tag is one of nuPlan's 73.",
+             so that \"{PROMPT}\" is satisfied; the tag is one of nuPlan's 73.",
             COUNTS.vehicles, COUNTS.pedestrians, COUNTS.bicycles
         ))
         .picture(&picture, "The generated scene.")?
-        .table(&["the scene was to satisfy", "holds"], &table)
-        .link("generated.gif", "Watch it go on in the learned world");
+        .table(&["constraint", "satisfied"], &table)
+        .link("generated.gif", "Play the rollout in the learned world");
     Ok(json!({
         "agents": present.now().agents().len(),
         "attempts": made.attempts,

@@ -43,19 +43,19 @@ pub(crate) struct Args {
     /// the shipped data that are for training]
     #[arg(long, value_name = "PATH")]
     bank: Option<PathBuf>,
-    /// At most so many scenarios that take part [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
-    /// Recorded vehicles within 50 m that a scenario needs to take part
+    /// Recorded vehicles within 50 m that a scenario needs at least
     #[arg(long, value_name = "N", default_value_t = 8)]
     min_vehicles: usize,
-    /// Maps that each tag is asked for on, among those that admit it; 0 leaves prompts out
+    /// Maps per prompt tag, among those that admit it; 0 leaves prompts out
     #[arg(long, value_name = "N", default_value_t = 2)]
     prompt_maps: usize,
-    /// Scenes made per prompt before the last one counts
+    /// Attempts per prompt; the last one counts
     #[arg(long, value_name = "N", default_value_t = 12)]
     attempts: usize,
-    /// Made-up scenes that are imagined for 30 s, with and without agents that come and leave
+    /// Generated scenes rolled out for 30 s, with and without agents that spawn and leave
     #[arg(long, value_name = "N", default_value_t = 8)]
     long_scenes: usize,
     /// Weights of the model [default: the shipped ones]

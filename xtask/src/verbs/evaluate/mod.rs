@@ -28,17 +28,17 @@ pub(crate) enum Verb {
     Motion(motion::Args),
     /// Realism: the Waymo Sim Agents Challenge
     Wosac(wosac::Args),
-    /// What a driver would notice, in worlds and in the log: parked cars that move, overlaps, slip
+    /// Implausible actions in worlds and in the log: parked cars that move, overlaps, slip
     Behaviour(behaviour::Args),
-    /// The ego leaves its log; who runs into it
+    /// How agents react when the ego departs from its log
     Reactions(reactions::Args),
-    /// Generated scenes: likeness to recorded ones, overlaps, prompts
+    /// Generated scenes: similarity to recorded ones, overlaps, prompt satisfaction
     Generation(generation::Args),
-    /// How well a planner drives, as nuPlan scores it
+    /// Closed-loop planning, with nuPlan's scores
     ClosedLoop(closed_loop::Args),
-    /// How near a planner's plans are to what was driven
+    /// Open-loop planning: distance of plans from the recorded drive
     OpenLoop(open_loop::Args),
-    /// Put the shards of one evaluation together
+    /// Merge the shards of one evaluation
     Merge(merge::Args),
 }
 

@@ -30,13 +30,13 @@ pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// Who plans; several for several rows
+    /// Planners to evaluate, comma-separated, one row each
     #[arg(long, value_parser = PlannerParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
-    /// What planners imagine in: idm or model:WEIGHTS
+    /// Traffic model of planners' rollouts: idm or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
-    /// At most so many scenarios [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
     #[command(flatten)]

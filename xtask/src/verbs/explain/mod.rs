@@ -34,7 +34,7 @@ impl Explained<'_> {
     ///
     /// Error: files that cannot be written.
     pub(crate) fn write(&self, run: &Run) -> anyhow::Result<()> {
-        let title = format!("Why the ego does that: {}", self.scenario.id);
+        let title = format!("Why this candidate: {}", self.scenario.id);
         let mut page = Page::new(title);
         self.choice(&mut page)?;
         let order = ranked(self.decision);
@@ -70,8 +70,8 @@ impl Explained<'_> {
         let mut compared = Vec::new();
         let ordinary = reasons::ordinary(decision);
         for (what, other) in [
-            ("the best that was rejected and goes elsewhere", rejected),
-            ("who drives at the limit and imagines nothing", ordinary),
+            ("the best alternative with another path", rejected),
+            ("IDM at the speed limit, without rollouts", ordinary),
         ] {
             let Some(i) = other.filter(|&i| i != decision.chosen && !compared.contains(&i)) else {
                 continue;
@@ -79,7 +79,7 @@ impl Explained<'_> {
             compared.push(i);
             let other = &decision.prospects[i];
             section.prose(&format!(
-                "\"{}\" is worth {}; \"{}\", {what}, {}. {}",
+                "\"{}\" scores {}; \"{}\", {what}, {}. {}",
                 chosen.kind,
                 rounded(chosen.value),
                 other.kind,
@@ -199,9 +199,9 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
         true => String::new(),
         false => format!(" Equal for all: {}.", all_alike.join(", ")),
     };
-    page.section("What each is worth")
+    page.section("Scores")
         .prose(&format!(
-            "Means over the futures that a candidate was imagined in. Gates (collision, road, \
+            "Means over a candidate's futures. Gates (collision, road, \
              direction) multiply; progress, time to collision, the speed limit and comfort add with \
              weights of 5, 5, 4 and 2.{alike}"
         ))
@@ -242,7 +242,7 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
     page.section("What the others did")
         .prose(&format!(
             "Means over the futures, with the chosen candidate (\"{}\") and with the best rejected \
-             one (\"{}\"). Who drives less far with the one than with the other gives way to it.",
+             one (\"{}\"). An agent that drives less far with one of them yields to it.",
             shown[0].kind, shown[1].kind
         ))
         .table(
@@ -314,7 +314,7 @@ fn viewer<'a>(
     order: &[usize],
 ) -> Viewer<'a> {
     let mut viewer = Viewer::new(scenario);
-    viewer.note("The first imagined future of every candidate, the chosen one first.");
+    viewer.note("The first simulated future of every candidate, the chosen one first.");
     for &i in order {
         let prospect = &decision.prospects[i];
         viewer.future(prospect.kind.to_string(), &prospect.futures[0]);

@@ -89,7 +89,7 @@ pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> V
     }
     told.extend(approaches(chosen, other, near));
     if told.is_empty() {
-        told.push("Nothing: both are worth the same, and ties go to more progress.".into());
+        told.push("Nothing: both have the same score, and ties go to more progress.".into());
     }
     told
 }

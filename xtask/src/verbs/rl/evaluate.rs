@@ -35,10 +35,10 @@ pub(crate) struct Args {
     /// A folder with a manifest.toml, whose test scenarios are taken, or any file or folder
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
-    /// At most so many scenarios [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
-    /// How often each scenario is driven, each time in other traffic of the same world
+    /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
     #[command(flatten)]

@@ -31,13 +31,13 @@ const STEP: f64 = 0.5;
 
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
-    /// Learn to drive, by soft actor-critic in a world or by imitation of the log.
+    /// Train a driving policy, by soft actor-critic in a world or by imitation of the log.
     Train(train::Args),
-    /// Let policies drive and print the paper's columns.
+    /// Evaluate policies in closed loop and print the paper's columns.
     Evaluate(evaluate::Args),
     /// Serve environments to Python and others over a Unix socket, until Ctrl-C.
     Serve(serve::Args),
-    /// Train all policies of the paper's table and evaluate them, going on where it stopped.
+    /// Train and evaluate all policies of the paper's table, resuming where it stopped.
     Table(table::Args),
 }
 

@@ -18,22 +18,22 @@ use crate::run::{Common, Run, interrupted};
 /// Arguments of `rl serve`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Where to listen
+    /// Socket to listen on
     #[arg(long, value_name = "PATH")]
     socket: PathBuf,
     /// A file or folder of scenarios to drive through; of a data set those of its train split
     #[arg(long, value_name = "PATH")]
     scenarios: PathBuf,
-    /// Who moves the others: log, idm, constant-velocity or model:WEIGHTS
+    /// Traffic model: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "log")]
     world: WorldName,
-    /// Read no more scenarios than that
+    /// Maximum number of scenarios
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
-    /// Seconds until an episode is cut off
+    /// Seconds until an episode is truncated
     #[arg(long, value_name = "S", default_value_t = 8.0)]
     horizon: f64,
-    /// Drive scenarios that were failed lately more often
+    /// Sample recently failed scenarios more often
     #[arg(long)]
     prioritized: bool,
     #[command(flatten)]

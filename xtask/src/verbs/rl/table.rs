@@ -17,10 +17,10 @@ use crate::sampling::Sampling;
 /// Arguments of `rl table`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Where to train beside the log: model:WEIGHTS, or any other world
+    /// World to train in besides the log: model:WEIGHTS, or any other world
     #[arg(long, value_name = "W")]
     world: WorldName,
-    /// Worlds to test in beside the log and --world, such as a model that nobody trained in
+    /// Worlds to test in besides the log and --world, such as a model not used in training
     #[arg(long, value_name = "W", value_delimiter = ',')]
     test_world: Vec<WorldName>,
     /// Scenarios to train on: a folder with a manifest.toml, or any file or folder
@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// Policies of each kind, which differ in their seeds
     #[arg(long, value_name = "N", default_value_t = 3)]
     policies: u64,
-    /// How often each scenario is driven, each time in other traffic of the same world
+    /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
     #[command(flatten)]

@@ -27,10 +27,10 @@ const POINTS_PER_SEGMENT: usize = 10;
 /// Arguments of `rl train`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// What is learned from
+    /// Learning algorithm
     #[arg(long, value_enum, default_value_t = AlgorithmName::Sac)]
     algorithm: AlgorithmName,
-    /// log, idm, constant-velocity or model:WEIGHTS; imitation knows the log alone
+    /// log, idm, constant-velocity or model:WEIGHTS; imitation only with log
     #[arg(long, value_name = "W", default_value = "log")]
     train_world: WorldName,
     /// A folder with a manifest.toml, or any file or folder of scenarios
@@ -39,10 +39,10 @@ pub(crate) struct Args {
     /// Gradient steps [default: the configuration's]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
-    /// Stop at the first checkpoint from this gradient step on, to go on with --resume
+    /// Stop at the first checkpoint from this gradient step on; continue with --resume
     #[arg(long, value_name = "N")]
     stop_at: Option<usize>,
-    /// Go on with the run in --out, with the configuration it began with
+    /// Continue the run in --out with its original configuration
     #[arg(long)]
     resume: bool,
     #[command(flatten)]
@@ -53,13 +53,13 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What is learned from.
+/// Learning algorithm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum AlgorithmName {
-    /// Rewards, and a share of expert transitions
+    /// Soft actor-critic: rewards, and a share of expert transitions
     Sac,
-    /// The log's actions
+    /// Imitation of the log's actions
     Imitation,
 }
 
@@ -270,7 +270,7 @@ impl Job<'_> {
             }
             anyhow::ensure!(
                 !run::interrupted(),
-                "stopped by Ctrl-C after step {} of {total}, go on with --resume from the last \
+                "stopped by Ctrl-C after step {} of {total}, continue with --resume from the last \
                  checkpoint",
                 training.steps()
             );

@@ -48,10 +48,10 @@ struct Source {
     /// A file of `ScenarioRollouts`, or a folder of such files
     #[arg(long, value_name = "PATH")]
     rollouts: Option<PathBuf>,
-    /// Imagine them: idm, constant-velocity or model:WEIGHTS
+    /// Simulate them: idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W")]
     world: Option<WorldName>,
-    /// Pack nothing: check this archive
+    /// Only check this archive
     #[arg(long, value_name = "FILE")]
     archive: Option<PathBuf>,
 }
@@ -65,13 +65,13 @@ struct Maker {
     /// Name of the method, short and unique
     #[arg(long, value_name = "NAME", default_value = "")]
     method: String,
-    /// Names with commas between
+    /// Authors, comma-separated
     #[arg(long, value_name = "NAMES", default_value = "")]
     authors: String,
-    /// Where they work
+    /// Their affiliation
     #[arg(long, value_name = "TEXT")]
     affiliation: Option<String>,
-    /// The method in a few words
+    /// Short description of the method
     #[arg(long, value_name = "TEXT")]
     description: Option<String>,
     /// Where the method is described
@@ -86,10 +86,10 @@ struct Maker {
     /// The method uses camera data
     #[arg(long)]
     uses_camera_data: bool,
-    /// Public models it was pretrained with, with commas between
+    /// Public models it was pretrained with, comma-separated
     #[arg(long, value_name = "NAMES", default_value = "")]
     public_models: String,
-    /// The futures were imagined in closed loop at 10 Hz, as the rules demand
+    /// The futures were simulated in closed loop at 10 Hz, as the rules demand
     #[arg(long)]
     complies_with_closed_loop: bool,
 }

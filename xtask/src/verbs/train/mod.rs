@@ -45,13 +45,14 @@ const LOSSES: &str = "losses.csv";
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     /// A folder with a manifest.toml, or any file or folder of scenarios; a cache is not held in
-    /// memory; or `fresh:PROFILE` or `fresh:PROFILE:SEED`, scenes made up on the way, none of which comes back
+    /// memory; or `fresh:PROFILE` or `fresh:PROFILE:SEED`, synthetic scenes generated on the fly,
+    /// each used once
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
     /// Scenarios to validate on [default: the manifest's]
     #[arg(long, value_name = "PATH")]
     validation: Option<PathBuf>,
-    /// Weights to go on from, with a fresh optimiser and schedule
+    /// Initial weights, with a new optimiser and schedule
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// The size of the model: tiny, small, base or medium; or `relative`, the network with relative
@@ -64,14 +65,14 @@ pub(crate) struct Args {
     /// Samples per step
     #[arg(long, value_name = "N")]
     batch: Option<usize>,
-    /// Stop after this step, to go on with --resume
+    /// Stop after this step; continue with --resume
     #[arg(long, value_name = "N")]
     stop_at: Option<usize>,
-    /// Go on with the run in --out, with the configuration it began with
+    /// Continue the run in --out with its original configuration
     #[arg(long)]
     resume: bool,
-    /// Futures of each of up to 8 validation scenes, whose realism is told ten times in a run; 0
-    /// tells the loss alone
+    /// Futures of each of up to 8 validation scenes for realism, evaluated ten times per run; 0
+    /// reports the loss only
     #[arg(long, value_name = "N", default_value_t = 2)]
     realism_rollouts: usize,
     #[command(flatten)]
@@ -419,7 +420,7 @@ fn learn(
         let step = trainer.steps_done();
         anyhow::ensure!(
             !trainer.any(run::interrupted())?,
-            "stopped by Ctrl-C after step {step} of {total}, go on with --resume"
+            "stopped by Ctrl-C after step {step} of {total}, continue with --resume"
         );
         let report = trainer.step()?;
         progress.message(&format!("training, loss {:.3}", report.loss.total));

@@ -36,20 +36,20 @@ pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, side by side
+    /// log, idm, constant-velocity or model:WEIGHTS; comma-separated
     #[arg(long, value_name = "W", required = true, num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
-    /// How far to look: 8, 30 or 60; the log only as far as it goes
+    /// Seconds to evaluate: 8, 30 or 60; the log only as far as it goes
     #[arg(long, value_name = "S", default_value = "8", value_parser = horizon)]
     seconds: u32,
-    /// Futures of each scenario; worlds without chance have one
+    /// Futures of each scenario; deterministic worlds have one
     #[arg(long, value_name = "N", default_value = "8")]
     futures: NonZeroUsize,
-    /// At most so many scenarios, the first [default: all]
+    /// Use only the first N scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
     #[command(flatten)]
@@ -189,7 +189,7 @@ impl Args {
                 progress.advance(1);
                 anyhow::ensure!(
                     !interrupted(),
-                    "stopped by Ctrl-C; the same command goes on after scenario {index}"
+                    "stopped by Ctrl-C; the same command resumes after scenario {index}"
                 );
             }
             Ok(())

@@ -39,13 +39,13 @@ pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// Who plans; several, apart by commas, for several rows
+    /// Planners to evaluate, comma-separated, one row each
     #[arg(long, value_parser = ChosenParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<Chosen>,
-    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, for several tables
+    /// log, idm, constant-velocity or model:WEIGHTS; comma-separated, one table each
     #[arg(long, value_name = "W", default_value = "idm", num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
-    /// What planners imagine in [default: the learned world of --world, else idm]
+    /// Traffic model of planners' rollouts [default: the learned world of --world, else idm]
     #[arg(long, value_name = "W")]
     imagination: Option<WorldName>,
     #[command(flatten)]
@@ -54,14 +54,14 @@ pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
     thinking: ImaginationArgs,
-    /// At most so many scenarios [default: all]
+    /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
-    /// Films of the first so many scenarios
+    /// Films of the first N scenarios
     #[arg(long, value_name = "N", default_value_t = 2)]
     films: usize,
     #[command(flatten)]
@@ -75,13 +75,13 @@ pub(crate) struct Args {
 /// How a planner is let drive.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Driving {
-    /// How far to drive; a recording may be shorter
+    /// Seconds to drive; a recording may be shorter
     #[arg(long, value_name = "S", default_value_t = 15.0)]
     pub(crate) seconds: f64,
-    /// How the ego follows its plans
+    /// Controller that tracks the plans
     #[arg(long, value_enum, default_value_t = TrackingName::TwoStage)]
     controller: TrackingName,
-    /// A planner that takes longer for a step has failed [default: no limit]
+    /// Time limit per planning step; a planner that exceeds it fails [default: no limit]
     #[arg(long, value_name = "MS")]
     budget_ms: Option<f64>,
 }
@@ -89,9 +89,9 @@ pub(crate) struct Driving {
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum TrackingName {
-    /// An LQR tracker steers a kinematic bicycle
+    /// LQR tracker with a kinematic bicycle model
     TwoStage,
-    /// It is where the plan says
+    /// Perfect tracking of the plan
     Perfect,
 }
 
@@ -269,7 +269,7 @@ impl Args {
         done.into_iter().collect::<anyhow::Result<()>>()?;
         anyhow::ensure!(
             !interrupted(),
-            "stopped by Ctrl-C; the same command goes on where this one stopped"
+            "stopped by Ctrl-C; the same command resumes where this one stopped"
         );
         let ledger = ledger.into_inner().expect("nobody panics while holding it");
         Ok(ledger.close()?)

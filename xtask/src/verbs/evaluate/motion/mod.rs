@@ -49,7 +49,7 @@ pub(crate) struct Args {
     /// Futures of the world that are condensed to the six modes of a prediction
     #[arg(long, value_name = "N", default_value = "32")]
     futures: NonZeroUsize,
-    /// Which definition of path shapes mAP is averaged over
+    /// Definition of the path shapes that mAP is averaged over
     #[arg(long, value_enum, default_value_t = Shapes::Current)]
     shapes: Shapes,
     /// Only every N-th scenario from the K-th; see `evaluate merge`

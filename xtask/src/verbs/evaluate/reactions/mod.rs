@@ -38,23 +38,23 @@ pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
-    /// log, idm, constant-velocity or model:WEIGHTS; several, apart by commas, side by side
+    /// log, idm, constant-velocity or model:WEIGHTS; comma-separated
     #[arg(long, value_name = "W", default_values_t = worlds(), num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
-    /// log, brake, stop, speed-up, change-lane or run-light; several, apart by commas [default: all]
+    /// log, brake, stop, speed-up, change-lane or run-light; comma-separated [default: all]
     #[arg(long, value_name = "M", num_args = 1.., value_delimiter = ',', value_parser = manoeuvre)]
     manoeuvre: Vec<&'static str>,
-    /// How far to look; the log must go on for as long
+    /// Seconds to evaluate; the log must be as long
     #[arg(long, value_name = "S", default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=60))]
     seconds: u32,
-    /// Futures of each manoeuvre; worlds without chance have one
+    /// Futures of each manoeuvre; deterministic worlds have one
     #[arg(long, value_name = "N", default_value = "4")]
     futures: NonZeroUsize,
-    /// At most so many scenarios, the first [default: all]
+    /// Use only the first N scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<NonZeroUsize>,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
     #[command(flatten)]
@@ -113,7 +113,7 @@ impl Args {
                 progress.advance(1);
                 anyhow::ensure!(
                     !interrupted(),
-                    "stopped by Ctrl-C; the same command goes on after scenario {index}"
+                    "stopped by Ctrl-C; the same command resumes after scenario {index}"
                 );
             }
             Ok(())

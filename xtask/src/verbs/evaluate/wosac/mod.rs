@@ -51,18 +51,18 @@ pub(crate) struct Args {
     /// File or directory of ScenarioRollouts messages or of a submission's shards
     #[arg(long, value_name = "PATH", conflicts_with = "world")]
     rollouts: Option<PathBuf>,
-    /// Which year's challenge
+    /// Year of the challenge
     #[arg(long, value_enum, default_value_t = YearName::Y2025)]
     year: YearName,
-    /// Rollouts that a world imagines of each scenario
+    /// Rollouts of each scenario
     #[arg(long, value_name = "N", default_value = "32")]
     rollouts_per_scenario: NonZeroUsize,
-    /// Evaluate part K of N, or the part that a cluster's variables name; put the parts together
-    /// with `evaluate merge`
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", value_parser = shard)]
     shard: Option<Shard>,
-    /// Also say what lowered the scores of the first row and when, in explain.jsonl, agents.parquet
-    /// and the largest losses in the report, and which agents do what no driver would, in
+    /// Also report what lowered the scores of the first row and when, in explain.jsonl,
+    /// agents.parquet and the largest losses in the report, and implausible actions in
     /// conduct.parquet
     #[arg(long)]
     explain: bool,
@@ -217,7 +217,7 @@ impl Args {
                 progress.advance(1);
                 anyhow::ensure!(
                     !interrupted(),
-                    "stopped by Ctrl-C; the same command goes on after scenario {}",
+                    "stopped by Ctrl-C; the same command resumes after scenario {}",
                     recorded.index
                 );
             }
