@@ -56,8 +56,9 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         if matches!(self.world, WorldName::Log | WorldName::ConstantVelocity) {
             let found = &self.world;
-            let wrong =
-                format!("--world: expected idm or model:WEIGHTS to imagine in, found {found}");
+            let wrong = format!(
+                "--world: expected idm or model:WEIGHTS for the planner's rollouts, found {found}"
+            );
             return Err(WrongArguments(wrong).into());
         }
         let sampling = self.sampling.resolve()?;
