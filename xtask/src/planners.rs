@@ -115,6 +115,24 @@ impl TypedValueParser for ChosenParser {
         if told.starts_with(REMOTE) {
             return remote.parse_ref(command, arg, value);
         }
+        let known = || ours().into_iter().any(|known| known.get_name() == told);
+        if !known() && told != "model" {
+            // The names of ours, and how others are called.
+            let all: Vec<String> = self
+                .possible_values()
+                .into_iter()
+                .flatten()
+                .map(|value| value.get_name().to_owned())
+                .collect();
+            let wrong = format!(
+                "--planner: expected one of {}, found {told}\n",
+                all.join(", ")
+            );
+            return Err(clap::Error::raw(
+                clap::error::ErrorKind::InvalidValue,
+                wrong,
+            ));
+        }
         let ours = PlannerParser.parse_ref(command, arg, value);
         ours.map(Chosen::Ours)
     }

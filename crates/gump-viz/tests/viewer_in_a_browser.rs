@@ -268,7 +268,9 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         );
         let address = report["address"].as_str().expect("a text");
         assert!(
-            address.contains("t=1.5") && address.contains("agent=0"),
+            ["t=1.5", "agent=0", "candidate=1"]
+                .iter()
+                .all(|part| address.contains(part)),
             "{address}"
         );
         assert_eq!(report["panel_in_sight"], true, "{report}");

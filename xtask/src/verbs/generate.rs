@@ -14,7 +14,7 @@ use gump_generate::constraint::parse_constraints;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
 use gump_generate::verdict::{off_road, overlaps};
 use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateError, GenerateRequest, Placement};
-use gump_model::{Device, checkpoint};
+use gump_model::{Device, checkpoint, relative};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
 use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
 use serde::Serialize;
@@ -267,7 +267,14 @@ pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
     }
     let tag = |name: &String| {
         name.parse::<ScenarioTag>().map_err(|why| {
-            let nearness = |tag: &ScenarioTag| strsim::jaro_winkler(tag.name(), name);
+            // A word in common says more than letters in common.
+            let shared = |tag: &ScenarioTag| {
+                let words: Vec<&str> = tag.name().split('_').collect();
+                let asked = name.split(['_', ' ', '-']);
+                asked.filter(|word| words.contains(word)).count() as f64
+            };
+            let nearness =
+                |tag: &ScenarioTag| strsim::jaro_winkler(tag.name(), name) + 0.5 * shared(tag);
             let nearest = ScenarioTag::all()
                 .max_by(|a, b| nearness(a).total_cmp(&nearness(b)))
                 .expect("there are tags");
@@ -292,6 +299,15 @@ pub(crate) fn world(
             shipped::weights()
         }
     };
+    if relative::is_relative(&path)? {
+        let wrong = format!(
+            "--weights: expected weights of the sequence network, which places agents, such as {}; \
+             found those of the relative network: {}",
+            shipped::weights().display(),
+            path.display()
+        );
+        return Err(WrongArguments(wrong).into());
+    }
     let network = checkpoint::load(&path, device)?;
     let sampling = SamplingConfig {
         life,

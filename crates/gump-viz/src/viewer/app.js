@@ -98,7 +98,7 @@ function buildScenes() {
   }));
 }
 
-// The address says what is shown: viewer.html#scene=ID&t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north&ruler=3,5.
+// The address says what is shown: viewer.html#scene=ID&t=4&shown=all&beside=0&colour=speed&agent=3&follow=1&up=north&candidate=2&ruler=3,5.
 const address = () => new URLSearchParams(location.hash.slice(1));
 
 function written() {
@@ -111,6 +111,7 @@ function written() {
   if (ui.selected >= 0) said.set('agent', facts.agents[ui.selected].id);
   if (ui.follow >= 0) said.set('follow', 1);
   if (ui.up !== 'ego') said.set('up', ui.up);
+  if (ui.candidate >= 0) said.set('candidate', ui.candidate + 1);
   // Places are not worth their digits.
   if (ui.ends.length > 1 && ui.ends.every(end => end.agent !== undefined)) said.set('ruler', ui.ends.map(end => facts.agents[end.agent].id).join());
   return String(said);
@@ -137,6 +138,7 @@ function restore() {
   if (said.has('agent')) ui.selected = facts.agents.findIndex(agent => agent.id === said.get('agent'));
   const ends = (said.get('ruler') || '').split(',').map(id => ({ agent: facts.agents.findIndex(agent => agent.id === id) }));
   if (ends.length === 2 && ends.every(end => end.agent >= 0)) ui.ends = ends;
+  if (facts.candidates[Number(said.get('candidate')) - 1]) ui.candidate = Number(said.get('candidate')) - 1;
   if (said.has('follow')) ui.follow = ui.selected < 0 ? facts.ego : ui.selected;
 }
 

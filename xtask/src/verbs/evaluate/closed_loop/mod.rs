@@ -99,9 +99,10 @@ impl Driving {
     /// Error: [`WrongArguments`] for a number out of its range.
     pub(crate) fn check(&self) -> anyhow::Result<()> {
         let positive = |x: f64| x > 0.0 && x.is_finite();
-        if !positive(self.seconds) {
+        // A drive is judged by its changes, so it has two steps of a tenth of a second at least.
+        if !(0.2..=3600.0).contains(&self.seconds) {
             let wrong = format!(
-                "--seconds: expected a number above 0, found {}",
+                "--seconds: expected a number from 0.2 to 3600, found {}",
                 self.seconds
             );
             return Err(WrongArguments(wrong).into());
