@@ -110,7 +110,10 @@ fn numbers_that_cannot_be_meant_are_told_plainly() {
     let check = |flags: &str, part: &str| place.check(&format!("{simulate} {flags}"), 2, &[part]);
     check("--futures 0", "--futures: expected at least 1, found 0");
     check("--threads 0", "--threads: expected at least 1, found 0");
-    check("--seconds -3", "--seconds: expected a number from 0.1 to 3600");
+    check(
+        "--seconds -3",
+        "--seconds: expected a number from 0.1 to 3600",
+    );
     check("--futures -3", "found -3");
     assert!(!place.path("out/simulate/film.gif").exists());
 }
