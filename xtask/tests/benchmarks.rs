@@ -452,7 +452,7 @@ fn a_submission_that_breaks_the_rules_is_not_packed() {
         1,
         "scenario a: expected 32 futures, found 7",
     );
-    fails(&folder, submit, 2, "account_name");
+    fails(&folder, submit, 2, "--account");
     fails(
         &folder,
         "submit wosac --scenarios two.tfrecord",
