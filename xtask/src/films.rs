@@ -168,3 +168,25 @@ pub(crate) fn first_few(rollouts: &[Rollout]) -> Vec<(&'static str, &Rollout)> {
         .zip(rollouts)
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_log_ends_with_the_futures() {
+        let scenario = gump_scene::fixture::scenario(
+            "ego vehicle 0: 0,0 velocity 5,0\nhistory 1 future 8 dt 0.1",
+        )
+        .unwrap();
+        let log = log_as_rollout(&scenario);
+        let mut short = Rollout::begin(scenario.present());
+        for frame in &log.imagined()[..30] {
+            short.push(frame.clone());
+        }
+        let steps = |futures: &[(&str, &Rollout)]| log_until(&scenario, futures).steps();
+        assert_eq!(steps(&[("short", &short)]), 30);
+        assert_eq!(steps(&[("short", &short), ("long", &log)]), 80);
+        assert_eq!(steps(&[]), 80);
+    }
+}

@@ -986,7 +986,21 @@ fn evaluate_wosac_takes_rollouts_from_files() {
     let row = place.report(&words)["results"]["rows"][0].clone();
     assert_eq!(row["world"], "rollouts");
     assert!(row["metametric"].as_f64().unwrap() > 0.3);
-    place.fails("evaluate wosac --scenarios two.tfrecord", 2, &["--world"]);
+    // Arrays have no heights, which the recording has.
+    place.report(&format!(
+        "simulate --scenario {scenes}#0 --world idm --futures 2"
+    ));
+    for file in ["futures.npy", "futures.json"] {
+        fs::copy(place.path(&format!("out/{file}")), place.path(file)).unwrap();
+    }
+    let words = format!("evaluate wosac --scenarios {scenes} --rollouts futures.npy --shard 1/2");
+    let same = place.report(&words)["results"]["rows"][0].clone();
+    assert_eq!(same["metametric"], row["metametric"]);
+    place.fails(
+        "evaluate wosac --scenarios two.tfrecord",
+        2,
+        &["--world", "--rollouts"],
+    );
     let both = "evaluate wosac --scenarios two.tfrecord --world idm --shard 3/2";
     place.fails(both, 2, &["K/N"]);
 }

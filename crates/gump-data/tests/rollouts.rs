@@ -26,6 +26,21 @@ fn future(scenario: &Scenario, k: usize) -> Rollout {
 }
 
 #[test]
+fn agents_without_heights_keep_those_of_the_present() {
+    let scenario = common::crossing();
+    let (mut message, _) = rollouts_to_proto(&scenario.id, &[future(&scenario, 1)]).unwrap();
+    for trajectory in &mut message.joint_scenes[0].simulated_trajectories {
+        trajectory.center_z.clear();
+    }
+    let read = rollouts_from_proto(&message, &scenario).unwrap();
+    let present = scenario.present();
+    for agent in read[0].imagined().iter().flat_map(Frame::agents) {
+        let before = present.now().agent(agent.id).unwrap();
+        assert!((agent.elevation - before.elevation).abs() < 1e-6);
+    }
+}
+
+#[test]
 fn thirty_two_futures_come_back() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("some.binproto");

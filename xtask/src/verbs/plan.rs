@@ -12,7 +12,7 @@ use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{Candidate, Decision, Explain};
 use gump_rollout::BoxError;
-use gump_scene::{Frame, Rollout, Scenario};
+use gump_scene::{Agent, Frame, Rollout, Scenario};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -120,14 +120,18 @@ impl Noted<'_> {
         let (Some(explain), Some(decision)) = (self.explain, self.inner.decision()) else {
             return;
         };
-        // Between two decisions the ego follows the older one.
-        let now = moment.scene.ego_now().state;
-        let begins = |future: &Rollout| future.start().agent(future.ego()).map(|ego| ego.state);
+        // Between two decisions the ego follows the older one, which began with others elsewhere.
+        let now = moment.scene.now();
+        let is_here = |then: &Agent| {
+            let position = |agent: &Agent| agent.state.pose.position;
+            now.agent(then.id)
+                .is_some_and(|agent| position(agent).distance(position(then)) < 1e-6)
+        };
+        let begins_now = |future: &Rollout| future.start().agents().iter().all(is_here);
         let is_new = decision.prospects[decision.chosen]
             .futures
             .first()
-            .and_then(begins)
-            .is_some_and(|then| then.pose.position.distance(now.pose.position) < 1e-6);
+            .is_some_and(begins_now);
         let weight = explain::weight(decision);
         let is_asked = match explain {
             Step::Number(step) => moment.iteration <= step,

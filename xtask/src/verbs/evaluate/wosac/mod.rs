@@ -46,9 +46,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     scenarios: Scenes,
     /// log, idm, constant-velocity or model:WEIGHTS
-    #[arg(long, value_name = "W", required_unless_present = "rollouts")]
+    #[arg(long, value_name = "W")]
     world: Option<WorldName>,
-    /// File or directory of ScenarioRollouts messages or of a submission's shards
+    /// File or directory of ScenarioRollouts messages or of a submission's shards, or a file of
+    /// arrays (.npy, .npz, .parquet)
     #[arg(long, value_name = "PATH", conflicts_with = "world")]
     rollouts: Option<PathBuf>,
     /// Year of the challenge
