@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, Command};
+use gump_engine::SamplingConfig;
 use gump_eval::planners::{PlannerConfig, PlannerName};
 use gump_planner::{Aggregate, Allocation};
 use serde::{Serialize, Serializer};
@@ -176,6 +177,15 @@ enum AggregateName {
     Worst,
 }
 
+#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum YieldingName {
+    /// Rules resample those that would hit it, whoever has the right of way
+    Ruled,
+    /// As the network itself reacts
+    Learned,
+}
+
 /// How planners that imagine do it.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct ImaginationArgs {
@@ -203,12 +213,23 @@ pub(crate) struct ImaginationArgs {
     /// Planners with rollouts decide at every N-th step
     #[arg(long, value_name = "N", default_value_t = 5)]
     replan_every: usize,
+    /// How simulated agents make way for the interactive planner's ego
+    #[arg(long, value_enum, default_value_t = YieldingName::Ruled)]
+    yielding: YieldingName,
     /// Discount per half second; without it a future's score is that of the whole drive
     #[arg(long, value_name = "X")]
     discount: Option<f64>,
 }
 
 impl ImaginationArgs {
+    /// How the world of the rollouts decodes: as otherwise, but for `--yielding`.
+    pub(crate) fn sampling(&self, sampling: &SamplingConfig) -> SamplingConfig {
+        SamplingConfig {
+            yields_to_driven: matches!(self.yielding, YieldingName::Ruled),
+            ..sampling.clone()
+        }
+    }
+
     /// The same for a library.
     ///
     /// Error: a limit that is no time, counts of none.

@@ -158,6 +158,7 @@ impl Footprints {
                     foreseen(request, bins, config),
                     request.forced[4].is_some(),
                 );
+                member.is_ignored = member.is_driven && !config.yields_to_driven;
                 if agent.key.kind == AgentKind::Vehicle && !member.is_driven {
                     member.look_for_edges(&window.survey);
                 }

@@ -59,6 +59,8 @@ pub(crate) struct Member {
     off: f64,
     /// Driven objects are where they are.
     pub(crate) is_driven: bool,
+    /// Others do not keep clear of it.
+    pub(crate) is_ignored: bool,
     reach: f64,
 }
 
@@ -81,6 +83,7 @@ impl Member {
             edges: Vec::new(),
             off: 0.0,
             is_driven,
+            is_ignored: false,
             reach: length.hypot(width) / 2.0,
         }
     }
@@ -154,7 +157,7 @@ impl Footprints {
         let mut unclear: Vec<bool> = self.members.iter().map(leaves).collect();
         for (i, a) in self.members.iter().enumerate() {
             for (j, b) in self.members.iter().enumerate().skip(first.max(i + 1)) {
-                if clear_places(a, &a.ahead, b) == a.ahead.len() {
+                if a.is_ignored || b.is_ignored || clear_places(a, &a.ahead, b) == a.ahead.len() {
                     continue;
                 }
                 let a_gives_way =
@@ -173,7 +176,8 @@ impl Footprints {
     pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
         let member = &self.members[i];
         let clear = |ahead: &Way| {
-            let others = self.members.iter().enumerate().filter(|(j, _)| *j != i);
+            let others = self.members.iter().enumerate();
+            let others = others.filter(|(j, other)| *j != i && !other.is_ignored);
             let clear = others.map(|(_, other)| clear_places(member, ahead, other));
             let on_road = member.places_on_road(ahead);
             clear.fold(on_road, usize::min)

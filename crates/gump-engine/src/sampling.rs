@@ -40,6 +40,9 @@ pub struct SamplingConfig {
     /// Maximum number of redraws of an object that would overlap another or leave the road within
     /// 1.5 s (paper: 0); in partial-AR decoding only.
     pub redraws: usize,
+    /// Whether redraws also keep agents clear of an agent that is driven from outside. Without it
+    /// only the network makes them react to it.
+    pub yields_to_driven: bool,
     /// Whether kinematic limits apply to vehicles and bicycles (paper: no).
     pub limits: bool,
     /// The form in which the weights are multiplied (on a CPU; other devices compute as trained).
@@ -61,6 +64,7 @@ impl Default for SamplingConfig {
             lights: LightSource::Model,
             pace: RateScale::default(),
             redraws: 12,
+            yields_to_driven: true,
             limits: true,
             precision: Precision::F32,
         }
@@ -204,6 +208,7 @@ mod tests {
                 light_changes: 1.0,
             },
             redraws: 0,
+            yields_to_driven: true,
             limits: false,
             precision: Precision::F32,
         };

@@ -183,7 +183,7 @@ impl Args {
             Ok(PlanningWorld::load_imagination(
                 run.device(),
                 &self.world,
-                &sampling,
+                &self.thinking.sampling(&sampling),
             )?)
         })?;
         let imagination = imagined.imagination();

@@ -14,6 +14,7 @@ fn member(x: f64, step: f64) -> Member {
         off: 0.0,
         ahead: straight(x, step),
         is_driven: false,
+        is_ignored: false,
         reach: 2.3,
     }
 }
@@ -48,6 +49,16 @@ fn the_driven_stay_and_those_that_overlap_already_are_left_alone() {
         members: vec![member(10.0, 0.0), driven],
     };
     assert_eq!(crowd.unclear(0), [0]);
+    let ignored = Member {
+        is_driven: true,
+        is_ignored: true,
+        ..member(0.0, 5.0)
+    };
+    let mut unimpressed = Footprints {
+        members: vec![member(10.0, 0.0), ignored],
+    };
+    assert!(unimpressed.unclear(0).is_empty());
+    assert!(!unimpressed.improve(0, &straight(10.0, 5.0)));
     let yielding = Footprints {
         members: vec![member(0.0, 5.0), member(10.0, 0.0)],
     };

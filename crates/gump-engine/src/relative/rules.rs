@@ -187,16 +187,26 @@ pub(super) fn heed(
     }
 }
 
+/// An agent that is driven from outside.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Driven {
+    /// Its index.
+    pub index: usize,
+    /// Whether others are kept clear of it.
+    pub is_heeded: bool,
+}
+
 /// Redraws moves that are not clear, up to `redraws` times each; an agent without a clear path
 /// brakes.
 pub fn settle(
     agents: &[Shown],
-    driven: Option<usize>,
+    driven: Option<Driven>,
     survey: &Survey,
     redraws: usize,
     moves: &mut [Pose],
     again: &mut Again<'_>,
 ) {
+    let is_driven = |i: usize| driven.filter(|driven| driven.index == i);
     let members = agents
         .iter()
         .zip(&*moves)
@@ -207,9 +217,10 @@ pub fn settle(
                 Some(now.pose),
                 now.velocity().length(),
                 ahead(now.pose, *step),
-                driven == Some(i),
+                is_driven(i).is_some(),
             );
-            if now.body.kind == AgentKind::Vehicle && driven != Some(i) {
+            member.is_ignored = is_driven(i).is_some_and(|driven| !driven.is_heeded);
+            if now.body.kind == AgentKind::Vehicle && !member.is_driven {
                 member.look_for_edges(survey);
             }
             member
@@ -290,6 +301,10 @@ mod tests {
         .then(Pose::new(x, 0.0, 0.0))
     }
 
+    fn driven(index: usize, is_heeded: bool) -> Option<Driven> {
+        Some(Driven { index, is_heeded })
+    }
+
     fn straight(step: f64) -> Pose {
         Pose::new(step, 0.0, 0.0)
     }
@@ -321,7 +336,7 @@ mod tests {
     fn who_finds_no_way_brakes_and_the_driven_are_left_alone() {
         let agents = [car(0.0, 4.0), car(9.0, 0.0)];
         let survey = Survey::default();
-        let settled = |driven| {
+        let settled = |driven: Option<Driven>| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
             settle(&agents, driven, &survey, 2, &mut moves, &mut |who, _| {
                 who.iter().map(|_| straight(4.0)).collect()
@@ -331,7 +346,27 @@ mod tests {
         // 8 m/s, braking at 5 m/s² for half a second.
         let braked = settled(None)[0].position.x;
         assert!((braked - 3.375).abs() < 1e-9, "{braked}");
-        assert_eq!(settled(Some(0))[0], straight(4.0));
+        assert_eq!(settled(driven(0, true))[0], straight(4.0));
+    }
+
+    #[test]
+    fn a_driven_agent_may_be_left_to_the_network() {
+        let agents = [car(0.0, 4.0), car(9.0, 0.0)];
+        let survey = Survey::default();
+        let follower = |yields: bool| {
+            let mut moves = [straight(4.0), Pose::IDENTITY];
+            settle(
+                &agents,
+                driven(1, yields),
+                &survey,
+                2,
+                &mut moves,
+                &mut |_, _| vec![straight(1.0)],
+            );
+            moves[0]
+        };
+        assert_eq!(follower(true), straight(1.0));
+        assert_eq!(follower(false), straight(4.0));
     }
 
     #[test]

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
-use crate::relative::rules::{StopLine, heed, held_back, runs_red, settle};
+use crate::relative::rules::{Driven, StopLine, heed, held_back, runs_red, settle};
 use crate::relative::seen::{Seen, add_presents};
 use crate::sampling::SamplingConfig;
 
@@ -81,6 +81,9 @@ pub struct RelativeSampling {
     /// Maximum number of redraws of an agent that would overlap another or leave the road within
     /// 1.5 s.
     pub redraws: usize,
+    /// Whether redraws also keep agents clear of an ego that is driven from outside. Without it only
+    /// the network makes them react to it.
+    pub yields_to_driven: bool,
     /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways.
     pub limits: bool,
     /// The form in which the weights are multiplied.
@@ -93,6 +96,7 @@ impl Default for RelativeSampling {
             temperature: 1.0,
             top_p: TOP_P,
             redraws: 0,
+            yields_to_driven: true,
             limits: false,
             precision: Precision::F32,
         }
@@ -107,6 +111,7 @@ impl From<&SamplingConfig> for RelativeSampling {
             temperature: config.temperature.unwrap_or(usual.temperature),
             top_p: config.top_p.unwrap_or(usual.top_p),
             redraws: config.redraws,
+            yields_to_driven: config.yields_to_driven,
             limits: config.limits,
             precision: config.precision,
         }
@@ -607,6 +612,10 @@ impl Future {
             });
             held.collect()
         };
+        let driven = driven.map(|index| Driven {
+            index,
+            is_heeded: sampling.yields_to_driven,
+        });
         settle(&agents, driven, survey, redraws, &mut moves, &mut lawful);
         moves
     }

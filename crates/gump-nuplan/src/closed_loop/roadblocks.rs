@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use gump_geometry::{DVec2, Polygon, angle_difference};
+use gump_geometry::{DVec2, Polygon, Polyline, angle_difference};
 use gump_scene::{
     Area, AreaKind, Lane, LaneId, MapGraph, MapParts, Roadblock, RoadblockId, Route, Scenario,
 };
@@ -13,12 +13,15 @@ use gump_scene::{
 const BEYOND: f64 = 200.0;
 /// Distance into a lane over which its turn is determined, metres.
 const TURN_SEEN: f64 = 10.0;
+/// How far a derived surface goes on past a linked end of its lane, metres.
+const OVERLAP: f64 = 0.5;
 /// Ids of derived areas start here, above those of the formats.
 const FIRST_AREA: i64 = 1 << 40;
 
 /// Completes a scenario whose map has lanes but no roadblocks; other scenarios are not changed.
 ///
-/// Adjacent lanes share a roadblock, named after its lowest lane. Outlines are the lanes' surfaces.
+/// Adjacent lanes share a roadblock, named after its lowest lane. Outlines are the lanes' surfaces;
+/// where they follow from centre line and width, those of linked lanes overlap a little.
 /// Lanes through intersections become the area of the intersection. The route gets the roadblocks
 /// of its lanes and is extended straight on by 200 m.
 pub fn derive_roadblocks(scenario: &mut Scenario) {
@@ -38,7 +41,7 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
         unstated: old.unstated(),
     };
     for lane in &mut parts.lanes {
-        lane.outline = lane.surface().map(|polygon| polygon.into_owned());
+        lane.outline = lane.outline.take().or_else(|| joined_ribbon(lane));
         lane.roadblock = block_of.get(&lane.id).copied();
     }
     let inside = parts.lanes.iter().filter(|lane| lane.in_intersection);
@@ -54,6 +57,21 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
         scenario.route = Some(Arc::new(with_roadblocks(&map, route)));
     }
     scenario.map = map;
+}
+
+/// The surface of a lane without a stated outline. It reaches into the lanes linked to it: ribbons
+/// of lanes that meet at an angle leave a wedge uncovered, and a corner of the vehicle over it would
+/// count as off the road.
+fn joined_ribbon(lane: &Lane) -> Option<Polygon> {
+    let line = &lane.centerline;
+    let beyond = |s: f64, by: f64| {
+        let end = line.pose_at(s);
+        end.position + end.direction() * by
+    };
+    let before = (!lane.predecessors.is_empty()).then(|| beyond(0.0, -OVERLAP));
+    let after = (!lane.successors.is_empty()).then(|| beyond(line.length(), OVERLAP));
+    let points = before.into_iter().chain(line.points().iter().copied());
+    Polyline::new(points.chain(after).collect())?.ribbon(lane.width)
 }
 
 /// The roadblock of every lane that has a surface.
@@ -192,6 +210,28 @@ mod tests {
     use super::*;
     use gump_geometry::dvec2;
     use gump_scene::fixture;
+
+    #[test]
+    fn surfaces_of_lanes_that_meet_at_an_angle_leave_no_gap() {
+        let mut scenario = fixture::scenario(
+            "lane 1: 0,0 50,0 next 2
+             lane 2: 50,0 100,5
+             ego vehicle 0: 10,0 velocity 5,0",
+        )
+        .unwrap();
+        // On the outer side of the bend.
+        let seam = dvec2(50.05, -1.7);
+        let is_covered = |scenario: &Scenario| {
+            let mut lanes = scenario.map.lanes().iter();
+            lanes.any(|lane| lane.surface().is_some_and(|polygon| polygon.contains(seam)))
+        };
+        assert!(!is_covered(&scenario));
+        derive_roadblocks(&mut scenario);
+        assert!(is_covered(&scenario));
+        // The far end of the second lane leads nowhere.
+        let end = scenario.map.lane(LaneId(2)).unwrap();
+        assert!(!end.surface().unwrap().contains(dvec2(100.2, 5.02)));
+    }
 
     #[test]
     fn neighbours_share_a_roadblock_and_the_route_goes_on() {

@@ -66,7 +66,7 @@ impl Args {
             Ok(PlanningWorld::load_imagination(
                 run.device(),
                 &self.world,
-                &sampling,
+                &self.thinking.sampling(&sampling),
             )?)
         })?;
         let found = run.phase("find", |_| self.scenarios.find())?;

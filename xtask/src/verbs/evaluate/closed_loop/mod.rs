@@ -203,7 +203,7 @@ impl Args {
             Ok(PlanningWorld::load_imagination(
                 run.device(),
                 name,
-                &sampling,
+                &self.thinking.sampling(&sampling),
             )?)
         })?;
         let worlds = run.phase("load", |run| {
