@@ -198,6 +198,9 @@ pub(crate) struct ImaginationArgs {
     /// How a candidate's scores over its futures are aggregated
     #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
     aggregate: AggregateName,
+    /// Weight of a future in which the others keep their velocity, 0 to 1
+    #[arg(long, value_name = "X", default_value_t = PlannerConfig::default().hedge)]
+    hedge: f64,
     /// Bonus on the score of the previous choice, 0 to 1
     #[arg(long, value_name = "X", default_value_t = PlannerConfig::default().hysteresis)]
     hysteresis: f64,
@@ -261,6 +264,7 @@ impl ImaginationArgs {
                 AggregateName::Mean => Aggregate::Mean,
                 AggregateName::Worst => Aggregate::Worst,
             },
+            hedge: self.hedge,
             hysteresis: self.hysteresis,
             nearest: self.nearest,
             horizon: self.horizon,

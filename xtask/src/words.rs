@@ -68,15 +68,17 @@ const DECODING: [&str; 12] = [
 const TRAFFIC: [&str; 2] = ["life", "lights"];
 
 /// How the interactive planner simulates and chooses.
-const THINKING: [&str; 9] = [
+const THINKING: [&str; 11] = [
     "futures",
     "allocation",
     "aggregate",
+    "hedge",
     "hysteresis",
     "nearest",
     "horizon",
     "think_ms",
     "replan_every",
+    "yielding",
     "discount",
 ];
 

@@ -150,6 +150,8 @@ pub struct PlannerConfig {
     pub allocation: Allocation,
     /// How the values of a candidate's futures are combined into one.
     pub aggregate: Aggregate,
+    /// Weight of a future in which other agents keep their velocity, 0 to 1.
+    pub hedge: f64,
     /// Bonus for the previous choice, added to its value.
     pub hysteresis: f64,
     /// Number of agents to simulate, those nearest to the ego.
@@ -170,6 +172,7 @@ impl Default for PlannerConfig {
             futures: 4,
             allocation: Allocation::default(),
             aggregate: Aggregate::default(),
+            hedge: InteractiveDriverConfig::default().hedge,
             hysteresis: 0.0,
             nearest: 12,
             horizon: 4.0,
@@ -194,6 +197,7 @@ impl PlannerConfig {
             n_futures: self.futures,
             allocation: self.allocation,
             aggregate: self.aggregate,
+            hedge: self.hedge,
             hysteresis: self.hysteresis,
             seed,
             replan_every: self.replan_every,

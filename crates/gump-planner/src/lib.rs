@@ -98,5 +98,6 @@ pub use interactive::{
     Aggregate, Allocation, CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig,
     Phases, PlanBudget, Prospect, Worth,
 };
+pub use pdm::Side;
 pub use pdm::{PdmClosed, PdmConfig, PdmScore};
 pub use proposal::{Proposal, ProposalKind};

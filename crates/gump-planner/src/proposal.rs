@@ -8,6 +8,8 @@ use std::fmt;
 use gump_geometry::{Pose, interpolate_angle};
 use gump_scene::AgentState;
 
+use crate::Side;
+
 /// A trajectory of the ego and its origin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Proposal {
@@ -39,6 +41,13 @@ pub enum ProposalKind {
         /// Desired speed as a share of the limit, > 0.
         speed_fraction: f64,
     },
+    /// The Intelligent Driver Model along a line into the lane beside the ego's.
+    LaneChange {
+        /// Desired speed as a share of the limit, > 0.
+        speed_fraction: f64,
+        /// The side of that lane.
+        side: Side,
+    },
     /// The world's own motion of the ego.
     Imitation,
     /// Braking straight ahead as hard as allowed.
@@ -60,6 +69,20 @@ impl fmt::Display for ProposalKind {
             }
             Self::Yielding { speed_fraction } => {
                 write!(f, "yielding {:.0} % of the limit", speed_fraction * 100.0)
+            }
+            Self::LaneChange {
+                speed_fraction,
+                side,
+            } => {
+                let side = match side {
+                    Side::Left => "left",
+                    Side::Right => "right",
+                };
+                write!(
+                    f,
+                    "change to the {side}, {:.0} % of the limit",
+                    speed_fraction * 100.0
+                )
             }
             Self::Imitation => f.write_str("imitation"),
             Self::EmergencyBrake => f.write_str("emergency brake"),

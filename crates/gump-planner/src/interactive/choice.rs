@@ -228,6 +228,8 @@ fn weighted_mean(terms: [f64; 4]) -> f64 {
 pub(super) struct Tally {
     rows: Vec<Row>,
     scores: Vec<Judged>,
+    /// The score among agents that keep their velocity, where it counts.
+    hedge: Option<Judged>,
 }
 
 /// The value by which a candidate is chosen.
@@ -246,6 +248,16 @@ impl Tally {
             self.rows.push(row);
             self.scores.push(score);
         }
+    }
+
+    /// Sets the score among agents that keep their velocity.
+    pub(super) fn hedge(&mut self, score: Judged) {
+        self.hedge = Some(score);
+    }
+
+    /// The ego's motion in the first future.
+    pub(super) fn first_drive(&self) -> &[EgoState] {
+        &self.rows[0].drive
     }
 
     fn score(&self) -> CandidateScore {
@@ -271,6 +283,10 @@ impl Tally {
                 totals.fold(f64::INFINITY, f64::min)
             }
         };
+        let value = self
+            .hedge
+            .as_ref()
+            .map_or(value, |hedge| value + config.hedge * (hedge.total - value));
         let collided = self.scores.iter();
         let collided = collided.filter(|judged| judged.parts.collision_step.is_some());
         Standing {
@@ -291,6 +307,7 @@ impl Tally {
     ) -> Prospect {
         let standing = self.standing(config);
         let score = self.score();
+        let hedge = self.hedge.as_ref().map(told);
         let (mut futures, mut drives) = (Vec::new(), Vec::new());
         for row in self.rows {
             futures.push(film(row.frames));
@@ -300,6 +317,7 @@ impl Tally {
             kind,
             value: standing.value,
             score,
+            hedge,
             finalist,
             collisions: standing.collisions,
             progress_m: standing.progress_m,

@@ -47,6 +47,7 @@ const COMFORT_PAST: usize = 20;
 const ROUND: u64 = 1 << 32;
 
 /// Some futures of some candidates, simulated together.
+#[derive(Clone, Copy)]
 struct Round<'a> {
     /// When the decision began.
     began: Duration,
@@ -108,12 +109,13 @@ impl<'a> Imagination<'a> {
             ..self.moment.scene
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
-        let policies = policies::all(self.config, self.speeds);
+        let changes = self.state.lane_changes();
+        let policies = policies::all(self.config, self.speeds, &changes);
         let begun = self.begin(&proposer, &policies);
-        let corridors: Vec<Corridor> = (0..self.config.proposals.lateral_offsets.len())
+        let corridors: Vec<Corridor> = (0..proposer.lines.len())
             .map(|line| {
-                let (first, _) = &begun[line * self.speeds.len()];
-                proposer.corridor(line, first.drives[0].progress)
+                let place = self.moment.ego.rear_axle.position;
+                proposer.corridor(line, proposer.lines[line].project(place))
             })
             .collect();
         let n_candidates = begun.len() + usize::from(self.config.imitation);
@@ -147,6 +149,9 @@ impl<'a> Imagination<'a> {
                 let own = judged.by_ref().take(n_futures);
                 tallies[candidate].add(own);
             }
+            if r == 0 && self.config.hedge > 0.0 {
+                self.hedge(&round, &begun, horizon, &mut tallies);
+            }
             if r + 1 < rounds.len() {
                 left = best_of(&tallies, &left, self.config);
             }
@@ -168,6 +173,33 @@ impl<'a> Imagination<'a> {
             horizon: horizon as f64 * DECISION_S,
             phases,
         })
+    }
+
+    /// Scores every candidate among agents that keep their velocity, as PDM forecasts them. Policies
+    /// drive anew there; imitation, which has none, as it did in its first future.
+    fn hedge(
+        &self,
+        round: &Round<'_>,
+        begun: &[(Proposal, IdmConfig)],
+        n_decisions: usize,
+        tallies: &mut [Tally],
+    ) {
+        let one = Round {
+            n_futures: 1,
+            ..*round
+        };
+        let mut rows = self.rows(&one, begun);
+        let n_ruled = begun.len().min(rows.len());
+        for _ in 0..n_decisions {
+            self.drive(one.proposer, one.corridors, &mut rows[..n_ruled]);
+        }
+        for (row, tally) in rows.iter_mut().zip(&*tallies).skip(n_ruled) {
+            row.drive = tally.first_drive().to_vec();
+        }
+        let scores = self.reward().judge(&rows, 1);
+        for (&candidate, score) in round.candidates.iter().zip(scores) {
+            tallies[candidate].hedge(score);
+        }
     }
 
     /// Seed of a round: the same for all candidates.

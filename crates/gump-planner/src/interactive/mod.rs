@@ -16,6 +16,7 @@ mod tests;
 
 use std::time::Duration;
 
+use gump_metrics::Score;
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, WorldModel};
@@ -38,6 +39,8 @@ pub struct InteractiveDriverConfig {
     /// Whether other driving styles are candidates as well: two brisk ones, one that keeps a long
     /// distance and one that creeps, all along the centre.
     pub driving_styles: bool,
+    /// Whether changes into the lanes beside the ego's are candidates as well, two for each side.
+    pub lane_changes: bool,
     /// Whether the world's own ego is a candidate as well.
     pub imitation: bool,
     /// Futures per candidate, > 0; fewer for candidates that drop out.
@@ -55,6 +58,10 @@ pub struct InteractiveDriverConfig {
     /// Number of standard deviations over the futures that are subtracted from the mean, at least
     /// 0.
     pub caution: f64,
+    /// Weight of a further future in which other agents keep their velocity, 0 to 1; the rest is that
+    /// of the futures in the world. A world that expects others to make way is right on average,
+    /// and expensive where it is wrong.
+    pub hedge: f64,
     /// Bonus for the previous choice, added to its value.
     pub hysteresis: f64,
     /// Budget of the rollouts.
@@ -69,6 +76,7 @@ impl Default for InteractiveDriverConfig {
         Self {
             proposals: PdmConfig::default(),
             driving_styles: true,
+            lane_changes: true,
             imitation: true,
             n_futures: 4,
             allocation: Allocation::default(),
@@ -77,6 +85,7 @@ impl Default for InteractiveDriverConfig {
             worth: Worth::Rollout,
             aggregate: Aggregate::default(),
             caution: 0.0,
+            hedge: 0.0,
             hysteresis: 0.0,
             budget: PlanBudget::default(),
         }
@@ -172,8 +181,11 @@ pub struct Prospect {
     pub kind: ProposalKind,
     /// The result of each future.
     pub score: CandidateScore,
-    /// The value by which it is chosen: [`InteractiveDriverConfig::aggregate`] of its futures.
+    /// The value by which it is chosen: [`InteractiveDriverConfig::aggregate`] of its futures, and
+    /// the [`hedge`](InteractiveDriverConfig::hedge).
     pub value: f64,
+    /// The score among agents that keep their velocity; `None` where it has no weight.
+    pub hedge: Option<Score>,
     /// Whether it was simulated to the end and could be chosen: [`Allocation::Halving`] drops
     /// others on the way.
     pub finalist: bool,
@@ -276,7 +288,11 @@ impl<'w> InteractiveDriver<'w> {
             clock: &*self.clock,
         };
         let mut decision = imagination.imagine()?;
-        let previous = self.decision.as_ref().map(|decision| decision.chosen);
+        // Changes of lane come and go: the previous choice is found by its kind.
+        let kind = |decision: &Decision| decision.prospects[decision.chosen].kind;
+        let kind = self.decision.as_ref().map(kind);
+        let same = |prospect: &Prospect| Some(prospect.kind) == kind;
+        let previous = decision.prospects.iter().position(same);
         decision.chosen = choose(&decision.prospects, previous, self.config.hysteresis);
         let chosen = &decision.prospects[decision.chosen];
         decision.brakes = is_emergency(chosen, moment.ego);
@@ -300,7 +316,7 @@ impl<'w> InteractiveDriver<'w> {
         if let Some(way) = &self.following {
             return Ok(way.clone());
         }
-        let policies = policies::all(&self.config, speeds);
+        let policies = policies::all(&self.config, speeds, &state.lane_changes());
         let chosen = &policies[decision.chosen];
         let proposer = state.proposer(&chosen.law, speeds);
         let mut policy = [proposer.begin(chosen.line, ego.rear_axle, ego.velocity.x)];
@@ -325,6 +341,10 @@ impl Driver for InteractiveDriver<'_> {
         let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
         let speeds = state.prepare(moment, &self.config.proposals)?;
         if self.is_due(moment) {
+            let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
+            if self.config.lane_changes {
+                state.lay_changes(moment.ego, &self.config.proposals)?;
+            }
             self.decide(moment, &speeds)?;
         }
         Ok(self.follow(moment, &speeds)?)
@@ -416,6 +436,9 @@ fn check(config: &InteractiveDriverConfig) -> Result<(), PlanError> {
         if !(value >= 0.0 && value.is_finite()) {
             return wrong(name, value, "0 or more");
         }
+    }
+    if !(0.0..=1.0).contains(&config.hedge) {
+        return wrong("hedge", config.hedge, "0 to 1");
     }
     if let Worth::DiscountedStep { gamma } = config.worth
         && !(gamma > 0.0 && gamma <= 1.0)

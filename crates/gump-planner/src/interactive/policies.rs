@@ -3,7 +3,7 @@
 use gump_rollout::worlds::IdmConfig;
 
 use super::InteractiveDriverConfig;
-use crate::ProposalKind;
+use crate::{ProposalKind, Side};
 
 /// A policy: a line, a desired speed and a car-following law.
 #[derive(Clone, Debug)]
@@ -20,13 +20,19 @@ pub(super) struct Policy {
 const BRISK: [f64; 2] = [0.7, 1.0];
 /// Share of the limit that a driver desires who keeps a long distance.
 const YIELDING: f64 = 0.8;
+/// Shares of the limit at which lanes are changed.
+const CHANGING: [f64; 2] = [0.6, 1.0];
 /// Share of the limit at which a driver creeps forward.
 const CREEPING: f64 = 0.07;
 
 /// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers with
-/// other driving styles along the centre, if that is a line and they are requested. `speeds` are
-/// PDM's.
-pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Policy> {
+/// other driving styles along the centre, if that is a line and they are requested; then changes of
+/// lane, along these lines to these sides. `speeds` are PDM's.
+pub(super) fn all(
+    config: &InteractiveDriverConfig,
+    speeds: &[f64],
+    changes: &[(usize, Side)],
+) -> Vec<Policy> {
     let proposals = &config.proposals;
     let offsets = proposals.lateral_offsets.iter().enumerate();
     let of_line = |(line, &lateral_offset)| {
@@ -42,9 +48,9 @@ pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Polic
         })
     };
     let mut policies: Vec<Policy> = offsets.flat_map(of_line).collect();
+    let limit = speeds[0] / proposals.speed_fractions[0];
     let centre = proposals.lateral_offsets.iter().position(|&y| y == 0.0);
     if let Some(line) = centre.filter(|_| config.driving_styles) {
-        let limit = speeds[0] / proposals.speed_fractions[0];
         let policy = |kind, fraction: f64, law| Policy {
             kind,
             line,
@@ -60,6 +66,17 @@ pub(super) fn all(config: &InteractiveDriverConfig, speeds: &[f64]) -> Vec<Polic
             let kind = ProposalKind::Yielding { speed_fraction };
             policies.push(policy(kind, speed_fraction, yielding(usual)));
         }
+    }
+    for &(line, side) in changes {
+        policies.extend(CHANGING.map(|speed_fraction| Policy {
+            kind: ProposalKind::LaneChange {
+                speed_fraction,
+                side,
+            },
+            line,
+            desired_speed: speed_fraction * limit,
+            law: proposals.law.clone(),
+        }));
     }
     policies
 }

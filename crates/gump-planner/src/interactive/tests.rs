@@ -11,8 +11,8 @@ use gump_rollout::{RolloutError, Session, Start};
 use gump_scene::{Agent, AgentId, AgentState, Frame, fixture};
 
 use super::*;
-use crate::PdmClosed;
 use crate::closed_loop::plan_once;
+use crate::{PdmClosed, Side};
 
 const STREET: &str = "
     lane 1: -30,0 300,0 speed 12
@@ -164,6 +164,76 @@ fn who_moves_first_is_let_in_and_a_forecast_does_not_know_it() {
     let deaf = ByLaw(|agent, _, _| coasted(agent));
     let decision = decide(&deaf, InteractiveDriverConfig::default(), CROSSING);
     assert!(decision.prospects[decision.chosen].progress_m < waits + 2.0);
+}
+
+#[test]
+fn a_hedge_keeps_from_relying_on_others() {
+    let world = ByLaw(yields_to_the_bold);
+    let with = |hedge: f64| {
+        let config = InteractiveDriverConfig {
+            hedge,
+            ..InteractiveDriverConfig::default()
+        };
+        let decision = decide(&world, config, CROSSING);
+        decision.prospects[decision.chosen].clone()
+    };
+    let (bold, careful) = (with(0.0), with(0.9));
+    assert_eq!(bold.hedge, None);
+    assert!(bold.progress_m > careful.progress_m + 5.0);
+    // Nothing happens to the careful among those who do not answer, either.
+    let hedge = careful.hedge.unwrap();
+    assert!(hedge.total > 0.5, "{hedge:?}");
+    let value = 0.1 * careful.score.mean + 0.9 * hedge.total;
+    assert_abs_diff_eq!(careful.value, value, epsilon = 1e-12);
+}
+
+/// Two lanes, of which the right one ends after 70 m.
+const MERGE: &str = "
+    lane 1: -30,0 70,0 speed 12 left 2
+    lane 2: -30,3.5 70,3.5 speed 12 right 1 next 3
+    lane 3: 70,3.5 400,3.5 speed 12
+    drivable: -30,-2 70,-2 70,1.5 400,1.5 400,5.5 -30,5.5
+    route 1,2,3
+    ego vehicle 0: 20,0 velocity 10,0";
+
+fn merging(others: &str, config: InteractiveDriverConfig) -> Decision {
+    let mut scenario = fixture::scenario(&format!("{MERGE}\n{others}")).unwrap();
+    derive_roadblocks(&mut scenario);
+    let recording = Recording::of_boxes(scenario).unwrap();
+    let mut driver = InteractiveDriver::new(&ConstantVelocity, config).unwrap();
+    plan_once(&recording, &mut driver).unwrap();
+    driver.decision.unwrap()
+}
+
+#[test]
+fn a_lane_that_ends_is_left() {
+    let config = InteractiveDriverConfig {
+        imitation: false,
+        ..InteractiveDriverConfig::default()
+    };
+    let decision = merging("", config.clone());
+    let chosen = &decision.prospects[decision.chosen];
+    let left = ProposalKind::LaneChange {
+        speed_fraction: 1.0,
+        side: Side::Left,
+    };
+    assert_eq!(chosen.kind, left);
+    let end = chosen.drives[0].last().unwrap().rear_axle;
+    assert!((3.0..4.0).contains(&end.position.y), "{end:?}");
+    // Not into somebody who drives beside it.
+    let beside = merging("agent vehicle 1: 21,3.5 velocity 10,0", config.clone());
+    let chosen = &beside.prospects[beside.chosen];
+    assert_eq!(chosen.collisions, 0);
+    assert!(chosen.score.mean > 0.0);
+    // Without them there are as many candidates as on a road of one lane.
+    let none = InteractiveDriverConfig {
+        lane_changes: false,
+        ..config
+    };
+    assert_eq!(
+        merging("", none).prospects.len() + 2,
+        decision.prospects.len()
+    );
 }
 
 /// Speed and line of the chosen one.
@@ -919,6 +989,7 @@ fn numbers_out_of_range_are_refused() {
     check(|c| c.replan_every = 0, "replan_every");
     check(|c| c.caution = f64::NAN, "caution");
     check(|c| c.hysteresis = -1.0, "hysteresis");
+    check(|c| c.hedge = 1.5, "hedge");
     check(|c| c.worth = Worth::DiscountedStep { gamma: 0.0 }, "gamma");
     check(|c| c.budget.horizon = 0.3, "horizon");
     check(|c| c.budget.horizon = 9.0, "horizon");

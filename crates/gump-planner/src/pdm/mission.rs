@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use gump_geometry::{Polygon, Pose, Quad, angle_difference};
+use gump_geometry::{DVec2, Polygon, Pose, Quad, angle_difference};
 use gump_nuplan::closed_loop::{Mission, Moment};
 use gump_nuplan::path::{Path, baseline};
 use gump_nuplan::tracking::Trajectory;
@@ -15,6 +15,7 @@ use gump_scene::{
 
 use super::forecast::Forecast;
 use super::ground::Ground;
+use super::lane_change::{OTHER_LANE_M, Side, changes, way_from};
 use super::propose::{DT, Line, Proposer};
 use super::{PdmConfig, TRAJECTORY_STEPS};
 use crate::PlanError;
@@ -45,6 +46,12 @@ struct Way {
     /// One per lateral offset, the centre line among them where the offset is 0.
     lines: Vec<Line>,
     centerline: Line,
+    /// The centre line that progress counts on, where the ego's own ends before the route does.
+    goes_on: Option<Line>,
+    /// The lanes of the centre line.
+    chain: Vec<LaneId>,
+    /// Changes of lane, whose lines follow those of the lateral offsets.
+    changes: Vec<Side>,
 }
 
 impl State {
@@ -100,9 +107,10 @@ impl State {
         }
     }
 
-    /// The centre line of the way.
+    /// The centre line that progress counts on.
     pub(crate) fn centerline(&self) -> &Line {
-        &self.prepared().centerline
+        let way = self.prepared();
+        way.goes_on.as_ref().unwrap_or(&way.centerline)
     }
 
     fn prepared(&self) -> &Way {
@@ -128,6 +136,9 @@ impl State {
                 route,
                 lines: Vec::with_capacity(config.lateral_offsets.len()),
                 centerline: Line::new(nowhere),
+                goes_on: None,
+                chain: Vec::new(),
+                changes: Vec::new(),
             });
         }
         let way = self.way.as_ref().expect("the way was just found");
@@ -205,8 +216,68 @@ impl State {
             .map(|&left| Line::new(center.shifted(left)))
             .collect();
         way.centerline = Line::new(center);
+        way.chain = lanes;
         Ok(())
     }
+
+    /// Lays lines into the lanes beside the ego's own, anew for every decision; once the ego is in
+    /// another lane, its own lines are laid there.
+    ///
+    /// # Errors
+    /// As [`Self::prepare`].
+    pub(crate) fn lay_changes(
+        &mut self,
+        ego: &EgoState,
+        config: &PdmConfig,
+    ) -> Result<(), PlanError> {
+        let place = ego.rear_axle.position;
+        let here = self.starting_lane(ego)?;
+        let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
+        let off = |id: &LaneId| metres_to(&self.map, *id, place);
+        let least = way.chain.iter().map(off).fold(f64::INFINITY, f64::min);
+        if !way.chain.contains(&here) && least > OTHER_LANE_M {
+            way.lines.clear();
+            self.lay_lines(here, config)?;
+        }
+        let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
+        way.lines.truncate(config.lateral_offsets.len());
+        way.changes.clear();
+        way.goes_on = None;
+        let off = |id: &LaneId| metres_to(&self.map, *id, place);
+        let own = way.chain.iter().min_by(|a, b| off(a).total_cmp(&off(b)));
+        let Some(&own) = own else { return Ok(()) };
+        let block = self.map.lane(own).and_then(|lane| lane.roadblock);
+        let at = way.route.iter().position(|&id| Some(id) == block);
+        let Some(at) = at else { return Ok(()) };
+        let window = &way.route[at..way.route.len().min(at + WINDOW)];
+        let found = changes(&self.map, own, window, ego.rear_axle, ego.speed());
+        let arrives = way_from(&self.map, own, window).is_some_and(|(_, arrives)| arrives);
+        if !arrives && let Some(change) = found.iter().find(|change| change.arrives) {
+            way.goes_on = Some(Line::new(change.target.clone()));
+        }
+        for change in found {
+            way.lines.push(change.line);
+            way.changes.push(change.side);
+        }
+        Ok(())
+    }
+
+    /// The changes of lane that are laid, with the indices of their lines.
+    pub(crate) fn lane_changes(&self) -> Vec<(usize, Side)> {
+        self.way.as_ref().map_or_else(Vec::new, |way| {
+            let first = way.lines.len() - way.changes.len();
+            let changes = way.changes.iter().enumerate();
+            changes.map(|(i, &side)| (first + i, side)).collect()
+        })
+    }
+}
+
+/// Metres to the centre line of a lane.
+fn metres_to(map: &MapGraph, lane: LaneId, place: DVec2) -> f64 {
+    let lane = map.lane(lane);
+    lane.map_or(f64::INFINITY, |lane| {
+        lane.centerline.project(place).distance
+    })
 }
 
 /// Surfaces of the route's lanes through intersections whose lights are red.

@@ -11,6 +11,7 @@
 pub(crate) mod comfort;
 pub(crate) mod forecast;
 pub(crate) mod ground;
+pub(crate) mod lane_change;
 pub(crate) mod mission;
 pub(crate) mod propose;
 #[cfg(test)]
@@ -20,6 +21,7 @@ pub(crate) mod score;
 mod tests;
 pub(crate) mod track;
 
+pub use lane_change::Side;
 pub use score::PdmScore;
 
 use gump_nuplan::closed_loop::{Driver, Mission, Moment};
