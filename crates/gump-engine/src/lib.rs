@@ -77,10 +77,14 @@ pub mod temporal_ensemble;
 #[cfg(feature = "tensors")]
 mod tests;
 #[cfg(feature = "tensors")]
+mod trajectories;
+#[cfg(feature = "tensors")]
 pub mod world;
 
 pub use gump_kernels::panels::Precision;
 pub use predictive_samples::{PredictiveSamples, ProbeConfig};
 pub use sampling::{CacheMode, LightSource, Mode, RateScale, SamplingConfig, Surrogate};
+#[cfg(feature = "tensors")]
+pub use trajectories::{AgentTrajectories, TrajectoryMode};
 #[cfg(feature = "tensors")]
 pub use world::TransformerWorld;

@@ -19,6 +19,7 @@ use crate::reference::{Passes, decode};
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
 use crate::temporal_ensemble::ChunkBuffer;
+use crate::trajectories::TrajectoryMode;
 use crate::world::TransformerWorld;
 
 fn largest_difference(a: &[Vec<f32>], b: &[Vec<f32>]) -> f32 {
@@ -609,4 +610,38 @@ fn velocities_agree_with_displacements() {
         }
         before.clone_from(frames);
     }
+}
+
+#[test]
+fn trajectory_heads_predict_every_agent_of_the_window() {
+    let scenario = scenario();
+    let with = |heads: Vec<usize>| {
+        let config = ModelConfig {
+            trajectory_heads: heads,
+            ..network().config().clone()
+        };
+        Network::random(config, Seed(3), &Device::Cpu).unwrap()
+    };
+    let last = network().config().layers - 1;
+    let plain = TransformerWorld::plain(with(vec![0, last]), SamplingConfig::default());
+    let predicted = plain.predict_trajectories(scenario.present()).unwrap();
+    let present = scenario.present();
+    let agents = present.now().agents().iter();
+    let moving = agents.filter(|agent| agent.kind.is_moving());
+    assert_eq!(predicted.len(), moving.count());
+    for agent in &predicted {
+        let sum: f64 = agent.modes.iter().map(|mode| mode.probability).sum();
+        assert!((sum - 1.0).abs() < 1e-6 && agent.modes.len() == 6);
+        let is_whole = |mode: &TrajectoryMode| {
+            mode.positions.len() == 16 && mode.positions.iter().all(|p| p.is_finite())
+        };
+        assert!(agent.modes.iter().all(is_whole));
+    }
+    // The engine keeps the map in another form.
+    let engine = TransformerWorld::new(with(vec![0, last]), SamplingConfig::default());
+    let same = engine.predict_trajectories(scenario.present()).unwrap();
+    assert_eq!(same, predicted);
+    let none = TransformerWorld::plain(with(vec![]), SamplingConfig::default());
+    let error = none.predict_trajectories(scenario.present()).unwrap_err();
+    assert!(error.to_string().contains("no trajectory heads"), "{error}");
 }

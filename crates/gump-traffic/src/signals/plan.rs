@@ -366,13 +366,17 @@ impl<'a> Draft<'a> {
             phases.push(self.phase(&set));
         }
         let is_shut = phases[0].green.iter().all(|green| !green);
-        // Red for a moment only is between two phases; for longer, somebody else is served.
+        // Red for a moment only is between two phases; for longer, somebody else is served, unless
+        // the lights of all roads are seen.
         let just_now = self.lights.iter().any(|&light| {
             let age = self.seen.age(light);
             matches!(age, Age::Exactly(age) if age < super::timing::CLEARANCE_S)
         });
+        let crosses = |g: usize, h: usize| self.conflicts[g][h] && !self.shares_road(g, h);
+        let all_seen = (0..n).all(|g| !shows(g, LightState::Unknown))
+            && (0..n).any(|g| (0..g).any(|h| crosses(g, h)));
         let is_known = (0..n).any(|g| !shows(g, LightState::Unknown));
-        let is_between = is_shut && (just_now || !is_known) && phases.len() > 1;
+        let is_between = is_shut && (just_now || all_seen || !is_known) && phases.len() > 1;
         if is_between {
             phases.remove(0);
         }

@@ -237,6 +237,19 @@ fn lanes_of_few_points_cross_too() {
 }
 
 #[test]
+fn where_all_roads_are_red_one_of_them_is_next() {
+    // Red in every frame: longer than the clearance between two phases.
+    let plan = plan(&crossing(["red"; 5]));
+    for seed in 0..20 {
+        let mut signals = Signals::begin(&plan, Seed(seed));
+        for _ in 0..4 {
+            signals.advance(0.5, Some(&everywhere()));
+        }
+        assert!(states(&signals).contains(&Green), "seed {seed}");
+    }
+}
+
+#[test]
 fn no_lights_no_plan() {
     let scenario = fixture::scenario("lane 1: 0,0 40,0\nego vehicle 0: 0,0").unwrap();
     assert!(plan(&scenario).is_empty());

@@ -10,11 +10,12 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use gump_data::ReadOptions;
+use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::{WorldName, Worlds};
-use gump_model::Device;
-use gump_scene::{Prediction, Scenario};
+use gump_model::{Device, checkpoint, relative};
+use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
 use gump_wosac::motion::{
     MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
     forecast,
@@ -25,6 +26,7 @@ use self::scores::Scores;
 use self::source::Predictions;
 use super::left_out::LeftOut;
 use crate::benchmark::{Found, Scenes};
+use crate::cli::WrongArguments;
 use crate::decoding::Decoding;
 use crate::futures;
 use crate::imagine::imagine;
@@ -46,6 +48,9 @@ pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
     source: Source,
+    /// Predictions of the network's trajectory heads instead of futures; only of sequence networks
+    #[arg(long, requires = "world")]
+    heads: bool,
     /// Futures of the world that are condensed to the six modes of a prediction
     #[arg(long, value_name = "N", default_value = "32")]
     futures: NonZeroUsize,
@@ -161,6 +166,13 @@ impl Args {
     fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
         Ok(match (&self.source.rollouts, &self.source.world) {
             (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
+            (None, Some(name)) if self.heads => {
+                let WorldName::Model(path) = name else {
+                    let wrong = format!("--heads: expected --world model:WEIGHTS, found {name}");
+                    return Err(WrongArguments(wrong).into());
+                };
+                Forecaster::heads(path, device)?
+            }
             (None, Some(name)) => {
                 let decoding = self.sampling.decoding(name)?;
                 Forecaster::World {
@@ -186,6 +198,7 @@ impl Args {
         }
         if let Some(world) = &self.source.world {
             set("world", world.to_string().into());
+            set("heads", self.heads.into());
             set("futures", i64::try_from(self.futures.get())?.into());
             set("sampling", toml::Value::try_from(&self.sampling)?);
         }
@@ -210,6 +223,8 @@ fn is_of_another_length(error: &anyhow::Error) -> bool {
 enum Forecaster<'a> {
     /// A file.
     File(Predictions, &'a Path),
+    /// The trajectory heads of a network.
+    Heads(Box<TransformerWorld>),
     /// Futures of a world.
     World {
         worlds: Box<Worlds<'a>>,
@@ -219,12 +234,32 @@ enum Forecaster<'a> {
 }
 
 impl Forecaster<'_> {
+    /// Error: [`WrongArguments`] for a network without heads, weights that cannot be read.
+    fn heads(path: &Path, device: &Device) -> anyhow::Result<Self> {
+        let without = |what: &str| {
+            let wrong = format!(
+                "--heads: expected a sequence network with trajectory heads, found {what}: {}",
+                path.display()
+            );
+            WrongArguments(wrong)
+        };
+        if relative::is_relative(path)? {
+            return Err(without("a relative network").into());
+        }
+        let network = checkpoint::load(path, device)?;
+        if network.trajectory_heads.is_empty() {
+            return Err(without("one without").into());
+        }
+        let world = TransformerWorld::plain(network, SamplingConfig::default());
+        Ok(Self::Heads(Box::new(world)))
+    }
+
     /// Leaves out targets that nobody can imagine because they are absent now; how many.
     ///
     /// A file is held to all targets, as the challenge holds it.
     fn drop_absent(&self, scenario: &mut Scenario) -> usize {
         let before = scenario.targets.len();
-        if let Self::World { .. } = self {
+        if !matches!(self, Self::File(..)) {
             let now = &scenario.log[scenario.now];
             scenario.targets.retain(|&id| now.agent(id).is_some());
         }
@@ -234,7 +269,7 @@ impl Forecaster<'_> {
     /// How its futures are made; a file does not tell.
     fn decoding(&self) -> &'static str {
         match self {
-            Self::File(..) => Decoding::NONE,
+            Self::File(..) | Self::Heads(_) => Decoding::NONE,
             Self::World { decoding, .. } => decoding.name,
         }
     }
@@ -249,6 +284,7 @@ impl Forecaster<'_> {
     ) -> anyhow::Result<(Vec<Prediction>, Option<String>)> {
         match self {
             Self::File(predictions, path) => Ok((predictions.of(scenario, config, path)?, None)),
+            Self::Heads(world) => Ok((by_heads(world, scenario, config)?, None)),
             Self::World { .. } if scenario.targets.is_empty() => Ok((Vec::new(), None)),
             Self::World {
                 worlds,
@@ -270,7 +306,53 @@ impl Forecaster<'_> {
     fn check_all_used(&self, ids: &BTreeSet<String>) -> anyhow::Result<()> {
         match self {
             Self::File(predictions, path) => predictions.check_all_known(ids, path),
-            Self::World { .. } => Ok(()),
+            Self::Heads(_) | Self::World { .. } => Ok(()),
         }
     }
+}
+
+/// The heads' predictions of every target. Targets outside the network's window keep their velocity.
+fn by_heads(
+    world: &TransformerWorld,
+    scenario: &Scenario,
+    config: &MotionConfig,
+) -> anyhow::Result<Vec<Prediction>> {
+    let present = scenario.present();
+    let predicted = world.predict_trajectories(present)?;
+    let of = |&agent: &AgentId| {
+        let own = predicted.iter().find(|found| found.agent == agent);
+        let modes = match own {
+            Some(own) => own
+                .modes
+                .iter()
+                .map(|mode| PredictedMode {
+                    confidence: mode.probability,
+                    paths: vec![
+                        mode.positions
+                            .iter()
+                            .take(config.n_steps)
+                            .copied()
+                            .collect(),
+                    ],
+                })
+                .collect(),
+            None => {
+                let now = present.now().agent(agent).map(|agent| agent.state);
+                let state = now.unwrap_or_default();
+                let place = |step: usize| {
+                    let seconds = (step + 1) as f64 * config.step_seconds;
+                    state.pose.position + state.velocity * seconds
+                };
+                vec![PredictedMode {
+                    confidence: 1.0,
+                    paths: vec![(0..config.n_steps).map(place).collect()],
+                }]
+            }
+        };
+        Prediction {
+            agents: vec![agent],
+            modes,
+        }
+    };
+    Ok(scenario.targets.iter().map(of).collect())
 }
