@@ -4,7 +4,7 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_scene::{Agent, AgentId, Rollout, Scenario};
+use gump_scene::{Agent, AgentId, Prediction, Rollout, Scenario};
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -15,6 +15,18 @@ pub(crate) fn digest(rollouts: &[Rollout]) -> String {
     let mut hash = Sha256::new();
     for frame in rollouts.iter().flat_map(Rollout::imagined) {
         for number in frame.agents().iter().flat_map(numbers) {
+            hash.update((number as f32).to_le_bytes());
+        }
+    }
+    hexadecimal(hash)
+}
+
+/// SHA-256 over the confidence and the positions of every mode, as little-endian f32.
+pub(crate) fn digest_of_predictions(predictions: &[Prediction]) -> String {
+    let mut hash = Sha256::new();
+    for mode in predictions.iter().flat_map(|predicted| &predicted.modes) {
+        let places = mode.paths.iter().flatten().flat_map(|p| p.to_array());
+        for number in std::iter::once(mode.confidence).chain(places) {
             hash.update((number as f32).to_le_bytes());
         }
     }

@@ -227,6 +227,9 @@ fn no_world_and_no_verb_sees_what_comes_after_the_present() {
             });
             checked += 4;
         }
+        check(1, &|f| {
+            format!("evaluate motion --scenarios {f} --world {model} --heads")
+        });
         check(4, &|f| {
             format!("ablate nar --scenario {f} --world {model} --futures 1 --seconds 4")
         });

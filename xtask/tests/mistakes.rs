@@ -173,6 +173,23 @@ fn weights_are_found_or_hinted_at() {
 }
 
 #[test]
+fn heads_are_asked_of_networks_that_have_them() {
+    let place = Workplace::new();
+    let words =
+        |world: &str| format!("evaluate motion --scenarios scene.tfrecord --heads --world {world}");
+    let expected = "--heads: expected --world model:WEIGHTS, found idm";
+    place.check(&words("idm"), 2, &[expected]);
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/weights");
+    let relative = weights.join("gump-relative.safetensors");
+    let world = format!("model:{}", relative.display());
+    place.check(
+        &words(&world),
+        2,
+        &["--heads: ", "found a relative network"],
+    );
+}
+
+#[test]
 fn a_broken_file_has_no_counts_before_the_reason() {
     let place = Workplace::new();
     place.write_map();

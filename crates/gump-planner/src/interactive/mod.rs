@@ -69,9 +69,9 @@ pub struct InteractiveDriverConfig {
 }
 
 impl Default for InteractiveDriverConfig {
-    /// The paper's 15 policies and imitation, four more policies of other driving styles, 4 futures of 4 s for
-    /// the finalists of sequential halving, the mean; a decision every
-    /// half second, which is a frame of the learned world.
+    /// The paper's 15 policies and imitation, four more policies of other driving styles, changes of
+    /// lane, 4 futures of 4 s for the finalists of sequential halving, the mean, half of the value
+    /// from the hedge; a decision every half second, which is a frame of the learned world.
     fn default() -> Self {
         Self {
             proposals: PdmConfig::default(),
@@ -85,7 +85,7 @@ impl Default for InteractiveDriverConfig {
             worth: Worth::Rollout,
             aggregate: Aggregate::default(),
             caution: 0.0,
-            hedge: 0.0,
+            hedge: 0.5,
             hysteresis: 0.0,
             budget: PlanBudget::default(),
         }

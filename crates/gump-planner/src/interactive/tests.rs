@@ -155,14 +155,18 @@ fn who_moves_first_is_let_in_and_a_forecast_does_not_know_it() {
     );
     assert!(waits < 16.0, "{waits}");
     // ... but not where the other answers.
+    let trusting = || InteractiveDriverConfig {
+        hedge: 0.0,
+        ..InteractiveDriverConfig::default()
+    };
     let world = ByLaw(yields_to_the_bold);
-    let decision = decide(&world, InteractiveDriverConfig::default(), CROSSING);
+    let decision = decide(&world, trusting(), CROSSING);
     let chosen = &decision.prospects[decision.chosen];
     assert!(chosen.progress_m > waits + 5.0, "{}", chosen.progress_m);
     assert!(fraction(chosen) > 0.5 && chosen.collisions == 0);
     // With others who do not answer it waits as well.
     let deaf = ByLaw(|agent, _, _| coasted(agent));
-    let decision = decide(&deaf, InteractiveDriverConfig::default(), CROSSING);
+    let decision = decide(&deaf, trusting(), CROSSING);
     assert!(decision.prospects[decision.chosen].progress_m < waits + 2.0);
 }
 

@@ -274,7 +274,7 @@ impl Forecaster<'_> {
         }
     }
 
-    /// Predictions, and the digest of the futures they were condensed from.
+    /// Predictions, and the digest of what they come from: futures, or the heads' predictions.
     fn predict(
         &mut self,
         run: &Run,
@@ -284,7 +284,11 @@ impl Forecaster<'_> {
     ) -> anyhow::Result<(Vec<Prediction>, Option<String>)> {
         match self {
             Self::File(predictions, path) => Ok((predictions.of(scenario, config, path)?, None)),
-            Self::Heads(world) => Ok((by_heads(world, scenario, config)?, None)),
+            Self::Heads(world) => {
+                let predictions = by_heads(world, scenario, config)?;
+                let digest = futures::digest_of_predictions(&predictions);
+                Ok((predictions, Some(digest)))
+            }
             Self::World { .. } if scenario.targets.is_empty() => Ok((Vec::new(), None)),
             Self::World {
                 worlds,
@@ -317,7 +321,8 @@ fn by_heads(
     scenario: &Scenario,
     config: &MotionConfig,
 ) -> anyhow::Result<Vec<Prediction>> {
-    let present = scenario.present();
+    // The route is derived from where the ego drives later.
+    let present = scenario.present().unguided();
     let predicted = world.predict_trajectories(present)?;
     let of = |&agent: &AgentId| {
         let own = predicted.iter().find(|found| found.agent == agent);
