@@ -39,7 +39,7 @@ pub enum PlannerName {
     PdmClosed,
     /// The mean of the ego's motion in the rollouts of a world.
     Imitation,
-    /// 19 policies and imitation, each rolled out among reactive agents.
+    /// Policies, lane changes among them, and imitation, each rolled out among reactive agents.
     Interactive,
     /// PDM's 15 proposals, each a planner of its own.
     Proposals,
@@ -78,7 +78,9 @@ impl PlannerName {
             Self::Simple => "Straight on",
             Self::PdmClosed => "PDM-Closed: 15 proposals against a constant-velocity forecast",
             Self::Imitation => "Mean ego trajectory of the world model over several futures",
-            Self::Interactive => "19 policies and imitation, each rolled out among reactive agents",
+            Self::Interactive => {
+                "19 policies, lane changes and imitation, each rolled out among reactive agents"
+            }
             Self::Proposals => {
                 "PDM's 15 proposals, each alone to the end: two rows, the best of them and the best \
                  in each scenario, an oracle"

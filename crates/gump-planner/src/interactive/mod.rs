@@ -203,6 +203,16 @@ pub struct Prospect {
     pub drives: Vec<Vec<EgoState>>,
 }
 
+impl Prospect {
+    /// Means over the futures of every gate's factor and every term's value, by name, and the total
+    /// of the hedge as `hedge`.
+    pub fn parts(&self) -> Vec<(&'static str, f64)> {
+        let mut parts = self.score.parts();
+        parts.extend(self.hedge.as_ref().map(|hedge| ("hedge", hedge.total)));
+        parts
+    }
+}
+
 /// A decision with all prospects.
 #[derive(Clone, Debug)]
 pub struct Decision {
@@ -362,7 +372,7 @@ impl Explain for InteractiveDriver<'_> {
                 name: prospect.kind.to_string(),
                 chosen: i == decision.chosen && !decision.brakes,
                 score: Some(prospect.value),
-                parts: prospect.score.parts(),
+                parts: prospect.parts(),
                 poses: prospect.drives[0].iter().map(|s| s.rear_axle).collect(),
             })
             .collect();

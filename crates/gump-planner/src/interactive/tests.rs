@@ -42,6 +42,7 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
         },
         imitation: false,
         driving_styles: false,
+        hedge: 0.0,
         allocation: Allocation::Uniform,
         ..InteractiveDriverConfig::default()
     }

@@ -54,6 +54,6 @@ class Imitation(_Planner):
 
 
 class Interactive(_Planner):
-    """19 policies and imitation, each rolled out among reactive agents."""
+    """19 policies, lane changes and imitation, each rolled out among reactive agents."""
 
     _gump_planner = "interactive"

@@ -44,7 +44,7 @@ impl Driver for Watched<'_> {
 }
 
 /// The median milliseconds of every phase over `n` decisions with the shipped weights in the shipped
-/// scenario: 20 candidates, 4 futures of 4 s for the finalists, the 12 nearest agents. One decision before them warms
+/// scenario: 20 candidates (more beside other lanes), 4 futures of 4 s for the finalists, the 12 nearest agents. One decision before them warms
 /// up.
 ///
 /// Error: no shipped weights, or a drive that fails.

@@ -157,7 +157,7 @@ pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
 
 /// What every candidate is worth, part by part; parts that are equal for all are one sentence.
 fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
-    let parts = |i: usize| decision.prospects[i].score.parts();
+    let parts = |i: usize| decision.prospects[i].parts();
     let names: Vec<&str> = parts(order[0]).iter().map(|(name, _)| *name).collect();
     let value = |i: usize, part: usize| parts(i).get(part).map_or(0.0, |(_, value)| *value);
     let (equal, telling): (Vec<usize>, Vec<usize>) = (0..names.len()).partition(|&part| {
@@ -199,11 +199,18 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
         true => String::new(),
         false => format!(" Equal for all: {}.", all_alike.join(", ")),
     };
+    let hedged = match decision.prospects[order[0]].hedge {
+        Some(_) => {
+            " The hedge is the same score where the others keep their velocity; it is a part of the \
+             total."
+        }
+        None => "",
+    };
     page.section("Scores")
         .prose(&format!(
             "Means over a candidate's futures. Gates (collision, road, \
              direction) multiply; progress, time to collision, the speed limit and comfort add with \
-             weights of 5, 5, 4 and 2.{alike}"
+             weights of 5, 5, 4 and 2.{hedged}{alike}"
         ))
         .table(&columns, &rows);
 }
@@ -326,7 +333,7 @@ fn viewer<'a>(
 /// A candidate with its line in the first of its futures, as the viewer takes it.
 pub(crate) fn path(vehicle: &VehicleParameters, decision: &Decision, i: usize) -> CandidatePath {
     let prospect = &decision.prospects[i];
-    let (parts, states) = (prospect.score.parts(), prospect.drives[0].iter());
+    let (parts, states) = (prospect.parts(), prospect.drives[0].iter());
     CandidatePath {
         name: prospect.kind.to_string(),
         score: Some(prospect.value),

@@ -79,6 +79,14 @@ pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> V
     if !parts.is_empty() {
         told.push(format!("Of the score's parts, {}.", parts.join("; ")));
     }
+    if let (Some(mine), Some(theirs)) = (&chosen.hedge, &other.hedge)
+        && (mine.total - theirs.total).abs() > SAME_PART
+    {
+        told.push(format!(
+            "Where the others keep their velocity, it scores {:.2} instead of {:.2}.",
+            mine.total, theirs.total
+        ));
+    }
     let (mine, theirs) = (chosen.progress_m, other.progress_m);
     if (mine - theirs).abs() > SAME_GAP {
         told.push(format!(
