@@ -243,3 +243,41 @@ fn failures_keep_their_place_among_results() {
     let expected: Vec<(usize, bool)> = (0..6).map(|i| (i, i % 3 != 1)).collect();
     assert_eq!(results, expected);
 }
+
+#[test]
+fn a_lane_that_ends_is_left_in_comfort() {
+    // The right lane ends after 100 m.
+    let case = recording(
+        "lane 1: -30,0 100,0 speed 12 left 2
+         lane 2: -30,3.5 100,3.5 speed 12 right 1 next 3
+         lane 3: 100,3.5 400,3.5 speed 12
+         drivable: -30,-2 100,-2 100,1.5 400,1.5 400,5.5 -30,5.5
+         agent vehicle 1: 60,3.5 velocity 10,0
+         agent vehicle 2: -15,3.5 velocity 8,0
+         route 1,2,3
+         ego vehicle 0: 20,0 velocity 10,0 size 5,2",
+    );
+    let world = Idm::default();
+    let config = InteractiveDriverConfig {
+        n_futures: 1,
+        imitation: false,
+        ..InteractiveDriverConfig::default()
+    };
+    let mut driver = InteractiveDriver::new(&world, config).unwrap();
+    let drive = DriveConfig {
+        seconds: 8.0,
+        ..DriveConfig::default()
+    };
+    let mut traffic = NuplanIdm::default();
+    let scored = drive_and_score(&case.0, &case.1, &mut traffic, &mut driver, &drive).unwrap();
+    let end = scored.driven.ego.last().unwrap().rear_axle;
+    assert!(end.position.x > 75.0, "{end:?}");
+    assert!((end.position.y - 3.5).abs() < 0.5, "{end:?}");
+    let metric = |name: &str| {
+        let named = scored.metrics.scores();
+        let found = named.into_iter().find(|(metric, _)| *metric == name);
+        found.and_then(|(_, value)| value)
+    };
+    assert_eq!(metric("ego_is_comfortable"), Some(1.0));
+    assert_eq!(metric("no_ego_at_fault_collisions"), Some(1.0));
+}

@@ -30,7 +30,9 @@ fn check(scenario: &Scenario, expected: Range<f64>) {
         let mut planner = InteractiveDriver::new(world, config).unwrap();
         plan_once(&recording, &mut planner).unwrap();
         let decision = planner.decision().unwrap();
-        assert_eq!(decision.prospects.len(), 20);
+        // Beside 19 policies and imitation two for each lane to change to.
+        let n = decision.prospects.len();
+        assert!(n >= 20 && n.is_multiple_of(2), "{n}");
         assert!(!decision.brakes, "the emergency brake was needed");
         for prospect in &decision.prospects {
             for pair in prospect.drives[0].windows(2) {

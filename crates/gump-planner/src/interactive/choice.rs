@@ -230,6 +230,8 @@ pub(super) struct Tally {
     scores: Vec<Judged>,
     /// The score among agents that keep their velocity, where it counts.
     hedge: Option<Judged>,
+    /// Deducted from the value.
+    cost: f64,
 }
 
 /// The value by which a candidate is chosen.
@@ -242,6 +244,14 @@ pub(super) struct Standing {
 }
 
 impl Tally {
+    /// No futures yet, of a candidate whose choice costs so much.
+    pub(super) fn new(cost: f64) -> Self {
+        Self {
+            cost,
+            ..Self::default()
+        }
+    }
+
     /// Adds simulated and scored futures.
     pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, Judged)>) {
         for (row, score) in judged {
@@ -287,6 +297,8 @@ impl Tally {
             .hedge
             .as_ref()
             .map_or(value, |hedge| value + config.hedge * (hedge.total - value));
+        // What has no value costs nothing: the least evil is chosen by other means.
+        let value = (value - self.cost).max(value.min(0.0));
         let collided = self.scores.iter();
         let collided = collided.filter(|judged| judged.parts.collision_step.is_some());
         Standing {

@@ -109,8 +109,7 @@ impl<'a> Imagination<'a> {
             ..self.moment.scene
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
-        let changes = self.state.lane_changes();
-        let policies = policies::all(self.config, self.speeds, &changes);
+        let policies = policies::all(self.config, self.speeds, self.state.lane_changes());
         let begun = self.begin(&proposer, &policies);
         let corridors: Vec<Corridor> = (0..proposer.lines.len())
             .map(|line| {
@@ -119,7 +118,8 @@ impl<'a> Imagination<'a> {
             })
             .collect();
         let n_candidates = begun.len() + usize::from(self.config.imitation);
-        let mut tallies: Vec<Tally> = (0..n_candidates).map(|_| Tally::default()).collect();
+        let cost = |i: usize| policies.get(i).map_or(0.0, |policy| policy.cost);
+        let mut tallies: Vec<Tally> = (0..n_candidates).map(|i| Tally::new(cost(i))).collect();
         let mut left: Vec<usize> = (0..n_candidates).collect();
         let mut horizon = steps(&self.config.budget) / DECISION;
         let rounds = self.config.allocation.rounds(self.config.n_futures);

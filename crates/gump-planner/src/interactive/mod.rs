@@ -182,7 +182,7 @@ pub struct Prospect {
     /// The result of each future.
     pub score: CandidateScore,
     /// The value by which it is chosen: [`InteractiveDriverConfig::aggregate`] of its futures, and
-    /// the [`hedge`](InteractiveDriverConfig::hedge).
+    /// the [`hedge`](InteractiveDriverConfig::hedge), less a small cost of changing lane.
     pub value: f64,
     /// The score among agents that keep their velocity; `None` where it has no weight.
     pub hedge: Option<Score>,
@@ -326,7 +326,7 @@ impl<'w> InteractiveDriver<'w> {
         if let Some(way) = &self.following {
             return Ok(way.clone());
         }
-        let policies = policies::all(&self.config, speeds, &state.lane_changes());
+        let policies = policies::all(&self.config, speeds, state.lane_changes());
         let chosen = &policies[decision.chosen];
         let proposer = state.proposer(&chosen.law, speeds);
         let mut policy = [proposer.begin(chosen.line, ego.rear_axle, ego.velocity.x)];
@@ -351,9 +351,14 @@ impl Driver for InteractiveDriver<'_> {
         let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
         let speeds = state.prepare(moment, &self.config.proposals)?;
         if self.is_due(moment) {
+            let chosen = |decision: &Decision| decision.prospects[decision.chosen].kind;
+            let under_way = match self.decision.as_ref().map(chosen) {
+                Some(ProposalKind::LaneChange { side, .. }) => Some(side),
+                _ => None,
+            };
             let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
             if self.config.lane_changes {
-                state.lay_changes(moment.ego, &self.config.proposals)?;
+                state.lay_changes(moment.ego, &self.config.proposals, under_way)?;
             }
             self.decide(moment, &speeds)?;
         }

@@ -3,7 +3,8 @@
 use gump_rollout::worlds::IdmConfig;
 
 use super::InteractiveDriverConfig;
-use crate::{ProposalKind, Side};
+use crate::ProposalKind;
+use crate::pdm::lane_change::Change;
 
 /// A policy: a line, a desired speed and a car-following law.
 #[derive(Clone, Debug)]
@@ -14,12 +15,16 @@ pub(super) struct Policy {
     /// Metres per second.
     pub(super) desired_speed: f64,
     pub(super) law: IdmConfig,
+    /// Deducted from its value.
+    pub(super) cost: f64,
 }
 
 /// Shares of the limit that brisk drivers desire.
 const BRISK: [f64; 2] = [0.7, 1.0];
 /// Share of the limit that a driver desires who keeps a long distance.
 const YIELDING: f64 = 0.8;
+/// Value that a change of lane without need has to gain.
+const CHANGE_COST: f64 = 0.02;
 /// Shares of the limit at which lanes are changed.
 const CHANGING: [f64; 2] = [0.6, 1.0];
 /// Share of the limit at which a driver creeps forward.
@@ -27,11 +32,11 @@ const CREEPING: f64 = 0.07;
 
 /// All policies: PDM's lateral offsets one after another, within each the speeds; then drivers with
 /// other driving styles along the centre, if that is a line and they are requested; then changes of
-/// lane, along these lines to these sides. `speeds` are PDM's.
-pub(super) fn all(
+/// lane, along the lines of these indices. `speeds` are PDM's.
+pub(super) fn all<'a>(
     config: &InteractiveDriverConfig,
     speeds: &[f64],
-    changes: &[(usize, Side)],
+    changes: impl Iterator<Item = (usize, &'a Change)>,
 ) -> Vec<Policy> {
     let proposals = &config.proposals;
     let offsets = proposals.lateral_offsets.iter().enumerate();
@@ -45,6 +50,7 @@ pub(super) fn all(
             line,
             desired_speed,
             law: proposals.law.clone(),
+            cost: 0.0,
         })
     };
     let mut policies: Vec<Policy> = offsets.flat_map(of_line).collect();
@@ -56,6 +62,7 @@ pub(super) fn all(
             line,
             desired_speed: fraction * limit,
             law,
+            cost: 0.0,
         };
         let usual = &proposals.law;
         policies.extend(BRISK.map(|speed_fraction| {
@@ -67,15 +74,16 @@ pub(super) fn all(
             policies.push(policy(kind, speed_fraction, yielding(usual)));
         }
     }
-    for &(line, side) in changes {
+    for (line, change) in changes {
         policies.extend(CHANGING.map(|speed_fraction| Policy {
             kind: ProposalKind::LaneChange {
                 speed_fraction,
-                side,
+                side: change.side,
             },
             line,
             desired_speed: speed_fraction * limit,
             law: proposals.law.clone(),
+            cost: if change.is_due { 0.0 } else { CHANGE_COST },
         }));
     }
     policies

@@ -18,6 +18,10 @@ const SPACING: f64 = 0.5;
 const BESIDE_M: f64 = 6.0;
 /// A lane that ends or begins within this is no place to change to, metres.
 const ROOM_M: f64 = 5.0;
+/// A change is followed to its end unless the ego is farther than this from its line, metres, ...
+const LEFT_M: f64 = 0.5;
+/// ... or nearer than this to the centre of the other lane.
+const DONE_M: f64 = 0.3;
 /// Beyond this distance from the centre of its line the ego is in another lane, metres.
 pub(crate) const OTHER_LANE_M: f64 = 1.8;
 
@@ -30,25 +34,35 @@ pub enum Side {
     Right,
 }
 
-/// A line from the ego's pose into a lane beside its own, and on along the route.
-#[derive(Debug)]
+/// A change into a lane beside the ego's.
+#[derive(Clone, Debug)]
 pub(crate) struct Change {
     pub(crate) side: Side,
-    pub(crate) line: Line,
     /// The centre of that lane and of those that follow it on the route.
     pub(crate) target: Path,
     /// Whether that way gets to the end of the route.
     pub(crate) arrives: bool,
+    /// Whether it has a reason of its own: it was begun before, or the ego's own lane ends.
+    pub(crate) is_due: bool,
 }
 
-/// The changes that are possible from a lane of the route.
+impl Change {
+    /// Whether a vehicle here is still under way on the change's line: another line from its pose
+    /// would bend differently, and the change would never end smoothly.
+    pub(crate) fn goes_on(&self, line: &Line, place: DVec2) -> bool {
+        let off = |path: &Path| path.line().project(place).distance;
+        off(&line.path) < LEFT_M && off(&self.target) > DONE_M
+    }
+}
+
+/// The changes that are possible from a lane of the route, with their lines from the ego's pose on.
 pub(crate) fn changes(
     map: &MapGraph,
     own: LaneId,
     route: &[RoadblockId],
     rear_axle: Pose,
     speed: f64,
-) -> Vec<Change> {
+) -> Vec<(Change, Line)> {
     let Some(own) = map.lane(own) else {
         return Vec::new();
     };
@@ -62,12 +76,13 @@ pub(crate) fn changes(
         let lane = lanes.find(|lane| is_beside(lane, rear_axle))?;
         let (target, arrives) = way_from(map, lane.id, route)?;
         let line = Line::new(into(&target, rear_axle, speed)?);
-        Some(Change {
+        let change = Change {
             side,
-            line,
             target,
             arrives,
-        })
+            is_due: false,
+        };
+        Some((change, line))
     };
     [Side::Left, Side::Right]
         .into_iter()

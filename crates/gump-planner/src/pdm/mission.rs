@@ -15,7 +15,7 @@ use gump_scene::{
 
 use super::forecast::Forecast;
 use super::ground::Ground;
-use super::lane_change::{OTHER_LANE_M, Side, changes, way_from};
+use super::lane_change::{Change, OTHER_LANE_M, Side, changes, way_from};
 use super::propose::{DT, Line, Proposer};
 use super::{PdmConfig, TRAJECTORY_STEPS};
 use crate::PlanError;
@@ -51,7 +51,7 @@ struct Way {
     /// The lanes of the centre line.
     chain: Vec<LaneId>,
     /// Changes of lane, whose lines follow those of the lateral offsets.
-    changes: Vec<Side>,
+    changes: Vec<Change>,
 }
 
 impl State {
@@ -220,8 +220,8 @@ impl State {
         Ok(())
     }
 
-    /// Lays lines into the lanes beside the ego's own, anew for every decision; once the ego is in
-    /// another lane, its own lines are laid there.
+    /// Lays lines into the lanes beside the ego's own, anew for every decision, but for the change
+    /// that is under way; once the ego is in another lane, its own lines are laid there.
     ///
     /// # Errors
     /// As [`Self::prepare`].
@@ -229,10 +229,22 @@ impl State {
         &mut self,
         ego: &EgoState,
         config: &PdmConfig,
+        under_way: Option<Side>,
     ) -> Result<(), PlanError> {
         let place = ego.rear_axle.position;
         let here = self.starting_lane(ego)?;
         let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
+        let first = way.lines.len() - way.changes.len();
+        let mut laid = way.changes.iter().zip(&way.lines[first..]);
+        let kept = laid
+            .find(|(change, line)| Some(change.side) == under_way && change.goes_on(line, place));
+        let kept = kept.map(|(change, line)| {
+            let change = Change {
+                is_due: true,
+                ..change.clone()
+            };
+            (change, line.clone())
+        });
         let off = |id: &LaneId| metres_to(&self.map, *id, place);
         let least = way.chain.iter().map(off).fold(f64::INFINITY, f64::min);
         if !way.chain.contains(&here) && least > OTHER_LANE_M {
@@ -250,24 +262,32 @@ impl State {
         let at = way.route.iter().position(|&id| Some(id) == block);
         let Some(at) = at else { return Ok(()) };
         let window = &way.route[at..way.route.len().min(at + WINDOW)];
-        let found = changes(&self.map, own, window, ego.rear_axle, ego.speed());
+        let mut found = changes(&self.map, own, window, ego.rear_axle, ego.speed());
         let arrives = way_from(&self.map, own, window).is_some_and(|(_, arrives)| arrives);
-        if !arrives && let Some(change) = found.iter().find(|change| change.arrives) {
+        // A lane that ends looks empty, and good for as long as a rollout reaches.
+        found.retain(|(change, _)| change.arrives || !arrives);
+        for (change, _) in &mut found {
+            change.is_due = !arrives && change.arrives;
+        }
+        if let Some(kept) = kept {
+            found.retain(|(change, _)| change.side != kept.0.side);
+            found.push(kept);
+        }
+        if !arrives && let Some(change) = found.iter().map(|found| &found.0).find(|c| c.arrives) {
             way.goes_on = Some(Line::new(change.target.clone()));
         }
-        for change in found {
-            way.lines.push(change.line);
-            way.changes.push(change.side);
+        for (change, line) in found {
+            way.lines.push(line);
+            way.changes.push(change);
         }
         Ok(())
     }
 
     /// The changes of lane that are laid, with the indices of their lines.
-    pub(crate) fn lane_changes(&self) -> Vec<(usize, Side)> {
-        self.way.as_ref().map_or_else(Vec::new, |way| {
+    pub(crate) fn lane_changes(&self) -> impl Iterator<Item = (usize, &Change)> {
+        self.way.iter().flat_map(|way| {
             let first = way.lines.len() - way.changes.len();
-            let changes = way.changes.iter().enumerate();
-            changes.map(|(i, &side)| (first + i, side)).collect()
+            (first..).zip(&way.changes)
         })
     }
 }
