@@ -254,6 +254,12 @@ impl ImaginationArgs {
                 return Err(WrongArguments(wrong).into());
             }
         }
+        for (flag, share) in [("--hedge", self.hedge), ("--hysteresis", self.hysteresis)] {
+            if !(0.0..=1.0).contains(&share) {
+                let wrong = format!("{flag}: expected a number from 0 to 1, found {share}");
+                return Err(WrongArguments(wrong).into());
+            }
+        }
         Ok(PlannerConfig {
             futures: self.futures,
             allocation: match self.allocation {

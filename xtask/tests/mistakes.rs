@@ -173,6 +173,20 @@ fn weights_are_found_or_hinted_at() {
 }
 
 #[test]
+fn shares_of_a_planner_are_from_0_to_1() {
+    let place = Workplace::new();
+    let words = "evaluate closed-loop --scenarios scene.tfrecord --planner interactive --world idm";
+    for (flag, found) in [
+        ("--hedge", "2"),
+        ("--hedge", "NaN"),
+        ("--hysteresis", "1.5"),
+    ] {
+        let expected = format!("{flag}: expected a number from 0 to 1, found {found}");
+        place.check(&format!("{words} {flag} {found}"), 2, &[&expected]);
+    }
+}
+
+#[test]
 fn heads_are_asked_of_networks_that_have_them() {
     let place = Workplace::new();
     let words =

@@ -98,6 +98,5 @@ pub use interactive::{
     Aggregate, Allocation, CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig,
     Phases, PlanBudget, Prospect, Worth,
 };
-pub use pdm::Side;
-pub use pdm::{PdmClosed, PdmConfig, PdmScore};
+pub use pdm::{PdmClosed, PdmConfig, PdmScore, Side};
 pub use proposal::{Proposal, ProposalKind};
