@@ -116,6 +116,27 @@ fn a_policy_learns_goes_on_and_is_evaluated() {
     assert_eq!(results["differences"].as_array().unwrap().len(), 6);
     let drives = fs::read_to_string(place.path("evaluated/drives.csv")).unwrap();
     assert_eq!(drives.lines().count(), 1 + 6 * 4);
+
+    // Shards put together are the whole.
+    for k in 1..=2 {
+        place.results(&format!("{words} --shard {k}/2"), &format!("shard-{k}"));
+    }
+    let merge = |shards: &str| {
+        let folders = shards.split(' ').map(|k| place.path(&format!("shard-{k}")));
+        let folders: Vec<String> = folders.map(|f| f.display().to_string()).collect();
+        format!("evaluate merge {}", folders.join(" "))
+    };
+    let merged = place.results(&merge("2 1"), "merged");
+    for part in ["rows", "differences", "scenarios"] {
+        assert_eq!(merged[part], results[part], "{part}");
+    }
+    let again = fs::read_to_string(place.path("merged/drives.csv")).unwrap();
+    assert_eq!(again, drives);
+    let other = words.replace("whole/policy", "halves/policy");
+    place.results(&format!("{other} --shard 2/2"), "shard-foreign");
+    for wrong in ["1 foreign", "1 1", "1"] {
+        place.fails(&merge(wrong), 1, "shard");
+    }
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use gump_geometry::{DVec2, LineIndex, Polyline};
 use gump_metrics::Border;
-use gump_scene::{AgentState, Frame, LaneId, LightState, Scenario};
+use gump_scene::{AgentId, AgentState, Frame, LaneId, LightState, Scenario};
 
 use crate::RlError;
 use crate::observation::Texture;
@@ -23,6 +23,8 @@ pub struct Course {
     route: Option<(Polyline, LineIndex)>,
     lights: Vec<RouteLight>,
     pub(crate) border: Border,
+    /// The other agents of the present; computed on first use.
+    by_distance: OnceLock<Vec<AgentId>>,
     /// The map in bird's-eye view, for rasters; rendered on first use.
     pub(crate) texture: OnceLock<Texture>,
 }
@@ -71,6 +73,7 @@ impl Course {
                 HALF,
             ),
             route,
+            by_distance: OnceLock::new(),
             texture: OnceLock::new(),
             scenario,
         })
@@ -129,6 +132,35 @@ impl Course {
             .log
             .get(self.scenario.now + step * self.stride)?;
         Some(frame.agent(self.scenario.ego)?.state)
+    }
+
+    /// The other agents of the present, by the smallest distance to the ego that the log has from
+    /// then on.
+    pub(crate) fn by_distance(&self) -> &[AgentId] {
+        self.by_distance.get_or_init(|| {
+            let ego = self.scenario.ego;
+            let smallest = |id: AgentId| {
+                let frames = (0..=self.logged_steps()).map(|step| self.logged(step));
+                let distances = frames.filter_map(|frame| {
+                    let [own, other] = [ego, id].map(|id| frame.agent(id));
+                    Some(
+                        own?.state
+                            .pose
+                            .position
+                            .distance(other?.state.pose.position),
+                    )
+                });
+                distances.fold(f64::INFINITY, f64::min)
+            };
+            let others = self
+                .logged(0)
+                .agents()
+                .iter()
+                .filter(|agent| agent.id != ego);
+            let mut by: Vec<_> = others.map(|agent| (smallest(agent.id), agent.id)).collect();
+            by.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            by.into_iter().map(|(_, id)| id).collect()
+        })
     }
 
     /// The ego `steps` steps before the present, if the log goes back that far.

@@ -4,12 +4,16 @@
 //! same successor. The caller chooses the traffic: [`Rules::step`] reads the other agents from the
 //! log, [`Rules::advance`] takes a frame of any world.
 
-use gump_geometry::OrientedBox;
+use gump_geometry::{OrientedBox, angle_difference};
 use gump_metrics::{ComfortBounds, Felt};
 use gump_scene::{Agent, AgentKind, AgentState, Frame};
 use serde::{Deserialize, Serialize};
 
 use crate::{Course, Dynamics, RlError};
+
+/// Seconds between the moments of a step at which collisions and road edges are tested: a vehicle
+/// at 15 m/s moves a third of its length.
+const MOMENT: f64 = 0.1;
 
 /// Dynamics, rewards and horizon of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -173,39 +177,51 @@ impl Rules {
         state: &EpisodeState,
         action: &[f32],
     ) -> EpisodeState {
-        let dt = course.dt();
-        let ego = self.dynamics.advance(&state.ego.state, action, dt, dt);
-        let mut next = self.advance(course, state, ego, course.logged(state.steps + 1));
+        let others = [state.steps, state.steps + 1].map(|step| course.logged(step));
+        let mut next = self.advance(course, state, action, others);
         if next.end.is_none() && next.steps >= course.logged_steps() {
             next.end = Some(End::Truncated);
         }
         next
     }
 
-    /// The state after one step with the ego in state `ego` and all other agents as in `frame`.
+    /// The state after one step in which `action` drives the ego and all other agents move from
+    /// their places in `before` to those in `after`.
     ///
-    /// A collision or leaving the road terminates, in this order; an episode that starts in a
-    /// collision ends with its first step. The horizon and the end of the route truncate.
+    /// A collision or leaving the road at any tenth of a second of the step terminates, in this
+    /// order; an episode that starts in a collision ends with its first step. The horizon and the
+    /// end of the route truncate. Between the two frames others move in straight lines; those that
+    /// `before` lacks stand where `after` has them.
+    ///
+    /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
     pub fn advance(
         &self,
         course: &Course,
         state: &EpisodeState,
-        ego: AgentState,
-        frame: &Frame,
+        action: &[f32],
+        [before, after]: [&Frame; 2],
     ) -> EpisodeState {
-        let seen = frame.agent(state.ego.id).unwrap_or(&state.ego);
+        let (dt, now) = (course.dt(), state.ego.state);
+        let seen = after.agent(state.ego.id).unwrap_or(&state.ego);
+        let n = (dt / MOMENT).round().max(1.0) as usize;
+        let at = |k: usize| {
+            let elapsed = dt * k as f64 / n as f64;
+            seen.with_state(self.dynamics.advance(&now, action, dt, elapsed))
+        };
+        let way: Vec<Agent> = (1..=n).map(at).collect();
+        let ego = way[n - 1].state;
         let mut next = EpisodeState {
             steps: state.steps + 1,
-            ego: seen.with_state(ego),
-            before: [Some(state.ego.state), state.before[0]],
+            ego: way[n - 1],
+            before: [Some(now), state.before[0]],
             along: course.along_route(ego.pose.position),
             ..state.clone()
         };
-        let moved = ego.pose.position.distance(state.ego.state.pose.position);
+        let moved = ego.pose.position.distance(now.pose.position);
         let progress = (next.along - state.along).clamp(-moved, moved);
-        let collided = collides(&next.ego, frame);
-        let off_road = is_off_road(course, &next.ego);
-        let uncomfortable = next.is_uncomfortable(course.dt());
+        let collided = collides(&way, before, after);
+        let off_road = way.iter().any(|ego| is_off_road(course, ego));
+        let uncomfortable = next.is_uncomfortable(dt);
 
         let weights = &self.reward;
         let happened = |weight: f64, it: bool| if it { weight } else { 0.0 };
@@ -302,20 +318,39 @@ impl EpisodeState {
 }
 
 fn turn_rate(from: &AgentState, to: &AgentState, dt: f64) -> f64 {
-    gump_geometry::angle_difference(to.pose.heading, from.pose.heading) / dt
+    angle_difference(to.pose.heading, from.pose.heading) / dt
 }
 
-/// [`gump_metrics::Collision`] of the ego.
-fn collides(ego: &Agent, frame: &Frame) -> bool {
-    let own = ego.oriented_box();
-    frame.agents().iter().any(|other| {
+/// [`gump_metrics::Collision`] of the ego at any moment of a step. `way` has the ego at evenly
+/// spaced moments, the last of them the step's end.
+fn collides(way: &[Agent], before: &Frame, after: &Frame) -> bool {
+    let own = way[way.len() - 1].oriented_box();
+    let from_end = |ego: &Agent| ego.state.pose.position.distance(own.pose.position);
+    let own_way = way.iter().map(from_end).fold(0.0, f64::max);
+    after.agents().iter().any(|other| {
+        let end = other.state.pose;
+        let start = before.agent(other.id).map_or(end, |then| then.state.pose);
         // Half the sum of length and width is no less than half the diagonal.
-        let reach = (own.length + own.width + other.length + other.width) / 2.0;
-        let distance = own
-            .pose
-            .position
-            .distance_squared(other.state.pose.position);
-        distance < reach * reach && other.id != ego.id && own.overlaps(&other.oriented_box())
+        let size = (own.length + own.width + other.length + other.width) / 2.0;
+        let reach = size + own_way + start.position.distance(end.position);
+        let distance = own.pose.position.distance_squared(end.position);
+        if other.id == way[0].id || distance >= reach * reach {
+            return false;
+        }
+        way.iter().enumerate().any(|(k, ego)| {
+            let share = (k + 1) as f64 / way.len() as f64;
+            let there = OrientedBox {
+                pose: if share < 1.0 {
+                    start.interpolate(end, share)
+                } else {
+                    end
+                },
+                ..other.oriented_box()
+            };
+            let ego = ego.oriented_box();
+            ego.pose.position.distance_squared(there.pose.position) < size * size
+                && ego.overlaps(&there)
+        })
     })
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gump_metrics::{Interval, interval};
+use gump_metrics::{Interval, intervals};
 use gump_scene::Seed;
 use rand::Rng as _;
 
@@ -16,6 +16,9 @@ use crate::{
 ///
 /// Source: reproduces the paper's scores from its other columns.
 pub const LOGGED_PROGRESS: f64 = 62.0;
+
+/// Resamples of a bootstrap.
+const N_RESAMPLES: usize = 2000;
 
 /// The driver.
 #[derive(Clone, Copy, Debug)]
@@ -116,11 +119,34 @@ impl Columns {
     }
 }
 
-/// Drives every course `repeats` times, `config.n_envs` in parallel.
+/// The episodes of an evaluation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Episodes {
+    /// Indices of the courses to drive.
+    pub scenarios: Vec<usize>,
+    /// Drives of each, in other traffic of the same world.
+    pub repeats: usize,
+    /// Source of all randomness: that of an episode depends on this seed, the index of the course
+    /// and the repeat only, so an evaluation in parts equals one in one go.
+    pub seed: Seed,
+}
+
+impl Episodes {
+    /// All of `n` courses.
+    pub fn all(n: usize, repeats: usize, seed: Seed) -> Self {
+        Self {
+            scenarios: (0..n).collect(),
+            repeats,
+            seed,
+        }
+    }
+}
+
+/// Drives these episodes, `config.n_envs` in parallel.
 ///
-/// The randomness of a world depends only on the course and the repeat, so all drivers are compared
-/// in the same traffic; random actions depend on `seed`. The results are in the order of the
-/// courses, with the repeats of a course together.
+/// All drivers are compared in the same traffic, of which worlds simulate all agents whatever
+/// [`EnvConfig::nearest`] is. The results are in the order of the scenarios, with the repeats of
+/// one together.
 ///
 /// # Errors
 /// Errors of the environment; [`RlError::Shape`] for a driver with other observations or actions.
@@ -129,25 +155,29 @@ pub fn evaluate(
     traffic: Traffic<'_>,
     config: &EnvConfig,
     driver: Driver<'_>,
-    (repeats, seed): (usize, Seed),
+    episodes: &Episodes,
 ) -> Result<Vec<Drive>, RlError> {
-    let of_scenario = |scenario: usize| (0..repeats).map(move |repeat| (scenario, repeat));
-    let all: Vec<_> = (0..courses.len()).flat_map(of_scenario).collect();
+    let of_scenario = |&scenario: &usize| {
+        let repeats = 0..episodes.repeats;
+        repeats.map(move |repeat| (scenario, repeat))
+    };
+    let all: Vec<_> = episodes.scenarios.iter().flat_map(of_scenario).collect();
     let mut drives = Vec::with_capacity(all.len());
-    for (chunk, episodes) in all.chunks(config.n_envs.max(1)).enumerate() {
+    for episodes_now in all.chunks(config.n_envs.max(1)) {
         let config = EnvConfig {
-            n_envs: episodes.len(),
+            n_envs: episodes_now.len(),
             autoreset: Autoreset::SameStep,
+            nearest: None,
             ..*config
         };
         let mut env = DrivingEnv::new(Arc::clone(courses), traffic, config)?;
         let start = |&(scenario, repeat): &(usize, usize)| EpisodeStart {
             scenario,
-            seed: seed.fork(scenario as u64).fork(repeat as u64),
+            seed: episodes.seed.fork(scenario as u64).fork(repeat as u64),
         };
-        env.reset_to(&episodes.iter().map(start).collect::<Vec<_>>())?;
-        let outcomes = drive(&mut env, driver, seed.fork(u64::MAX - chunk as u64))?;
-        let ended = episodes.iter().zip(&outcomes);
+        let starts: Vec<EpisodeStart> = episodes_now.iter().map(start).collect();
+        let outcomes = drive(&mut env, driver, &starts)?;
+        let ended = episodes_now.iter().zip(&outcomes);
         drives.extend(ended.map(|(&(scenario, repeat), o)| Drive::new(scenario, repeat, o)));
     }
     Ok(drives)
@@ -157,10 +187,13 @@ pub fn evaluate(
 fn drive(
     env: &mut DrivingEnv<'_>,
     driver: Driver<'_>,
-    seed: Seed,
+    starts: &[EpisodeStart],
 ) -> Result<Vec<Outcome>, RlError> {
+    env.reset_to(starts)?;
     let (n, o, a) = (env.n_envs(), env.observation_len(), env.action_len());
-    let mut rng = seed.rng();
+    // Seeds that no world forks from the start of an episode.
+    let of_driver = |start: &EpisodeStart| start.seed.fork(u64::MAX).rng();
+    let mut rngs: Vec<_> = starts.iter().map(of_driver).collect();
     let mut actions = vec![0.0; n * a];
     let mut outcomes: Vec<Option<Outcome>> = vec![None; n];
     while outcomes.contains(&None) {
@@ -171,7 +204,11 @@ fn drive(
                 actions = actor.modes(env.observations());
             }
             Driver::Expert => env.expert_actions(&mut actions)?,
-            Driver::Random => actions.fill_with(|| rng.random_range(-1.0..=1.0)),
+            Driver::Random => {
+                for (action, rng) in actions.chunks_exact_mut(a).zip(&mut rngs) {
+                    action.fill_with(|| rng.random_range(-1.0..=1.0));
+                }
+            }
             Driver::Constant(action) => {
                 check("actions", action.len(), a)?;
                 actions = action.repeat(n);
@@ -210,16 +247,76 @@ pub fn score_by_scenario(drives: &[Drive]) -> Vec<f64> {
     driven.map(|(sum, n)| sum / n).collect()
 }
 
-/// The difference of `a` and `b` on the same scenarios, with its 95 % interval; `None` if they are
-/// not of the same scenarios, or of fewer than two.
-pub fn paired_difference(a: &[f64], b: &[f64], seed: Seed) -> Option<(f64, Interval)> {
-    if a.len() != b.len() {
+/// The mean score of a group of policies that differ in their seeds, or the difference of the means
+/// of two groups, with its interval.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Estimate {
+    /// The mean.
+    pub mean: f64,
+    /// Its 95 % interval; `None` for fewer than two scenarios.
+    pub interval: Option<Interval>,
+    /// Whether the interval resamples policies as well as scenarios, which takes two policies or
+    /// more in each group.
+    pub over_policies: bool,
+}
+
+/// The mean of `scores`, by policy and scenario, all of them on the same scenarios. `None` if there
+/// is no score, or policies were tested on different numbers of scenarios.
+///
+/// The interval is a bootstrap of 2000 resamples, each of which draws scenarios and policies with
+/// replacement, independently of each other (Owen 2007, "The pigeonhole bootstrap").
+pub fn estimate(scores: &[Vec<f64>], seed: Seed) -> Option<Estimate> {
+    resampled(&[(scores, 1.0)], seed)
+}
+
+/// The mean of `a` less that of `b`, as in [`estimate`]; scenarios are paired, policies are drawn
+/// from each group independently.
+pub fn estimate_difference(a: &[Vec<f64>], b: &[Vec<f64>], seed: Seed) -> Option<Estimate> {
+    resampled(&[(a, 1.0), (b, -1.0)], seed)
+}
+
+/// A weighted sum of the means of groups.
+fn resampled(groups: &[(&[Vec<f64>], f64)], seed: Seed) -> Option<Estimate> {
+    let n = groups.first()?.0.first()?.len();
+    let fits = |(scores, _): &(&[Vec<f64>], f64)| {
+        !scores.is_empty() && scores.iter().all(|policy| policy.len() == n)
+    };
+    if n == 0 || !groups.iter().all(fits) {
         return None;
     }
-    let differences: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
-    let interval = interval(&differences, seed)?;
-    let mean = differences.iter().sum::<f64>() / differences.len() as f64;
-    Some((mean, interval))
+    let over_policies = groups.iter().all(|(scores, _)| scores.len() > 1);
+    // Sums over chosen policies of the scenarios drawn.
+    let of = |drawn: &[usize], policies: &[Vec<usize>]| -> f64 {
+        let groups = groups.iter().zip(policies);
+        let means = groups.map(|((scores, weight), policies)| {
+            let of_policy = |&p: &usize| drawn.iter().map(|&s| scores[p][s]).sum::<f64>();
+            weight * policies.iter().map(of_policy).sum::<f64>() / policies.len() as f64
+        });
+        means.sum::<f64>() / drawn.len() as f64
+    };
+    let every: Vec<usize> = (0..n).collect();
+    let all: Vec<Vec<usize>> = groups.iter().map(|(s, _)| (0..s.len()).collect()).collect();
+    let resample = |drawn: &[usize]| {
+        // The draw of scenarios is a resample's seed for its policies.
+        let mixed = drawn.iter().fold(0u64, |hash, &scenario| {
+            hash.wrapping_mul(0x0100_0000_01b3) ^ scenario as u64
+        });
+        let mut rng = seed.fork(mixed).rng();
+        let draw = |all: &Vec<usize>| {
+            let n = all.len();
+            (0..n).map(|_| rng.random_range(0..n)).collect()
+        };
+        match over_policies {
+            true => vec![Some(of(drawn, &all.iter().map(draw).collect::<Vec<_>>()))],
+            false => vec![Some(of(drawn, &all))],
+        }
+    };
+    let found = intervals(n, N_RESAMPLES, seed, resample);
+    Some(Estimate {
+        mean: of(&every, &all),
+        interval: found.first().copied().flatten(),
+        over_policies,
+    })
 }
 
 #[cfg(test)]
@@ -272,9 +369,43 @@ mod tests {
     fn differences_are_paired() {
         let a: Vec<f64> = (0..50).map(f64::from).collect();
         let b: Vec<f64> = a.iter().map(|x| x - 0.5).collect();
-        let (mean, interval) = paired_difference(&a, &b, Seed(0)).unwrap();
-        assert_eq!((mean, interval.low, interval.high), (0.5, 0.5, 0.5));
-        assert!(paired_difference(&a, &b[1..], Seed(0)).is_none());
+        let one = estimate_difference(&[a.clone()], &[b.clone()], Seed(0)).unwrap();
+        let interval = one.interval.unwrap();
+        assert_eq!((one.mean, interval.low, interval.high), (0.5, 0.5, 0.5));
+        assert!(!one.over_policies);
+        assert!(estimate_difference(&[a], &[b[1..].to_vec()], Seed(0)).is_none());
+        assert!(estimate(&[], Seed(0)).is_none());
+        let single = estimate(&[vec![1.0]], Seed(0)).unwrap();
+        assert_eq!((single.mean, single.interval), (1.0, None));
+    }
+
+    /// Of means of rows and columns without interaction the variance is known: that of the rows
+    /// over their number plus that of the columns over theirs.
+    #[test]
+    fn intervals_are_over_scenarios_and_policies() {
+        let of_policy = |p: usize| 0.3 * (p % 2) as f64;
+        let of_scenario = |s: usize| 0.2 * (s % 2) as f64;
+        let policy = |p| (0..400).map(|s| of_policy(p) + of_scenario(s)).collect();
+        let group = |n: usize| (0..n).map(policy).collect::<Vec<Vec<f64>>>();
+        let half = |found: Estimate| {
+            let interval = found.interval.unwrap();
+            (interval.high - interval.low) / 2.0
+        };
+        let expected = |n: f64| 1.96 * (0.15f64.powi(2) / n + 0.1f64.powi(2) / 400.0).sqrt();
+        let ten = estimate(&group(10), Seed(1)).unwrap();
+        assert!((ten.mean - 0.25).abs() < 1e-9 && ten.over_policies);
+        assert!(
+            (half(ten) / expected(10.0) - 1.0).abs() < 0.1,
+            "{}",
+            half(ten)
+        );
+        // Scenarios are paired, so only the policies are left in a difference.
+        let difference = estimate_difference(&group(10), &group(10), Seed(1)).unwrap();
+        assert_eq!(difference.mean, 0.0);
+        let of_both = 1.96 * (2.0 * 0.15f64.powi(2) / 10.0).sqrt();
+        assert!((half(difference) / of_both - 1.0).abs() < 0.1);
+        let one = estimate(&group(1), Seed(1)).unwrap();
+        assert!(!one.over_policies && half(one) < 0.012);
     }
 
     /// Empty roads of different lengths behind the ego, a recorded ego of constant speed.
@@ -295,7 +426,8 @@ mod tests {
         };
         let world = Idm::default();
         let traffic = Traffic::World(&world);
-        evaluate(&courses(), traffic, &config, driver, (2, Seed(3))).unwrap()
+        let episodes = Episodes::all(3, 2, Seed(3));
+        evaluate(&courses(), traffic, &config, driver, &episodes).unwrap()
     }
 
     #[test]
@@ -327,7 +459,7 @@ mod tests {
         );
         let still = run(Driver::Constant(&[-1.0, 0.0]), 6);
         assert!(still.iter().all(|drive| drive.progress < 20.0));
-        assert_eq!(run(Driver::Random, 6), run(Driver::Random, 6));
+        assert_eq!(run(Driver::Random, 6), run(Driver::Random, 1));
     }
 
     #[test]
@@ -335,7 +467,8 @@ mod tests {
         let actor = Actor::new(&SacConfig::default(), 3, 2, Seed(1));
         let config = EnvConfig::default();
         let driver = Driver::Learned(&actor);
-        let result = evaluate(&courses(), Traffic::Log, &config, driver, (1, Seed(0)));
+        let episodes = Episodes::all(3, 1, Seed(0));
+        let result = evaluate(&courses(), Traffic::Log, &config, driver, &episodes);
         assert!(matches!(result, Err(RlError::Shape { expected: 3, .. })));
     }
 }

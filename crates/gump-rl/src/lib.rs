@@ -50,7 +50,8 @@ pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling,
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
 pub use error::RlError;
 pub use evaluate::{
-    Columns, Drive, Driver, LOGGED_PROGRESS, evaluate, paired_difference, score_by_scenario,
+    Columns, Drive, Driver, Episodes, Estimate, LOGGED_PROGRESS, estimate, estimate_difference,
+    evaluate, score_by_scenario,
 };
 pub use imitation::demonstrations;
 pub use observation::{

@@ -129,6 +129,24 @@ fn the_number_of_threads_changes_nothing() {
     }
 }
 
+#[test]
+fn agents_far_away_follow_the_log() {
+    let courses = busy(6);
+    let idm = Idm::default();
+    let of = |nearest| {
+        let config = EnvConfig {
+            nearest,
+            ..config(3)
+        };
+        let mut env = DrivingEnv::new(courses.clone(), Traffic::World(&idm), config).unwrap();
+        roam(&mut env, Seed(1), 40)
+    };
+    let all = of(None);
+    assert_eq!(all, of(Some(1000)));
+    assert_ne!(all, of(Some(2)));
+    assert_eq!(of(Some(2)), of(Some(2)));
+}
+
 /// Replaying the log needs no session; a session that replays it moves everyone alike.
 #[test]
 fn the_log_is_the_world_that_replays_it() {

@@ -5,13 +5,13 @@
 mod common;
 
 use common::{DT, STREET, busy, config, env, street, until_end, wander};
-use gump_metrics::Reward;
+use gump_metrics::{Collision, Metric, OffRoad, Reward};
 use gump_rl::{
     BicycleLimits, Course, DrivingEnv, Dynamics, End, EnvConfig, Failure, PoseLimits, RlError,
     Rules, Traffic, VectorEnv,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
-use gump_scene::{Frame, Rollout, SceneState, Seed, fixture};
+use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
 
 const COAST: [f32; 2] = [0.0, 0.0];
 
@@ -53,6 +53,16 @@ fn a_collision_terminates() {
     }
 }
 
+/// Both boxes are clear of each other after 2.5 and after 3 s; the car passes in between.
+#[test]
+fn a_collision_within_a_step_terminates() {
+    let courses = street("agent vehicle 1: 37.5,-55.5 heading 1.5708 velocity 0,20");
+    for traffic in [Traffic::Log, Traffic::World(&ConstantVelocity)] {
+        let (n, outcome) = until_end(&mut env(&courses, traffic, 1), &COAST);
+        assert_eq!((n, outcome.end), (6, End::Terminated(Failure::Collision)));
+    }
+}
+
 #[test]
 fn leaving_the_road_terminates() {
     let courses = street("edge: -10,-3 400,-3\nedge: 400,3 -10,3");
@@ -74,13 +84,14 @@ fn the_end_of_the_route_and_of_the_log_truncate() {
     assert_eq!(steps(Traffic::World(&ConstantVelocity)), 16);
 }
 
-/// Every step earns what the reward of the metrics says about the same frames.
+/// Every step earns what the reward of the metrics says about the same frames; collisions and road
+/// edges count at any tenth of a second.
 #[test]
 fn rewards_are_those_of_the_metrics() {
     let rules = Rules::default();
     let reward = Reward::driving_step();
     let (mut failures, mut n) = (0, 0);
-    for (i, course) in busy(12).iter().enumerate() {
+    for (i, course) in busy(24).iter().enumerate() {
         let scene = course.scenario().present();
         let history: Vec<Frame> = scene.strided_history(5, 9).into_iter().cloned().collect();
         let start = SceneState {
@@ -92,18 +103,46 @@ fn rewards_are_those_of_the_metrics() {
         let mut state = rules.reset(course);
         while state.end.is_none() {
             let action = wander(i, state.steps as u64, 2);
-            state = rules.step(course, &state, &action).unwrap();
-            let frame = course.logged(state.steps);
+            let next = rules.step(course, &state, &action).unwrap();
+            let [before, frame] = [state.steps, next.steps].map(|step| course.logged(step));
             let others = frame.agents().iter().filter(|agent| agent.id != scene.ego);
-            let agents = others.copied().chain([state.ego]).collect();
+            // Both failures by the metrics at a moment of the step.
+            let failed = |k: usize| {
+                let share = k as f64 / 5.0;
+                let ego = rules
+                    .dynamics
+                    .advance(&state.ego.state, &action, DT, DT * share);
+                let moved = others.clone().map(|agent| {
+                    let from = before.agent(agent.id).unwrap_or(agent).state.pose;
+                    let pose = from.interpolate(agent.state.pose, share);
+                    agent.with_state(AgentState {
+                        pose,
+                        ..agent.state
+                    })
+                });
+                let agents = moved.chain([next.ego.with_state(ego)]).collect();
+                let mut then = rollout.clone();
+                then.push(Frame::new(agents, frame.lights().to_vec()));
+                let now = then.last();
+                let metric = |metric: &dyn Metric| metric.at(&now, now.ego_now()) > Some(0.0);
+                [metric(&Collision), metric(&OffRoad)]
+            };
+            let moments: Vec<[bool; 2]> = (1..=5).map(failed).collect();
+            let agents = others.clone().copied().chain([next.ego]).collect();
             rollout.push(Frame::new(agents, frame.lights().to_vec()));
             let now = rollout.last();
-            let expected = reward.at(&now, now.ego_now());
+            let mut expected = reward.at(&now, now.ego_now()).total;
+            for failure in 0..2 {
+                if moments.iter().any(|m| m[failure]) && !moments[4][failure] {
+                    expected -= 5.0;
+                }
+            }
             assert!(
-                (state.reward - expected.total).abs() < 1e-9,
-                "{} but {expected:?}",
-                state.reward
+                (next.reward - expected).abs() < 1e-9,
+                "{} but {expected}",
+                next.reward
             );
+            state = next;
             n += 1;
         }
         failures += usize::from(state.end != Some(End::Truncated));

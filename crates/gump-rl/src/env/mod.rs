@@ -68,7 +68,7 @@ impl<'w> DrivingEnv<'w> {
         let n = config.n_envs;
         let observed = || Observed::new(&config.observation, n);
         Ok(Self {
-            others: Others::new(traffic),
+            others: Others::new(traffic, config.nearest),
             sampler: Sampler::new(config.sampling, n, courses.len()),
             rows: Vec::new(),
             observations: observed(),

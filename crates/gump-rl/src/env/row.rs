@@ -1,6 +1,6 @@
 //! One episode in progress.
 
-use gump_scene::{Frame, Seed};
+use gump_scene::{Agent, Frame, SceneState, Seed};
 
 use super::sampler::Sampler;
 use crate::observation::{ObservedRow, View};
@@ -41,6 +41,8 @@ pub(super) struct Row {
     pub(super) imagined: [Option<Frame>; 2],
     /// True if the other agents replay the log.
     pub(super) in_log: bool,
+    /// Past and present of the agents that the world simulates; empty if it simulates all.
+    pub(super) history: Vec<Frame>,
 }
 
 impl Row {
@@ -53,7 +55,49 @@ impl Row {
             state: blank.clone(),
             imagined: [None, None],
             in_log: true,
+            history: Vec::new(),
         }
+    }
+
+    /// Limits the world to the `n` agents that come nearest to the ego in the log.
+    pub(super) fn limit(&mut self, course: &Course, n: Option<usize>) {
+        let (all, ego) = (course.by_distance(), course.scenario().ego);
+        self.history.clear();
+        let Some(nearest) = n.and_then(|n| all.get(..n)) else {
+            return;
+        };
+        let kept = |agent: &&Agent| agent.id == ego || nearest.contains(&agent.id);
+        let past = course.scenario().present().history.iter();
+        self.history.extend(past.map(|frame| {
+            let agents = frame.agents().iter().filter(kept).copied().collect();
+            Frame::new(agents, frame.lights().to_vec())
+        }));
+    }
+
+    /// The scene as the world is to see it.
+    pub(super) fn scene<'a>(&'a self, course: &'a Course) -> SceneState<'a> {
+        let scene = course.scenario().present();
+        match self.history.is_empty() {
+            true => scene,
+            false => SceneState {
+                history: &self.history,
+                ..scene
+            },
+        }
+    }
+
+    /// The world's frame together with the agents that follow the log.
+    pub(super) fn complete(&self, course: &Course, frame: Frame) -> Frame {
+        let Some(present) = self.history.last() else {
+            return frame;
+        };
+        let logged = course.logged(self.state.steps + 1).agents().iter();
+        let follows_log = |agent: &&Agent| {
+            let id = agent.id;
+            present.agent(id).is_none() && course.logged(0).agent(id).is_some()
+        };
+        let agents = logged.filter(follows_log).chain(frame.agents()).copied();
+        Frame::new(agents.collect(), frame.lights().to_vec())
     }
 
     /// Chooses the next episode of row number `i`.
@@ -68,13 +112,10 @@ impl Row {
 
     /// Moves the episode to the result of an action and the world.
     pub(super) fn arrive(&mut self, course: &Course, rules: &Rules, action: &[f32]) {
-        self.state = match &self.imagined[0] {
-            Some(frame) if !self.in_log => {
-                let dt = course.dt();
-                let ego = rules
-                    .dynamics
-                    .advance(&self.state.ego.state, action, dt, dt);
-                rules.advance(course, &self.state, ego, frame)
+        self.state = match &self.imagined {
+            [Some(after), before] if !self.in_log => {
+                let before = before.as_ref().unwrap_or(course.logged(self.state.steps));
+                rules.advance(course, &self.state, action, [before, after])
             }
             _ => rules.step_in_log(course, &self.state, action),
         };
@@ -117,5 +158,43 @@ impl Outcome {
             self.end,
             End::Terminated(Failure::Collision | Failure::OffRoad)
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use super::*;
+    use gump_scene::{AgentId, fixture};
+
+    #[test]
+    fn what_is_not_simulated_follows_the_log() {
+        // The second is nearer at first, but drives away; the third comes.
+        let text = "lane 1: 0,0 400,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 10,0\n
+            agent vehicle 1: 60,9\nagent vehicle 2: 0,5 velocity -10,0\n
+            agent vehicle 3: 120,5 velocity -10,0\n";
+        let course = Course::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
+        let rules = Rules::default();
+        let mut row = Row::new(Seed(0), &rules.reset(&course));
+        let ids = |frame: &Frame| -> Vec<i64> { frame.agents().iter().map(|a| a.id.0).collect() };
+
+        row.limit(&course, Some(2));
+        let seen = row.scene(&course);
+        assert_eq!(
+            seen.history.len(),
+            course.scenario().present().history.len()
+        );
+        assert_eq!(ids(seen.now()), [0, 1, 3]);
+        // The world leaves everyone in place.
+        let frame = row.complete(&course, seen.now().clone());
+        assert_eq!(ids(&frame), [0, 1, 2, 3]);
+        let x = |id| frame.agent(AgentId(id)).unwrap().state.pose.position.x;
+        assert_eq!((x(2), x(3)), (-5.0, 120.0));
+
+        for n in [Some(3), Some(7), None] {
+            row.limit(&course, n);
+            assert_eq!(ids(row.scene(&course).now()), [0, 1, 2, 3]);
+        }
     }
 }

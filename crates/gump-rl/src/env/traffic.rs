@@ -10,12 +10,15 @@ use crate::{Course, RlError, Rules};
 /// The other agents of all rows.
 pub(super) struct Others<'w> {
     world: Option<&'w dyn WorldModel>,
+    /// As in [`crate::EnvConfig::nearest`].
+    nearest: Option<usize>,
     session: Option<Box<dyn Session + 'w>>,
 }
 
 impl<'w> Others<'w> {
-    pub(super) fn new(traffic: Traffic<'w>) -> Self {
+    pub(super) fn new(traffic: Traffic<'w>, nearest: Option<usize>) -> Self {
         Self {
+            nearest,
             world: match traffic {
                 Traffic::Log => None,
                 Traffic::World(world) => Some(world),
@@ -34,6 +37,9 @@ impl<'w> Others<'w> {
         let Some(world) = self.world else {
             return Ok(());
         };
+        for row in rows.iter_mut() {
+            row.limit(&courses[row.start.scenario], self.nearest);
+        }
         let starts: Vec<Start<'_>> = rows.iter().map(|row| start(courses, row)).collect();
         let session = world.open(&starts).map_err(|e| failed(world, e))?;
         frames_per_step(courses[rows[0].start.scenario].dt(), session.dt())?;
@@ -57,6 +63,7 @@ impl<'w> Others<'w> {
         }
         if let (Some(world), Some(session)) = (self.world, &mut self.session) {
             for &i in chosen {
+                rows[i].limit(&courses[rows[i].start.scenario], self.nearest);
                 let start = start(courses, &rows[i]);
                 session.replace(i, start).map_err(|e| failed(world, e))?;
             }
@@ -105,6 +112,7 @@ impl<'w> Others<'w> {
         check(rows, &frames)?;
         for (row, frame) in rows.iter_mut().zip(frames) {
             let before = row.imagined[0].take();
+            let frame = row.complete(&courses[row.start.scenario], frame);
             row.imagined = [Some(frame), before];
         }
         self.session = Some(session);
@@ -130,9 +138,9 @@ fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
     }
 }
 
-fn start<'a>(courses: &'a [Course], row: &Row) -> Start<'a> {
+fn start<'a>(courses: &'a [Course], row: &'a Row) -> Start<'a> {
     Start {
-        scene: courses[row.start.scenario].scenario().present(),
+        scene: row.scene(&courses[row.start.scenario]),
         n_futures: 1,
         seed: row.start.seed,
     }

@@ -68,6 +68,12 @@ pub struct SacConfig {
     pub imitation_share: f64,
     /// Weight of the imitation loss in the actor's (ours: 1).
     pub imitation_weight: f64,
+    /// Highest norm of the imitation loss's gradient by the actor's outputs, as a multiple of that
+    /// of the rest of the actor's loss; where it is higher, the gradient is scaled down (ours:
+    /// any). Imitation grows with the precision of the policy: the gradient of a log density is
+    /// inversely proportional to the standard deviation.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub imitation_limit: Option<f64>,
     /// Whether vector observations are scaled to mean 0 and variance 1, by the transitions known
     /// when learning begins (ours: yes, as they are in metres). Images are not changed.
     pub normalize: bool,
@@ -106,6 +112,7 @@ impl Default for SacConfig {
             head_gain: 0.3,
             imitation_share: 0.2,
             imitation_weight: 1.0,
+            imitation_limit: None,
             normalize: true,
             segment: 1000,
         }
@@ -181,6 +188,12 @@ impl SacConfig {
                 self.imitation_weight,
                 self.imitation_weight >= 0.0 && self.imitation_weight.is_finite(),
                 "a number of at least 0",
+            ),
+            (
+                "imitation_limit",
+                self.imitation_limit.unwrap_or(1.0),
+                self.imitation_limit.is_none_or(is_positive),
+                positive,
             ),
             (
                 "huber",

@@ -47,6 +47,12 @@ pub struct UpdateReport {
     pub actor_loss: f64,
     /// Negative log density of the experts' actions, nats, mean over their transitions.
     pub imitation_loss: f64,
+    /// Norm of the gradient of the actor's loss by the actor's outputs for the learner's own
+    /// transitions, which is the part of rewards and entropy.
+    pub reward_gradient: f64,
+    /// The same for the experts' transitions, which is the part of imitation, before
+    /// [`SacConfig::imitation_limit`].
+    pub imitation_gradient: f64,
     /// Minus the log density of drawn actions, nats, mean.
     pub entropy: f64,
     /// The temperature.
@@ -303,7 +309,7 @@ impl Learner {
                 }
             }
         }
-        let imitated = &mut now_gradient[2 * own..];
+        let (rewarded, imitated) = now_gradient.split_at_mut(2 * own);
         report.imitation_loss = imitation_gradient(
             actor,
             &now.output()[2 * own..],
@@ -311,6 +317,11 @@ impl Learner {
             self.config.imitation_weight,
             imitated,
         );
+        report.reward_gradient = norm(rewarded).hypot(norm(next_gradient));
+        report.imitation_gradient = norm(imitated);
+        if let Some(limit) = self.config.imitation_limit {
+            clip(imitated, Some(limit * report.reward_gradient));
+        }
         reset(gradient, actor.network.parameters().len());
         let separate = self.vision.as_mut().filter(|vision| vision.is_separate());
         let Some((vision, encoder)) = separate.zip(actor.encoder()) else {
@@ -441,6 +452,11 @@ fn both<T: Send>(
     let [first, second] = critics;
     let (a, b) = rayon::join(|| work(0, first), || work(1, second));
     [a, b]
+}
+
+fn norm(values: &[f32]) -> f64 {
+    let squares = values.iter().map(|&x| f64::from(x).powi(2));
+    squares.sum::<f64>().sqrt()
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> f64 {

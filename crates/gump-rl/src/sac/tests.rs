@@ -206,6 +206,32 @@ fn gradients_of_all_losses_are_finite_differences() {
 }
 
 #[test]
+fn imitation_is_limited_to_a_multiple_of_the_rest() {
+    let after = |imitation_weight: f64, imitation_limit: Option<f64>| {
+        let config = SacConfig {
+            imitation_weight,
+            imitation_limit,
+            ..config()
+        };
+        let mut learner = Learner::new(config, 2, 1, Seed(3));
+        let report = learner.update(&batch(1), Seed(4));
+        (learner.actor_gradient_taken().to_vec(), report)
+    };
+    let (free, report) = after(50.0, None);
+    let ratio = report.imitation_gradient / report.reward_gradient;
+    assert!(ratio > 2.0, "{ratio}");
+    // A limit of half the ratio is the same as half the weight.
+    let (limited, told) = after(50.0, Some(ratio / 2.0));
+    let (lighter, lighter_told) = after(25.0, None);
+    assert_eq!(told.imitation_gradient, report.imitation_gradient);
+    assert!((lighter_told.imitation_gradient / report.imitation_gradient - 0.5).abs() < 1e-6);
+    for (a, b) in limited.iter().zip(&lighter) {
+        assert!((a - b).abs() < 1e-6 * (1.0 + b.abs()), "{a}, {b}");
+    }
+    assert_eq!(after(50.0, Some(2.0 * ratio)).0, free);
+}
+
+#[test]
 fn a_batch_holds_its_share_of_experts() {
     let filled = |reward: f32| {
         let mut buffer = ReplayBuffer::new(4, 2, 1).unwrap();

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use gump_eval::results;
 use serde::Serialize;
 
+use super::super::rl;
 use super::{behaviour, closed_loop, motion, reactions, wosac};
 use crate::run::{Common, Run};
 
@@ -17,6 +18,7 @@ const BENCHMARKS: &[(&str, Tell)] = &[
     (closed_loop::BENCHMARK, closed_loop::tell_merged),
     (motion::NAME, motion::tell_merged),
     (reactions::BENCHMARK, reactions::tell_merged),
+    (rl::evaluate::BENCHMARK, rl::columns::tell_merged),
     (wosac::BENCHMARK, wosac::tell_merged),
 ];
 

@@ -9,7 +9,8 @@ use gump_viz::{Chart, Series};
 
 use super::write;
 
-const HEADER: [&str; 13] = [
+const N_COLUMNS: usize = 15;
+const HEADER: [&str; N_COLUMNS] = [
     "step",
     "env_steps",
     "episodes",
@@ -23,13 +24,15 @@ const HEADER: [&str; 13] = [
     "alpha",
     "value",
     "learning_rate",
+    "reward_gradient",
+    "imitation_gradient",
 ];
 
 /// The curves of a run, one row per window.
 #[derive(Debug)]
 pub(super) struct Curves {
     window: usize,
-    rows: Vec<[f64; 13]>,
+    rows: Vec<[f64; N_COLUMNS]>,
     open: Vec<StepReport>,
 }
 
@@ -112,6 +115,8 @@ impl Curves {
             of_updates(|r| r.update.alpha),
             of_updates(|r| r.update.value),
             last.update.learning_rate,
+            of_updates(|r| r.update.reward_gradient),
+            of_updates(|r| r.update.imitation_gradient),
         ]);
         self.open.clear();
     }
@@ -160,6 +165,13 @@ impl Curves {
         )?;
         let losses = [("critic", 6), ("temperature", 10)];
         self.draw(&folder.join("losses"), "loss", &losses, true)?;
+        let gradients = [("rewards", 13), ("imitation", 14)];
+        self.draw(
+            &folder.join("gradients"),
+            "norm of the actor's gradient by its outputs",
+            &gradients,
+            true,
+        )?;
         let nats = [("entropy", 9), ("imitation", 8)];
         self.draw(&folder.join("entropy"), "nats", &nats, false)
     }
@@ -172,7 +184,7 @@ impl Curves {
         columns: &[(&str, usize)],
         log_y: bool,
     ) -> anyhow::Result<()> {
-        let point = |row: &[f64; 13], column: usize| (row[0], row[column]);
+        let point = |row: &[f64; N_COLUMNS], column: usize| (row[0], row[column]);
         let drawable = |p: &(f64, f64)| p.1.is_finite() && (!log_y || p.1 > 0.0);
         let series = columns.iter().map(|&(name, column)| Series {
             name: name.to_owned(),

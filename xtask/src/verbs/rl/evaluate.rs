@@ -1,26 +1,30 @@
 //! `rl evaluate`: the paper's columns for any policies in any worlds.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_metrics::interval;
-use gump_rl::{
-    Actor, Columns, Course, Drive, Driver, EnvConfig, evaluate, paired_difference,
-    score_by_scenario,
-};
-use gump_scene::Seed;
+use gump_rl::{Actor, Course, Driver, EnvConfig, Episodes, evaluate};
 use serde::Serialize;
-use serde_json::{Value, json};
+use sha2::{Digest as _, Sha256};
 
-use super::{Notes, RlWorld, Settings, courses, read, write};
+use super::columns::{Driven, One, Policy, Tested, tell};
+use super::{Notes, RlWorld, Settings, courses, read};
 use crate::cli::WrongArguments;
 use crate::dataset::Split;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
+use crate::sharding::shard;
+
+/// Name of the benchmark in stores of results.
+pub(crate) const BENCHMARK: &str = "rl";
+
+/// Scenarios that are driven before their results are stored.
+const SCENARIOS_PER_ROUND: usize = 32;
 
 /// Arguments of `rl evaluate`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -41,6 +45,10 @@ pub(crate) struct Args {
     /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
+    /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
+    /// `evaluate merge`
+    #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
+    shard: Shard,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -55,6 +63,8 @@ pub(super) struct Candidate {
     policy: String,
     train_world: Option<String>,
     file: PathBuf,
+    /// Of the file; none of a fixed rule.
+    sha256: Option<String>,
     kind: Kind,
 }
 
@@ -65,23 +75,14 @@ enum Kind {
     Constant([f32; 2]),
 }
 
-/// Policies of a kind in a world: a row of the table.
-struct Group {
-    policy: String,
-    train_world: Option<String>,
-    test_world: String,
-    /// Drives of each policy of the group.
-    drives: Vec<Vec<Drive>>,
-}
-
-/// The table in the making.
-pub(super) struct Table<'a> {
-    courses: &'a Arc<[Course]>,
-    repeats: usize,
-    groups: Vec<Group>,
-    csv: String,
-    steps: usize,
-    began: Instant,
+/// An evaluation: who drives where.
+pub(super) struct Test<'a> {
+    pub(super) candidates: &'a [Candidate],
+    pub(super) worlds: Vec<(&'a WorldName, RlWorld)>,
+    pub(super) env: &'a EnvConfig,
+    pub(super) repeats: usize,
+    pub(super) sampling: &'a Sampling,
+    pub(super) shard: Shard,
 }
 
 impl Args {
@@ -89,21 +90,21 @@ impl Args {
         if self.repeats == 0 {
             return Err(WrongArguments("--repeats: expected at least 1, found 0".into()).into());
         }
-        let sampling = self.sampling.resolve()?;
         let (candidates, env) = self.candidates()?;
         let limit = self.limit;
         let courses = run.phase("read", |run| {
             courses(run, &self.scenarios, Split::Test, limit)
         })?;
-        let mut table = Table::new(&courses, self.repeats);
-        let device = run.device().clone();
-        for name in &self.test_world {
-            let world = run.phase("load", |_| RlWorld::load(&device, name, &sampling))?;
-            run.phase("drive", |run| {
-                table.drive(run, &candidates, &env, (name, &world))
-            })?;
-        }
-        table.report(run)
+        let worlds = load(run, &self.test_world, &self.sampling)?;
+        let test = Test {
+            candidates: &candidates,
+            worlds,
+            env: &env,
+            repeats: self.repeats,
+            sampling: &self.sampling,
+            shard: self.shard,
+        };
+        test.execute(run, &courses)
     }
 
     /// Reads the policies; the environment is that of the config file, else that of the first.
@@ -119,6 +120,116 @@ impl Args {
             candidates.push(candidate);
         }
         Ok((candidates, env.unwrap_or_default()))
+    }
+}
+
+/// Loads every world with what it needs.
+pub(super) fn load<'a>(
+    run: &mut Run,
+    names: impl IntoIterator<Item = &'a WorldName>,
+    sampling: &Sampling,
+) -> anyhow::Result<Vec<(&'a WorldName, RlWorld)>> {
+    let (sampling, device) = (sampling.resolve()?, run.device().clone());
+    run.phase("load", |_| {
+        let load = |name| Ok((name, RlWorld::load(&device, name, &sampling)?));
+        names.into_iter().map(load).collect()
+    })
+}
+
+impl Test<'_> {
+    /// Drives what the folder does not have yet and reports on all.
+    pub(super) fn execute(&self, run: &mut Run, courses: &Arc<[Course]>) -> anyhow::Result<()> {
+        let tested = self.tested(run, courses)?;
+        let header = Header {
+            benchmark: BENCHMARK.into(),
+            shard: self.shard,
+            settings: toml::Table::try_from(&tested)?,
+        };
+        let mut store = ResultStore::open(run.out(), &header)?;
+        let missing = |index: &usize| self.shard.holds(*index) && !store.has(*index);
+        let todo: Vec<usize> = (0..courses.len()).filter(missing).collect();
+        let (mut steps, began) = (0, Instant::now());
+        run.phase("drive", |run| {
+            let n = todo.len() * self.worlds.len() * self.candidates.len();
+            let progress = run.progress("driving", n as u64, "scenarios x policies x worlds");
+            for round in todo.chunks(SCENARIOS_PER_ROUND) {
+                let mut driven = vec![Driven::default(); round.len()];
+                for w in 0..self.worlds.len() {
+                    for p in 0..self.candidates.len() {
+                        stop_if_interrupted()?;
+                        steps += self.drive(run, courses, (w, p), round, &mut driven)?;
+                        progress.advance(round.len() as u64);
+                    }
+                }
+                for (&index, scores) in round.iter().zip(driven) {
+                    let id = courses[index].scenario().id.clone();
+                    store.add(Entry { index, id, scores })?;
+                }
+            }
+            anyhow::Ok(())
+        })?;
+        let entries = store.close()?;
+        anyhow::ensure!(
+            !entries.is_empty(),
+            "expected scenarios in shard {}, found none among {}",
+            self.shard,
+            courses.len()
+        );
+        tell(run, &tested, &entries)?;
+        run.result(
+            "steps_per_second",
+            f64::from(steps) / began.elapsed().as_secs_f64(),
+        )
+    }
+
+    /// Lets one candidate drive these scenarios in one world; steps made.
+    fn drive(
+        &self,
+        run: &Run,
+        courses: &Arc<[Course]>,
+        (w, p): (usize, usize),
+        scenarios: &[usize],
+        driven: &mut [Driven],
+    ) -> anyhow::Result<u32> {
+        let (candidate, (_, world)) = (&self.candidates[p], &self.worlds[w]);
+        let episodes = Episodes {
+            scenarios: scenarios.to_vec(),
+            repeats: self.repeats,
+            seed: run.seed(),
+        };
+        let drives = evaluate(
+            courses,
+            world.traffic(),
+            self.env,
+            candidate.driver(),
+            &episodes,
+        )
+        .with_context(|| candidate.file.display().to_string())?;
+        let of_scenario = drives.chunks_exact(self.repeats);
+        for (driven, drives) in driven.iter_mut().zip(of_scenario) {
+            driven
+                .drives
+                .extend(drives.iter().map(|drive| One::new(w, p, drive)));
+        }
+        Ok(drives.iter().map(|drive| drive.steps as u32).sum())
+    }
+
+    fn tested(&self, run: &Run, courses: &[Course]) -> anyhow::Result<Tested> {
+        let ids: Vec<&str> = courses.iter().map(|c| c.scenario().id.as_str()).collect();
+        Ok(Tested {
+            scenarios: courses.len(),
+            sha256_of_ids: sha256(ids.join("\n").as_bytes()),
+            repeats: self.repeats,
+            seed: run.seed().0.to_string(),
+            env: toml::to_string(self.env)?,
+            sampling: serde_json::to_string(self.sampling)?,
+            worlds: self
+                .worlds
+                .iter()
+                .map(|(name, _)| name.to_string())
+                .collect(),
+            policies: self.candidates.iter().map(Candidate::named).collect(),
+        })
     }
 }
 
@@ -139,20 +250,32 @@ impl Candidate {
                 policy: file.display().to_string(),
                 train_world: None,
                 file: file.to_owned(),
+                sha256: None,
                 kind,
             };
             return Ok((rule, None));
         }
         let in_file = || file.display().to_string();
-        let (actor, notes) = Actor::from_bytes(&read(file)?).with_context(in_file)?;
+        let bytes = read(file)?;
+        let (actor, notes) = Actor::from_bytes(&bytes).with_context(in_file)?;
         let notes = Notes::from_map(&notes).with_context(in_file)?;
         let learned = Self {
             policy: notes.algorithm,
             train_world: Some(notes.train_world),
             file: file.to_owned(),
+            sha256: Some(sha256(&bytes)),
             kind: Kind::Learned(Box::new(actor)),
         };
         Ok((learned, Some(notes.env)))
+    }
+
+    fn named(&self) -> Policy {
+        Policy {
+            policy: self.policy.clone(),
+            train_world: self.train_world.clone(),
+            file: self.file.clone(),
+            sha256: self.sha256.clone(),
+        }
     }
 
     fn driver(&self) -> Driver<'_> {
@@ -165,163 +288,7 @@ impl Candidate {
     }
 }
 
-impl<'a> Table<'a> {
-    pub(super) fn new(courses: &'a Arc<[Course]>, repeats: usize) -> Self {
-        let csv = "policy,train_world,test_world,file,scenario,repeat,collided,offroad,\
-                   progress_m,comfortable,score\n";
-        Self {
-            courses,
-            repeats,
-            groups: Vec::new(),
-            csv: csv.into(),
-            steps: 0,
-            began: Instant::now(),
-        }
-    }
-
-    /// Lets all candidates drive in one world.
-    pub(super) fn drive(
-        &mut self,
-        run: &Run,
-        candidates: &[Candidate],
-        env: &EnvConfig,
-        (name, world): (&WorldName, &RlWorld),
-    ) -> anyhow::Result<()> {
-        let label = format!("driving in {name}");
-        let progress = run.progress(&label, candidates.len() as u64, "policies");
-        for candidate in candidates {
-            stop_if_interrupted()?;
-            let episodes = (self.repeats, run.seed());
-            let drives = evaluate(
-                self.courses,
-                world.traffic(),
-                env,
-                candidate.driver(),
-                episodes,
-            )
-            .with_context(|| candidate.file.display().to_string())?;
-            self.steps += drives.iter().map(|drive| drive.steps).sum::<usize>();
-            self.note(candidate, name, &drives)?;
-            self.group(candidate, name).drives.push(drives);
-            progress.advance(1);
-        }
-        Ok(())
-    }
-
-    /// The row of a candidate in a world.
-    fn group(&mut self, candidate: &Candidate, name: &WorldName) -> &mut Group {
-        let test_world = name.to_string();
-        let is_it = |g: &Group| {
-            let of_candidate = (&g.policy, &g.train_world, &g.test_world);
-            of_candidate == (&candidate.policy, &candidate.train_world, &test_world)
-        };
-        let i = self.groups.iter().position(is_it).unwrap_or_else(|| {
-            self.groups.push(Group {
-                policy: candidate.policy.clone(),
-                train_world: candidate.train_world.clone(),
-                test_world: test_world.clone(),
-                drives: Vec::new(),
-            });
-            self.groups.len() - 1
-        });
-        &mut self.groups[i]
-    }
-
-    fn note(
-        &mut self,
-        candidate: &Candidate,
-        test_world: &WorldName,
-        drives: &[Drive],
-    ) -> anyhow::Result<()> {
-        let train_world = candidate.train_world.as_deref().unwrap_or("");
-        for drive in drives {
-            writeln!(
-                self.csv,
-                "{},{train_world},{test_world},{},{},{},{},{},{},{},{}",
-                candidate.policy,
-                candidate.file.display(),
-                self.courses[drive.scenario].scenario().id,
-                drive.repeat,
-                u8::from(drive.collided),
-                u8::from(drive.off_road),
-                drive.progress,
-                u8::from(drive.comfortable),
-                drive.score(),
-            )?;
-        }
-        Ok(())
-    }
-
-    /// Writes every drive to a file, rows and paired differences to the report.
-    pub(super) fn report(&self, run: &mut Run) -> anyhow::Result<()> {
-        write(&run.path("drives.csv"), self.csv.as_bytes())?;
-        let seed = run.seed();
-        let rows: Vec<Value> = self.groups.iter().map(|group| group.row(seed)).collect();
-        run.result("rows", rows)?;
-        run.result("differences", self.differences(seed))?;
-        run.result("scenarios", self.courses.len())?;
-        let seconds = self.began.elapsed().as_secs_f64();
-        run.result("steps_per_second", self.steps as f64 / seconds)
-    }
-
-    /// Every row against every earlier row of the same test world, on the same scenarios.
-    fn differences(&self, seed: Seed) -> Vec<Value> {
-        let mut differences = Vec::new();
-        for (i, than) in self.groups.iter().enumerate() {
-            for group in self.groups[i + 1..].iter() {
-                if group.test_world != than.test_world {
-                    continue;
-                }
-                let scores = [group, than].map(Group::scores);
-                if let Some((difference, span)) = paired_difference(&scores[0], &scores[1], seed) {
-                    differences.push(json!({
-                        "test_world": group.test_world,
-                        "policy": group.label(),
-                        "than": than.label(),
-                        "difference": difference,
-                        "low": span.low,
-                        "high": span.high,
-                    }));
-                }
-            }
-        }
-        differences
-    }
-}
-
-impl Group {
-    fn label(&self) -> String {
-        match &self.train_world {
-            Some(world) => format!("{} in {world}", self.policy),
-            None => self.policy.clone(),
-        }
-    }
-
-    fn all(&self) -> Vec<Drive> {
-        self.drives.concat()
-    }
-
-    fn scores(&self) -> Vec<f64> {
-        score_by_scenario(&self.all())
-    }
-
-    fn row(&self, seed: Seed) -> Value {
-        let all = self.all();
-        let columns = Columns::of(&all);
-        let span = interval(&self.scores(), seed);
-        json!({
-            "policy": self.policy,
-            "train_world": self.train_world,
-            "test_world": self.test_world,
-            "policies": self.drives.len(),
-            "episodes": all.len(),
-            "score": columns.map(|c| c.score),
-            "low": span.map(|span| span.low),
-            "high": span.map(|span| span.high),
-            "collision_rate": columns.map(|c| c.collision_rate),
-            "offroad_rate": columns.map(|c| c.offroad_rate),
-            "progress_m": columns.and_then(|c| c.progress),
-            "comfort": columns.and_then(|c| c.comfort),
-        })
-    }
+fn sha256(bytes: &[u8]) -> String {
+    let digest = Sha256::digest(bytes);
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -5,6 +5,7 @@ pub(crate) mod serve;
 pub(crate) mod table;
 pub(crate) mod train;
 
+pub(crate) mod columns;
 mod curves;
 
 use std::collections::BTreeMap;
@@ -83,6 +84,7 @@ fn known_keys() -> anyhow::Result<Table> {
         encoder: Some(Architecture::SmallConv),
         huber: Some(1.0),
         clip: Some(1.0),
+        imitation_limit: Some(1.0),
         ..SacConfig::default()
     };
     let mut known = Table::new();

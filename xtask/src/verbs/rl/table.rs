@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
+use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_scene::Seed;
 use serde::Serialize;
 
-use super::evaluate::{Candidate, Table};
+use super::evaluate::{Candidate, Test, load};
 use super::train::{AlgorithmName, Job};
 use super::{RlWorld, Settings, courses};
 use crate::cli::WrongArguments;
@@ -111,17 +112,16 @@ impl Args {
         let candidates: Vec<Candidate> = all
             .map(|file| Ok(Candidate::read(file)?.0))
             .collect::<anyhow::Result<_>>()?;
-        let sampling = self.sampling.resolve()?;
-        let device = run.device().clone();
-        let mut table = Table::new(&courses, self.repeats);
-        let worlds = [&WorldName::Log, &self.world].into_iter();
-        for name in worlds.chain(&self.test_world) {
-            let world = run.phase("load", |_| RlWorld::load(&device, name, &sampling))?;
-            let world = (name, &world);
-            run.phase("drive", |run| {
-                table.drive(run, &candidates, &settings.env, world)
-            })?;
-        }
-        table.report(run)
+        let trained_in = [&WorldName::Log, &self.world].into_iter();
+        let worlds = load(run, trained_in.chain(&self.test_world), &self.sampling)?;
+        let test = Test {
+            candidates: &candidates,
+            worlds,
+            env: &settings.env,
+            repeats: self.repeats,
+            sampling: &self.sampling,
+            shard: Shard::WHOLE,
+        };
+        test.execute(run, &courses)
     }
 }
