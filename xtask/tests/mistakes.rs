@@ -201,6 +201,19 @@ fn heads_are_asked_of_networks_that_have_them() {
         2,
         &["--heads: ", "found a relative network"],
     );
+    for flag in [
+        "--futures 8",
+        "--temperature 0.5",
+        "--raw",
+        "--life",
+        "--lights log",
+    ] {
+        let words = format!("{} {flag}", words(&world));
+        let output = place.run(&words);
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{words}: {error}");
+        assert!(error.contains("'--heads' cannot be used with"), "{error}");
+    }
 }
 
 #[test]

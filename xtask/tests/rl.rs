@@ -132,6 +132,11 @@ fn a_policy_learns_goes_on_and_is_evaluated() {
     }
     let again = fs::read_to_string(place.path("merged/drives.csv")).unwrap();
     assert_eq!(again, drives);
+    let half = place.results(&format!("{} --incomplete", merge("2")), "half");
+    assert_eq!(
+        (&half["scenarios"], &half["shards"]),
+        (&1.into(), &"2/2".into())
+    );
     let other = words.replace("whole/policy", "halves/policy");
     place.results(&format!("{other} --shard 2/2"), "shard-foreign");
     for wrong in ["1 foreign", "1 1", "1"] {

@@ -145,11 +145,21 @@ pub fn header(folder: &Path) -> Result<Header, EvalError> {
     parse::<toml::Table>(start, folder).map(|(header, _)| header)
 }
 
+/// What to do about shards that are not there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MissingShards {
+    /// An error.
+    Refuse,
+    /// The result is that of the scenarios of the others, for a look at an evaluation in progress.
+    Allow,
+}
+
 /// Entries of the shards of one evaluation in order of the scenarios, and the header without shard.
 ///
-/// Error: shards that are missing, given twice, or of different evaluations.
+/// Error: shards given twice or of different evaluations, and missing ones unless they are allowed.
 pub fn merge<T: DeserializeOwned>(
     folders: &[PathBuf],
+    when_missing: MissingShards,
 ) -> Result<(Header, Vec<Entry<T>>), EvalError> {
     let mut shards: BTreeMap<usize, &Path> = BTreeMap::new();
     let mut first: Option<(Header, &Path)> = None;
@@ -182,7 +192,7 @@ pub fn merge<T: DeserializeOwned>(
     let (header, _) = first.ok_or_else(none)?;
     let n = header.shard.n;
     let missing: Vec<_> = (1..=n).filter(|k| !shards.contains_key(k)).collect();
-    if !missing.is_empty() {
+    if !missing.is_empty() && when_missing == MissingShards::Refuse {
         return Err(EvalError::Results(format!(
             "expected all {n} shards, missing are {missing:?}"
         )));
@@ -278,8 +288,9 @@ mod tests {
         for k in 1..=3 {
             shard(&place(&k.to_string()), k, 3);
         }
-        let (_, whole) = merge::<f64>(&[place("whole")]).unwrap();
-        let (_, parts) = merge::<f64>(&[place("3"), place("1"), place("2")]).unwrap();
+        let (_, whole) = merge::<f64>(&[place("whole")], MissingShards::Refuse).unwrap();
+        let (_, parts) =
+            merge::<f64>(&[place("3"), place("1"), place("2")], MissingShards::Allow).unwrap();
         assert_eq!(whole.len(), 10);
         assert_eq!(whole, parts);
         assert_eq!(whole[7].scores.to_bits(), 7.1f64.sin().to_bits());
@@ -294,10 +305,18 @@ mod tests {
         shard(&place("1of3"), 1, 3);
         let fails = |names: &[&str], part: &str| {
             let folders: Vec<_> = names.iter().map(|name| place(name)).collect();
-            let error = format!("{:#}", merge::<f64>(&folders).unwrap_err());
+            let error = format!(
+                "{:#}",
+                merge::<f64>(&folders, MissingShards::Refuse).unwrap_err()
+            );
             assert!(error.contains(part), "{error}");
         };
         fails(&["1of2"], "missing are [2]");
+        let (_, half) = merge::<f64>(&[place("1of2")], MissingShards::Allow).unwrap();
+        assert_eq!(
+            half.iter().map(|e| e.index).collect::<Vec<_>>(),
+            [0, 2, 4, 6, 8]
+        );
         fails(&["1of2", "also 1of2"], "every shard once, found 1/2");
         fails(&["1of2", "1of3"], "one evaluation");
         fails(&["nowhere"], "cannot read");
@@ -317,7 +336,8 @@ mod tests {
         assert_eq!(store.indices(), BTreeSet::from([0, 1]));
         store.add(entry(2, 2.5)).unwrap();
         assert_eq!(store.close().unwrap().len(), 3);
-        let (_, entries) = merge::<f64>(&[folder.path().to_owned()]).unwrap();
+        let (_, entries) =
+            merge::<f64>(&[folder.path().to_owned()], MissingShards::Refuse).unwrap();
         assert_eq!(entries.iter().map(|e| e.scores).sum::<f64>(), 4.5);
     }
 

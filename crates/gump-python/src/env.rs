@@ -94,6 +94,7 @@ impl Env {
         dynamics: &str,
         horizon: f64,
         prioritized: bool,
+        nearest: Option<usize>,
     ) -> PyResult<Self> {
         let mut config = EnvConfig {
             n_envs: num_envs,
@@ -123,6 +124,7 @@ impl Env {
             }
         };
         config.rules.horizon = horizon;
+        config.nearest = nearest;
         if prioritized {
             config.sampling = Sampling::prioritized();
         }

@@ -42,6 +42,18 @@ def test_shapes_and_types(courses):
     assert (env.dt, env.num_scenarios, env.action_len) == (0.5, 8, 2)
 
 
+def test_distant_agents_follow_the_log(courses):
+    def of(nearest):
+        return roam(gump.VectorEnv(courses, 3, "idm", nearest=nearest), 25, 1)
+
+    def same(one, other):
+        return all(np.array_equal(a, b) for a, b in zip(one, other))
+
+    everyone = of(None)
+    assert same(of(1000), everyone)
+    assert not same(of(1), everyone)
+
+
 def test_same_seed_same_episodes(courses):
     one, again, other = (roam(gump.VectorEnv(courses, 3), 25, seed) for seed in (1, 1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(one, again))

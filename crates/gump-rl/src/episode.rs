@@ -11,9 +11,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Course, Dynamics, RlError};
 
-/// Seconds between the moments of a step at which collisions and road edges are tested: a vehicle
-/// at 15 m/s moves a third of its length.
+/// Seconds between the moments of a step at which collisions are tested: a vehicle at 15 m/s moves
+/// a third of its length.
 const MOMENT: f64 = 0.1;
+
+/// Metres between the places at which road edges are tested; they are the larger part of a step.
+const BETWEEN_EDGES: f64 = 2.0;
+
+/// Metres per second that no agent exceeds: whoever is farther away than this allows is not
+/// looked for in the frame before.
+const FASTEST: f64 = 60.0;
 
 /// Dynamics, rewards and horizon of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -188,8 +195,8 @@ impl Rules {
     /// The state after one step in which `action` drives the ego and all other agents move from
     /// their places in `before` to those in `after`.
     ///
-    /// A collision or leaving the road at any tenth of a second of the step terminates, in this
-    /// order; an episode that starts in a collision ends with its first step. The horizon and the
+    /// A collision or leaving the road terminates, in this order. Collisions are tested every tenth
+    /// of a second, road edges at the end and about every two metres before it; an episode that starts in a collision ends with its first step. The horizon and the
     /// end of the route truncate. Between the two frames others move in straight lines; those that
     /// `before` lacks stand where `after` has them.
     ///
@@ -219,8 +226,13 @@ impl Rules {
         };
         let moved = ego.pose.position.distance(now.pose.position);
         let progress = (next.along - state.along).clamp(-moved, moved);
-        let collided = collides(&way, before, after);
-        let off_road = way.iter().any(|ego| is_off_road(course, ego));
+        let collided = collides(&way, before, after, FASTEST * dt);
+        let stride = n.div_ceil((moved / BETWEEN_EDGES).ceil().clamp(1.0, n as f64) as usize);
+        let off_road = way
+            .iter()
+            .rev()
+            .step_by(stride)
+            .any(|ego| is_off_road(course, ego));
         let uncomfortable = next.is_uncomfortable(dt);
 
         let weights = &self.reward;
@@ -322,19 +334,22 @@ fn turn_rate(from: &AgentState, to: &AgentState, dt: f64) -> f64 {
 }
 
 /// [`gump_metrics::Collision`] of the ego at any moment of a step. `way` has the ego at evenly
-/// spaced moments, the last of them the step's end.
-fn collides(way: &[Agent], before: &Frame, after: &Frame) -> bool {
+/// spaced moments, the last of them the step's end; nobody moves farther than `farthest` metres.
+fn collides(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> bool {
     let own = way[way.len() - 1].oriented_box();
     let from_end = |ego: &Agent| ego.state.pose.position.distance(own.pose.position);
     let own_way = way.iter().map(from_end).fold(0.0, f64::max);
     after.agents().iter().any(|other| {
         let end = other.state.pose;
-        let start = before.agent(other.id).map_or(end, |then| then.state.pose);
         // Half the sum of length and width is no less than half the diagonal.
         let size = (own.length + own.width + other.length + other.width) / 2.0;
-        let reach = size + own_way + start.position.distance(end.position);
         let distance = own.pose.position.distance_squared(end.position);
-        if other.id == way[0].id || distance >= reach * reach {
+        let far = |reach: f64| distance >= reach * reach;
+        if other.id == way[0].id || far(size + own_way + farthest) {
+            return false;
+        }
+        let start = before.agent(other.id).map_or(end, |then| then.state.pose);
+        if far(size + own_way + start.position.distance(end.position)) {
             return false;
         }
         way.iter().enumerate().any(|(k, ego)| {

@@ -191,6 +191,7 @@ class Env:
         dynamics: str,
         horizon: float,
         prioritized: bool,
+        nearest: Optional[int],
     ) -> None: ...
     @property
     def action_len(self) -> int: ...

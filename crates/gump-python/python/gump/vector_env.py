@@ -44,7 +44,9 @@ class VectorEnv(_VectorBase):
     numbers]` ("vector") or uint8 0 or 1 `[num_envs, layer, row, column]` ("raster"); actions float32
     `[num_envs, action_len]` in [-1, 1], of a "bicycle" (acceleration, steering), the "next_pose" or a
     "trajectory". An action is held for half a second; an episode is cut off after `horizon` seconds.
-    `prioritized` drives scenarios that were failed lately more often.
+    `prioritized` drives scenarios that were failed lately more often. `nearest` limits a world to the
+    agents that come nearest to the ego in the log; the others follow the log, which makes steps in a
+    learned world faster.
 
     When an episode ends, `infos` tells its scenario (an index), steps, return, metres of progress, and
     whether it collided, left the road or was uncomfortable; with `autoreset_mode="same_step"` under
@@ -66,6 +68,7 @@ class VectorEnv(_VectorBase):
         dynamics: str = "bicycle",
         horizon: float = 8.0,
         prioritized: bool = False,
+        nearest: Optional[int] = None,
     ) -> None:
         world = world if isinstance(world, World) else World(world)
         self.num_envs = num_envs
@@ -79,6 +82,7 @@ class VectorEnv(_VectorBase):
             dynamics,
             horizon,
             prioritized,
+            nearest,
         )
         self.action_len: int = self._env.action_len
         self.dt: float = self._env.dt

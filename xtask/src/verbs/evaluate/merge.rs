@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use gump_eval::results;
+use gump_eval::results::{self, MissingShards};
 use serde::Serialize;
 
 use super::super::rl;
@@ -10,7 +10,7 @@ use super::{behaviour, closed_loop, motion, reactions, wosac};
 use crate::run::{Common, Run};
 
 /// How the report of a benchmark is made from the folders of its shards.
-type Tell = fn(&mut Run, &[PathBuf]) -> anyhow::Result<()>;
+type Tell = fn(&mut Run, &[PathBuf], MissingShards) -> anyhow::Result<()>;
 
 /// Benchmarks that can be sharded, by the name in their ledgers.
 const BENCHMARKS: &[(&str, Tell)] = &[
@@ -28,6 +28,9 @@ pub(crate) struct Args {
     /// Output folders of all shards, in any order
     #[arg(value_name = "DIR", required = true)]
     folders: Vec<PathBuf>,
+    /// Report on the shards given, though others are missing
+    #[arg(long)]
+    incomplete: bool,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -44,6 +47,17 @@ impl Args {
                 self.folders[0].display()
             );
         };
-        tell(run, &self.folders)
+        let missing = match self.incomplete {
+            true => MissingShards::Allow,
+            false => MissingShards::Refuse,
+        };
+        tell(run, &self.folders, missing)?;
+        if self.incomplete {
+            let shards = self.folders.iter().map(|folder| results::header(folder));
+            let shards = shards.map(|header| Ok(header?.shard.to_string()));
+            let shards = shards.collect::<anyhow::Result<Vec<_>>>()?;
+            run.result("shards", shards.join(" "))?;
+        }
+        Ok(())
     }
 }

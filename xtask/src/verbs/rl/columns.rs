@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_rl::{Columns, Drive, estimate, estimate_difference, score_by_scenario};
 use gump_scene::Seed;
 use serde::{Deserialize, Serialize};
@@ -99,8 +99,12 @@ impl One {
 }
 
 /// Puts shards together and reports on the whole.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Driven>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Driven>(folders, missing)?;
     tell(run, &header.settings.try_into()?, &entries)
 }
 

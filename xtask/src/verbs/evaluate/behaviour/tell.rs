@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::behaviour::{Count, Key, Measure, Tally};
 use gump_metrics::{Interval, intervals};
 use gump_scene::Seed;
@@ -40,8 +40,12 @@ const CHARTS: [Chart; 3] = [
 ];
 
 /// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Counted>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Counted>(folders, missing)?;
     tell(run, &header.settings.try_into()?, &entries)
 }
 

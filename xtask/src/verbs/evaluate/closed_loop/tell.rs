@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_nuplan::metrics::MetricScores;
@@ -44,8 +44,12 @@ impl Drives<'_> {
 }
 
 /// The report of the shards in some folders.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Driven>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Driven>(folders, missing)?;
     tell(run, &header.settings.try_into()?, &entries)
 }
 

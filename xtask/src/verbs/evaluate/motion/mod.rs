@@ -39,6 +39,25 @@ pub(crate) use self::tell::tell_merged;
 /// Name of the benchmark in ledgers.
 pub(crate) const NAME: &str = "motion";
 
+/// Flags about futures, of which the trajectory heads have none.
+const OF_FUTURES: [&str; 15] = [
+    "futures",
+    "mode",
+    "cache",
+    "precision",
+    "temperature",
+    "top_k",
+    "top_p",
+    "decay",
+    "redraws",
+    "no_limits",
+    "raw",
+    "paper",
+    "ruled",
+    "life",
+    "lights",
+];
+
 /// Arguments of `evaluate motion`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
@@ -49,7 +68,7 @@ pub(crate) struct Args {
     #[serde(flatten)]
     source: Source,
     /// Predictions of the network's trajectory heads instead of futures; only of sequence networks
-    #[arg(long, requires = "world")]
+    #[arg(long, requires = "world", conflicts_with_all = OF_FUTURES)]
     heads: bool,
     /// Futures of the world that are condensed to the six modes of a prediction
     #[arg(long, value_name = "N", default_value = "32")]

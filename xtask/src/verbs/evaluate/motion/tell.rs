@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
 use gump_viz::Bars;
@@ -69,8 +69,12 @@ pub(super) fn tell(
 }
 
 /// Fills the report of shards put together.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scores>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Scores>(folders, missing)?;
     let shapes = header.settings.get("shapes").cloned();
     let shapes = shapes.context("expected the setting shapes in the ledger")?;
     let seed = header

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::AddAssign;
 use std::path::PathBuf;
 
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::reactions::Manoeuvre;
 use gump_metrics::{Interval, intervals};
 use gump_scene::Seed;
@@ -22,8 +22,12 @@ const DRAWS: usize = 1000;
 const ALL: &str = "all";
 
 /// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scored>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Scored>(folders, missing)?;
     any_scored(&entries)?;
     tell(run, &header.settings.try_into()?, &entries)
 }

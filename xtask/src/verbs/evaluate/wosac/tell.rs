@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use gump_data::Table;
-use gump_eval::results::{self, Entry};
+use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::interval;
 use gump_scene::Seed;
 use gump_viz::Bars;
@@ -21,8 +21,12 @@ const ORACLE: &str = "logged-oracle";
 const CONSTANT_VELOCITY: &str = "constant-velocity";
 
 /// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(run: &mut Run, folders: &[PathBuf]) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scored>(folders)?;
+pub(crate) fn tell_merged(
+    run: &mut Run,
+    folders: &[PathBuf],
+    missing: MissingShards,
+) -> anyhow::Result<()> {
+    let (header, entries) = results::merge::<Scored>(folders, missing)?;
     let settings: Settings = header.settings.try_into()?;
     tell(run, &settings, &entries)
 }
