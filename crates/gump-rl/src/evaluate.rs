@@ -369,7 +369,8 @@ mod tests {
     fn differences_are_paired() {
         let a: Vec<f64> = (0..50).map(f64::from).collect();
         let b: Vec<f64> = a.iter().map(|x| x - 0.5).collect();
-        let one = estimate_difference(&[a.clone()], &[b.clone()], Seed(0)).unwrap();
+        let [first, second] = [&a, &b].map(std::slice::from_ref);
+        let one = estimate_difference(first, second, Seed(0)).unwrap();
         let interval = one.interval.unwrap();
         assert_eq!((one.mean, interval.low, interval.high), (0.5, 0.5, 0.5));
         assert!(!one.over_policies);
