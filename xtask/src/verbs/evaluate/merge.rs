@@ -53,9 +53,10 @@ impl Args {
         };
         tell(run, &self.folders, missing)?;
         if self.incomplete {
-            let shards = self.folders.iter().map(|folder| results::header(folder));
-            let shards = shards.map(|header| Ok(header?.shard.to_string()));
-            let shards = shards.collect::<anyhow::Result<Vec<_>>>()?;
+            let mut shards = Vec::new();
+            for folder in &self.folders {
+                shards.push(results::header(folder)?.shard.to_string());
+            }
             run.result("shards", shards.join(" "))?;
         }
         Ok(())
