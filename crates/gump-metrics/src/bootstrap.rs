@@ -53,10 +53,27 @@ pub fn intervals(
     if n < 2 {
         return Vec::new();
     }
+    intervals_of_groups(&[n], n_resamples, seed, |drawn| statistic(&drawn[0]))
+}
+
+/// As [`intervals`] over several groups at once, for instance scenarios and policies: every
+/// resample draws from each group as many indices as it has members, independently of the others,
+/// and passes them in the order of the groups.
+///
+/// Source: Owen 2007, "The pigeonhole bootstrap".
+///
+/// # Panics
+/// For an empty group.
+pub fn intervals_of_groups(
+    sizes: &[usize],
+    n_resamples: usize,
+    seed: Seed,
+    statistic: impl Fn(&[Vec<usize>]) -> Vec<Option<f64>> + Sync,
+) -> Vec<Option<Interval>> {
     let resample = |k: usize| {
         let mut rng = seed.fork(k as u64).rng();
-        let drawn: Vec<usize> = (0..n).map(|_| rng.random_range(0..n)).collect();
-        statistic(&drawn)
+        let mut draw = |&n: &usize| (0..n).map(|_| rng.random_range(0..n)).collect();
+        statistic(&sizes.iter().map(&mut draw).collect::<Vec<Vec<usize>>>())
     };
     let resamples: Vec<_> = (0..n_resamples).into_par_iter().map(resample).collect();
     let n_numbers = resamples.iter().map(Vec::len).max().unwrap_or(0);

@@ -49,7 +49,7 @@ pub mod statistics;
 mod summary;
 pub mod tags;
 
-pub use bootstrap::{Interval, interval, intervals};
+pub use bootstrap::{Interval, interval, intervals, intervals_of_groups};
 pub use border::Border;
 pub use collision::{Collision, overlapping};
 pub use comfort::{ComfortBounds, Discomfort, Felt};

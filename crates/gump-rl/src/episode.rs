@@ -15,8 +15,8 @@ use crate::{Course, Dynamics, RlError};
 /// a third of its length.
 const MOMENT: f64 = 0.1;
 
-/// Metres between the places at which road edges are tested; they are the larger part of a step.
-const BETWEEN_EDGES: f64 = 2.0;
+/// Metres between two tests of road edges, about; these tests take most of a step's time.
+const ROAD_TEST_SPACING: f64 = 2.0;
 
 /// Metres per second that no agent exceeds: whoever is farther away than this allows is not
 /// looked for in the frame before.
@@ -227,7 +227,7 @@ impl Rules {
         let moved = ego.pose.position.distance(now.pose.position);
         let progress = (next.along - state.along).clamp(-moved, moved);
         let collided = collides(&way, before, after, FASTEST * dt);
-        let stride = n.div_ceil((moved / BETWEEN_EDGES).ceil().clamp(1.0, n as f64) as usize);
+        let stride = n.div_ceil((moved / ROAD_TEST_SPACING).ceil().clamp(1.0, n as f64) as usize);
         let off_road = way
             .iter()
             .rev()

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gump_metrics::{Interval, intervals};
+use gump_metrics::{Interval, intervals_of_groups};
 use gump_scene::Seed;
 use rand::Rng as _;
 
@@ -285,35 +285,29 @@ fn resampled(groups: &[(&[Vec<f64>], f64)], seed: Seed) -> Option<Estimate> {
         return None;
     }
     let over_policies = groups.iter().all(|(scores, _)| scores.len() > 1);
-    // Sums over chosen policies of the scenarios drawn.
-    let of = |drawn: &[usize], policies: &[Vec<usize>]| -> f64 {
+    // The first of `drawn` are scenarios, the others policies of each group.
+    let of = |drawn: &[Vec<usize>]| -> f64 {
+        let (scenarios, policies) = (&drawn[0], &drawn[1..]);
         let groups = groups.iter().zip(policies);
         let means = groups.map(|((scores, weight), policies)| {
-            let of_policy = |&p: &usize| drawn.iter().map(|&s| scores[p][s]).sum::<f64>();
+            let of_policy = |&p: &usize| scenarios.iter().map(|&s| scores[p][s]).sum::<f64>();
             weight * policies.iter().map(of_policy).sum::<f64>() / policies.len() as f64
         });
-        means.sum::<f64>() / drawn.len() as f64
+        means.sum::<f64>() / scenarios.len() as f64
     };
-    let every: Vec<usize> = (0..n).collect();
-    let all: Vec<Vec<usize>> = groups.iter().map(|(s, _)| (0..s.len()).collect()).collect();
-    let resample = |drawn: &[usize]| {
-        // The draw of scenarios is a resample's seed for its policies.
-        let mixed = drawn.iter().fold(0u64, |hash, &scenario| {
-            hash.wrapping_mul(0x0100_0000_01b3) ^ scenario as u64
-        });
-        let mut rng = seed.fork(mixed).rng();
-        let draw = |all: &Vec<usize>| {
-            let n = all.len();
-            (0..n).map(|_| rng.random_range(0..n)).collect()
-        };
-        match over_policies {
-            true => vec![Some(of(drawn, &all.iter().map(draw).collect::<Vec<_>>()))],
-            false => vec![Some(of(drawn, &all))],
-        }
+    let n_policies = groups.iter().map(|(scores, _)| scores.len());
+    let sizes: Vec<usize> = std::iter::once(n).chain(n_policies).collect();
+    let everyone: Vec<Vec<usize>> = sizes.iter().map(|&n| (0..n).collect()).collect();
+    let statistic = |drawn: &[Vec<usize>]| match over_policies {
+        true => vec![Some(of(drawn))],
+        false => vec![Some(of(&[&drawn[..1], &everyone[1..]].concat()))],
     };
-    let found = intervals(n, N_RESAMPLES, seed, resample);
+    let found = match n {
+        1 => Vec::new(),
+        _ => intervals_of_groups(&sizes, N_RESAMPLES, seed, statistic),
+    };
     Some(Estimate {
-        mean: of(&every, &all),
+        mean: of(&everyone),
         interval: found.first().copied().flatten(),
         over_policies,
     })

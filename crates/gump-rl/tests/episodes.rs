@@ -7,8 +7,8 @@ mod common;
 use common::{DT, STREET, busy, config, env, street, until_end, wander};
 use gump_metrics::{Collision, Metric, OffRoad, Reward};
 use gump_rl::{
-    BicycleLimits, Course, DrivingEnv, Dynamics, End, EnvConfig, Failure, PoseLimits, RlError,
-    Rules, Traffic, VectorEnv,
+    BicycleLimits, Course, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Failure, PoseLimits,
+    RlError, Rules, Traffic, VectorEnv,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
@@ -85,7 +85,7 @@ fn the_end_of_the_route_and_of_the_log_truncate() {
 }
 
 /// Every step earns what the reward of the metrics says about the same frames; collisions count at
-/// any tenth of a second, road edges at some.
+/// any tenth of a second, road edges at the end and about every two metres before it.
 #[test]
 fn rewards_are_those_of_the_metrics() {
     let rules = Rules::default();
@@ -132,13 +132,18 @@ fn rewards_are_those_of_the_metrics() {
             rollout.push(Frame::new(agents, frame.lights().to_vec()));
             let now = rollout.last();
             let mut expected = reward.at(&now, now.ego_now()).total;
-            let within = |i: usize| moments.iter().any(|m| m[i]) && !moments[4][i];
-            if within(0) {
-                expected -= 5.0;
+            let position = |state: &EpisodeState| state.ego.state.pose.position;
+            let moved = position(&next).distance(position(&state));
+            let stride = [5, 5, 3, 2, 2, 1][(moved / 2.0).ceil().min(5.0) as usize];
+            let collided = moments.iter().any(|m| m[0]);
+            let off_road = moments.iter().rev().step_by(stride).any(|m| m[1]);
+            for (within, at_end) in [(collided, moments[4][0]), (off_road, moments[4][1])] {
+                if within && !at_end {
+                    expected -= 5.0;
+                }
             }
-            let is = |expected: f64| (next.reward - expected).abs() < 1e-9;
             assert!(
-                is(expected) || (within(1) && is(expected - 5.0)),
+                (next.reward - expected).abs() < 1e-9,
                 "{} but {expected}",
                 next.reward
             );

@@ -23,8 +23,8 @@ pub struct EnvConfig {
     /// How episodes choose their scenarios.
     pub sampling: Sampling,
     /// Agents that a world simulates in each episode, those that come nearest to the ego in the
-    /// log; all others follow the log, unseen by those simulated. `None` simulates all. For
-    /// training: a step of a learned world costs as much as it has agents.
+    /// log; all others follow the log, unseen by those simulated, and stand where it ends. `None`
+    /// simulates all. For training: a step of a learned world costs as much as it has agents.
     /// [`crate::evaluate`] always simulates all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub nearest: Option<usize>,

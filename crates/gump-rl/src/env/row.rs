@@ -61,11 +61,11 @@ impl Row {
 
     /// Limits the world to the `n` agents that come nearest to the ego in the log.
     pub(super) fn limit(&mut self, course: &Course, n: Option<usize>) {
-        let (all, ego) = (course.by_distance(), course.scenario().ego);
         self.history.clear();
-        let Some(nearest) = n.and_then(|n| all.get(..n)) else {
+        let Some(nearest) = n.and_then(|n| course.by_distance().get(..n)) else {
             return;
         };
+        let ego = course.scenario().ego;
         let kept = |agent: &&Agent| agent.id == ego || nearest.contains(&agent.id);
         let past = course.scenario().present().history.iter();
         self.history.extend(past.map(|frame| {

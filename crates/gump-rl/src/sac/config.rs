@@ -70,8 +70,8 @@ pub struct SacConfig {
     pub imitation_weight: f64,
     /// Highest norm of the imitation loss's gradient by the actor's outputs, as a multiple of that
     /// of the rest of the actor's loss; where it is higher, the gradient is scaled down (ours:
-    /// any). Imitation grows with the precision of the policy: the gradient of a log density is
-    /// inversely proportional to the standard deviation.
+    /// any). Imitation grows as the policy narrows: for a given error the gradient of a log density
+    /// by the mean is inversely proportional to the variance.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub imitation_limit: Option<f64>,
     /// Whether vector observations are scaled to mean 0 and variance 1, by the transitions known

@@ -43,12 +43,12 @@ pub(super) struct Policy {
 /// All drives of one scenario.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct Driven {
-    pub(super) drives: Vec<One>,
+    pub(super) drives: Vec<DriveRecord>,
 }
 
 /// One drive.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) struct One {
+pub(super) struct DriveRecord {
     /// Index in [`Tested::worlds`].
     pub(super) world: usize,
     /// Index in [`Tested::policies`].
@@ -70,7 +70,7 @@ struct Group<'a> {
     drives: Vec<Vec<Drive>>,
 }
 
-impl One {
+impl DriveRecord {
     pub(super) fn new(world: usize, policy: usize, drive: &Drive) -> Self {
         Self {
             world,

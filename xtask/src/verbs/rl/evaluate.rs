@@ -12,7 +12,7 @@ use gump_rl::{Actor, Course, Driver, EnvConfig, Episodes, evaluate};
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use super::columns::{Driven, One, Policy, Tested, tell};
+use super::columns::{DriveRecord, Driven, Policy, Tested, tell};
 use super::{Notes, RlWorld, Settings, courses, read};
 use crate::cli::WrongArguments;
 use crate::dataset::Split;
@@ -209,7 +209,7 @@ impl Test<'_> {
         for (driven, drives) in driven.iter_mut().zip(of_scenario) {
             driven
                 .drives
-                .extend(drives.iter().map(|drive| One::new(w, p, drive)));
+                .extend(drives.iter().map(|drive| DriveRecord::new(w, p, drive)));
         }
         Ok(drives.iter().map(|drive| drive.steps as u32).sum())
     }
