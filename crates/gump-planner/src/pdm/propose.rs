@@ -12,6 +12,9 @@ use super::forecast::{Forecast, Object};
 pub(crate) const DT: f64 = 0.1;
 /// How far ahead a line is examined, seconds at the highest desired speed.
 const CORRIDOR_SECONDS: f64 = 8.0;
+/// Distance between points of a line beyond which a corridor does not begin and end at points but
+/// at the ends of its range, metres; nuPlan's lines have a point every metre.
+const SPARSE: f64 = 1.0 + 1e-6;
 /// Length that PDM assumes behind the position of a lead that does not exist, metres.
 ///
 /// It is half the length of nuPlan's car; PDM has it as a constant of the vehicle.
@@ -44,6 +47,9 @@ impl Line {
 
     /// The strip that a vehicle sweeps between two arc lengths: the points in between, with square
     /// ends.
+    ///
+    /// As in the original it begins at the first point within the range and ends at the last, unless
+    /// points are [`SPARSE`]: there an obstacle may stand between the range's end and the next point.
     fn corridor(&self, from: f64, to: f64, half_width: f64) -> Vec<Quad> {
         let line = self.path.line();
         let arc = line.arc_lengths();
@@ -51,7 +57,14 @@ impl Line {
         let first = arc.partition_point(|&s| s < from);
         let end = arc.partition_point(|&s| s <= to);
         let points = if end > first + 1 {
-            line.points()[first..end].to_vec()
+            let mut points = line.points()[first..end].to_vec();
+            if arc[first] - from > SPARSE {
+                points.insert(0, line.pose_at(from).position);
+            }
+            if to - arc[end - 1] > SPARSE {
+                points.push(line.pose_at(to).position);
+            }
+            points
         } else {
             line.slice(from, to).points().to_vec()
         };

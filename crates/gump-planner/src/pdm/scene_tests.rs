@@ -122,6 +122,18 @@ fn a_box_between_two_bends_of_the_way_is_on_one_of_them() {
     assert_ne!(poses("agent vehicle 1: 20,2 size 8,2.4"), free);
 }
 
+/// The obstacle stands before the second point of the lane, the ego is past the first.
+#[test]
+fn an_obstacle_between_points_of_a_lane_is_stopped_for() {
+    let street = STREET.replace("150,0", "40,0 80,0");
+    let text = format!("{street} ego vehicle 0: 10,0 velocity 5,0\nagent vehicle 1: 30,0");
+    let (recording, planner) = check(&text);
+    for i in 0..5 {
+        let front = front(&recording, &planner, i);
+        assert!(front < 28.0, "{front}");
+    }
+}
+
 #[test]
 fn a_red_light_is_stopped_for() {
     let text = "lane 1: 0,0 40,0 speed 10 next 2\n lane 2: 40,0 60,0 speed 10 next 3
