@@ -203,6 +203,9 @@ impl Cli {
             Verb::Bench(bench::Verb::Engine(args)) => {
                 Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))
             }
+            Verb::Bench(bench::Verb::Train(args)) => {
+                Run::of("bench train", &args.common, &args)?.execute(|run| args.execute(run))
+            }
             Verb::Bench(bench::Verb::Device(args)) => {
                 Run::of("bench device", &args.common, &args)?.execute(|run| args.execute(run))
             }

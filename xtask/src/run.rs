@@ -250,6 +250,11 @@ impl Run {
         &self.device
     }
 
+    /// Threads to use.
+    pub(crate) fn threads(&self) -> usize {
+        self.threads
+    }
+
     /// Where all randomness comes from.
     pub(crate) fn seed(&self) -> Seed {
         self.seed

@@ -187,6 +187,15 @@ fn shares_of_a_planner_are_from_0_to_1() {
 }
 
 #[test]
+fn a_python_without_pytorch_is_told() {
+    let place = Workplace::new();
+    for verb in ["train", "engine"] {
+        let words = format!("bench {verb} --torch no-such-python");
+        place.check(&words, 2, &["--torch no-such-python: cannot be run"]);
+    }
+}
+
+#[test]
 fn heads_are_asked_of_networks_that_have_them() {
     let place = Workplace::new();
     let words =

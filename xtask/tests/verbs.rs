@@ -1039,3 +1039,17 @@ fn bench_wosac_times_every_year() {
     assert_eq!(rows.as_array().unwrap().len(), 5);
     assert!(rows[3]["seconds_per_scenario"].as_f64().unwrap() > 0.0);
 }
+
+#[test]
+fn bench_train_times_both_number_formats() {
+    let place = Workplace::new();
+    let words = "bench train --sizes tiny --batch 1 --steps 1 --rounds 1 --threads 1";
+    let rows = place.report(words)["results"]["rows"].clone();
+    let precisions: Vec<_> = rows.as_array().unwrap().iter().collect();
+    assert_eq!(precisions.len(), 2);
+    for (row, precision) in precisions.into_iter().zip(["f32", "bf16"]) {
+        assert_eq!(row["precision"], precision);
+        assert!(row["cpu_milliseconds_per_step"].as_f64().unwrap() > 0.0);
+        assert!(row["ratio"].is_null());
+    }
+}

@@ -298,6 +298,12 @@ impl StateDecoder {
         }
     }
 
+    /// With smooth bins the sine features of every field's bins, in the order of their tokens;
+    /// otherwise nothing.
+    pub(crate) fn bin_sines(&self) -> &[Tensor] {
+        self.smooth.as_ref().map_or(&[], |smooth| &smooth.sines)
+    }
+
     /// Which of [`StateDecoder::all_output_rows`] are the bins of a field.
     pub fn rows_of(field: Field) -> Range<usize> {
         let first = field.first_token() as usize - field_rows().start;

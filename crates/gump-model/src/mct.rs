@@ -273,6 +273,38 @@ pub struct TokenBatch {
     pub shape: (usize, usize),
 }
 
+impl TokenBatch {
+    /// What the transformer reads, by name, for code of another language: `rows`,
+    /// `sine_positions`, `sines`, `lookers`, `seers` and `surroundings` as stored, and `places`
+    /// \[places, K\], rows of the visual tokens of all sequences, of which each has `visual_tokens`.
+    ///
+    /// Every sequence must have a scene of its own.
+    ///
+    /// # Errors
+    /// The tensor library failed.
+    pub fn named(&self, visual_tokens: usize) -> Result<Vec<(&'static str, Tensor)>> {
+        let of_row = |(row, cell): (&u32, &u32)| row * visual_tokens as u32 + cell;
+        let places: Vec<u32> = self
+            .places
+            .iter()
+            .flat_map(|cells| self.looker_rows.iter().zip(cells).map(of_row))
+            .collect();
+        let shape = (PLACES.len(), self.looker_rows.len());
+        Ok(vec![
+            ("rows", self.rows.clone()),
+            ("sine_positions", self.sine_positions.clone()),
+            ("sines", self.sines.clone()),
+            ("lookers", self.lookers.clone()),
+            (
+                "places",
+                Tensor::from_vec(places, shape, self.rows.device())?,
+            ),
+            ("seers", self.seers.clone()),
+            ("surroundings", self.surroundings.clone()),
+        ])
+    }
+}
+
 /// Positions at which an object reads the map: seconds ahead on its present course.
 pub const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
 

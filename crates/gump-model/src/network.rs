@@ -1,16 +1,19 @@
 //! The whole network with its parameters, as stored in a checkpoint.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor};
 use gump_nn::parameters::Parameters;
 use gump_raster::{Raster, RasterSpec};
 use gump_scene::Seed;
+use gump_tokenizer::{BEGIN, FIRST_LIGHT, Field, N_CLASSES, TABLE_ROWS};
+use serde_json::{Value, json};
 
 use crate::ModelError;
 use crate::batch::Packer;
 use crate::config::ModelConfig;
-use crate::decoder::StateDecoder;
+use crate::decoder::{CONTROL_KEYS, N_LIGHT_STATES, STEPS, StateDecoder};
 use crate::local_context::Survey;
 use crate::mct::{Mct, TokenBatch, VisualMemory};
 use crate::placed_slot::PlacedSlot;
@@ -136,6 +139,49 @@ impl Network {
             .collect();
         let shape = (rasters.len(), self.raster_spec.layers.len(), side, side);
         Ok(Tensor::from_vec(data, shape, self.device())?)
+    }
+
+    /// Everything that the same network in another language needs: tensors by name and the numbers
+    /// of its shape.
+    ///
+    /// `weight.NAME` and `statistic.NAME` are parameters and running statistics as in a checkpoint;
+    /// `constant.positions` [M, C] are the sine features of the visual tokens, and with smooth bins
+    /// `constant.sines.N` [bins, 2k] those of every field's bins, in the order of their tokens.
+    ///
+    /// # Errors
+    /// The tensor library failed.
+    pub fn export(&self) -> Result<(BTreeMap<String, Tensor>, Value), ModelError> {
+        let mut all = BTreeMap::new();
+        let of_kind = [
+            ("weight", self.parameters.trainable().collect::<Vec<_>>()),
+            ("statistic", self.parameters.statistics().collect()),
+        ];
+        for (kind, vars) in of_kind {
+            for (name, var) in vars {
+                all.insert(format!("{kind}.{name}"), var.as_tensor().copy()?);
+            }
+        }
+        let positions = self.visual.positions().clone();
+        all.insert("constant.positions".into(), positions);
+        for (i, sines) in self.decoder.bin_sines().iter().enumerate() {
+            all.insert(format!("constant.sines.{i}"), sines.clone());
+        }
+        let rows_of = |field: &Field| {
+            let rows = StateDecoder::rows_of(*field);
+            [rows.start, rows.end]
+        };
+        let shape = json!({
+            "model": self.config,
+            "token_rows": TABLE_ROWS,
+            "field_row": Field::X.first_token(),
+            "step_rows": STEPS.iter().map(rows_of).collect::<Vec<_>>(),
+            "control_keys": CONTROL_KEYS,
+            "begin": BEGIN,
+            "first_light": FIRST_LIGHT,
+            "light_states": N_LIGHT_STATES,
+            "classes": N_CLASSES,
+        });
+        Ok((all, shape))
     }
 
     /// Visual features with their positions added, [S, M, C].

@@ -32,4 +32,4 @@ pub use mpi::Mpi;
 pub use peers::{ProcessGroup, SingleProcess};
 pub use sample::SampleConfig;
 pub use scenes::ScenarioSource;
-pub use trainer::{StepReport, Trainer};
+pub use trainer::{Batch, StepReport, Trainer};

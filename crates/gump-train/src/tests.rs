@@ -620,3 +620,41 @@ fn a_network_reproduces_the_scene_it_learned() {
     }
     std::fs::remove_file(path).unwrap();
 }
+
+#[test]
+fn a_step_on_drawn_samples_is_the_step_that_draws_them() {
+    let (mut drawing, mut given) = (trainer(2, 2.0), trainer(2, 2.0));
+    for step in 0..2 {
+        let batch = given.batch(step).unwrap();
+        let (a, b) = (drawing.step().unwrap(), given.step_on(&batch).unwrap());
+        assert_eq!(a.loss, b.loss);
+        assert_eq!(a.tokens, batch.tokens());
+        assert_eq!(a.gradient_norm.to_bits(), b.gradient_norm.to_bits());
+    }
+}
+
+#[test]
+fn an_export_has_all_weights_and_all_targets_of_its_batch() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("batch");
+    let trainer = trainer(2, 9.0);
+    let batch = trainer.batch(0).unwrap();
+    trainer.export(&batch, &path).unwrap();
+    let mut archive = checkpoint::read(&path).unwrap();
+    let shape: serde_json::Value = serde_json::from_str(archive.entry("shape").unwrap()).unwrap();
+    assert_eq!(shape["sequences"], 2);
+    let weights = archive.take("weight.");
+    for (name, var) in trainer.network().parameters().trainable() {
+        assert_eq!(weights[name].dims(), var.dims(), "{name}");
+    }
+    assert_eq!(
+        weights.len(),
+        trainer.network().parameters().trainable().count()
+    );
+    let input = archive.take("input.");
+    let tokens = shape["tokens"].as_u64().unwrap() as usize;
+    assert_eq!(input["rows"].dims()[0], 2 * tokens);
+    // Four agents in each of four frames of both samples.
+    assert_eq!(archive.take("state.")["rows"].dims(), [32]);
+    assert_eq!(archive.take("trajectory.")["future"].dims(), [32, 16, 4]);
+}

@@ -15,6 +15,7 @@ use serde::Serialize;
 
 use gump_model::ModelError;
 use gump_model::Network;
+use gump_model::checkpoint::{self, Precision};
 use gump_model::config::ModelConfig;
 use gump_nn::layers::Dropout;
 use gump_nn::ops::Deferred;
@@ -23,7 +24,7 @@ use crate::closed_loop;
 use crate::config::TrainConfig;
 use crate::gradients::{BatchGradients, Part};
 use crate::learner::TrainState;
-use crate::loss::{Counts, LossConfig, LossParts, loss};
+use crate::loss::{Counts, LossConfig, LossParts, export, loss};
 use crate::peers::{ProcessGroup, SingleProcess};
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
@@ -44,6 +45,18 @@ pub struct StepReport {
     pub tokens: usize,
     /// Realism of the rollouts used in the step, if any.
     pub rollouts: Option<f64>,
+}
+
+/// The samples of a step.
+pub struct Batch {
+    samples: Vec<Sample>,
+}
+
+impl Batch {
+    /// Its tokens.
+    pub fn tokens(&self) -> usize {
+        self.samples.iter().map(|sample| sample.slots.len()).sum()
+    }
 }
 
 /// A training run.
@@ -165,10 +178,56 @@ impl Trainer {
             return Err(ModelError::Peers(why));
         }
         let samples = drawn?;
-        let step = self.learner.step;
         let share = share(&self.config, &*self.peers);
-        self.next = prefetch(&self.source, step + 1, share);
-        let found = self.differentiate(&samples)?;
+        self.next = prefetch(&self.source, self.learner.step + 1, share);
+        self.learn_from(&samples)
+    }
+
+    /// This process's samples of a step, drawn now.
+    ///
+    /// # Errors
+    /// [`ModelError::Scene`] for a scenario that cannot be read.
+    pub fn batch(&self, step: usize) -> Result<Batch, ModelError> {
+        let share = share(&self.config, &*self.peers);
+        let samples = self.source.samples(step, &share)?;
+        Ok(Batch { samples })
+    }
+
+    /// One optimiser step on these samples, which any number of steps may share.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`].
+    pub fn step_on(&mut self, batch: &Batch) -> Result<StepReport, ModelError> {
+        self.learn_from(&batch.samples)
+    }
+
+    /// The loss of a training pass over these samples, without dropout.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn loss_of(&self, batch: &Batch) -> Result<f64, ModelError> {
+        let (network, config) = (&self.learner.network, &self.config.loss);
+        let whole = Counts::of(&batch.samples, config);
+        let (_, parts) = loss(network, &batch.samples, config, &whole, true, None)?;
+        Ok(parts.total)
+    }
+
+    /// Writes the weights and everything that the loss of these samples depends on as safetensors,
+    /// for the same step in another language; the metadata `shape` has the configuration as JSON.
+    ///
+    /// # Errors
+    /// [`ModelError::Io`], or a tensor error.
+    pub fn export(&self, batch: &Batch, path: &Path) -> Result<(), ModelError> {
+        let network = &self.learner.network;
+        let (tensors, shape) = export(network, &batch.samples, &self.config.loss)?;
+        let mut header = checkpoint::header(network.config())?;
+        header.insert("shape".to_owned(), shape.to_string());
+        checkpoint::write(path, tensors, header, Precision::Full)
+    }
+
+    fn learn_from(&mut self, samples: &[Sample]) -> Result<StepReport, ModelError> {
+        let step = self.learner.step;
+        let found = self.differentiate(samples)?;
         if let Some(field) = found.loss.first_not_finite() {
             return Err(ModelError::LossNotFinite { step, field });
         }

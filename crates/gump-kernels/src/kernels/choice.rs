@@ -61,6 +61,12 @@ impl Kernel {
         }
     }
 
+    /// Whether it multiplies bfloat16 by instructions of the processor. Others round, then multiply
+    /// in f32, which takes longer than f32 alone.
+    pub fn multiplies_bfloat16(self) -> bool {
+        matches!(self, Self::Amx | Self::Avx512Bf16)
+    }
+
     /// The kernel of this name.
     ///
     /// # Errors

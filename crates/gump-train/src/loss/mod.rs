@@ -7,6 +7,7 @@
 //! Source: GUMP's loss with separate means for values and keys, winner-takes-all trajectories.
 
 mod counts;
+mod export;
 mod trajectory;
 
 use std::sync::Arc;
@@ -15,6 +16,7 @@ use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use self::counts::Counts;
+pub(crate) use self::export::export;
 use gump_kernels::smoothing::OrdinalSmoothing;
 use gump_model::ModelError;
 use gump_model::Network;
@@ -25,7 +27,7 @@ use gump_nn::ops::Targets;
 
 use self::counts::weight;
 use self::trajectory::{at_agents, trajectory_loss, trajectory_targets};
-use crate::sample::{ControlTarget, Sample};
+use crate::sample::{ControlTarget, Sample, StateTarget};
 
 /// Decoder steps of sizes.
 const SIZES: usize = 2;
@@ -308,17 +310,8 @@ fn state_loss(
     if k == 0 {
         return Ok(None);
     }
-    let rows = samples.iter().enumerate().flat_map(|(row, sample)| {
-        sample
-            .states
-            .iter()
-            .map(move |target| (row * t + target.key) as u32)
-    });
-    let hidden = flat.index_select(&Tensor::from_vec(rows.collect::<Vec<u32>>(), k, device)?, 0)?; // [K, C]
-    let tokens: Vec<u32> = (0..STEPS.len())
-        .flat_map(|step| targets.iter().map(move |target| target.token(step)))
-        .collect();
-    let tokens = Tensor::from_vec(tokens, (STEPS.len(), k), device)?;
+    let hidden = flat.index_select(&Tensor::new(state_rows(samples, t), device)?, 0)?; // [K, C]
+    let tokens = Tensor::from_vec(state_tokens(&targets), (STEPS.len(), k), device)?;
     let outputs = network.decoder.teacher_forced(
         &network.decoder.input_table(&network.mct.token_table()?)?,
         &hidden,
@@ -357,6 +350,35 @@ fn state_loss(
     Ok(Some((means * shares)?.sum_all()?))
 }
 
+/// The flat index of every state target's key, in sequences of `t` tokens.
+fn state_rows(samples: &[Sample], t: usize) -> Vec<u32> {
+    let rows = samples.iter().enumerate().flat_map(|(row, sample)| {
+        let keys = sample.states.iter().map(|target| target.key);
+        keys.map(move |key| (row * t + key) as u32)
+    });
+    rows.collect()
+}
+
+/// The tokens of state targets, step by step.
+fn state_tokens(targets: &[&StateTarget]) -> Vec<u32> {
+    (0..STEPS.len())
+        .flat_map(|step| targets.iter().map(move |target| target.token(step)))
+        .collect()
+}
+
+/// The flat index of every slot with such a target, in sequences of `t` tokens, and the target.
+fn successor_rows(
+    samples: &[Sample],
+    targets: impl Fn(&Sample) -> &Vec<ControlTarget>,
+    t: usize,
+) -> (Vec<u32>, Vec<u32>) {
+    let of_sample = |(row, sample): (usize, _)| {
+        let at = move |target: &ControlTarget| ((row * t + target.slot) as u32, target.successor);
+        targets(sample).iter().map(at).collect::<Vec<_>>()
+    };
+    samples.iter().enumerate().flat_map(of_sample).unzip()
+}
+
 /// Mean cross-entropy of the successors of some slots.
 fn successor_loss(
     samples: &[Sample],
@@ -366,14 +388,7 @@ fn successor_loss(
     logits: impl Fn(&Tensor) -> candle_core::Result<Tensor>,
 ) -> Result<Option<Tensor>, ModelError> {
     let device = flat.device();
-    let (rows, successors): (Vec<u32>, Vec<u32>) = samples
-        .iter()
-        .enumerate()
-        .flat_map(|(row, sample)| {
-            let of_sample = targets(sample).iter();
-            of_sample.map(move |target| ((row * t + target.slot) as u32, target.successor))
-        })
-        .unzip();
+    let (rows, successors) = successor_rows(samples, targets, t);
     let n = rows.len();
     if n == 0 {
         return Ok(None);

@@ -78,7 +78,7 @@ pub(super) fn trajectory_loss(
 }
 
 /// Poses [A, N, POSE] with zeros where missing, and per step 1 / (valid steps) or 0, [A, N].
-fn pose_tensors<'a, const N: usize>(
+pub(super) fn pose_tensors<'a, const N: usize>(
     rows: impl Iterator<Item = &'a [Option<[f32; POSE]>; N]>,
     device: &Device,
 ) -> candle_core::Result<(Tensor, Tensor)> {

@@ -4,17 +4,19 @@
 //! Weights are random: speed does not depend on them. Processor time is measured beside wall time,
 //! and rates are per second of processor time, so that a busy machine blurs them less.
 
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_engine::{CacheMode, Mode, SamplingConfig, TransformerWorld};
-use gump_model::Network;
 use gump_model::config::ModelConfig;
+use gump_model::{Network, checkpoint};
 use gump_rollout::{Start, WorldModel as _};
 use gump_scene::Scenario;
 use serde::Serialize;
 use serde_json::json;
 
+use super::torch::{Timed, Torch};
 use crate::machine::{cpu_seconds, peak_rss_mb};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::PrecisionName;
@@ -56,6 +58,9 @@ pub(crate) struct Args {
     /// Frames per measurement of partial autoregression, half a second each
     #[arg(long, value_name = "N", default_value_t = 16)]
     frames: usize,
+    /// Python with PyTorch, whose frames with cached keys and values are timed in the same run
+    #[arg(long, value_name = "PYTHON")]
+    torch: Option<PathBuf>,
     /// Only `tiny`, only a few frames, full autoregression only of one future
     #[arg(long)]
     quick: bool,
@@ -131,6 +136,8 @@ struct Cost {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        let torch = self.torch.as_deref().map(Torch::find).transpose()?;
+        run.setting("torch_version", torch.as_ref().map(|torch| &torch.version))?;
         let gemm = run.phase("gemm", |_| Ok(gemm_rate()))?;
         run.result("gemm_gflops_per_cpu_second", gemm / 1e9)?;
         let sizes = if self.quick {
@@ -139,12 +146,20 @@ impl Args {
             &self.sizes[..]
         };
         let mut rows = Vec::new();
+        let mut pairs = Vec::new();
         for size in sizes {
             for &n_agents in &self.agents {
                 let scenario = super::crowd(n_agents)?;
                 let more = run.phase(size, |run| self.rows(run, size, &scenario, gemm))?;
                 rows.extend(more);
                 run.result("rows", &rows)?;
+                if let Some(torch) = &torch {
+                    let more = run.phase(&format!("{size} in PyTorch"), |run| {
+                        self.beside_torch(run, size, &scenario, torch)
+                    })?;
+                    pairs.extend(more);
+                    run.result("torch", &pairs)?;
+                }
             }
         }
         run.result("peak_rss_mb", peak_rss_mb())
@@ -204,18 +219,117 @@ impl Args {
         Ok(rows)
     }
 
+    /// A growing window in each number format beside PyTorch's frames, alternating.
+    fn beside_torch(
+        &self,
+        run: &Run,
+        size: &str,
+        scenario: &Scenario,
+        torch: &Torch,
+    ) -> anyhow::Result<Vec<serde_json::Value>> {
+        let growing = &WAYS[WAYS.len() - 1];
+        let file = run.path(&format!("{size}.safetensors"));
+        let (tensors, shape) = network(run, size)?.export()?;
+        let header = [("shape".to_owned(), shape.to_string())];
+        checkpoint::write(&file, tensors, header.into(), checkpoint::Precision::Full)?;
+        let steps = self.steps(growing);
+        let mut rows = Vec::new();
+        for &n_futures in &self.futures {
+            let formats = [PrecisionName::F32, PrecisionName::Bf16, PrecisionName::Int8];
+            let mut worlds = Vec::new();
+            for precision in formats {
+                worlds.push(self.world_in(run, size, growing, precision)?);
+            }
+            let mut ours = [const { Vec::new() }; 3];
+            let mut theirs = [const { Vec::new() }; 2];
+            let mut operations = [0.0; 2];
+            for _ in 0..ROUNDS {
+                for (world, costs) in worlds.iter().zip(&mut ours) {
+                    let cost = measure(world, scenario, n_futures, steps, run)?;
+                    costs.push(cost.cpu / cost.frames as f64);
+                    operations[0] = cost.operations as f64 / cost.frames as f64;
+                }
+                for (precision, costs) in ["f32", "bf16"].into_iter().zip(&mut theirs) {
+                    let timed = self.frames_in_torch(
+                        torch,
+                        &file,
+                        precision,
+                        (scenario, n_futures, steps),
+                        run.threads(),
+                    )?;
+                    let frames = (steps * n_futures) as f64;
+                    costs.push(timed.cpu_seconds / frames);
+                    operations[1] = timed.operations / frames;
+                }
+            }
+            let [f32, bf16, int8] = ours.map(median);
+            let [torch_f32, torch_bf16] = theirs.map(median);
+            rows.push(json!({
+                "size": size,
+                "agents": scenario.present().now().agents().len(),
+                "futures": n_futures,
+                "threads": run.threads(),
+                "ratio_f32": torch_f32 / f32,
+                "ratio_bf16": torch_bf16 / bf16,
+                "f32_cpu_ms": 1e3 * f32,
+                "bf16_cpu_ms": 1e3 * bf16,
+                "int8_cpu_ms": 1e3 * int8,
+                "torch_f32_cpu_ms": 1e3 * torch_f32,
+                "torch_bf16_cpu_ms": 1e3 * torch_bf16,
+                "gflop_per_frame": operations[0] / 1e9,
+                "torch_gflop_per_frame": operations[1] / 1e9,
+            }));
+        }
+        std::fs::remove_file(&file).with_context(|| format!("cannot remove {}", file.display()))?;
+        Ok(rows)
+    }
+
+    fn frames_in_torch(
+        &self,
+        torch: &Torch,
+        file: &Path,
+        precision: &str,
+        (scenario, n_futures, steps): (&Scenario, usize, usize),
+        threads: usize,
+    ) -> anyhow::Result<Timed> {
+        stop_if_interrupted()?;
+        let agents = scenario.present().now().agents().len().to_string();
+        let (futures, frames) = (n_futures.to_string(), steps.to_string());
+        let history = SamplingConfig::default().history.to_string();
+        let arguments = [
+            &file.display().to_string(),
+            "--agents",
+            &agents,
+            "--futures",
+            &futures,
+            "--frames",
+            &frames,
+            "--history",
+            &history,
+            "--precision",
+            precision,
+        ];
+        torch.time("frame.py", threads, &arguments)
+    }
+
     fn world(&self, run: &Run, size: &str, way: &Way) -> anyhow::Result<TransformerWorld> {
-        let config = ModelConfig::preset(size).with_context(|| {
-            let known = ModelConfig::PRESETS.join(", ");
-            format!("--sizes: expected one of {known}, found {size}")
-        })?;
+        self.world_in(run, size, way, self.precision)
+    }
+
+    fn world_in(
+        &self,
+        run: &Run,
+        size: &str,
+        way: &Way,
+        precision: PrecisionName,
+    ) -> anyhow::Result<TransformerWorld> {
         let sampling = SamplingConfig {
             mode: way.mode,
             cache: way.kept,
-            precision: self.precision.resolve(),
+            precision: precision.resolve(),
             ..SamplingConfig::default()
         };
-        let network = Network::random(config, run.seed(), run.device())?;
+        let network = network(run, size)?;
         Ok(if way.engine {
             TransformerWorld::new(network, sampling)
         } else {
@@ -230,6 +344,23 @@ impl Args {
             Mode::PartialAr => self.frames,
         }
     }
+}
+
+/// A network of this size with random weights.
+///
+/// Error: a size that does not exist.
+fn network(run: &Run, size: &str) -> anyhow::Result<Network> {
+    let config = ModelConfig::preset(size).with_context(|| {
+        let known = ModelConfig::PRESETS.join(", ");
+        format!("--sizes: expected one of {known}, found {size}")
+    })?;
+    Ok(Network::random(config, run.seed(), run.device())?)
+}
+
+/// The middle of an odd number of measurements.
+fn median(mut all: Vec<f64>) -> f64 {
+    all.sort_by(f64::total_cmp);
+    all[all.len() / 2]
 }
 
 /// Imagines some steps of some futures; opening is not counted, nor is one step to warm up where
@@ -272,6 +403,9 @@ fn measure(
         operations: world.operations() - operations,
     })
 }
+
+/// Measurements of each implementation, alternating; the median is reported.
+const ROUNDS: usize = 3;
 
 /// Products per measurement: half a second of work, for a clock of hundredths.
 const REPEATS: usize = 24;

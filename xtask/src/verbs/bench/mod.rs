@@ -6,6 +6,8 @@ mod decision;
 pub(crate) mod device;
 pub(crate) mod engine;
 mod planning;
+mod torch;
+pub(crate) mod train;
 pub(crate) mod wosac;
 
 use gump_scene::{Scenario, fixture};
@@ -15,6 +17,8 @@ use gump_scene::{Scenario, fixture};
 pub(crate) enum Verb {
     /// Simulation: decoding orders, caches, batches and sizes, against the machine's own rate
     Engine(engine::Args),
+    /// A training step in f32 and bfloat16, against the same network in PyTorch
+    Train(train::Args),
     /// The chosen device against the CPU: agreement and speed
     Device(device::Args),
     /// Scoring the realism of 32 rollouts, against the official evaluator

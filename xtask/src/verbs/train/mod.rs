@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_kernels::Choice;
 use gump_model::checkpoint::Precision;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_rollout::WorldModel;
@@ -179,6 +180,7 @@ impl Args {
         let (training, validation) = run.phase("read", |run| self.read(run, stage))?;
         let checkpoint = run.path(&stage.files.path(CHECKPOINT));
         let config = stage.config.train.clone();
+        warn_of_slow_bfloat16(run, config.mixed_precision);
         let mut losses = Losses::default();
         let trainer = match begin {
             Begin::New => Trainer::new(stage.config.model()?, config, training, run.device())?,
@@ -378,6 +380,18 @@ fn warn_of_frozen(run: &Run, training: &Training) -> anyhow::Result<()> {
         ));
     }
     Ok(())
+}
+
+/// Says so if products in bfloat16 take longer than in f32 on this processor.
+fn warn_of_slow_bfloat16(run: &Run, mixed_precision: bool) {
+    let kernel = Choice::made().kernel;
+    if mixed_precision && run.device().is_cpu() && !kernel.multiplies_bfloat16() {
+        run.say(&format!(
+            "note: mixed_precision takes longer than f32 with the kernel {}, which has no products \
+             of bfloat16",
+            kernel.name()
+        ));
+    }
 }
 
 /// The weights to go on from; those without marks of what is not known grow them where the

@@ -17,7 +17,9 @@ use toml::Table;
 
 use super::realism::Judge;
 use super::stages::{self, Stage};
-use super::{Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, tell, write};
+use super::{
+    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, tell, warn_of_slow_bfloat16, write,
+};
 use crate::cli::WrongArguments;
 use crate::losses::Losses;
 use crate::peers::Processes;
@@ -119,6 +121,7 @@ fn train(
 ) -> anyhow::Result<RelativeNetwork> {
     let config = stage.config.train.clone();
     let batch = config.batch;
+    warn_of_slow_bfloat16(run, config.mixed_precision);
     let (training, validation) =
         run.phase("read", |run| args.read_data(run, &stage.data, batch))?;
     let checkpoint = run.path(&stage.files.path(CHECKPOINT));
