@@ -74,6 +74,12 @@ impl Torch {
         arguments: &[&str],
     ) -> anyhow::Result<T> {
         let path = repository().join("python/bench").join(script);
+        if !path.is_file() {
+            anyhow::bail!(
+                "{} not found: --torch needs a checkout of gump",
+                path.display()
+            );
+        }
         let output = Command::new(&self.python)
             .arg(&path)
             .args(arguments)
