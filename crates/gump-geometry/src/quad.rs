@@ -4,7 +4,7 @@
 
 use glam::DVec2;
 
-use crate::{OrientedBox, Polygon, distance_to_segment, project_on_segment, segments_intersect};
+use crate::{OrientedBox, Polygon, project_on_segment, segments_intersect};
 
 /// Four corners of a convex shape, in either direction; corners may coincide.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -51,11 +51,17 @@ impl Quad {
         if self.min.cmpgt(max).any() || self.max.cmplt(min).any() {
             return false;
         }
+        // Most of a long polygon is nowhere near: bounds tell at once.
+        let is_near =
+            |low: DVec2, high: DVec2| low.cmple(self.max).all() && high.cmpge(self.min).all();
+        let mut points = polygon.ring().iter();
+        let mut edges = polygon.edges();
         self.corners.iter().any(|&corner| polygon.contains(corner))
-            || polygon.ring().iter().any(|&point| self.contains(point))
-            || polygon
-                .edges()
-                .any(|(a, b)| self.edges().any(|(c, d)| segments_intersect(a, b, c, d)))
+            || points.any(|&point| is_near(point, point) && self.contains(point))
+            || edges.any(|(a, b)| {
+                is_near(a.min(b), a.max(b))
+                    && self.edges().any(|(c, d)| segments_intersect(a, b, c, d))
+            })
     }
 
     /// True if `point` is inside or on the border.
@@ -89,21 +95,37 @@ impl Quad {
         if self.intersects_polygon(polygon) {
             return 0.0;
         }
+        let square = |p: DVec2, a: DVec2, b: DVec2| {
+            p.distance_squared(a.lerp(b, project_on_segment(p, a, b)))
+        };
         let mut least = f64::INFINITY;
         for (a, b) in polygon.edges() {
+            let gap = self.gap_to_bounds(a.min(b), a.max(b)).length_squared();
+            // Rounding must not make the nearest edge look farther than another one.
+            if gap * (1.0 - 1e-9) > least {
+                continue;
+            }
             for (c, d) in self.edges() {
-                least = least
-                    .min(distance_to_segment(c, a, b))
-                    .min(distance_to_segment(a, c, d));
+                least = least.min(square(c, a, b)).min(square(a, c, d));
             }
         }
-        least
+        least.sqrt()
+    }
+
+    /// A lower bound of [`Quad::distance_to_polygon`], metres: the gap between the bounding boxes.
+    pub fn gap_to_polygon_at_least(&self, polygon: &Polygon) -> f64 {
+        let (min, max) = polygon.bounds();
+        self.gap_to_bounds(min, max).length()
     }
 
     /// A lower bound of [`Quad::distance`], metres: the gap between the bounding boxes.
     pub fn gap_at_least(&self, other: &Self) -> f64 {
-        let gap = (other.min - self.max).max(self.min - other.max);
-        gap.max(DVec2::ZERO).length()
+        self.gap_to_bounds(other.min, other.max).length()
+    }
+
+    /// Along both axes.
+    fn gap_to_bounds(&self, min: DVec2, max: DVec2) -> DVec2 {
+        (min - self.max).max(self.min - max).max(DVec2::ZERO)
     }
 
     fn bounds_intersect(&self, other: &Self) -> bool {
@@ -185,7 +207,7 @@ pub fn joint(point: DVec2, before: DVec2, after: DVec2) -> Option<Quad> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Pose;
+    use crate::{Pose, distance_to_segment};
     use approx::assert_abs_diff_eq;
     use glam::dvec2;
 
@@ -236,6 +258,42 @@ mod tests {
         check(0.1, 0.0, 0.0);
         check(10.0, 11.0, 0.0);
         check(10.0, 15.0, 3.0);
+    }
+
+    #[test]
+    fn bounds_leave_no_edge_of_a_long_polygon_out() {
+        // A bent strip, as a lane through a junction is.
+        let at = |i: i32, radius: f64| {
+            let angle = f64::from(i) * 0.05;
+            dvec2(radius * angle.cos(), radius * angle.sin())
+        };
+        let outer = (0..=30).map(|i| at(i, 22.0));
+        let ring: Vec<DVec2> = outer.chain((0..=30).rev().map(|i| at(i, 18.0))).collect();
+        let polygon = Polygon::new(ring).unwrap();
+        let mut seen = [false; 2];
+        for i in 0..500 {
+            let f = f64::from(i);
+            let quad = Quad::from(&car(f % 37.0 - 6.0, f * 0.7 % 31.0 - 4.0, f * 0.61));
+            let pairs = || {
+                let edges = polygon.edges();
+                edges.flat_map(|edge| quad.edges().map(move |own| (edge, own)))
+            };
+            let crosses = pairs().any(|((a, b), (c, d))| segments_intersect(a, b, c, d));
+            let meets = crosses
+                || quad.corners().iter().any(|&p| polygon.contains(p))
+                || polygon.ring().iter().any(|&p| quad.contains(p));
+            let apart = pairs()
+                .map(|((a, b), (c, d))| {
+                    distance_to_segment(c, a, b).min(distance_to_segment(a, c, d))
+                })
+                .fold(f64::INFINITY, f64::min);
+            let distance = if meets { 0.0 } else { apart };
+            assert_eq!(quad.intersects_polygon(&polygon), meets);
+            assert_eq!(quad.distance_to_polygon(&polygon), distance);
+            assert!(quad.gap_to_polygon_at_least(&polygon) <= distance);
+            seen[usize::from(meets)] = true;
+        }
+        assert_eq!(seen, [true, true]);
     }
 
     #[test]

@@ -318,9 +318,10 @@ impl<'a> Surroundings<'a> {
             }
         }
         for &(place, polygon) in &self.lights {
-            if place > progress {
+            let least = nearest.map_or(f64::INFINITY, |(least, _)| least);
+            if place > progress && own.gap_to_polygon_at_least(polygon) < least {
                 let distance = own.distance_to_polygon(polygon);
-                if nearest.is_none_or(|(least, _)| distance < least) {
+                if distance < least {
                     nearest = Some((distance, None));
                 }
             }
