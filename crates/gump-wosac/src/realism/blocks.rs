@@ -1,4 +1,4 @@
-//! A two-level hierarchy of bounding boxes over a list, for finding the first nearest item.
+//! A three-level hierarchy of bounding boxes over a list, for finding the first nearest item.
 
 /// An axis-aligned box in space.
 #[derive(Clone, Copy, Debug)]
@@ -23,34 +23,38 @@ impl Bounds {
         })
     }
 
-    /// Distance from a point, 0 inside.
-    fn distance(&self, p: [f32; 3]) -> f32 {
+    /// Square of the distance from a point, 0 inside.
+    #[inline]
+    fn squared_distance(&self, p: [f32; 3]) -> f32 {
         let gap = |i: usize| (self.lo[i] - p[i]).max(p[i] - self.hi[i]).max(0.0);
         let (x, y, z) = (gap(0), gap(1), gap(2));
-        (x * x + y * y + z * z).sqrt()
+        x * x + y * y + z * z
     }
 }
 
-/// Items per small box, small boxes per large one; neighbours in a polyline are neighbours in the
-/// list, so boxes are tight.
-const FAN: usize = 12;
+/// Items per box of the lowest level, then boxes per box of the levels above; neighbours in a
+/// polyline are neighbours in the list, so boxes are tight. An item costs about three boxes.
+const FANS: [usize; 3] = [3, 4, 8];
 
 /// Boxes over consecutive items.
 #[derive(Clone, Debug)]
 pub(crate) struct Blocks {
     n_items: usize,
-    small: Vec<Bounds>,
-    large: Vec<Bounds>,
+    /// From the boxes of items to the largest.
+    levels: [Vec<Bounds>; 3],
 }
 
 impl Blocks {
     pub(crate) fn new(items: &[Bounds]) -> Self {
-        let small: Vec<_> = items.chunks(FAN).map(Bounds::join).collect();
-        let large = small.chunks(FAN).map(Bounds::join).collect();
+        let join = |parts: &[Bounds], fan: usize| -> Vec<_> {
+            parts.chunks(fan).map(Bounds::join).collect()
+        };
+        let small = join(items, FANS[0]);
+        let middle = join(&small, FANS[1]);
+        let large = join(&middle, FANS[2]);
         Self {
             n_items: items.len(),
-            small,
-            large,
+            levels: [small, middle, large],
         }
     }
 
@@ -67,23 +71,29 @@ impl Blocks {
         if self.n_items == 0 {
             return None;
         }
+        let [small, middle, large] = &self.levels;
+        let parts = |whole: usize, fan: usize, n: usize| whole * fan..((whole + 1) * fan).min(n);
         // The bound alone: which item is first among equals is decided in order below.
-        let mut limit = with_margin(cost(hint.min(self.n_items - 1)));
+        let mut limit = squared_limit(cost(hint.min(self.n_items - 1)));
         let (mut best, mut best_cost) = (None, f32::INFINITY);
-        for (i, large) in self.large.iter().enumerate() {
-            if large.distance(point) > limit {
+        for (i, bounds) in large.iter().enumerate() {
+            if bounds.squared_distance(point) > limit {
                 continue;
             }
-            let end = ((i + 1) * FAN).min(self.small.len());
-            for j in i * FAN..end {
-                if self.small[j].distance(point) > limit {
+            for j in parts(i, FANS[2], middle.len()) {
+                if middle[j].squared_distance(point) > limit {
                     continue;
                 }
-                for k in j * FAN..((j + 1) * FAN).min(self.n_items) {
-                    let found = cost(k);
-                    if found < best_cost {
-                        (best, best_cost) = (Some(k), found);
-                        limit = limit.min(with_margin(found));
+                for k in parts(j, FANS[1], small.len()) {
+                    if small[k].squared_distance(point) > limit {
+                        continue;
+                    }
+                    for item in parts(k, FANS[0], self.n_items) {
+                        let found = cost(item);
+                        if found < best_cost {
+                            (best, best_cost) = (Some(item), found);
+                            limit = limit.min(squared_limit(found));
+                        }
                     }
                 }
             }
@@ -92,10 +102,11 @@ impl Blocks {
     }
 }
 
-/// A margin larger than rounding errors of distances: items whose cost may be as small must not be
-/// skipped.
-fn with_margin(cost: f32) -> f32 {
-    cost * 1.000_1 + 1e-3
+/// The square of a cost with a margin larger than rounding errors of distances: items whose cost
+/// may be as small must not be skipped.
+fn squared_limit(cost: f32) -> f32 {
+    let limit = cost * 1.000_1 + 1e-3;
+    limit * limit
 }
 
 #[cfg(test)]
@@ -114,7 +125,7 @@ mod tests {
         let blocks = Blocks::new(&bounds);
         for hint in 0..300 {
             let query = point();
-            let cost = |i: usize| bounds[i].distance(query);
+            let cost = |i: usize| bounds[i].squared_distance(query).sqrt();
             let expected = (0..items.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b)));
             let found = blocks.nearest(query, hint, cost);
             assert_eq!(found.map(|(i, _)| i), expected);

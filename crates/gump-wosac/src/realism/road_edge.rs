@@ -99,7 +99,7 @@ impl RoadEdges {
                 };
                 hints[0] = i;
                 let offset = self.segments[i].offset(point);
-                self.sign(i, point, offset.t > 1.0) * offset.on_ground()
+                self.sign(i, point, offset.t, offset.t > 1.0) * offset.on_ground()
             }
             Lookup::Ground(parts) => {
                 hints.resize(parts.len(), 0);
@@ -113,7 +113,7 @@ impl RoadEdges {
                     *hint = i;
                     let t = self.segments[first + i].offset(point).t;
                     // The sign is 0 on the line itself, and 0 then wins over every other edge.
-                    let value = self.sign(first + i, point, t >= 1.0) * distance;
+                    let value = self.sign(first + i, point, t, t >= 1.0) * distance;
                     if value.abs() < nearest.abs() {
                         nearest = value;
                     }
@@ -123,11 +123,12 @@ impl RoadEdges {
         }
     }
 
-    /// On which side of the edge the point is: 1 right, -1 left, 0 on it.
-    fn sign(&self, i: usize, point: [f32; 3], is_past_end: bool) -> f32 {
+    /// On which side of the edge the point is: 1 right, -1 left, 0 on it; `t` is its position along
+    /// segment `i`.
+    fn sign(&self, i: usize, point: [f32; 3], t: f32, is_past_end: bool) -> f32 {
         let segment = &self.segments[i];
         let own = segment.side(point);
-        let (neighbor, convex) = if segment.offset(point).t < 0.0 {
+        let (neighbor, convex) = if t < 0.0 {
             (segment.previous, segment.convex_start)
         } else if is_past_end {
             (segment.next, segment.convex_end)
