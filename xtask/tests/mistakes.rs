@@ -187,11 +187,13 @@ fn shares_of_a_planner_are_from_0_to_1() {
 }
 
 #[test]
-fn a_python_without_pytorch_is_told() {
+fn a_bench_tells_missing_pytorch_and_unknown_sizes() {
     let place = Workplace::new();
     for verb in ["train", "engine"] {
         let words = format!("bench {verb} --torch no-such-python");
         place.check(&words, 2, &["--torch no-such-python: cannot be run"]);
+        let words = format!("bench {verb} --sizes huge");
+        place.check(&words, 2, &["--sizes: expected one of tiny,", "found huge"]);
     }
 }
 

@@ -9,7 +9,6 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_engine::{CacheMode, Mode, SamplingConfig, TransformerWorld};
-use gump_model::config::ModelConfig;
 use gump_model::{Network, checkpoint};
 use gump_rollout::{Start, WorldModel as _};
 use gump_scene::Scenario;
@@ -262,8 +261,9 @@ impl Args {
                     operations[1] = timed.operations / frames;
                 }
             }
-            let [f32, bf16, int8] = ours.map(median);
-            let [torch_f32, torch_bf16] = theirs.map(median);
+            let middle = |all| super::median(all).unwrap_or(f64::NAN);
+            let [f32, bf16, int8] = ours.map(middle);
+            let [torch_f32, torch_bf16] = theirs.map(middle);
             rows.push(json!({
                 "size": size,
                 "agents": scenario.present().now().agents().len(),
@@ -350,17 +350,8 @@ impl Args {
 ///
 /// Error: a size that does not exist.
 fn network(run: &Run, size: &str) -> anyhow::Result<Network> {
-    let config = ModelConfig::preset(size).with_context(|| {
-        let known = ModelConfig::PRESETS.join(", ");
-        format!("--sizes: expected one of {known}, found {size}")
-    })?;
+    let config = super::preset(size)?;
     Ok(Network::random(config, run.seed(), run.device())?)
-}
-
-/// The middle of an odd number of measurements.
-fn median(mut all: Vec<f64>) -> f64 {
-    all.sort_by(f64::total_cmp);
-    all[all.len() / 2]
 }
 
 /// Imagines some steps of some futures; opening is not counted, nor is one step to warm up where

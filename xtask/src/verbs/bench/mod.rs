@@ -10,7 +10,10 @@ mod torch;
 pub(crate) mod train;
 pub(crate) mod wosac;
 
+use gump_model::config::ModelConfig;
 use gump_scene::{Scenario, fixture};
+
+use crate::cli::WrongArguments;
 
 /// What is measured.
 #[derive(Debug, clap::Subcommand)]
@@ -26,6 +29,23 @@ pub(crate) enum Verb {
     /// PDM-Closed, reactive traffic and a whole scored drive, against nuPlan's own times; a decision
     /// among learned drivers
     Planning(planning::Args),
+}
+
+/// The configuration of a size in `--sizes`.
+///
+/// Error: [`WrongArguments`] for one that does not exist.
+fn preset(size: &str) -> anyhow::Result<ModelConfig> {
+    let config = ModelConfig::preset(size).ok_or_else(|| {
+        let known = ModelConfig::PRESETS.join(", ");
+        WrongArguments(format!("--sizes: expected one of {known}, found {size}"))
+    })?;
+    Ok(config)
+}
+
+/// The middle of an odd number of measurements, the upper one of an even number; `None` of none.
+fn median(mut all: Vec<f64>) -> Option<f64> {
+    all.sort_by(f64::total_cmp);
+    all.get(all.len() / 2).copied()
 }
 
 /// A made-up crossing of that many agents, all within the window of the tokens, with a second of

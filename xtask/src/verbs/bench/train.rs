@@ -69,9 +69,8 @@ struct Costs(Vec<Cost>);
 impl Costs {
     /// The median of a measurement per step.
     fn median(&self, part: impl Fn(&Cost) -> f64, steps: usize) -> Option<f64> {
-        let mut all: Vec<f64> = self.0.iter().map(part).collect();
-        all.sort_by(f64::total_cmp);
-        Some(all.get(all.len() / 2)? / steps as f64)
+        let middle = super::median(self.0.iter().map(part).collect())?;
+        Some(middle / steps as f64)
     }
 }
 
@@ -81,10 +80,7 @@ impl Args {
         run.setting("torch_version", torch.as_ref().map(|torch| &torch.version))?;
         let mut rows = Vec::new();
         for size in &self.sizes {
-            let config = ModelConfig::preset(size).with_context(|| {
-                let known = ModelConfig::PRESETS.join(", ");
-                format!("--sizes: expected one of {known}, found {size}")
-            })?;
+            let config = super::preset(size)?;
             let more = run.phase(size, |run| self.rows(run, size, &config, torch.as_ref()))?;
             rows.extend(more);
             run.result("rows", &rows)?;
