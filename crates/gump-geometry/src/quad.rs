@@ -16,6 +16,7 @@ pub struct Quad {
 
 impl Quad {
     /// Takes the corners in order.
+    #[inline]
     pub fn new(corners: [DVec2; 4]) -> Self {
         let [a, b, c, d] = corners;
         Self {
@@ -26,21 +27,25 @@ impl Quad {
     }
 
     /// The corners in order.
+    #[inline]
     pub fn corners(&self) -> &[DVec2; 4] {
         &self.corners
     }
 
     /// The corners of the axis-aligned bounding box, (min, max).
+    #[inline]
     pub fn bounds(&self) -> (DVec2, DVec2) {
         (self.min, self.max)
     }
 
     /// Mean of the corners.
+    #[inline]
     pub fn center(&self) -> DVec2 {
         self.corners.iter().copied().sum::<DVec2>() / 4.0
     }
 
     /// True if the shapes share a point; touching counts.
+    #[inline]
     pub fn intersects(&self, other: &Self) -> bool {
         self.bounds_intersect(other) && !self.is_separated(other) && !other.is_separated(self)
     }
@@ -65,6 +70,7 @@ impl Quad {
     }
 
     /// True if `point` is inside or on the border.
+    #[inline]
     pub fn contains(&self, point: DVec2) -> bool {
         let side = |(a, b): (DVec2, DVec2)| (b - a).perp_dot(point - a);
         self.edges().map(side).all(|side| side >= 0.0)
@@ -72,6 +78,7 @@ impl Quad {
     }
 
     /// Distance in metres, 0 if the shapes intersect.
+    #[inline]
     pub fn distance(&self, other: &Self) -> f64 {
         if self.intersects(other) {
             return 0.0;
@@ -119,34 +126,39 @@ impl Quad {
     }
 
     /// A lower bound of [`Quad::distance`], metres: the gap between the bounding boxes.
+    #[inline]
     pub fn gap_at_least(&self, other: &Self) -> f64 {
         self.gap_to_bounds(other.min, other.max).length()
     }
 
     /// Along both axes.
+    #[inline]
     fn gap_to_bounds(&self, min: DVec2, max: DVec2) -> DVec2 {
         (min - self.max).max(self.min - max).max(DVec2::ZERO)
     }
 
+    #[inline]
     fn bounds_intersect(&self, other: &Self) -> bool {
         self.min.cmple(other.max).all() && other.min.cmple(self.max).all()
     }
 
     /// True if an edge of this shape has all of `other` strictly on its outer side.
     fn is_separated(&self, other: &Self) -> bool {
-        self.edges().any(|(a, b)| {
+        (0..4).any(|i| {
+            let [a, b, c, d] = [0, 1, 2, 3].map(|j| self.corners[(i + j) % 4]);
             let normal = (b - a).perp();
-            let side = |p: &DVec2| normal.dot(*p - a);
-            let range = |corners: &[DVec2; 4]| {
-                let [p, q, r, s] = [0, 1, 2, 3].map(|i| side(&corners[i]));
-                (p.min(q).min(r.min(s)), p.max(q).max(r.max(s)))
-            };
-            let ((low, high), (other_low, other_high)) =
-                (range(&self.corners), range(&other.corners));
+            let side = |p: DVec2| normal.dot(p - a);
+            // Both ends of the edge are at exactly 0.
+            let (c, d) = (side(c), side(d));
+            let (low, high) = (c.min(d).min(0.0), c.max(d).max(0.0));
+            let [p, q, r, s] = other.corners.map(side);
+            let other_low = p.min(q).min(r.min(s));
+            let other_high = p.max(q).max(r.max(s));
             normal != DVec2::ZERO && (other_low > high || other_high < low)
         })
     }
 
+    #[inline]
     fn edges(&self) -> impl Iterator<Item = (DVec2, DVec2)> + '_ {
         (0..4).map(|i| (self.corners[i], self.corners[(i + 1) % 4]))
     }

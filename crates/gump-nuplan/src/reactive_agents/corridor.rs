@@ -198,11 +198,13 @@ impl Corridor {
     }
 }
 
+#[inline]
 fn overlap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> bool {
     a.0.cmple(b.1).all() && b.0.cmple(a.1).all()
 }
 
 /// Metres between two boxes along the axes.
+#[inline]
 fn gap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> f64 {
     (b.0 - a.1).max(a.0 - b.1).max(DVec2::ZERO).length()
 }
