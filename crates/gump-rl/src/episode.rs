@@ -202,47 +202,6 @@ impl Rules {
     /// stand where `after` has them.
     ///
     /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
-    ///
-    /// # Errors
-    /// [`RlError::Finished`] if the episode has ended; [`RlError::Count`], [`RlError::NotFinite`]
-    /// and [`RlError::OutOfRange`] for invalid actions.
-    pub fn step(
-        &self,
-        course: &Course,
-        state: &EpisodeState,
-        action: &[f32],
-    ) -> Result<EpisodeState, RlError> {
-        if state.end.is_some() {
-            return Err(RlError::Finished { row: 0 });
-        }
-        self.check_actions(action, 1)?;
-        Ok(self.step_in_log(course, state, action))
-    }
-
-    /// One step with `action_len` checked numbers, the other agents replaying the log.
-    pub(crate) fn step_in_log(
-        &self,
-        course: &Course,
-        state: &EpisodeState,
-        action: &[f32],
-    ) -> EpisodeState {
-        let others = [state.steps, state.steps + 1].map(|step| course.logged(step));
-        let mut next = self.advance(course, state, action, others);
-        if next.end.is_none() && next.steps >= course.logged_steps() {
-            next.end = Some(End::Truncated);
-        }
-        next
-    }
-
-    /// The state after one step in which `action` drives the ego and all other agents move from
-    /// their places in `before` to those in `after`.
-    ///
-    /// A collision or leaving the road terminates, in this order. Collisions are tested every tenth
-    /// of a second, road edges at the end and about every two metres before it; an episode that starts in a collision ends with its first step. The horizon and the
-    /// end of the route truncate. Between the two frames others move in straight lines; those that
-    /// `before` lacks stand where `after` has them.
-    ///
-    /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
     pub fn advance(
         &self,
         course: &Course,
