@@ -49,6 +49,39 @@ pub(crate) struct Network {
     pub(crate) hides_limits: bool,
     /// Lanes that are not on the map, often those of car parks.
     pub(crate) unmapped: BTreeSet<LaneIdx>,
+    /// Where car parks and yards open to a road.
+    pub(crate) mouths: Vec<Mouth>,
+    /// Edges inside car parks and yards, as indices into [`Furniture::edges`].
+    pub(crate) inner_edges: BTreeSet<usize>,
+}
+
+/// The opening of a car park or yard to a road.
+#[derive(Clone, Debug)]
+pub(crate) struct Mouth {
+    /// The edges of its two corners, as indices into [`Furniture::edges`].
+    pub(crate) corners: [usize; 2],
+    /// The edge of the road as if there were no opening.
+    pub(crate) curb: Vec<DVec2>,
+    /// The surface between the curb and the two corners.
+    pub(crate) apron: Vec<DVec2>,
+}
+
+impl Network {
+    /// Draws the edge of the road across all mouths, and a driveway behind it, and forgets the
+    /// edges inside: recorded maps have no more of most yards and car parks.
+    pub(crate) fn close_mouths(&mut self) {
+        let mut gone = std::mem::take(&mut self.inner_edges);
+        let mouths = std::mem::take(&mut self.mouths);
+        gone.extend(mouths.iter().flat_map(|mouth| mouth.corners));
+        let edges = std::mem::take(&mut self.furniture.edges).into_iter();
+        let kept = edges.enumerate().filter(|(i, _)| !gone.contains(i));
+        self.furniture.edges = kept.map(|(_, edge)| edge).collect();
+        for mouth in mouths {
+            let edge = (RoadEdgeKind::Boundary, mouth.curb);
+            self.furniture.edges.push(edge);
+            self.furniture.areas.push((AreaKind::Driveway, mouth.apron));
+        }
+    }
 }
 
 /// Curbs, paint and surfaces.

@@ -84,7 +84,15 @@ pub(crate) struct RoadPlan {
     pub(crate) ring: bool,
 }
 
+/// Roads with a lower limit lie in car parks and yards, metres per second.
+pub(crate) const CAR_PARK_SPEED: f64 = 6.0;
+
 impl RoadPlan {
+    /// Whether it lies in a car park or yard.
+    pub(crate) fn is_inner(&self) -> bool {
+        self.speed_limit < CAR_PARK_SPEED
+    }
+
     /// Lanes in the direction `forward` (or against it).
     pub(crate) fn n_lanes(&self, forward: bool) -> usize {
         if forward { self.forward } else { self.backward }

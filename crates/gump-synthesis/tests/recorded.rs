@@ -158,3 +158,42 @@ fn what_is_seen_is_what_the_tracker_makes_of_the_clean_scene() {
         assert_eq!(tracked.log, seen.log);
     }
 }
+
+#[test]
+fn some_vehicles_leave_the_road_across_its_edge() {
+    // As they turn into yards and car parks whose mouths recorded maps do not open.
+    let crosses = |scene: &Scenario, id: gump_scene::AgentId| {
+        let edges: Vec<_> = scene
+            .map
+            .road_edges()
+            .iter()
+            .map(|edge| &edge.line)
+            .collect();
+        let places = scene.log.iter().filter_map(|frame| frame.agent(id));
+        let places: Vec<_> = places.map(|agent| agent.state.pose.position).collect();
+        places.windows(2).any(|step| {
+            edges.iter().any(|line| {
+                line.points().windows(2).any(|edge| {
+                    let side = |p: gump_geometry::DVec2, line: &[gump_geometry::DVec2]| {
+                        (line[1] - line[0]).perp_dot(p - line[0]) > 0.0
+                    };
+                    side(step[0], edge) != side(step[1], edge)
+                        && side(edge[0], step) != side(edge[1], step)
+                })
+            })
+        })
+    };
+    let (mut moving, mut crossing) = (0, 0);
+    for scene in clean() {
+        let now = &scene.log[scene.now];
+        for agent in now.agents() {
+            let drives = agent.kind == AgentKind::Vehicle && agent.state.speed() > 2.0;
+            if drives {
+                moving += 1;
+                crossing += usize::from(crosses(scene, agent.id));
+            }
+        }
+    }
+    let share = crossing as f64 / f64::from(moving);
+    assert!((0.005..0.1).contains(&share), "{crossing} of {moving}");
+}

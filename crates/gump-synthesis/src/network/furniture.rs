@@ -4,8 +4,8 @@ use gump_geometry::DVec2;
 use gump_scene::{AreaKind, RoadEdgeKind, RoadLineKind};
 
 use crate::curve::{Track, connect};
-use crate::network::Network;
 use crate::network::leg::{Leg, STOP_GAP};
+use crate::network::{Mouth, Network};
 use crate::plan::{BIKE_LANE_WIDTH, Control, Plan, RoadPlan};
 
 /// Medians narrower than this are paint, wider ones have curbs; metres.
@@ -15,7 +15,11 @@ impl Network {
     /// Adds the features that are drawn but not driven along.
     pub(crate) fn furnish(&mut self, plan: &Plan, legs: &[Vec<Leg>], trimmed: &[Track]) {
         for (road, track) in plan.roads.iter().zip(trimmed) {
+            let first = self.furniture.edges.len();
             self.furnish_road(road, track);
+            if road.is_inner() {
+                self.inner_edges.extend(first..self.furniture.edges.len());
+            }
         }
         for (node, legs) in legs.iter().enumerate() {
             self.furnish_junction(plan, node, legs);
@@ -86,6 +90,7 @@ impl Network {
 
     fn furnish_junction(&mut self, plan: &Plan, node: usize, legs: &[Leg]) {
         let mut ring: Vec<DVec2> = Vec::new();
+        let first_edge = self.furniture.edges.len();
         for (i, leg) in legs.iter().enumerate() {
             let next = &legs[(i + 1) % legs.len()];
             let curvatures = [-leg.curvature, next.curvature];
@@ -95,6 +100,7 @@ impl Network {
             ring.extend(&corner);
             self.furniture.edges.push((RoadEdgeKind::Boundary, corner));
         }
+        self.find_mouths(plan, legs, first_edge);
         let control = plan.nodes[node].control;
         if control != Control::Free {
             self.furniture
@@ -108,6 +114,37 @@ impl Network {
             .filter(|(_, leg)| !leg.incoming.is_empty())
         {
             self.mark_entry(plan, node, i, leg);
+        }
+    }
+
+    /// The legs of a junction that lead into a car park or yard; `first_edge` is the corner after
+    /// the first leg.
+    fn find_mouths(&mut self, plan: &Plan, legs: &[Leg], first_edge: usize) {
+        let n = legs.len();
+        let is_inner = |leg: &Leg| plan.roads[leg.road].is_inner();
+        if legs.iter().all(is_inner) {
+            self.inner_edges.extend(first_edge..first_edge + n);
+            return;
+        }
+        for (i, _) in legs.iter().enumerate().filter(|(_, leg)| is_inner(leg)) {
+            let (before, after) = ((i + n - 1) % n, (i + 1) % n);
+            if n < 3 || is_inner(&legs[before]) || is_inner(&legs[after]) {
+                continue;
+            }
+            let (from, to) = (&legs[before], &legs[after]);
+            let curvatures = [-from.curvature, to.curvature];
+            let curb = connect(from.left_curb(), to.right_curb(), curvatures, 14.0);
+            let curb = Track::through(&curb).points().to_vec();
+            let corners = [first_edge + before, first_edge + i];
+            let mut apron = curb.clone();
+            for corner in [corners[1], corners[0]] {
+                apron.extend(backwards(self.furniture.edges[corner].1.clone()));
+            }
+            self.mouths.push(Mouth {
+                corners,
+                curb,
+                apron,
+            });
         }
     }
 

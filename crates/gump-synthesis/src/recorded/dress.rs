@@ -20,6 +20,8 @@ const OWN_JUNCTION: f64 = 26.0;
 /// Length of a driveway between the road and the first bay, metres: of one aisle alone, and of
 /// several side by side.
 const DRIVEWAY: [f64; 2] = [16.0, 11.0];
+/// Metres that are seen of a yard, from the curb.
+const YARD: std::ops::Range<f64> = 11.0..24.0;
 /// Share of scenes with a car park of several aisles, as in front of shops.
 const WIDE_CAR_PARKS: f64 = 0.4;
 /// Aisles leave their road within this of a right angle, radians.
@@ -35,6 +37,8 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     add_some(plan, extent, n_side, add_side_road, rng);
     let n_parks = rng.random_range(1..=6);
     add_some(plan, extent, n_parks, add_car_park, rng);
+    let n_yards = rng.random_range(0..=8);
+    add_some(plan, extent, n_yards, add_yard, rng);
     allow_parking(plan, rng);
     // Traffic is faster than plain plans have it, on wide roads above all.
     let haste: f64 = rng.random_range(1.3..2.0);
@@ -117,6 +121,30 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     let radius = rng.random_range(3.5..7.0);
     let node = split(plan, at, Control::MinorYield, (false, radius));
     add_aisle(plan, node, &whole, driveway, &style);
+    true
+}
+
+/// A short way into a yard, from which nobody sees what becomes of a vehicle.
+fn add_yard(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
+    let style = RoadPlan {
+        bays: false,
+        parking: false,
+        ..aisle(rng)
+    };
+    let start = start(plan, at, rng.random_range(-0.15..0.15));
+    let length = plan.roads[at.0].half_width(!at.2) + rng.random_range(YARD);
+    let whole = Track::through(&bend(start, length, &[]));
+    let is_in = start.position.length() < extent;
+    if !is_in || !is_clear(plan, at.0, &whole, style.half_width(true)) {
+        return false;
+    }
+    let radius = rng.random_range(1.5..4.0);
+    let node = split(plan, at, Control::MinorYield, (false, radius));
+    plan.roads.push(RoadPlan {
+        reference: whole,
+        ends: [Some(node), None],
+        ..style
+    });
     true
 }
 

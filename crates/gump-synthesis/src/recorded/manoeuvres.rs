@@ -9,6 +9,7 @@ use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
 
 use crate::network::Network;
+use crate::plan::CAR_PARK_SPEED;
 use crate::record::Recording;
 use crate::traffic::Body;
 
@@ -21,8 +22,6 @@ const PATHS: usize = 5;
 const REACH_M: f64 = 70.0;
 /// From the centre of a lane of a road, metres; those of car parks may be driven on.
 const OFF_ROAD_M: f64 = 3.4;
-/// Lanes with a lower limit are those of car parks, m/s.
-const CAR_PARK_SPEED: f64 = 6.0;
 /// Distance kept to standing and to moving agents, metres.
 const ROOM_M: [f64; 2] = [0.15, 0.8];
 /// From the middle of a vehicle to its rear axle, as a share of its length.

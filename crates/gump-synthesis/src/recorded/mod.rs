@@ -21,6 +21,7 @@ use self::driveways::Driveway;
 use crate::layout::draw_plan;
 use crate::map::{build_map, lane_id};
 use crate::network::Network;
+use crate::plan::CAR_PARK_SPEED;
 use crate::record::{Recording, Track};
 use crate::scenario::{draw_placement, frames, route, targets};
 use crate::traffic::{Demand, Traffic};
@@ -46,8 +47,9 @@ const NO_SIGNS: f64 = 0.12;
 const NO_LIGHTS: f64 = 0.3;
 /// Share of scenes whose map has no lanes in car parks.
 const UNMAPPED_CAR_PARKS: f64 = 0.7;
-/// Limits below this are those of car parks, m/s.
-const CAR_PARK_SPEED: f64 = 6.0;
+/// Share of these whose road edges run across the mouths of car parks and yards, as they do across
+/// driveways in recordings.
+const CLOSED_MOUTHS: f64 = 0.75;
 /// Roads with a higher limit are wide and carry more traffic, m/s.
 const WIDE_ROAD_SPEED: f64 = 15.0;
 /// Metres from the centre of the scene within which the ego is chosen.
@@ -181,7 +183,7 @@ fn draw_skewed(range: &RangeInclusive<usize>, skew: f64, density: f64, rng: &mut
     ((low + (high - low) * part.powf(skew)) * density).round() as usize
 }
 
-/// Leaves the lanes of most car parks off the map, unless the ego drives there.
+/// Leaves the lanes of most car parks and yards off the map, unless the ego drives there.
 fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
     let slow = |lane: &crate::network::NetworkLane| lane.speed_limit < CAR_PARK_SPEED;
     let ego_parks = ego
@@ -191,6 +193,9 @@ fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
     if !ego_parks && rng.random_bool(UNMAPPED_CAR_PARKS) {
         let lanes = network.lanes.iter().enumerate();
         network.unmapped = lanes.filter(|(_, l)| slow(l)).map(|(i, _)| i).collect();
+        if rng.random_bool(CLOSED_MOUTHS) {
+            network.close_mouths();
+        }
     }
 }
 

@@ -11,6 +11,7 @@ use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size
 use super::vehicle::Vehicle;
 use super::{Body, Traffic};
 use crate::network::{LaneIdx, Turn};
+use crate::plan::CAR_PARK_SPEED;
 
 /// Longest path that is planned, in lanes.
 const LONGEST_PATH: usize = 40;
@@ -59,6 +60,8 @@ pub(crate) struct Standing {
     pub(crate) pose: Pose,
 }
 
+/// How often drivers turn into a yard or car park, less than into another road.
+const INTO_YARDS: f64 = 0.3;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s.
 const FAST_LANE: f64 = 16.0;
 
@@ -323,6 +326,11 @@ impl Traffic<'_> {
                     Turn::Right => 0.25,
                     Turn::Left => 0.25,
                 };
+                let leaves_road = lanes[next]
+                    .successors
+                    .first()
+                    .is_some_and(|&beyond| lanes[beyond].speed_limit < CAR_PARK_SPEED);
+                let turn = if leaves_road { turn * INTO_YARDS } else { turn };
                 if fits { turn } else { 1e-6 }
             };
             let total: f64 = here.successors.iter().map(weight).sum();
