@@ -61,6 +61,9 @@ pub(crate) struct Member {
     pub(crate) is_driven: bool,
     /// Others do not keep clear of it.
     pub(crate) is_ignored: bool,
+    /// Somebody on foot, who does not keep clear of others on foot: the boxes of people who walk
+    /// side by side overlap in recordings.
+    pub(crate) walks: bool,
     reach: f64,
 }
 
@@ -84,6 +87,7 @@ impl Member {
             off: 0.0,
             is_driven,
             is_ignored: false,
+            walks: false,
             reach: length.hypot(width) / 2.0,
         }
     }
@@ -193,6 +197,9 @@ impl Footprints {
 /// Number of positions before two objects, the first of them on its path `ahead`, overlap; all of
 /// them for a pair that already overlaps, since no draw can undo that.
 fn clear_places(a: &Member, ahead: &Way, b: &Member) -> usize {
+    if a.walks && b.walks {
+        return ahead.len();
+    }
     let reach = a.reach + b.reach;
     let meets = |(p, q): (&Pose, &Pose)| {
         p.position.distance_squared(q.position) < reach * reach && a.at(*p).overlaps(&b.at(*q))

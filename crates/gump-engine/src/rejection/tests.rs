@@ -15,6 +15,7 @@ fn member(x: f64, step: f64) -> Member {
         ahead: straight(x, step),
         is_driven: false,
         is_ignored: false,
+        walks: false,
         reach: 2.3,
     }
 }
@@ -71,6 +72,22 @@ fn the_driven_stay_and_those_that_overlap_already_are_left_alone() {
         members: vec![member(3.0, 0.0), member(0.0, 1.0)],
     };
     assert!(touching.unclear(0).is_empty());
+}
+
+#[test]
+fn people_on_foot_may_touch_each_other_and_no_vehicle() {
+    let walker = |x: f64, step: f64| Member {
+        walks: true,
+        ..member(x, step)
+    };
+    let pair = Footprints {
+        members: vec![walker(10.0, 0.0), walker(0.0, 5.0)],
+    };
+    assert!(pair.unclear(0).is_empty());
+    let mixed = Footprints {
+        members: vec![walker(10.0, 0.0), member(0.0, 5.0)],
+    };
+    assert_eq!(mixed.unclear(0), [1]);
 }
 
 /// A vehicle at a pose beside edges.

@@ -219,6 +219,7 @@ pub fn settle(
                 ahead(now.pose, *step),
                 is_driven(i).is_some(),
             );
+            member.walks = now.body.kind == AgentKind::Pedestrian;
             member.is_ignored = is_driven(i).is_some_and(|driven| !driven.is_heeded);
             if now.body.kind == AgentKind::Vehicle && !member.is_driven {
                 member.look_for_edges(survey);

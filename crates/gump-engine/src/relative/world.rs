@@ -329,7 +329,7 @@ impl Scene {
             map,
             survey: match sampling.redraws {
                 0 => Survey::default(),
-                _ => Survey::of_edges(&source, centre, MAP_M),
+                _ => Survey::of_curbs(&source, centre, MAP_M),
             },
             lines: match sampling.redraws {
                 0 => Vec::new(),

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use gump_geometry::{DVec2, Pose, angle_difference};
-use gump_scene::{LaneId, MapGraph, Unstated};
+use gump_scene::{AreaKind, LaneId, MapGraph, Unstated};
 
 use super::edges::Edge;
 
@@ -19,6 +19,8 @@ pub(super) const N_PATHS: usize = 3;
 const HALF_SIDE_M: f64 = 128.0;
 /// Side of a cell of the grid, metres.
 const CELL_M: f64 = 8.0;
+/// An edge this near to a driveway is its mouth, metres: the two are drawn apart from each other.
+const DRIVEWAY_M: f64 = 1.0;
 /// An object follows a lane whose centre is at most this far away, metres.
 const LANE_REACH_M: f64 = 4.0;
 /// And whose direction differs at most this much, radians.
@@ -131,6 +133,28 @@ impl Survey {
             edges,
             ..Self::default()
         }
+    }
+
+    /// As [`Self::of_edges`] without the edges in front of driveways, which vehicles cross: recorded
+    /// maps draw the edge of a road on through the mouths of yards and car parks.
+    pub fn of_curbs(map: &MapGraph, centre: DVec2, reach: f64) -> Self {
+        let driveways = map.areas().iter();
+        let driveways = driveways.filter(|area| area.kind == AreaKind::Driveway);
+        let driveways: Vec<_> = driveways
+            .map(|area| (&area.polygon, area.polygon.bounds()))
+            .collect();
+        let is_open = |edge: &Edge| {
+            let middle = edge.from.midpoint(edge.to);
+            driveways.iter().any(|(polygon, (low, high))| {
+                let near =
+                    middle.cmpge(*low - DRIVEWAY_M).all() && middle.cmple(*high + DRIVEWAY_M).all();
+                near && polygon.signed_distance(middle) < DRIVEWAY_M
+            })
+        };
+        let mut all = Self::of_edges(map, centre, reach);
+        all.edges.retain(|edge| !is_open(edge));
+        all.edge_cells = Cells::new(all.edges.iter().map(|edge| edge.from));
+        all
     }
 
     pub(super) fn point(&self, index: u32) -> LanePoint {

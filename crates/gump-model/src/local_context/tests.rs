@@ -107,6 +107,29 @@ fn points_are_found_where_they_are() {
     assert_eq!(survey.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
 }
 
+#[test]
+fn the_mouth_of_a_driveway_is_no_curb() {
+    let scenario = scenario();
+    let mut parts = scenario.map.parts().clone();
+    // Behind the edge, which passes two metres to the right, and drawn a little apart from it.
+    let corners = [(-3.0, -2.6), (3.0, -2.6), (3.0, -8.0), (-3.0, -8.0)];
+    let ring = corners.map(|(x, y)| dvec2(x, y)).to_vec();
+    let polygon = gump_geometry::Polygon::new(ring).unwrap();
+    let area = gump_scene::Area::new(99, gump_scene::AreaKind::Driveway, polygon);
+    parts.areas.push(area);
+    let map = gump_scene::MapGraph::new(parts).unwrap();
+    let ahead = |survey: &Survey| {
+        let near = survey.edges_near(dvec2(0.0, 0.0), 10.0);
+        let middles = near.map(|edge| edge.from.midpoint(edge.to).x);
+        middles.filter(|x| x.abs() < 8.0).collect::<Vec<_>>()
+    };
+    let all = ahead(&Survey::of_edges(&map, dvec2(0.0, 0.0), 50.0));
+    let curbs = ahead(&Survey::of_curbs(&map, dvec2(0.0, 0.0), 50.0));
+    assert!(all.iter().any(|x| x.abs() < 2.0), "{all:?}");
+    assert!(curbs.iter().all(|x| x.abs() > 3.0), "{curbs:?}");
+    assert!(curbs.len() >= 3, "{curbs:?}");
+}
+
 /// Everything the ego sees last.
 fn ego_sees(scenario: &Scenario) -> LocalContext {
     let slots = slots(scenario);

@@ -136,7 +136,7 @@ impl TrackDriver for Driver {
         seed: Seed,
     ) {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
-        let survey = ruled.then(|| Survey::of_edges(streets, centre, EDGES_M));
+        let survey = ruled.then(|| Survey::of_curbs(streets, centre, EDGES_M));
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
