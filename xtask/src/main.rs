@@ -49,7 +49,7 @@ fn main() -> ExitCode {
     installed::settle();
     run::catch_interrupts();
     let arguments = std::env::args_os().collect();
-    match cli::parse(arguments).and_then(cli::Cli::execute) {
+    match cli::parse(arguments).and_then(cli::Asked::execute) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => cli::explain(&error),
     }

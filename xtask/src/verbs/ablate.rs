@@ -15,7 +15,7 @@ use gump_viz::Picture;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-pub(crate) use self::decoding::Knob;
+pub(crate) use self::decoding::Sweep;
 use gump_eval::worlds::{World, WorldName};
 
 use crate::cli::WrongArguments;

@@ -1,7 +1,7 @@
 //! `ablate temperature|decay|history|chunking|quantization`: how decoding changes realism, and what
 //! it costs.
 //!
-//! One knob at a time, under rules and without; scenes, seeds and weights stay. Realism is that of
+//! One setting at a time, under rules and without; scenes, seeds and weights stay. Realism is that of
 //! the Waymo Sim Agents Challenge, since displacements alone would reward timid futures.
 
 use std::num::NonZeroUsize;
@@ -46,14 +46,14 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What is turned.
+/// The setting that is varied.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Knob {
+pub(crate) enum Sweep {
     Temperature,
     Decay,
     History,
     Chunking,
-    Precision,
+    Quantization,
 }
 
 /// Frames of a rollout: 8 s, half a second apart.
@@ -67,10 +67,10 @@ pub(super) struct Cost {
     cpu: f64,
 }
 
-/// One setting of a knob: what the table calls it, its place on the axis, how to decode.
+/// A value of the setting: its name in the table, its place on the axis, how to decode.
 type Setting = (String, f64, Decoding);
 
-impl Knob {
+impl Sweep {
     /// What the horizontal axis says.
     fn label(self) -> &'static str {
         match self {
@@ -78,13 +78,13 @@ impl Knob {
             Self::Decay => "decay (0: no averaging)",
             Self::History => "frames of history, half a second apart",
             Self::Chunking => "what is made of the four poses of a chunk",
-            Self::Precision => "form of the weights",
+            Self::Quantization => "form of the weights",
         }
     }
 
     /// Whether its settings are numbers, and not ways.
     fn is_numeric(self) -> bool {
-        !matches!(self, Self::Chunking | Self::Precision)
+        !matches!(self, Self::Chunking | Self::Quantization)
     }
 
     fn settings(self, base: &Decoding) -> Vec<Setting> {
@@ -118,7 +118,7 @@ impl Knob {
                 };
                 ways.into_iter().enumerate().map(setting).collect()
             }
-            Self::Precision => {
+            Self::Quantization => {
                 let forms = [
                     ("f32", Precision::F32),
                     ("bf16", Precision::Bf16),
@@ -135,7 +135,7 @@ impl Knob {
 }
 
 impl Args {
-    pub(crate) fn execute(&self, run: &mut Run, knob: Knob) -> anyhow::Result<()> {
+    pub(crate) fn execute(&self, run: &mut Run, sweep: Sweep) -> anyhow::Result<()> {
         let world = self.world.clone().unwrap_or_else(shipped::sequence_world);
         if !matches!(world, WorldName::Model(_)) {
             let wrong = format!("--world: expected model:WEIGHTS, found {world}");
@@ -150,7 +150,7 @@ impl Args {
             let (mut first, mut curve) = (None, Series::default());
             curve.name = base.name.into();
             ways.clear();
-            for (name, at, decoding) in knob.settings(&base) {
+            for (name, at, decoding) in sweep.settings(&base) {
                 let phase = format!("{name}, {}", base.name);
                 let judged = run.phase(&phase, |run| {
                     let n = self.rollouts_per_scenario.get();
@@ -177,10 +177,10 @@ impl Args {
         run.result("rows", rows)?;
         run.result("digests", digests)?;
         let chart = Chart {
-            x_label: knob.label().into(),
+            x_label: sweep.label().into(),
             y_label: "realism (2025), mean and 95 % interval".into(),
             markers: true,
-            ways: if knob.is_numeric() { Vec::new() } else { ways },
+            ways: if sweep.is_numeric() { Vec::new() } else { ways },
             series: curves,
             ..Chart::default()
         };
@@ -271,20 +271,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_knob_turns_nothing_else() {
+    fn a_sweep_changes_nothing_else() {
         let config = SamplingConfig {
             decay: 1.2,
             ..SamplingConfig::default()
         };
         let base = Decoding::of(config.clone());
-        let settings = Knob::Temperature.settings(&base);
+        let settings = Sweep::Temperature.settings(&base);
         assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
         for (_, at, decoding) in settings {
             assert_eq!(decoding.sampling.temperature, Some(at));
             let back = decoding.turned(|turned| turned.temperature = config.temperature);
             assert_eq!(back, base);
         }
-        let chunking = Knob::Chunking.settings(&base);
+        let chunking = Sweep::Chunking.settings(&base);
         assert_eq!(chunking[2].2, base);
         assert_eq!(
             chunking[0].2.sampling.surrogate,
