@@ -36,13 +36,16 @@ fn main() -> anyhow::Result<()> {
             let evaluation = reference.evaluate(&rollouts)?;
             scores.push(evaluation.scores.clone());
             // ANCHOR_END: score
-            let blame = evaluation.explain().into_iter().next();
-            largest = largest.or(blame.map(|blame| (scenario.id.clone(), blame)));
+            let attribution = evaluation.explain().into_iter().next();
+            largest = largest.or(attribution.map(|attribution| (scenario.id.clone(), attribution)));
         }
-        if let (Some(mean), Some((id, blame))) = (Scores::mean(&scores), largest) {
+        if let (Some(mean), Some((id, attribution))) = (Scores::mean(&scores), largest) {
             println!("{}: realism {:.3}", world.name(), mean.metametric);
-            let what = blame.component.name().replace('_', " ");
-            println!("  costs most in {id}: {what} of agent {}", blame.agent);
+            let what = attribution.component.name().replace('_', " ");
+            println!(
+                "  costs most in {id}: {what} of agent {}",
+                attribution.agent
+            );
         }
     }
     Ok(())

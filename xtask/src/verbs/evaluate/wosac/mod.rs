@@ -21,7 +21,7 @@ use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_rollout::worlds::ConstantVelocity;
 use gump_rollout::{SimulateConfig, Start, simulate};
-use gump_wosac::realism::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
+use gump_wosac::realism::{Attribution, Config, Mode, Reference, Scores, WosacError, Year};
 use serde::{Deserialize, Serialize};
 
 use super::left_out::LeftOut;
@@ -295,7 +295,7 @@ impl Args {
         recorded: &Recorded,
         sources: &mut [Source],
         (mut worst, fewest): (Option<&mut Worst>, &mut usize),
-    ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
+    ) -> anyhow::Result<(Entry<Scored>, Vec<Attribution>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
         let found = sources.iter_mut().map(|source| {
@@ -368,7 +368,7 @@ fn note(
     log: &mut std::fs::File,
     scenario: &str,
     config: &Config,
-    blames: &[Blame],
+    blames: &[Attribution],
     dearest: &mut Vec<Explained>,
 ) -> anyhow::Result<()> {
     // Steps count from the first scored one: that after the present, or that 1 s before it.
