@@ -10,13 +10,12 @@
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
 )]
 
+mod annotations;
 mod benchmark;
 mod charts;
 mod checks;
 mod cli;
 mod config;
-mod dataset;
-mod decoding;
 mod films;
 mod fresh;
 mod futures;
@@ -36,7 +35,7 @@ mod sumo;
 mod table;
 mod tables;
 mod targets;
-mod told;
+mod training_set;
 mod verbs;
 mod words;
 

@@ -10,6 +10,9 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_engine::{Mode, Precision, SamplingConfig, Surrogate};
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
+use gump_eval::realism::{RolloutSource, recordings};
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_scene::Seed;
@@ -19,12 +22,11 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
 use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Draw;
-use crate::verbs::evaluate::wosac::{Source, recordings};
-use crate::{futures, shipped};
+use crate::shipped;
+use crate::verbs::evaluate;
 
 /// Arguments of the ablations of decoding.
 #[derive(Debug, Serialize, clap::Args)]
@@ -89,7 +91,7 @@ impl Sweep {
 
     fn settings(self, base: &Decoding) -> Vec<Setting> {
         let with = |value: f64, turn: &dyn Fn(&mut SamplingConfig)| {
-            (value.to_string(), value, base.turned(turn))
+            (value.to_string(), value, base.with(turn))
         };
         match self {
             Self::Temperature => [0.3, 0.5, 0.7, 0.9, 1.1, 1.3]
@@ -110,7 +112,7 @@ impl Sweep {
                     ("chunks averaged", Surrogate::Chunk, average),
                 ];
                 let setting = |(i, (name, surrogate, decay)): (usize, (&str, _, _))| {
-                    let turned = base.turned(|config| {
+                    let turned = base.with(|config| {
                         config.surrogate = surrogate;
                         config.decay = decay;
                     });
@@ -125,7 +127,7 @@ impl Sweep {
                     ("int8", Precision::Int8),
                 ];
                 let setting = |(i, (name, precision)): (usize, (&str, _))| {
-                    let turned = base.turned(|config| config.precision = precision);
+                    let turned = base.with(|config| config.precision = precision);
                     (name.to_owned(), (i + 1) as f64, turned)
                 };
                 forms.into_iter().enumerate().map(setting).collect()
@@ -237,7 +239,7 @@ pub(super) fn score(
     n: usize,
 ) -> anyhow::Result<Judged> {
     let config = Config::of(Year::Y2025);
-    let mut source = Source::world(world.clone(), decoding.clone(), n, run.seed());
+    let mut source = RolloutSource::world(world.clone(), decoding.clone(), n, run.seed());
     let progress = run.progress("evaluating", 0, "scenarios");
     let (mut scores, mut digests) = (Vec::new(), Vec::new());
     let (mut cost, mut frames) = (Cost::default(), 0.0);
@@ -246,7 +248,7 @@ pub(super) fn score(
         stop_if_interrupted()?;
         let recorded = recorded?;
         let (cpu, began) = (cpu_seconds(), Instant::now());
-        let found = source.rollouts(run, &recorded, config.mode)?;
+        let found = evaluate::wosac::rollouts(run, &mut source, &recorded, config.mode)?;
         let wall = began.elapsed().as_secs_f64();
         let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
         cost.cpu += cpu.map_or(wall, spent);
@@ -262,7 +264,7 @@ pub(super) fn score(
     Ok(Judged {
         scores,
         cost,
-        digest: futures::digest_of(digests.iter().map(String::as_str)),
+        digest: digest::of_digests(digests.iter().map(String::as_str)),
     })
 }
 
@@ -281,7 +283,7 @@ mod tests {
         assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
         for (_, at, decoding) in settings {
             assert_eq!(decoding.sampling.temperature, Some(at));
-            let back = decoding.turned(|turned| turned.temperature = config.temperature);
+            let back = decoding.with(|turned| turned.temperature = config.temperature);
             assert_eq!(back, base);
         }
         let chunking = Sweep::Chunking.settings(&base);

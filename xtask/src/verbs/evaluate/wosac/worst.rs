@@ -35,11 +35,11 @@ impl Worst {
         scenario: &Scenario,
         rollouts: &Rollouts,
         evaluation: &Evaluation<'_>,
-        blames: &[Attribution],
+        attributions: &[Attribution],
     ) {
         let mut costs: BTreeMap<AgentId, f64> = BTreeMap::new();
-        for blame in blames {
-            *costs.entry(blame.agent).or_default() += blame.cost;
+        for attribution in attributions {
+            *costs.entry(attribution.agent).or_default() += attribution.cost;
         }
         let conduct = Behaviour::new(scenario, HORIZON_S).conduct(&rollouts.in_scene(scenario));
         let realism = evaluation.realism();
