@@ -2,10 +2,7 @@
 //!
 //! `cargo run -p examples --example brake_for_nobody [FILE#INDEX]`
 
-use gump_metrics::summarize;
-use gump_rollout::worlds::{Idm, LogReplay};
-use gump_rollout::{BoxError, Command, Policy, SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{SceneState, Seed};
+use gump::prelude::*;
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -31,7 +28,7 @@ impl Policy for BrakeForNobody {
 
 fn main() -> anyhow::Result<()> {
     let name = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
-    let scenario = gump_data::find(&name)?;
+    let scenario = gump::data::find(&name)?;
     let speed = scenario.present().ego_now().state.speed();
     println!("{}: the ego brakes from {speed:.1} m/s", scenario.id);
 

@@ -4,10 +4,8 @@
 
 use std::path::PathBuf;
 
-use gump_rollout::worlds::{ConstantVelocity, Idm};
-use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::Seed;
-use gump_wosac::realism::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
+use gump::prelude::*;
+use gump::wosac::realism::{Config, Log, Mode, Reference, Rollouts, Scores, Year};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -20,8 +18,8 @@ fn main() -> anyhow::Result<()> {
     let (straight_on, reactive) = (ConstantVelocity, Idm::default());
     let worlds: [&dyn WorldModel; 2] = [&straight_on, &reactive];
     for world in worlds {
-        let (mut scores, mut dearest) = (Vec::new(), None);
-        for record in gump_data::open(&path)?.take(3) {
+        let (mut scores, mut largest) = (Vec::new(), None);
+        for record in gump::data::open(&path)?.take(3) {
             let scenario = record?.scenario;
             let start = Start {
                 scene: scenario.present().unguided(),
@@ -38,13 +36,16 @@ fn main() -> anyhow::Result<()> {
             let evaluation = reference.evaluate(&rollouts)?;
             scores.push(evaluation.scores.clone());
             // ANCHOR_END: score
-            let blame = evaluation.explain().into_iter().next();
-            dearest = dearest.or(blame.map(|blame| (scenario.id.clone(), blame)));
+            let attribution = evaluation.explain().into_iter().next();
+            largest = largest.or(attribution.map(|attribution| (scenario.id.clone(), attribution)));
         }
-        if let (Some(mean), Some((id, blame))) = (Scores::mean(&scores), dearest) {
+        if let (Some(mean), Some((id, attribution))) = (Scores::mean(&scores), largest) {
             println!("{}: realism {:.3}", world.name(), mean.metametric);
-            let what = blame.component.name().replace('_', " ");
-            println!("  costs most in {id}: {what} of agent {}", blame.agent);
+            let what = attribution.component.name().replace('_', " ");
+            println!(
+                "  costs most in {id}: {what} of agent {}",
+                attribution.agent
+            );
         }
     }
     Ok(())

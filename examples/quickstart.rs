@@ -4,11 +4,8 @@
 
 use std::path::Path;
 
-use gump_metrics::summarize;
-use gump_rollout::worlds::{ConstantVelocity, Idm};
-use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{Rollout, Seed};
-use gump_viz::{Camera, PictureSpec, draw_futures};
+use gump::prelude::*;
+use gump::viz::{Camera, PictureSpec, draw_futures};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -18,7 +15,7 @@ const SHIPPED: &str = concat!(
 fn main() -> anyhow::Result<()> {
     // A scenario is what was recorded, its future included; a scene is what an actor may see.
     let name = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
-    let scenario = gump_data::find(&name)?;
+    let scenario = gump::data::find(&name)?;
     let scene = scenario.present();
     println!("{}: {} agents", scenario.id, scene.now().agents().len());
 

@@ -2,7 +2,7 @@
 //!
 //! `cargo run -p examples --example raster_as_text [FILE#INDEX]`
 
-use gump_raster::{Layer, RasterSpec, rasterize};
+use gump::raster::{Layer, RasterSpec, rasterize};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -11,7 +11,7 @@ const SHIPPED: &str = concat!(
 
 fn main() -> anyhow::Result<()> {
     let name = std::env::args().nth(1).unwrap_or_else(|| SHIPPED.into());
-    let scenario = gump_data::find(&name)?;
+    let scenario = gump::data::find(&name)?;
     let scene = scenario.present();
     let ego = scene.ego_now().state.pose;
 

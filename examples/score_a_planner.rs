@@ -1,19 +1,9 @@
 //! Scores your own planner in three worlds: the log, reactive rules and learned agents.
 //!
 //! `cargo run -p examples --example score_a_planner [FILE]`. Replace `Cruise` by
-//! `gump_planner::PdmClosed::default()`, or by `InteractiveDriver::new(&learned, ...)?`, which uses
-//! rollouts.
+//! `PdmClosed::default()`, or by `InteractiveDriver::new(&learned, ...)?`, which uses rollouts.
 
-use gump_engine::SamplingConfig;
-use gump_engine::TransformerWorld;
-use gump_geometry::Pose;
-use gump_model::{Device, checkpoint};
-use gump_nuplan::closed_loop::*;
-use gump_nuplan::reactive_agents::NuplanIdm;
-use gump_nuplan::tracking::Trajectory;
-use gump_planner::closed_loop::drive_scenario;
-use gump_rollout::BoxError;
-use gump_scene::{EgoState, Seed};
+use gump::prelude::*;
 
 const DATASETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../datasets");
 
@@ -44,7 +34,7 @@ fn main() -> anyhow::Result<()> {
     let weights = format!("{DATASETS}/weights/gump-tiny.safetensors");
     let network = checkpoint::load(weights.as_ref(), &Device::Cpu)?;
     let learned = TransformerWorld::new(network, SamplingConfig::default());
-    for record in gump_data::open(path.as_ref())?.take(3) {
+    for record in gump::data::open(path.as_ref())?.take(3) {
         let scenario = record?.scenario;
         let (mut rules, mut model) = (NuplanIdm::default(), Imagined::new(&learned, Seed(0)));
         for world in [&mut Replayed as &mut dyn Traffic, &mut rules, &mut model] {

@@ -5,11 +5,8 @@
 
 use std::path::Path;
 
-use gump_engine::{SamplingConfig, TransformerWorld};
-use gump_model::{Device, checkpoint};
-use gump_rollout::{SimulateConfig, Start, simulate};
-use gump_scene::Seed;
-use gump_viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};
+use gump::prelude::*;
+use gump::viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};
 
 const DATASETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../datasets");
 
@@ -17,7 +14,7 @@ fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
     let mut next = |shipped| arguments.next().unwrap_or(format!("{DATASETS}/{shipped}"));
     let weights = next("weights/gump-tiny.safetensors");
-    let scenario = gump_data::find(&next("mini/procedural.tfrecord.gz#22"))?;
+    let scenario = gump::data::find(&next("mini/procedural.tfrecord.gz#22"))?;
     let scene = scenario.present();
 
     // ANCHOR: imagine

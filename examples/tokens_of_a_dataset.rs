@@ -4,7 +4,7 @@
 
 use std::path::PathBuf;
 
-use gump_tokenizer::{Field, Identities, Tokenizer, TokenizerConfig, VOCABULARY_SIZE};
+use gump::tokenizer::{Field, Identities, Tokenizer, TokenizerConfig, VOCABULARY_SIZE};
 
 const SHIPPED: &str = concat!(
     env!("CARGO_MANIFEST_DIR"),
@@ -16,7 +16,7 @@ fn main() -> anyhow::Result<()> {
     let tokenizer = Tokenizer::new(TokenizerConfig::default());
     let (mut lengths, mut clamped, mut far) = (Vec::new(), 0, 0);
     let mut errors: Vec<f64> = Vec::new();
-    for record in gump_data::open(&path)? {
+    for record in gump::data::open(&path)? {
         let scenario = record?.scenario;
         let scene = scenario.present();
 

@@ -5,9 +5,9 @@
 
 use std::path::PathBuf;
 
-use gump_model::relative::RelativeConfig;
-use gump_scene::Scenario;
-use gump_train::relative::{RelativeTrainConfig, RelativeTrainer};
+use gump::model::relative::RelativeConfig;
+use gump::scene::Scenario;
+use gump::train::relative::{RelativeTrainConfig, RelativeTrainer};
 
 fn main() -> anyhow::Result<()> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -29,9 +29,9 @@ fn main() -> anyhow::Result<()> {
         steps: number(2, 6)?,
         ..RelativeTrainConfig::default()
     };
-    let records = gump_data::open(data.as_ref())?;
+    let records = gump::data::open(data.as_ref())?;
     let scenarios: Result<Vec<Scenario>, _> = records.map(|r| r.map(|r| r.scenario)).collect();
-    let device = gump_model::Device::Cpu;
+    let device = gump::model::Device::Cpu;
     let mut trainer = match out.as_ref().filter(|out| out.is_file()) {
         Some(run) => RelativeTrainer::resume(run, scenarios?, &device)?,
         None => RelativeTrainer::new(model, config, scenarios?, &device)?,

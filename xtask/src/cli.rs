@@ -5,12 +5,13 @@
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use gump_data::DataError;
 use gump_eval::EvalError;
+use serde::Serialize;
 
-use crate::run::{self, Run, print_error};
-use crate::verbs::ablate::Knob;
+use crate::run::{self, Common, Run, print_error};
+use crate::verbs::ablate::Sweep;
 use crate::verbs::{
     ablate, bench, ci, data, demo, evaluate, generate, manual, plan, rl, simulate, submit, tidy,
     train, web,
@@ -24,8 +25,15 @@ use crate::{config, words};
     bin_name = "cargo xtask",
     args_override_self = true
 )]
-pub(crate) struct Cli {
+struct Cli {
     #[command(subcommand)]
+    verb: Verb,
+}
+
+/// A verb with its arguments and its name.
+#[derive(Debug)]
+pub(crate) struct Asked {
+    name: String,
     verb: Verb,
 }
 
@@ -79,13 +87,16 @@ pub(crate) struct WrongArguments(pub(crate) String);
 /// Parses the command line, after a `--config` file has been turned into flags before it.
 ///
 /// Error: clap's own, or [`WrongArguments`] for a config file that does not fit the verb.
-pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Cli> {
+pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Asked> {
     let mut command = command();
     let arguments = config::splice(&command, arguments)?;
     let matches = command.try_get_matches_from_mut(arguments);
     let matches = matches.map_err(words::plainer)?;
     words::check_device(&matches)?;
-    Ok(Cli::from_arg_matches(&matches)?)
+    Ok(Asked {
+        name: name_of(&matches),
+        verb: Cli::from_arg_matches(&matches)?.verb,
+    })
 }
 
 /// The command line as it is offered.
@@ -93,139 +104,65 @@ fn command() -> Command {
     words::dressed(Cli::command())
 }
 
-impl Cli {
+impl Asked {
     /// Does what was asked.
     pub(crate) fn execute(self) -> anyhow::Result<()> {
-        match self.verb {
-            Verb::Demo(args) => {
-                Run::of("demo", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Inspect(args)) => {
-                Run::of("data inspect", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Verify(args)) => {
-                Run::of("data verify", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Stats(args)) => {
-                Run::of("data stats", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Convert(args)) => {
-                Run::of("data convert", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Synthesize(args)) => {
-                Run::of("data synthesize", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Data(data::Verb::Benchmark(args)) => {
-                Run::of("data benchmark", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Train(args) => {
-                Run::of("train", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Simulate(args) => {
-                Run::of("simulate", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Generate(args) => {
-                Run::of("generate", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Motion(args)) => {
-                Run::of("evaluate motion", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Wosac(args)) => {
-                Run::of("evaluate wosac", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Behaviour(args)) => {
-                Run::of("evaluate behaviour", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Reactions(args)) => {
-                Run::of("evaluate reactions", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Plan(args) => {
-                Run::of("plan", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Generation(args)) => {
-                Run::of("evaluate generation", &args.common, &args)?
-                    .execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::ClosedLoop(args)) => {
-                Run::of("evaluate closed-loop", &args.common, &args)?
-                    .execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::OpenLoop(args)) => {
-                Run::of("evaluate open-loop", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Evaluate(evaluate::Verb::Merge(args)) => {
-                Run::of("evaluate merge", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Rl(rl::Verb::Train(args)) => {
-                Run::of("rl train", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Rl(rl::Verb::Evaluate(args)) => {
-                Run::of("rl evaluate", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Rl(rl::Verb::Serve(args)) => {
-                Run::of("rl serve", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Rl(rl::Verb::Table(args)) => {
-                Run::of("rl table", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Submit(submit::Verb::Wosac(args)) => {
-                Run::of("submit wosac", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Ablate(ablate::Verb::Nar(args)) => {
-                Run::of("ablate nar", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Ablate(ablate::Verb::Quantization(args)) => {
-                Run::of("ablate quantization", &args.common, &args)?
-                    .execute(|run| args.execute(run, Knob::Precision))
-            }
-            Verb::Ablate(ablate::Verb::Temperature(args)) => {
-                Run::of("ablate temperature", &args.common, &args)?
-                    .execute(|run| args.execute(run, Knob::Temperature))
-            }
-            Verb::Ablate(ablate::Verb::Decay(args)) => {
-                Run::of("ablate decay", &args.common, &args)?
-                    .execute(|run| args.execute(run, Knob::Decay))
-            }
-            Verb::Ablate(ablate::Verb::History(args)) => {
-                Run::of("ablate history", &args.common, &args)?
-                    .execute(|run| args.execute(run, Knob::History))
-            }
-            Verb::Ablate(ablate::Verb::Chunking(args)) => {
-                Run::of("ablate chunking", &args.common, &args)?
-                    .execute(|run| args.execute(run, Knob::Chunking))
-            }
-            Verb::Ablate(ablate::Verb::Scaling(args)) => {
-                Run::of("ablate scaling", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Ablate(ablate::Verb::Switches(args)) => {
-                Run::of("ablate switches", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Bench(bench::Verb::Engine(args)) => {
-                Run::of("bench engine", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Bench(bench::Verb::Train(args)) => {
-                Run::of("bench train", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Bench(bench::Verb::Device(args)) => {
-                Run::of("bench device", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Bench(bench::Verb::Wosac(args)) => {
-                Run::of("bench wosac", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Bench(bench::Verb::Planning(args)) => {
-                Run::of("bench planning", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Web(args) => {
-                Run::of("web", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Ci(args) => Run::of("ci", &args.common, &args)?.execute(|run| args.execute(run)),
-            Verb::Tidy(args) => {
-                Run::of("tidy", &args.common, &args)?.execute(|run| args.execute(run))
-            }
-            Verb::Completions(args) => args.execute(command()),
-            Verb::Manual(args) => args.execute(command()),
+        let name = self.name;
+        // A row runs the verbs of one group. They take nothing but their arguments, which they all
+        // have in the same form; a verb is called as its subcommand is. The last row has the
+        // ablations of one setting.
+        macro_rules! run {
+            (
+                $($alone:ident)*;
+                $($group:ident $module:ident: $($verb:ident)*;)*
+                [$($sweep:ident)*]
+            ) => {
+                match self.verb {
+                    $(Verb::$alone(args) => run(&name, &args.common, &args, |run| args.execute(run)),)*
+                    $($(Verb::$group($module::Verb::$verb(args)) => {
+                        run(&name, &args.common, &args, |run| args.execute(run))
+                    })*)*
+                    $(Verb::Ablate(ablate::Verb::$sweep(args)) => {
+                        run(&name, &args.common, &args, |run| args.execute(run, Sweep::$sweep))
+                    })*
+                    Verb::Completions(args) => args.execute(command()),
+                    Verb::Manual(args) => args.execute(command()),
+                }
+            };
+        }
+        run! {
+            Demo Train Simulate Generate Plan Web Ci Tidy;
+            Data data: Inspect Verify Stats Convert Synthesize Benchmark;
+            Evaluate evaluate:
+                Motion Wosac Behaviour Reactions Generation ClosedLoop OpenLoop Merge;
+            Rl rl: Train Evaluate Serve Table;
+            Submit submit: Wosac;
+            Ablate ablate: Nar Scaling Switches;
+            Bench bench: Engine Train Device Wosac Planning;
+            [Quantization Temperature Decay History Chunking]
         }
     }
+}
+
+/// Runs one verb.
+fn run(
+    name: &str,
+    common: &Common,
+    settings: &impl Serialize,
+    work: impl FnOnce(&mut Run) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    Run::of(name, common, settings)?.execute(work)
+}
+
+/// The names of the chosen subcommands: "data inspect".
+fn name_of(matches: &ArgMatches) -> String {
+    let mut names = Vec::new();
+    let mut level = matches.subcommand();
+    while let Some((name, matches)) = level {
+        names.push(name);
+        level = matches.subcommand();
+    }
+    names.join(" ")
 }
 
 /// Prints an error as one sentence and chooses the exit status.

@@ -4,60 +4,10 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_scene::{Agent, AgentId, Prediction, Rollout, Scenario};
+use gump_eval::digest::numbers;
+use gump_scene::{Agent, AgentId, Rollout, Scenario};
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde_json::json;
-use sha2::{Digest, Sha256};
-
-/// SHA-256 over x, y, heading and the two velocities of every agent of every frame, as
-/// little-endian f32: futures, then steps, then agents by id.
-pub(crate) fn digest(rollouts: &[Rollout]) -> String {
-    let mut hash = Sha256::new();
-    for frame in rollouts.iter().flat_map(Rollout::imagined) {
-        for number in frame.agents().iter().flat_map(numbers) {
-            hash.update((number as f32).to_le_bytes());
-        }
-    }
-    hexadecimal(hash)
-}
-
-/// SHA-256 over the confidence and the positions of every mode, as little-endian f32.
-pub(crate) fn digest_of_predictions(predictions: &[Prediction]) -> String {
-    let mut hash = Sha256::new();
-    for mode in predictions.iter().flat_map(|predicted| &predicted.modes) {
-        let places = mode.paths.iter().flatten().flat_map(|p| p.to_array());
-        for number in std::iter::once(mode.confidence).chain(places) {
-            hash.update((number as f32).to_le_bytes());
-        }
-    }
-    hexadecimal(hash)
-}
-
-/// One digest of many in their order; `None` of none.
-pub(crate) fn digest_of<'a>(digests: impl IntoIterator<Item = &'a str>) -> Option<String> {
-    let mut digests = digests.into_iter().peekable();
-    digests.peek()?;
-    let mut hash = Sha256::new();
-    digests.for_each(|digest| hash.update(digest));
-    Some(hexadecimal(hash))
-}
-
-fn hexadecimal(hash: Sha256) -> String {
-    let bytes = hash.finalize();
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn numbers(agent: &Agent) -> [f64; 5] {
-    let pose = agent.state.pose;
-    let velocity = agent.state.velocity;
-    [
-        pose.position.x,
-        pose.position.y,
-        pose.heading,
-        velocity.x,
-        velocity.y,
-    ]
-}
 
 /// Writes `futures.npy`, shape [future, step, agent, number], and `futures.json`, which says what
 /// the rows are.
@@ -159,28 +109,6 @@ mod tests {
         .unwrap();
         let log = log_as_rollout(&scenario);
         (scenario, vec![log; 2])
-    }
-
-    #[test]
-    fn the_digest_is_that_of_the_bytes_it_names() {
-        let (_, rollouts) = rollouts();
-        let mut bytes = Vec::new();
-        for rollout in &rollouts {
-            for frame in rollout.imagined() {
-                for a in frame.agents() {
-                    let (p, v) = (a.state.pose, a.state.velocity);
-                    for x in [p.position.x, p.position.y, p.heading, v.x, v.y] {
-                        bytes.extend((x as f32).to_le_bytes());
-                    }
-                }
-            }
-        }
-        assert_eq!(bytes.len(), 2 * 20 * 2 * 5 * 4);
-        let expected: String = Sha256::digest(&bytes)
-            .iter()
-            .map(|b| format!("{b:02x}"))
-            .collect();
-        assert_eq!(digest(&rollouts), expected);
     }
 
     #[test]

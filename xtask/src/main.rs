@@ -10,13 +10,12 @@
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
 )]
 
+mod annotations;
 mod benchmark;
 mod charts;
 mod checks;
 mod cli;
 mod config;
-mod dataset;
-mod decoding;
 mod films;
 mod fresh;
 mod futures;
@@ -36,7 +35,7 @@ mod sumo;
 mod table;
 mod tables;
 mod targets;
-mod told;
+mod training_set;
 mod verbs;
 mod words;
 
@@ -49,7 +48,7 @@ fn main() -> ExitCode {
     installed::settle();
     run::catch_interrupts();
     let arguments = std::env::args_os().collect();
-    match cli::parse(arguments).and_then(cli::Cli::execute) {
+    match cli::parse(arguments).and_then(cli::Asked::execute) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => cli::explain(&error),
     }

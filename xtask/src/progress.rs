@@ -4,9 +4,10 @@ use std::io::IsTerminal as _;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use gump_eval::Monitor;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::run::print_error;
+use crate::run::{interrupted, print_error};
 
 /// Seconds between lines where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -89,6 +90,16 @@ impl Progress {
                 what.clone_into(&mut lines.what);
             }
         }
+    }
+}
+
+impl Monitor for Progress {
+    fn advance(&self, n: u64) {
+        self.advance(n);
+    }
+
+    fn is_stopped(&self) -> bool {
+        interrupted()
     }
 }
 

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::Monitor;
 use gump_kernels::{Choice, Kernel};
 use gump_scene::Seed;
 use serde::Serialize;
@@ -187,6 +188,12 @@ impl Run {
         Progress::begin(self.quiet, what, total, unit)
     }
 
+    /// Begins the progress bar of a simulation of so many frames; silent where nothing is simulated.
+    pub(crate) fn simulating(&self, frames: Option<u64>) -> Progress {
+        let quiet = self.quiet || frames.is_none();
+        Progress::begin(quiet, "simulating", frames.unwrap_or(0), "frames")
+    }
+
     /// Tells the reader something that is no result.
     pub(crate) fn say(&self, line: &str) {
         if !self.quiet {
@@ -284,6 +291,17 @@ pub(crate) fn interrupted() -> bool {
 pub(crate) fn stop_if_interrupted() -> anyhow::Result<()> {
     anyhow::ensure!(!interrupted(), "stopped by Ctrl-C");
     Ok(())
+}
+
+/// Hears of Ctrl-C for work without a progress bar.
+pub(crate) struct Unseen;
+
+impl Monitor for Unseen {
+    fn advance(&self, _: u64) {}
+
+    fn is_stopped(&self) -> bool {
+        interrupted()
+    }
 }
 
 /// Makes the first Ctrl-C a request and the second an end.

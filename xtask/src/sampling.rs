@@ -1,11 +1,11 @@
 //! How a learned world decodes, as flags.
 
 use gump_engine::{CacheMode, LightSource, Mode, Precision, SamplingConfig};
+use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
 
 /// How a learned world decodes.
 #[derive(Clone, Debug, Serialize, clap::Args)]

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use gump_data::DataError;
 use gump_model::ModelError;
 use gump_planner::PlanError;
-use gump_rollout::RolloutError;
+use gump_rollout::{BoxError, RolloutError};
+use gump_wosac::motion::MotionError;
+use gump_wosac::realism::WosacError;
 
 /// An error of an evaluation's inputs or of its results.
 #[derive(Debug, thiserror::Error)]
@@ -31,6 +33,35 @@ pub enum EvalError {
     /// Stored results are incomplete, or of different evaluations.
     #[error("{0}")]
     Results(String),
+    /// A data set's manifest cannot be understood.
+    #[error("{0}")]
+    Dataset(String),
+    /// A list of scenes is none, or scenes are missing or not what it says.
+    #[error("{0}")]
+    Benchmark(String),
+    /// Rollouts in files are missing, or there twice.
+    #[error("{0}")]
+    Rollouts(String),
+    /// A log or rollouts that the realism metric is not defined on.
+    #[error(transparent)]
+    Realism(#[from] WosacError),
+    /// Predictions that the motion metrics are not defined on.
+    #[error(transparent)]
+    Motion(#[from] MotionError),
+    /// A world or a driver failed in a simulation.
+    #[error(transparent)]
+    Simulation(BoxError),
+    /// The monitor wanted the work to end.
+    #[error("stopped by Ctrl-C")]
+    Stopped,
+    /// An error with the place at which it occurred.
+    #[error("{place}: {error}")]
+    At {
+        /// The file, record or scenario, or what could not be done.
+        place: String,
+        /// The error there.
+        error: Box<EvalError>,
+    },
     /// An input or output error of the operating system.
     #[error("cannot {doing} {}: {cause}", path.display())]
     Io {
@@ -52,10 +83,34 @@ impl EvalError {
         }
     }
 
+    /// The same error with its place.
+    pub(crate) fn at(self, place: &impl std::fmt::Display) -> Self {
+        Self::At {
+            place: place.to_string(),
+            error: Box::new(self),
+        }
+    }
+
+    /// An error of a simulation, which may be one of this crate's that went through it.
+    pub(crate) fn of_simulation(error: BoxError) -> Self {
+        match error.downcast::<Self>() {
+            Ok(own) => *own,
+            Err(other) => Self::Simulation(other),
+        }
+    }
+
+    /// The error itself, without the places around it.
+    pub fn cause(&self) -> &Self {
+        match self {
+            Self::At { error, .. } => error.cause(),
+            error => error,
+        }
+    }
+
     /// Whether a different argument, rather than a different file, would help.
     pub fn is_argument(&self) -> bool {
         matches!(
-            self,
+            self.cause(),
             Self::Argument(_)
                 | Self::Data(DataError::NoSuchScenario { .. } | DataError::SeveralFiles { .. })
         )

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
 
+use gump_data::ReadOptions;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_engine::{LightSource, PredictiveSamples, ProbeConfig, SamplingConfig, TransformerWorld};
 use gump_model::{Device, checkpoint, relative};
@@ -43,6 +44,24 @@ impl FromStr for WorldName {
                 None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
                 _ => Err(no_world(name)),
             },
+        }
+    }
+}
+
+impl WorldName {
+    /// How many of `n` futures differ: worlds without chance have one.
+    pub fn distinct_futures(&self, n: usize) -> usize {
+        match self {
+            Self::Log | Self::ConstantVelocity => n.min(1),
+            Self::Idm | Self::Model(_) => n,
+        }
+    }
+
+    /// Which gaps of Waymo's messages matter to the world.
+    pub fn read_options(&self) -> ReadOptions {
+        match self {
+            Self::Log | Self::ConstantVelocity => ReadOptions::STATED,
+            Self::Idm | Self::Model(_) => ReadOptions::ALL,
         }
     }
 }

@@ -5,8 +5,8 @@ use std::sync::{Arc, OnceLock};
 use gump_data::submission::decode_rollouts;
 use gump_scene::{AgentId, AgentKind};
 use gump_wosac::realism::{
-    AgentRealism, Blame, Component, Config, Log, Mode, N_FUTURE, N_STEPS, Reference, Rollouts,
-    Scores, Trajectory, WosacError, Year,
+    AgentRealism, Attribution, Component, Config, Log, Mode, N_FUTURE, N_STEPS, Reference,
+    Rollouts, Scores, Trajectory, WosacError, Year,
 };
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
@@ -61,7 +61,7 @@ struct Found {
     scores: Scores,
     leave_one_out: Option<Vec<f64>>,
     per_agent: Option<Vec<AgentRealism>>,
-    blames: Option<Vec<Blame>>,
+    attributions: Option<Vec<Attribution>>,
 }
 
 fn evaluate(
@@ -76,7 +76,7 @@ fn evaluate(
     Ok(Found {
         leave_one_out: leave_one_out.flatten().map(|worth| worth.metametric),
         per_agent: wanted.per_agent.then(|| evaluation.realism()),
-        blames: wanted.explain.then(|| evaluation.explain()),
+        attributions: wanted.explain.then(|| evaluation.explain()),
         scores: evaluation.scores,
     })
 }
@@ -107,10 +107,10 @@ impl Found {
         if let Some(agents) = &self.per_agent {
             told.set_item("per_agent", per_agent(py, agents)?)?;
         }
-        if let Some(blames) = &self.blames {
+        if let Some(attributions) = &self.attributions {
             let list = PyList::empty(py);
-            for blame in blames {
-                list.append(told_blame(py, blame)?)?;
+            for attribution in attributions {
+                list.append(attribution_dict(py, attribution)?)?;
             }
             told.set_item("explanation", list)?;
         }
@@ -140,16 +140,19 @@ fn per_agent<'py>(py: Python<'py>, agents: &[AgentRealism]) -> PyResult<Bound<'p
     Ok(told)
 }
 
-fn told_blame<'py>(py: Python<'py>, blame: &Blame) -> PyResult<Bound<'py, PyDict>> {
+fn attribution_dict<'py>(
+    py: Python<'py>,
+    attribution: &Attribution,
+) -> PyResult<Bound<'py, PyDict>> {
     let told = PyDict::new(py);
-    told.set_item("component", blame.component.name())?;
-    told.set_item("agent_id", blame.agent.0)?;
-    told.set_item("kind", blame.kind.name())?;
-    told.set_item("cost", blame.cost)?;
-    told.set_item("likelihood", blame.likelihood)?;
-    told.set_item("step", blame.step)?;
-    told.set_item("logged", blame.logged)?;
-    told.set_item("imagined", blame.imagined)?;
+    told.set_item("component", attribution.component.name())?;
+    told.set_item("agent_id", attribution.agent.0)?;
+    told.set_item("kind", attribution.kind.name())?;
+    told.set_item("cost", attribution.cost)?;
+    told.set_item("likelihood", attribution.likelihood)?;
+    told.set_item("step", attribution.step)?;
+    told.set_item("logged", attribution.logged)?;
+    told.set_item("imagined", attribution.imagined)?;
     Ok(told)
 }
 

@@ -111,7 +111,7 @@ fn who_runs_a_red_light_is_found() {
 }
 
 #[test]
-fn the_dearest_blame_names_agent_and_step() {
+fn the_largest_penalty_names_agent_and_step() {
     let log = log();
     let config = year(Year::Y2025);
     let reference = Reference::new(&log, &config).unwrap();
@@ -123,24 +123,31 @@ fn the_dearest_blame_names_agent_and_step() {
         }
     }
     let evaluation = reference.evaluate(&crash).unwrap();
-    let blames = evaluation.explain();
-    assert!(blames.windows(2).all(|pair| pair[0].cost >= pair[1].cost));
-    let collisions: Vec<_> = blames
+    let attributions = evaluation.explain();
+    assert!(
+        attributions
+            .windows(2)
+            .all(|pair| pair[0].cost >= pair[1].cost)
+    );
+    let collisions: Vec<_> = attributions
         .iter()
-        .filter(|blame| blame.component == Component::Collision)
+        .filter(|attribution| attribution.component == Component::Collision)
         .collect();
     assert_eq!(collisions.len(), 2);
-    for blame in collisions {
+    for attribution in collisions {
         assert_eq!(
-            (blame.step, blame.logged, blame.imagined),
+            (attribution.step, attribution.logged, attribution.imagined),
             (Some(20), 0.0, 1.0)
         );
         // 0 of 32 rollouts agree with the log.
-        assert!((blame.likelihood.ln() + 10.3736).abs() < 1e-3);
+        assert!((attribution.likelihood.ln() + 10.3736).abs() < 1e-3);
         // Two agents share a quarter of the meta metric.
-        assert!((blame.cost - 0.125).abs() < 1e-4);
+        assert!((attribution.cost - 0.125).abs() < 1e-4);
     }
-    let costs: f64 = blames.iter().map(|blame| blame.cost).sum();
+    let costs: f64 = attributions
+        .iter()
+        .map(|attribution| attribution.cost)
+        .sum();
     assert!((costs - (1.0 - evaluation.scores.metametric)).abs() < 1e-6);
     let oracle = log.oracle(32, false);
     let oracle = reference.evaluate(&oracle).unwrap().explain();

@@ -4,12 +4,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_eval::benchmarks::{BenchmarkList, MadePart, RecordedPart};
+use gump_eval::datasets::Split;
 use gump_scene::Seed;
 use rand::Rng as _;
 use serde_json::Value;
-
-use super::{List, Made, Recorded};
-use crate::dataset::Split;
 
 /// Which scenes are drawn.
 pub(crate) struct Draw<'a> {
@@ -33,7 +32,7 @@ impl Draw<'_> {
     /// The scenes of `list` that are drawn, in their order.
     ///
     /// Error: a list without sums, or nothing that may be drawn.
-    pub(crate) fn of(&self, list: &List) -> anyhow::Result<List> {
+    pub(crate) fn of(&self, list: &BenchmarkList) -> anyhow::Result<BenchmarkList> {
         let mut drawn: BTreeMap<Split, Vec<(u64, usize, usize)>> = BTreeMap::new();
         let made = list.made.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
@@ -64,7 +63,7 @@ impl Draw<'_> {
         };
         let made = list.made.iter().enumerate().map(|(p, part)| {
             let kept = of_part(p);
-            Made {
+            MadePart {
                 scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
                 keep: kept
                     .iter()
@@ -75,18 +74,17 @@ impl Draw<'_> {
         });
         let recorded = list.recorded.iter().enumerate().map(|(p, part)| {
             let kept = of_part(list.made.len() + p);
-            Recorded {
+            RecordedPart {
                 scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
                 ..part.clone()
             }
         });
-        Ok(List {
-            name: self.name.clone(),
-            about: format!("{} {}", list.about, self.rule.sentence(&list.name)),
-            made: made.filter(|part| !part.keep.is_empty()).collect(),
-            recorded: recorded.filter(|part| !part.scenes.is_empty()).collect(),
-            path: list.path.clone(),
-        })
+        let mut drawn_list = list.clone();
+        drawn_list.name.clone_from(&self.name);
+        drawn_list.about = format!("{} {}", list.about, self.rule.sentence(&list.name));
+        drawn_list.made = made.filter(|part| !part.keep.is_empty()).collect();
+        drawn_list.recorded = recorded.filter(|part| !part.scenes.is_empty()).collect();
+        Ok(drawn_list)
     }
 }
 
@@ -116,9 +114,9 @@ impl Rule<'_> {
 pub(crate) fn worst_scores(report: &Path) -> anyhow::Result<BTreeMap<String, f64>> {
     let text = std::fs::read_to_string(report)
         .with_context(|| format!("cannot read {}", report.display()))?;
-    let told: Value = serde_json::from_str(&text)
+    let report_json: Value = serde_json::from_str(&text)
         .with_context(|| format!("expected a report, found {}", report.display()))?;
-    let scenarios = told["results"]["scenarios"].as_array();
+    let scenarios = report_json["results"]["scenarios"].as_array();
     let scenarios = scenarios.with_context(|| {
         format!(
             "expected results.scenarios of evaluate closed-loop in {}",
@@ -139,7 +137,7 @@ pub(crate) fn worst_scores(report: &Path) -> anyhow::Result<BTreeMap<String, f64
 mod tests {
     use super::*;
 
-    fn pool() -> List {
+    fn pool() -> BenchmarkList {
         let part = |file: &str, split: &str, seed: u64| {
             let scenes: Vec<String> = (0..6).map(|i| format!("\"s{i} {file}-{i}\"")).collect();
             format!(
@@ -156,10 +154,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("pool.toml");
         std::fs::write(&path, text).unwrap();
-        List::read(&path).unwrap()
+        BenchmarkList::read(&path).unwrap()
     }
 
-    fn draw(rule: Rule<'_>, at_most: usize, seed: u64) -> anyhow::Result<List> {
+    fn draw(rule: Rule<'_>, at_most: usize, seed: u64) -> anyhow::Result<BenchmarkList> {
         let name = "drawn".into();
         let seed = Seed(seed);
         let draw = Draw {
@@ -176,21 +174,21 @@ mod tests {
         let worst = [("a-1", 0.5), ("a-4", 0.95), ("b-0", 0.0), ("b-5", 0.89)];
         let worst = worst.map(|(id, score)| (id.to_owned(), score)).into();
         let list = draw(Rule::Below(0.9, &worst), 10, 0).unwrap();
-        let told: Vec<_> = list
+        let parts: Vec<_> = list
             .made
             .iter()
             .map(|p| (&p.keep[..], &p.scenes[..]))
             .collect();
-        assert_eq!(told.len(), 2);
+        assert_eq!(parts.len(), 2);
         assert_eq!(
-            (told[0].0, told[0].1),
+            (parts[0].0, parts[0].1),
             (&[1][..], &["s1 a-1".to_owned()][..])
         );
-        assert_eq!(told[1].0, [0, 5]);
+        assert_eq!(parts[1].0, [0, 5]);
         assert!(list.about.contains("below 0.9"), "{}", list.about);
         // It reads back as it was written.
         let text = toml::to_string_pretty(&list).unwrap();
-        let again: List = toml::from_str(&text).unwrap();
+        let again: BenchmarkList = toml::from_str(&text).unwrap();
         assert_eq!(again.made[1].keep, [0, 5]);
         assert!(draw(Rule::Below(-1.0, &worst), 10, 0).is_err());
     }

@@ -1,20 +1,15 @@
-//! Makes the scenes of a list anew and holds them to its sums.
+//! Makes the scenes of a list and holds them to its checksums.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use gump_data::tfrecord::TfRecordReader;
-use gump_proto as proto;
+use gump_eval::benchmarks::{BenchmarkList, MadePart, checksums, sha256, verify_made};
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{SumoDemand, SynthesisConfig, synthesize};
-use prost::Message as _;
 use rayon::prelude::*;
 
-use super::fingerprint::fingerprint;
-use super::recorded::sha256;
-use super::{List, Made};
 use crate::progress::Progress;
-use crate::run::stop_if_interrupted;
+use crate::run::{Unseen, stop_if_interrupted};
 use crate::sumo::{FUTURE_S, Place, Sumo};
 
 /// So many runs of SUMO more than are needed mean that there is no room to drive.
@@ -30,7 +25,7 @@ impl Generator {
     /// The generator of a part.
     ///
     /// Error: a generator or a version that this build does not have.
-    fn of(part: &Made) -> anyhow::Result<Self> {
+    fn of(part: &MadePart) -> anyhow::Result<Self> {
         let mut generator = Self::named(&part.generator)?;
         if let Some(asked) = part.density {
             let (Self::Procedural(SynthesisConfig { density, .. })
@@ -65,17 +60,17 @@ impl Generator {
 /// Error: SUMO is missing or of another version, a network differs, or scenes come out otherwise
 /// than the list says.
 pub(crate) fn make(
-    list: &List,
-    part: &Made,
+    list: &BenchmarkList,
+    part: &MadePart,
     folder: &Path,
     progress: &Progress,
 ) -> anyhow::Result<bool> {
-    if !part.scenes.is_empty() && check(list, part, folder).is_ok() {
+    if !part.scenes.is_empty() && verify_made(list, part, folder, &Unseen).is_ok() {
         progress.advance(part.kept() as u64);
         return Ok(false);
     }
     write(list, part, folder, progress)?;
-    check(list, part, folder).with_context(|| {
+    verify_made(list, part, folder, &Unseen).with_context(|| {
         let n = gump_synthesis::GENERATOR_VERSION;
         format!(
             "scenes of {} come out otherwise than they were frozen (newest version: {n})",
@@ -89,67 +84,21 @@ pub(crate) fn make(
 ///
 /// Error: as [`make`], sums aside.
 pub(crate) fn freeze(
-    list: &List,
-    part: &Made,
+    list: &BenchmarkList,
+    part: &MadePart,
     folder: &Path,
     progress: &Progress,
 ) -> anyhow::Result<Vec<String>> {
     write(list, part, folder, progress)?;
-    sums(&list.file(folder, part))
+    Ok(checksums(&list.file(folder, part), &Unseen)?)
 }
 
-/// Holds the file of a part to the sums of the list.
-///
-/// Error: a file that is missing, or the first scene that differs.
-pub(crate) fn check(list: &List, part: &Made, folder: &Path) -> anyhow::Result<()> {
-    let path = list.file(folder, part);
-    anyhow::ensure!(
-        !part.scenes.is_empty(),
-        "expected sums of the part {} in {}, found none: `data benchmark --freeze` writes those \
-         of a new list",
-        part.file,
-        list.path.display()
-    );
-    let found = sums(&path)?;
-    let differs = part.scenes.iter().zip(&found).position(|(a, b)| a != b);
-    if let Some(k) = differs {
-        anyhow::bail!(
-            "expected scene {k} of {} to be \"{}\" as {} says, found \"{}\": {}",
-            part.file,
-            part.scenes[k],
-            list.path.display(),
-            found[k],
-            path.display()
-        );
-    }
-    anyhow::ensure!(
-        found.len() == part.kept() && part.scenes.len() == part.kept(),
-        "expected {} scenes as {} says, found {}: {}",
-        part.kept(),
-        list.path.display(),
-        found.len(),
-        path.display()
-    );
-    Ok(())
-}
-
-/// Sum and id of every scene of a file.
-fn sums(path: &Path) -> anyhow::Result<Vec<String>> {
-    let sum = |payload: Result<gump_data::tfrecord::Payload, _>| {
-        stop_if_interrupted()?;
-        let payload = payload?;
-        let message = proto::Scenario::decode(payload.bytes.as_slice())
-            .with_context(|| format!("expected a Scenario message: {}", payload.place))?;
-        Ok(format!(
-            "{} {}",
-            fingerprint(&message),
-            message.scenario_id()
-        ))
-    };
-    TfRecordReader::open(path.to_owned())?.map(sum).collect()
-}
-
-fn write(list: &List, part: &Made, folder: &Path, progress: &Progress) -> anyhow::Result<()> {
+fn write(
+    list: &BenchmarkList,
+    part: &MadePart,
+    folder: &Path,
+    progress: &Progress,
+) -> anyhow::Result<()> {
     let scenes = match Generator::of(part)? {
         Generator::Procedural(config) => (0..part.count as u64)
             .into_par_iter()
@@ -182,7 +131,7 @@ fn write(list: &List, part: &Made, folder: &Path, progress: &Progress) -> anyhow
 
 /// SUMO at work on a part.
 struct Simulation<'a> {
-    part: &'a Made,
+    part: &'a MadePart,
     sumo: Sumo,
     demand: SumoDemand,
     /// Networks to take in turn; none: made anew for every run.
@@ -192,8 +141,8 @@ struct Simulation<'a> {
 
 impl<'a> Simulation<'a> {
     fn begin(
-        list: &List,
-        part: &'a Made,
+        list: &BenchmarkList,
+        part: &'a MadePart,
         demand: SumoDemand,
         work: PathBuf,
     ) -> anyhow::Result<Self> {
@@ -206,7 +155,7 @@ impl<'a> Simulation<'a> {
             "the part {} of {} expects SUMO {expected} \
              (`pip install eclipse-sumo=={expected}`), found \"{found}\"",
             part.file,
-            list.path.display()
+            list.path().display()
         );
         std::fs::create_dir_all(&work)
             .with_context(|| format!("cannot create the folder {}", work.display()))?;
@@ -296,19 +245,19 @@ mod tests {
     use super::*;
     use crate::machine::repository;
 
-    fn shipped(name: &str) -> List {
-        List::read(&repository().join(format!("datasets/benchmarks/{name}.toml"))).unwrap()
+    fn shipped(name: &str) -> BenchmarkList {
+        BenchmarkList::read(&repository().join(format!("datasets/benchmarks/{name}.toml"))).unwrap()
     }
 
     /// The first scenes of the parts that are `wanted` come out as the lists say.
-    fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&Made) -> bool) {
+    fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&MadePart) -> bool) {
         let folder = tempfile::tempdir().unwrap();
         let silent = Progress::begin(true, "", 0, "");
         let mut parts = 0;
         for name in ["synthetic-tune", "synthetic-test"] {
             let list = shipped(name);
             for part in list.made.iter().filter(|part| wanted(part)) {
-                let first = Made {
+                let first = MadePart {
                     count: n,
                     scenes: part.scenes[..n].to_vec(),
                     ..part.clone()
@@ -335,7 +284,7 @@ mod tests {
         }
         // One run of the smallest part, unless there is time for a run of each.
         let all = std::env::var_os("RUN_SLOW_TESTS").is_some();
-        let is_small = |part: &Made| {
+        let is_small = |part: &MadePart| {
             part.networks
                 .iter()
                 .any(|n| n.path.ends_with("i80.net.xml.gz"))
@@ -350,12 +299,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let silent = Progress::begin(true, "", 0, "");
         let list = shipped("synthetic-tune");
-        let part = Made {
+        let part = MadePart {
             count: 1,
             scenes: vec!["0123456789abcdef other".into()],
             ..list.made[0].clone()
         };
-        let error = |part: &Made| {
+        let error = |part: &MadePart| {
             format!(
                 "{:#}",
                 make(&list, part, folder.path(), &silent).unwrap_err()
@@ -364,7 +313,7 @@ mod tests {
         let told = error(&part);
         assert!(told.contains("expected scene 0 of procedural"), "{told}");
         assert!(told.contains("synthetic-tune.toml"), "{told}");
-        let unknown = Made {
+        let unknown = MadePart {
             generator: "procedural/99".into(),
             ..part
         };

@@ -19,8 +19,8 @@ const CONFINED: [(&str, &[&str], &str); 5] = [
     ),
     (
         "prost",
-        &["gump-proto", "gump-data", "gump-grpc", "xtask"],
-        "only messages, gump-data, planners in other processes and the driver know a layout of bytes",
+        &["gump-proto", "gump-data", "gump-grpc"],
+        "only messages, gump-data and planners in other processes know a layout of bytes",
     ),
     ("clap", &["xtask"], "only the driver reads a command line"),
     (

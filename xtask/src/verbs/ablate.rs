@@ -9,17 +9,18 @@ use std::num::NonZeroUsize;
 
 use gump_data::find;
 use gump_engine::Mode;
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
 use gump_metrics::{Part, summarize};
 use gump_scene::{Rollout, Scenario};
 use gump_viz::Picture;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-pub(crate) use self::decoding::Knob;
+pub(crate) use self::decoding::Sweep;
 use gump_eval::worlds::{World, WorldName};
 
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
 use crate::sampling::Draw;
@@ -99,7 +100,7 @@ impl Args {
             for (mode, i) in [("full-AR", 0), ("partial-AR", 1)] {
                 let (imagined, decoding) = (&pair[i], partial.name);
                 rows.push(row(mode, decoding, imagined, &parts[i]));
-                let digest = futures::digest(&imagined.rollouts);
+                let digest = digest::of_rollouts(&imagined.rollouts);
                 digests.push(json!({"mode": mode, "decoding": decoding, "digest": digest}));
             }
             pairs.push((pair, parts));

@@ -6,6 +6,7 @@ use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use gump_data::{find, submission};
+use gump_eval::digest;
 use gump_eval::worlds::{World, WorldName};
 use gump_metrics::{Part, Summary, summarize};
 use gump_scene::{Rollout, Scenario};
@@ -18,7 +19,7 @@ use crate::films::{self, FilmArgs};
 use crate::imagine::{Imagined, imagine};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
-use crate::{futures, tables, told};
+use crate::{annotations, futures, tables};
 
 /// The most futures of one run: they are held in memory until they are written.
 const MOST_FUTURES: usize = 65_536;
@@ -126,14 +127,14 @@ impl Args {
         })?;
         let mut viewer = Viewer::new(&scenario);
         run.phase("look closer", |run| {
-            told::realism(&mut viewer, &scenario, &imagined.rollouts);
+            annotations::realism(&mut viewer, &scenario, &imagined.rollouts);
             let n = self
                 .heat
                 .map_or(0, NonZeroUsize::get)
                 .min(self.futures.get());
             match n {
                 0 => Ok(()),
-                n => told::heat(run, &mut viewer, world, &scenario, n, &config),
+                n => annotations::heat(run, &mut viewer, world, &scenario, n, &config),
             }
         })?;
         run.phase("write", |run| {
@@ -200,7 +201,7 @@ impl Args {
         run.result("passes_per_frame", imagined.passes_per_frame)?;
         run.result("collision_rate", total.collision_rate())?;
         run.result("offroad_rate", total.offroad_rate())?;
-        run.result("digest", futures::digest(rollouts))?;
+        run.result("digest", digest::of_rollouts(rollouts))?;
         run.result("by_class", by_class(summary))
     }
 }

@@ -109,7 +109,7 @@ class Scores:
     per_agent: Optional[AgentRealism] = None
     """On request."""
     explanation: Optional[List[Blame]] = None
-    """Dearest first; on request."""
+    """Largest first; on request."""
 
     @property
     def buckets(self) -> Buckets:

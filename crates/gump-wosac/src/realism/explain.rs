@@ -7,7 +7,7 @@ use super::reference::Evaluation;
 
 /// The penalty of one agent in one component.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Blame {
+pub struct Attribution {
     /// The component.
     pub component: Component,
     /// The agent.
@@ -70,10 +70,13 @@ impl Evaluation<'_> {
         let mut steps = vec![Weighted::default(); n * n_steps];
         for (component, feature) in self.reference.config.components() {
             let weight = f64::from(feature.weight);
-            for blame in self.blames(component) {
-                let own = features.agents.iter().position(|id| *id == blame.agent);
+            for attribution in self.attributions(component) {
+                let own = features
+                    .agents
+                    .iter()
+                    .position(|id| *id == attribution.agent);
                 if let Some(agent) = own {
-                    whole[agent].add(blame.likelihood, weight);
+                    whole[agent].add(attribution.likelihood, weight);
                 }
             }
             if component.is_indication() {
@@ -99,25 +102,27 @@ impl Evaluation<'_> {
     }
 
     /// The penalty of each agent in each component, largest first; zero penalties are left out.
-    pub fn explain(&self) -> Vec<Blame> {
+    pub fn explain(&self) -> Vec<Attribution> {
         let config = self.reference.config;
-        let mut blames: Vec<Blame> = config
+        let mut attributions: Vec<Attribution> = config
             .components()
             .flat_map(|(component, feature)| {
                 let weight = f64::from(feature.weight);
-                self.blames(component).into_iter().map(move |blame| Blame {
-                    cost: blame.cost * weight,
-                    ..blame
-                })
+                self.attributions(component)
+                    .into_iter()
+                    .map(move |attribution| Attribution {
+                        cost: attribution.cost * weight,
+                        ..attribution
+                    })
             })
-            .filter(|blame| blame.cost > 0.0)
+            .filter(|attribution| attribution.cost > 0.0)
             .collect();
-        blames.sort_by(|a, b| b.cost.total_cmp(&a.cost));
-        blames
+        attributions.sort_by(|a, b| b.cost.total_cmp(&a.cost));
+        attributions
     }
 
     /// Costs in terms of the component's own likelihood.
-    fn blames(&self, component: Component) -> Vec<Blame> {
+    fn attributions(&self, component: Component) -> Vec<Attribution> {
         let features = self.reference.features();
         let found = &self.log_likelihoods[&component];
         let (n_steps, mask) = if component.is_indication() {
@@ -149,7 +154,7 @@ impl Evaluation<'_> {
                     let logged = features.values(component)[worst];
                     (Some(worst % n_steps), f64::from(logged), mean(imagined))
                 };
-                Some(Blame {
+                Some(Attribution {
                     component,
                     agent: features.agents[agent],
                     kind: features.kinds[agent],

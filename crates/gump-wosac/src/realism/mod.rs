@@ -44,7 +44,7 @@ mod scores;
 pub use config::{Algorithm, Component, Config, Estimator, FeatureConfig, Group, Mode, Year};
 pub use error::WosacError;
 pub use estimate::{Shape, log_likelihoods};
-pub use explain::{AgentRealism, Blame};
+pub use explain::{AgentRealism, Attribution};
 pub use features::Features;
 pub use input::{
     Log, N_FUTURE, N_HISTORY, N_STEPS, Rollouts, Signal, SignalLane, State, Track, Trajectory,

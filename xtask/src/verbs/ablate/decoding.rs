@@ -1,7 +1,7 @@
 //! `ablate temperature|decay|history|chunking|quantization`: how decoding changes realism, and what
 //! it costs.
 //!
-//! One knob at a time, under rules and without; scenes, seeds and weights stay. Realism is that of
+//! One setting at a time, under rules and without; scenes, seeds and weights stay. Realism is that of
 //! the Waymo Sim Agents Challenge, since displacements alone would reward timid futures.
 
 use std::num::NonZeroUsize;
@@ -10,6 +10,9 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_engine::{Mode, Precision, SamplingConfig, Surrogate};
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
+use gump_eval::realism::{RolloutSource, recordings};
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_scene::Seed;
@@ -19,12 +22,11 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
 use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Draw;
-use crate::verbs::evaluate::wosac::{Source, recordings};
-use crate::{futures, shipped};
+use crate::shipped;
+use crate::verbs::evaluate;
 
 /// Arguments of the ablations of decoding.
 #[derive(Debug, Serialize, clap::Args)]
@@ -46,14 +48,14 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What is turned.
+/// The setting that is varied.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Knob {
+pub(crate) enum Sweep {
     Temperature,
     Decay,
     History,
     Chunking,
-    Precision,
+    Quantization,
 }
 
 /// Frames of a rollout: 8 s, half a second apart.
@@ -67,10 +69,10 @@ pub(super) struct Cost {
     cpu: f64,
 }
 
-/// One setting of a knob: what the table calls it, its place on the axis, how to decode.
+/// A value of the setting: its name in the table, its place on the axis, how to decode.
 type Setting = (String, f64, Decoding);
 
-impl Knob {
+impl Sweep {
     /// What the horizontal axis says.
     fn label(self) -> &'static str {
         match self {
@@ -78,18 +80,18 @@ impl Knob {
             Self::Decay => "decay (0: no averaging)",
             Self::History => "frames of history, half a second apart",
             Self::Chunking => "what is made of the four poses of a chunk",
-            Self::Precision => "form of the weights",
+            Self::Quantization => "form of the weights",
         }
     }
 
     /// Whether its settings are numbers, and not ways.
     fn is_numeric(self) -> bool {
-        !matches!(self, Self::Chunking | Self::Precision)
+        !matches!(self, Self::Chunking | Self::Quantization)
     }
 
     fn settings(self, base: &Decoding) -> Vec<Setting> {
         let with = |value: f64, turn: &dyn Fn(&mut SamplingConfig)| {
-            (value.to_string(), value, base.turned(turn))
+            (value.to_string(), value, base.with(turn))
         };
         match self {
             Self::Temperature => [0.3, 0.5, 0.7, 0.9, 1.1, 1.3]
@@ -110,7 +112,7 @@ impl Knob {
                     ("chunks averaged", Surrogate::Chunk, average),
                 ];
                 let setting = |(i, (name, surrogate, decay)): (usize, (&str, _, _))| {
-                    let turned = base.turned(|config| {
+                    let turned = base.with(|config| {
                         config.surrogate = surrogate;
                         config.decay = decay;
                     });
@@ -118,14 +120,14 @@ impl Knob {
                 };
                 ways.into_iter().enumerate().map(setting).collect()
             }
-            Self::Precision => {
+            Self::Quantization => {
                 let forms = [
                     ("f32", Precision::F32),
                     ("bf16", Precision::Bf16),
                     ("int8", Precision::Int8),
                 ];
                 let setting = |(i, (name, precision)): (usize, (&str, _))| {
-                    let turned = base.turned(|config| config.precision = precision);
+                    let turned = base.with(|config| config.precision = precision);
                     (name.to_owned(), (i + 1) as f64, turned)
                 };
                 forms.into_iter().enumerate().map(setting).collect()
@@ -135,7 +137,7 @@ impl Knob {
 }
 
 impl Args {
-    pub(crate) fn execute(&self, run: &mut Run, knob: Knob) -> anyhow::Result<()> {
+    pub(crate) fn execute(&self, run: &mut Run, sweep: Sweep) -> anyhow::Result<()> {
         let world = self.world.clone().unwrap_or_else(shipped::sequence_world);
         if !matches!(world, WorldName::Model(_)) {
             let wrong = format!("--world: expected model:WEIGHTS, found {world}");
@@ -150,7 +152,7 @@ impl Args {
             let (mut first, mut curve) = (None, Series::default());
             curve.name = base.name.into();
             ways.clear();
-            for (name, at, decoding) in knob.settings(&base) {
+            for (name, at, decoding) in sweep.settings(&base) {
                 let phase = format!("{name}, {}", base.name);
                 let judged = run.phase(&phase, |run| {
                     let n = self.rollouts_per_scenario.get();
@@ -177,10 +179,10 @@ impl Args {
         run.result("rows", rows)?;
         run.result("digests", digests)?;
         let chart = Chart {
-            x_label: knob.label().into(),
+            x_label: sweep.label().into(),
             y_label: "realism (2025), mean and 95 % interval".into(),
             markers: true,
-            ways: if knob.is_numeric() { Vec::new() } else { ways },
+            ways: if sweep.is_numeric() { Vec::new() } else { ways },
             series: curves,
             ..Chart::default()
         };
@@ -237,7 +239,7 @@ pub(super) fn score(
     n: usize,
 ) -> anyhow::Result<Judged> {
     let config = Config::of(Year::Y2025);
-    let mut source = Source::world(world.clone(), decoding.clone(), n, run.seed());
+    let mut source = RolloutSource::world(world.clone(), decoding.clone(), n, run.seed());
     let progress = run.progress("evaluating", 0, "scenarios");
     let (mut scores, mut digests) = (Vec::new(), Vec::new());
     let (mut cost, mut frames) = (Cost::default(), 0.0);
@@ -246,7 +248,7 @@ pub(super) fn score(
         stop_if_interrupted()?;
         let recorded = recorded?;
         let (cpu, began) = (cpu_seconds(), Instant::now());
-        let found = source.rollouts(run, &recorded, config.mode)?;
+        let found = evaluate::wosac::rollouts(run, &mut source, &recorded, config.mode)?;
         let wall = began.elapsed().as_secs_f64();
         let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
         cost.cpu += cpu.map_or(wall, spent);
@@ -262,7 +264,7 @@ pub(super) fn score(
     Ok(Judged {
         scores,
         cost,
-        digest: futures::digest_of(digests.iter().map(String::as_str)),
+        digest: digest::of_digests(digests.iter().map(String::as_str)),
     })
 }
 
@@ -271,20 +273,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_knob_turns_nothing_else() {
+    fn a_sweep_changes_nothing_else() {
         let config = SamplingConfig {
             decay: 1.2,
             ..SamplingConfig::default()
         };
         let base = Decoding::of(config.clone());
-        let settings = Knob::Temperature.settings(&base);
+        let settings = Sweep::Temperature.settings(&base);
         assert!(settings.iter().any(|(_, at, _)| *at == 1.1));
         for (_, at, decoding) in settings {
             assert_eq!(decoding.sampling.temperature, Some(at));
-            let back = decoding.turned(|turned| turned.temperature = config.temperature);
+            let back = decoding.with(|turned| turned.temperature = config.temperature);
             assert_eq!(back, base);
         }
-        let chunking = Knob::Chunking.settings(&base);
+        let chunking = Sweep::Chunking.settings(&base);
         assert_eq!(chunking[2].2, base);
         assert_eq!(
             chunking[0].2.sampling.surrogate,

@@ -7,6 +7,8 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_engine::Mode;
+use gump_eval::datasets::{self, Part, Split};
+use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_model::checkpoint::Precision;
@@ -18,11 +20,10 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::decoding;
-use crate::dataset::{self, Part, Split, Training};
-use crate::decoding::Decoding;
 use crate::run::{Run, stop_if_interrupted};
 use crate::sampling::Draw;
 use crate::shipped;
+use crate::training_set::Training;
 
 /// How the laptop model is trained.
 pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
@@ -84,7 +85,7 @@ impl Lesson {
         let progress = run.progress("reading", 0, "scenarios");
         Ok(Class {
             lesson: self,
-            scenes: dataset::read(&[Part::whole(&held_out)], &progress)?,
+            scenes: datasets::read(&[Part::whole(&held_out)], &progress)?,
             decodings: self.draw.decodings(Mode::PartialAr)?,
             held_out,
         })
@@ -137,7 +138,10 @@ impl Class<'_> {
         weights: &Path,
     ) -> anyhow::Result<Learned> {
         let progress = run.progress("reading", 0, "scenarios");
-        let data = Training::open(&dataset::parts(&self.lesson.data, Split::Train)?, &progress)?;
+        let data = Training::open(
+            &datasets::parts(&self.lesson.data, Split::Train)?,
+            &progress,
+        )?;
         drop(progress);
         let steps = self.lesson.steps();
         config.steps = steps;

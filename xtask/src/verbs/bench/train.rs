@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::datasets::{self, Part};
 use gump_model::config::ModelConfig;
 use gump_train::{Batch, SampleConfig, TrainConfig, Trainer};
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::torch::{Timed, Torch};
-use crate::dataset::{self, Part};
 use crate::machine::{cpu_seconds, peak_rss_mb};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
@@ -188,7 +188,7 @@ impl Args {
         };
         let progress = run.progress("reading", 0, "scenarios");
         let file = [Part::whole(&shipped::data().join(SCENES))];
-        let scenes = dataset::read_first(2 * self.batch.get(), &file, &progress)?;
+        let scenes = datasets::read_first(2 * self.batch.get(), &file, &progress)?;
         Ok(Trainer::new(model.clone(), config, scenes, run.device())?)
     }
 

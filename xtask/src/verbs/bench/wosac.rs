@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
+use gump_eval::realism::recordings;
 use gump_scene::Seed;
 use gump_wosac::realism::{Config, Log, Mode, Rollouts, Year, score};
 use rand::Rng as _;
@@ -14,7 +15,6 @@ use serde_json::json;
 
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
-use crate::verbs::evaluate::wosac::recordings;
 
 /// Arguments of `bench wosac`.
 #[derive(Debug, Serialize, clap::Args)]

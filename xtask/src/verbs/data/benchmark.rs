@@ -5,11 +5,12 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
+use gump_eval::benchmarks::{BenchmarkList, MadePart, verify_made, verify_recorded};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::benchmark::{self, Draw, List, Rule};
-use crate::run::{Common, Run};
+use crate::benchmark::{self, Draw, Rule};
+use crate::run::{Common, Run, Unseen};
 
 /// Arguments of `data benchmark`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -46,7 +47,7 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let mut list = List::read(&self.list)?;
+        let mut list = BenchmarkList::read(&self.list)?;
         if let (Some(n), Some(into)) = (self.draw, &self.into) {
             return self.draw(run, &list, n.get(), into);
         }
@@ -54,7 +55,7 @@ impl Args {
         let folder = self.check.clone().unwrap_or_else(|| run.out().to_owned());
         for i in 0..list.made.len() {
             let part = &list.made[i];
-            let row = |part: &benchmark::Made, state: &str| {
+            let row = |part: &MadePart, state: &str| {
                 json!({
                     "part": part.file,
                     "split": part.split,
@@ -65,7 +66,7 @@ impl Args {
                 })
             };
             if self.check.is_some() {
-                run.phase("check", |_| benchmark::check(&list, part, &folder))?;
+                run.phase("check", |_| Ok(verify_made(&list, part, &folder, &Unseen)?))?;
                 rows.push(row(part, "as listed"));
                 continue;
             }
@@ -85,7 +86,9 @@ impl Args {
         }
         let data = self.data.clone().unwrap_or_else(benchmark::recorded_data);
         for part in &list.recorded {
-            let files = run.phase("check", |_| benchmark::check_recorded(&list, part, &data))?;
+            let files = run.phase("check", |_| {
+                Ok(verify_recorded(&list, part, &data, &Unseen)?)
+            })?;
             rows.push(json!({
                 "part": part.folder,
                 "split": part.split,
@@ -101,7 +104,13 @@ impl Args {
     }
 
     /// Writes a list that is drawn from this one; never over one that is there.
-    fn draw(&self, run: &mut Run, list: &List, n: usize, into: &Path) -> anyhow::Result<()> {
+    fn draw(
+        &self,
+        run: &mut Run,
+        list: &BenchmarkList,
+        n: usize,
+        into: &Path,
+    ) -> anyhow::Result<()> {
         anyhow::ensure!(
             !into.exists(),
             "expected a new file for the list, found {}: a published list never changes",
@@ -144,7 +153,7 @@ impl Args {
     }
 
     /// The list with its new sums under the comment that it begins with.
-    fn write(&self, list: &List) -> anyhow::Result<()> {
+    fn write(&self, list: &BenchmarkList) -> anyhow::Result<()> {
         let before = std::fs::read_to_string(&self.list)
             .with_context(|| format!("cannot read {}", self.list.display()))?;
         let comment = before.lines().take_while(|line| line.starts_with('#'));

@@ -5,12 +5,12 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
+use gump_eval::benchmarks::RESERVED_SEEDS;
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, RoadFamily, SumoDemand, SynthesisConfig};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::fresh::profile_of_name;
 use crate::run::{self, Common, Run};
@@ -265,7 +265,7 @@ impl Args {
 
 /// Error: [`WrongArguments`] for a seed of the frozen sets.
 fn check_seed(seed: Seed) -> anyhow::Result<()> {
-    let reserved = benchmark::RESERVED;
+    let reserved = RESERVED_SEEDS;
     if !reserved.contains(&seed.0) {
         return Ok(());
     }

@@ -1,6 +1,7 @@
 //! Futures in every world, their metrics, and a plan.
 
 use anyhow::Context as _;
+use gump_eval::decoding::Decoding;
 use gump_eval::recordings;
 use gump_eval::worlds::{World, WorldName};
 use gump_metrics::summarize;
@@ -12,7 +13,6 @@ use gump_wosac::realism::{Config, Log, Rollouts, Year, score};
 use serde_json::{Value, json};
 
 use super::Demo;
-use crate::decoding::Decoding;
 use crate::imagine::imagine;
 use crate::run::Run;
 use crate::table::decimal;

@@ -1,12 +1,12 @@
 //! What the network is, and a few steps of learning.
 
+use gump_eval::datasets::{self, Split};
 use gump_model::{Device, checkpoint};
 use gump_train::{TrainConfig, Trainer};
 use gump_viz::{Chart, Series};
 use serde_json::{Value, json};
 
 use super::Demo;
-use crate::dataset::{self, Split};
 use crate::run::{Run, stop_if_interrupted};
 use crate::shipped;
 
@@ -55,7 +55,10 @@ pub(super) fn network(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
 
 pub(super) fn train(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     let progress = run.progress("training", STEPS as u64, "steps");
-    let read = |split| dataset::read(&dataset::parts(&shipped::data(), split)?, &progress);
+    let read = |split| -> anyhow::Result<_> {
+        let parts = datasets::parts(&shipped::data(), split)?;
+        Ok(datasets::read(&parts, &progress)?)
+    };
     let (scenarios, validation) = (read(Split::Train)?, read(Split::Tune)?);
     drop(progress);
     let shipped = checkpoint::load(&shipped::weights(), &Device::Cpu)?;

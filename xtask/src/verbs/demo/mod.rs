@@ -11,15 +11,15 @@ mod make;
 
 use gump_data::find;
 use gump_engine::SamplingConfig;
+use gump_eval::decoding::Decoding;
 use gump_eval::worlds::World;
 use gump_scene::{Rollout, Scenario};
 use gump_viz::{CandidatePath, Page, Viewer};
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::decoding::Decoding;
 use crate::run::{Common, Run};
-use crate::{machine, shipped, told};
+use crate::{annotations, machine, shipped};
 
 /// Arguments of `demo`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -124,7 +124,7 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
             demo.futures.len()
         ))
         .futures(&demo.futures);
-    told::realism(&mut viewer, &demo.scenario, &demo.futures);
+    annotations::realism(&mut viewer, &demo.scenario, &demo.futures);
     let world = World::build(
         run.device(),
         &shipped::world(),
@@ -132,7 +132,7 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
         &demo.sampling,
     )?;
     let config = Decoding::of(demo.sampling.clone()).frames(imagine::SECONDS);
-    told::heat(run, &mut viewer, world, &demo.scenario, 1, &config)?;
+    annotations::heat(run, &mut viewer, world, &demo.scenario, 1, &config)?;
     for candidate in &demo.candidates {
         viewer.candidate(candidate.clone());
     }

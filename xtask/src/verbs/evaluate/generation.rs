@@ -9,6 +9,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use gump_engine::SamplingConfig;
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
+use gump_eval::datasets::{self, Split};
 use gump_eval::worlds::{self, World};
 use gump_generate::Placement;
 use gump_generate::baseline::{overlapping_vehicles, wrong_way};
@@ -24,18 +26,16 @@ use serde_json::{Value, json};
 
 use super::sources::{Case, Makers, Source};
 use super::{long, prompts};
-use crate::benchmark::{Found, Scenes};
-use crate::dataset::{self, Split};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::verbs::generate;
-use crate::{charts, shipped};
+use crate::{benchmark, charts, shipped};
 
 /// Arguments of `evaluate generation`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// Further scenes per scenario, each around another vehicle at another time
     #[arg(long, value_name = "N", default_value_t = 0)]
     centres: usize,
@@ -97,8 +97,8 @@ impl Args {
             ..MmdProtocol::gump()
         };
         let seed = run.seed();
-        let found = run.phase("find", |_| self.scenarios.find())?;
-        run.result("set", &found.set)?;
+        let found = benchmark::find(run, &self.scenarios)?;
+        run.result("set", &found.name)?;
         let scenarios = run.phase("read", |_| read(&found, self.limit, &protocol))?;
         let bank = run.phase("bank", |_| self.bank(&protocol))?;
         anyhow::ensure!(
@@ -166,19 +166,19 @@ impl Args {
     /// The recordings that are retrieved.
     fn bank(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
         if let Some(path) = &self.bank {
-            return read(&Found::path(path), None, protocol);
+            return read(&ScenarioSet::of_path(path), None, protocol);
         }
-        let parts = dataset::parts(&shipped::data(), Split::Train)?;
+        let parts = datasets::parts(&shipped::data(), Split::Train)?;
         let parts = parts
             .iter()
-            .map(|part| read(&Found::path(&part.path), None, protocol));
+            .map(|part| read(&ScenarioSet::of_path(&part.path), None, protocol));
         Ok(parts.collect::<anyhow::Result<Vec<_>>>()?.concat())
     }
 }
 
 /// The scenarios that take part.
 fn read(
-    found: &Found,
+    found: &ScenarioSet,
     limit: Option<usize>,
     protocol: &MmdProtocol,
 ) -> anyhow::Result<Vec<Scenario>> {

@@ -2,6 +2,7 @@
 
 use std::num::NonZeroUsize;
 
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::planners::{PlannerName, PlanningWorld};
 use gump_eval::recordings;
 use gump_eval::recordings::{Case, Named};
@@ -14,12 +15,11 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
-use crate::benchmark::{Found, Scenes};
-use crate::charts;
 use crate::cli::WrongArguments;
 use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
+use crate::{benchmark, charts};
 
 /// Seconds that plans are compared over.
 const HORIZON: f64 = 8.0;
@@ -29,7 +29,7 @@ const HORIZON: f64 = 8.0;
 pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// Planners to evaluate, comma-separated, one row each
     #[arg(long, value_parser = PlannerParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
@@ -69,8 +69,8 @@ impl Args {
                 &self.thinking.sampling(&sampling),
             )?)
         })?;
-        let found = run.phase("find", |_| self.scenarios.find())?;
-        run.result("set", &found.set)?;
+        let found = benchmark::find(run, &self.scenarios)?;
+        run.result("set", &found.name)?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
         for &planner in &self.planner {
             let outcomes =
@@ -95,7 +95,7 @@ impl Args {
     fn plan(
         &self,
         run: &Run,
-        found: &Found,
+        found: &ScenarioSet,
         planner: PlannerName,
         surroundings: &PlanningWorld,
     ) -> anyhow::Result<Vec<Outcome>> {

@@ -1,10 +1,10 @@
 //! Worlds and how they decode: a learned one as it is used and without its rules.
 
+use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
 use serde::{Deserialize, Serialize};
 
 use crate::charts;
-use crate::decoding::Decoding;
 use crate::sampling::Sampling;
 
 /// A world and how it decodes, as ledgers name it.
@@ -51,10 +51,7 @@ pub(super) fn ways(worlds: &[WorldName], sampling: &Sampling) -> anyhow::Result<
 impl Way {
     /// How many futures are imagined where `n` are asked for: worlds without chance have one.
     pub(super) fn futures(&self, n: usize) -> usize {
-        match self.world {
-            WorldName::Log | WorldName::ConstantVelocity => 1,
-            WorldName::Idm | WorldName::Model(_) => n,
-        }
+        self.world.distinct_futures(n)
     }
 
     pub(super) fn named(&self) -> Named {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::datasets::Split;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
@@ -15,7 +16,6 @@ use sha2::{Digest as _, Sha256};
 use super::columns::{DriveRecord, Driven, Policy, Tested, tell};
 use super::{Notes, RlWorld, Settings, courses, read};
 use crate::cli::WrongArguments;
-use crate::dataset::Split;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;

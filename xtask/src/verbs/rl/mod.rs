@@ -14,6 +14,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use gump_engine::SamplingConfig;
+use gump_eval::datasets::{self, Part, Split};
 use gump_eval::worlds::{World, WorldName};
 use gump_model::Device;
 use gump_rl::networks::Architecture;
@@ -24,7 +25,6 @@ use toml::Table;
 
 use crate::cli::WrongArguments;
 use crate::config;
-use crate::dataset::{self, Part, Split};
 use crate::run::Run;
 
 /// Seconds that an action is held: a frame of the world model, as in the paper.
@@ -128,11 +128,11 @@ fn courses(
     limit: Option<usize>,
 ) -> anyhow::Result<Arc<[Course]>> {
     let progress = run.progress("reading", 0, "scenarios");
-    let parts = match dataset::Manifest::of(path)? {
-        Some(_) => dataset::parts(path, split)?,
+    let parts = match datasets::Manifest::of(path)? {
+        Some(_) => datasets::parts(path, split)?,
         None => vec![Part::whole(path)],
     };
-    let mut scenarios = dataset::read(&parts, &progress)?;
+    let mut scenarios = datasets::read(&parts, &progress)?;
     scenarios.truncate(limit.unwrap_or(usize::MAX));
     anyhow::ensure!(!scenarios.is_empty(), "no scenario in {}", path.display());
     Ok(Course::prepare(scenarios, STEP)?)

@@ -6,13 +6,13 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use gump_engine::SamplingConfig;
+use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
 use gump_rl::server::{Event, Server};
 use gump_rl::{Course, EnvConfig, Sampling, Traffic};
 use serde::Serialize;
 
 use super::{RlWorld, courses};
-use crate::dataset::Split;
 use crate::run::{Common, Run, interrupted};
 
 /// Arguments of `rl serve`.

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gump_eval::datasets::Split;
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_scene::Seed;
@@ -11,7 +12,6 @@ use super::evaluate::{Candidate, Test, load};
 use super::train::{AlgorithmName, Job};
 use super::{RlWorld, Settings, courses};
 use crate::cli::WrongArguments;
-use crate::dataset::Split;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
 use gump_rl::sac::{Algorithm, Training};
 use gump_rl::{Course, DrivingEnv, demonstrations};
@@ -15,7 +16,6 @@ use serde::Serialize;
 use super::curves::Curves;
 use super::{Notes, RlWorld, Settings, courses, read, write};
 use crate::cli::WrongArguments;
-use crate::dataset::Split;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
 

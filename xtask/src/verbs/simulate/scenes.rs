@@ -4,6 +4,8 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
 use gump_eval::worlds::World;
 use gump_metrics::{Part, Summary, summarize};
 use gump_rollout::SimulateConfig;
@@ -12,11 +14,10 @@ use gump_viz::{Gallery, Viewer};
 use serde::Serialize;
 
 use super::{Args, by_class};
+use crate::annotations;
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
 use crate::imagine::{Imagined, imagine};
 use crate::run::Run;
-use crate::{futures, told};
 
 /// A scene in the report.
 #[derive(Serialize)]
@@ -102,10 +103,10 @@ fn add(
     let mut viewer = Viewer::new(scenario);
     viewer.note(note(args, &summary.total()));
     viewer.futures(&imagined.rollouts);
-    told::realism(&mut viewer, scenario, &imagined.rollouts);
+    annotations::realism(&mut viewer, scenario, &imagined.rollouts);
     if let Some(n) = args.heat {
         let n = n.min(args.futures).get();
-        told::heat(run, &mut viewer, world, scenario, n, config)?;
+        annotations::heat(run, &mut viewer, world, scenario, n, config)?;
     }
     gallery.add(&viewer);
     Ok((imagined, summary))
@@ -136,7 +137,7 @@ impl Total {
             agents: scenario.present().now().agents().len(),
             collision_rate: part.collision_rate(),
             offroad_rate: part.offroad_rate(),
-            digest: futures::digest(&imagined.rollouts),
+            digest: digest::of_rollouts(&imagined.rollouts),
         });
         self.summary.merge(summary);
         self.steps = self
@@ -163,7 +164,7 @@ impl Total {
         run.result("collision_rate", total.collision_rate())?;
         run.result("offroad_rate", total.offroad_rate())?;
         let digests = self.rows.iter().map(|row| row.digest.as_str());
-        run.result("digest", futures::digest_of(digests))?;
+        run.result("digest", digest::of_digests(digests))?;
         run.result("rows", &self.rows)?;
         // A part counts its agents once in each future.
         let by_class = by_class(&Summary {

@@ -7,13 +7,13 @@ use gump_data::submission::{
     metadata_problems, read_rollouts, rollouts_to_proto,
 };
 use gump_data::{ReadOptions, open_with};
+use gump_eval::digest;
 use gump_eval::rollout_files;
 use gump_eval::worlds::{WorldName, Worlds};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType};
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
-use crate::futures;
 use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
@@ -167,7 +167,7 @@ impl Args {
         if let Some(world) = &self.source.world {
             run.result("decoding", self.sampling.decoding(world)?.name)?;
             let digests = packer.digests.iter().map(String::as_str);
-            run.result("digest", futures::digest_of(digests))?;
+            run.result("digest", digest::of_digests(digests))?;
         }
         packer.check.finish(&expected);
         if packer.check.n_problems > 0 {
@@ -210,7 +210,7 @@ impl Args {
                 let config = decoding.frames(N_STEPS as f64 * scenario.dt);
                 let world = worlds.of(&scenario)?;
                 let imagined = imagine(run, world, &scenario, N_FUTURES, &config, seed)?;
-                packer.digests.push(futures::digest(&imagined.rollouts));
+                packer.digests.push(digest::of_rollouts(&imagined.rollouts));
                 let (rollouts, _) = rollouts_to_proto(&scenario.id, &imagined.rollouts)?;
                 packer.add(&rollouts)?;
             }

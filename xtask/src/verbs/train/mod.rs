@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_eval::datasets::{self, Part, Split};
 use gump_kernels::Choice;
 use gump_model::checkpoint::Precision;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
@@ -22,11 +23,11 @@ use self::realism::Judge;
 use self::stages::{Files, Stage};
 use crate::benchmark;
 use crate::cli::WrongArguments;
-use crate::dataset::{self, Part, Split, Training};
 use crate::fresh::Stream;
 use crate::losses::Losses;
 use crate::peers::{Processes, together};
 use crate::run::{self, Common, Run};
+use crate::training_set::{self, Training};
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
@@ -286,7 +287,7 @@ impl Args {
         let mut training = Vec::with_capacity(data.len());
         let mut validation = Vec::new();
         for named in data {
-            let (path, share) = dataset::with_share(named);
+            let (path, share) = training_set::with_share(named);
             let (source, held_out) = match Stream::of_name(&path)? {
                 Some(stream) => {
                     let held_out = match &self.validation {
@@ -297,13 +298,13 @@ impl Args {
                     (Training::fresh(stream, of_batch), held_out)
                 }
                 None => {
-                    let source = Training::open(&dataset::parts(&path, Split::Train)?, &progress)?;
+                    let source = Training::open(&datasets::parts(&path, Split::Train)?, &progress)?;
                     let held_out = match &self.validation {
                         Some(_) => Vec::new(),
-                        None => dataset::parts(&path, Split::Tune)?,
+                        None => datasets::parts(&path, Split::Tune)?,
                     };
                     let most = VALIDATION_SAMPLES / data.len();
-                    (source, dataset::read_first(most, &held_out, &progress)?)
+                    (source, datasets::read_first(most, &held_out, &progress)?)
                 }
             };
             warn_of_frozen(run, &source)?;
@@ -312,7 +313,7 @@ impl Args {
         }
         if let Some(path) = &self.validation {
             let whole = [Part::whole(path)];
-            validation = dataset::read_first(VALIDATION_SAMPLES, &whole, &progress)?;
+            validation = datasets::read_first(VALIDATION_SAMPLES, &whole, &progress)?;
         }
         Ok((Training::mixed(training), validation))
     }

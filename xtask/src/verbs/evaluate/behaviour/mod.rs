@@ -10,6 +10,7 @@ use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::{WorldName, Worlds};
@@ -17,7 +18,7 @@ use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
 use serde::{Deserialize, Serialize};
 
 use super::ways::{Named, Way, ways};
-use crate::benchmark::{Found, Scenes};
+use crate::benchmark;
 use crate::imagine::imagine;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
@@ -35,7 +36,7 @@ const HORIZONS: [u32; 3] = [8, 30, 60];
 pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// log, idm, constant-velocity or model:WEIGHTS; comma-separated
     #[arg(long, value_name = "W", required = true, num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
@@ -145,7 +146,7 @@ impl Cells {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let ways = ways(&self.world, &self.sampling)?;
-        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios, &ways)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
@@ -199,7 +200,7 @@ impl Args {
             !entries.is_empty(),
             "expected scenarios in shard {}, found none: {}",
             self.shard,
-            scenarios.set
+            scenarios.name
         );
         tell::tell(run, &settings, &entries)
     }
@@ -212,9 +213,14 @@ impl Args {
         }
     }
 
-    fn settings(&self, run: &Run, scenarios: &Found, ways: &[Way]) -> anyhow::Result<Settings> {
+    fn settings(
+        &self,
+        run: &Run,
+        scenarios: &ScenarioSet,
+        ways: &[Way],
+    ) -> anyhow::Result<Settings> {
         Ok(Settings {
-            scenarios: scenarios.set.clone(),
+            scenarios: scenarios.name.clone(),
             seconds: self.seconds,
             futures: self.futures.get(),
             limit: self.limit.map(NonZeroUsize::get),

@@ -12,6 +12,7 @@ use std::num::NonZeroUsize;
 use std::sync::Mutex;
 use std::time::Duration;
 
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::planners::PlanningWorld;
 use gump_eval::recordings;
 use gump_eval::results::{Entry, Header, ResultStore};
@@ -21,7 +22,7 @@ use gump_nuplan::closed_loop::{DriveConfig, Tracking};
 use gump_planner::closed_loop::evaluate;
 use serde::{Deserialize, Serialize};
 
-use crate::benchmark::{Found, Scenes};
+use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::planners::{Chosen, ChosenParser, ImaginationArgs};
 use crate::run::{Common, Run, interrupted, stop_if_interrupted};
@@ -38,7 +39,7 @@ pub(crate) const BENCHMARK: &str = "closed-loop";
 pub(crate) struct Args {
     /// A file or folder of scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// Planners to evaluate, comma-separated, one row each
     #[arg(long, value_parser = ChosenParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<Chosen>,
@@ -191,7 +192,7 @@ impl Args {
         self.planner.iter().try_for_each(Chosen::check)?;
         let thinking = self.thinking.config()?;
         let sampling = self.sampling.resolve()?;
-        let found = run.phase("find", |_| self.scenarios.find())?;
+        let found = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &found)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
@@ -237,7 +238,7 @@ impl Args {
     fn drive(
         &self,
         run: &Run,
-        found: &Found,
+        found: &ScenarioSet,
         drives: &drive::Drives<'_>,
         ledger: ResultStore<Driven>,
     ) -> anyhow::Result<Vec<Entry<Driven>>> {
@@ -284,9 +285,9 @@ impl Args {
         named.unwrap_or(&WorldName::Idm)
     }
 
-    fn settings(&self, run: &Run, found: &Found) -> anyhow::Result<Settings> {
+    fn settings(&self, run: &Run, found: &ScenarioSet) -> anyhow::Result<Settings> {
         Ok(Settings {
-            scenarios: found.set.clone(),
+            scenarios: found.name.clone(),
             limit: self.limit.map(NonZeroUsize::get),
             worlds: self.world.iter().map(ToString::to_string).collect(),
             planners: self.planner.iter().map(ToString::to_string).collect(),

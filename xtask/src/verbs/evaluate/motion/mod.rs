@@ -2,34 +2,28 @@
 //! file or of a world's futures.
 
 mod scores;
-mod source;
 mod tell;
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use gump_data::ReadOptions;
-use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_eval::EvalError;
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
+use gump_eval::motion::PredictionSource;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
-use gump_eval::worlds::{WorldName, Worlds};
-use gump_model::{Device, checkpoint, relative};
-use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
+use gump_eval::worlds::WorldName;
 use gump_wosac::motion::{
-    MotionConfig, MotionError, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
-    forecast,
+    MotionConfig, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
 };
 use serde::{Deserialize, Serialize};
 
 use self::scores::Scores;
-use self::source::Predictions;
 use super::left_out::LeftOut;
-use crate::benchmark::{Found, Scenes};
+use crate::benchmark;
 use crate::cli::WrongArguments;
-use crate::decoding::Decoding;
-use crate::futures;
-use crate::imagine::imagine;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
@@ -63,7 +57,7 @@ const OF_FUTURES: [&str; 15] = [
 pub(crate) struct Args {
     /// Scenarios with their futures: a file, a folder, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     #[command(flatten)]
     #[serde(flatten)]
     source: Source,
@@ -126,9 +120,9 @@ impl Shapes {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let config = self.shapes.config();
-        let mut forecaster = run.phase("load", |run| self.forecaster(run.device()))?;
-        let scenarios = run.phase("find", |_| self.scenarios.find())?;
-        let header = self.header(run, &scenarios, forecaster.decoding())?;
+        let mut source = run.phase("load", |run| self.predictions(run))?;
+        let scenarios = benchmark::find(run, &self.scenarios)?;
+        let header = self.header(run, &scenarios, source.decoding())?;
         let mut ledger = ResultStore::open(run.out(), &header)?;
         let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
         let progress = run.progress("measuring", 0, "scenarios");
@@ -140,14 +134,17 @@ impl Args {
             if !self.shard.holds(index) || ledger.has(index) {
                 continue;
             }
-            let absent = forecaster.drop_absent(&mut scenario);
+            let absent = source.drop_absent(&mut scenario);
             let predictions = run.phase("predict", |run| {
-                forecaster.predict(run, &scenario, &config, index)
+                let frames = source.frames(&scenario, &config);
+                let progress = run.simulating(frames);
+                Ok(source.predict(&scenario, index, &config, &progress)?)
             });
-            let scores = predictions.and_then(|(predictions, digest)| {
+            let scores = predictions.and_then(|predicted| {
                 run.phase("score", |_| {
-                    let scores = evaluate_predictions(&scenario, &predictions, &config)?;
-                    Ok((scores, digest))
+                    let predictions = &predicted.predictions;
+                    let scores = evaluate_predictions(&scenario, predictions, &config);
+                    Ok((scores.map_err(EvalError::from)?, predicted.digest))
                 })
             });
             let scores: Option<(Vec<PredictionScore>, Option<String>)> =
@@ -161,19 +158,13 @@ impl Args {
             progress.advance(1);
         }
         drop(progress);
-        forecaster.check_all_used(&ids)?;
+        source.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(
-            run,
-            &scenarios.set,
-            &entries,
-            &config,
-            forecaster.decoding(),
-        )
+        tell::tell(run, &scenarios.name, &entries, &config, source.decoding())
     }
 
-    fn open(&self, scenarios: &Found) -> anyhow::Result<gump_data::Reader> {
+    fn open(&self, scenarios: &ScenarioSet) -> anyhow::Result<gump_data::Reader> {
         // Only worlds look at the map.
         let options = match self.source.world {
             Some(_) => ReadOptions::ALL,
@@ -182,33 +173,34 @@ impl Args {
         Ok(scenarios.open(options)?)
     }
 
-    fn forecaster(&self, device: &Device) -> anyhow::Result<Forecaster<'_>> {
+    fn predictions(&self, run: &Run) -> anyhow::Result<PredictionSource<'_>> {
         Ok(match (&self.source.rollouts, &self.source.world) {
-            (Some(path), _) => Forecaster::File(Predictions::read(path)?, path),
+            (Some(path), _) => PredictionSource::files(path)?,
+            (None, Some(WorldName::Model(path))) if self.heads => {
+                match PredictionSource::heads(path, run.device()) {
+                    Err(EvalError::Argument(why)) => {
+                        return Err(WrongArguments(format!("--heads: {why}")).into());
+                    }
+                    heads => heads?,
+                }
+            }
             (None, Some(name)) if self.heads => {
-                let WorldName::Model(path) = name else {
-                    let wrong = format!("--heads: expected --world model:WEIGHTS, found {name}");
-                    return Err(WrongArguments(wrong).into());
-                };
-                Forecaster::heads(path, device)?
+                let wrong = format!("--heads: expected --world model:WEIGHTS, found {name}");
+                return Err(WrongArguments(wrong).into());
             }
             (None, Some(name)) => {
-                let decoding = self.sampling.decoding(name)?;
-                Forecaster::World {
-                    worlds: Box::new(Worlds::new(device, name, decoding.sampling.clone())),
-                    n_futures: self.futures.get(),
-                    decoding,
-                }
+                let (decoding, n) = (self.sampling.decoding(name)?, self.futures.get());
+                PredictionSource::world(run.device(), name, decoding, n, run.seed())
             }
             (None, None) => anyhow::bail!("expected --rollouts or --world"),
         })
     }
 
     /// Everything that the scores of a scenario depend on.
-    fn header(&self, run: &Run, scenarios: &Found, decoding: &str) -> anyhow::Result<Header> {
+    fn header(&self, run: &Run, scenarios: &ScenarioSet, decoding: &str) -> anyhow::Result<Header> {
         let mut settings = toml::Table::new();
         let mut set = |key: &str, value: toml::Value| settings.insert(key.into(), value);
-        set("scenarios", scenarios.set.clone().into());
+        set("scenarios", scenarios.name.clone().into());
         set("shapes", toml::Value::try_from(self.shapes)?);
         set("decoding", decoding.into());
         set("seed", i64::try_from(run.seed().0)?.into());
@@ -231,152 +223,11 @@ impl Args {
 
 /// True if the recording does not reach as far as the benchmark looks, or not in its steps.
 fn is_of_another_length(error: &anyhow::Error) -> bool {
-    let found = error.downcast_ref::<MotionError>();
-    matches!(
-        found.map(|error| &error.problem),
-        Some(MotionProblem::ShortLog { .. } | MotionProblem::TimeStep { .. })
-    )
-}
-
-/// Where predictions come from.
-enum Forecaster<'a> {
-    /// A file.
-    File(Predictions, &'a Path),
-    /// The trajectory heads of a network.
-    Heads(Box<TransformerWorld>),
-    /// Futures of a world.
-    World {
-        worlds: Box<Worlds<'a>>,
-        n_futures: usize,
-        decoding: Decoding,
-    },
-}
-
-impl Forecaster<'_> {
-    /// Error: [`WrongArguments`] for a network without heads, weights that cannot be read.
-    fn heads(path: &Path, device: &Device) -> anyhow::Result<Self> {
-        let without = |what: &str| {
-            let wrong = format!(
-                "--heads: expected a sequence network with trajectory heads, found {what}: {}",
-                path.display()
-            );
-            WrongArguments(wrong)
-        };
-        if relative::is_relative(path)? {
-            return Err(without("a relative network").into());
-        }
-        let network = checkpoint::load(path, device)?;
-        if network.trajectory_heads.is_empty() {
-            return Err(without("one without").into());
-        }
-        let world = TransformerWorld::plain(network, SamplingConfig::default());
-        Ok(Self::Heads(Box::new(world)))
-    }
-
-    /// Leaves out targets that nobody can imagine because they are absent now; how many.
-    ///
-    /// A file is held to all targets, as the challenge holds it.
-    fn drop_absent(&self, scenario: &mut Scenario) -> usize {
-        let before = scenario.targets.len();
-        if !matches!(self, Self::File(..)) {
-            let now = &scenario.log[scenario.now];
-            scenario.targets.retain(|&id| now.agent(id).is_some());
-        }
-        before - scenario.targets.len()
-    }
-
-    /// How its futures are made; a file does not tell.
-    fn decoding(&self) -> &'static str {
-        match self {
-            Self::File(..) | Self::Heads(_) => Decoding::NONE,
-            Self::World { decoding, .. } => decoding.name,
-        }
-    }
-
-    /// Predictions, and the digest of what they come from: futures, or the heads' predictions.
-    fn predict(
-        &mut self,
-        run: &Run,
-        scenario: &Scenario,
-        config: &MotionConfig,
-        index: usize,
-    ) -> anyhow::Result<(Vec<Prediction>, Option<String>)> {
-        match self {
-            Self::File(predictions, path) => Ok((predictions.of(scenario, config, path)?, None)),
-            Self::Heads(world) => {
-                let predictions = by_heads(world, scenario, config)?;
-                let digest = futures::digest_of_predictions(&predictions);
-                Ok((predictions, Some(digest)))
-            }
-            Self::World { .. } if scenario.targets.is_empty() => Ok((Vec::new(), None)),
-            Self::World {
-                worlds,
-                n_futures,
-                decoding,
-            } => {
-                let frames = decoding.frames(config.n_steps as f64 * config.step_seconds);
-                let seed = run.seed().fork(index as u64);
-                let world = worlds.of(scenario)?;
-                let imagined = imagine(run, world, scenario, *n_futures, &frames, seed)?;
-                let digest = futures::digest(&imagined.rollouts);
-                let predictions = forecast(scenario, &imagined.rollouts, config)?;
-                Ok((predictions, Some(digest)))
-            }
-        }
-    }
-
-    /// Refuses predictions of scenarios that are not there.
-    fn check_all_used(&self, ids: &BTreeSet<String>) -> anyhow::Result<()> {
-        match self {
-            Self::File(predictions, path) => predictions.check_all_known(ids, path),
-            Self::Heads(_) | Self::World { .. } => Ok(()),
-        }
-    }
-}
-
-/// The heads' predictions of every target. Targets outside the network's window keep their velocity.
-fn by_heads(
-    world: &TransformerWorld,
-    scenario: &Scenario,
-    config: &MotionConfig,
-) -> anyhow::Result<Vec<Prediction>> {
-    // The route is derived from where the ego drives later.
-    let present = scenario.present().unguided();
-    let predicted = world.predict_trajectories(present)?;
-    let of = |&agent: &AgentId| {
-        let own = predicted.iter().find(|found| found.agent == agent);
-        let modes = match own {
-            Some(own) => own
-                .modes
-                .iter()
-                .map(|mode| PredictedMode {
-                    confidence: mode.probability,
-                    paths: vec![
-                        mode.positions
-                            .iter()
-                            .take(config.n_steps)
-                            .copied()
-                            .collect(),
-                    ],
-                })
-                .collect(),
-            None => {
-                let now = present.now().agent(agent).map(|agent| agent.state);
-                let state = now.unwrap_or_default();
-                let place = |step: usize| {
-                    let seconds = (step + 1) as f64 * config.step_seconds;
-                    state.pose.position + state.velocity * seconds
-                };
-                vec![PredictedMode {
-                    confidence: 1.0,
-                    paths: vec![(0..config.n_steps).map(place).collect()],
-                }]
-            }
-        };
-        Prediction {
-            agents: vec![agent],
-            modes,
-        }
+    let Some(EvalError::Motion(error)) = error.downcast_ref().map(EvalError::cause) else {
+        return false;
     };
-    Ok(scenario.targets.iter().map(of).collect())
+    matches!(
+        error.problem,
+        MotionProblem::ShortLog { .. } | MotionProblem::TimeStep { .. }
+    )
 }

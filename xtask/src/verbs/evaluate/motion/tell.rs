@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
@@ -13,9 +15,8 @@ use serde_json::{Map, Value, json};
 
 use super::scores::Scores;
 use super::{NAME, Shapes};
-use crate::decoding::Decoding;
+use crate::charts;
 use crate::run::Run;
-use crate::{charts, futures};
 
 /// Draws of scenarios for an interval; its ends move by a tenth of its width with the seed.
 const DRAWS: usize = 200;
@@ -58,7 +59,7 @@ pub(super) fn tell(
     run.result("predictions", rows.last().map_or(0, |row| row.predictions))?;
     run.result("targets_absent_now", absent)?;
     let digests = entries.iter().filter_map(|e| e.scores.digest.as_deref());
-    run.result("digest", futures::digest_of(digests))?;
+    run.result("digest", digest::of_digests(digests))?;
     let table: Vec<Value> = rows.iter().map(|row| Value::Object(line(row))).collect();
     let intervals = interval_lines(&rows, &spans);
     for (stem, label, columns) in CHARTS {

@@ -11,6 +11,7 @@ use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use gump_data::ReadOptions;
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::{WorldName, Worlds};
@@ -20,12 +21,11 @@ use gump_scene::{Scenario, Seed};
 use serde::Serialize;
 
 use super::ways::{Way, ways};
-use crate::benchmark::{Found, Scenes};
 use crate::imagine::imagine_around;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
-use crate::shipped;
+use crate::{benchmark, shipped};
 use cells::{Scored, Seen, Settings, Tried};
 pub(crate) use tell::tell_merged;
 
@@ -37,7 +37,7 @@ pub(crate) const BENCHMARK: &str = "reactions";
 pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// log, idm, constant-velocity or model:WEIGHTS; comma-separated
     #[arg(long, value_name = "W", default_values_t = worlds(), num_args = 1.., value_delimiter = ',')]
     world: Vec<WorldName>,
@@ -83,7 +83,7 @@ fn manoeuvre(name: &str) -> Result<&'static str, String> {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let ways = ways(&self.world, &self.sampling)?;
-        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios, &ways)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
@@ -123,7 +123,7 @@ impl Args {
             !entries.is_empty(),
             "expected scenarios in shard {}, found none: {}",
             self.shard,
-            scenarios.set
+            scenarios.name
         );
         if self.shard == Shard::WHOLE {
             tell::any_scored(&entries)?;
@@ -188,9 +188,14 @@ impl Args {
         Ok(Seen::of(attempt, &imagined.rollouts))
     }
 
-    fn settings(&self, run: &Run, scenarios: &Found, ways: &[Way]) -> anyhow::Result<Settings> {
+    fn settings(
+        &self,
+        run: &Run,
+        scenarios: &ScenarioSet,
+        ways: &[Way],
+    ) -> anyhow::Result<Settings> {
         Ok(Settings {
-            scenarios: scenarios.set.clone(),
+            scenarios: scenarios.name.clone(),
             manoeuvres: self.manoeuvres().map(|one| one.name().into()).collect(),
             seconds: self.seconds,
             futures: self.futures.get(),

@@ -1,38 +1,35 @@
 //! `evaluate wosac`: realism as the Waymo Sim Agents Challenge measures it.
 //!
 //! Scenarios stream through one at a time; each gets three scores (what is evaluated, the log
-//! itself as an oracle, constant velocity), which the ledger keeps. `recording` reads scenarios,
-//! `rollouts` finds a scenario's rollouts or imagines them, `tell` makes the report.
+//! itself as an oracle, constant velocity), which the ledger keeps. Scenarios, their rollouts and
+//! their scores are [`gump_eval::realism`]'s; `tell` makes the report.
 
-mod recording;
-mod rollouts;
 mod tell;
 mod worst;
 
 use std::io::Write as _;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
-use std::time::Instant;
 
 use anyhow::Context as _;
-use gump_data::ReadOptions;
+use gump_eval::EvalError;
+use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
+use gump_eval::realism::{
+    FoundRollouts, Recorded, RolloutSource, ScenarioScores, evaluate, recordings,
+};
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_rollout::worlds::ConstantVelocity;
-use gump_rollout::{SimulateConfig, Start, simulate};
-use gump_wosac::realism::{Blame, Config, Mode, Reference, Scores, WosacError, Year};
+use gump_wosac::realism::{Attribution, Config, Mode, WosacError, Year};
 use serde::{Deserialize, Serialize};
 
 use super::left_out::LeftOut;
-use crate::benchmark::{Found, Scenes};
+use crate::benchmark;
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 use crate::tables;
-pub(crate) use recording::{Recorded, recordings};
-pub(crate) use rollouts::Source;
 pub(crate) use tell::tell_merged;
 use worst::Worst;
 
@@ -44,7 +41,7 @@ pub(crate) const BENCHMARK: &str = "wosac";
 pub(crate) struct Args {
     /// File or directory of recorded scenarios, or LIST.toml#SPLIT of datasets/benchmarks
     #[arg(long, value_name = "PATH")]
-    scenarios: Scenes,
+    scenarios: ScenarioSetName,
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W")]
     world: Option<WorldName>,
@@ -127,28 +124,6 @@ pub(crate) struct Settings {
     seed: String,
 }
 
-/// What one scenario got.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Scored {
-    /// Wall seconds that scoring took, without imagining.
-    pub(crate) seconds: f64,
-    /// One for each decoding, in order.
-    pub(crate) evaluated: Vec<Evaluated>,
-    pub(crate) oracle: Scores,
-    pub(crate) constant_velocity: Scores,
-}
-
-/// What is evaluated, decoded in one way.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Evaluated {
-    /// `ruled`, `raw` or `paper`; `-` where nothing is decoded.
-    pub(crate) decoding: String,
-    /// Of the rollouts, if a world imagined them.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) digest: Option<String>,
-    pub(crate) scores: Scores,
-}
-
 /// What one agent cost in one scenario, as it is written.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Explained {
@@ -173,7 +148,7 @@ const N_EXPLAINED: usize = 20;
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let shard = self.shard.unwrap_or(Shard::WHOLE);
-        let scenarios = run.phase("find", |_| self.scenarios.find())?;
+        let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
@@ -196,13 +171,13 @@ impl Args {
             let kept = ledger.indices();
             let wanted = move |index| shard.holds(index) && !kept.contains(&index);
             for recorded in recordings(&scenarios.paths, options, wanted)? {
-                let scored = recorded.and_then(|recorded| {
+                let scored = recorded.map_err(Into::into).and_then(|recorded: Recorded| {
                     let seen = (worst.as_mut(), &mut fewest);
                     let scored = self.evaluate(run, &config, &recorded, &mut sources, seen)?;
                     Ok((recorded, scored))
                 });
                 let scored = left_out.sift(scored, is_of_another_length)?;
-                let Some((recorded, (entry, blames))) = scored else {
+                let Some((recorded, (entry, attributions))) = scored else {
                     continue;
                 };
                 ledger.add(entry)?;
@@ -211,7 +186,7 @@ impl Args {
                         log,
                         &recorded.log.scenario,
                         &config,
-                        &blames,
+                        &attributions,
                         &mut explained,
                     )?;
                 }
@@ -255,13 +230,17 @@ impl Args {
     }
 
     /// Where rollouts come from, once for each decoding; at least one.
-    fn sources(&self, run: &mut Run) -> anyhow::Result<Vec<Source>> {
+    fn sources(&self, run: &mut Run) -> anyhow::Result<Vec<RolloutSource>> {
         match (&self.world, &self.rollouts) {
-            (_, Some(path)) => Ok(vec![run.phase("index rollouts", |_| Source::files(path))?]),
+            (_, Some(path)) => {
+                let index = |_: &mut Run| Ok(RolloutSource::files(path)?);
+                Ok(vec![run.phase("index rollouts", index)?])
+            }
             (Some(world), None) => {
                 let (n, seed) = (self.rollouts_per_scenario.get(), run.seed());
                 let decodings = self.sampling.decodings(world)?.into_iter();
-                let sources = decodings.map(|way| Source::world(world.clone(), way, n, seed));
+                let sources =
+                    decodings.map(|way| RolloutSource::world(world.clone(), way, n, seed));
                 Ok(sources.collect())
             }
             (None, None) => {
@@ -271,7 +250,7 @@ impl Args {
         }
     }
 
-    fn settings(&self, run: &Run, scenarios: &Found) -> anyhow::Result<Settings> {
+    fn settings(&self, run: &Run, scenarios: &ScenarioSet) -> anyhow::Result<Settings> {
         let name = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default();
             name.to_string_lossy().into_owned()
@@ -281,7 +260,7 @@ impl Args {
             world: world.unwrap_or_else(|| "rollouts".into()),
             year: self.year.year().name().into(),
             rollouts_per_scenario: self.rollouts_per_scenario.get(),
-            scenarios: scenarios.set.clone(),
+            scenarios: scenarios.name.clone(),
             rollouts: self.rollouts.as_ref().map(name).unwrap_or_default(),
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
@@ -293,106 +272,79 @@ impl Args {
         run: &Run,
         config: &Config,
         recorded: &Recorded,
-        sources: &mut [Source],
+        sources: &mut [RolloutSource],
         (mut worst, fewest): (Option<&mut Worst>, &mut usize),
-    ) -> anyhow::Result<(Entry<Scored>, Vec<Blame>)> {
+    ) -> anyhow::Result<(Entry<ScenarioScores>, Vec<Attribution>)> {
         let n = self.rollouts_per_scenario.get();
         let id = &recorded.log.scenario;
         let found = sources.iter_mut().map(|source| {
-            let found = source.rollouts(run, recorded, config.mode);
-            let found = found.with_context(|| format!("cannot evaluate scenario {id}"))?;
-            Ok((source.decoding(), found))
+            let found = rollouts(run, source, recorded, config.mode);
+            found.with_context(|| format!("cannot evaluate scenario {id}"))
         });
         let found = found.collect::<anyhow::Result<Vec<_>>>()?;
-        let baseline = constant_velocity(recorded, config.mode)
-            .with_context(|| format!("cannot evaluate scenario {id}"))?;
-        let oracle = recorded.log.oracle(n, config.mode == Mode::Generation);
-        let began = Instant::now();
-        let reference = Reference::new(&recorded.log, config)?;
-        let (mut evaluated, mut blames) = (Vec::new(), None);
-        for (decoding, found) in found {
-            let evaluation = reference.evaluate(&found.rollouts)?;
+        let mut attributions = None;
+        let scores = evaluate(recorded, found, n, config, |found, evaluation| {
             *fewest = found.rollouts.count().min(*fewest);
-            if blames.is_none() {
+            if attributions.is_none() {
                 let of_first = evaluation.explain();
                 if let Some(worst) = worst.take().filter(|_| config.mode == Mode::SimAgents) {
-                    worst.add(&recorded.scenario, &found.rollouts, &evaluation, &of_first);
+                    worst.add(&recorded.scenario, &found.rollouts, evaluation, &of_first);
                 }
-                blames = Some(of_first);
+                attributions = Some(of_first);
             }
-            evaluated.push(Evaluated {
-                decoding: decoding.into(),
-                digest: found.digest,
-                scores: evaluation.scores,
-            });
-        }
-        let seconds = began.elapsed().as_secs_f64() / evaluated.len() as f64;
-        let scores = Scored {
-            seconds,
-            oracle: reference.evaluate(&oracle)?.scores,
-            constant_velocity: reference.evaluate(&baseline.repeated(n))?.scores,
-            evaluated,
-        };
+        })?;
         let entry = Entry {
             index: recorded.index,
             id: id.clone(),
             scores,
         };
-        Ok((entry, blames.unwrap_or_default()))
+        Ok((entry, attributions.unwrap_or_default()))
     }
 }
 
-/// Everyone goes straight on: one rollout, since all would be equal.
-fn constant_velocity(
+/// Rollouts of one scenario, with a progress bar where they are simulated.
+///
+/// Error: as [`RolloutSource::rollouts`].
+pub(crate) fn rollouts(
+    run: &Run,
+    source: &mut RolloutSource,
     recorded: &Recorded,
     mode: Mode,
-) -> anyhow::Result<gump_wosac::realism::Rollouts> {
-    let start = Start {
-        scene: recorded.scenario.present().unguided(),
-        n_futures: 1,
-        seed: gump_scene::Seed(0),
-    };
-    let rollouts = simulate(
-        &ConstantVelocity,
-        &[start],
-        None,
-        &SimulateConfig::default(),
-    )
-    .map_err(|error| anyhow::anyhow!(error))?;
-    let id = &recorded.log.scenario;
-    Ok(gump_wosac::realism::Rollouts::of(id, &rollouts, mode)?)
+) -> anyhow::Result<FoundRollouts> {
+    let progress = run.simulating(source.frames(&recorded.scenario));
+    Ok(source.rollouts(run.device(), recorded, mode, &progress)?)
 }
 
-/// Writes what a scenario's score lacks, and keeps the dearest of all scenarios.
+/// Writes what a scenario's score lacks, and keeps the largest attributions of all scenarios.
 fn note(
     log: &mut std::fs::File,
     scenario: &str,
     config: &Config,
-    blames: &[Blame],
-    dearest: &mut Vec<Explained>,
+    attributions: &[Attribution],
+    largest: &mut Vec<Explained>,
 ) -> anyhow::Result<()> {
     // Steps count from the first scored one: that after the present, or that 1 s before it.
     let first = match config.mode {
         Mode::SimAgents => 1.0,
         Mode::Generation => -10.0,
     };
-    for blame in blames {
+    for attribution in attributions {
         let explained = Explained {
             scenario: scenario.into(),
-            component: blame.component.name(),
-            agent: blame.agent.0,
-            class: blame.kind.name(),
-            cost: blame.cost,
-            likelihood: blame.likelihood,
-            seconds: blame.step.map(|step| (first + step as f64) / 10.0),
-            logged: blame.logged,
-            imagined: blame.imagined,
+            component: attribution.component.name(),
+            agent: attribution.agent.0,
+            class: attribution.kind.name(),
+            cost: attribution.cost,
+            likelihood: attribution.likelihood,
+            seconds: attribution.step.map(|step| (first + step as f64) / 10.0),
+            logged: attribution.logged,
+            imagined: attribution.imagined,
         };
         writeln!(log, "{}", serde_json::to_string(&explained)?)?;
-        dearest.push(explained);
+        largest.push(explained);
     }
-    dearest.sort_by(|a, b| b.cost.total_cmp(&a.cost));
-    dearest.truncate(N_EXPLAINED);
+    largest.sort_by(|a, b| b.cost.total_cmp(&a.cost));
+    largest.truncate(N_EXPLAINED);
     Ok(())
 }
 
@@ -406,14 +358,6 @@ fn tabulate(run: &Run) -> anyhow::Result<()> {
 
 /// True if the challenge's second of past and eight of future are not what the log has.
 fn is_of_another_length(error: &anyhow::Error) -> bool {
-    let found = error.downcast_ref::<WosacError>();
-    matches!(found, Some(WosacError::Clock { .. }))
-}
-
-/// Which gaps of Waymo's messages matter to a world.
-fn read_options(world: &WorldName) -> ReadOptions {
-    match world {
-        WorldName::Log | WorldName::ConstantVelocity => ReadOptions::STATED,
-        WorldName::Idm | WorldName::Model(_) => ReadOptions::ALL,
-    }
+    let found = error.downcast_ref().map(EvalError::cause);
+    matches!(found, Some(EvalError::Realism(WosacError::Clock { .. })))
 }

@@ -3,6 +3,9 @@
 use std::path::PathBuf;
 
 use gump_data::Table;
+use gump_eval::decoding::Decoding;
+use gump_eval::digest;
+use gump_eval::realism::ScenarioScores;
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::interval;
 use gump_scene::Seed;
@@ -10,10 +13,9 @@ use gump_viz::Bars;
 use gump_wosac::realism::{Component, Scores};
 use serde_json::{Map, Value, json};
 
-use super::{Scored, Settings};
-use crate::decoding::Decoding;
+use super::Settings;
 use crate::run::Run;
-use crate::{charts, futures, tables};
+use crate::{charts, tables};
 
 /// The name of the log as a world.
 const ORACLE: &str = "logged-oracle";
@@ -26,7 +28,7 @@ pub(crate) fn tell_merged(
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scored>(folders, missing)?;
+    let (header, entries) = results::merge::<ScenarioScores>(folders, missing)?;
     let settings: Settings = header.settings.try_into()?;
     tell(run, &settings, &entries)
 }
@@ -52,7 +54,7 @@ impl Told {
 }
 
 /// What is evaluated in every decoding, then the log and the baseline.
-fn told(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Told> {
+fn told(settings: &Settings, entries: &[Entry<ScenarioScores>]) -> Vec<Told> {
     let decodings = entries.first().map_or(&[][..], |e| &e.scores.evaluated);
     let evaluated = decodings.iter().enumerate().map(|(i, first)| {
         let of = entries.iter().filter_map(|e| e.scores.evaluated.get(i));
@@ -60,11 +62,11 @@ fn told(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Told> {
         Told {
             world: settings.world.clone(),
             decoding: first.decoding.clone(),
-            digest: futures::digest_of(digests),
+            digest: digest::of_digests(digests),
             scores: of.map(|found| found.scores.clone()).collect(),
         }
     });
-    let other = |world: &str, pick: fn(&Scored) -> &Scores| Told {
+    let other = |world: &str, pick: fn(&ScenarioScores) -> &Scores| Told {
         world: world.into(),
         decoding: Decoding::NONE.into(),
         digest: None,
@@ -82,7 +84,7 @@ fn told(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Told> {
 pub(crate) fn tell(
     run: &mut Run,
     settings: &Settings,
-    entries: &[Entry<Scored>],
+    entries: &[Entry<ScenarioScores>],
 ) -> anyhow::Result<()> {
     let worlds = told(settings, entries);
     per_scenario(settings, entries, &worlds).write(&run.path("scores.parquet"))?;
@@ -104,7 +106,7 @@ pub(crate) fn tell(
     let names: Vec<&str> = labelled.iter().map(|(name, _)| name.as_str()).collect();
     charts::save(run, "realism", &chart(&intervals, &names))?;
     run.result("intervals", intervals)?;
-    let is_undefined = |e: &&Entry<Scored>| {
+    let is_undefined = |e: &&Entry<ScenarioScores>| {
         let mut evaluated = e.scores.evaluated.iter();
         evaluated.any(|found| found.scores.metametric.is_nan())
     };
@@ -145,7 +147,7 @@ fn row((world, decoding): (&str, &str), year: &str, scenarios: usize, scores: &S
 }
 
 /// A row per world and scenario, in the order of the worlds.
-fn per_scenario(settings: &Settings, entries: &[Entry<Scored>], worlds: &[Told]) -> Table {
+fn per_scenario(settings: &Settings, entries: &[Entry<ScenarioScores>], worlds: &[Told]) -> Table {
     let rows = worlds.iter().flat_map(|world| {
         entries
             .iter()

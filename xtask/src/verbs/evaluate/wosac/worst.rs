@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use gump_metrics::behaviour::{Behaviour, Judged, judge};
 use gump_scene::{AgentId, Scenario};
-use gump_wosac::realism::{Blame, Evaluation, Rollouts};
+use gump_wosac::realism::{Attribution, Evaluation, Rollouts};
 use serde_json::{Value, json};
 
 use crate::run::Run;
@@ -35,11 +35,11 @@ impl Worst {
         scenario: &Scenario,
         rollouts: &Rollouts,
         evaluation: &Evaluation<'_>,
-        blames: &[Blame],
+        attributions: &[Attribution],
     ) {
         let mut costs: BTreeMap<AgentId, f64> = BTreeMap::new();
-        for blame in blames {
-            *costs.entry(blame.agent).or_default() += blame.cost;
+        for attribution in attributions {
+            *costs.entry(attribution.agent).or_default() += attribution.cost;
         }
         let conduct = Behaviour::new(scenario, HORIZON_S).conduct(&rollouts.in_scene(scenario));
         let realism = evaluation.realism();

@@ -1,20 +1,24 @@
 //! Predictions from files: as such, or as futures that are condensed to modes.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
 use gump_data::submission::{
     predictions_from_proto, read_predictions, read_rollouts, rollouts_from_proto,
 };
-use gump_eval::rollout_files;
+use gump_data::{DataError, Problem};
 use gump_proto::ScenarioRollouts;
 use gump_proto::motion::{ChallengeScenarioPredictions, MotionChallengeSubmission, PredictionKind};
 use gump_scene::{Prediction, Scenario};
 use gump_wosac::motion::{MotionConfig, forecast};
 
-/// What is predicted, by scenario.
-pub(super) struct Predictions(BTreeMap<String, Message>);
+use crate::{EvalError, rollout_files};
+
+/// Predictions in files, by scenario.
+pub(super) struct Predictions {
+    path: PathBuf,
+    by_scenario: BTreeMap<String, Message>,
+}
 
 enum Message {
     Predictions(ChallengeScenarioPredictions),
@@ -25,19 +29,22 @@ impl Predictions {
     /// Reads a file or all files of a folder.
     ///
     /// Error: a file of another kind, or a scenario that occurs twice.
-    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+    pub(super) fn read(path: &Path) -> Result<Self, EvalError> {
         let mut by_scenario = BTreeMap::new();
         for file in rollout_files::files(path)? {
             for (id, message) in messages(&file)? {
-                let twice = by_scenario.insert(id.clone(), message).is_some();
-                anyhow::ensure!(
-                    !twice,
-                    "expected scenario {id} once, found it twice: {}",
-                    file.display()
-                );
+                if by_scenario.insert(id.clone(), message).is_some() {
+                    return Err(EvalError::Rollouts(format!(
+                        "expected scenario {id} once, found it twice: {}",
+                        file.display()
+                    )));
+                }
             }
         }
-        Ok(Self(by_scenario))
+        Ok(Self {
+            path: path.to_owned(),
+            by_scenario,
+        })
     }
 
     /// The predictions of a scenario.
@@ -45,43 +52,37 @@ impl Predictions {
         &self,
         scenario: &Scenario,
         config: &MotionConfig,
-        path: &Path,
-    ) -> anyhow::Result<Vec<Prediction>> {
+    ) -> Result<Vec<Prediction>, EvalError> {
         let id = &scenario.id;
-        let place = || format!("scenario {id} of {}", path.display());
-        match self.0.get(id) {
-            Some(Message::Predictions(message)) => {
-                predictions_from_proto(message).with_context(place)
-            }
+        let path = self.path.display();
+        let wrong =
+            |problem: Problem| EvalError::Rollouts(format!("scenario {id} of {path}: {problem}"));
+        match self.by_scenario.get(id) {
+            Some(Message::Predictions(message)) => predictions_from_proto(message).map_err(wrong),
             Some(Message::Rollouts(message)) => {
-                let rollouts = rollouts_from_proto(message, scenario).with_context(place)?;
+                let rollouts = rollouts_from_proto(message, scenario);
+                let rollouts = rollouts.map_err(wrong)?;
                 Ok(forecast(scenario, &rollouts, config)?)
             }
-            None => anyhow::bail!(
-                "expected predictions of scenario {id}, found none: {}",
-                path.display()
-            ),
+            None => Err(EvalError::Rollouts(format!(
+                "expected predictions of scenario {id}, found none: {path}"
+            ))),
         }
     }
 
     /// Refuses predictions of scenarios that are not among `ids`.
-    pub(super) fn check_all_known(
-        &self,
-        ids: &BTreeSet<String>,
-        path: &Path,
-    ) -> anyhow::Result<()> {
-        let unknown = self.0.keys().find(|id| !ids.contains(*id));
-        match unknown {
-            Some(id) => anyhow::bail!(
+    pub(super) fn check_all_known(&self, ids: &BTreeSet<String>) -> Result<(), EvalError> {
+        match self.by_scenario.keys().find(|id| !ids.contains(*id)) {
+            Some(id) => Err(EvalError::Rollouts(format!(
                 "found predictions of \"{id}\", which is not among the scenarios: {}",
-                path.display()
-            ),
+                self.path.display()
+            ))),
             None => Ok(()),
         }
     }
 }
 
-fn messages(file: &Path) -> anyhow::Result<Vec<(String, Message)>> {
+fn messages(file: &Path) -> Result<Vec<(String, Message)>, EvalError> {
     match read_predictions(file) {
         Ok(submission) if holds_predictions(&submission) => {
             let messages = submission.scenario_predictions.into_iter();
@@ -89,12 +90,12 @@ fn messages(file: &Path) -> anyhow::Result<Vec<(String, Message)>> {
                 .map(|m| (m.scenario_id().to_owned(), Message::Predictions(m)))
                 .collect());
         }
-        Ok(_) | Err(gump_data::DataError::Proto { .. }) => {}
+        Ok(_) | Err(DataError::Proto { .. }) => {}
         Err(error) => return Err(error.into()),
     }
-    let rollouts = read_rollouts(file).context(
-        "expected a MotionChallengeSubmission, a ScenarioRollouts or a SimAgentsChallengeSubmission",
-    )?;
+    let expected = "expected a MotionChallengeSubmission, a ScenarioRollouts or a \
+                    SimAgentsChallengeSubmission";
+    let rollouts = read_rollouts(file).map_err(|error| EvalError::from(error).at(&expected))?;
     Ok(rollouts
         .into_iter()
         .map(|m| (m.scenario_id().to_owned(), Message::Rollouts(m)))

@@ -8,22 +8,22 @@ use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::tfrecord::TfRecordReader;
-use gump_data::womd::scenario_from_proto;
+use gump_data::womd::{decode_scenario, scenario_from_proto};
 use gump_scene::Scenario;
 use gump_wosac::realism::{Log, N_HISTORY, N_STEPS};
-use prost::Message as _;
+
+use crate::EvalError;
 
 /// A recorded scenario.
-pub(crate) struct Recorded {
-    /// Position among all scenarios of the path.
-    pub(crate) index: usize,
+pub struct Recorded {
+    /// Position among all scenarios of the paths.
+    pub index: usize,
     /// As worlds see it.
-    pub(crate) scenario: Scenario,
-    /// As the metric does.
-    pub(crate) log: Log,
+    pub scenario: Scenario,
+    /// As the metric sees it.
+    pub log: Log,
 }
 
 /// The `wanted` scenarios of files or directories in order; holds one at a time. Their indices go on
@@ -32,18 +32,18 @@ pub(crate) struct Recorded {
 /// Waymo's messages are filled as `options` say, other formats as far as can be: some state
 /// neither an ego nor whom to predict nor edges of the road.
 ///
-/// Error: a path without scenarios; of single scenarios the iterator tells.
-pub(crate) fn recordings<'a>(
+/// # Errors
+/// A first path without scenarios. Errors of later paths and of single scenarios are items.
+pub fn recordings<'a>(
     paths: &'a [PathBuf],
     options: ReadOptions,
     wanted: impl Fn(usize) -> bool + 'a,
-) -> anyhow::Result<Recordings<'a>> {
+) -> Result<Recordings<'a>, EvalError> {
     let (next, wanted): (_, Rc<dyn Fn(usize) -> bool>) = (Rc::default(), Rc::new(wanted));
     let open = move |path: &PathBuf| of_path(path, options, Rc::clone(&wanted), Rc::clone(&next));
-    let (first, others) = paths
-        .split_first()
-        .context("expected scenarios, found none")?;
-    // A single path that holds none is told at once; others are opened as they are reached.
+    let none = || EvalError::Recording("expected scenarios, found none".into());
+    let (first, others) = paths.split_first().ok_or_else(none)?;
+    // A single path that holds none is an error at once; others are opened as they are reached.
     let first = open(first)?;
     Ok(Box::new(first.chain(others.iter().flat_map(
         move |path| match open(path) {
@@ -54,7 +54,7 @@ pub(crate) fn recordings<'a>(
 }
 
 /// Recorded scenarios, one at a time.
-type Recordings<'a> = Box<dyn Iterator<Item = anyhow::Result<Recorded>> + 'a>;
+pub type Recordings<'a> = Box<dyn Iterator<Item = Result<Recorded, EvalError>> + 'a>;
 
 /// The scenarios of one path, numbered from `next` on.
 fn of_path<'a>(
@@ -62,7 +62,7 @@ fn of_path<'a>(
     options: ReadOptions,
     wanted: Rc<dyn Fn(usize) -> bool + 'a>,
     next: Rc<Cell<usize>>,
-) -> anyhow::Result<Recordings<'a>> {
+) -> Result<Recordings<'a>, EvalError> {
     let files = waymo_files(path)?;
     let number = move || next.replace(next.get() + 1);
     if files.is_empty() {
@@ -95,27 +95,26 @@ fn of_path<'a>(
         payloads
             .map(move |payload| (number(), payload))
             .filter(move |(index, payload)| {
-                // What is broken is always told.
+                // What is broken is always reported.
                 wanted(*index) || payload.is_err()
             });
     Ok(Box::new(payloads.map(move |(index, payload)| {
         let payload = payload?;
-        recorded(index, &payload.bytes, options).with_context(|| format!("{}", payload.place))
+        recorded(index, &payload.bytes, options).map_err(|error| error.at(&payload.place))
     })))
 }
 
 /// The TFRecord files at a path in order of their names; none if it holds another format.
-fn waymo_files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+fn waymo_files(path: &Path) -> Result<Vec<PathBuf>, EvalError> {
     if !path.is_dir() {
         let first = TfRecordReader::open(path.to_owned())?.next();
         let is_waymo = matches!(first, Some(Ok(_)));
         return Ok(is_waymo.then(|| path.to_owned()).into_iter().collect());
     }
     let mut files = Vec::new();
-    for entry in
-        std::fs::read_dir(path).with_context(|| format!("cannot list {}", path.display()))?
-    {
-        let file = entry?.path();
+    let cannot = |cause| EvalError::io("list", path, cause);
+    for entry in std::fs::read_dir(path).map_err(cannot)? {
+        let file = entry.map_err(cannot)?.path();
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         if name.contains(".tfrecord") && !name.ends_with(".partial") && file.is_file() {
             files.push(file);
@@ -125,11 +124,11 @@ fn waymo_files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> anyhow::Result<Recorded> {
-    let message = gump_proto::Scenario::decode(bytes).context("expected a Scenario message")?;
-    let id = message.scenario_id();
-    let (scenario, _) =
-        scenario_from_proto(&message, options).with_context(|| format!("scenario {id}"))?;
+fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> Result<Recorded, EvalError> {
+    let wrong = |problem: &dyn std::fmt::Display| EvalError::Recording(problem.to_string());
+    let message = decode_scenario(bytes).map_err(|problem| wrong(&problem))?;
+    let (scenario, _) = scenario_from_proto(&message, options)
+        .map_err(|problem| wrong(&problem).at(&format!("scenario {}", message.scenario_id())))?;
     // Waymo's own messages all have this clock; others are scored as scenarios.
     let log = match (scenario.now + 1, scenario.log.len()) {
         (N_HISTORY, N_STEPS) => Log {

@@ -1,4 +1,4 @@
-//! What `--scenarios` takes: a file, a folder, or the split of a list, `LIST.toml#SPLIT`.
+//! Scenarios by name: a file, a folder, or the split of a list, `LIST.toml#SPLIT`.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -8,27 +8,34 @@ use std::str::FromStr;
 use gump_data::{DataError, ReadOptions, Reader};
 use serde::{Serialize, Serializer};
 
-use super::{List, check, check_recorded, recorded_data};
-use crate::dataset::Split;
+use super::{BenchmarkList, verify_made, verify_recorded};
+use crate::datasets::Split;
+use crate::{EvalError, Monitor};
 
-/// Where `data benchmark` puts what it makes, unless told otherwise.
-const MADE: &str = "out/data-benchmark";
-
-/// Scenarios as they are asked for.
+/// Scenarios by name: `PATH`, or `LIST.toml#SPLIT`.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Scenes(String);
+pub struct ScenarioSetName(String);
 
-/// Scenarios as they were found.
-#[derive(Debug)]
-pub(crate) struct Found {
-    /// What results call them: [`List::set`], else the name of the file or folder.
-    pub(crate) set: String,
+/// The files of some scenarios, and the name of their set.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScenarioSet {
+    /// Its name in results: [`BenchmarkList::set`], otherwise the name of the file or folder.
+    pub name: String,
     /// One file or folder; of a list the files of its scenes.
-    pub(crate) paths: Vec<PathBuf>,
+    pub paths: Vec<PathBuf>,
 }
 
-impl Scenes {
-    /// The list and the split asked for; `None` if it is none that is named.
+/// Where the scenes of lists are.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BenchmarkFolders {
+    /// The folder in which made scenes were made, one folder a list.
+    pub made: PathBuf,
+    /// The folder of recorded data.
+    pub recorded: PathBuf,
+}
+
+impl ScenarioSetName {
+    /// The list and the split asked for; `None` if it is no list.
     fn list(&self) -> Option<(&Path, Option<&str>)> {
         let (path, split) = match self.0.rsplit_once('#') {
             Some((path, split)) => (path, Some(split)),
@@ -37,14 +44,19 @@ impl Scenes {
         path.ends_with(".toml").then(|| (Path::new(path), split))
     }
 
-    /// Looks for the scenarios; those of a list are held to its sums.
+    /// Finds the scenarios; those of a list are held to its checksums.
     ///
-    /// Error: a list that is none, a split that it does not have, or scenes that are missing or
-    /// differ. Of another file or folder, only reading it tells.
-    pub(crate) fn find(&self) -> anyhow::Result<Found> {
+    /// # Errors
+    /// A list that is none, a split that it does not have, or scenes that are missing or differ.
+    /// Another file or folder is not looked at.
+    pub fn find(
+        &self,
+        folders: &BenchmarkFolders,
+        monitor: &dyn Monitor,
+    ) -> Result<ScenarioSet, EvalError> {
         match self.list() {
-            Some((path, split)) => find_listed(path, split, &recorded_data(), Path::new(MADE)),
-            None => Ok(Found::path(Path::new(&self.0))),
+            Some((path, split)) => find_listed(path, split, folders, monitor),
+            None => Ok(ScenarioSet::of_path(Path::new(&self.0))),
         }
     }
 }
@@ -52,34 +64,35 @@ impl Scenes {
 fn find_listed(
     path: &Path,
     split: Option<&str>,
-    data: &Path,
-    made: &Path,
-) -> anyhow::Result<Found> {
-    let list = List::read(path)?;
+    folders: &BenchmarkFolders,
+    monitor: &dyn Monitor,
+) -> Result<ScenarioSet, EvalError> {
+    let list = BenchmarkList::read(path)?;
     let split = choose(&list, split)?;
     let mut paths = Vec::new();
     for part in list.made.iter().filter(|part| part.split == split) {
-        let file = list.file(made, part);
-        anyhow::ensure!(
-            file.is_file(),
-            "expected scenes of the list {} at {}, found none: \
-             `cargo xtask data benchmark --list {}` makes them",
-            list.name,
-            file.display(),
-            path.display()
-        );
-        check(&list, part, made)?;
+        let file = list.file(&folders.made, part);
+        if !file.is_file() {
+            return Err(EvalError::Benchmark(format!(
+                "expected scenes of the list {} at {}, found none: \
+                 `cargo xtask data benchmark --list {}` makes them",
+                list.name,
+                file.display(),
+                path.display()
+            )));
+        }
+        verify_made(&list, part, &folders.made, monitor)?;
         paths.push(file);
     }
     for part in list.recorded.iter().filter(|part| part.split == split) {
-        paths.extend(check_recorded(&list, part, data)?);
+        paths.extend(verify_recorded(&list, part, &folders.recorded, monitor)?);
     }
-    let set = list.set(split);
-    Ok(Found { set, paths })
+    let name = list.set(split);
+    Ok(ScenarioSet { name, paths })
 }
 
 /// The split asked for, or the only one.
-fn choose(list: &List, asked: Option<&str>) -> anyhow::Result<Split> {
+fn choose(list: &BenchmarkList, asked: Option<&str>) -> Result<Split, EvalError> {
     let splits = list.splits();
     let names: Vec<&str> = splits.iter().map(|split| split.name()).collect();
     let found = match (asked, &splits[..]) {
@@ -87,30 +100,31 @@ fn choose(list: &List, asked: Option<&str>) -> anyhow::Result<Split> {
         (None, [only]) => Some(*only),
         (None, _) => None,
     };
-    let path = list.path.display();
+    let path = list.path().display();
     found.ok_or_else(|| {
-        anyhow::anyhow!(
+        EvalError::Benchmark(format!(
             "expected {path}#SPLIT with {}, found {path}{}",
             names.join(" or "),
             asked.map(|name| format!("#{name}")).unwrap_or_default()
-        )
+        ))
     })
 }
 
-impl Found {
-    /// What is at a path, called by its name.
-    pub(crate) fn path(path: &Path) -> Self {
+impl ScenarioSet {
+    /// The scenarios at a path; the set has the name of the file or folder.
+    pub fn of_path(path: &Path) -> Self {
         let name = path.file_name().unwrap_or(path.as_os_str());
         Self {
-            set: name.to_string_lossy().into_owned(),
+            name: name.to_string_lossy().into_owned(),
             paths: vec![path.to_owned()],
         }
     }
 
     /// Reads them one by one.
     ///
-    /// Error: nothing there to read.
-    pub(crate) fn open(&self, options: ReadOptions) -> Result<Reader, DataError> {
+    /// # Errors
+    /// Nothing there to read.
+    pub fn open(&self, options: ReadOptions) -> Result<Reader, DataError> {
         match &self.paths[..] {
             [path] => gump_data::open_with(path, options),
             paths => Ok(gump_data::open_files(paths.to_vec(), options)),
@@ -118,7 +132,7 @@ impl Found {
     }
 }
 
-impl FromStr for Scenes {
+impl FromStr for ScenarioSetName {
     type Err = Infallible;
 
     fn from_str(text: &str) -> Result<Self, Infallible> {
@@ -126,13 +140,13 @@ impl FromStr for Scenes {
     }
 }
 
-impl fmt::Display for Scenes {
+impl fmt::Display for ScenarioSetName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
     }
 }
 
-impl Serialize for Scenes {
+impl Serialize for ScenarioSetName {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(&self.0)
     }
@@ -141,17 +155,25 @@ impl Serialize for Scenes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::machine::repository;
+    use crate::benchmarks::tests::repository;
 
-    fn find(text: &str) -> Result<Found, String> {
-        let scenes: Scenes = text.parse().unwrap();
-        scenes.find().map_err(|error| format!("{error:#}"))
+    fn folders() -> BenchmarkFolders {
+        BenchmarkFolders {
+            made: "nowhere".into(),
+            recorded: repository().join("../shared/data"),
+        }
+    }
+
+    fn find(text: &str) -> Result<ScenarioSet, String> {
+        let name: ScenarioSetName = text.parse().unwrap();
+        name.find(&folders(), &())
+            .map_err(|error| error.to_string())
     }
 
     #[test]
     fn a_path_is_taken_as_it_is_and_names_its_set() {
         let found = find("a/b.tfrecord.gz").unwrap();
-        assert_eq!(found.set, "b.tfrecord.gz");
+        assert_eq!(found.name, "b.tfrecord.gz");
         assert_eq!(found.paths, [PathBuf::from("a/b.tfrecord.gz")]);
     }
 
@@ -173,27 +195,31 @@ mod tests {
         );
         let error = find(&list("synthetic-test.toml#tune")).unwrap_err();
         assert!(error.contains("#SPLIT with test"), "{error}");
-        let nowhere = Path::new("nowhere");
-        let path = list("synthetic-test.toml");
-        let error = find_listed(Path::new(&path), None, nowhere, nowhere).unwrap_err();
-        let error = format!("{error:#}");
-        assert!(error.contains("data benchmark --list"), "{error}");
-        let path = list("recorded.toml");
-        let error = find_listed(Path::new(&path), Some("test"), nowhere, nowhere).unwrap_err();
-        let error = format!("{error:#}");
-        assert!(error.contains("GUMP_RECORDED"), "{error}");
+        let nowhere = BenchmarkFolders {
+            recorded: "nowhere".into(),
+            ..folders()
+        };
+        let error = |name: &str, split| {
+            let path = list(name);
+            let found = find_listed(Path::new(&path), split, &nowhere, &());
+            found.unwrap_err().to_string()
+        };
+        let told = error("synthetic-test.toml", None);
+        assert!(told.contains("data benchmark --list"), "{told}");
+        let told = error("recorded.toml", Some("test"));
+        assert!(told.contains("GUMP_RECORDED"), "{told}");
     }
 
     #[test]
     fn recorded_scenes_are_read_in_the_order_of_the_list() {
         let path = repository().join("datasets/benchmarks/recorded.toml");
-        if !recorded_data().exists() {
+        if !folders().recorded.exists() {
             eprintln!("SKIPPED: no recorded data beside the checkout");
             return;
         }
         let found = find(&format!("{}#test", path.display())).unwrap();
-        assert_eq!(found.set, "recorded/test");
-        let list = List::read(&path).unwrap();
+        assert_eq!(found.name, "recorded/test");
+        let list = BenchmarkList::read(&path).unwrap();
         let parts = list
             .recorded
             .iter()

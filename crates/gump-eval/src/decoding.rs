@@ -1,29 +1,29 @@
 //! Ways of decoding: the network alone, under rules, and as in the paper.
 //!
-//! Realism is told of the network alone beside what rules make of it, for rules that look at the
-//! same edges and boxes as a score raise the score by themselves. The flags are in `worlds`.
+//! Results have the network alone beside the network under rules, because rules that look at the
+//! same edges and boxes as a score raise the score by themselves.
 
+use crate::worlds::WorldName;
 use gump_engine::SamplingConfig;
-use gump_eval::worlds::WorldName;
 use gump_rollout::SimulateConfig;
 
-/// How the futures of a world are made.
+/// A way to make the futures of a world.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Decoding {
+pub struct Decoding {
     /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
-    pub(crate) name: &'static str,
-    /// How a network draws.
-    pub(crate) sampling: SamplingConfig,
+    pub name: &'static str,
+    /// How a network samples.
+    pub sampling: SamplingConfig,
     /// How its frames become those of the scene, but for the length.
     frames: SimulateConfig,
 }
 
 impl Decoding {
     /// The name for worlds that decode nothing.
-    pub(crate) const NONE: &str = "-";
+    pub const NONE: &'static str = "-";
 
     /// A decoding with the name it deserves: `raw` if no rule corrects it.
-    pub(crate) fn of(sampling: SamplingConfig) -> Self {
+    pub fn of(sampling: SamplingConfig) -> Self {
         Self {
             name: if sampling.has_rules() { "ruled" } else { "raw" },
             sampling,
@@ -32,7 +32,7 @@ impl Decoding {
     }
 
     /// The paper's decoding, its interpolation included.
-    pub(crate) fn paper(sampling: SamplingConfig) -> Self {
+    pub fn paper(sampling: SamplingConfig) -> Self {
         Self {
             name: "paper",
             sampling,
@@ -41,7 +41,7 @@ impl Decoding {
     }
 
     /// The same for a world: one that follows rules decodes nothing.
-    pub(crate) fn for_world(self, world: &WorldName) -> Self {
+    pub fn for_world(self, world: &WorldName) -> Self {
         match world {
             WorldName::Model(_) => self,
             WorldName::Log | WorldName::Idm | WorldName::ConstantVelocity => Self {
@@ -53,27 +53,27 @@ impl Decoding {
     }
 
     /// The network alone, decoded the same otherwise.
-    pub(crate) fn without_rules(&self) -> Self {
+    pub fn without_rules(&self) -> Self {
         Self::of(self.sampling.clone().without_rules())
     }
 
-    /// The same way with one thing turned.
-    pub(crate) fn turned(&self, turn: impl FnOnce(&mut SamplingConfig)) -> Self {
-        let mut turned = self.clone();
-        turn(&mut turned.sampling);
-        turned
+    /// The same way with another setting.
+    pub fn with(&self, change: impl FnOnce(&mut SamplingConfig)) -> Self {
+        let mut changed = self.clone();
+        change(&mut changed.sampling);
+        changed
     }
 
     /// How frames become those of the scene, for so many seconds.
-    pub(crate) fn frames(&self, seconds: f64) -> SimulateConfig {
+    pub fn frames(&self, seconds: f64) -> SimulateConfig {
         SimulateConfig {
             seconds,
             ..self.frames.clone()
         }
     }
 
-    /// What a world is called beside others: with the decoding, unless that is the usual one.
-    pub(crate) fn label(world: &str, name: &str) -> String {
+    /// The name of a world beside others: with the decoding, unless that is the usual one.
+    pub fn label(world: &str, name: &str) -> String {
         match name {
             Self::NONE | "ruled" => world.to_owned(),
             name => format!("{world} ({name})"),

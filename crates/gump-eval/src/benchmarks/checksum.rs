@@ -1,4 +1,4 @@
-//! The sum of a scene: what its file says, whatever packed the file.
+//! The checksum of a scene: of what its file says, whatever packed the file.
 //!
 //! Taken of the stored message, before a reader infers anything, and of numbers rounded so far
 //! that the last bits of another machine's sine do not count.
@@ -6,11 +6,11 @@
 use gump_proto::{FeatureData, MapPoint, Scenario};
 use sha2::{Digest, Sha256};
 
-/// Parts of a metre, a radian and a metre per second that count.
+/// Numbers count to this part of a metre, a radian, a metre per second.
 const PARTS: f64 = 1000.0;
 
-/// Sixteen hexadecimal digits that change with anything a driver could see.
-pub(crate) fn fingerprint(message: &Scenario) -> String {
+/// The checksum of a scene: sixteen hexadecimal digits that change with anything a driver could see.
+pub fn checksum(message: &Scenario) -> String {
     let mut sum = Sum(Sha256::new());
     sum.0.update(message.scenario_id());
     sum.whole(message.current_time_index());
@@ -121,12 +121,12 @@ mod tests {
 
     #[test]
     fn what_can_be_seen_counts_and_the_last_bits_do_not() {
-        let (message, plain) = (message(), fingerprint(&message()));
+        let (message, plain) = (message(), checksum(&message()));
         assert_eq!(plain.len(), 16);
         let changed = |change: &dyn Fn(&mut Scenario)| {
             let mut other = message.clone();
             change(&mut other);
-            fingerprint(&other)
+            checksum(&other)
         };
         let moved = |by: f64| {
             changed(&|m| {

@@ -1,0 +1,112 @@
+//! Holds scenes to the checksums of a list.
+
+use std::path::{Path, PathBuf};
+
+use gump_data::tfrecord::TfRecordReader;
+use gump_data::womd::decode_scenario;
+
+use super::{BenchmarkList, MadePart, RecordedPart, RecordedScene, checksum};
+use crate::{EvalError, Monitor, digest};
+
+/// Holds the file of a part below `folder` to the checksums of the list.
+///
+/// # Errors
+/// A file that is missing, or the first scene that differs.
+pub fn verify_made(
+    list: &BenchmarkList,
+    part: &MadePart,
+    folder: &Path,
+    monitor: &dyn Monitor,
+) -> Result<(), EvalError> {
+    let (path, list_path) = (list.file(folder, part), list.path().display());
+    if part.scenes.is_empty() {
+        return Err(EvalError::Benchmark(format!(
+            "expected sums of the part {} in {list_path}, found none: `data benchmark --freeze` \
+             writes those of a new list",
+            part.file,
+        )));
+    }
+    let found = checksums(&path, monitor)?;
+    let differs = part.scenes.iter().zip(&found).position(|(a, b)| a != b);
+    if let Some(k) = differs {
+        return Err(EvalError::Benchmark(format!(
+            "expected scene {k} of {} to be \"{}\" as {list_path} says, found \"{}\": {}",
+            part.file,
+            part.scenes[k],
+            found[k],
+            path.display()
+        )));
+    }
+    if found.len() != part.kept() || part.scenes.len() != part.kept() {
+        return Err(EvalError::Benchmark(format!(
+            "expected {} scenes as {list_path} says, found {}: {}",
+            part.kept(),
+            found.len(),
+            path.display()
+        )));
+    }
+    Ok(())
+}
+
+/// Checksum and id of every scene of a TFRecord file, as lists have them.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn checksums(path: &Path, monitor: &dyn Monitor) -> Result<Vec<String>, EvalError> {
+    let sum = |payload: Result<gump_data::tfrecord::Payload, _>| {
+        monitor.check()?;
+        let payload = payload?;
+        let message = decode_scenario(&payload.bytes)
+            .map_err(|problem| EvalError::Benchmark(format!("{problem}: {}", payload.place)))?;
+        let id = message.scenario_id();
+        Ok(format!("{} {id}", checksum(&message)))
+    };
+    TfRecordReader::open(path.to_owned())?.map(sum).collect()
+}
+
+/// The files of a part below the folder of recorded data, each once, held to their checksums.
+///
+/// # Errors
+/// A file that is missing or differs.
+pub fn verify_recorded(
+    list: &BenchmarkList,
+    part: &RecordedPart,
+    data: &Path,
+    monitor: &dyn Monitor,
+) -> Result<Vec<PathBuf>, EvalError> {
+    let mut files = Vec::new();
+    for line in &part.scenes {
+        monitor.check()?;
+        let scene = RecordedScene::parse(line)?;
+        let path = data.join(&part.folder).join(scene.file);
+        if !path.is_file() {
+            return Err(EvalError::Benchmark(format!(
+                "expected the recorded scene {} of the list {}, found no file {}; \
+                 GUMP_RECORDED names the folder of recorded data",
+                scene.id.unwrap_or(scene.file),
+                list.name,
+                path.display()
+            )));
+        }
+        let found = sha256(&path)?;
+        if found != scene.sha256 {
+            return Err(EvalError::Benchmark(format!(
+                "expected SHA-256 {} as {} says, found {found}: {}",
+                scene.sha256,
+                list.path().display(),
+                path.display()
+            )));
+        }
+        files.push(path);
+    }
+    Ok(files)
+}
+
+/// SHA-256 of a file, lower-case hexadecimal.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn sha256(path: &Path) -> Result<String, EvalError> {
+    let bytes = std::fs::read(path).map_err(|cause| EvalError::io("read", path, cause))?;
+    Ok(digest::of_bytes(&bytes))
+}

@@ -1,0 +1,178 @@
+//! Futures of one scene, with what they cost and an ear for who wants them to end.
+//!
+//! The engine in `gump-rollout` knows no clock, so the world is watched from outside.
+#![allow(
+    clippy::disallowed_methods,
+    reason = "worlds are timed; layers 0-3 may not look at the clock"
+)]
+
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use gump_rollout::{BoxError, Policy, Session, SimulateConfig, Start, WorldModel, simulate};
+use gump_scene::{AgentState, Frame, Rollout, Scenario, Seed};
+
+use crate::worlds::World;
+use crate::{EvalError, Monitor};
+
+/// Futures of one scene, and what they cost.
+pub struct Imagined {
+    /// The futures.
+    pub rollouts: Vec<Rollout>,
+    /// Frames that the world made, at its own rate, over all futures.
+    pub frames: usize,
+    /// Wall time that the world took, opening included.
+    pub elapsed: Duration,
+    /// Passes of the network per step of the world, whatever their batch, without those over the
+    /// history; 0 for worlds that follow rules.
+    pub passes_per_frame: f64,
+}
+
+impl Imagined {
+    /// Frames that the world made per second of wall time.
+    pub fn frames_per_second(&self) -> f64 {
+        self.frames as f64 / self.elapsed.as_secs_f64().max(1e-9)
+    }
+}
+
+/// Frames that the monitor of a simulation is told of: in steps of the scene, over all futures.
+pub fn frames(scenario: &Scenario, n_futures: usize, config: &SimulateConfig) -> u64 {
+    let steps = (config.seconds / scenario.dt).round().max(1.0);
+    steps as u64 * n_futures as u64
+}
+
+/// Simulates `n_futures` of what comes after the present; the world drives the ego too, and does
+/// not get its route, which comes from what is to be imagined. The monitor counts [`frames`].
+///
+/// # Errors
+/// A map without lanes for a world that follows them, what the world reports, or
+/// [`EvalError::Stopped`].
+pub fn imagine(
+    world: &World,
+    scenario: &Scenario,
+    n_futures: usize,
+    config: &SimulateConfig,
+    seed: Seed,
+    monitor: &dyn Monitor,
+) -> Result<Imagined, EvalError> {
+    imagine_around(world, scenario, n_futures, config, seed, None, monitor)
+}
+
+/// The same around an ego that `driver` drives, if there is one.
+///
+/// # Errors
+/// As [`imagine`], and what the driver reports.
+pub fn imagine_around(
+    world: &World,
+    scenario: &Scenario,
+    n_futures: usize,
+    config: &SimulateConfig,
+    seed: Seed,
+    driver: Option<&mut dyn Policy>,
+    monitor: &dyn Monitor,
+) -> Result<Imagined, EvalError> {
+    if world.follows_lanes() && scenario.map.lanes().is_empty() {
+        return Err(EvalError::Recording(format!(
+            "scenario {}: expected a map with lanes to drive on, found none",
+            scenario.id
+        )));
+    }
+    let scene = scenario.present().unguided();
+    let start = Start {
+        scene,
+        n_futures,
+        seed,
+    };
+    let watched = Watched {
+        world,
+        monitor,
+        scene_dt: scene.dt,
+        cost: Mutex::new(Cost::default()),
+    };
+    let rollouts =
+        simulate(&watched, &[start], driver, config).map_err(EvalError::of_simulation)?;
+    let cost = watched.cost.into_inner();
+    let cost = cost.unwrap_or_else(PoisonError::into_inner);
+    let passes = world.passes().saturating_sub(cost.passes_before);
+    Ok(Imagined {
+        rollouts,
+        frames: cost.frames,
+        elapsed: cost.elapsed,
+        passes_per_frame: passes as f64 / cost.steps.max(1) as f64,
+    })
+}
+
+struct Watched<'a> {
+    world: &'a World,
+    /// Told in units of the scene's step, since the world's own is not known before it is open.
+    monitor: &'a dyn Monitor,
+    scene_dt: f64,
+    cost: Mutex<Cost>,
+}
+
+#[derive(Default)]
+struct Cost {
+    frames: usize,
+    steps: usize,
+    elapsed: Duration,
+    /// Passes of the world once its session was open.
+    passes_before: u64,
+}
+
+impl Watched<'_> {
+    fn add(&self, change: impl FnOnce(&mut Cost)) {
+        // Adding numbers cannot leave them half added, so a poisoned lock still holds good ones.
+        let cost = self.cost.lock();
+        change(&mut cost.unwrap_or_else(PoisonError::into_inner));
+    }
+}
+
+impl WorldModel for Watched<'_> {
+    fn name(&self) -> &str {
+        self.world.model().name()
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        let began = Instant::now();
+        let session = self.world.model().open(starts)?;
+        self.add(|cost| {
+            cost.elapsed += began.elapsed();
+            cost.passes_before = self.world.passes();
+        });
+        Ok(Box::new(WatchedSession {
+            session,
+            watched: self,
+        }))
+    }
+}
+
+struct WatchedSession<'a> {
+    session: Box<dyn Session + 'a>,
+    watched: &'a Watched<'a>,
+}
+
+impl Session for WatchedSession<'_> {
+    fn dt(&self) -> f64 {
+        self.session.dt()
+    }
+
+    fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+        self.watched.monitor.check()?;
+        let began = Instant::now();
+        let frames = self.session.step(ego)?;
+        let stride = (self.session.dt() / self.watched.scene_dt).round().max(1.0);
+        self.watched
+            .monitor
+            .advance((stride * frames.len() as f64) as u64);
+        self.watched.add(|cost| {
+            cost.elapsed += began.elapsed();
+            cost.frames += frames.len();
+            cost.steps += 1;
+        });
+        Ok(frames)
+    }
+
+    fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
+        self.session.replace(future, start)
+    }
+}

@@ -1,0 +1,173 @@
+//! Waymo's realism of recorded scenarios: of a world or of files of rollouts, beside an oracle and
+//! constant velocity.
+//!
+//! [`recordings`] reads scenarios as the metric sees them, [`RolloutSource`] finds or makes their
+//! rollouts, [`evaluate`] scores those of one scenario. The metric itself is in `gump-wosac`.
+//!
+//! ```no_run
+//! use gump_engine::SamplingConfig;
+//! use gump_eval::decoding::Decoding;
+//! use gump_eval::realism::{RolloutSource, evaluate, recordings};
+//! use gump_model::Device;
+//! use gump_scene::Seed;
+//! use gump_wosac::realism::{Config, Year};
+//!
+//! let (paths, config) = (["scenarios.tfrecord".into()], Config::of(Year::Y2025));
+//! let decoding = Decoding::of(SamplingConfig::default());
+//! let mut source = RolloutSource::world("idm".parse()?, decoding, 32, Seed(0));
+//! for recorded in recordings(&paths, source.read_options(), |_| true)? {
+//!     let recorded = recorded?;
+//!     let rollouts = source.rollouts(&Device::Cpu, &recorded, config.mode, &())?;
+//!     let scores = evaluate(&recorded, vec![rollouts], 32, &config, |_, _| {})?;
+//!     println!("{}", scores.evaluated[0].scores.metametric);
+//! }
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+#![allow(
+    clippy::disallowed_methods,
+    reason = "scoring is timed; layers 0-3 may not look at the clock"
+)]
+
+mod recordings;
+mod rollouts;
+
+use std::time::Instant;
+
+use gump_rollout::worlds::ConstantVelocity;
+use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_scene::Seed;
+use gump_wosac::realism::{Config, Evaluation, Mode, Reference, Rollouts, Scores};
+use serde::{Deserialize, Serialize};
+
+use crate::EvalError;
+
+pub use recordings::{Recorded, Recordings, recordings};
+pub use rollouts::{FoundRollouts, RolloutSource};
+
+/// What one scenario got.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScenarioScores {
+    /// Wall seconds that scoring took, without imagining.
+    pub seconds: f64,
+    /// One for each decoding, in order.
+    pub evaluated: Vec<DecodingScores>,
+    /// Of the log itself.
+    pub oracle: Scores,
+    /// Of agents that keep their velocity.
+    pub constant_velocity: Scores,
+}
+
+/// What is evaluated, decoded in one way.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DecodingScores {
+    /// `ruled`, `raw` or `paper`; `-` where nothing is decoded.
+    pub decoding: String,
+    /// Of the rollouts, if a world imagined them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub digest: Option<String>,
+    /// Of the rollouts.
+    pub scores: Scores,
+}
+
+/// Scores the rollouts of one scenario, beside `n_rollouts` of the log and of constant velocity;
+/// `visit` sees each evaluation with its rollouts.
+///
+/// # Errors
+/// A log or rollouts that the metric is not defined on.
+pub fn evaluate(
+    recorded: &Recorded,
+    rollouts: Vec<FoundRollouts>,
+    n_rollouts: usize,
+    config: &Config,
+    mut visit: impl FnMut(&FoundRollouts, &Evaluation<'_>),
+) -> Result<ScenarioScores, EvalError> {
+    let id = &recorded.log.scenario;
+    let of_this = |error: EvalError| error.at(&format!("cannot evaluate scenario {id}"));
+    let baseline = constant_velocity(recorded, config.mode).map_err(of_this)?;
+    let oracle = recorded
+        .log
+        .oracle(n_rollouts, config.mode == Mode::Generation);
+    let began = Instant::now();
+    let reference = Reference::new(&recorded.log, config)?;
+    let mut evaluated = Vec::new();
+    for found in rollouts {
+        let evaluation = reference.evaluate(&found.rollouts)?;
+        visit(&found, &evaluation);
+        evaluated.push(DecodingScores {
+            decoding: found.decoding.into(),
+            digest: found.digest.clone(),
+            scores: evaluation.scores,
+        });
+    }
+    Ok(ScenarioScores {
+        seconds: began.elapsed().as_secs_f64() / evaluated.len() as f64,
+        oracle: reference.evaluate(&oracle)?.scores,
+        constant_velocity: reference.evaluate(&baseline.repeated(n_rollouts))?.scores,
+        evaluated,
+    })
+}
+
+/// Everyone keeps its velocity: one rollout, since all would be equal.
+fn constant_velocity(recorded: &Recorded, mode: Mode) -> Result<Rollouts, EvalError> {
+    let start = Start {
+        scene: recorded.scenario.present().unguided(),
+        n_futures: 1,
+        seed: Seed(0),
+    };
+    let config = SimulateConfig::default();
+    let rollouts = simulate(&ConstantVelocity, &[start], None, &config);
+    let rollouts = rollouts.map_err(EvalError::of_simulation)?;
+    Ok(Rollouts::of(&recorded.log.scenario, &rollouts, mode)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use gump_engine::SamplingConfig;
+    use gump_model::Device;
+    use gump_wosac::realism::Year;
+
+    use super::*;
+    use crate::decoding::Decoding;
+
+    #[test]
+    fn a_world_is_scored_beside_the_log_and_seen_once() {
+        let file = "../../datasets/mini/sumo-hamburg.tfrecord.gz";
+        let paths = [Path::new(env!("CARGO_MANIFEST_DIR")).join(file)];
+        let config = Config::of(Year::Y2025);
+        let decoding = Decoding::of(SamplingConfig::default());
+        let idm = "idm".parse().unwrap();
+        let mut source = RolloutSource::world(idm, decoding, 4, Seed(0));
+        let first = recordings(&paths, source.read_options(), |index| index == 1)
+            .unwrap()
+            .next();
+        let recorded = first.unwrap().unwrap();
+        assert_eq!(recorded.index, 1);
+        assert_eq!(source.frames(&recorded.scenario), Some(4 * 80));
+        let found = source
+            .rollouts(&Device::Cpu, &recorded, config.mode, &())
+            .unwrap();
+        assert_eq!(found.rollouts.count(), 4);
+        let mut visited = 0;
+        let scores = evaluate(&recorded, vec![found], 4, &config, |_, evaluation| {
+            assert!(!evaluation.explain().is_empty());
+            visited += 1;
+        });
+        let scores = scores.unwrap();
+        assert_eq!((visited, scores.evaluated.len()), (1, 1));
+        for found in [&scores.evaluated[0].scores, &scores.oracle] {
+            assert!(0.0 < found.metametric && found.metametric < 1.0);
+        }
+        assert!(scores.evaluated[0].digest.is_some());
+    }
+
+    #[test]
+    fn no_paths_and_no_rollouts_are_errors() {
+        let error = recordings(&[], gump_data::ReadOptions::ALL, |_| true).err();
+        assert!(error.unwrap().to_string().contains("found none"));
+        let folder = tempfile::tempdir().unwrap();
+        let error = RolloutSource::files(folder.path()).err().unwrap();
+        assert!(error.to_string().contains("*.binproto*"), "{error}");
+    }
+}
