@@ -61,12 +61,17 @@ pub(crate) enum Device {
 impl Device {
     /// Opens the device.
     ///
-    /// Error: [`WrongArguments`] in a build without CUDA, or what the driver reports.
+    /// Error: [`WrongArguments`] in a build without CUDA, or where there is no GPU or something that
+    /// it takes is missing.
     fn open(self) -> anyhow::Result<gump_model::Device> {
         match self {
             Self::Cpu => Ok(gump_model::Device::Cpu),
             Self::Cuda if cfg!(feature = "cuda") => {
-                gump_model::Device::new_cuda(0).context("cannot open the first NVIDIA GPU")
+                let opened = quietly(|| gump_model::Device::new_cuda(0));
+                opened.map_err(|why| {
+                    let what = format!("--device cuda: cannot open the first NVIDIA GPU, {why}");
+                    WrongArguments(what).into()
+                })
             }
             Self::Cuda => {
                 let why = "--device cuda needs a build with CUDA, this one has none: \
@@ -82,6 +87,26 @@ impl Device {
             Self::Cuda => "cuda",
         }
     }
+}
+
+/// What `open` returns; why it failed, in one line. Libraries of a GPU are loaded at their first use,
+/// and where one is missing that panics.
+fn quietly<T, E: std::fmt::Display>(open: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| ()));
+    let found = std::panic::catch_unwind(std::panic::AssertUnwindSafe(open));
+    std::panic::set_hook(hook);
+    let why = match found {
+        Ok(Ok(opened)) => return Ok(opened),
+        Ok(Err(error)) => error.to_string(),
+        Err(panic) => match (panic.downcast_ref::<String>(), panic.downcast_ref::<&str>()) {
+            (Some(why), _) => why.clone(),
+            (_, Some(why)) => (*why).to_owned(),
+            _ => String::new(),
+        },
+    };
+    let first = why.lines().map(str::trim).find(|line| !line.is_empty());
+    Err(first.unwrap_or("it does not say why").to_owned())
 }
 
 /// Columns of a terminal that tables fit into.
@@ -314,5 +339,22 @@ pub(crate) fn catch_interrupts() {
     });
     if caught.is_err() {
         print_error("warning: Ctrl-C cannot be caught and stops at once");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn libraries_that_panic_at_their_first_use_are_errors_of_one_line() {
+        let check = |open: fn() -> Result<u8, String>, expected: Result<u8, &str>| {
+            assert_eq!(quietly(open), expected.map_err(str::to_owned));
+        };
+        check(|| Ok(7), Ok(7));
+        check(|| Err("\n no device\n at line 3".into()), Err("no device"));
+        check(|| Err(String::new()), Err("it does not say why"));
+        check(|| panic!("no library"), Err("no library"));
+        check(|| panic!("no library {}", 3), Err("no library 3"));
     }
 }

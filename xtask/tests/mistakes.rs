@@ -197,6 +197,35 @@ fn a_bench_tells_missing_pytorch_and_unknown_sizes() {
     }
 }
 
+#[cfg(unix)]
+#[test]
+fn a_bench_tells_pythons_without_a_recent_pytorch() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let place = Workplace::new();
+    let missing = "echo 'ModuleNotFoundError: no module torch' >&2; exit 1";
+    for (name, says, expected) in [
+        ("without", missing, "ModuleNotFoundError: no module torch"),
+        (
+            "old",
+            "echo 1.13.1+cpu",
+            "expected PyTorch 2.4 or newer, found 1.13.1+cpu",
+        ),
+        (
+            "odd",
+            "echo unknown",
+            "expected PyTorch 2.4 or newer, found unknown",
+        ),
+    ] {
+        let python = place.path(name);
+        fs::write(&python, format!("#!/bin/sh\n{says}\n")).unwrap();
+        fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+        for verb in ["train", "engine"] {
+            let words = format!("bench {verb} --sizes tiny --torch {}", python.display());
+            place.check(&words, 2, &["--torch ", expected]);
+        }
+    }
+}
+
 #[test]
 fn heads_are_asked_of_networks_that_have_them() {
     let place = Workplace::new();

@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use gump_geometry::{OrientedBox, Polygon, Pose, Quad};
 use gump_scene::{Agent, AgentState, Lane, LaneId, LightState, MapGraph};
 
-use super::corridor::{Corridor, Footprint};
-use super::{Scene, in_intersection};
+use super::corridor::{Corridor, Footprint, Start};
+use super::{Obstacle, Scene, in_intersection};
 use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
 use gump_rollout::worlds::idm_euler_step;
 
@@ -29,6 +29,55 @@ pub(super) struct Vehicle {
     target_speed: f64,
     /// The box and, once it has moved, its position in 1.5 s.
     footprint: Footprint,
+    /// Which of the others, the fixed ones first, was the leader in the last step.
+    led_by: Option<usize>,
+    /// Kept between steps for its memory: see [`Vehicle::nearest`].
+    near: Vec<(f64, usize)>,
+}
+
+/// All that may be in the way of a vehicle: the fixed obstacles, then the vehicles but itself.
+#[derive(Clone, Copy)]
+pub(super) struct Others<'a> {
+    pub(super) fixed: &'a [Obstacle],
+    pub(super) before: &'a [Vehicle],
+    pub(super) after: &'a [Vehicle],
+}
+
+impl<'a> Others<'a> {
+    fn len(self) -> usize {
+        self.fixed.len() + self.before.len() + self.after.len()
+    }
+
+    fn get(self, i: usize) -> InTheWay<'a> {
+        let n_before = self.fixed.len() + self.before.len();
+        let vehicle = match self.fixed.get(i) {
+            Some(fixed) => {
+                return InTheWay {
+                    footprint: &fixed.footprint,
+                    heading: fixed.heading,
+                    speed: fixed.speed,
+                    vehicle: None,
+                };
+            }
+            None if i < n_before => &self.before[i - self.fixed.len()],
+            None => &self.after[i - n_before],
+        };
+        InTheWay {
+            footprint: &vehicle.footprint,
+            heading: vehicle.pose().heading,
+            speed: vehicle.speed,
+            vehicle: Some(vehicle),
+        }
+    }
+}
+
+/// What may be in the way of a vehicle.
+#[derive(Clone, Copy)]
+struct InTheWay<'a> {
+    footprint: &'a Footprint,
+    heading: f64,
+    speed: f64,
+    vehicle: Option<&'a Vehicle>,
 }
 
 /// Pairs of vehicles whose corridors intersect. Computed once per pair of corridors, which only get
@@ -117,6 +166,8 @@ impl Vehicle {
             speed: agent.state.speed(),
             target_speed: *target,
             footprint: Footprint::new(vec![Quad::from(&placed)]),
+            led_by: None,
+            near: Vec::new(),
         };
         vehicle.place(pose);
         Some(vehicle)
@@ -135,10 +186,10 @@ impl Vehicle {
     }
 
     /// Moves for `dt` seconds; `others` are in their current states.
-    pub(super) fn step<'a>(
+    pub(super) fn step(
         &mut self,
         scene: &Scene<'_>,
-        others: impl Iterator<Item = &'a Self>,
+        others: Others<'_>,
         encounters: &mut Encounters,
         dt: f64,
     ) {
@@ -168,14 +219,9 @@ impl Vehicle {
     fn sweep(&mut self, headway: f64) {
         let half = self.agent.length / 2.0;
         let own = Quad::from(&self.agent.oriented_box());
-        self.footprint.pieces.clear();
-        self.footprint.pieces.push(own);
-        let (from, to) = (
-            self.progress - half,
-            self.progress + half + self.speed * headway,
-        );
-        self.corridor.pieces(from, to, &mut self.footprint.pieces);
-        self.footprint.measure();
+        let to = self.progress + half + self.speed * headway;
+        self.footprint
+            .sweep(own, &self.corridor, self.progress - half, to);
     }
 
     /// Adds lanes while the path ahead is short; it ends where none may be entered.
@@ -206,41 +252,17 @@ impl Vehicle {
     }
 
     /// The nearest agent that reaches into the path ahead; the end of the path where there is none.
-    fn lead<'a>(
-        &self,
-        scene: &Scene<'_>,
-        others: impl Iterator<Item = &'a Self>,
-        encounters: &mut Encounters,
-    ) -> Lead {
-        let bounds = self.corridor.bounds_from(self.progress);
-        let fixed = scene.fixed.iter();
-        let fixed = fixed.map(|fixed| (&fixed.footprint, fixed.heading, fixed.speed, None));
-        let others = others.map(|other| {
-            let heading = other.pose().heading;
-            (&other.footprint, heading, other.speed, Some(other))
+    fn lead(&mut self, scene: &Scene<'_>, others: Others<'_>, encounters: &mut Encounters) -> Lead {
+        let start = self.corridor.start(self.progress);
+        let bounds = self.corridor.bounds_from(start);
+        let mut near = std::mem::take(&mut self.near);
+        let nearest = self.nearest(others, start, encounters, &mut near);
+        self.near = near;
+        self.led_by = nearest.map(|(_, i)| i);
+        let mut nearest = nearest.map(|(distance, i)| {
+            let InTheWay { heading, speed, .. } = others.get(i);
+            (distance, speed * (heading - self.pose().heading).cos())
         });
-        let mut near: Vec<_> = fixed
-            .chain(others)
-            .filter(|(footprint, ..)| footprint.is_within(bounds))
-            .enumerate()
-            .map(|(i, other)| (self.footprint.gap_at_least(other.0), i, other))
-            .collect();
-        near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let mut nearest: Option<(f64, usize, f64)> = None;
-        for (gap, i, (footprint, heading, speed, vehicle)) in near {
-            if nearest.is_some_and(|(least, ..)| gap > least) {
-                break;
-            }
-            if !self.is_crossed(footprint, vehicle, encounters) {
-                continue;
-            }
-            let distance = self.footprint.distance(footprint);
-            // Of several as near as each other the first counts.
-            if nearest.is_none_or(|(least, first, _)| (distance, i) < (least, first)) {
-                nearest = Some((distance, i, speed * (heading - self.pose().heading).cos()));
-            }
-        }
-        let mut nearest = nearest.map(|(distance, _, speed)| (distance, speed));
         for line in self
             .lanes
             .iter()
@@ -262,21 +284,76 @@ impl Vehicle {
         }
     }
 
-    /// True if a footprint, possibly of a vehicle, reaches into the path ahead.
-    fn is_crossed(
+    /// The distance to the nearest of the others that reach into the path ahead, and which it is: of
+    /// several as near as each other the first. `near` is overwritten.
+    ///
+    /// They are looked at in the order of the gaps between bounding boxes, up to the first gap
+    /// larger than the least distance. Who was nearest in the last step is looked at before: mostly
+    /// it still is, and few have a smaller gap than its distance.
+    fn nearest(
         &self,
-        footprint: &Footprint,
-        vehicle: Option<&Self>,
+        others: Others<'_>,
+        start: Start,
         encounters: &mut Encounters,
-    ) -> bool {
-        match vehicle {
-            // All that it sweeps lies on its own way, which does not meet this one.
-            Some(other) if !encounters.meet(self, other) => {
-                let body = &footprint.pieces[..1];
-                self.corridor
-                    .is_touched_by(self.progress, body, body[0].bounds())
+        near: &mut Vec<(f64, usize)>,
+    ) -> Option<(f64, usize)> {
+        let bounds = self.corridor.bounds_from(start);
+        let mut measure = |i: usize| {
+            let found = others.get(i);
+            self.is_crossed(found, start, encounters)
+                .then(|| self.footprint.distance(found.footprint))
+        };
+        let gap_squared = |i: usize| {
+            let footprint = others.get(i).footprint;
+            let is_within = footprint.is_within(bounds);
+            is_within.then(|| self.footprint.gap_squared(footprint))
+        };
+        let mut nearest: Option<(f64, usize)> = None;
+        if let Some(i) = self.led_by.filter(|&i| i < others.len())
+            && let Some(gap) = gap_squared(i)
+            && let Some(distance) = measure(i)
+            // Not where rounding makes it nearer than its bounds: the order would then matter.
+            && distance >= gap.sqrt()
+        {
+            nearest = Some((distance, i));
+        }
+        let first = nearest;
+        // The root decides, but only of what may be near.
+        let may_be_near = first.map_or(f64::INFINITY, |(d, _)| d * d * (1.0 + 1e-9));
+        near.clear();
+        for i in 0..others.len() {
+            if let Some(gap) = gap_squared(i).filter(|&gap| gap <= may_be_near) {
+                near.push((gap.sqrt(), i));
             }
-            _ => self.corridor.is_touched(self.progress, footprint),
+        }
+        near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        for &(gap, i) in near.iter() {
+            if let Some((least, first)) = nearest {
+                // Those without a gap come first, in their own order.
+                if gap > least || (least == 0.0 && i > first) {
+                    break;
+                }
+            }
+            if first.is_some_and(|(_, first)| first == i) {
+                continue;
+            }
+            if let Some(distance) = measure(i)
+                && nearest.is_none_or(|least| (distance, i) < least)
+            {
+                nearest = Some((distance, i));
+            }
+        }
+        nearest
+    }
+
+    /// True if something reaches into the path ahead.
+    fn is_crossed(&self, other: InTheWay<'_>, start: Start, encounters: &mut Encounters) -> bool {
+        match other.vehicle {
+            // All that it sweeps lies on its own way, which does not meet this one.
+            Some(vehicle) if !encounters.meet(self, vehicle) => {
+                self.corridor.is_touched_by_body(start, other.footprint)
+            }
+            _ => self.corridor.is_touched(start, other.footprint),
         }
     }
 
@@ -314,4 +391,142 @@ fn straightest<'m>(scene: &Scene<'m>, last: LaneId) -> Option<&'m Lane> {
         }
     }
     best.map(|(_, lane)| lane)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::closed_loop::{Recording, Step, Traffic};
+    use crate::reactive_agents::{NuplanIdm, fixed_obstacles};
+    use crate::tracking::Trajectory;
+    use std::fmt::Write as _;
+
+    /// A road of two lanes in a bend, one that joins it, two that cross it at an angle; queues on all
+    /// of them and people beside them.
+    fn busy() -> Recording {
+        let bend = |radius: f64, i: i32| {
+            let angle = f64::from(i) * 0.05;
+            (radius * angle.sin(), 60.0 - radius * angle.cos(), angle)
+        };
+        let line = |x: f64, y: f64, angle: f64, i: i32| {
+            let s = f64::from(i) * 4.0;
+            (x + s * angle.cos(), y + s * angle.sin(), angle)
+        };
+        let at = |lane: i32, i: i32| match lane {
+            1 => bend(60.0, i),
+            2 => bend(56.5, i),
+            3 => line(-80.0, 0.0, 0.0, i),
+            4 => line(-15.0, 45.0, -0.9, i),
+            _ => line(60.0, -20.0, 2.3, i),
+        };
+        let mut text = String::from("history 0.1 future 9 dt 0.1\nego vehicle 0: 3,0.2\n");
+        for (lane, rest) in [(1, ""), (2, ""), (3, " next 1"), (4, ""), (5, "")] {
+            write!(text, "lane {lane}:").unwrap();
+            for i in 0..=20 {
+                let (x, y, _) = at(lane, i);
+                write!(text, " {x:.3},{y:.3}").unwrap();
+            }
+            writeln!(text, " speed {}{rest}", 6 + 2 * lane).unwrap();
+            for i in 0..6 {
+                let (x, y, heading) = at(lane, 3 * i + 1);
+                let id = 10 * lane + i;
+                let (vx, vy) = (5.0 * heading.cos(), 5.0 * heading.sin());
+                writeln!(
+                    text,
+                    "agent vehicle {id}: {x:.3},{y:.3} heading {heading} velocity {vx},{vy}"
+                )
+                .unwrap();
+            }
+            let (x, y, _) = at(lane, 9);
+            let y = y - 3.0;
+            writeln!(
+                text,
+                "agent pedestrian {}: {x},{y} velocity 0,0.7",
+                100 + lane
+            )
+            .unwrap();
+        }
+        text.push_str("route 1\n");
+        Recording::of_boxes(gump_scene::fixture::scenario(&text).unwrap()).unwrap()
+    }
+
+    /// [`Vehicle::nearest`], without leaving anything out.
+    fn plainly(
+        vehicle: &Vehicle,
+        others: Others<'_>,
+        encounters: &mut Encounters,
+    ) -> Option<(f64, usize)> {
+        let mut ahead = Vec::new();
+        let corridor = &vehicle.corridor;
+        corridor.pieces(vehicle.progress, f64::INFINITY, &mut ahead);
+        let apart = |a: &[Quad], b: &[Quad]| {
+            let pairs = a.iter().flat_map(|a| b.iter().map(|b| a.distance(b)));
+            pairs.fold(f64::INFINITY, f64::min)
+        };
+        let mut nearest = None;
+        for i in 0..others.len() {
+            let other = others.get(i);
+            let pieces = other.footprint.pieces();
+            let meets = other
+                .vehicle
+                .is_none_or(|other| encounters.meet(vehicle, other));
+            let reaching = if meets { pieces } else { &pieces[..1] };
+            let touches = |a: &Quad| reaching.iter().any(|b| a.intersects(b));
+            if ahead.iter().any(touches) {
+                let found = (apart(vehicle.footprint.pieces(), pieces), i);
+                if nearest.is_none_or(|least| found < least) {
+                    nearest = Some(found);
+                }
+            }
+        }
+        nearest
+    }
+
+    #[test]
+    fn the_leader_is_that_of_a_plain_search() {
+        let recording = busy();
+        let mut traffic = NuplanIdm::default();
+        traffic.begin(&recording).unwrap();
+        assert!(traffic.n_vehicles() > 20);
+        let scene = recording.scenario().present();
+        let (mut led, mut touching, mut free) = (0, 0, 0);
+        for iteration in 0..80 {
+            let (ego, next) = (recording.ego_at(iteration), recording.ego_at(iteration + 1));
+            let plan = Trajectory::new(vec![*ego, *next]).unwrap();
+            let step = Step {
+                recording: &recording,
+                iteration,
+                ego,
+                next,
+                plan: &plan,
+                scene,
+            };
+            traffic.advance(&step).unwrap();
+            let shape = recording.vehicle().footprint(ego.rear_axle);
+            let fixed = fixed_obstacles(&shape, ego.speed(), step.logged());
+            for i in 0..traffic.vehicles.len() {
+                let (before, rest) = traffic.vehicles.split_at(i);
+                let others = Others {
+                    fixed: &fixed,
+                    before,
+                    after: &rest[1..],
+                };
+                let vehicle = &rest[0];
+                let start = vehicle.corridor.start(vehicle.progress);
+                let encounters = &mut traffic.encounters;
+                let expected = plainly(vehicle, others, encounters);
+                let found = vehicle.nearest(others, start, encounters, &mut Vec::new());
+                assert_eq!(found, expected, "vehicle {i} in step {iteration}");
+                match found {
+                    Some((distance, _)) if distance > 0.0 => led += 1,
+                    Some(_) => touching += 1,
+                    None => free += 1,
+                }
+            }
+        }
+        assert!(
+            led > 200 && touching > 200 && free > 200,
+            "{led} {touching} {free}"
+        );
+    }
 }

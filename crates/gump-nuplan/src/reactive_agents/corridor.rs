@@ -6,6 +6,16 @@ use crate::path::Path;
 
 /// Segments that share bounds.
 const CHUNK: usize = 16;
+/// Pieces of a footprint that share bounds.
+const BLOCK: usize = 8;
+/// What bounds along a chunk are wider than what they hold, metres: far more than rounding costs at
+/// coordinates of 10^7 m.
+const SLACK: f64 = 1e-6;
+
+/// The corners of an axis-aligned bounding box, (min, max).
+type Bounds = (DVec2, DVec2);
+
+const NOWHERE: Bounds = (DVec2::INFINITY, DVec2::NEG_INFINITY);
 
 /// A path widened to the width of a vehicle. Pieces are cut once per path, not once per step.
 #[derive(Clone, Debug)]
@@ -16,10 +26,88 @@ pub(super) struct Corridor {
     stretches: Vec<Quad>,
     /// The piece that closes the bend at the start of each segment.
     joints: Vec<Option<Quad>>,
+    /// Bounds of each segment with its joint.
+    cells: Vec<Bounds>,
     /// Bounds of all that follows the start of each segment.
-    bounds: Vec<(DVec2, DVec2)>,
-    /// Bounds of every few segments with their joints.
-    chunks: Vec<(DVec2, DVec2)>,
+    bounds: Vec<Bounds>,
+    /// Every few segments with their joints.
+    chunks: Vec<Chunk>,
+}
+
+/// Where a vehicle is in its corridor.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Start {
+    /// Arc length, metres.
+    from: f64,
+    /// The segment that holds it.
+    segment: usize,
+}
+
+/// Bounds of a few segments with their joints.
+#[derive(Clone, Copy, Debug)]
+struct Chunk {
+    bounds: Bounds,
+    /// Unit vector from the start to the end; the x axis where there is no such direction.
+    along: DVec2,
+    /// The least and the greatest coordinates along and across that direction.
+    low: DVec2,
+    high: DVec2,
+    /// The rectangle that these bound.
+    strip: Quad,
+    /// Whether every segment has a length and a width.
+    is_solid: bool,
+}
+
+impl Chunk {
+    fn around(pieces: &[Quad], joints: &[Option<Quad>], margin: f64) -> Self {
+        let margin = DVec2::splat(margin);
+        let ends = pieces[pieces.len() - 1].center() - pieces[0].center();
+        let along = ends.try_normalize().unwrap_or(DVec2::X);
+        let all = pieces.iter().chain(joints.iter().flatten());
+        let extents = all.map(|piece| extent(along, piece));
+        let (low, high) = extents.fold(NOWHERE, union);
+        let (low, high) = (low - SLACK, high + SLACK);
+        let at = |x: f64, y: f64| along * x + along.perp() * y;
+        let bounds = pieces.iter().map(Quad::bounds).fold(NOWHERE, union);
+        Self {
+            bounds: (bounds.0 - margin, bounds.1 + margin),
+            along,
+            low,
+            high,
+            strip: Quad::new([
+                at(low.x, low.y),
+                at(high.x, low.y),
+                at(high.x, high.y),
+                at(low.x, high.y),
+            ]),
+            is_solid: pieces.iter().all(is_solid),
+        }
+    }
+
+    /// True only if a shape shares no point with any piece of the chunk.
+    #[inline]
+    fn is_clear_of(&self, quad: &Quad) -> bool {
+        !overlap((self.low, self.high), extent(self.along, quad))
+    }
+
+    /// True only if no two pieces of the chunks share a point.
+    fn is_clear_of_all(&self, other: &Self) -> bool {
+        self.is_clear_of(&other.strip) || other.is_clear_of(&self.strip)
+    }
+}
+
+/// The least and the greatest coordinates of a shape along and across a direction.
+#[inline]
+fn extent(along: DVec2, quad: &Quad) -> Bounds {
+    let corners = quad.corners().iter();
+    let turned = corners.map(|&p| DVec2::new(along.dot(p), along.perp_dot(p)));
+    turned.fold(NOWHERE, |(low, high), p| (low.min(p), high.max(p)))
+}
+
+/// Whether a rectangle has a length and a width.
+fn is_solid(quad: &Quad) -> bool {
+    let [a, b, c, _] = *quad.corners();
+    a.distance_squared(b) > SLACK && b.distance_squared(c) > SLACK
 }
 
 impl Corridor {
@@ -34,7 +122,7 @@ impl Corridor {
             .zip(&sides)
             .map(|(pair, &side)| stretch(pair[0], pair[1], side))
             .collect();
-        let joints = (0..sides.len())
+        let joints: Vec<Option<Quad>> = (0..sides.len())
             .map(|i| joint(points[i], *sides.get(i.checked_sub(1)?)?, sides[i]))
             .collect();
         let mut bounds = Vec::with_capacity(stretches.len());
@@ -48,16 +136,16 @@ impl Corridor {
             bounds.push(all);
         }
         bounds.reverse();
-        let none = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        let chunks = stretches.chunks(CHUNK).map(|chunk| {
-            let (low, high) = chunk
-                .iter()
-                .map(Quad::bounds)
-                .fold(none, |all, (min, max)| (all.0.min(min), all.1.max(max)));
-            (low - margin, high + margin)
-        });
+        let chunks = stretches.chunks(CHUNK).zip(joints.chunks(CHUNK));
+        let chunks = chunks.map(|(pieces, joints)| Chunk::around(pieces, joints, half_width));
         let chunks = chunks.collect();
+        let cells = stretches.iter().zip(&joints).map(|(piece, joint)| {
+            let joint: Option<&Quad> = joint.as_ref();
+            joint.map_or(piece.bounds(), |j| union(piece.bounds(), j.bounds()))
+        });
+        let cells = cells.collect();
         Self {
+            cells,
             chunks,
             path,
             half_width,
@@ -71,9 +159,18 @@ impl Corridor {
         &self.path
     }
 
-    /// Bounds of the corridor from arc length `s` on.
-    pub(super) fn bounds_from(&self, s: f64) -> (DVec2, DVec2) {
-        self.bounds[self.segment(s)]
+    /// Arc length `s`, clamped to the path.
+    pub(super) fn start(&self, s: f64) -> Start {
+        let from = s.clamp(0.0, self.path.length());
+        Start {
+            from,
+            segment: self.segment(from),
+        }
+    }
+
+    /// Bounds of the corridor from `start` on.
+    pub(super) fn bounds_from(&self, start: Start) -> Bounds {
+        self.bounds[start.segment]
     }
 
     /// The pieces between two arc lengths, with flat ends, appended to `pieces`; both are clamped
@@ -107,36 +204,60 @@ impl Corridor {
         }
     }
 
-    /// True if a footprint reaches into the corridor anywhere from arc length `from` on.
-    pub(super) fn is_touched(&self, from: f64, footprint: &Footprint) -> bool {
-        self.is_touched_by(from, &footprint.pieces, (footprint.min, footprint.max))
+    /// True if a footprint reaches into the corridor anywhere from `start` on.
+    pub(super) fn is_touched(&self, start: Start, footprint: &Footprint) -> bool {
+        let bounds = footprint.bounds;
+        let touches = |piece: &Quad| {
+            overlap(piece.bounds(), bounds)
+                && footprint
+                    .near(piece.bounds())
+                    .any(|body| body.intersects(piece))
+        };
+        self.has_piece(start, bounds, |_| true, touches)
     }
 
-    /// True if any of `bodies`, which lie within `bounds`, reaches into the corridor anywhere from
-    /// arc length `from` on.
-    pub(super) fn is_touched_by(&self, from: f64, bodies: &[Quad], bounds: (DVec2, DVec2)) -> bool {
-        let length = self.path.length();
-        let from = from.clamp(0.0, length);
-        if from >= length {
+    /// True if the first piece of a footprint reaches into the corridor anywhere from `start` on.
+    pub(super) fn is_touched_by_body(&self, start: Start, footprint: &Footprint) -> bool {
+        let body = &footprint.pieces[0];
+        // What bounds along the chunk keep apart, the test of two shapes finds apart too, as long as
+        // one of them has a length and a width.
+        let is_near = |chunk: &Chunk| !footprint.is_solid || !chunk.is_clear_of(body);
+        self.has_piece(start, body.bounds(), is_near, |piece| {
+            body.intersects(piece)
+        })
+    }
+
+    /// True for any piece from `start` on that `touches`, among those that overlap `bounds` and
+    /// whose chunk is near.
+    fn has_piece(
+        &self,
+        start: Start,
+        bounds: Bounds,
+        is_near: impl Fn(&Chunk) -> bool,
+        touches: impl Fn(&Quad) -> bool,
+    ) -> bool {
+        let Start { from, segment } = start;
+        if from >= self.path.length() {
             return false;
         }
-        let first = self.segment(from);
-        let touches = |piece: &Quad| {
-            overlap(piece.bounds(), bounds) && bodies.iter().any(|body| body.intersects(piece))
-        };
-        if self
-            .rest_of(first, from)
-            .is_some_and(|piece| touches(&piece))
-        {
-            return true;
+        for (i, chunk) in self.chunks(segment) {
+            if !overlap(chunk.bounds, bounds) || !is_near(chunk) {
+                continue;
+            }
+            for i in self.segments(i, segment) {
+                if i == segment {
+                    if self.rest_of(i, from).is_some_and(|piece| touches(&piece)) {
+                        return true;
+                    }
+                } else if overlap(self.cells[i], bounds)
+                    && (touches(&self.stretches[i])
+                        || self.joints[i].as_ref().is_some_and(&touches))
+                {
+                    return true;
+                }
+            }
         }
-        let start = first + 1;
-        self.chunks(start).any(|(chunk, of_chunk)| {
-            overlap(of_chunk, bounds)
-                && self.segments(chunk, start).any(|i| {
-                    touches(&self.stretches[i]) || self.joints[i].as_ref().is_some_and(touches)
-                })
-        })
+        false
     }
 
     /// True if what follows arc length `from` shares a point with what follows `other_from` of
@@ -147,22 +268,34 @@ impl Corridor {
             return false;
         }
         let bounds = other.bounds[other_start];
-        let mut near = self.chunks(start).filter(|(_, b)| overlap(*b, bounds));
-        near.any(|(chunk, own)| {
-            let mut theirs = other.chunks(other_start).filter(|(_, b)| overlap(*b, own));
-            theirs.any(|(other_chunk, _)| {
-                other.segments(other_chunk, other_start).any(|j| {
-                    let pieces = std::iter::once(&other.stretches[j]).chain(&other.joints[j]);
-                    pieces.into_iter().any(|piece| {
-                        overlap(piece.bounds(), own)
-                            && self.segments(chunk, start).any(|i| {
-                                self.stretches[i].intersects(piece)
-                                    || self.joints[i].as_ref().is_some_and(|p| p.intersects(piece))
-                            })
-                    })
+        self.chunks(start).any(|(chunk, own)| {
+            overlap(own.bounds, bounds)
+                && other.chunks(other_start).any(|(other_chunk, theirs)| {
+                    overlap(own.bounds, theirs.bounds)
+                        && !(own.is_solid && theirs.is_solid && own.is_clear_of_all(theirs))
+                        && other.segments(other_chunk, other_start).any(|j| {
+                            overlap(own.bounds, other.cells[j])
+                                && self.meets_segment(chunk, start, other, j)
+                        })
                 })
-            })
         })
+    }
+
+    /// True if a segment of a chunk, from `start` on, shares a point with segment `j` of another
+    /// corridor.
+    fn meets_segment(&self, chunk: usize, start: usize, other: &Self, j: usize) -> bool {
+        let own = &self.chunks[chunk];
+        std::iter::once(&other.stretches[j])
+            .chain(&other.joints[j])
+            .any(|piece| {
+                overlap(own.bounds, piece.bounds())
+                    && !(own.is_solid && is_solid(&other.stretches[j]) && own.is_clear_of(piece))
+                    && self.segments(chunk, start).any(|i| {
+                        overlap(self.cells[i], piece.bounds())
+                            && (self.stretches[i].intersects(piece)
+                                || self.joints[i].as_ref().is_some_and(|p| p.intersects(piece)))
+                    })
+            })
     }
 
     /// The part of segment `i` after arc length `from`.
@@ -178,9 +311,9 @@ impl Corridor {
         (start != points[i + 1]).then(|| stretch(start, points[i + 1], side))
     }
 
-    /// The chunks from that of segment `start` on, with their bounds.
-    fn chunks(&self, start: usize) -> impl Iterator<Item = (usize, (DVec2, DVec2))> + '_ {
-        let chunks = self.chunks.iter().copied().enumerate();
+    /// The chunks from that of segment `start` on, with their indices.
+    fn chunks(&self, start: usize) -> impl Iterator<Item = (usize, &Chunk)> + '_ {
+        let chunks = self.chunks.iter().enumerate();
         chunks.skip(start / CHUNK)
     }
 
@@ -199,14 +332,19 @@ impl Corridor {
 }
 
 #[inline]
-fn overlap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> bool {
+fn overlap(a: Bounds, b: Bounds) -> bool {
     a.0.cmple(b.1).all() && b.0.cmple(a.1).all()
 }
 
-/// Metres between two boxes along the axes.
 #[inline]
-fn gap(a: (DVec2, DVec2), b: (DVec2, DVec2)) -> f64 {
-    (b.0 - a.1).max(a.0 - b.1).max(DVec2::ZERO).length()
+fn union(a: Bounds, b: Bounds) -> Bounds {
+    (a.0.min(b.0), a.1.max(b.1))
+}
+
+/// Square metres between two boxes along the axes.
+#[inline]
+fn gap_squared(a: Bounds, b: Bounds) -> f64 {
+    (b.0 - a.1).max(a.0 - b.1).max(DVec2::ZERO).length_squared()
 }
 
 fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
@@ -216,38 +354,67 @@ fn stretch(start: DVec2, end: DVec2, side: DVec2) -> Quad {
 /// The area of a body: convex pieces with common bounds.
 #[derive(Clone, Debug)]
 pub(super) struct Footprint {
-    pub(super) pieces: Vec<Quad>,
-    min: DVec2,
-    max: DVec2,
+    pieces: Vec<Quad>,
+    /// Bounds of every few pieces.
+    blocks: Vec<Bounds>,
+    bounds: Bounds,
+    /// Whether the first piece has a length and a width.
+    is_solid: bool,
 }
 
 impl Footprint {
     pub(super) fn new(pieces: Vec<Quad>) -> Self {
         let mut footprint = Self {
             pieces,
-            min: DVec2::INFINITY,
-            max: DVec2::NEG_INFINITY,
+            blocks: Vec::new(),
+            bounds: NOWHERE,
+            is_solid: false,
         };
         footprint.measure();
         footprint
     }
 
+    /// Becomes a box and the road of a corridor between two arc lengths.
+    pub(super) fn sweep(&mut self, body: Quad, corridor: &Corridor, from: f64, to: f64) {
+        self.pieces.clear();
+        self.pieces.push(body);
+        corridor.pieces(from, to, &mut self.pieces);
+        self.measure();
+    }
+
+    #[cfg(test)]
+    pub(super) fn pieces(&self) -> &[Quad] {
+        &self.pieces
+    }
+
     /// Recomputes the bounds after the pieces were changed.
-    pub(super) fn measure(&mut self) {
-        (self.min, self.max) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        for piece in &self.pieces {
-            let (min, max) = piece.bounds();
-            (self.min, self.max) = (self.min.min(min), self.max.max(max));
+    fn measure(&mut self) {
+        self.blocks.clear();
+        self.bounds = NOWHERE;
+        for block in self.pieces.chunks(BLOCK) {
+            let bounds = block.iter().map(Quad::bounds).fold(NOWHERE, union);
+            self.blocks.push(bounds);
+            self.bounds = union(self.bounds, bounds);
         }
+        self.is_solid = self.pieces.first().is_some_and(is_solid);
     }
 
-    pub(super) fn is_within(&self, bounds: (DVec2, DVec2)) -> bool {
-        overlap((self.min, self.max), bounds)
+    /// The pieces whose bounds, or those of some around them, overlap.
+    #[inline]
+    fn near(&self, bounds: Bounds) -> impl Iterator<Item = &Quad> {
+        let blocks = self.pieces.chunks(BLOCK).zip(&self.blocks);
+        let near = blocks.filter(move |(_, of_block)| overlap(**of_block, bounds));
+        near.flat_map(|(pieces, _)| pieces)
     }
 
-    /// A lower bound of [`Footprint::distance`], metres: the gap between the bounding boxes.
-    pub(super) fn gap_at_least(&self, other: &Self) -> f64 {
-        gap((self.min, self.max), (other.min, other.max))
+    pub(super) fn is_within(&self, bounds: Bounds) -> bool {
+        overlap(self.bounds, bounds)
+    }
+
+    /// The square of a lower bound of [`Footprint::distance`], square metres: of the gap between
+    /// the bounding boxes.
+    pub(super) fn gap_squared(&self, other: &Self) -> f64 {
+        gap_squared(self.bounds, other.bounds)
     }
 
     /// Metres between two footprints, 0 if they intersect.
@@ -256,16 +423,24 @@ impl Footprint {
         if self.intersects(other) {
             return 0.0;
         }
-        let bounds = (other.min, other.max);
-        let mut least = f64::INFINITY;
+        // Together with its square: roots are taken only of what the squares do not decide.
+        let (mut least, mut square) = (f64::INFINITY, f64::INFINITY);
+        let is_nearer = |gap: f64, least: f64, square: f64| gap < square && gap.sqrt() < least;
         // From the front, since what counts is mostly ahead: then most pairs are too far to look at.
         for own in self.pieces.iter().rev() {
-            if gap(own.bounds(), bounds) >= least {
+            let bounds = own.bounds();
+            if !is_nearer(gap_squared(bounds, other.bounds), least, square) {
                 continue;
             }
-            for piece in &other.pieces {
-                if own.gap_at_least(piece) < least {
-                    least = least.min(own.distance(piece));
+            for (pieces, of_block) in other.pieces.chunks(BLOCK).zip(&other.blocks) {
+                if !is_nearer(gap_squared(bounds, *of_block), least, square) {
+                    continue;
+                }
+                for piece in pieces {
+                    if is_nearer(gap_squared(bounds, piece.bounds()), least, square) {
+                        square = own.distance_squared_apart(piece, square);
+                        least = square.sqrt();
+                    }
                 }
             }
         }
@@ -273,10 +448,8 @@ impl Footprint {
     }
 
     fn intersects(&self, other: &Self) -> bool {
-        let theirs = (other.min, other.max);
-        let near = |own: &&Quad| overlap(own.bounds(), theirs);
-        let meets = |own: &Quad| other.pieces.iter().any(|piece| own.intersects(piece));
-        self.is_within(theirs) && self.pieces.iter().filter(near).any(meets)
+        self.near(other.bounds)
+            .any(|own| other.near(own.bounds()).any(|piece| own.intersects(piece)))
     }
 
     pub(super) fn distance_to_polygon(&self, polygon: &Polygon) -> f64 {
@@ -292,7 +465,7 @@ impl Footprint {
 mod tests {
     use super::*;
     use approx::assert_abs_diff_eq;
-    use gump_geometry::{Pose, dvec2, widen};
+    use gump_geometry::{OrientedBox, Pose, dvec2, widen};
 
     fn intersect(a: &Footprint, b: &[Quad]) -> bool {
         let meets = |own: &Quad| b.iter().any(|piece| own.intersects(piece));
@@ -324,7 +497,7 @@ mod tests {
                 epsilon = 1e-9
             );
         }
-        let bounds = corridor.bounds_from(0.0);
+        let bounds = corridor.bounds_from(corridor.start(0.0));
         assert!(Footprint::new(pieces).is_within(bounds));
     }
 
@@ -340,8 +513,8 @@ mod tests {
             let mut pieces = Vec::new();
             corridor.pieces(from, to, &mut pieces);
             let footprint = Footprint::new(pieces);
-            let found =
-                (!footprint.pieces.is_empty()).then_some((footprint.min.x, footprint.max.x));
+            let found = (!footprint.pieces.is_empty())
+                .then_some((footprint.bounds.0.x, footprint.bounds.1.x));
             assert_eq!(found, expected);
         };
         check(2.0, 8.0, Some((2.0, 8.0)));
@@ -363,7 +536,7 @@ mod tests {
                 corridor.pieces(from, f64::INFINITY, &mut pieces);
                 let slow = intersect(&footprint, &pieces);
                 assert_eq!(
-                    corridor.is_touched(from, &footprint),
+                    corridor.is_touched(corridor.start(from), &footprint),
                     slow,
                     "{x} {y} {from}"
                 );
@@ -409,5 +582,68 @@ mod tests {
         assert_eq!(at(0.0).distance(&at(7.0)), 3.0);
         assert_eq!(at(0.0).distance(&at(4.0)), 0.0);
         assert!(intersect(&at(0.0), &at(4.0).pieces) && !intersect(&at(0.0), &at(4.5).pieces));
+    }
+
+    #[test]
+    fn bodies_beside_the_corridor_are_found_clear_of_it() {
+        let corridor = bend();
+        let start = corridor.start(3.3);
+        let mut pieces = Vec::new();
+        corridor.pieces(3.3, f64::INFINITY, &mut pieces);
+        let (mut touched, mut cleared) = (0, 0);
+        for i in 0..2000 {
+            let f = f64::from(i);
+            let shape = OrientedBox {
+                pose: Pose::new(f * 0.73 % 26.0 - 3.0, f * 0.31 % 24.0 - 4.0, f * 0.17),
+                // Every tenth is a line, which the bounds along chunks have nothing to say about.
+                length: 4.0,
+                width: if i % 10 == 0 { 0.0 } else { 1.8 },
+            };
+            let body = Quad::from(&shape);
+            let slow = pieces.iter().any(|piece| piece.intersects(&body));
+            let footprint = Footprint::new(vec![body]);
+            assert_eq!(footprint.is_solid, i % 10 != 0);
+            assert_eq!(corridor.is_touched_by_body(start, &footprint), slow, "{i}");
+            touched += usize::from(slow);
+            let near = |chunk: &Chunk| overlap(chunk.bounds, body.bounds());
+            let clear = |chunk: &Chunk| chunk.is_clear_of(&body);
+            let chunk = &corridor.chunks[0];
+            cleared += usize::from(near(chunk) && clear(chunk));
+            for piece in corridor
+                .stretches
+                .iter()
+                .chain(corridor.joints.iter().flatten())
+            {
+                assert!(!clear(chunk) || !piece.intersects(&body));
+            }
+        }
+        assert!(touched > 200 && cleared > 200, "{touched} {cleared}");
+    }
+
+    #[test]
+    fn parallel_corridors_do_not_meet() {
+        let lane = |radius: f64| {
+            let at = |i: i32| {
+                let angle = f64::from(i) * 0.02;
+                Pose::new(radius * angle.sin(), -radius * angle.cos(), angle)
+            };
+            let poses: Vec<Pose> = (0..=60).map(at).collect();
+            Corridor::new(Path::through(&poses).unwrap(), 1.0)
+        };
+        let inner = lane(100.0);
+        for (radius, meet) in [(103.5, false), (102.1, false), (101.5, true), (100.0, true)] {
+            let outer = lane(radius);
+            let pairs = || {
+                let theirs = || outer.stretches.iter().chain(outer.joints.iter().flatten());
+                let own = inner.stretches.iter().chain(inner.joints.iter().flatten());
+                own.flat_map(move |a| theirs().map(move |b| (a, b)))
+            };
+            assert_eq!(pairs().any(|(a, b)| a.intersects(b)), meet);
+            assert_eq!(inner.meets(0.0, &outer, 0.0), meet, "{radius}");
+            assert_eq!(outer.meets(0.0, &inner, 0.0), meet, "{radius}");
+        }
+        let beside = &lane(103.5).chunks[1];
+        assert!(overlap(beside.bounds, inner.chunks[1].bounds));
+        assert!(inner.chunks[1].is_clear_of_all(beside));
     }
 }

@@ -161,7 +161,11 @@ impl Traffic for NuplanIdm {
         for i in 0..self.vehicles.len() {
             let (before, rest) = self.vehicles.split_at_mut(i);
             let (vehicle, after) = rest.split_first_mut().expect("vehicle i exists");
-            let others = before.iter().chain(after.iter());
+            let others = agent::Others {
+                fixed: &scene.fixed,
+                before,
+                after,
+            };
             vehicle.step(&scene, others, &mut self.encounters, step.dt());
         }
         Ok(self.others(logged))
