@@ -10,7 +10,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use gump_rollout::{BoxError, Policy, Session, SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{AgentState, Frame, Rollout, Scenario, Seed};
+use gump_scene::{Agent, AgentId, AgentState, Frame, Light, Rollout, Scenario, Seed};
 
 use crate::worlds::World;
 use crate::{EvalError, Monitor};
@@ -170,6 +170,18 @@ impl Session for WatchedSession<'_> {
             cost.steps += 1;
         });
         Ok(frames)
+    }
+
+    fn keep(&mut self, futures: &[usize]) -> bool {
+        self.session.keep(futures)
+    }
+
+    fn show(&mut self, future: usize, lights: &[Light]) -> bool {
+        self.session.show(future, lights)
+    }
+
+    fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
+        self.session.exchange(future, leave, come)
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
