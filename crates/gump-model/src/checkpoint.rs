@@ -124,7 +124,7 @@ pub fn load_to_grow(
 }
 
 /// The matrix `[rows, n]` with columns of zeros up to `columns`.
-pub(crate) fn widened(matrix: &Tensor, columns: usize) -> Result<Tensor, ModelError> {
+fn widened(matrix: &Tensor, columns: usize) -> Result<Tensor, ModelError> {
     let (rows, n) = matrix.dims2()?;
     let zeros = Tensor::zeros((rows, columns - n), matrix.dtype(), matrix.device())?;
     Ok(Tensor::cat(&[matrix, &zeros], 1)?)

@@ -16,22 +16,16 @@ use crate::steps::TOKEN_DT;
 /// Numbers of a node.
 pub const NODE_NUMBERS: usize = 28;
 /// Numbers of an edge.
-pub const EDGE_NUMBERS: usize = OF_CROSSING + CROSSING * PATHS;
+pub const EDGE_NUMBERS: usize = 46;
 
 /// Number of past frames of the agent that a node attends to, besides itself.
 pub const PAST: usize = 6;
-/// Number of neighbours of a node: those that come nearest soonest.
-const NEIGHBOURS: usize = 20;
-/// Times at which the distance to a neighbour is predicted with constant velocities, seconds.
-const COMING_S: [f64; 6] = [0.0, 0.5, 1.0, 2.0, 3.0, 4.0];
-/// A predicted second counts as much as this many metres.
-const METRES_PER_SECOND_AHEAD: f64 = 3.0;
-/// Maximum distance of a neighbour, metres, and of one that comes nearer than that within
-/// [`COMING_S`]: oncoming traffic, for which a vehicle that turns has to wait.
-const NEIGHBOUR_REACH_M: [f64; 2] = [60.0, 140.0];
-/// A standing neighbour counts as this much farther away, and twice if the agent stands, too: of
-/// rows of parked vehicles the nearest say enough.
-const STANDING: f64 = 1.25;
+/// Number of neighbours of a node: the nearest ones now and soon.
+const NEIGHBOURS: usize = 16;
+/// How soon, seconds.
+const SOON_S: f64 = 2.0;
+/// Maximum distance of a neighbour, metres.
+const NEIGHBOUR_REACH_M: f64 = 60.0;
 /// Number of lane pieces beside the paths ahead, the nearest ones.
 const LANES: usize = 10;
 /// Number of road edge pieces, the nearest ones.
@@ -206,13 +200,6 @@ const OF_NEIGHBOUR: usize = OF_PAST + 1;
 const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
 const OF_GAP: usize = OF_LANE + 10;
-const OF_CROSSING: usize = OF_GAP + 2;
-/// Numbers of each path ahead that say when a neighbour will cross it.
-const CROSSING: usize = 3;
-/// How far ahead in time crossings are predicted, seconds.
-const CROSSING_S: f64 = 8.0;
-/// An agent below this speed is taken to start with it, metres per second.
-const STARTING: f64 = 2.0;
 /// The time at which the predicted gap to a neighbour is evaluated, with constant velocities,
 /// seconds.
 const GAPS_S: [f64; 4] = [0.5, 1.0, 1.5, 2.0];
@@ -312,11 +299,17 @@ type Paths = [Vec<(u32, f64)>];
 fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: &mut View) {
     let own = &agents[i];
     let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
+    // Of a row of parked cars the next few say enough; who comes closer counts as nearer.
     let mut near: Vec<(f64, usize)> = agents
         .iter()
         .enumerate()
         .filter(|(j, _)| *j != i)
-        .filter_map(|(j, other)| Some((remoteness(own, other)?, j)))
+        .filter_map(|(j, other)| {
+            let place = other.pose.position - own.pose.position;
+            let away = place.length();
+            let soon = place + (other.velocity() - own_velocity) * SOON_S;
+            (away < NEIGHBOUR_REACH_M).then(|| (away + soon.length(), j))
+        })
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBOURS);
@@ -354,58 +347,7 @@ fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: 
         let soon = GAPS_S.map(gap).into_iter().fold(f64::INFINITY, f64::min);
         Writer(&mut row[OF_GAP..]).put([bend(gap(0.0) / 0.5), bend(soon / 0.5)]);
         on_paths(map, other, paths, &mut row);
-        crossings(map, own, other, paths, &mut row);
         view.neighbours.push((j, row));
-    }
-}
-
-/// How far away another agent is and stays, metres: its distance at the time when it comes nearest,
-/// with a price on waiting. `None` for one that is out of reach.
-fn remoteness(own: &Shown, other: &Shown) -> Option<f64> {
-    let place = other.pose.position - own.pose.position;
-    let velocity = other.velocity() - own.velocity();
-    let now = place.length();
-    let (mut least, mut nearest) = (f64::INFINITY, f64::INFINITY);
-    for seconds in COMING_S {
-        let away = (place + velocity * seconds).length();
-        nearest = nearest.min(away);
-        least = least.min(away + METRES_PER_SECOND_AHEAD * seconds);
-    }
-    let [reach, coming] = NEIGHBOUR_REACH_M;
-    if now >= reach && (now >= coming || nearest >= reach) {
-        return None;
-    }
-    let standing = match (own.stands(), other.stands()) {
-        (_, false) => 1.0,
-        (false, true) => STANDING,
-        (true, true) => STANDING * STANDING,
-    };
-    Some(least * standing)
-}
-
-/// When another agent that keeps its velocity will cross the paths ahead, how far ahead that is,
-/// and whether it will be there before the agent itself.
-fn crossings(map: &VectorMap, own: &Shown, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
-    let velocity = other.velocity();
-    if other.stands() || paths.is_empty() {
-        return;
-    }
-    let (from, reach) = (other.pose.position, velocity * CROSSING_S);
-    let speed = own.velocity().length().max(STARTING);
-    for (k, path) in paths.iter().enumerate().take(PATHS) {
-        let crossing = path.iter().find_map(|&(i, away)| {
-            let piece = &map.pieces[i as usize];
-            let (along, share) = piece.crossed_by(from, reach)?;
-            let ahead = away + along;
-            (ahead > 0.0).then_some((ahead, share * CROSSING_S))
-        });
-        if let Some((ahead, arrives)) = crossing {
-            Writer(&mut row[OF_CROSSING + CROSSING * k..]).put([
-                fast_exp(-arrives / 3.0),
-                fast_exp(-ahead / 15.0),
-                bend((arrives - ahead / speed) / 1.5),
-            ]);
-        }
     }
 }
 
@@ -593,62 +535,6 @@ mod tests {
         }
         // The car 30 m ahead in the lane is on the path.
         assert_eq!(here.neighbours[0].1[OF_PATH], 1.0);
-    }
-
-    /// The view of a vehicle at the stop line of a lane that turns left across an oncoming one.
-    fn before_a_left_turn(others: &[Shown]) -> View {
-        let scenario = gump_scene::fixture::scenario(
-            "lane 1: 0,0 20,0 next 2
-             lane 2: 20,0 24,1 27,4 28,8 28,60
-             lane 3: 200,4 0,4
-             ego vehicle 0: 18,0 velocity 4,0",
-        )
-        .unwrap();
-        let map = VectorMap::new(&scenario.map, DVec2::ZERO, 300.0, Default::default());
-        let own = Shown::first(CAR, Pose::new(16.0, 0.0, 0.0), DVec2::new(4.0, 0.0));
-        let mut agents = vec![own.then(Pose::new(18.0, 0.0, 0.0))];
-        agents.extend(others);
-        look(&map, &Lights::default(), &agents, 0)
-    }
-
-    /// A vehicle that drives back along the x axis, or stands.
-    fn oncoming(x: f64, speed: f64) -> Shown {
-        let turned = std::f64::consts::PI;
-        let before = Pose::new(x + speed * TOKEN_DT, 4.0, turned);
-        let first = Shown::first(CAR, before, DVec2::new(-speed, 0.0));
-        first.then(Pose::new(x, 4.0, turned))
-    }
-
-    #[test]
-    fn oncoming_traffic_is_seen_from_afar_and_before_parked_rows() {
-        let row = |i: i32| oncoming(22.0 + 6.0 * f64::from(i % 6), 0.0);
-        let mut others: Vec<Shown> = (0..40).map(row).collect();
-        others.push(oncoming(110.0, 20.0));
-        let view = before_a_left_turn(&others);
-        assert_eq!(view.neighbours.len(), NEIGHBOURS);
-        assert!(view.neighbours.iter().any(|(i, _)| *i == 41));
-        // One that stays as far away is out of reach.
-        let view = before_a_left_turn(&[oncoming(110.0, 0.0)]);
-        assert!(view.neighbours.is_empty());
-    }
-
-    #[test]
-    fn who_will_cross_a_path_is_marked_with_when() {
-        let crossing = |other: Shown| {
-            let view = before_a_left_turn(&[other]);
-            let row = view.neighbours[0].1;
-            [row[OF_CROSSING], row[OF_CROSSING + 1], row[OF_CROSSING + 2]]
-        };
-        // The path crosses the oncoming lane at x = 27, about 10 m ahead.
-        let [arrives, ahead, after] = crossing(oncoming(47.0, 10.0));
-        assert!((arrives - (-2.0_f32 / 3.0).exp()).abs() < 0.02, "{arrives}");
-        assert!((-15.0 * ahead.ln() - 10.0).abs() < 1.0, "{ahead}");
-        // 2 s against 2.5 s: it is there first.
-        assert!(after < 0.0, "{after}");
-        let [_, _, after] = crossing(oncoming(67.0, 10.0));
-        assert!(after > 0.0, "{after}");
-        assert_eq!(crossing(oncoming(40.0, 0.0)), [0.0; 3]);
-        assert_eq!(crossing(oncoming(20.0, 10.0)), [0.0; 3], "it has passed");
     }
 
     #[test]

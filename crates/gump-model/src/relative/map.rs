@@ -82,34 +82,6 @@ impl Piece {
         }
         best
     }
-
-    /// Where the segment from `from` to `from + reach` first crosses the line of the piece: metres
-    /// along it, counted from its middle, and the share of the segment before that.
-    pub(super) fn crossed_by(&self, from: DVec2, reach: DVec2) -> Option<(f64, f64)> {
-        let (start, way) = (self.axes.see(from), self.axes.turn(reach));
-        // The piece lies within half its length of its middle.
-        let nearest = (-start.dot(way) / way.length_squared().max(1e-9)).clamp(0.0, 1.0);
-        if (start + way * nearest).length() > 0.5 * self.length + 1.0 {
-            return None;
-        }
-        let mut passed = -0.5 * self.length;
-        let mut first: Option<(f64, f64)> = None;
-        for pair in self.shape.windows(2) {
-            let (a, along) = (pair[0], pair[1] - pair[0]);
-            let length = along.length();
-            let turned = way.perp_dot(along);
-            if turned.abs() > 1e-9 {
-                let share = (a - start).perp_dot(along) / turned;
-                let part = (a - start).perp_dot(way) / turned;
-                let is_sooner = first.is_none_or(|(_, sooner)| share < sooner);
-                if (0.0..=1.0).contains(&share) && (0.0..=1.0).contains(&part) && is_sooner {
-                    first = Some((passed + part * length, share));
-                }
-            }
-            passed += length;
-        }
-        first
-    }
 }
 
 /// Information of a map to withhold.

@@ -7,10 +7,8 @@ use gump_nn::Parameters;
 
 use super::{RelativeConfig, RelativeNetwork};
 use crate::ModelError;
-use crate::checkpoint::{self, Precision, widened};
+use crate::checkpoint::{self, Precision};
 use crate::prefixes::PREFIXES;
-use crate::relative::graph::EDGE_NUMBERS;
-use crate::relative::weights::EDGES_IN;
 
 /// Header entry that distinguishes the two architectures.
 const ARCHITECTURE: (&str, &str) = ("architecture", "relative");
@@ -44,15 +42,7 @@ pub fn load(path: &Path, device: &Device) -> Result<RelativeNetwork, ModelError>
     let is_beside = |name: &str| PREFIXES.iter().any(|prefix| name.starts_with(prefix));
     let tensors = archive.tensors.into_iter();
     let tensors = tensors.filter(|(name, _)| !is_beside(name));
-    let tensors = tensors.map(|(name, tensor)| {
-        let tensor = match name.as_str() {
-            EDGES_IN if tensor.dim(1)? < EDGE_NUMBERS => widened(&tensor, EDGE_NUMBERS)?,
-            _ => tensor,
-        };
-        Ok((name, tensor))
-    });
-    let tensors = tensors.collect::<Result<_, ModelError>>()?;
-    RelativeNetwork::build(config, Parameters::loaded(tensors, device))
+    RelativeNetwork::build(config, Parameters::loaded(tensors.collect(), device))
 }
 
 /// Whether a file of weights contains a network of this kind.
@@ -86,47 +76,4 @@ pub fn config(archive: &checkpoint::Archive) -> Result<RelativeConfig, ModelErro
     let text = archive.entry("config")?;
     serde_json::from_str(text)
         .map_err(|error| archive.error(format!("its configuration is not valid ({error})")))
-}
-
-#[cfg(test)]
-mod tests {
-    use gump_scene::Seed;
-
-    use super::*;
-    use crate::relative::RelativeWeights;
-
-    #[test]
-    fn files_with_fewer_numbers_of_edges_get_zeros_for_the_rest() {
-        let config = RelativeConfig {
-            width: 16,
-            layers: 1,
-            ..RelativeConfig::default()
-        };
-        let network = RelativeNetwork::random(config, Seed(3), &Device::Cpu).unwrap();
-        let known = EDGE_NUMBERS - 9;
-        let all = network.parameters().all();
-        let tensors = all.map(|(name, var)| {
-            let tensor = match name {
-                EDGES_IN => var.narrow(1, 0, known).unwrap().contiguous().unwrap(),
-                _ => var.as_tensor().clone(),
-            };
-            (name.to_owned(), tensor)
-        });
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("older.safetensors");
-        let header = header(network.config()).unwrap();
-        checkpoint::write(&path, tensors.collect(), header, Precision::Full).unwrap();
-
-        let rows = |network: &RelativeNetwork| {
-            let matrix = network.parameters().find(EDGES_IN).unwrap();
-            matrix.to_vec2::<f32>().unwrap()
-        };
-        let (before, after) = (rows(&network), rows(&load(&path, &Device::Cpu).unwrap()));
-        for (before, after) in before.iter().zip(&after) {
-            assert_eq!(before[..known], after[..known]);
-            assert_eq!(after[known..], [0.0; 9]);
-        }
-        let read = RelativeWeights::read(&std::fs::read(&path).unwrap()).unwrap();
-        assert_eq!(read.find(EDGES_IN).unwrap(), after.concat());
-    }
 }

@@ -8,11 +8,6 @@ use safetensors::tensor::Dtype;
 use super::RelativeConfig;
 use crate::ModelError;
 use crate::prefixes::PREFIXES;
-use crate::relative::graph::EDGE_NUMBERS;
-
-/// The matrix that reads the numbers of edges. Files of networks with fewer of them get columns of
-/// zeros for the rest, with which they compute the same.
-pub(super) const EDGES_IN: &str = "edges.first.weight";
 
 /// The parameters of a trained relative network by name, row-major f32, with its shape.
 ///
@@ -71,15 +66,6 @@ impl RelativeWeights {
                         "tensor \"{name}\" has type {other:?}, expected F16 or F32"
                     )));
                 }
-            };
-            let flat = match (name.as_str(), view.shape()) {
-                (EDGES_IN, &[_, columns]) if columns > 0 && columns < EDGE_NUMBERS => {
-                    let zeros = std::iter::repeat_n(0.0, EDGE_NUMBERS - columns);
-                    let rows = flat.chunks_exact(columns);
-                    rows.flat_map(|row| row.iter().copied().chain(zeros.clone()))
-                        .collect()
-                }
-                _ => flat,
             };
             numbers.insert(name, flat);
         }
