@@ -37,7 +37,7 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     add_some(plan, extent, n_side, add_side_road, rng);
     let n_parks = rng.random_range(1..=6);
     add_some(plan, extent, n_parks, add_car_park, rng);
-    let n_yards = rng.random_range(0..=8);
+    let n_yards = rng.random_range(0..=4);
     add_some(plan, extent, n_yards, add_yard, rng);
     allow_parking(plan, rng);
     // Traffic is faster than plain plans have it, on wide roads above all.

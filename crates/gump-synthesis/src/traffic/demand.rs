@@ -61,7 +61,7 @@ pub(crate) struct Standing {
 }
 
 /// How often drivers turn into a yard or car park, less than into another road.
-const INTO_YARDS: f64 = 0.3;
+const INTO_YARDS: f64 = 0.5;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s.
 const FAST_LANE: f64 = 16.0;
 
