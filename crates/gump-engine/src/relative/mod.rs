@@ -4,6 +4,7 @@
 pub mod engine;
 pub mod rules;
 pub mod seen;
+mod waiting;
 mod world;
 
 pub use self::world::{LiveFuture, MAP_M, RelativeSampling, RelativeWorld};

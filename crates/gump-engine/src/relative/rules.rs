@@ -5,7 +5,7 @@
 //! three poses at once; here the second part of the checked horizon, one second, continues the
 //! drawn move.
 
-use gump_geometry::{Polyline, Pose, angle_difference};
+use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
 use gump_model::local_context::Survey;
 use gump_model::relative::graph::Shown;
 use gump_model::steps::TOKEN_DT;
@@ -187,6 +187,29 @@ pub(super) fn heed(
     }
 }
 
+/// Separates the streams of [`start`] from those of other rules.
+const STARTS: usize = 1 << 10;
+
+/// Redraws the moves of agents that stand although nothing holds them until they start, up to
+/// `redraws` times each.
+pub(super) fn start(
+    mut standing: Vec<usize>,
+    redraws: usize,
+    moves: &mut [Pose],
+    again: &mut Again<'_>,
+) {
+    standing.retain(|&i| moves[i].position == DVec2::ZERO);
+    for attempt in 0..redraws {
+        if standing.is_empty() {
+            return;
+        }
+        for (&i, step) in standing.iter().zip(again(&standing, STARTS + attempt)) {
+            moves[i] = step;
+        }
+        standing.retain(|&i| moves[i].position == DVec2::ZERO);
+    }
+}
+
 /// An agent that is driven from outside.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Driven {
@@ -282,7 +305,6 @@ fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
 
 #[cfg(test)]
 mod tests {
-    use gump_geometry::DVec2;
     use gump_model::relative::graph::Body;
 
     use super::*;
@@ -368,6 +390,18 @@ mod tests {
         };
         assert_eq!(follower(true), straight(1.0));
         assert_eq!(follower(false), straight(4.0));
+    }
+
+    #[test]
+    fn who_could_go_is_drawn_again_until_it_starts() {
+        let mut moves = [Pose::IDENTITY, Pose::IDENTITY, straight(2.0)];
+        let mut asked = Vec::new();
+        start(vec![0, 2], 3, &mut moves, &mut |who, attempt| {
+            asked.push((who.to_vec(), attempt - STARTS));
+            vec![straight([0.0, 0.4, 9.0][attempt - STARTS]); who.len()]
+        });
+        assert_eq!(asked, [(vec![0], 0), (vec![0], 1)]);
+        assert_eq!(moves, [straight(0.4), Pose::IDENTITY, straight(2.0)]);
     }
 
     #[test]

@@ -1,0 +1,228 @@
+//! Agents that stand in a lane although nothing holds them.
+//!
+//! Training scenes last nine seconds, in which whoever stands throughout is usually parked or in a
+//! queue. In a longer rollout agents that have waited for each other, or for somebody who has gone,
+//! look like those and never start. Here it is decided from the map, the lights and the others
+//! whether an agent could drive on; the world then shows such agents to the network as having just
+//! stopped. Whether and how they start remains the network's decision.
+
+use gump_geometry::{DVec2, angle_difference};
+use gump_scene::{Agent, AgentKind, Lane, Light, LightState, MapGraph, stop_line};
+
+/// How near to a lane's centre an agent stands in the lane, metres: vehicles, and bicycles, which
+/// keep to the side.
+const IN_LANE_M: f64 = 1.0;
+const BESIDE_M: f64 = 2.0;
+/// How well aligned with it, radians.
+const ALONG: f64 = 0.35;
+/// How far ahead lights and crossing traffic are considered, metres.
+const LOOK_M: f64 = 25.0;
+/// The free path that a start needs beyond the front bumper, metres.
+const ROOM_M: f64 = 5.0;
+/// Space beside the path, from the side of the agent, that others are not in, metres; people need
+/// more.
+const SIDE_M: f64 = 0.3;
+const SIDE_OF_PEOPLE_M: f64 = 1.0;
+/// Crossing traffic within this time is let pass, seconds, ...
+const GAP_S: f64 = 4.0;
+/// ... if it comes this near to the path, from its own side, metres, ...
+const NEAR_PATH_M: f64 = 1.5;
+/// ... and moves faster than this, metres per second.
+const MOVES: f64 = 0.5;
+/// Agents that wait for each other are within this, metres, and meet at more than this angle,
+/// radians.
+const MEETING_M: f64 = 25.0;
+const CROSSES: f64 = 0.52;
+
+/// A lane ahead, with the distance from the front bumper to its start, metres.
+type Ahead<'m> = (&'m Lane, f64);
+
+/// Which of the agents stand in a lane, have waited for more than `patience_s` and could drive on:
+/// nobody is on the path ahead or about to cross it, no light forbids it, and of those that meet
+/// there they have waited longest.
+///
+/// `agents` are all of the frame, each with its waiting time in seconds. Returns indices.
+pub(super) fn held_by_nothing(
+    map: &MapGraph,
+    lights: &[Light],
+    agents: &[(Agent, f64)],
+    patience_s: f64,
+) -> Vec<usize> {
+    let waits = |i: &usize| agents[*i].1 > patience_s;
+    let mut free: Vec<usize> = (0..agents.len()).filter(waits).collect();
+    free.retain(|&i| {
+        let agent = &agents[i].0;
+        let reached = ahead(map, agent);
+        !reached.is_empty()
+            && !is_shut(&reached, lights)
+            && !agents
+                .iter()
+                .any(|(other, _)| other.id != agent.id && holds(&reached, agent, other))
+    });
+    let goes_first = |i: usize, j: usize| {
+        let ((one, waited), (other, longer)) = (&agents[i], &agents[j]);
+        let turn = angle_difference(one.state.pose.heading, other.state.pose.heading);
+        let gap = one.state.pose.position.distance(other.state.pose.position);
+        let is_later = (-*waited, one.id) > (-*longer, other.id);
+        turn.abs() > CROSSES && gap < MEETING_M && is_later
+    };
+    let is_next = |i: &usize| !free.iter().any(|&j| goes_first(*i, j));
+    free.iter().copied().filter(is_next).collect()
+}
+
+/// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
+/// agents beside the lanes.
+fn ahead<'m>(map: &'m MapGraph, agent: &Agent) -> Vec<Ahead<'m>> {
+    let beside = match agent.kind {
+        AgentKind::Vehicle => IN_LANE_M,
+        AgentKind::Bicycle => BESIDE_M,
+        _ => return Vec::new(),
+    };
+    let pose = agent.state.pose;
+    let along = |lane: &Lane| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let heading = lane.centerline.pose_at(at).heading;
+        (angle_difference(heading, pose.heading).abs() < ALONG).then_some(at)
+    };
+    let mut near = map.lanes_near(pose.position, beside);
+    let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
+        return Vec::new();
+    };
+    let mut reached = vec![(lane, -at - agent.length / 2.0)];
+    let mut i = 0;
+    while let Some(&(lane, base)) = reached.get(i) {
+        i += 1;
+        let end = base + lane.centerline.length();
+        if end >= LOOK_M {
+            continue;
+        }
+        for next in map.successors(lane.id) {
+            if reached.iter().all(|(known, _)| known.id != next.id) {
+                reached.push((next, end));
+            }
+        }
+    }
+    reached
+}
+
+/// Whether the lights ahead forbid every way on.
+fn is_shut(reached: &[Ahead<'_>], lights: &[Light]) -> bool {
+    let mut is_one_shut = false;
+    for (lane, base) in reached {
+        for light in lights.iter().filter(|light| light.lane == lane.id) {
+            let line = stop_line(lane, light).position;
+            let at = base + lane.centerline.project(line).arc_length;
+            if !(-1.0..LOOK_M).contains(&at) {
+                continue;
+            }
+            if light.state == LightState::Green {
+                return false;
+            }
+            is_one_shut = true;
+        }
+    }
+    is_one_shut
+}
+
+/// Whether another agent is in the way, or will be when it crosses.
+fn holds(reached: &[Ahead<'_>], agent: &Agent, other: &Agent) -> bool {
+    let (pose, at) = (other.state.pose, other.state.pose.position);
+    let own = agent.state.pose;
+    let reach = LOOK_M + agent.length + other.length + GAP_S * other.state.speed();
+    if at.distance(own.position) > reach {
+        return false;
+    }
+    let side = match other.kind {
+        AgentKind::Pedestrian | AgentKind::Bicycle => SIDE_OF_PEOPLE_M,
+        _ => SIDE_M,
+    };
+    let corners = other.oriented_box().corners();
+    let is_ahead = |point: DVec2, beside: f64, metres: f64| {
+        reached.iter().any(|(lane, base)| {
+            let foot = lane.centerline.project(point);
+            let ahead = base + foot.arc_length;
+            foot.distance <= beside && (0.0..metres).contains(&ahead)
+        })
+    };
+    // Bicycles keep to the side of their lane.
+    let (lane, _) = reached[0];
+    let aside = lane.centerline.project(own.position).distance;
+    let mut body = corners.into_iter().chain([at]);
+    if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, ROOM_M)) {
+        return true;
+    }
+    let velocity = other.state.velocity;
+    if other.state.speed() < MOVES || angle_difference(pose.heading, own.heading).abs() < ALONG {
+        return false;
+    }
+    let beside = NEAR_PATH_M + other.width / 2.0;
+    let steps = (GAP_S * 2.0) as usize;
+    (1..=steps).any(|k| is_ahead(at + velocity * (0.5 * k as f64), beside, LOOK_M))
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::{AgentId, Scenario, fixture};
+
+    use super::*;
+
+    /// Those who could go, everybody having waited as long as given.
+    fn free(scenario: &Scenario, waited: &[(i64, f64)]) -> Vec<i64> {
+        let scene = scenario.present();
+        let since = |id: AgentId| waited.iter().find(|(of, _)| *of == id.0);
+        let agents = scene.now().agents().iter();
+        let agents: Vec<_> = agents
+            .map(|agent| (*agent, since(agent.id).map_or(0.0, |(_, s)| *s)))
+            .collect();
+        let found = held_by_nothing(scene.map, scene.now().lights(), &agents, 4.0);
+        found.into_iter().map(|i| agents[i].0.id.0).collect()
+    }
+
+    fn scenario(text: &str) -> Scenario {
+        fixture::scenario(text).unwrap()
+    }
+
+    #[test]
+    fn a_free_road_holds_nobody_and_a_leader_does() {
+        let road = |rest: &str| scenario(&format!("lane 1: 0,0 200,0\n{rest}"));
+        let two = road("ego vehicle 0: 20,0\nagent vehicle 1: 27,0\nagent vehicle 2: 27,6");
+        let waited = [(0, 9.0), (1, 9.0), (2, 9.0)];
+        // The second has the road to itself, the third is parked beside it.
+        assert_eq!(free(&two, &waited), [1]);
+        assert!(free(&two, &[(0, 9.0), (1, 3.0)]).is_empty());
+        let bicycle = road("ego bicycle 0: 20,-1.5\nagent pedestrian 1: 25,-2.5");
+        assert!(free(&bicycle, &[(0, 9.0)]).is_empty());
+        let alone = road("ego bicycle 0: 20,-1.5\nagent pedestrian 1: 25,4");
+        assert_eq!(free(&alone, &[(0, 9.0)]), [0]);
+    }
+
+    #[test]
+    fn red_lights_and_crossing_traffic_hold() {
+        let lanes = "lane 1: 0,0 30,0 next 2\nlane 2: 30,0 60,0\nlane 3: 45,-60 45,60\n";
+        let waiting = |rest: &str| scenario(&format!("{lanes}ego vehicle 0: 26,0\n{rest}"));
+        let waited = [(0, 9.0)];
+        assert_eq!(free(&waiting(""), &waited), [0]);
+        assert!(free(&waiting("light 1 red: 30,0"), &waited).is_empty());
+        assert_eq!(free(&waiting("light 1 green: 30,0"), &waited), [0]);
+        let crossing = |y: f64, speed: f64| {
+            waiting(&format!(
+                "agent vehicle 1: 45,{y} heading 1.5708 velocity 0,{speed}"
+            ))
+        };
+        assert!(free(&crossing(-20.0, 8.0), &waited).is_empty());
+        // It has passed, or stands.
+        assert_eq!(free(&crossing(20.0, 8.0), &waited), [0]);
+        assert_eq!(free(&crossing(-20.0, 0.0), &waited), [0]);
+    }
+
+    #[test]
+    fn of_two_that_wait_for_each_other_the_first_goes() {
+        let crossing = scenario(
+            "lane 1: 0,0 60,0\nlane 2: 30,-40 30,40\n\
+             ego vehicle 0: 20,0\nagent vehicle 1: 30,-12 heading 1.5708",
+        );
+        assert_eq!(free(&crossing, &[(0, 9.0), (1, 12.0)]), [1]);
+        assert_eq!(free(&crossing, &[(0, 9.0), (1, 9.0)]), [0]);
+        assert_eq!(free(&crossing, &[(0, 9.0), (1, 1.0)]), [0]);
+    }
+}
