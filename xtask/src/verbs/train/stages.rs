@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use gump_eval::fresh::PREFIX;
 use gump_model::ModelConfig;
 use gump_train::{ClosedLoopConfig, RunConfig, TrainConfig};
 use serde::Serialize;
@@ -15,7 +16,6 @@ use toml::{Table, Value};
 use super::Args;
 use crate::cli::WrongArguments;
 use crate::config;
-use crate::fresh::PREFIX;
 
 /// A part of a run with a schedule of its own.
 #[derive(Debug)]

@@ -1,4 +1,4 @@
-//! Scenes that are made up while they are learned from, none of which comes back: `fresh:PROFILE`.
+//! Synthetic scenes that are made while a training run uses them, each for a while: `fresh:PROFILE`.
 //!
 //! Scenes form an endless stream: number `k` comes from the stream's seed and `k` alone. Step `s`
 //! of a training run draws its samples from a window of the stream that moves on with `s`, so a run
@@ -16,10 +16,10 @@ use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, SynthesisConfig};
 use rayon::prelude::*;
 
-use crate::cli::WrongArguments;
+use crate::EvalError;
 
-/// What the name of a stream begins with.
-pub(crate) const PREFIX: &str = "fresh:";
+/// The beginning of a stream's name.
+pub const PREFIX: &str = "fresh:";
 /// Scenes that samples of one step are drawn from: enough that a batch shows as many scenes, few
 /// enough to be held (about 1.5 MB each).
 const WINDOW: usize = 128;
@@ -31,23 +31,23 @@ const TRAIN: u64 = 0;
 /// See [`TRAIN`].
 const VALIDATE: u64 = 1;
 
-/// A stream of scenes.
-pub(crate) struct Fresh {
-    stream: Stream,
+/// A stream of scenes in use: a window of it is held, and a thread makes scenes ahead.
+pub struct FreshScenes {
+    stream: SceneStream,
     shared: Arc<Shared>,
     /// Scenes by which the window moves on in a step, times [`USES`].
     batch: usize,
 }
 
-/// Which scenes the stream consists of.
+/// An endless stream of scenes: a profile and a seed.
 #[derive(Clone, Debug)]
-pub(crate) struct Stream {
+pub struct SceneStream {
     profile: Profile,
     config: SynthesisConfig,
     seed: Seed,
 }
 
-/// What the thread that makes scenes shares with those who ask.
+/// State that the thread that makes scenes shares with those who ask.
 struct Shared {
     held: Mutex<Held>,
     /// Told when the window moves on.
@@ -63,18 +63,19 @@ struct Held {
     scenes: BTreeMap<usize, Arc<Scenario>>,
 }
 
-impl Stream {
+impl SceneStream {
     /// The stream of this name, `fresh:PROFILE` or `fresh:PROFILE:SEED`; `None` for other names.
     ///
-    /// Error: [`WrongArguments`] for a profile that does not exist or a seed that is no number.
-    pub(crate) fn of_name(name: &Path) -> anyhow::Result<Option<Self>> {
+    /// # Errors
+    /// [`EvalError::Argument`] for a profile that does not exist or a seed that is no number.
+    pub fn of_name(name: &Path) -> Result<Option<Self>, EvalError> {
         let Some(asked) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
             return Ok(None);
         };
         let (profile, seed) = asked.split_once(':').unwrap_or((asked, "0"));
-        let profile = profile_of_name(profile).map_err(WrongArguments)?;
+        let profile = profile_of_name(profile).map_err(EvalError::Argument)?;
         let seed = seed.parse().map_err(|_| {
-            WrongArguments(format!(
+            EvalError::Argument(format!(
                 "expected a whole number as seed in {PREFIX}{asked}"
             ))
         })?;
@@ -91,8 +92,8 @@ impl Stream {
         self.profile.synthesize(&self.config, seed)
     }
 
-    /// Scenes to validate on, which are none of those to learn from.
-    pub(crate) fn validation(&self, n: usize) -> Vec<Scenario> {
+    /// `n` scenes to validate on, which are none of those to learn from.
+    pub fn validation(&self, n: usize) -> Vec<Scenario> {
         let seed = self.seed.fork(VALIDATE);
         let scene = |k: usize| self.profile.synthesize(&self.config, seed.fork(k as u64));
         (0..n).into_par_iter().map(scene).collect()
@@ -101,17 +102,18 @@ impl Stream {
 
 /// The profile of this name.
 ///
-/// Error: a sentence that names those there are.
-pub(crate) fn profile_of_name(name: &str) -> Result<Profile, String> {
+/// # Errors
+/// A sentence that names the profiles that exist.
+pub fn profile_of_name(name: &str) -> Result<Profile, String> {
     Profile::of_name(name).ok_or_else(|| {
         let known = Profile::ALL.map(Profile::name).join(", ");
         format!("expected one of the profiles {known}, found {name:?}")
     })
 }
 
-impl Fresh {
+impl FreshScenes {
     /// Starts to make the scenes that steps of `batch` samples are drawn from.
-    pub(crate) fn start(stream: Stream, batch: usize) -> Self {
+    pub fn start(stream: SceneStream, batch: usize) -> Self {
         let shared = Arc::new(Shared {
             held: Mutex::default(),
             moved: Condvar::new(),
@@ -128,20 +130,24 @@ impl Fresh {
         fresh
     }
 
-    /// Scenes to draw from at any step.
-    pub(crate) fn len(&self) -> usize {
+    /// Number of scenes to draw from at any step.
+    #[expect(clippy::len_without_is_empty, reason = "a stream is never empty")]
+    pub fn len(&self) -> usize {
         WINDOW
     }
 
-    /// The scene that a draw of a step means; moves the window on.
-    pub(crate) fn pick(&self, step: usize, draw: u64) -> usize {
+    /// The index of the scene that a draw of a step means; moves the window on.
+    pub fn pick(&self, step: usize, draw: u64) -> usize {
         let first = step * self.batch / USES;
         self.shared.move_to(first);
         first + (draw % WINDOW as u64) as usize
     }
 
     /// A scene of the stream.
-    pub(crate) fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    ///
+    /// # Errors
+    /// None; the form is that of [`ScenarioSource::get`](gump_train::ScenarioSource::get).
+    pub fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
         if let Some(scene) = self.shared.lock().scenes.get(&index) {
             return Ok(Cow::Owned(Scenario::clone(scene)));
         }
@@ -157,7 +163,7 @@ impl Fresh {
     }
 }
 
-impl Drop for Fresh {
+impl Drop for FreshScenes {
     fn drop(&mut self) {
         // Under the lock, so that the thread cannot begin to wait in between.
         let _held = self.shared.lock();
@@ -193,7 +199,7 @@ impl Shared {
 }
 
 /// Makes the scenes of the window, and as many again after it, until the stream is dropped.
-fn make_ahead(stream: &Stream, shared: &Shared) {
+fn make_ahead(stream: &SceneStream, shared: &Shared) {
     // Of a stream that nobody has asked yet nobody knows where it begins.
     let mut held = shared.lock();
     while !shared.ends.load(Ordering::Relaxed) {
@@ -217,16 +223,24 @@ fn make_ahead(stream: &Stream, shared: &Shared) {
 mod tests {
     use super::*;
 
-    fn stream(name: &str) -> Stream {
-        Stream::of_name(Path::new(name)).unwrap().unwrap()
+    fn stream(name: &str) -> SceneStream {
+        SceneStream::of_name(Path::new(name)).unwrap().unwrap()
     }
 
     #[test]
     fn names_are_understood_or_refused() {
-        assert!(Stream::of_name(Path::new("some/folder")).unwrap().is_none());
+        assert!(
+            SceneStream::of_name(Path::new("some/folder"))
+                .unwrap()
+                .is_none()
+        );
         assert_eq!(stream("fresh:recorded-like").profile, Profile::RecordedLike);
         assert_eq!(stream("fresh:plain:7").seed, Seed(7));
-        let told = |name: &str| Stream::of_name(Path::new(name)).unwrap_err().to_string();
+        let told = |name: &str| {
+            SceneStream::of_name(Path::new(name))
+                .unwrap_err()
+                .to_string()
+        };
         assert!(told("fresh:real").contains("plain, recorded-like, found \"real\""));
         assert!(told("fresh:plain:x").contains("a whole number as seed in fresh:plain:x"));
     }
@@ -234,7 +248,7 @@ mod tests {
     #[test]
     fn a_position_in_the_stream_is_all_that_counts() {
         let batch = 16;
-        let [one, two] = [(); 2].map(|()| Fresh::start(stream("fresh:plain:3"), batch));
+        let [one, two] = [(); 2].map(|()| FreshScenes::start(stream("fresh:plain:3"), batch));
         // The second begins in the middle, as a resumed run does.
         let draws = [5_u64, 130, 999];
         for step in [0, 1, 40] {
@@ -253,7 +267,7 @@ mod tests {
 
     #[test]
     fn what_the_window_has_left_is_not_held_and_never_picked_again() {
-        let fresh = Fresh::start(stream("fresh:plain:1"), 8 * USES);
+        let fresh = FreshScenes::start(stream("fresh:plain:1"), 8 * USES);
         let old = fresh.pick(0, 0);
         assert!(!fresh.get(old).unwrap().log.is_empty());
         let later = WINDOW / 8 + 1;
