@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gump_data::DataError;
+use gump_engine::EngineError;
 use gump_model::ModelError;
 use gump_planner::PlanError;
 use gump_rollout::{BoxError, RolloutError};
@@ -22,6 +23,9 @@ pub enum EvalError {
     /// Weights cannot be read or do not fit the network.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// A learned world cannot be built or simulated.
+    #[error(transparent)]
+    Engine(#[from] EngineError),
     /// A recording cannot be driven through.
     #[error(transparent)]
     Drive(#[from] RolloutError),

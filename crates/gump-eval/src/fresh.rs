@@ -11,7 +11,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-use gump_model::ModelError;
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, SynthesisConfig};
 use rayon::prelude::*;
@@ -144,16 +143,13 @@ impl FreshScenes {
     }
 
     /// A scene of the stream.
-    ///
-    /// # Errors
-    /// None; the form is that of [`ScenarioSource::get`](gump_train::ScenarioSource::get).
-    pub fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    pub fn get(&self, index: usize) -> Cow<'_, Scenario> {
         if let Some(scene) = self.shared.lock().scenes.get(&index) {
-            return Ok(Cow::Owned(Scenario::clone(scene)));
+            return Cow::Owned(Scenario::clone(scene));
         }
         let scene = Arc::new(self.stream.scene(index));
         self.shared.keep(index, &scene);
-        Ok(Cow::Owned(Arc::unwrap_or_clone(scene)))
+        Cow::Owned(Arc::unwrap_or_clone(scene))
     }
 
     /// Scenes made so far, by anybody.
@@ -257,7 +253,7 @@ mod tests {
                 assert!((step * batch / USES..).contains(&index));
                 if step == 40 {
                     assert_eq!(two.pick(step, draw), index);
-                    let [a, b] = [&one, &two].map(|fresh| fresh.get(index).unwrap().into_owned());
+                    let [a, b] = [&one, &two].map(|fresh| fresh.get(index).into_owned());
                     assert_eq!((a.id, a.log), (b.id, b.log));
                 }
             }
@@ -269,12 +265,12 @@ mod tests {
     fn what_the_window_has_left_is_not_held_and_never_picked_again() {
         let fresh = FreshScenes::start(stream("fresh:plain:1"), 8 * USES);
         let old = fresh.pick(0, 0);
-        assert!(!fresh.get(old).unwrap().log.is_empty());
+        assert!(!fresh.get(old).log.is_empty());
         let later = WINDOW / 8 + 1;
         assert!((0..500).all(|draw| fresh.pick(later, draw) > old));
         assert!(!fresh.shared.lock().scenes.contains_key(&old));
         // Drives of the network ask for scenes of the past: they are made again.
-        assert!(fresh.get(old).unwrap().id.ends_with(&format!("{:016x}", {
+        assert!(fresh.get(old).id.ends_with(&format!("{:016x}", {
             fresh.stream.seed.fork(TRAIN).fork(old as u64).0
         })));
     }

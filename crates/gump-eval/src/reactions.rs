@@ -333,7 +333,9 @@ mod tests {
 
     #[test]
     fn scenarios_in_which_nothing_can_be_tried_say_why() {
-        let found = reactions("lane 1: 0,0 99,0\nego vehicle 3: 0,0 velocity 12,0\nhistory 1 future 2 dt 0.1");
+        let found = reactions(
+            "lane 1: 0,0 99,0\nego vehicle 3: 0,0 velocity 12,0\nhistory 1 future 2 dt 0.1",
+        );
         let why = found.unfit.clone().unwrap();
         let entry = Entry {
             index: 0,

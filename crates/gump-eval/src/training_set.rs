@@ -7,9 +7,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use gump_data::cache::Cache;
-use gump_model::ModelError;
 use gump_scene::{Scenario, Seed};
-use gump_train::ScenarioSource;
+use gump_train::{ScenarioSource, TrainError};
 
 use crate::datasets::{Part, read};
 use crate::fresh::{FreshScenes, SceneStream};
@@ -118,15 +117,15 @@ impl ScenarioSource for TrainingSet {
         }
     }
 
-    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError> {
         if let Some(fresh) = &self.fresh {
-            return fresh.get(index);
+            return Ok(fresh.get(index));
         }
         if !self.mixed.is_empty() {
             let n = self.mixed.len();
             return self.mixed[index % n].1.get(index / n);
         }
-        let missing = || ModelError::Scene(format!("there is no scenario {index}"));
+        let missing = || TrainError::Source(format!("there is no scenario {index}").into());
         let i = self.stores.partition_point(|(end, _)| *end <= index);
         let begin = i.checked_sub(1).map_or(0, |before| self.stores[before].0);
         match self.stores.get(i).map(|(_, store)| store) {
@@ -134,7 +133,7 @@ impl ScenarioSource for TrainingSet {
             Some(ScenarioStore::Held(held)) => Ok(Cow::Borrowed(&held[index - begin])),
             Some(ScenarioStore::Cached { cache, start }) => {
                 let found = cache.get(start + index - begin);
-                let found = found.map_err(|error| ModelError::Scene(error.to_string()))?;
+                let found = found.map_err(|error| TrainError::Source(error.into()))?;
                 found.map(Cow::Owned).ok_or_else(missing)
             }
         }

@@ -136,7 +136,7 @@ impl Args {
         config.train.steps = self.steps.unwrap_or(config.train.steps);
         config.train.batch = self.batch.unwrap_or(config.train.batch);
         config.train.seed = self.common.seed.unwrap_or(config.train.seed);
-        let checked = config.model().and_then(|model| model.validate());
+        let checked = config.model().and_then(|model| Ok(model.validate()?));
         checked
             .and_then(|()| config.train.validate(1))
             .map_err(|error| wrong(error.to_string()))?;
