@@ -74,13 +74,6 @@ impl Chosen {
     }
 }
 
-impl Chosen {
-    /// Whether it plans in another process.
-    pub(crate) fn is_remote(&self) -> bool {
-        matches!(self, Self::Remote(_))
-    }
-}
-
 impl fmt::Display for Chosen {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

@@ -101,6 +101,11 @@ impl Monitor for Progress {
     fn is_stopped(&self) -> bool {
         interrupted()
     }
+
+    fn part<'a>(&'a self, name: &str, total: u64, unit: &'static str) -> Box<dyn Monitor + 'a> {
+        let is_silent = matches!(self.0, Form::Silent);
+        Box::new(Self::begin(is_silent, name, total, unit))
+    }
 }
 
 impl Drop for Progress {

@@ -213,6 +213,11 @@ impl Run {
         Progress::begin(self.quiet, what, total, unit)
     }
 
+    /// Follows work that shows progress in parts only.
+    pub(crate) fn monitor(&self) -> PartMonitor {
+        PartMonitor { quiet: self.quiet }
+    }
+
     /// Begins the progress bar of a simulation of so many frames; silent where nothing is simulated.
     pub(crate) fn simulating(&self, frames: Option<u64>) -> Progress {
         let quiet = self.quiet || frames.is_none();
@@ -326,6 +331,23 @@ impl Monitor for Unseen {
 
     fn is_stopped(&self) -> bool {
         interrupted()
+    }
+}
+
+/// Hears of Ctrl-C, and shows the progress of parts of the work.
+pub(crate) struct PartMonitor {
+    quiet: bool,
+}
+
+impl Monitor for PartMonitor {
+    fn advance(&self, _: u64) {}
+
+    fn is_stopped(&self) -> bool {
+        interrupted()
+    }
+
+    fn part<'a>(&'a self, name: &str, total: u64, unit: &'static str) -> Box<dyn Monitor + 'a> {
+        Box::new(Progress::begin(self.quiet, name, total, unit))
     }
 }
 

@@ -7,7 +7,6 @@
 use std::convert::Infallible;
 use std::sync::Arc;
 
-use gump_model::ModelError;
 use gump_model::decoder::Bins;
 use gump_model::exact::ExactFrames;
 use gump_model::local_context::Survey;
@@ -15,6 +14,7 @@ use gump_model::placed_slot::{PlacedSlot, place_exactly};
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
+use crate::EngineError;
 use crate::cpu::{Context, Engine, Job, SceneMemory};
 use crate::predictive_samples::{ProbeConfig, Seen};
 use crate::redraw::Clearance;
@@ -41,7 +41,10 @@ pub(crate) struct Window {
 
 /// The slots of a window, up to the last provisional value. If the window would be longer than
 /// `block_size`, its oldest frames are dropped as a whole.
-pub(crate) fn presented(window: &Window, block_size: usize) -> Result<Vec<PlacedSlot>, ModelError> {
+pub(crate) fn presented(
+    window: &Window,
+    block_size: usize,
+) -> Result<Vec<PlacedSlot>, EngineError> {
     let mut room = block_size.saturating_sub(window.next.len_slots());
     let newest = window.history.iter().rev();
     let n = newest
@@ -55,8 +58,7 @@ pub(crate) fn presented(window: &Window, block_size: usize) -> Result<Vec<Placed
     let mut frames = window.history[first..].to_vec();
     frames[0] = std::mem::take(&mut frames[0]).into_first();
     frames.push(window.next.clone());
-    let sequence = TokenSequence::new(Vec::new(), frames)
-        .map_err(|error| ModelError::Scene(error.to_string()))?;
+    let sequence = TokenSequence::new(Vec::new(), frames).map_err(EngineError::Grammar)?;
     let mut slots = place_exactly(&sequence, |frame, id| window.exact.of(first + frame, id));
     // The last frame's NEWBORN decides nothing yet.
     slots.truncate(
@@ -243,7 +245,7 @@ impl Step<'_> {
 pub(crate) fn present_all(
     windows: &[Window],
     block_size: usize,
-) -> Result<Vec<Vec<PlacedSlot>>, ModelError> {
+) -> Result<Vec<Vec<PlacedSlot>>, EngineError> {
     windows
         .par_iter()
         .map(|window| presented(window, block_size))

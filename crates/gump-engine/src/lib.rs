@@ -49,6 +49,7 @@ pub mod decode;
 mod deconvolution;
 #[cfg(feature = "tensors")]
 mod draw;
+mod error;
 pub mod kinematic_limits;
 pub mod nucleus;
 #[cfg(feature = "tensors")]
@@ -81,6 +82,7 @@ mod trajectories;
 #[cfg(feature = "tensors")]
 pub mod world;
 
+pub use error::EngineError;
 pub use gump_kernels::panels::Precision;
 pub use predictive_samples::{PredictiveSamples, ProbeConfig};
 pub use sampling::{CacheMode, LightSource, Mode, RateScale, SamplingConfig, Surrogate};

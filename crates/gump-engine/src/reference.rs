@@ -8,7 +8,6 @@
 use std::collections::BTreeMap;
 
 use candle_core::Tensor;
-use gump_model::ModelError;
 use gump_model::Network;
 use gump_model::decoder::{Bins, STEPS};
 use gump_model::mct::{Cache, VisualMemory};
@@ -16,6 +15,7 @@ use gump_model::placed_slot::PlacedSlot;
 use gump_tokenizer::Slot;
 use rayon::prelude::*;
 
+use crate::EngineError;
 use crate::decode::Window;
 use crate::draw::draw_field;
 use crate::redraw::Clearance;
@@ -55,7 +55,7 @@ impl<'a> Passes<'a> {
         slots: &[&[PlacedSlot]],
         memory: &VisualMemory,
         cache: Option<&mut Cache>,
-    ) -> Result<Tensor, ModelError> {
+    ) -> Result<Tensor, EngineError> {
         self.count.set(self.count.get() + 1);
         let network = self.network;
         let from = cache.as_ref().map_or(0, |cache| cache.len());
@@ -64,7 +64,7 @@ impl<'a> Passes<'a> {
     }
 
     /// The memory of a batch: shared where consecutive futures share a scene evenly, else repeated.
-    fn memory(&self, scenes: &[usize]) -> Result<VisualMemory, ModelError> {
+    fn memory(&self, scenes: &[usize]) -> Result<VisualMemory, EngineError> {
         let mut distinct: Vec<usize> = scenes.to_vec();
         distinct.dedup();
         let each = scenes.len() / distinct.len();
@@ -84,7 +84,7 @@ pub(crate) fn decode(
     passes: &Passes<'_>,
     windows: &[Window],
     placed: &[Vec<PlacedSlot>],
-) -> Result<Vec<Vec<Bins>>, ModelError> {
+) -> Result<Vec<Vec<Bins>>, EngineError> {
     // One pass for all: shorter windows are padded at their end. One by one, the end grows, so only
     // windows of one layout may go together.
     let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
@@ -127,7 +127,7 @@ struct Group<'a> {
 
 impl Group<'_> {
     /// Partial autoregression: one pass with surrogates in place, then every key is decoded.
-    fn all_at_once(&self, passes: &Passes<'_>) -> Result<Vec<Vec<Bins>>, ModelError> {
+    fn all_at_once(&self, passes: &Passes<'_>) -> Result<Vec<Vec<Bins>>, EngineError> {
         let hidden = passes.run(&self.slots, &self.memory, None)?; // [B, T, C]
         let (b, t, c) = hidden.dims3()?;
         let counts: Vec<usize> = self.windows.iter().map(|w| w.next.tracked.len()).collect();
@@ -166,7 +166,7 @@ impl Group<'_> {
     }
 
     /// Full autoregression: each object sees the final states of those before it.
-    fn one_by_one(&self, passes: &Passes<'_>) -> Result<Vec<Vec<Bins>>, ModelError> {
+    fn one_by_one(&self, passes: &Passes<'_>) -> Result<Vec<Vec<Bins>>, EngineError> {
         let n = self.windows[0].next.tracked.len();
         let first = self.slots[0].len() - 2 * n;
         let mut cache = match passes.sampling.cache {
@@ -213,7 +213,7 @@ pub(crate) fn sample_states(
     hidden: &Tensor,
     requests: &[Request],
     config: &SamplingConfig,
-) -> Result<Vec<Bins>, ModelError> {
+) -> Result<Vec<Bins>, EngineError> {
     let table = network.decoder.input_table(&network.mct.token_table()?)?;
     let mut states = network.decoder.begin(hidden);
     let mut bins = vec![[0; STEPS.len()]; requests.len()];

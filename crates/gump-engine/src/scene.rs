@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
 
 use gump_geometry::Pose;
+use gump_model::ModelConfig;
 use gump_model::config::KEEP_RANGE_M;
 use gump_model::exact::ExactFrames;
 use gump_model::local_context::Survey;
@@ -12,13 +13,13 @@ use gump_model::local_frame::LocalFrame;
 use gump_model::mct::VisualMemory;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 use gump_model::steps::TOKEN_DT;
-use gump_model::{ModelConfig, ModelError};
 use gump_raster::rasterize;
 use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, MapGraph, Route, SceneState};
 use gump_tokenizer::{
     Identities, Key, N_CLASSES, QuantizedState, TokenAgent, TokenFrame, TokenSequence, class_index,
 };
 
+use crate::EngineError;
 use crate::cpu::{Context, SceneMemory};
 use crate::placement::ground::Ground;
 use crate::world::TransformerWorld;
@@ -79,12 +80,14 @@ pub struct Scene {
 
 impl Scene {
     /// The content of the present of a scene.
-    pub fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, ModelError> {
+    pub fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, EngineError> {
         let world_from_scene = scene.ego_now().state.pose;
         let stride = (TOKEN_DT / scene.dt).round().max(1.0) as usize;
         if (stride as f64 * scene.dt - TOKEN_DT).abs() > 1e-3 {
-            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", scene.dt);
-            return Err(ModelError::Scene(what));
+            return Err(EngineError::TimeStep {
+                dt: scene.dt,
+                expected: TOKEN_DT,
+            });
         }
         let frames = scene.strided_history(stride, world.sampling().history.max(1));
         // The ego must be in every frame of the window: start after the last one it is missing in.
@@ -108,7 +111,7 @@ impl Scene {
         recent: Vec<Frame>,
         ego: AgentId,
         identities: Identities,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, EngineError> {
         let view = SceneState {
             map: &map,
             route: route.as_ref(),
@@ -160,9 +163,9 @@ impl Scene {
     }
 
     /// The slots of its own history.
-    pub fn slots(&self) -> Result<Vec<PlacedSlot>, ModelError> {
-        let sequence = TokenSequence::new(Vec::new(), self.history.clone())
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
+    pub fn slots(&self) -> Result<Vec<PlacedSlot>, EngineError> {
+        let sequence =
+            TokenSequence::new(Vec::new(), self.history.clone()).map_err(EngineError::Grammar)?;
         let n = self.history.len();
         let exact = ExactFrames::last(n, &self.recent, &self.identities, self.world_from_scene);
         Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))

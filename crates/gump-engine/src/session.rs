@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use gump_model::ModelError;
 use gump_model::decoder::Bins;
 use gump_model::mct::VisualMemory;
 use gump_model::steps::TOKEN_DT;
@@ -10,6 +9,7 @@ use gump_rollout::{BoxError, Session, Start};
 use gump_scene::{AgentState, Frame};
 use rayon::prelude::*;
 
+use crate::EngineError;
 use crate::cpu::SceneMemory;
 use crate::decode::{Step, Window, present_all};
 use crate::predictive_samples::{PredictiveSamples, Seen};
@@ -40,12 +40,11 @@ impl Session for TransformerSession<'_> {
         if let Some(states) = ego
             && states.len() != self.futures.len()
         {
-            let what = format!(
-                "{} ego states for {} futures",
-                states.len(),
-                self.futures.len()
-            );
-            return Err(ModelError::Scene(what).into());
+            let wrong = EngineError::EgoStates {
+                found: states.len(),
+                futures: self.futures.len(),
+            };
+            return Err(wrong.into());
         }
         self.recentre()?;
         let sampling = self.world.sampling();
@@ -104,7 +103,7 @@ impl TransformerSession<'_> {
 
     /// Gives every future whose ego nears the edge of its window a new scene around the ego's
     /// present, with map and tokens; such a future no longer shares its visual memory with others.
-    fn recentre(&mut self) -> Result<(), ModelError> {
+    fn recentre(&mut self) -> Result<(), EngineError> {
         let reach = match self.world.sampling().life {
             true => RECENTRE_ALIVE_M,
             false => RECENTRE_M,
@@ -137,7 +136,7 @@ impl TransformerSession<'_> {
     }
 
     /// One chunk of bins per tracked agent of every window.
-    fn decode(&mut self, windows: &[Window]) -> Result<Vec<Vec<Bins>>, ModelError> {
+    fn decode(&mut self, windows: &[Window]) -> Result<Vec<Vec<Bins>>, EngineError> {
         let (network, sampling) = (self.world.network(), self.world.sampling());
         let placed = present_all(windows, network.config().block_size)?;
         let Some(engine) = self.world.engine() else {

@@ -22,11 +22,11 @@ use gump_scene::{AgentKind, AgentState, Frame, Light, Seed};
 use gump_tokenizer::{Key, TokenAgent, TokenFrame, TokenSequence};
 
 pub(crate) use crate::spawning::lights::Phases;
-use gump_model::ModelError;
 use gump_model::decoder::STEPS;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 
+use crate::EngineError;
 use crate::cpu::{Context, Engine, Job};
 use crate::decode::{Window, present_all};
 use crate::nucleus::uniform;
@@ -56,10 +56,10 @@ enum About {
 
 impl TransformerSession<'_> {
     /// Draws the lights of the next frames and removes agents that have left.
-    pub(crate) fn before_decoding(&mut self, windows: &mut [Window]) -> Result<(), ModelError> {
+    pub(crate) fn before_decoding(&mut self, windows: &mut [Window]) -> Result<(), EngineError> {
         let Some(engine) = self.world.engine() else {
-            let what = "traffic lives on a CPU only, and this world is elsewhere";
-            return Err(ModelError::Scene(what.into()));
+            let what = "traffic lives";
+            return Err(EngineError::NotOnCpu { what });
         };
         let block_size = self.world.network().config().block_size;
         let mut placed = present_all(windows, block_size)?;
@@ -154,7 +154,7 @@ impl TransformerSession<'_> {
 
     /// Removes agents that left the window, sets the lights, and adds new agents; `frames` are
     /// those just committed.
-    pub(crate) fn after_decoding(&mut self, frames: &mut [Frame]) -> Result<(), ModelError> {
+    pub(crate) fn after_decoding(&mut self, frames: &mut [Frame]) -> Result<(), EngineError> {
         for (future, frame) in self.futures.iter_mut().zip(frames.iter_mut()) {
             let scene = &self.scenes[future.scene];
             *frame = future.without_the_gone(frame, scene);
@@ -231,7 +231,7 @@ impl TransformerSession<'_> {
         open: &mut Vec<usize>,
         coming: Vec<(usize, AgentKind, Seed)>,
         frames: &mut [Frame],
-    ) -> Result<(), ModelError> {
+    ) -> Result<(), EngineError> {
         let mut arriving = Vec::new();
         for (f, kind, seed) in coming {
             let future = &mut self.futures[f];
@@ -375,15 +375,15 @@ impl Future {
     }
 
     /// All slots of the window, the present frame included, up to where a new agent may come.
-    fn slots_to_end(&self, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
+    fn slots_to_end(&self, scene: &Scene) -> Result<Vec<PlacedSlot>, EngineError> {
         let sequence = TokenSequence::new(Vec::new(), self.frames.clone());
-        let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
+        let sequence = sequence.map_err(EngineError::Grammar)?;
         let exact = self.exact(scene);
         Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
     }
 
     /// The same with the key of a new agent after them.
-    fn slots_to_key(&self, key: Key, scene: &Scene) -> Result<Vec<PlacedSlot>, ModelError> {
+    fn slots_to_key(&self, key: Key, scene: &Scene) -> Result<Vec<PlacedSlot>, EngineError> {
         let mut frames = self.frames.clone();
         let now = frames.last_mut().expect("a future has a present");
         now.newborn.push(TokenAgent {
@@ -391,7 +391,7 @@ impl Future {
             state: Default::default(),
         });
         let sequence = TokenSequence::new(Vec::new(), frames);
-        let sequence = sequence.map_err(|error| ModelError::Scene(error.to_string()))?;
+        let sequence = sequence.map_err(EngineError::Grammar)?;
         let exact = self.exact(scene);
         let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
         slots.pop();

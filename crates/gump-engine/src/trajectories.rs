@@ -5,13 +5,13 @@ use std::sync::Arc;
 
 use candle_core::Tensor;
 use gump_geometry::{DVec2, dvec2};
-use gump_model::ModelError;
 use gump_model::steps::TOKEN_DT;
 use gump_model::trajectory_head::{FUTURE, MODES, POSE};
 use gump_raster::rasterize;
 use gump_scene::{AgentId, SceneState};
 use gump_tokenizer::Slot;
 
+use crate::EngineError;
 use crate::scene::Scene;
 use crate::world::TransformerWorld;
 
@@ -46,12 +46,10 @@ impl TransformerWorld {
     pub fn predict_trajectories(
         &self,
         scene: SceneState<'_>,
-    ) -> Result<Vec<AgentTrajectories>, ModelError> {
+    ) -> Result<Vec<AgentTrajectories>, EngineError> {
         let network = self.network();
         let Some(head) = network.trajectory_heads.last() else {
-            return Err(ModelError::Scene(
-                "the network has no trajectory heads".into(),
-            ));
+            return Err(EngineError::NoTrajectoryHeads);
         };
         let scene = Scene::new(self, scene)?;
         let slots = scene.slots()?;

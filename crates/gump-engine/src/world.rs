@@ -14,7 +14,6 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use candle_core::Tensor;
-use gump_model::ModelError;
 use gump_model::Network;
 use gump_model::decoder::{Bins, STEPS};
 use gump_model::local_frame::LocalFrame;
@@ -24,6 +23,7 @@ use gump_scene::{SceneState, Seed};
 use gump_tokenizer::{QuantizedState, Slot, Tokenizer, TokenizerConfig};
 use rayon::prelude::*;
 
+use crate::EngineError;
 use crate::cpu::{Engine, Job};
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::reference::sample_states;
@@ -167,7 +167,7 @@ impl TransformerWorld {
     pub(crate) fn open_session(
         &self,
         starts: &[Start<'_>],
-    ) -> Result<TransformerSession<'_>, ModelError> {
+    ) -> Result<TransformerSession<'_>, EngineError> {
         let mut distinct: Vec<SceneState<'_>> = Vec::new();
         let mut scene_of = Vec::with_capacity(starts.len());
         for start in starts {
@@ -205,7 +205,7 @@ impl TransformerWorld {
         shared: &mut Scene,
         n: usize,
         seed: Seed,
-    ) -> Result<Vec<Future>, ModelError> {
+    ) -> Result<Vec<Future>, EngineError> {
         let chunks = self.first_chunks(shared, n, seed)?;
         let last = shared
             .history
@@ -239,7 +239,7 @@ impl TransformerWorld {
         scene: &mut Scene,
         n: usize,
         seed: Seed,
-    ) -> Result<Vec<Vec<(u16, Chunk)>>, ModelError> {
+    ) -> Result<Vec<Vec<(u16, Chunk)>>, EngineError> {
         let network = &self.network;
         let slots = scene.slots()?;
         let last = scene.history.len() - 1;
@@ -298,7 +298,7 @@ impl TransformerWorld {
         scene: &mut Scene,
         slots: &[PlacedSlot],
         places: Vec<usize>,
-    ) -> Result<Vec<f32>, ModelError> {
+    ) -> Result<Vec<f32>, EngineError> {
         self.count_passes(1);
         if let (Some(engine), Memory::Packed(memory)) = (&self.engine, &scene.memory) {
             return Ok(engine.run(&mut [Job {
@@ -324,7 +324,7 @@ impl TransformerWorld {
     ///
     /// # Errors
     /// A scene that cannot be tokenised, or errors of the tensor library.
-    pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, ModelError> {
+    pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, EngineError> {
         let mut scene = Scene::new(self, scene)?;
         let slots = scene.slots()?;
         let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));

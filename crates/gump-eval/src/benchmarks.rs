@@ -2,9 +2,12 @@
 //!
 //! A list names scenes, it holds none: made ones by generator version, seed, network and checksum,
 //! recorded ones by id, file and checksum. [`ScenarioSetName::find`] finds the scenes of a list and
-//! holds them to it; to make those that are made is the driver's work (`data benchmark`).
+//! holds them to it; [`make()`] makes those that are made, and [`ListDraw`] draws a list from a larger
+//! one.
 
 mod checksum;
+mod draw;
+mod make;
 mod scenario_set;
 mod verify;
 
@@ -18,6 +21,8 @@ use crate::EvalError;
 use crate::datasets::Split;
 
 pub use checksum::checksum;
+pub use draw::{DrawRule, ListDraw};
+pub use make::{freeze, make};
 pub use scenario_set::{BenchmarkFolders, ScenarioSet, ScenarioSetName};
 pub use verify::{checksums, sha256, verify_made, verify_recorded};
 

@@ -3,9 +3,11 @@
 //! Results have the network alone beside the network under rules, because rules that look at the
 //! same edges and boxes as a score raise the score by themselves.
 
-use crate::worlds::WorldName;
 use gump_engine::SamplingConfig;
 use gump_rollout::SimulateConfig;
+use serde::{Deserialize, Serialize};
+
+use crate::worlds::WorldName;
 
 /// A way to make the futures of a world.
 #[derive(Clone, Debug, PartialEq)]
@@ -81,6 +83,39 @@ impl Decoding {
     }
 }
 
+/// A world and the way it decodes: one column of a comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DecodedWorld {
+    /// The world.
+    pub world: WorldName,
+    /// The way it decodes.
+    pub decoding: Decoding,
+}
+
+/// The name of a [`DecodedWorld`], as results are stored under it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DecodedWorldName {
+    /// The name of the world.
+    pub world: String,
+    /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
+    pub decoding: String,
+}
+
+impl DecodedWorld {
+    /// The number of futures to simulate where `n` are asked for: worlds without chance have one.
+    pub fn futures(&self, n: usize) -> usize {
+        self.world.distinct_futures(n)
+    }
+
+    /// Its name in results.
+    pub fn name(&self) -> DecodedWorldName {
+        DecodedWorldName {
+            world: self.world.to_string(),
+            decoding: self.decoding.name.into(),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use gump_rollout::Interpolation;
@@ -112,5 +147,17 @@ mod tests {
         );
         assert_eq!(Decoding::label("w", "ruled"), "w");
         assert_eq!(Decoding::label("w", "raw"), "w (raw)");
+    }
+
+    #[test]
+    fn a_world_without_chance_has_one_future_and_decodes_nothing() {
+        let column = |world: WorldName| DecodedWorld {
+            decoding: Decoding::of(SamplingConfig::default()).for_world(&world),
+            world,
+        };
+        let (log, idm) = (column(WorldName::Log), column(WorldName::Idm));
+        assert_eq!((log.futures(8), idm.futures(8)), (1, 8));
+        assert_eq!(log.name().decoding, Decoding::NONE);
+        assert_eq!(idm.name().world, "idm");
     }
 }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gump_data::DataError;
+use gump_engine::EngineError;
 use gump_model::ModelError;
 use gump_planner::PlanError;
 use gump_rollout::{BoxError, RolloutError};
@@ -11,6 +12,7 @@ use gump_wosac::realism::WosacError;
 
 /// An error of an evaluation's inputs or of its results.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum EvalError {
     /// The request does not exist or contradicts itself.
     #[error("{0}")]
@@ -21,6 +23,9 @@ pub enum EvalError {
     /// Weights cannot be read or do not fit the network.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// A learned world cannot be built or simulated.
+    #[error(transparent)]
+    Engine(#[from] EngineError),
     /// A recording cannot be driven through.
     #[error(transparent)]
     Drive(#[from] RolloutError),
@@ -54,6 +59,15 @@ pub enum EvalError {
     /// The monitor wanted the work to end.
     #[error("stopped by Ctrl-C")]
     Stopped,
+    /// As [`EvalError::Stopped`], with a store that the same evaluation resumes from.
+    #[error("stopped by Ctrl-C; the same command resumes {from}")]
+    StoppedAndStored {
+        /// The place from which it resumes: "after scenario 7".
+        from: String,
+    },
+    /// SUMO is missing, of another version than expected, or failed.
+    #[error("{0}")]
+    Sumo(String),
     /// An error with the place at which it occurred.
     #[error("{place}: {error}")]
     At {
@@ -107,6 +121,11 @@ impl EvalError {
         }
     }
 
+    /// The error and what caused it, as one sentence.
+    pub fn sentence(&self) -> String {
+        sentence(self)
+    }
+
     /// Whether a different argument, rather than a different file, would help.
     pub fn is_argument(&self) -> bool {
         matches!(
@@ -114,5 +133,31 @@ impl EvalError {
             Self::Argument(_)
                 | Self::Data(DataError::NoSuchScenario { .. } | DataError::SeveralFiles { .. })
         )
+    }
+}
+
+/// An error and what caused it, as one sentence.
+pub(crate) fn sentence(error: &dyn std::error::Error) -> String {
+    let mut sentence = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        sentence += &format!(": {error}");
+        cause = error.source();
+    }
+    sentence
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sentence_names_the_cause_once() {
+        let io = std::io::Error::other("disk full");
+        let error = EvalError::io("write", Path::new("a"), io);
+        assert_eq!(sentence(&error), "cannot write a: disk full");
+        let error = EvalError::Stopped.at(&"scenario 3");
+        assert_eq!(sentence(&error), "scenario 3: stopped by Ctrl-C");
+        assert!(matches!(error.cause(), EvalError::Stopped));
     }
 }

@@ -22,6 +22,28 @@ pub trait Monitor: Sync {
             false => Ok(()),
         }
     }
+
+    /// Begins a part of the work, `total` units long: "simulating", 3200, "frames". Its monitor counts
+    /// those units and ends with this one. By default nobody counts them.
+    fn part<'a>(&'a self, _name: &str, _total: u64, _unit: &'static str) -> Box<dyn Monitor + 'a> {
+        Box::new(Uncounted(self))
+    }
+}
+
+/// A part of work whose units nobody counts.
+struct Uncounted<'a, M: ?Sized>(&'a M);
+
+impl<M: Monitor + ?Sized> Monitor for Uncounted<'_, M> {
+    fn advance(&self, _: u64) {}
+
+    fn is_stopped(&self) -> bool {
+        self.0.is_stopped()
+    }
+
+    // Without this, each part would have a type of its own, without end.
+    fn part<'a>(&'a self, _: &str, _: u64, _: &'static str) -> Box<dyn Monitor + 'a> {
+        Box::new(Uncounted(self.0))
+    }
 }
 
 impl Monitor for () {
@@ -29,5 +51,30 @@ impl Monitor for () {
 
     fn is_stopped(&self) -> bool {
         false
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Stopped;
+
+    impl Monitor for Stopped {
+        fn advance(&self, _: u64) {
+            unreachable!("a part counts for itself")
+        }
+
+        fn is_stopped(&self) -> bool {
+            true
+        }
+    }
+
+    #[test]
+    fn a_part_ends_with_the_whole_and_counts_for_itself() {
+        let part = Stopped.part("simulating", 10, "frames");
+        part.advance(1);
+        assert!(matches!(part.check(), Err(EvalError::Stopped)));
+        assert!(().part("simulating", 10, "frames").check().is_ok());
     }
 }

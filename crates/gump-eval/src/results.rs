@@ -9,11 +9,13 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use gump_data::{DataError, ScenarioRecord};
+use gump_scene::Scenario;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
 use crate::shard::Shard;
+use crate::{EvalError, Monitor};
 
 /// Name of a complete store in an output folder.
 const NAME: &str = "scenarios.toml";
@@ -55,6 +57,7 @@ struct Document<T> {
 /// A store being written; an entry is safe once [`ResultStore::add`] returns.
 pub struct ResultStore<T> {
     folder: PathBuf,
+    shard: Shard,
     file: File,
     entries: BTreeMap<usize, Entry<T>>,
 }
@@ -71,6 +74,7 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
         let file = File::create(&path).map_err(|cause| EvalError::io("create", &path, cause))?;
         let mut store = Self {
             folder: folder.to_owned(),
+            shard: header.shard,
             file,
             entries: BTreeMap::new(),
         };
@@ -82,6 +86,49 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
             store.add(entry)?;
         }
         Ok(store)
+    }
+
+    /// Scores scenario after scenario: those of the shard that are not done yet. `score` gets the
+    /// position and the scenario; the monitor counts scenarios.
+    ///
+    /// # Errors
+    /// The first record that cannot be read, the error of `score` with its scenario, or
+    /// [`EvalError::StoppedAndStored`].
+    pub fn fill(
+        &mut self,
+        records: impl Iterator<Item = Result<ScenarioRecord, DataError>>,
+        monitor: &dyn Monitor,
+        mut score: impl FnMut(usize, &Scenario) -> Result<T, EvalError>,
+    ) -> Result<(), EvalError> {
+        for (index, record) in records.enumerate() {
+            if !self.is_wanted(index) {
+                continue;
+            }
+            let scenario = record?.scenario;
+            let place = || format!("cannot evaluate scenario {}", scenario.id);
+            let scores = score(index, &scenario).map_err(|error| error.at(&place()))?;
+            self.add(Entry {
+                index,
+                id: scenario.id.clone(),
+                scores,
+            })?;
+            monitor.advance(1);
+            if monitor.is_stopped() {
+                let from = format!("after scenario {index}");
+                return Err(EvalError::StoppedAndStored { from });
+            }
+        }
+        Ok(())
+    }
+
+    /// The shard whose scenarios belong into the store.
+    pub fn shard(&self) -> Shard {
+        self.shard
+    }
+
+    /// True if the scenario at `index` is of the shard and not done yet.
+    pub fn is_wanted(&self, index: usize) -> bool {
+        self.shard.holds(index) && !self.has(index)
     }
 
     /// True if the scenario at `index` is already done.

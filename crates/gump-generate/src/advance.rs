@@ -4,13 +4,12 @@
 
 use std::sync::Arc;
 
-use gump_engine::TransformerWorld;
 use gump_engine::cpu::{Engine, Job};
 use gump_engine::placement::rules::{Rules, state_of};
 use gump_engine::request::Request;
 use gump_engine::temporal_ensemble::ChunkBuffer;
+use gump_engine::{EngineError, TransformerWorld};
 use gump_geometry::OrientedBox;
-use gump_model::ModelError;
 use gump_model::decoder::Bins;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
@@ -83,7 +82,7 @@ fn read(
     engine: &Engine,
     open: &mut [&mut Draft<'_>],
     last: impl Fn(usize) -> Option<Option<Key>>,
-) -> Result<Vec<f32>, ModelError> {
+) -> Result<Vec<f32>, EngineError> {
     let slots = open.iter().enumerate().map(|(i, draft)| {
         let next = last(i);
         let slots = next.map(|next| draft.prepared.slots(&draft.agents, next));

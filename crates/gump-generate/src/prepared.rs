@@ -4,15 +4,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use gump_engine::SamplingConfig;
-use gump_engine::TransformerWorld;
 use gump_engine::cpu::SceneMemory;
 use gump_engine::placement::ground::Ground;
 use gump_engine::placement::object_spec::{ObjectSpec, agent_of};
 use gump_engine::placement::rules::{Manner, Rules};
 use gump_engine::scene::Scene;
+use gump_engine::{EngineError, SamplingConfig, TransformerWorld};
 use gump_geometry::OrientedBox;
-use gump_model::ModelError;
 use gump_model::placed_slot::{PlacedSlot, place};
 use gump_scene::{AgentId, AgentKind, AgentState, Frame, LaneId, ScenarioTag};
 use gump_tokenizer::{
@@ -188,7 +186,7 @@ impl<'a> Prepared<'a> {
         &self,
         agents: &[TokenAgent],
         next: Option<Key>,
-    ) -> Result<Vec<PlacedSlot>, ModelError> {
+    ) -> Result<Vec<PlacedSlot>, EngineError> {
         let mut tracked = agents.to_vec();
         tracked.extend(next.map(|key| TokenAgent {
             key,
@@ -202,8 +200,8 @@ impl<'a> Prepared<'a> {
             tracked,
             newborn: Vec::new(),
         };
-        let sequence = TokenSequence::new(self.prompts.clone(), vec![frame])
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
+        let sequence =
+            TokenSequence::new(self.prompts.clone(), vec![frame]).map_err(EngineError::Grammar)?;
         let mut slots = place(&sequence);
         // NEWBORN decides nothing yet, nor does the value that is still to come.
         slots.truncate(slots.len() - 1 - usize::from(next.is_some()));
@@ -217,10 +215,10 @@ impl<'a> Prepared<'a> {
 }
 
 /// The map with only the ego, as the network sees it.
-fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<Scene, ModelError> {
+fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<Scene, EngineError> {
     if world.engine().is_none() {
-        let what = "scenes are generated on a CPU only, and this world is elsewhere";
-        return Err(ModelError::Scene(what.into()));
+        let what = "scenes are generated";
+        return Err(EngineError::NotOnCpu { what });
     }
     let start = request.ego;
     let state = AgentState {

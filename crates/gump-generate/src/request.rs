@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use gump_engine::TransformerWorld;
 use gump_engine::placement::object_spec::ObjectSpec;
+use gump_engine::{EngineError, TransformerWorld};
 use gump_geometry::{DVec2, Pose};
-use gump_model::ModelError;
+use gump_rollout::BoxError;
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Light, MapGraph, Scenario, ScenarioTag, Seed};
 use serde::{Deserialize, Serialize};
 
@@ -234,9 +234,12 @@ pub enum GenerateError {
         /// The most frequent violation.
         clause: String,
     },
-    /// The network failed.
+    /// The network failed, or cannot generate.
     #[error(transparent)]
-    Model(#[from] ModelError),
+    Engine(#[from] EngineError),
+    /// The future of a scene could not be simulated.
+    #[error("scene: {0}")]
+    Rollout(BoxError),
 }
 
 /// One scene per seed, each a function of the request and its own seed only.

@@ -1,10 +1,10 @@
 //! Repeated rollouts of a scene, and the instant at which one of them satisfies the prompts: a tag
 //! is about an instant, so any instant may become the present of the scenario.
 
-use gump_model::ModelError;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Rollout, Scenario, Seed};
 
+use crate::GenerateError;
 use crate::drive::{Drive, Steered};
 
 /// Number of futures simulated of a scene, after a first one that is often sufficient.
@@ -22,7 +22,7 @@ pub(super) fn free(
     scene: &Scenario,
     n_futures: usize,
     seed: Seed,
-) -> Result<Vec<Scenario>, ModelError> {
+) -> Result<Vec<Scenario>, GenerateError> {
     let start = Start {
         scene: scene.present(),
         n_futures,
@@ -39,7 +39,7 @@ pub(super) fn steered(
     scene: &Scenario,
     drive: &Drive,
     seed: Seed,
-) -> Result<Vec<Scenario>, ModelError> {
+) -> Result<Vec<Scenario>, GenerateError> {
     let start = Start {
         scene: scene.present(),
         n_futures: FUTURES,
@@ -93,7 +93,7 @@ pub(super) fn extend(
     scenario: &mut Scenario,
     seconds: f64,
     seed: Seed,
-) -> Result<(), ModelError> {
+) -> Result<(), GenerateError> {
     let wanted = (seconds / scenario.dt).round() as usize;
     let missing = wanted.saturating_sub(scenario.future().len());
     if missing == 0 {
@@ -115,7 +115,7 @@ fn imagine(
     starts: &[Start<'_>],
     drive: Option<&Drive>,
     seconds: f64,
-) -> Result<Vec<Rollout>, ModelError> {
+) -> Result<Vec<Rollout>, GenerateError> {
     let config = SimulateConfig {
         seconds,
         ..SimulateConfig::default()
@@ -124,7 +124,7 @@ fn imagine(
         Some(drive) => simulate(world, starts, Some(&mut Steered::new(drive)), &config),
         None => simulate(world, starts, None, &config),
     };
-    result.map_err(|error| ModelError::Scene(error.to_string()))
+    result.map_err(GenerateError::Rollout)
 }
 
 fn with_future(scene: &Scenario, rollout: &Rollout) -> Scenario {

@@ -62,28 +62,6 @@ pub enum ModelError {
         /// The file.
         path: PathBuf,
     },
-    /// Training diverged.
-    #[error(
-        "the loss is not a number at step {step} (field {field}); the last checkpoint is intact"
-    )]
-    LossNotFinite {
-        /// Optimiser step.
-        step: usize,
-        /// First loss that is not finite.
-        field: String,
-    },
-    /// There is nothing to train on.
-    #[error("no scenario offers {frames} consecutive frames at 2 Hz to train on")]
-    NoData {
-        /// Frames a sample needs.
-        frames: usize,
-    },
-    /// Processes that train together lost their connection.
-    #[error("processes that train together: {0}")]
-    Peers(String),
-    /// A scene that this model cannot simulate.
-    #[error("scene: {0}")]
-    Scene(String),
 }
 
 #[cfg(feature = "tensors")]

@@ -10,7 +10,6 @@
 use gump_engine::SamplingConfig;
 use gump_engine::TransformerWorld;
 use gump_geometry::angle_difference;
-use gump_model::ModelError;
 use gump_model::Network;
 use gump_model::steps::{HISTORY, LONGEST_ROLLOUT, stride_of};
 use gump_rollout::{Start, WorldModel};
@@ -19,6 +18,7 @@ use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::TrainError;
 use crate::scenes::ScenarioSource;
 
 /// Weight of a radian of heading error, in metres, when candidates are compared.
@@ -87,7 +87,7 @@ pub(crate) fn drive(
     scenarios: &dyn ScenarioSource,
     config: &ClosedLoopConfig,
     seed: Seed,
-) -> Result<Vec<Drive>, ModelError> {
+) -> Result<Vec<Drive>, TrainError> {
     let sampling = SamplingConfig {
         temperature: Some(config.temperature),
         ..SamplingConfig::default()
@@ -116,7 +116,7 @@ fn drive_one(
     index: usize,
     candidates: usize,
     seed: Seed,
-) -> Result<Option<Drive>, ModelError> {
+) -> Result<Option<Drive>, TrainError> {
     let scenario = &*scenarios.get(index)?;
     let stride = stride_of(scenario.dt);
     let lead = (HISTORY - 1) * stride;
@@ -158,7 +158,7 @@ fn drive_one(
         let draws = world
             .open(&[start])
             .and_then(|mut session| session.step(None))
-            .map_err(|error| ModelError::Scene(error.to_string()))?;
+            .map_err(|error| TrainError::Rollout(error))?;
         history.push(nearest(&draws, logged));
     }
     Ok(Some(Drive {

@@ -1,10 +1,10 @@
 //! Configuration of a run: its file, and the part stored in a checkpoint.
 
-use gump_model::ModelError;
 use gump_model::config::ModelConfig;
 use gump_nn::optimizer::OptimizerConfig;
 use serde::{Deserialize, Serialize};
 
+use crate::TrainError;
 use crate::closed_loop::ClosedLoopConfig;
 use crate::loss::LossConfig;
 use crate::sample::SampleConfig;
@@ -65,9 +65,9 @@ impl TrainConfig {
     /// Checks that the values are consistent, for this number of processes.
     ///
     /// # Errors
-    /// [`ModelError::Config`] naming the first contradiction.
-    pub fn validate(&self, processes: usize) -> Result<(), ModelError> {
-        let fail = |what: String| Err(ModelError::Config(what));
+    /// [`TrainError::Config`] naming the first contradiction.
+    pub fn validate(&self, processes: usize) -> Result<(), TrainError> {
+        let fail = |what: String| Err(TrainError::Config(what));
         if self.batch == 0 || self.accumulate == 0 {
             return fail("batch and accumulate must be at least 1".into());
         }
@@ -110,21 +110,21 @@ impl RunConfig {
     /// Reads the TOML form.
     ///
     /// # Errors
-    /// [`ModelError::Config`] with the place and the key at fault.
-    pub fn from_toml(text: &str) -> Result<Self, ModelError> {
-        toml::from_str(text).map_err(|error| ModelError::Config(error.to_string()))
+    /// [`TrainError::Config`] with the place and the key at fault.
+    pub fn from_toml(text: &str) -> Result<Self, TrainError> {
+        toml::from_str(text).map_err(|error| TrainError::Config(error.to_string()))
     }
 
     /// The model's shape.
     ///
     /// # Errors
-    /// [`ModelError::Config`] for a preset that does not exist.
-    pub fn model(&self) -> Result<ModelConfig, ModelError> {
+    /// [`TrainError::Config`] for a preset that does not exist.
+    pub fn model(&self) -> Result<ModelConfig, TrainError> {
         match &self.model {
             ModelChoice::Config(config) => Ok((**config).clone()),
             ModelChoice::Preset(name) => ModelConfig::preset(name).ok_or_else(|| {
                 let known = ModelConfig::PRESETS.join(", ");
-                ModelError::Config(format!("unknown model \"{name}\", expected one of {known}"))
+                TrainError::Config(format!("unknown model \"{name}\", expected one of {known}"))
             }),
         }
     }

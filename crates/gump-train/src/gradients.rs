@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor};
-use gump_model::ModelError;
 use gump_nn::ops::Deferred;
 use gump_nn::parameters::Parameters;
 use rayon::prelude::*;
 
 use super::peers::ProcessGroup;
+use crate::TrainError;
 use crate::loss::LossParts;
 
 /// Gradients by the names of their parameters; parameters without a gradient are absent.
@@ -64,7 +64,7 @@ impl BatchGradients {
         &mut self,
         parameters: &Parameters,
         peers: &dyn ProcessGroup,
-    ) -> std::result::Result<(), ModelError> {
+    ) -> std::result::Result<(), TrainError> {
         if peers.size() == 1 {
             return Ok(());
         }

@@ -6,13 +6,14 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use gump_kernels::Operands;
 use gump_model::checkpoint::Precision;
-use gump_model::{ModelError, Network, checkpoint};
+use gump_model::{Network, checkpoint};
 use gump_nn::NnError;
 use gump_nn::optimizer::{AdamW, move_average};
 use gump_nn::parameters::Parameters;
 
 use super::config::TrainConfig;
 use super::gradients::Gradients;
+use crate::TrainError;
 
 /// A network in training.
 pub(super) struct TrainState {
@@ -31,7 +32,7 @@ pub(super) struct TrainState {
 
 impl TrainState {
     /// At the start of a run.
-    pub(super) fn new(network: Network, config: &TrainConfig) -> Result<Self, ModelError> {
+    pub(super) fn new(network: Network, config: &TrainConfig) -> Result<Self, TrainError> {
         let average = match config.ema {
             Some(_) => Some(build_like(&network, copies(&network)?)?),
             None => None,
@@ -51,7 +52,7 @@ impl TrainState {
     }
 
     /// From a checkpoint, with the training settings.
-    pub(super) fn restore(path: &Path, device: &Device) -> Result<(Self, TrainConfig), ModelError> {
+    pub(super) fn restore(path: &Path, device: &Device) -> Result<(Self, TrainConfig), TrainError> {
         let mut archive = checkpoint::read(path)?;
         let model = archive.config()?;
         let number = |key: &str| {
@@ -92,7 +93,7 @@ impl TrainState {
 
     /// Writes everything a resumed run needs. The weights to use have the plain names, so that the
     /// file can also be loaded as a network.
-    pub(super) fn save(&self, path: &Path, config: &TrainConfig) -> Result<(), ModelError> {
+    pub(super) fn save(&self, path: &Path, config: &TrainConfig) -> Result<(), TrainError> {
         let mut tensors = named("", self.shipped());
         if self.average.is_some() {
             tensors.extend(named(checkpoint::TRAINED, &self.network));
@@ -108,10 +109,10 @@ impl TrainState {
         );
         let mut header = checkpoint::header(self.network.config())?;
         let config =
-            serde_json::to_string(config).map_err(|e| ModelError::Config(e.to_string()))?;
+            serde_json::to_string(config).map_err(|e| TrainError::Config(e.to_string()))?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
-        checkpoint::write(path, tensors, header, Precision::Full)
+        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
     }
 
     /// The network to validate and to ship: the moving average if there is one.
@@ -127,7 +128,7 @@ impl TrainState {
     /// Switches matrix products to operands with fewer bits, if the run uses them.
     ///
     /// Error: a tensor error.
-    pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, ModelError> {
+    pub(super) fn in_precision_of(self, config: &TrainConfig) -> Result<Self, TrainError> {
         if !config.mixed_precision {
             return Ok(self);
         }
@@ -144,12 +145,12 @@ impl TrainState {
     }
 
     /// A copy of the network to ship.
-    pub(super) fn snapshot(&self) -> Result<Network, ModelError> {
+    pub(super) fn snapshot(&self) -> Result<Network, TrainError> {
         build_like(self.shipped(), copies(self.shipped())?)
     }
 
     /// The network that drives the scenes of closed-loop training.
-    pub(super) fn driver(&self) -> Result<Network, ModelError> {
+    pub(super) fn driver(&self) -> Result<Network, TrainError> {
         build_like(&self.network, self.drivers.clone())
     }
 
@@ -158,7 +159,7 @@ impl TrainState {
         &mut self,
         gradients: &Gradients,
         config: &TrainConfig,
-    ) -> Result<f64, ModelError> {
+    ) -> Result<f64, TrainError> {
         let rate = config.optimizer.rate(self.step, config.steps);
         let parameters = self.network.parameters();
         let norm = self
@@ -182,14 +183,14 @@ fn named(prefix: &str, network: &Network) -> BTreeMap<String, Tensor> {
 }
 
 /// A copy of the present weights.
-fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, ModelError> {
+fn copies(network: &Network) -> Result<BTreeMap<String, Tensor>, TrainError> {
     let all = network.parameters().all();
     all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
         .collect()
 }
 
 /// A network of the same shape with these weights.
-fn build_like(network: &Network, weights: BTreeMap<String, Tensor>) -> Result<Network, ModelError> {
+fn build_like(network: &Network, weights: BTreeMap<String, Tensor>) -> Result<Network, TrainError> {
     let parameters = Parameters::loaded(weights, network.device());
-    Network::build(network.config().clone(), parameters)
+    Ok(Network::build(network.config().clone(), parameters)?)
 }

@@ -8,6 +8,7 @@
 
 pub mod closed_loop;
 mod config;
+mod error;
 mod gradients;
 mod learner;
 pub mod loss;
@@ -25,6 +26,7 @@ mod trainer;
 
 pub use closed_loop::ClosedLoopConfig;
 pub use config::{ModelChoice, RunConfig, TrainConfig};
+pub use error::TrainError;
 pub use gump_nn::OptimizerConfig;
 pub use loss::{LossConfig, LossParts};
 #[cfg(feature = "mpi")]

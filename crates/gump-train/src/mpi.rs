@@ -2,13 +2,13 @@
 
 use std::rc::Rc;
 
-use gump_model::ModelError;
 use mpi::Threading;
 use mpi::collective::{CommunicatorCollectives as _, SystemOperation};
 use mpi::environment::Universe;
 use mpi::traits::Communicator as _;
 
 use super::peers::ProcessGroup;
+use crate::TrainError;
 
 /// The processes started by `mpirun`.
 #[derive(Clone)]
@@ -20,12 +20,12 @@ impl Mpi {
     /// Joins the group; a process that `mpirun` did not start is alone.
     ///
     /// # Errors
-    /// [`ModelError::Peers`] if this process has joined before.
-    pub fn join() -> Result<Self, ModelError> {
+    /// [`TrainError::Peers`] if this process has joined before.
+    pub fn join() -> Result<Self, TrainError> {
         // Other threads compute; only this one talks.
         let joined = mpi::initialize_with_threading(Threading::Funneled);
         let (universe, _) = joined.ok_or_else(|| {
-            ModelError::Peers("MPI can be joined once by a process, and was before".into())
+            TrainError::Peers("MPI can be joined once by a process, and was before".into())
         })?;
         Ok(Self {
             universe: universe.into(),
@@ -48,7 +48,7 @@ impl ProcessGroup for Mpi {
         usize::try_from(self.universe.world().size()).expect("sizes count from 1")
     }
 
-    fn sum(&self, numbers: &mut [f32]) -> Result<(), ModelError> {
+    fn sum(&self, numbers: &mut [f32]) -> Result<(), TrainError> {
         let own = numbers.to_vec();
         let world = self.universe.world();
         world.all_reduce_into(&own[..], numbers, SystemOperation::sum());

@@ -1,7 +1,7 @@
 //! Process groups: processes that train one network together. Each processes its share of every
 //! batch, and results are summed.
 
-use gump_model::ModelError;
+use crate::TrainError;
 
 /// The group of processes of a run, as seen by one of them.
 ///
@@ -16,8 +16,8 @@ pub trait ProcessGroup {
     /// Replaces every number by its sum over all processes, with equal bits on each.
     ///
     /// # Errors
-    /// [`ModelError::Peers`] if the connection to another process is lost.
-    fn sum(&self, numbers: &mut [f32]) -> Result<(), ModelError>;
+    /// [`TrainError::Peers`] if the connection to another process is lost.
+    fn sum(&self, numbers: &mut [f32]) -> Result<(), TrainError>;
 }
 
 /// A run of one process.
@@ -33,7 +33,7 @@ impl ProcessGroup for SingleProcess {
         1
     }
 
-    fn sum(&self, _: &mut [f32]) -> Result<(), ModelError> {
+    fn sum(&self, _: &mut [f32]) -> Result<(), TrainError> {
         Ok(())
     }
 }

@@ -2,8 +2,9 @@
 
 use std::borrow::Cow;
 
-use gump_model::ModelError;
 use gump_scene::Scenario;
+
+use crate::TrainError;
 
 /// Scenarios by index, read from many threads at once.
 ///
@@ -29,8 +30,8 @@ pub trait ScenarioSource: Send + Sync {
     /// Scenario `index`, which is below [`ScenarioSource::len`] or was returned by `pick`.
     ///
     /// # Errors
-    /// [`ModelError::Scene`] for one that cannot be read.
-    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError>;
+    /// [`TrainError::Source`] for one that cannot be read.
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError>;
 }
 
 impl ScenarioSource for Vec<Scenario> {
@@ -38,7 +39,7 @@ impl ScenarioSource for Vec<Scenario> {
         Self::len(self)
     }
 
-    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError> {
         Ok(Cow::Borrowed(&self[index]))
     }
 }

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 
-use gump_model::ModelError;
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{Scenario, Seed};
 use rand::Rng as _;
 
+use crate::TrainError;
 use crate::closed_loop::{ClosedLoopConfig, Drive};
 use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
@@ -30,7 +30,7 @@ impl Source {
         &self,
         step: usize,
         numbers: &[usize],
-    ) -> Result<Vec<Sample>, ModelError> {
+    ) -> Result<Vec<Sample>, TrainError> {
         const ATTEMPTS: u64 = 64;
         let seed = self.seed.fork(step as u64);
         let mut samples = Vec::with_capacity(numbers.len());
@@ -47,7 +47,7 @@ impl Source {
     }
 
     /// One draw; `None` if the scenario drawn is too short.
-    fn sample(&self, step: usize, seed: Seed) -> Result<Option<Sample>, ModelError> {
+    fn sample(&self, step: usize, seed: Seed) -> Result<Option<Sample>, TrainError> {
         let pick = |n: usize| (seed.fork(0).0 % n as u64) as usize;
         let is_driven =
             !self.drives.is_empty() && seed.fork(2).rng().random_bool(self.closed_loop.share);
@@ -73,20 +73,21 @@ impl Source {
 
 /// Frames must be available every half second; time steps may differ between scenarios.
 ///
-/// Error: [`ModelError::Scene`] naming the scenario.
-pub(super) fn check_rate(scenario: &Scenario) -> Result<(), ModelError> {
+/// Error: [`TrainError::TimeStep`].
+pub(super) fn check_rate(scenario: &Scenario) -> Result<(), TrainError> {
     let frames = TOKEN_DT / scenario.dt;
     if (frames - frames.round()).abs() < 1e-3 && frames.round() >= 1.0 {
         return Ok(());
     }
-    Err(ModelError::Scene(format!(
-        "{} has a frame every {} s, expected a time step that divides {TOKEN_DT} s",
-        scenario.id, scenario.dt
-    )))
+    Err(TrainError::TimeStep {
+        id: scenario.id.clone(),
+        dt: scenario.dt,
+        expected: TOKEN_DT,
+    })
 }
 
 /// The samples of a step, or the error of drawing them.
-pub(super) type SampleReceiver = Receiver<Result<Vec<Sample>, ModelError>>;
+pub(super) type SampleReceiver = Receiver<Result<Vec<Sample>, TrainError>>;
 
 /// Draws the samples of a step in the background, while the present step is computed.
 ///

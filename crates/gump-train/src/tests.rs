@@ -9,12 +9,13 @@ use candle_core::{DType, Device};
 use gump_engine::TransformerWorld;
 use gump_engine::{Mode, SamplingConfig};
 use gump_kernels::Operands;
+use gump_model::checkpoint;
 use gump_model::config::{Encoder, ModelConfig, VisualConfig};
-use gump_model::{ModelError, checkpoint};
 use gump_nn::OptimizerConfig;
 use gump_rollout::{Start, WorldModel};
 use gump_scene::{Scenario, Seed, fixture};
 
+use crate::TrainError;
 use crate::closed_loop::ClosedLoopConfig;
 use crate::config::TrainConfig;
 use crate::gradients::BatchGradients;
@@ -333,7 +334,7 @@ impl ProcessGroup for Thread {
         self.desks.len()
     }
 
-    fn sum(&self, numbers: &mut [f32]) -> Result<(), ModelError> {
+    fn sum(&self, numbers: &mut [f32]) -> Result<(), TrainError> {
         *self.desks[self.rank].lock().unwrap() = numbers.to_vec();
         self.barrier.wait();
         numbers.fill(0.0);
@@ -439,8 +440,8 @@ fn a_failure_of_one_process_stops_all() {
         fn len(&self) -> usize {
             1
         }
-        fn get(&self, _: usize) -> Result<std::borrow::Cow<'_, Scenario>, ModelError> {
-            Err(ModelError::Scene("rotten".into()))
+        fn get(&self, _: usize) -> Result<std::borrow::Cow<'_, Scenario>, TrainError> {
+            Err(TrainError::Source("rotten".into()))
         }
     }
     let failed = among(2, |peers| {

@@ -13,13 +13,13 @@ use gump_scene::{Scenario, Seed};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use gump_model::ModelError;
 use gump_model::Network;
 use gump_model::checkpoint::{self, Precision};
 use gump_model::config::ModelConfig;
 use gump_nn::layers::Dropout;
 use gump_nn::ops::Deferred;
 
+use crate::TrainError;
 use crate::closed_loop;
 use crate::config::TrainConfig;
 use crate::gradients::{BatchGradients, Part};
@@ -79,7 +79,7 @@ impl Trainer {
         config: TrainConfig,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let network = Network::random(model, Seed(config.seed).fork(0), device)?;
         Self::continuing(network, config, scenarios)
     }
@@ -92,7 +92,7 @@ impl Trainer {
         network: Network,
         config: TrainConfig,
         scenarios: impl ScenarioSource + 'static,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let learner = TrainState::new(network, &config)?;
         Self::assemble(learner, config, Box::new(scenarios))
     }
@@ -105,7 +105,7 @@ impl Trainer {
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let (learner, config) = TrainState::restore(path, device)?;
         Self::assemble(learner, config, Box::new(scenarios))
     }
@@ -114,11 +114,11 @@ impl Trainer {
         learner: TrainState,
         config: TrainConfig,
         scenarios: Box<dyn ScenarioSource>,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         config.validate(1)?;
         let learner = learner.in_precision_of(&config)?;
         if scenarios.is_empty() {
-            return Err(ModelError::NoData {
+            return Err(TrainError::NoData {
                 frames: config.sample.frames,
             });
         }
@@ -151,7 +151,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A batch that is too small to be shared.
-    pub fn among(self, peers: impl ProcessGroup + 'static) -> Result<Self, ModelError> {
+    pub fn among(self, peers: impl ProcessGroup + 'static) -> Result<Self, TrainError> {
         self.config.validate(peers.size())?;
         let share = share(&self.config, &peers);
         Ok(Self {
@@ -164,18 +164,18 @@ impl Trainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`ModelError::LossNotFinite`] before anything is changed, [`ModelError::Scene`] for a
-    /// scenario that cannot be read, [`ModelError::Peers`] if another process failed, or a tensor
+    /// [`TrainError::LossNotFinite`] before anything is changed, [`TrainError::Source`] for a
+    /// scenario that cannot be read, [`TrainError::Peers`] if another process failed, or a tensor
     /// error.
-    pub fn step(&mut self) -> Result<StepReport, ModelError> {
-        let no_data = ModelError::NoData {
+    pub fn step(&mut self) -> Result<StepReport, TrainError> {
+        let no_data = TrainError::NoData {
             frames: self.config.sample.frames,
         };
         let drawn = self.next.recv().unwrap_or(Err(no_data));
         if self.any(drawn.is_err())? {
             drawn?;
             let why = "another one could not draw its samples".to_owned();
-            return Err(ModelError::Peers(why));
+            return Err(TrainError::Peers(why));
         }
         let samples = drawn?;
         let share = share(&self.config, &*self.peers);
@@ -186,8 +186,8 @@ impl Trainer {
     /// This process's samples of a step, drawn now.
     ///
     /// # Errors
-    /// [`ModelError::Scene`] for a scenario that cannot be read.
-    pub fn batch(&self, step: usize) -> Result<Batch, ModelError> {
+    /// [`TrainError::Source`] for a scenario that cannot be read.
+    pub fn batch(&self, step: usize) -> Result<Batch, TrainError> {
         let share = share(&self.config, &*self.peers);
         let samples = self.source.samples(step, &share)?;
         Ok(Batch { samples })
@@ -197,7 +197,7 @@ impl Trainer {
     ///
     /// # Errors
     /// As [`Trainer::step`].
-    pub fn step_on(&mut self, batch: &Batch) -> Result<StepReport, ModelError> {
+    pub fn step_on(&mut self, batch: &Batch) -> Result<StepReport, TrainError> {
         self.learn_from(&batch.samples)
     }
 
@@ -205,7 +205,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A tensor error.
-    pub fn loss_of(&self, batch: &Batch) -> Result<f64, ModelError> {
+    pub fn loss_of(&self, batch: &Batch) -> Result<f64, TrainError> {
         let (network, config) = (&self.learner.network, &self.config.loss);
         let whole = Counts::of(&batch.samples, config);
         let (_, parts) = loss(network, &batch.samples, config, &whole, true, None)?;
@@ -216,20 +216,20 @@ impl Trainer {
     /// for the same step in another language; the metadata `shape` has the configuration as JSON.
     ///
     /// # Errors
-    /// [`ModelError::Io`], or a tensor error.
-    pub fn export(&self, batch: &Batch, path: &Path) -> Result<(), ModelError> {
+    /// [`TrainError::Model`], or a tensor error.
+    pub fn export(&self, batch: &Batch, path: &Path) -> Result<(), TrainError> {
         let network = &self.learner.network;
         let (tensors, shape) = export(network, &batch.samples, &self.config.loss)?;
         let mut header = checkpoint::header(network.config())?;
         header.insert("shape".to_owned(), shape.to_string());
-        checkpoint::write(path, tensors, header, Precision::Full)
+        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
     }
 
-    fn learn_from(&mut self, samples: &[Sample]) -> Result<StepReport, ModelError> {
+    fn learn_from(&mut self, samples: &[Sample]) -> Result<StepReport, TrainError> {
         let step = self.learner.step;
         let found = self.differentiate(samples)?;
         if let Some(field) = found.loss.first_not_finite() {
-            return Err(ModelError::LossNotFinite { step, field });
+            return Err(TrainError::LossNotFinite { step, field });
         }
         let gradient_norm = self.learner.learn(&found.gradients, &self.config)?;
         Ok(StepReport {
@@ -243,7 +243,7 @@ impl Trainer {
     }
 
     /// Loss and gradients of a batch, given this process's samples.
-    pub(crate) fn differentiate(&self, samples: &[Sample]) -> Result<BatchGradients, ModelError> {
+    pub(crate) fn differentiate(&self, samples: &[Sample]) -> Result<BatchGradients, TrainError> {
         let (network, config) = (&self.learner.network, &self.config.loss);
         let operands = self.learner.operands;
         let whole = self.total(Counts::of(samples, &self.config.loss))?;
@@ -267,7 +267,7 @@ impl Trainer {
                     tokens,
                 })
             });
-            let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+            let parts: Vec<_> = parts.collect::<Result<_, TrainError>>()?;
             found.add(network.parameters(), &parts)?;
         }
         found.share(network.parameters(), &*self.peers)?;
@@ -279,7 +279,7 @@ impl Trainer {
     ///
     /// # Errors
     /// No scenario long enough, or a tensor error.
-    pub fn validate(&self, scenarios: &[Scenario], limit: usize) -> Result<LossParts, ModelError> {
+    pub fn validate(&self, scenarios: &[Scenario], limit: usize) -> Result<LossParts, TrainError> {
         let config = SampleConfig {
             max_agents: self.config.sample.max_agents,
             ..SampleConfig::plain(self.config.sample.frames)
@@ -318,7 +318,7 @@ impl Trainer {
     /// Targets over all processes.
     ///
     /// Error: there are no targets.
-    fn total(&self, own: Counts) -> Result<Counts, ModelError> {
+    fn total(&self, own: Counts) -> Result<Counts, TrainError> {
         let mut whole = own;
         if self.peers.size() > 1 {
             let mut numbers = whole.numbers();
@@ -327,7 +327,7 @@ impl Trainer {
         }
         if whole.scenes == 0.0 {
             let frames = self.config.sample.frames;
-            return Err(ModelError::NoData { frames });
+            return Err(TrainError::NoData { frames });
         }
         Ok(whole)
     }
@@ -335,8 +335,8 @@ impl Trainer {
     /// True if it is true in any process.
     ///
     /// # Errors
-    /// [`ModelError::Peers`] if the connection to another process is lost.
-    pub fn any(&self, said: bool) -> Result<bool, ModelError> {
+    /// [`TrainError::Peers`] if the connection to another process is lost.
+    pub fn any(&self, said: bool) -> Result<bool, TrainError> {
         let mut number = [f32::from(u8::from(said))];
         self.peers.sum(&mut number)?;
         Ok(number[0] > 0.0)
@@ -345,8 +345,8 @@ impl Trainer {
     /// Writes everything a resumed run needs.
     ///
     /// # Errors
-    /// [`ModelError::Io`]; the previous file is intact.
-    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+    /// [`TrainError::Model`]; the previous file is intact.
+    pub fn save(&self, path: &Path) -> Result<(), TrainError> {
         self.learner.save(path, &self.config)
     }
 
@@ -369,7 +369,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A tensor error.
-    pub fn snapshot(&self) -> Result<Network, ModelError> {
+    pub fn snapshot(&self) -> Result<Network, TrainError> {
         self.learner.snapshot()
     }
 

@@ -2,18 +2,18 @@
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_eval::generation::request;
 use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::constraint::parse_constraints;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
 use gump_generate::verdict::{off_road, overlaps};
-use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateError, GenerateRequest, Placement};
+use gump_generate::{Counts, GenerateConfig, GenerateError, GenerateRequest, Placement};
 use gump_model::{Device, checkpoint, relative};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
 use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
@@ -314,32 +314,6 @@ pub(crate) fn world(
         ..SamplingConfig::default()
     };
     Ok(TransformerWorld::new(network, sampling))
-}
-
-/// A request for scenes where a scenario was recorded: its map, lights and fixtures, and its ego,
-/// whose speed is open.
-pub(crate) fn request(recorded: &Scenario) -> GenerateRequest {
-    let present = recorded.present();
-    let ego = present.ego_now();
-    let agents = present.now().agents().iter();
-    GenerateRequest {
-        map: Arc::clone(&recorded.map),
-        ego: EgoStart {
-            pose: ego.state.pose,
-            length: ego.length,
-            width: ego.width,
-            velocity: None,
-        },
-        lights: present.now().lights().to_vec(),
-        fixtures: agents
-            .filter(|agent| !agent.kind.is_moving())
-            .copied()
-            .collect(),
-        prompts: Vec::new(),
-        counts: None,
-        objects: Vec::new(),
-        config: GenerateConfig::default(),
-    }
 }
 
 /// All scenes as Waymo records, the first as JSON, as a picture, and as a film if it moves.

@@ -29,6 +29,7 @@ use gump_scene::{
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::EngineError;
 use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
 use crate::relative::rules::{Driven, StopLine, heed, held_back, runs_red, settle, start};
@@ -238,7 +239,7 @@ impl RelativeWorld {
     }
 
     /// The futures of starts from one scene, which share it.
-    fn begin(&self, starts: &[Start<'_>]) -> Result<Vec<Future>, ModelError> {
+    fn begin(&self, starts: &[Start<'_>]) -> Result<Vec<Future>, EngineError> {
         let Some(first) = starts.first() else {
             return Ok(Vec::new());
         };
@@ -261,7 +262,7 @@ impl RelativeWorld {
     ///
     /// # Errors
     /// A scene that cannot be simulated.
-    pub fn read_present(&self, scene: SceneState<'_>) -> Result<(Vec<f32>, Vec<f32>), ModelError> {
+    pub fn read_present(&self, scene: SceneState<'_>) -> Result<(Vec<f32>, Vec<f32>), EngineError> {
         let shared = self.scene(scene);
         let future = Future::begin(&self.engine, &shared, scene)?;
         let numbers = future
@@ -385,11 +386,13 @@ impl Future {
         engine: &Engine,
         scene: &Arc<Scene>,
         state: SceneState<'_>,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, EngineError> {
         let stride = (TOKEN_DT / state.dt).round().max(1.0) as usize;
         if (stride as f64 * state.dt - TOKEN_DT).abs() > 1e-3 {
-            let what = format!("a time step of {} s does not divide {TOKEN_DT} s", state.dt);
-            return Err(ModelError::Scene(what));
+            return Err(EngineError::TimeStep {
+                dt: state.dt,
+                expected: TOKEN_DT,
+            });
         }
         let frames = state.strided_history(stride, KEPT);
         let (predicted, others): (Vec<Agent>, Vec<Agent>) = state

@@ -15,7 +15,6 @@ use gump_engine::relative::rules::settle;
 use gump_engine::relative::seen::{Seen, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
-use gump_model::ModelError;
 use gump_model::local_context::Survey;
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::relative::grid::dequantize;
@@ -25,6 +24,8 @@ use gump_model::relative::{RelativeNetwork, RelativeWeights};
 use gump_scene::{MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
+
+use crate::TrainError;
 
 /// Frames that are shown as logged before the network drives.
 const WARM_UP: usize = 2;
@@ -78,9 +79,9 @@ impl Default for RelativeDrives {
 }
 
 impl RelativeDrives {
-    /// Error: [`ModelError::Config`] naming the first number out of its range.
-    pub(super) fn validate(&self) -> Result<(), ModelError> {
-        let fail = |what: &str| Err(ModelError::Config(format!("closed_loop: {what}")));
+    /// Error: [`TrainError::Config`] naming the first number out of its range.
+    pub(super) fn validate(&self) -> Result<(), TrainError> {
+        let fail = |what: &str| Err(TrainError::Config(format!("closed_loop: {what}")));
         for (name, share) in [("share", self.share), ("ruled", self.ruled)] {
             if !(0.0..=1.0).contains(&share) {
                 return fail(&format!("{name} must be between 0 and 1"));
@@ -112,7 +113,7 @@ impl Driver {
     pub(super) fn new(
         network: &RelativeNetwork,
         config: &RelativeDrives,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         Ok(Self {
             engine: Engine::new(&RelativeWeights::of(network)?, Precision::F32)?,
             config: config.clone(),

@@ -9,7 +9,6 @@
 //! the other futures become more likely, the others less likely.
 
 use gump_engine::relative::{MAP_M, RelativeSampling, RelativeWorld};
-use gump_model::ModelError;
 use gump_model::relative::RelativeNetwork;
 use gump_model::relative::map::{Hidden, VectorMap};
 use gump_model::relative::sample::{Sample, whole};
@@ -18,6 +17,8 @@ use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::{AgentId, Frame, Rollout, Scenario, Seed};
 use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Year};
 use serde::{Deserialize, Serialize};
+
+use crate::TrainError;
 
 /// Returns are clipped to this many standard deviations.
 const MOST: f64 = 3.0;
@@ -51,9 +52,9 @@ impl Default for RelativeRewards {
 }
 
 impl RelativeRewards {
-    /// Error: [`ModelError::Config`] naming the first number out of its range.
-    pub(super) fn validate(&self) -> Result<(), ModelError> {
-        let fail = |what: &str| Err(ModelError::Config(format!("realism: {what}")));
+    /// Error: [`TrainError::Config`] naming the first number out of its range.
+    pub(super) fn validate(&self) -> Result<(), TrainError> {
+        let fail = |what: &str| Err(TrainError::Config(format!("realism: {what}")));
         if self.rollouts < 2 {
             return fail("rollouts must be at least 2, as each is compared with the others");
         }
@@ -85,7 +86,7 @@ impl Judged {
     pub(super) fn new(
         network: &RelativeNetwork,
         config: &RelativeRewards,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         Ok(Self {
             world: RelativeWorld::new(network, RelativeSampling::default())?,
             config: config.clone(),
@@ -102,7 +103,7 @@ impl Judged {
         &self,
         scenario: &Scenario,
         seed: Seed,
-    ) -> Result<Option<Group>, ModelError> {
+    ) -> Result<Option<Group>, TrainError> {
         let scenario = nearest(scenario, self.config.agents);
         let Ok(log) = Log::of(&scenario) else {
             return Ok(None);
@@ -113,7 +114,7 @@ impl Judged {
             seed,
         };
         let futures = simulate(&self.world, &[start], None, &SimulateConfig::default())
-            .map_err(|error| ModelError::Scene(format!("{}: {error}", scenario.id)))?;
+            .map_err(|error| TrainError::Rollout(format!("{}: {error}", scenario.id).into()))?;
         let Ok(rollouts) = Rollouts::of(&scenario.id, &futures, Mode::SimAgents) else {
             return Ok(None);
         };

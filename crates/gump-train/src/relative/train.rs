@@ -8,11 +8,11 @@ use std::sync::mpsc::{Receiver, channel};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
 use gump_kernels::Operands;
+use gump_model::checkpoint;
 use gump_model::checkpoint::Precision;
 use gump_model::relative::grid::FIELDS;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
-use gump_model::{ModelError, checkpoint};
 use gump_nn::ops::Deferred;
 use gump_nn::optimizer::{AdamW, OptimizerConfig, move_average};
 use gump_nn::parameters::Parameters;
@@ -21,6 +21,7 @@ use gump_scene::{Scenario, Seed};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::TrainError;
 use crate::relative::drives::{Driver, RelativeDrives};
 use crate::relative::rewards::{Group, Judged, RelativeRewards};
 use crate::scenes::ScenarioSource;
@@ -91,11 +92,11 @@ impl RelativeTrainConfig {
     /// Checks that the values are in their ranges.
     ///
     /// # Errors
-    /// [`ModelError::Config`] naming the first that is not.
-    pub fn validate(&self) -> Result<(), ModelError> {
+    /// [`TrainError::Config`] naming the first that is not.
+    pub fn validate(&self) -> Result<(), TrainError> {
         if self.batch == 0 || self.steps == 0 {
             let what = "batch and steps must be at least 1".to_owned();
-            return Err(ModelError::Config(what));
+            return Err(TrainError::Config(what));
         }
         self.closed_loop
             .as_ref()
@@ -137,7 +138,7 @@ pub struct RelativeTrainer {
     source: Arc<Source>,
     /// The network that drives the agents of samples, as of the last update.
     driving: Option<RelativeNetwork>,
-    next: Receiver<Result<Batch, ModelError>>,
+    next: Receiver<Result<Batch, TrainError>>,
 }
 
 /// The data of a step.
@@ -161,7 +162,7 @@ struct Source {
 }
 
 impl Source {
-    fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, ModelError> {
+    fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, TrainError> {
         let group = drivers.judged.as_ref();
         let group = group.map(|judged| self.group(step, judged));
         Ok(Batch {
@@ -170,7 +171,7 @@ impl Source {
         })
     }
 
-    fn group(&self, step: usize, judged: &Judged) -> Result<Group, ModelError> {
+    fn group(&self, step: usize, judged: &Judged) -> Result<Group, TrainError> {
         let seed = self.seed.fork(step as u64).fork(GROUP);
         for attempt in 0..ATTEMPTS {
             let seed = seed.fork(attempt);
@@ -180,14 +181,14 @@ impl Source {
                 return Ok(group);
             }
         }
-        Err(ModelError::Config(
+        Err(TrainError::Config(
             "realism: no scene has the second of past and the eight seconds of future at 10 Hz, \
              the road edges and the agents that its rollouts are compared with"
                 .to_owned(),
         ))
     }
 
-    fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, ModelError> {
+    fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, TrainError> {
         let seed = self.seed.fork(step as u64);
         let drawn = (0..self.batch).map(|i| {
             let seed = seed.fork(i as u64);
@@ -205,7 +206,7 @@ impl Source {
                     return Ok(sample);
                 }
             }
-            Err(ModelError::NoData { frames: 3 })
+            Err(TrainError::NoData { frames: 3 })
         });
         drawn.collect()
     }
@@ -215,7 +216,7 @@ fn prefetch(
     source: &Arc<Source>,
     step: usize,
     drivers: Drivers,
-) -> Receiver<Result<Batch, ModelError>> {
+) -> Receiver<Result<Batch, TrainError>> {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.
@@ -233,7 +234,7 @@ impl RelativeTrainer {
         config: RelativeTrainConfig,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let network = RelativeNetwork::random(model, Seed(config.seed).fork(0), device)?;
         Self::continuing(network, config, scenarios)
     }
@@ -246,7 +247,7 @@ impl RelativeTrainer {
         network: RelativeNetwork,
         config: RelativeTrainConfig,
         scenarios: impl ScenarioSource + 'static,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let average = build_like(&network, copies(&network)?)?;
         let optimizer = AdamW::new(network.parameters())?;
         let driving = driving(&average, &config)?;
@@ -262,7 +263,7 @@ impl RelativeTrainer {
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         let mut archive = checkpoint::read(path)?;
         let model = gump_model::relative::config(&archive)?;
         let text = archive.entry("step")?;
@@ -296,10 +297,10 @@ impl RelativeTrainer {
         config: RelativeTrainConfig,
         step: usize,
         scenarios: Box<dyn ScenarioSource>,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, TrainError> {
         config.validate()?;
         if scenarios.is_empty() {
-            return Err(ModelError::NoData { frames: 3 });
+            return Err(TrainError::NoData { frames: 3 });
         }
         let source = Arc::new(Source {
             scenarios,
@@ -323,10 +324,10 @@ impl RelativeTrainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`ModelError::LossNotFinite`] before anything is changed, or errors of drawing samples.
-    pub fn step(&mut self) -> Result<RelativeStep, ModelError> {
+    /// [`TrainError::LossNotFinite`] before anything is changed, or errors of drawing samples.
+    pub fn step(&mut self) -> Result<RelativeStep, TrainError> {
         let drawn = self.next.recv();
-        let Batch { samples, group } = drawn.unwrap_or(Err(ModelError::NoData { frames: 3 }))?;
+        let Batch { samples, group } = drawn.unwrap_or(Err(TrainError::NoData { frames: 3 }))?;
         let refresh = self.config.refresh();
         if refresh.is_some_and(|refresh| self.step.is_multiple_of(refresh)) {
             self.driving = driving(&self.average, &self.config)?;
@@ -361,13 +362,13 @@ impl RelativeTrainer {
                 sums,
             })
         });
-        let parts: Vec<_> = parts.collect::<Result<_, ModelError>>()?;
+        let parts: Vec<_> = parts.collect::<Result<_, TrainError>>()?;
         let imitated = parts[..samples.len()].iter();
         let fields = mean_fields(imitated.map(|part| &part.sums), total);
         let loss: f64 = fields.iter().sum();
         if !loss.is_finite() {
             let field = "move".to_owned();
-            return Err(ModelError::LossNotFinite {
+            return Err(TrainError::LossNotFinite {
                 step: self.step,
                 field,
             });
@@ -385,7 +386,7 @@ impl RelativeTrainer {
             let sum = Deferred::take_in(deferred, var, sum)?;
             Ok(sum.map(|sum| (name.to_owned(), sum)))
         });
-        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        let sums: Vec<_> = sums.collect::<Result<_, TrainError>>()?;
         let gradients: Gradients = sums.into_iter().flatten().collect();
         let rate = self.config.optimizer.rate(self.step, self.config.steps);
         let parameters = self.trained.parameters();
@@ -411,7 +412,7 @@ impl RelativeTrainer {
     ///
     /// # Errors
     /// No scenario long enough, or a tensor error.
-    pub fn validate(&self, scenarios: &[Scenario]) -> Result<[f64; FIELDS], ModelError> {
+    pub fn validate(&self, scenarios: &[Scenario]) -> Result<[f64; FIELDS], TrainError> {
         let config = SampleConfig {
             max_agents: self.config.sample.max_agents,
             ..SampleConfig::plain()
@@ -423,22 +424,22 @@ impl RelativeTrainer {
             .filter(|sample| !sample.targets.is_empty())
             .collect();
         if samples.is_empty() {
-            return Err(ModelError::NoData { frames: 3 });
+            return Err(TrainError::NoData { frames: 3 });
         }
         let total = weight(&samples);
         let network = &self.average;
         let sums = samples
             .par_iter()
             .map(|sample| Ok(network.loss(sample, total, 0.0)?.1));
-        let sums: Vec<_> = sums.collect::<Result<_, ModelError>>()?;
+        let sums: Vec<_> = sums.collect::<Result<_, TrainError>>()?;
         Ok(mean_fields(sums.iter(), total))
     }
 
     /// Writes everything a resumed run needs; the file can also be loaded as a network.
     ///
     /// # Errors
-    /// [`ModelError::Io`]; the previous file is intact.
-    pub fn save(&self, path: &Path) -> Result<(), ModelError> {
+    /// [`TrainError::Model`]; the previous file is intact.
+    pub fn save(&self, path: &Path) -> Result<(), TrainError> {
         let named = |prefix: &str, network: &RelativeNetwork| -> BTreeMap<String, Tensor> {
             let all = network.parameters().all();
             all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))
@@ -453,10 +454,10 @@ impl RelativeTrainer {
         tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
         let mut header = gump_model::relative::header(self.trained.config())?;
         let config =
-            serde_json::to_string(&self.config).map_err(|e| ModelError::Config(e.to_string()))?;
+            serde_json::to_string(&self.config).map_err(|e| TrainError::Config(e.to_string()))?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
-        checkpoint::write(path, tensors, header, Precision::Full)
+        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
     }
 
     /// Ends the run and returns the network to use.
@@ -483,7 +484,7 @@ impl RelativeTrainer {
     ///
     /// # Errors
     /// A tensor error.
-    pub fn snapshot(&self) -> Result<RelativeNetwork, ModelError> {
+    pub fn snapshot(&self) -> Result<RelativeNetwork, TrainError> {
         build_like(&self.average, copies(&self.average)?)
     }
 }
@@ -492,7 +493,7 @@ impl RelativeTrainer {
 fn driving(
     average: &RelativeNetwork,
     config: &RelativeTrainConfig,
-) -> Result<Option<RelativeNetwork>, ModelError> {
+) -> Result<Option<RelativeNetwork>, TrainError> {
     let copied = config.refresh();
     let copied = copied.map(|_| build_like(average, copies(average)?));
     copied.transpose()
@@ -501,7 +502,7 @@ fn driving(
 fn drivers(
     driving: Option<&RelativeNetwork>,
     config: &RelativeTrainConfig,
-) -> Result<Drivers, ModelError> {
+) -> Result<Drivers, TrainError> {
     let driver = driving.zip(config.closed_loop.as_ref());
     let driver = driver.map(|(network, drives)| Driver::new(network, drives));
     let judged = driving.zip(config.realism.as_ref());
@@ -536,7 +537,7 @@ fn mean_fields<'a>(sums: impl Iterator<Item = &'a [f64; FIELDS]>, total: f64) ->
     mean
 }
 
-fn copies(network: &RelativeNetwork) -> Result<BTreeMap<String, Tensor>, ModelError> {
+fn copies(network: &RelativeNetwork) -> Result<BTreeMap<String, Tensor>, TrainError> {
     let all = network.parameters().all();
     all.map(|(name, var)| Ok((name.to_owned(), var.as_tensor().copy()?)))
         .collect()
@@ -545,7 +546,10 @@ fn copies(network: &RelativeNetwork) -> Result<BTreeMap<String, Tensor>, ModelEr
 fn build_like(
     network: &RelativeNetwork,
     weights: BTreeMap<String, Tensor>,
-) -> Result<RelativeNetwork, ModelError> {
+) -> Result<RelativeNetwork, TrainError> {
     let parameters = Parameters::loaded(weights, network.parameters().device());
-    RelativeNetwork::build(network.config().clone(), parameters)
+    Ok(RelativeNetwork::build(
+        network.config().clone(),
+        parameters,
+    )?)
 }

@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use gump_engine::Mode;
 use gump_eval::datasets::{self, Part, Split};
 use gump_eval::decoding::Decoding;
+use gump_eval::training_set::TrainingSet;
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
 use gump_model::checkpoint::Precision;
@@ -23,7 +24,6 @@ use super::decoding;
 use crate::run::{Run, stop_if_interrupted};
 use crate::sampling::Draw;
 use crate::shipped;
-use crate::training_set::Training;
 
 /// How the laptop model is trained.
 pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
@@ -138,7 +138,7 @@ impl Class<'_> {
         weights: &Path,
     ) -> anyhow::Result<Learned> {
         let progress = run.progress("reading", 0, "scenarios");
-        let data = Training::open(
+        let data = TrainingSet::open(
             &datasets::parts(&self.lesson.data, Split::Train)?,
             &progress,
         )?;

@@ -5,11 +5,13 @@ use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use gump_eval::benchmarks::{BenchmarkList, MadePart, verify_made, verify_recorded};
+use gump_eval::benchmarks::{
+    BenchmarkList, DrawRule, ListDraw, MadePart, freeze, make, verify_made, verify_recorded,
+};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::benchmark::{self, Draw, Rule};
+use crate::benchmark;
 use crate::run::{Common, Run, Unseen};
 
 /// Arguments of `data benchmark`.
@@ -72,16 +74,13 @@ impl Args {
             }
             let progress = run.progress(&part.file, part.kept() as u64, "scenes");
             if self.freeze {
-                let scenes = run.phase(&part.file, |_| {
-                    benchmark::freeze(&list, part, &folder, &progress)
-                })?;
+                let scenes =
+                    run.phase(&part.file, |_| Ok(freeze(&list, part, &folder, &progress)?))?;
                 rows.push(row(part, "frozen"));
                 list.made[i].scenes = scenes;
                 continue;
             }
-            let made = run.phase(&part.file, |_| {
-                benchmark::make(&list, part, &folder, &progress)
-            })?;
+            let made = run.phase(&part.file, |_| Ok(make(&list, part, &folder, &progress)?))?;
             rows.push(row(part, if made { "made as listed" } else { "as listed" }));
         }
         let data = self.data.clone().unwrap_or_else(benchmark::recorded_data);
@@ -119,11 +118,11 @@ impl Args {
         let name = into.file_stem().unwrap_or_default().to_string_lossy();
         let worst = self.report.as_deref().map(benchmark::worst_scores);
         let worst = worst.transpose()?;
-        let draw = Draw {
+        let draw = ListDraw {
             name: name.into_owned(),
             rule: match (self.below, &worst) {
-                (Some(bound), Some(worst)) => Rule::Below(bound, worst),
-                _ => Rule::Any,
+                (Some(bound), Some(worst)) => DrawRule::Below(bound, worst),
+                _ => DrawRule::Any,
             },
             at_most: n,
             seed: run.seed(),

@@ -6,15 +6,15 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use gump_eval::benchmarks::RESERVED_SEEDS;
+use gump_eval::fresh::profile_of_name;
+use gump_eval::sumo::{self, FUTURE_S, Sumo};
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, RoadFamily, SumoDemand, SynthesisConfig};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
-use crate::fresh::profile_of_name;
 use crate::run::{self, Common, Run};
-use crate::sumo::{self, FUTURE_S, Sumo};
 
 /// Files to spread scenes over; fewer if there are fewer scenes.
 const SHARDS: usize = 8;
@@ -194,7 +194,7 @@ impl Args {
             None => Vec::new(),
         };
         let places = files.iter().map(|file| sumo.prepare(file, &work));
-        let places = places.collect::<anyhow::Result<Vec<_>>>()?;
+        let places = places.collect::<Result<Vec<_>, _>>()?;
         let demand = SumoDemand {
             density: self.density,
             ..SumoDemand::standard()
@@ -215,7 +215,7 @@ impl Args {
                 }
             };
             let id = format!("{}-{r:05}", place.name);
-            sumo.scenes(place, &demand, self.seconds, seed.fork(2), &id, &folder)
+            Ok(sumo.scenes(place, &demand, self.seconds, seed.fork(2), &id, &folder)?)
         };
         let n = self.scenes.get();
         let names = shard_names(self.n_shards(SHARDS.max(n.div_ceil(SHARD_SCENES))));

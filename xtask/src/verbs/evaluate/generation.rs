@@ -1,9 +1,7 @@
 //! `evaluate generation`: how like recorded scenes generated ones are, beside simpler ways of
 //! making them.
 //!
-//! Likeness is the maximum mean discrepancy in TrafficGen's protocol, as the GUMP paper has it:
-//! vehicles within 50 m of the recorded ego, which every source is given with as many vehicles as
-//! were recorded. Prompts are judged on scenes of their own.
+//! The protocol, the sources of scenes and the scores are of [`gump_eval::generation`].
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -11,21 +9,21 @@ use std::path::PathBuf;
 use gump_engine::SamplingConfig;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::datasets::{self, Split};
+use gump_eval::generation::{
+    ATTRIBUTES, ComparedScene, GenerationTally, LongObservation, SceneMakers, SceneSource,
+    long_scenes, observe_logs, observe_world, prompt_satisfaction, recorded_scenarios,
+    summarize_long,
+};
 use gump_eval::worlds::{self, World};
 use gump_generate::Placement;
-use gump_generate::baseline::{overlapping_vehicles, wrong_way};
 use gump_generate::factory::GenerationWorlds;
-use gump_generate::verdict::off_road;
-use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
-use gump_metrics::{Interval, intervals};
-use gump_scene::{Frame, Scenario, Seed};
+use gump_metrics::Interval;
+use gump_metrics::mmd::MmdProtocol;
+use gump_scene::Scenario;
 use gump_viz::Bars;
-use rayon::prelude::*;
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
-use super::sources::{Case, Makers, Source};
-use super::{long, prompts};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::verbs::generate;
 use crate::{benchmark, charts, shipped};
@@ -66,19 +64,6 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What one source made.
-#[derive(Default)]
-struct Tally {
-    /// By recording.
-    mmd: Vec<(usize, SceneMmd)>,
-    failed: usize,
-    vehicles: usize,
-    overlapping: usize,
-    off_road: usize,
-    moving: usize,
-    wrong_way: usize,
-}
-
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let world = run.phase("load", |run| {
@@ -99,8 +84,11 @@ impl Args {
         let seed = run.seed();
         let found = benchmark::find(run, &self.scenarios)?;
         run.result("set", &found.name)?;
-        let scenarios = run.phase("read", |_| read(&found, self.limit, &protocol))?;
-        let bank = run.phase("bank", |_| self.bank(&protocol))?;
+        let scenarios = run.phase("read", |run| {
+            let monitor = run.monitor();
+            Ok(recorded_scenarios(&found, self.limit, &protocol, &monitor)?)
+        })?;
+        let bank = run.phase("bank", |run| self.bank(run, &protocol))?;
         anyhow::ensure!(
             scenarios.len() > 1,
             "{} scenarios have {} vehicles within 50 m, expected at least 2",
@@ -110,21 +98,23 @@ impl Args {
         let numbered = scenarios.iter().cloned().enumerate();
         let cases = numbered.flat_map(|(i, scenario)| {
             let seed = seed.fork(9).fork(i as u64);
-            Case::of(i, scenario, self.centres, &protocol, seed)
+            ComparedScene::of(i, scenario, self.centres, &protocol, seed)
         });
-        let cases: Vec<Case> = cases.collect();
+        let cases: Vec<ComparedScene> = cases.collect();
         run.result("scenarios", scenarios.len())?;
         run.result("scenes", cases.len())?;
-        let makers = Makers {
+        let makers = SceneMakers {
             world: &world,
             cases: &cases,
             bank: &bank,
             protocol,
         };
         let mut tallies = Vec::new();
-        for source in Source::ALL {
+        for source in SceneSource::ALL {
             stop_if_interrupted()?;
-            let tally = run.phase(source.name(), |_| Ok(tally(&makers, source, seed)))?;
+            let tally = run.phase(source.name(), |_| {
+                Ok(GenerationTally::of(&makers, source, seed))
+            })?;
             tallies.push((source, tally));
         }
         let prompts = run.phase("prompts", |run| {
@@ -132,13 +122,15 @@ impl Args {
                 scenes: &world,
                 traffic: traffic.model(),
             };
-            prompts::satisfaction(run, worlds, &scenarios, self.prompt_maps, self.attempts)
+            let (n_maps, attempts, monitor) = (self.prompt_maps, self.attempts, run.monitor());
+            let found = prompt_satisfaction(worlds, &scenarios, n_maps, attempts, seed, &monitor);
+            Ok(found?)
         })?;
         let rows = tallies.iter().map(|(source, tally)| {
             let satisfaction = match source {
-                Source::Model(Placement::Guided) => prompts.satisfaction,
-                Source::Model(Placement::Free) => prompts.unconditional,
-                Source::Log => prompts.logged,
+                SceneSource::Model(Placement::Guided) => prompts.satisfaction,
+                SceneSource::Model(Placement::Free) => prompts.unconditional,
+                SceneSource::Log => prompts.logged,
                 _ => None,
             };
             row(*source, tally, satisfaction)
@@ -155,116 +147,90 @@ impl Args {
         run.result("intervals", intervals)?;
         run.result("prompts", prompts.rows)?;
         if self.long_scenes > 0 {
-            let (weights, n) = (self.weights.as_ref(), self.long_scenes);
-            let rows = run.phase("long", |run| long::rows(run, weights, n))?;
-            charts::save(run, "life", &long::chart(&rows))?;
+            let rows = run.phase("long", |run| self.long_rows(run))?;
+            charts::save(run, "life", &long_chart(&rows))?;
             run.result("life", rows)?;
         }
         Ok(())
     }
 
     /// The recordings that are retrieved.
-    fn bank(&self, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
+    fn bank(&self, run: &Run, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
+        let monitor = run.monitor();
+        let read = |path| recorded_scenarios(&ScenarioSet::of_path(path), None, protocol, &monitor);
         if let Some(path) = &self.bank {
-            return read(&ScenarioSet::of_path(path), None, protocol);
+            return Ok(read(path)?);
         }
         let parts = datasets::parts(&shipped::data(), Split::Train)?;
-        let parts = parts
-            .iter()
-            .map(|part| read(&ScenarioSet::of_path(&part.path), None, protocol));
-        Ok(parts.collect::<anyhow::Result<Vec<_>>>()?.concat())
+        let parts = parts.iter().map(|part| read(&part.path));
+        Ok(parts.collect::<Result<Vec<_>, _>>()?.concat())
     }
-}
 
-/// The scenarios that take part.
-fn read(
-    found: &ScenarioSet,
-    limit: Option<usize>,
-    protocol: &MmdProtocol,
-) -> anyhow::Result<Vec<Scenario>> {
-    let mut scenarios = Vec::new();
-    for record in found.open(gump_data::ReadOptions::ALL)? {
+    /// One row per world: the log, traffic without and with agents that come and leave.
+    ///
+    /// Error: weights that cannot be read, or a world that fails.
+    fn long_rows(&self, run: &Run) -> anyhow::Result<Vec<Value>> {
+        let seed = run.seed();
+        let scenarios = long_scenes(self.long_scenes, seed);
+        let logged = observe_logs(&scenarios);
+        let mut rows = vec![long_row("log", &logged, &logged)?];
+        for (name, life) in [("those who are there", false), ("life", true)] {
+            stop_if_interrupted()?;
+            let sampling = SamplingConfig {
+                life,
+                ..SamplingConfig::default()
+            };
+            let traffic = World::without_log(run.device(), &shipped::world(), &sampling)?;
+            let observed = observe_world(traffic.model(), &scenarios, seed)?;
+            rows.push(long_row(name, &observed, &logged)?);
+        }
         stop_if_interrupted()?;
-        let scenario = record?.scenario;
-        let present = scenario.present();
-        if scene_mmd(&present, present.now(), protocol).is_some() {
-            scenarios.push(scenario);
-        }
-        if limit.is_some_and(|limit| scenarios.len() >= limit) {
-            break;
-        }
-    }
-    Ok(scenarios)
-}
-
-fn tally(makers: &Makers<'_>, source: Source, seed: Seed) -> Tally {
-    let made: Vec<Option<Frame>> = (0..makers.cases.len())
-        .into_par_iter()
-        .map(|i| makers.make(source, i, seed.fork(i as u64)))
-        .collect();
-    let mut tally = Tally::default();
-    for (case, frame) in makers.cases.iter().zip(made) {
-        let Some(frame) = frame else {
-            tally.failed += 1;
-            continue;
-        };
-        let recorded = &case.recorded;
-        if let Some(mmd) = scene_mmd(&recorded.present(), &frame, &makers.protocol) {
-            tally.mmd.push((case.recording, mmd));
-        }
-        let (overlapping, vehicles) = overlapping_vehicles(&frame);
-        let (wrong, moving) = wrong_way(&recorded.map, &frame);
-        tally.overlapping += overlapping;
-        tally.vehicles += vehicles;
-        tally.wrong_way += wrong;
-        tally.moving += moving;
-        tally.off_road += off_road(&alone(recorded, frame));
-    }
-    tally
-}
-
-impl Tally {
-    /// Means over scenes.
-    fn mean(&self) -> SceneMmd {
-        let mut mean = MmdMean::default();
-        self.mmd.iter().for_each(|(_, mmd)| mean.add(mmd));
-        mean.mean()
-    }
-
-    /// Where the means of position, heading, speed and size lie with 95 % confidence, recordings
-    /// drawn with all their scenes.
-    fn intervals(&self, n_recordings: usize, seed: Seed) -> Vec<Option<Interval>> {
-        intervals(n_recordings, 1000, seed, |drawn| {
-            let mut mean = MmdMean::default();
-            for recording in drawn {
-                let own = self.mmd.iter().filter(|(of, _)| of == recording);
-                own.for_each(|(_, mmd)| mean.add(mmd));
-            }
-            attributes(&mean.mean()).to_vec()
-        })
+        let world = generate::world(run.device(), self.weights.as_ref(), true)?;
+        let observed = observe_world(&world, &scenarios, seed)?;
+        rows.push(long_row(
+            "life of the sequence network",
+            &observed,
+            &logged,
+        )?);
+        Ok(rows)
     }
 }
 
-/// The frame as the only one of a scenario.
-fn alone(scenario: &Scenario, frame: Frame) -> Scenario {
-    Scenario {
-        log: vec![frame],
-        now: 0,
-        ..scenario.clone()
+/// The name of a world, then its numbers.
+fn long_row(
+    world: &str,
+    observed: &[LongObservation],
+    logged: &[LongObservation],
+) -> anyhow::Result<Value> {
+    let mut row = Map::from_iter([("world".to_owned(), json!(world))]);
+    let numbers = serde_json::to_value(summarize_long(observed, logged))?;
+    if let Value::Object(numbers) = numbers {
+        row.extend(numbers);
     }
+    Ok(Value::Object(row))
 }
 
-/// What scenes are compared in.
-const ATTRIBUTES: [&str; 4] = ["position", "heading", "speed", "size"];
-
-/// The numbers of [`ATTRIBUTES`].
-fn attributes(mmd: &SceneMmd) -> [Option<f64>; 4] {
-    [mmd.position, mmd.heading, mmd.velocity, mmd.size]
+/// Changes within half a minute, in every world.
+fn long_chart(rows: &[Value]) -> Bars {
+    let counts = [
+        ("agents at 30 s", "agents_at_30_s"),
+        ("error of the count", "agent_count_error"),
+        ("entries", "entries"),
+        ("exits", "exits"),
+        ("changes per light", "changes_per_light"),
+    ];
+    let worlds = rows.iter().filter_map(|row| row["world"].as_str());
+    let legend = worlds.map(String::from).collect();
+    let label = "within 80 m of the ego, mean over scenes";
+    let names = counts.map(|(name, _)| name.into()).into();
+    charts::bars(label, names, legend, |count, world| {
+        charts::bar(&rows[world][counts[count].1], &Value::Null, &Value::Null)
+    })
 }
 
 /// The discrepancy of every source on every attribute; the log's is none.
 fn chart(rows: &[Value], intervals: &[Value]) -> Bars {
-    let is_shown = |row: &&Value| row["source"] != Source::Log.name();
+    let is_shown = |row: &&Value| row["source"] != SceneSource::Log.name();
     let rows: Vec<&Value> = rows.iter().filter(is_shown).collect();
     let spans: Vec<&Value> = intervals.iter().filter(is_shown).collect();
     let sources = rows.iter().filter_map(|row| row["source"].as_str());
@@ -278,7 +244,7 @@ fn chart(rows: &[Value], intervals: &[Value]) -> Bars {
     })
 }
 
-fn spans_row(source: Source, spans: &[Option<Interval>]) -> Value {
+fn spans_row(source: SceneSource, spans: &[Option<Interval>]) -> Value {
     let mut row = json!({ "source": source.name() });
     for (name, span) in ATTRIBUTES.iter().zip(spans) {
         row[format!("{name}_low")] = json!(span.map(|span| span.low));
@@ -289,16 +255,16 @@ fn spans_row(source: Source, spans: &[Option<Interval>]) -> Value {
 
 /// By which share of random placement's discrepancy guided generation is below it.
 fn gain(rows: &[Value]) -> Value {
-    let of = |source: Source| rows.iter().find(|row| row["source"] == source.name());
-    let guided = of(Source::Model(Placement::Guided));
+    let of = |source: SceneSource| rows.iter().find(|row| row["source"] == source.name());
+    let guided = of(SceneSource::Model(Placement::Guided));
     let gain = |name: &str| {
         let value = |row: Option<&Value>| row.and_then(|row| row[name].as_f64());
-        Some(1.0 - value(guided)? / value(of(Source::Random))?)
+        Some(1.0 - value(guided)? / value(of(SceneSource::Random))?)
     };
     json!(BTreeMap::from(ATTRIBUTES.map(|name| (name, gain(name)))))
 }
 
-fn row(source: Source, tally: &Tally, prompt_satisfaction: Option<f64>) -> Value {
+fn row(source: SceneSource, tally: &GenerationTally, prompt_satisfaction: Option<f64>) -> Value {
     let mean = tally.mean();
     let rate = |n: usize, of: usize| n as f64 / of.max(1) as f64;
     json!({

@@ -14,10 +14,13 @@ type Tell = fn(&mut Run, &[PathBuf], MissingShards) -> anyhow::Result<()>;
 
 /// Benchmarks that can be sharded, by the name in their ledgers.
 const BENCHMARKS: &[(&str, Tell)] = &[
-    (behaviour::BENCHMARK, behaviour::tell_merged),
-    (closed_loop::BENCHMARK, closed_loop::tell_merged),
+    (gump_eval::behaviour::BENCHMARK, behaviour::report_merged),
+    (
+        gump_eval::closed_loop::BENCHMARK,
+        closed_loop::report_merged,
+    ),
     (motion::NAME, motion::tell_merged),
-    (reactions::BENCHMARK, reactions::tell_merged),
+    (gump_eval::reactions::BENCHMARK, reactions::report_merged),
     (rl::evaluate::BENCHMARK, rl::columns::tell_merged),
     (wosac::BENCHMARK, wosac::tell_merged),
 ];

@@ -1,22 +1,20 @@
 //! `evaluate`: the benchmarks, one file each.
 //!
-//! What they share: [`gump_eval::shard`] says which scenarios are this machine's, [`gump_eval::results`] keeps what each
-//! scenario got, so that a stopped run goes on and shards add up to one run. A new benchmark is a
+//! Each reads its arguments, shows the progress of an evaluation of [`gump_eval`] and reports its
+//! results. [`gump_eval::shard`] says which scenarios are this machine's, [`gump_eval::results`] keeps
+//! the results of each, from which a stopped run resumes and shards are merged. A new benchmark is a
 //! file, a variant of [`Verb`] and, if it can be sharded, a row of `BENCHMARKS` in [`merge`].
 
 pub(crate) mod behaviour;
 mod closed_loop;
+mod columns;
 pub(crate) mod generation;
 mod left_out;
-mod long;
 mod merge;
 pub(crate) mod motion;
 mod open_loop;
-mod prompts;
 mod ranking;
 pub(crate) mod reactions;
-mod sources;
-mod ways;
 pub(crate) mod wosac;
 
 pub(crate) use closed_loop::Driving;

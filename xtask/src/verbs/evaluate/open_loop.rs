@@ -3,14 +3,11 @@
 use std::num::NonZeroUsize;
 
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
+use gump_eval::open_loop::{OpenLoopOutcome, numbers, plan};
 use gump_eval::planners::{PlannerName, PlanningWorld};
 use gump_eval::recordings;
-use gump_eval::recordings::{Case, Named};
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
-use gump_nuplan::closed_loop::Replayed;
-use gump_nuplan::metrics::{OpenLoop, Scoring};
-use gump_planner::closed_loop::{evaluate, plan_and_compare};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -20,9 +17,6 @@ use crate::planners::{ImaginationArgs, PlannerParser};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::{benchmark, charts};
-
-/// Seconds that plans are compared over.
-const HORIZON: f64 = 8.0;
 
 /// Arguments of `evaluate open-loop`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -50,8 +44,6 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-type Outcome = (String, anyhow::Result<OpenLoop>);
-
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         if matches!(self.world, WorldName::Log | WorldName::ConstantVelocity) {
@@ -76,7 +68,11 @@ impl Args {
             let outcomes =
                 run.phase("plan", |run| self.plan(run, &found, planner, &surroundings))?;
             rows.push(row(planner.name(), &outcomes, run));
-            scenarios.extend(outcomes.iter().map(|outcome| tell(planner.name(), outcome)));
+            scenarios.extend(
+                outcomes
+                    .iter()
+                    .map(|outcome| entry(planner.name(), outcome)),
+            );
         }
         let scores = |row: usize, _| {
             let row: &Value = &rows[row];
@@ -98,73 +94,41 @@ impl Args {
         found: &ScenarioSet,
         planner: PlannerName,
         surroundings: &PlanningWorld,
-    ) -> anyhow::Result<Vec<Outcome>> {
-        let cases = recordings::open_all(&found.paths)?;
+    ) -> anyhow::Result<Vec<OpenLoopOutcome>> {
         let limit = self.limit.map(NonZeroUsize::get);
-        let cases = cases.take(limit.unwrap_or(usize::MAX));
+        let cases = recordings::open_all(&found.paths)?.take(limit.unwrap_or(usize::MAX));
         let progress = run.progress(planner.name(), limit.unwrap_or(0) as u64, "scenarios");
-        let thinking = self.thinking.config()?;
-        let outcomes = evaluate(cases, |i, named: Named| {
-            let outcome = named.case.map_err(anyhow::Error::from).and_then(|case| {
-                let seed = run.seed().fork(i as u64);
-                let imagination = surroundings.imagination();
-                let mut driver = planner.build(&case, imagination, seed, &thinking)?;
-                let seconds = comparable_seconds(&case);
-                let (recording, after) = (&case.recording, &case.after);
-                let mut traffic = Replayed;
-                Ok(plan_and_compare(
-                    recording,
-                    after,
-                    &mut traffic,
-                    &mut *driver,
-                    seconds,
-                )?)
-            });
-            progress.advance(1);
-            (named.id, outcome)
-        });
-        crate::run::stop_if_interrupted()?;
-        Ok(outcomes)
+        let (imagination, config) = (surroundings.imagination(), self.thinking.config()?);
+        Ok(plan(
+            cases,
+            planner,
+            imagination,
+            &config,
+            run.seed(),
+            &progress,
+        )?)
     }
 }
 
-/// How long plans can be made so that each still has what was driven to be compared with.
-fn comparable_seconds(case: &Case) -> f64 {
-    let scenario = case.recording.scenario();
-    let known = (scenario.future().len() + case.after.len()) as f64 * scenario.dt;
-    // One more second than plans start in, because they start at every whole one.
-    (known - HORIZON + 1.0).clamp(2.0 * scenario.dt, 15.0)
-}
-
-fn numbers(open: &OpenLoop) -> [(&'static str, f64); 6] {
-    let [three, five, eight] = &open.horizons;
-    [
-        ("score", Scoring::open_loop().score(&open.scores)),
-        ("ade_8s", eight.ade),
-        ("fde_3s", three.fde),
-        ("fde_5s", five.fde),
-        ("fde_8s", eight.fde),
-        ("miss_rate", eight.miss_rate),
-    ]
-}
-
-fn tell(planner: &str, (id, outcome): &Outcome) -> Value {
-    let mut told = json!({ "id": id, "planner": planner });
-    match outcome {
+/// One planner in one scenario.
+fn entry(planner: &str, outcome: &OpenLoopOutcome) -> Value {
+    let mut entry = json!({ "id": outcome.id, "planner": planner });
+    match &outcome.compared {
         Ok(open) => {
             for (name, value) in numbers(open) {
-                told[name] = json!(value);
+                entry[name] = json!(value);
             }
         }
-        Err(error) => told["error"] = json!(format!("{error:#}")),
+        Err(error) => entry["error"] = json!(error.sentence()),
     }
-    told
+    entry
 }
 
-fn row(planner: &str, outcomes: &[Outcome], run: &Run) -> Value {
+/// One planner over all scenarios.
+fn row(planner: &str, outcomes: &[OpenLoopOutcome], run: &Run) -> Value {
     let done: Vec<_> = outcomes
         .iter()
-        .filter_map(|(_, outcome)| outcome.as_ref().ok())
+        .filter_map(|outcome| outcome.compared.as_ref().ok())
         .map(numbers)
         .collect();
     let mut row = json!({

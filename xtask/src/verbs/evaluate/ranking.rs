@@ -5,7 +5,7 @@ use gump_planner::Comparison;
 use gump_scene::Seed;
 use serde_json::{Value, json};
 
-use super::closed_loop::{COLUMNS, Drives};
+use super::closed_loop::{COLUMNS, PlannerDrives};
 use crate::run::Run;
 use crate::table;
 
@@ -26,7 +26,10 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> Strin
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places.
-pub(super) fn tell(run: &mut Run, worlds: &[(String, Vec<Drives<'_>>)]) -> anyhow::Result<()> {
+pub(super) fn tell(
+    run: &mut Run,
+    worlds: &[(String, Vec<PlannerDrives<'_>>)],
+) -> anyhow::Result<()> {
     let Some((_, planners)) = worlds.first().filter(|(_, drives)| drives.len() > 1) else {
         return Ok(());
     };
@@ -96,13 +99,18 @@ impl Change {
 }
 
 /// Of the scenarios that both drove to the end.
-fn compare(a: &Drives<'_>, b: &Drives<'_>, seed: Seed) -> Option<Comparison> {
+fn compare(a: &PlannerDrives<'_>, b: &PlannerDrives<'_>, seed: Seed) -> Option<Comparison> {
     let pairs = a.scores().zip(b.scores());
     let (a, b): (Vec<f64>, Vec<f64>) = pairs.filter_map(|(a, b)| a.zip(b)).unzip();
     Comparison::of_scenes(&a, &b, seed)
 }
 
-fn tell_one(world: &str, a: &Drives<'_>, b: &Drives<'_>, compared: &Comparison) -> Value {
+fn tell_one(
+    world: &str,
+    a: &PlannerDrives<'_>,
+    b: &PlannerDrives<'_>,
+    compared: &Comparison,
+) -> Value {
     json!({
         "world": world,
         "planner": a.planner,

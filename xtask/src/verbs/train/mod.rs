@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_eval::datasets::{self, Part, Split};
+use gump_eval::fresh::SceneStream;
+use gump_eval::training_set::{self, TrainingSet};
 use gump_kernels::Choice;
 use gump_model::checkpoint::Precision;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
@@ -23,11 +25,9 @@ use self::realism::Judge;
 use self::stages::{Files, Stage};
 use crate::benchmark;
 use crate::cli::WrongArguments;
-use crate::fresh::Stream;
 use crate::losses::Losses;
 use crate::peers::{Processes, together};
 use crate::run::{self, Common, Run};
-use crate::training_set::{self, Training};
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
@@ -272,7 +272,7 @@ impl Args {
         Ok(())
     }
 
-    fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(Training, Vec<Scenario>)> {
+    fn read(&self, run: &Run, stage: &Stage) -> anyhow::Result<(TrainingSet, Vec<Scenario>)> {
         self.read_data(run, &stage.data, stage.config.train.batch)
     }
 
@@ -282,23 +282,24 @@ impl Args {
         run: &Run,
         data: &[PathBuf],
         batch: usize,
-    ) -> anyhow::Result<(Training, Vec<Scenario>)> {
+    ) -> anyhow::Result<(TrainingSet, Vec<Scenario>)> {
         let progress = run.progress("reading", 0, "scenarios");
         let mut training = Vec::with_capacity(data.len());
         let mut validation = Vec::new();
         for named in data {
             let (path, share) = training_set::with_share(named);
-            let (source, held_out) = match Stream::of_name(&path)? {
+            let (source, held_out) = match SceneStream::of_name(&path)? {
                 Some(stream) => {
                     let held_out = match &self.validation {
                         Some(_) => Vec::new(),
                         None => stream.validation(VALIDATION_SAMPLES / data.len()),
                     };
                     let of_batch = (batch as f64 * share).ceil() as usize;
-                    (Training::fresh(stream, of_batch), held_out)
+                    (TrainingSet::fresh(stream, of_batch), held_out)
                 }
                 None => {
-                    let source = Training::open(&datasets::parts(&path, Split::Train)?, &progress)?;
+                    let source =
+                        TrainingSet::open(&datasets::parts(&path, Split::Train)?, &progress)?;
                     let held_out = match &self.validation {
                         Some(_) => Vec::new(),
                         None => datasets::parts(&path, Split::Tune)?,
@@ -315,7 +316,7 @@ impl Args {
             let whole = [Part::whole(path)];
             validation = datasets::read_first(VALIDATION_SAMPLES, &whole, &progress)?;
         }
-        Ok((Training::mixed(training), validation))
+        Ok((TrainingSet::mixed(training), validation))
     }
 }
 
@@ -369,7 +370,7 @@ impl Learns for Trainer {
 /// Says so if the network is to learn from scenes of a frozen set.
 ///
 /// Error: a list of this repository that cannot be read.
-fn warn_of_frozen(run: &Run, training: &Training) -> anyhow::Result<()> {
+fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
     let frozen = benchmark::frozen_ids()?;
     let sets = training.ids().filter_map(|id| Some((id, frozen.get(id)?)));
     let found: Vec<_> = sets.collect();

@@ -10,7 +10,7 @@ use gump_model::{Device, relative};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
 use gump_train::relative::{RelativeTrainConfig, RelativeTrainer};
-use gump_train::{LossParts, ProcessGroup as _, StepReport};
+use gump_train::{LossParts, ProcessGroup as _, StepReport, TrainError};
 use serde::Deserialize;
 use serde_json::{Map, json};
 use toml::Table;
@@ -209,7 +209,7 @@ fn config(args: &Args, table: &Table) -> anyhow::Result<Config> {
     config.train.steps = args.steps.unwrap_or(config.train.steps);
     config.train.batch = args.batch.unwrap_or(config.train.batch);
     config.train.seed = args.common.seed.unwrap_or(config.train.seed);
-    let checked = config.relative.validate();
+    let checked = config.relative.validate().map_err(TrainError::from);
     checked
         .and_then(|()| config.train.validate())
         .map_err(|error| wrong(error.to_string()))?;

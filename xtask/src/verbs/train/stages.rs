@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use gump_eval::fresh::PREFIX;
 use gump_model::ModelConfig;
 use gump_train::{ClosedLoopConfig, RunConfig, TrainConfig};
 use serde::Serialize;
@@ -15,7 +16,6 @@ use toml::{Table, Value};
 use super::Args;
 use crate::cli::WrongArguments;
 use crate::config;
-use crate::fresh::PREFIX;
 
 /// A part of a run with a schedule of its own.
 #[derive(Debug)]
@@ -136,7 +136,7 @@ impl Args {
         config.train.steps = self.steps.unwrap_or(config.train.steps);
         config.train.batch = self.batch.unwrap_or(config.train.batch);
         config.train.seed = self.common.seed.unwrap_or(config.train.seed);
-        let checked = config.model().and_then(|model| model.validate());
+        let checked = config.model().and_then(|model| Ok(model.validate()?));
         checked
             .and_then(|()| config.train.validate(1))
             .map_err(|error| wrong(error.to_string()))?;

@@ -7,12 +7,12 @@
 use std::ops::Range;
 
 use gump_geometry::Pose;
-use gump_model::ModelError;
 use gump_model::steps::TOKEN_DT;
 use gump_rollout::Start;
 use gump_scene::{AgentId, AgentState, Frame, Light, SceneState, Seed};
 
 use super::{Future, RelativeWorld, Workspace};
+use crate::EngineError;
 use crate::predictive_samples::PredictiveSamples;
 
 #[cfg(doc)]
@@ -41,7 +41,7 @@ impl LiveFuture {
         world: &RelativeWorld,
         scene: SceneState<'_>,
         seed: Seed,
-    ) -> Result<Self, ModelError> {
+    ) -> Result<Self, EngineError> {
         let start = Start {
             scene,
             n_futures: 1,

@@ -1,38 +1,36 @@
 //! `evaluate closed-loop`: how well a planner drives, as nuPlan scores it.
 //!
-//! Scenarios stream through, several side by side; of each the ledger keeps what every planner got
-//! in every world, so that a stopped run goes on and shards add up to one run. `drive` drives,
-//! `tell` makes the report.
+//! The drives are of [`gump_eval::closed_loop`]; `report` sums them up, and `planners` are those of
+//! the command line.
 
-mod drive;
-mod tell;
+mod planners;
+mod report;
 
-use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
-use std::sync::Mutex;
 use std::time::Duration;
 
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
+use gump_eval::closed_loop::{
+    BENCHMARK, ClosedLoopEvaluation, ClosedLoopSettings, ScenarioDrives, VisitedDrive,
+};
 use gump_eval::planners::PlanningWorld;
 use gump_eval::recordings;
-use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::results::{Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_nuplan::closed_loop::{DriveConfig, Tracking};
-use gump_planner::closed_loop::evaluate;
-use serde::{Deserialize, Serialize};
+use gump_rollout::BoxError;
+use serde::Serialize;
 
-use crate::benchmark;
+use self::planners::{Remote, evaluated};
 use crate::cli::WrongArguments;
 use crate::planners::{Chosen, ChosenParser, ImaginationArgs};
-use crate::run::{Common, Run, interrupted, stop_if_interrupted};
+use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
-pub(crate) use tell::tell_merged;
-pub(super) use tell::{COLUMNS, Drives, mean};
-
-/// Name of the benchmark in ledgers.
-pub(crate) const BENCHMARK: &str = "closed-loop";
+use crate::{benchmark, films};
+pub(crate) use report::report_merged;
+pub(super) use report::{COLUMNS, PlannerDrives, mean};
 
 /// Arguments of `evaluate closed-loop`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -133,59 +131,6 @@ impl Driving {
     }
 }
 
-/// What the outcomes of a scenario depend on, beside the scenario.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Settings {
-    /// The set, or the name of the file or folder.
-    scenarios: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    limit: Option<usize>,
-    worlds: Vec<String>,
-    planners: Vec<String>,
-    imagination: String,
-    /// How planners are let drive, how they think and how learned worlds decode, as JSON.
-    driving: String,
-    thinking: String,
-    sampling: String,
-    seed: String,
-}
-
-/// What every planner got in every world in one scenario.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Driven {
-    log_name: String,
-    scenario_type: String,
-    /// World by world, in each the planners in their order.
-    outcomes: Vec<Outcome>,
-}
-
-/// One drive.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Outcome {
-    world: String,
-    planner: String,
-    /// Whether the planner is one of the proposals, of which the best and the oracle are told.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    proposal: bool,
-    /// Of a drive that reached its end.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    finished: Option<Finished>,
-    /// Why it did not.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    error: Option<String>,
-}
-
-/// A drive that reached its end.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Finished {
-    /// nuPlan's score, 0 to 1.
-    score: f64,
-    /// Milliseconds per plan.
-    milliseconds: f64,
-    /// nuPlan's metrics that apply, by their names.
-    metrics: BTreeMap<String, f64>,
-}
-
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
@@ -208,76 +153,44 @@ impl Args {
             )?)
         })?;
         let worlds = run.phase("load", |run| {
-            let load = |world| {
-                let loaded = PlanningWorld::load(run.device(), world, &sampling);
-                loaded.map_err(anyhow::Error::from)
+            let load = |world: &WorldName| {
+                let loaded = PlanningWorld::load(run.device(), world, &sampling)?;
+                Ok((world.clone(), loaded))
             };
-            self.world
-                .iter()
-                .map(load)
-                .collect::<anyhow::Result<Vec<_>>>()
+            let worlds = self.world.iter().map(load);
+            worlds.collect::<anyhow::Result<Vec<_>>>()
         })?;
-        let drives = drive::Drives {
-            args: self,
+        let remotes = Remote::of(&self.planner, self.driving.budget());
+        let evaluation = ClosedLoopEvaluation {
+            planners: &evaluated(&self.planner, &remotes),
             worlds: &worlds,
             imagination: imagined.imagination(),
-            thinking: &thinking,
+            config: &thinking,
+            drive: self.driving.config(),
+            budget: self.driving.budget(),
+            seed: run.seed(),
         };
-        let ledger = ResultStore::open(run.out(), &header)?;
-        let entries = run.phase("drive", |run| self.drive(run, &found, &drives, ledger))?;
+        let store: ResultStore<ScenarioDrives> = ResultStore::open(run.out(), &header)?;
+        let entries = run.phase("drive", |run| {
+            let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
+            let cases = recordings::open_all(&found.paths)?.take(limit);
+            let progress = run.progress("driving", 0, "scenarios");
+            let visit = |drive: VisitedDrive<'_>| match drive.index < self.films {
+                true => film(run, &drive),
+                false => Ok(()),
+            };
+            Ok(evaluation.fill(store, cases, &progress, &visit)?)
+        })?;
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {}, found none: {}",
             self.shard,
             self.scenarios
         );
-        tell::tell(run, &settings, &entries)
+        report::report(run, &settings, &entries)
     }
 
-    /// Drives through those scenarios of the shard that the ledger does not have.
-    fn drive(
-        &self,
-        run: &Run,
-        found: &ScenarioSet,
-        drives: &drive::Drives<'_>,
-        ledger: ResultStore<Driven>,
-    ) -> anyhow::Result<Vec<Entry<Driven>>> {
-        let kept = ledger.indices();
-        let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
-        let cases = recordings::open_all(&found.paths)?.enumerate().take(limit);
-        let cases = cases
-            .filter(|(index, _)| self.shard.holds(*index) && !kept.contains(index))
-            .take_while(|_| !interrupted());
-        let progress = run.progress("driving", 0, "scenarios");
-        let ledger = Mutex::new(ledger);
-        let work = |index: usize, named: recordings::Named| {
-            let entry = Entry {
-                index,
-                id: named.id.clone(),
-                scores: drives.through(run, index, named)?,
-            };
-            // One that was stopped in its middle is not done.
-            stop_if_interrupted()?;
-            progress.advance(1);
-            let mut ledger = ledger.lock().expect("nobody panics while holding it");
-            Ok(ledger.add(entry)?)
-        };
-        // A planner in another process plans for one at a time.
-        let one_by_one = self.planner.iter().any(Chosen::is_remote);
-        let done: Vec<anyhow::Result<()>> = match one_by_one {
-            true => cases.map(|(index, named)| work(index, named)).collect(),
-            false => evaluate(cases, |_, (index, named)| work(index, named)),
-        };
-        done.into_iter().collect::<anyhow::Result<()>>()?;
-        anyhow::ensure!(
-            !interrupted(),
-            "stopped by Ctrl-C; the same command resumes where this one stopped"
-        );
-        let ledger = ledger.into_inner().expect("nobody panics while holding it");
-        Ok(ledger.close()?)
-    }
-
-    /// What planners imagine in.
+    /// The world that planners roll out.
     fn imagination(&self) -> &WorldName {
         let learned = |world: &&WorldName| matches!(world, WorldName::Model(_));
         let met = || self.world.iter().find(learned);
@@ -285,8 +198,8 @@ impl Args {
         named.unwrap_or(&WorldName::Idm)
     }
 
-    fn settings(&self, run: &Run, found: &ScenarioSet) -> anyhow::Result<Settings> {
-        Ok(Settings {
+    fn settings(&self, run: &Run, found: &ScenarioSet) -> anyhow::Result<ClosedLoopSettings> {
+        Ok(ClosedLoopSettings {
             scenarios: found.name.clone(),
             limit: self.limit.map(NonZeroUsize::get),
             worlds: self.world.iter().map(ToString::to_string).collect(),
@@ -297,5 +210,38 @@ impl Args {
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
         })
+    }
+}
+
+/// Writes a film of a drive beside the log.
+fn film(run: &Run, drive: &VisitedDrive<'_>) -> Result<(), BoxError> {
+    let (planner, world) = (drive.planner, drive.world);
+    let folder = run.path("films");
+    std::fs::create_dir_all(&folder)?;
+    let label = format!("{planner} among {world}");
+    let film = films::film(
+        drive.case.recording.scenario(),
+        &[(label.as_str(), &drive.scored.driven.rollout)],
+    )?;
+    let name = format!(
+        "{}-{}-{}.gif",
+        drive.index,
+        file_name(planner),
+        short(world)
+    );
+    Ok(film.save(&folder.join(name))?)
+}
+
+/// A name without what file systems dislike.
+fn file_name(name: &str) -> String {
+    let plain = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
+    name.chars().map(plain).collect()
+}
+
+/// A world's name as part of a file's.
+fn short(world: &WorldName) -> String {
+    match world {
+        WorldName::Model(_) => "model".into(),
+        other => other.to_string(),
     }
 }

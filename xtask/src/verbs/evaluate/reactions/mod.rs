@@ -1,36 +1,29 @@
 //! `evaluate reactions`: the ego leaves its log; who runs into it.
 //!
-//! Scenarios stream through one at a time; in each the ego tries every manoeuvre in every world, and
-//! the ledger keeps who ran into it. Manoeuvres, whom they concern and what counts are in
-//! `gump_metrics::reactions`; `cells` is the form of the ledger, `tell` makes the report.
+//! The evaluation is [`gump_eval::reactions`]; `report` sums its results up.
 
-mod cells;
-mod tell;
+mod report;
 
 use std::num::NonZeroUsize;
 
-use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
-use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::decoding::DecodedWorld;
+use gump_eval::reactions::{
+    BENCHMARK, ReactionConfig, ReactionEvaluation, ReactionSettings, ScenarioReactions, any_scored,
+};
+use gump_eval::results::{Header, ResultStore};
 use gump_eval::shard::Shard;
-use gump_eval::worlds::{WorldName, Worlds};
-use gump_metrics::reactions::{Attempt, Manoeuvre, Reactions};
-use gump_rollout::Scripted;
-use gump_scene::{Scenario, Seed};
+use gump_eval::worlds::WorldName;
+use gump_metrics::reactions::Manoeuvre;
 use serde::Serialize;
 
-use super::ways::{Way, ways};
-use crate::imagine::imagine_around;
-use crate::run::{Common, Run, interrupted};
+use super::columns::columns;
+use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 use crate::{benchmark, shipped};
-use cells::{Scored, Seen, Settings, Tried};
-pub(crate) use tell::tell_merged;
-
-/// Name of the benchmark in ledgers.
-pub(crate) const BENCHMARK: &str = "reactions";
+pub(crate) use report::report_merged;
 
 /// Arguments of `evaluate reactions`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -82,43 +75,31 @@ fn manoeuvre(name: &str) -> Result<&'static str, String> {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let ways = ways(&self.world, &self.sampling)?;
+        let columns = columns(&self.world, &self.sampling)?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
-        let settings = self.settings(run, &scenarios, &ways)?;
+        let settings = self.settings(run, &scenarios, &columns)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard: self.shard,
             settings: toml::Table::try_from(&settings)?,
         };
-        let mut worlds: Vec<Worlds<'_>> = ways
-            .iter()
-            .map(|way| Worlds::new(run.device(), &way.world, way.decoding.sampling.clone()))
-            .collect();
-        let mut ledger = ResultStore::open(run.out(), &header)?;
-        let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
+        let config = ReactionConfig {
+            manoeuvres: self.manoeuvres().collect(),
+            seconds: self.seconds,
+            futures: self.futures.get(),
+            seed: run.seed(),
+        };
+        let mut evaluation = ReactionEvaluation::new(run.device(), &columns, config);
+        let mut store: ResultStore<ScenarioReactions> = ResultStore::open(run.out(), &header)?;
         run.phase("drive", |run| {
             let progress = run.progress("driving", 0, "scenarios");
-            let records = scenarios.open(ReadOptions::ALL)?;
-            for (index, record) in records.enumerate().take(limit) {
-                if !self.shard.holds(index) || ledger.has(index) {
-                    continue;
-                }
-                let scenario = record?.scenario;
-                let seed = run.seed().fork(index as u64);
-                let scores = self
-                    .score(run, &scenario, &ways, &mut worlds, seed)
-                    .with_context(|| format!("cannot evaluate scenario {}", scenario.id))?;
-                let id = scenario.id.clone();
-                ledger.add(Entry { index, id, scores })?;
-                progress.advance(1);
-                anyhow::ensure!(
-                    !interrupted(),
-                    "stopped by Ctrl-C; the same command resumes after scenario {index}"
-                );
-            }
-            Ok(())
+            let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
+            let records = scenarios.open(ReadOptions::ALL)?.take(limit);
+            Ok(store.fill(records, &progress, |index, scenario| {
+                evaluation.score(index, scenario, &progress)
+            })?)
         })?;
-        let entries = ledger.close()?;
+        let entries = store.close()?;
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {}, found none: {}",
@@ -126,9 +107,9 @@ impl Args {
             scenarios.name
         );
         if self.shard == Shard::WHOLE {
-            tell::any_scored(&entries)?;
+            any_scored(&entries)?;
         }
-        tell::tell(run, &settings, &entries)
+        report::report(run, &settings, &entries)
     }
 
     /// The manoeuvres asked for, in the order of tables.
@@ -138,63 +119,13 @@ impl Args {
         Manoeuvre::ALL.into_iter().filter(asked)
     }
 
-    /// Every manoeuvre in every world.
-    fn score(
-        &self,
-        run: &Run,
-        scenario: &Scenario,
-        ways: &[Way],
-        worlds: &mut [Worlds<'_>],
-        seed: Seed,
-    ) -> anyhow::Result<Scored> {
-        let reactions = match Reactions::new(scenario, self.seconds.into()) {
-            Ok(reactions) => reactions,
-            Err(unfit) => return Ok(Scored::unfit(&unfit)),
-        };
-        let mut tried = Vec::new();
-        for manoeuvre in self.manoeuvres() {
-            let attempt = match reactions.attempt(manoeuvre) {
-                Ok(attempt) => attempt,
-                Err(reason) => {
-                    tried.push(Tried::not_scored(manoeuvre, reason));
-                    continue;
-                }
-            };
-            let mut seen = Vec::with_capacity(ways.len());
-            for (way, worlds) in ways.iter().zip(&mut *worlds) {
-                seen.push(self.drive(run, scenario, &attempt, way, worlds, seed)?);
-            }
-            tried.push(Tried::scored(manoeuvre, &attempt, seen));
-        }
-        Ok(Scored { unfit: None, tried })
-    }
-
-    /// One manoeuvre in one world.
-    fn drive(
-        &self,
-        run: &Run,
-        scenario: &Scenario,
-        attempt: &Attempt<'_>,
-        way: &Way,
-        worlds: &mut Worlds<'_>,
-        seed: Seed,
-    ) -> anyhow::Result<Seen> {
-        let world = worlds.of(scenario)?;
-        let n = way.futures(self.futures.get());
-        let frames = way.decoding.frames(self.seconds.into());
-        let mut ego = Scripted::new(attempt.plan(), scenario.dt);
-        let driver = Some(&mut ego as &mut dyn gump_rollout::Policy);
-        let imagined = imagine_around(run, world, scenario, n, &frames, seed, driver)?;
-        Ok(Seen::of(attempt, &imagined.rollouts))
-    }
-
     fn settings(
         &self,
         run: &Run,
         scenarios: &ScenarioSet,
-        ways: &[Way],
-    ) -> anyhow::Result<Settings> {
-        Ok(Settings {
+        columns: &[DecodedWorld],
+    ) -> anyhow::Result<ReactionSettings> {
+        Ok(ReactionSettings {
             scenarios: scenarios.name.clone(),
             manoeuvres: self.manoeuvres().map(|one| one.name().into()).collect(),
             seconds: self.seconds,
@@ -202,7 +133,7 @@ impl Args {
             limit: self.limit.map(NonZeroUsize::get),
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
-            worlds: ways.iter().map(Way::named).collect(),
+            worlds: columns.iter().map(DecodedWorld::name).collect(),
         })
     }
 }

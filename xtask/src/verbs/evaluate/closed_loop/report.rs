@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gump_eval::closed_loop::{ClosedLoopSettings, DriveOutcome, ScenarioDrives};
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
@@ -10,7 +11,6 @@ use gump_scene::Seed;
 use gump_viz::Bars;
 use serde_json::{Value, json};
 
-use super::{Driven, Outcome, Settings};
 use crate::run::Run;
 use crate::verbs::evaluate::{any_succeeded, ranking};
 use crate::{charts, tables};
@@ -28,14 +28,14 @@ pub(in crate::verbs::evaluate) const COLUMNS: [(&str, &str); 8] = [
 ];
 
 /// A row of a world's table: one planner, every scenario.
-pub(in crate::verbs::evaluate) struct Drives<'a> {
-    /// Who drove.
+pub(in crate::verbs::evaluate) struct PlannerDrives<'a> {
+    /// Name of the planner.
     pub(in crate::verbs::evaluate) planner: String,
     /// Scenario by scenario.
-    drives: Vec<(&'a Entry<Driven>, &'a Outcome)>,
+    drives: Vec<(&'a Entry<ScenarioDrives>, &'a DriveOutcome)>,
 }
 
-impl Drives<'_> {
+impl PlannerDrives<'_> {
     /// The scores of the scenarios, in their order; `None` where one failed.
     pub(in crate::verbs::evaluate) fn scores(&self) -> impl Iterator<Item = Option<f64>> + '_ {
         let outcomes = self.drives.iter().map(|(_, outcome)| outcome);
@@ -43,21 +43,21 @@ impl Drives<'_> {
     }
 }
 
-/// The report of the shards in some folders.
-pub(crate) fn tell_merged(
+/// Reports on the shards in some folders.
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Driven>(folders, missing)?;
-    tell(run, &header.settings.try_into()?, &entries)
+    let (header, entries) = results::merge::<ScenarioDrives>(folders, missing)?;
+    report(run, &header.settings.try_into()?, &entries)
 }
 
 /// Fills the report of a run.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
-    settings: &Settings,
-    entries: &[Entry<Driven>],
+    settings: &ClosedLoopSettings,
+    entries: &[Entry<ScenarioDrives>],
 ) -> anyhow::Result<()> {
     run.result("set", &settings.scenarios)?;
     let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
@@ -71,7 +71,7 @@ pub(super) fn tell(
             run.say(&ranking::table_of(&world, &told, run.width()));
         }
         rows.extend(told);
-        let of_row = |row: &Drives<'_>| -> Vec<Value> {
+        let of_row = |row: &PlannerDrives<'_>| -> Vec<Value> {
             let drives = row.drives.iter();
             let told = drives.map(|(entry, outcome)| tell_one(entry, outcome, &row.planner));
             told.collect()
@@ -91,8 +91,8 @@ pub(super) fn tell(
 }
 
 /// The rows of a world's table, planners in their order.
-fn of_world<'a>(entries: &'a [Entry<Driven>], world: &str) -> Vec<Drives<'a>> {
-    let mut rows: Vec<(bool, Drives<'a>)> = Vec::new();
+fn of_world<'a>(entries: &'a [Entry<ScenarioDrives>], world: &str) -> Vec<PlannerDrives<'a>> {
+    let mut rows: Vec<(bool, PlannerDrives<'a>)> = Vec::new();
     for entry in entries {
         let of_world = entry.scores.outcomes.iter();
         for outcome in of_world.filter(|outcome| outcome.world == world) {
@@ -102,7 +102,7 @@ fn of_world<'a>(entries: &'a [Entry<Driven>], world: &str) -> Vec<Drives<'a>> {
             match known {
                 Some((_, row)) => row.drives.push((entry, outcome)),
                 None => {
-                    let row = Drives {
+                    let row = PlannerDrives {
                         planner: outcome.planner.clone(),
                         drives: vec![(entry, outcome)],
                     };
@@ -123,9 +123,9 @@ fn of_world<'a>(entries: &'a [Entry<Driven>], world: &str) -> Vec<Drives<'a>> {
 
 /// Of proposals that were each driven to the end: the one that is best on average, and the best of
 /// every scenario, which no one who does not know the outcome can choose.
-fn best_and_oracle(mut alone: Vec<Drives<'_>>) -> Vec<Drives<'_>> {
-    let average = |drives: &Drives<'_>| mean(&drives.scores().flatten().collect::<Vec<_>>());
-    let value = |drives: &Drives<'_>| average(drives).unwrap_or(f64::NEG_INFINITY);
+fn best_and_oracle(mut alone: Vec<PlannerDrives<'_>>) -> Vec<PlannerDrives<'_>> {
+    let average = |drives: &PlannerDrives<'_>| mean(&drives.scores().flatten().collect::<Vec<_>>());
+    let value = |drives: &PlannerDrives<'_>| average(drives).unwrap_or(f64::NEG_INFINITY);
     let best = (0..alone.len()).fold(0, |best, i| {
         if value(&alone[i]) > value(&alone[best]) {
             i
@@ -136,12 +136,12 @@ fn best_and_oracle(mut alone: Vec<Drives<'_>>) -> Vec<Drives<'_>> {
     let n = alone[best].drives.len();
     let oracle = (0..n).map(|scene| {
         let mut drives: Vec<_> = alone.iter().map(|row| row.drives[scene]).collect();
-        let score = |outcome: &Outcome| outcome.finished.as_ref().map_or(-1.0, |f| f.score);
+        let score = |outcome: &DriveOutcome| outcome.finished.as_ref().map_or(-1.0, |f| f.score);
         // The first of the best: the sort is stable.
         drives.sort_by(|a, b| score(b.1).total_cmp(&score(a.1)));
         drives[0]
     });
-    let oracle = Drives {
+    let oracle = PlannerDrives {
         planner: "oracle of the proposals".into(),
         drives: oracle.collect(),
     };
@@ -150,7 +150,7 @@ fn best_and_oracle(mut alone: Vec<Drives<'_>>) -> Vec<Drives<'_>> {
     vec![best, oracle]
 }
 
-fn tell_one(entry: &Entry<Driven>, outcome: &Outcome, planner: &str) -> Value {
+fn tell_one(entry: &Entry<ScenarioDrives>, outcome: &DriveOutcome, planner: &str) -> Value {
     let mut told = json!({
         "id": entry.id,
         "planner": planner,
@@ -169,11 +169,11 @@ fn tell_one(entry: &Entry<Driven>, outcome: &Outcome, planner: &str) -> Value {
 }
 
 /// Every drive that reached its end, as nuPlan's own tables show it.
-fn nuplan_table(worlds: &[(String, Vec<Drives<'_>>)]) -> gump_data::Table {
+fn nuplan_table(worlds: &[(String, Vec<PlannerDrives<'_>>)]) -> gump_data::Table {
     let mut nuplan = tables::NuPlan::default();
     for (world, rows) in worlds {
         for row in rows {
-            let finished: Vec<(&Entry<Driven>, f64, MetricScores)> = row
+            let finished: Vec<(&Entry<ScenarioDrives>, f64, MetricScores)> = row
                 .drives
                 .iter()
                 .filter_map(|(entry, outcome)| {
@@ -199,7 +199,7 @@ fn nuplan_table(worlds: &[(String, Vec<Drives<'_>>)]) -> gump_data::Table {
 }
 
 /// Means over the scenarios that were driven to the end; how many were not stands beside them.
-fn row(row: &Drives<'_>, world: &str, seed: Seed) -> Value {
+fn row(row: &PlannerDrives<'_>, world: &str, seed: Seed) -> Value {
     let outcomes = row.drives.iter().map(|(_, outcome)| outcome);
     let done: Vec<_> = outcomes.filter_map(|o| o.finished.as_ref()).collect();
     let scores: Vec<f64> = done.iter().map(|finished| finished.score).collect();

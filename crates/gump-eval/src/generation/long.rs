@@ -1,33 +1,27 @@
-//! The long part of `evaluate generation`: thirty seconds of traffic with and without agents that
-//! come and leave and lights that change, against what was simulated by rules.
+//! Half a minute of traffic in which agents come and leave and lights change, observed in a world
+//! beside what was simulated by rules.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
 
-use gump_engine::SamplingConfig;
-use gump_eval::worlds::World;
 use gump_rollout::{BoxError, Start, WorldModel};
 use gump_scene::{AgentId, Frame, LaneId, LightState, Scenario, SceneState, Seed};
 use gump_synthesis::{SynthesisConfig, try_synthesize};
-use gump_viz::Bars;
 use rayon::prelude::*;
-use serde_json::{Value, json};
+use serde::Serialize;
 
-use crate::charts;
-use crate::run::{Run, stop_if_interrupted};
-use crate::shipped;
-use crate::verbs::generate;
+use crate::EvalError;
 
-/// How far ahead is imagined.
+/// Length of the futures, seconds.
 const SECONDS: f64 = 30.0;
 /// Worlds are looked at as often as networks step, seconds.
 const DT: f64 = 0.5;
 /// Agents are counted up to this distance from the ego along either axis of the world, metres.
 const COUNTED_M: f64 = 80.0;
 
-/// What frames of half a minute show.
-#[derive(Clone, Default)]
-struct Seen {
+/// Observations of one scene over half a minute.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LongObservation {
+    /// Agents around the ego at the end.
     at_end: f64,
     /// How far from the ego agents come, and leave, metres.
     entries_m: Vec<f64>,
@@ -40,53 +34,75 @@ struct Seen {
     phases_s: [Vec<f64>; 3],
 }
 
+/// The observations of several scenes beside those of the log; `None` where nothing was observed.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LongSummary {
+    /// Number of scenes.
+    pub scenes: usize,
+    /// Agents around the ego after 30 s, mean over scenes.
+    pub agents_at_30_s: f64,
+    /// Mean absolute difference of that number from the log's.
+    pub agent_count_error: f64,
+    /// Agents that come per scene.
+    pub entries: f64,
+    /// Agents that leave per scene.
+    pub exits: f64,
+    /// Mean distance from the ego at which agents come, metres.
+    pub entry_m: Option<f64>,
+    /// Mean distance from the ego at which agents leave, metres.
+    pub exit_m: Option<f64>,
+    /// Wasserstein distance of the former distances from the log's, metres.
+    pub entry_off_m: Option<f64>,
+    /// Wasserstein distance of the latter distances from the log's, metres.
+    pub exit_off_m: Option<f64>,
+    /// Changes per traffic light.
+    pub changes_per_light: f64,
+    /// Share of changes from green to yellow, yellow to red, red to green.
+    pub changes_in_order: f64,
+    /// Mean length of green, seconds.
+    pub green_s: Option<f64>,
+    /// Mean length of yellow, seconds.
+    pub yellow_s: Option<f64>,
+    /// Mean length of red, seconds.
+    pub red_s: Option<f64>,
+    /// Wasserstein distance of the lengths from the log's, mean over colours, seconds.
+    pub phase_off_s: Option<f64>,
+}
+
 /// What lights show, in the order in which they do.
 const COLOURS: [LightState; 3] = [LightState::Green, LightState::Yellow, LightState::Red];
 
-/// One row per world: log, frozen casts, traffic that lives.
-///
-/// Error: weights that cannot be read, or a world that fails.
-pub(super) fn rows(run: &Run, weights: Option<&PathBuf>, n: usize) -> anyhow::Result<Vec<Value>> {
+/// At most `n` synthetic scenes with 30 s of future. There are fewer where more than half fail: few
+/// agents drive through a scene for half a minute, and in some scenes nobody does.
+pub fn long_scenes(n: usize, seed: Seed) -> Vec<Scenario> {
     let config = SynthesisConfig {
         future_s: SECONDS,
         ..SynthesisConfig::standard()
     };
-    let seed = run.seed();
-    // Few drive through a scene for half a minute, and in some scenes nobody does.
     let mut scenarios: Vec<Scenario> = (0..2 * n as u64)
         .into_par_iter()
         .filter_map(|i| try_synthesize(&config, seed.fork(100 + i)))
         .collect();
     scenarios.truncate(n);
-    let logged: Vec<Seen> = scenarios
-        .iter()
-        .map(|scenario| seen(scenario.present(), &strided(scenario, DT)))
-        .collect();
-    let mut rows = vec![row("log", &logged, &logged)];
-    for (name, life) in [("those who are there", false), ("life", true)] {
-        stop_if_interrupted()?;
-        let sampling = SamplingConfig {
-            life,
-            ..SamplingConfig::default()
-        };
-        let traffic = World::without_log(run.device(), &shipped::world(), &sampling)?;
-        let imagined = imagined(traffic.model(), &scenarios, seed)?;
-        rows.push(row(name, &imagined, &logged));
-    }
-    stop_if_interrupted()?;
-    let world = generate::world(run.device(), weights, true)?;
-    let imagined = imagined(&world, &scenarios, seed)?;
-    rows.push(row("life of the sequence network", &imagined, &logged));
-    Ok(rows)
+    scenarios
 }
 
-/// What each scene shows when its ego drives as it was recorded: how many are around it depends on
-/// where it goes first of all.
-fn imagined(
+/// The observations of the logs.
+pub fn observe_logs(scenarios: &[Scenario]) -> Vec<LongObservation> {
+    let of_log = |scenario: &Scenario| observe(scenario.present(), &strided(scenario, DT));
+    scenarios.iter().map(of_log).collect()
+}
+
+/// The observations of one future of each scene in a world. The ego drives as it was recorded, because
+/// the number of agents around it depends on where it goes first of all.
+///
+/// # Errors
+/// What the world reports.
+pub fn observe_world(
     world: &dyn WorldModel,
     scenarios: &[Scenario],
     seed: Seed,
-) -> anyhow::Result<Vec<Seen>> {
+) -> Result<Vec<LongObservation>, EvalError> {
     let one = |(i, scenario): (usize, &Scenario)| {
         let start = Start {
             scene: scenario.present(),
@@ -104,8 +120,8 @@ fn imagined(
             Ok(frames)
         };
         let frames: Result<Vec<Frame>, BoxError> = imagine();
-        let frames = frames.map_err(|error| anyhow::anyhow!(error))?;
-        Ok(seen(scenario.present(), &frames))
+        let frames = frames.map_err(EvalError::of_simulation)?;
+        Ok(observe(scenario.present(), &frames))
     };
     scenarios.par_iter().enumerate().map(one).collect()
 }
@@ -117,9 +133,9 @@ fn strided(scenario: &Scenario, dt: f64) -> Vec<Frame> {
     frames.step_by(stride).cloned().collect()
 }
 
-/// What frames after a present show.
-fn seen(present: SceneState<'_>, frames: &[Frame]) -> Seen {
-    let mut seen = Seen::default();
+/// The observations of the frames after a present.
+fn observe(present: SceneState<'_>, frames: &[Frame]) -> LongObservation {
+    let mut seen = LongObservation::default();
     let mut before = present.now();
     let mut began: BTreeMap<LaneId, usize> = BTreeMap::new();
     for (i, frame) in frames.iter().enumerate() {
@@ -169,17 +185,19 @@ fn near(frame: &Frame, ego: AgentId) -> BTreeSet<AgentId> {
         .collect()
 }
 
-fn row(world: &str, seen: &[Seen], logged: &[Seen]) -> Value {
+/// Sums observations up, beside those of the log of the same scenes.
+pub fn summarize_long(seen: &[LongObservation], logged: &[LongObservation]) -> LongSummary {
     let n = seen.len().max(1) as f64;
-    let sum = |of: fn(&Seen) -> f64| seen.iter().map(of).sum::<f64>();
+    let sum = |of: fn(&LongObservation) -> f64| seen.iter().map(of).sum::<f64>();
     let pairs = seen.iter().zip(logged);
     let error: f64 = pairs.map(|(a, b)| (a.at_end - b.at_end).abs()).sum();
     let mean = |values: &[f64]| {
         let n = values.len();
         (n > 0).then(|| values.iter().sum::<f64>() / n as f64)
     };
-    let all = |of: fn(&Seen) -> &[f64]| {
-        let pool = |seen: &[Seen]| seen.iter().flat_map(of).copied().collect::<Vec<f64>>();
+    let all = |of: fn(&LongObservation) -> &[f64]| {
+        let pool =
+            |seen: &[LongObservation]| seen.iter().flat_map(of).copied().collect::<Vec<f64>>();
         (pool(seen), pool(logged))
     };
     let (entries, logged_entries) = all(|s| &s.entries_m);
@@ -192,24 +210,23 @@ fn row(world: &str, seen: &[Seen], logged: &[Seen]) -> Value {
     let off = [&green, &yellow, &red];
     let off = off.map(|(own, logged)| apart(own, logged));
     let off: Vec<f64> = off.into_iter().flatten().collect();
-    json!({
-        "world": world,
-        "scenes": seen.len(),
-        "agents_at_30_s": sum(|s| s.at_end) / n,
-        "agent_count_error": error / n,
-        "entries": entries.len() as f64 / n,
-        "exits": exits.len() as f64 / n,
-        "entry_m": mean(&entries),
-        "exit_m": mean(&exits),
-        "entry_off_m": apart(&entries, &logged_entries),
-        "exit_off_m": apart(&exits, &logged_exits),
-        "changes_per_light": sum(|s| s.light_changes) / sum(|s| s.lights).max(1.0),
-        "changes_in_order": sum(|s| s.in_order) / sum(|s| s.light_changes).max(1.0),
-        "green_s": mean(&green.0),
-        "yellow_s": mean(&yellow.0),
-        "red_s": mean(&red.0),
-        "phase_off_s": mean(&off),
-    })
+    LongSummary {
+        scenes: seen.len(),
+        agents_at_30_s: sum(|s| s.at_end) / n,
+        agent_count_error: error / n,
+        entries: entries.len() as f64 / n,
+        exits: exits.len() as f64 / n,
+        entry_m: mean(&entries),
+        exit_m: mean(&exits),
+        entry_off_m: apart(&entries, &logged_entries),
+        exit_off_m: apart(&exits, &logged_exits),
+        changes_per_light: sum(|s| s.light_changes) / sum(|s| s.lights).max(1.0),
+        changes_in_order: sum(|s| s.in_order) / sum(|s| s.light_changes).max(1.0),
+        green_s: mean(&green.0),
+        yellow_s: mean(&yellow.0),
+        red_s: mean(&red.0),
+        phase_off_s: mean(&off),
+    }
 }
 
 /// How far apart two distributions are, in the unit of their values: the area between their
@@ -230,28 +247,9 @@ fn apart(a: &[f64], b: &[f64]) -> Option<f64> {
     Some(off.sum::<f64>() / N as f64)
 }
 
-/// What changes in half a minute, in every world.
-pub(super) fn chart(rows: &[Value]) -> Bars {
-    let counts = [
-        ("agents at 30 s", "agents_at_30_s"),
-        ("error of the count", "agent_count_error"),
-        ("entries", "entries"),
-        ("exits", "exits"),
-        ("changes per light", "changes_per_light"),
-    ];
-    let worlds = rows.iter().filter_map(|row| row["world"].as_str());
-    let legend = worlds.map(String::from).collect();
-    let label = "within 80 m of the ego, mean over scenes";
-    let names = counts.map(|(name, _)| name.into()).into();
-    charts::bars(label, names, legend, |count, world| {
-        charts::bar(&rows[world][counts[count].1], &Value::Null, &Value::Null)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use gump_scene::{Light, fixture};
-    use gump_viz::log_as_rollout;
 
     use super::*;
 
@@ -263,8 +261,7 @@ mod tests {
              agent vehicle 2: -90,0 velocity 5,0\nagent pedestrian 3: 5,5",
         )
         .unwrap();
-        let rollout = log_as_rollout(&scenario);
-        let found = seen(scenario.present(), rollout.imagined());
+        let found = observe(scenario.present(), scenario.future());
         let counts = (found.entries_m.len(), found.exits_m.len());
         assert_eq!((counts, found.at_end), ((1, 1), 2.0));
         assert!((found.exits_m[0] - 80.0).abs() < 1.0 && (found.entries_m[0] - 80.0).abs() < 1.0);
@@ -287,7 +284,7 @@ mod tests {
         shown.extend([red; 10]);
         shown.extend([yellow; 3]);
         let frames: Vec<Frame> = shown.into_iter().map(frame).collect();
-        let found = seen(scenario.present(), &frames);
+        let found = observe(scenario.present(), &frames);
         // Green was there before the first change, the last yellow goes on.
         assert_eq!(found.phases_s, [vec![], vec![3.0], vec![5.0]]);
         assert_eq!((found.light_changes, found.in_order), (3.0, 2.0));

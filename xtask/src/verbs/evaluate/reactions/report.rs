@@ -1,9 +1,11 @@
-//! The report of an evaluation, from the entries of its ledger alone.
+//! The report of an evaluation, from stored results alone.
 
 use std::collections::BTreeMap;
 use std::ops::AddAssign;
 use std::path::PathBuf;
 
+use gump_eval::decoding::DecodedWorldName;
+use gump_eval::reactions::{ReactionSettings, ScenarioReactions, TriedManoeuvre, any_scored};
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::reactions::Manoeuvre;
 use gump_metrics::{Interval, intervals};
@@ -11,8 +13,7 @@ use gump_scene::Seed;
 use gump_viz::Bars;
 use serde_json::{Value, json};
 
-use super::super::ways::Named;
-use super::cells::{Scored, Settings, Tried};
+use super::super::columns::label;
 use crate::run::Run;
 use crate::{charts, table};
 
@@ -21,35 +22,15 @@ const DRAWS: usize = 1000;
 /// The row of all manoeuvres that leave the log.
 const ALL: &str = "all";
 
-/// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(
+/// Reports on the shards in some folders.
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scored>(folders, missing)?;
+    let (header, entries) = results::merge::<ScenarioReactions>(folders, missing)?;
     any_scored(&entries)?;
-    tell(run, &header.settings.try_into()?, &entries)
-}
-
-/// Fails with the most frequent reason if no manoeuvre of no scenario is scored.
-pub(super) fn any_scored(entries: &[Entry<Scored>]) -> anyhow::Result<()> {
-    let tried = || entries.iter().flat_map(|entry| &entry.scores.tried);
-    if tried().any(|one| one.why.is_none()) {
-        return Ok(());
-    }
-    let unfit = entries.iter().filter_map(|e| e.scores.unfit.as_deref());
-    let reasons = tried().filter_map(|one| one.why.as_deref()).chain(unfit);
-    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
-    for reason in reasons {
-        *counts.entry(reason).or_default() += 1;
-    }
-    let most = counts.iter().max_by_key(|(_, n)| **n);
-    anyhow::bail!(
-        "expected a scenario in which the ego can leave its log, found none among {}: most often {}",
-        entries.len(),
-        most.map_or("there was nothing to try", |(reason, _)| reason)
-    )
+    report(run, &header.settings.try_into()?, &entries)
 }
 
 /// Sums over manoeuvres of one scenario, or over scenarios.
@@ -82,7 +63,7 @@ impl AddAssign for Sum {
 }
 
 impl Sum {
-    fn of(tried: &Tried, world: usize) -> Option<Self> {
+    fn of(tried: &TriedManoeuvre, world: usize) -> Option<Self> {
         let seen = tried.worlds.get(world)?;
         let is_pressed = f64::from(u8::from(tried.log > 0));
         Some(Self {
@@ -111,7 +92,7 @@ impl Sum {
 
 /// A world and a manoeuvre over all scenarios.
 struct Line<'a> {
-    name: &'a Named,
+    name: &'a DecodedWorldName,
     manoeuvre: &'a str,
     sum: Sum,
     /// As [`Sum::rates`].
@@ -121,16 +102,16 @@ struct Line<'a> {
 impl<'a> Line<'a> {
     /// `None` if it was not driven in any scenario.
     fn of(
-        entries: &[Entry<Scored>],
-        name: &'a Named,
+        entries: &[Entry<ScenarioReactions>],
+        name: &'a DecodedWorldName,
         world: usize,
         manoeuvre: &'a str,
     ) -> Option<Self> {
-        let is_meant = |tried: &&Tried| match manoeuvre {
+        let is_meant = |tried: &&TriedManoeuvre| match manoeuvre {
             ALL => tried.manoeuvre != Manoeuvre::Log.name(),
             one => tried.manoeuvre == one,
         };
-        let of_scene = |entry: &Entry<Scored>| {
+        let of_scene = |entry: &Entry<ScenarioReactions>| {
             let meant = entry.scores.tried.iter().filter(is_meant);
             let sums = meant.filter_map(|tried| Sum::of(tried, world));
             sums.reduce(|mut a, b| {
@@ -205,7 +186,7 @@ impl<'a> Line<'a> {
         };
         let number = |x: Option<f64>| x.map_or("-".into(), |x| format!("{x:.2}"));
         json!({
-            "world": self.name.label(),
+            "world": label(self.name),
             "manoeuvre": self.manoeuvre,
             "scenes": sum.scenes as u64,
             "agents": sum.agents as u64,
@@ -219,10 +200,10 @@ impl<'a> Line<'a> {
 }
 
 /// Totals, intervals, the table and the chart.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
-    settings: &Settings,
-    entries: &[Entry<Scored>],
+    settings: &ReactionSettings,
+    entries: &[Entry<ScenarioReactions>],
 ) -> anyhow::Result<()> {
     let mut names: Vec<&str> = settings.manoeuvres.iter().map(String::as_str).collect();
     names.push(ALL);
@@ -247,7 +228,7 @@ pub(super) fn tell(
 }
 
 /// How often a manoeuvre is not scored, and why.
-fn not_scored(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Value> {
+fn not_scored(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>]) -> Vec<Value> {
     let tried = || entries.iter().flat_map(|entry| &entry.scores.tried);
     let mut rows = Vec::new();
     for name in &settings.manoeuvres {
@@ -263,7 +244,7 @@ fn not_scored(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Value> {
 }
 
 /// Everybody that ran into the ego, for whoever wants to look.
-fn cases(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Value> {
+fn cases(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>]) -> Vec<Value> {
     let mut rows = Vec::new();
     for entry in entries {
         for tried in &entry.scores.tried {
@@ -287,8 +268,8 @@ fn cases(settings: &Settings, entries: &[Entry<Scored>]) -> Vec<Value> {
 }
 
 /// Names scenarios that say nothing.
-fn left_out(run: &mut Run, entries: &[Entry<Scored>]) -> anyhow::Result<()> {
-    let why = |entry: &Entry<Scored>| {
+fn left_out(run: &mut Run, entries: &[Entry<ScenarioReactions>]) -> anyhow::Result<()> {
+    let why = |entry: &Entry<ScenarioReactions>| {
         let why = entry.scores.unfit.as_ref()?;
         Some(format!("scenario {}: {why}", entry.id))
     };
@@ -300,8 +281,8 @@ fn left_out(run: &mut Run, entries: &[Entry<Scored>]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn chart(settings: &Settings, names: &[&str], lines: &[Line<'_>]) -> Bars {
-    let legend = settings.worlds.iter().map(Named::label).collect();
+fn chart(settings: &ReactionSettings, names: &[&str], lines: &[Line<'_>]) -> Bars {
+    let legend = settings.worlds.iter().map(label).collect();
     let rows = names.iter().map(|name| (*name).to_owned()).collect();
     let label = "share of agents near that run into the ego, with 95 % intervals over scenarios";
     charts::bars(label, rows, legend, |row, column| {

@@ -2,20 +2,18 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
-use gump_eval::benchmarks::{BenchmarkList, MadePart, checksums, sha256, verify_made};
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{SumoDemand, SynthesisConfig, synthesize};
 use rayon::prelude::*;
 
-use crate::progress::Progress;
-use crate::run::{Unseen, stop_if_interrupted};
-use crate::sumo::{FUTURE_S, Place, Sumo};
+use super::{BenchmarkList, MadePart, checksums, sha256, verify_made};
+use crate::sumo::{FUTURE_S, Sumo, SumoNetwork};
+use crate::{EvalError, Monitor};
 
-/// So many runs of SUMO more than are needed mean that there is no room to drive.
+/// Runs of SUMO beyond those needed, after which there is no room to drive.
 const SPARE_RUNS: u64 = 200;
 
-/// Which generator, and its version.
+/// A generator of some version.
 enum Generator {
     Procedural(SynthesisConfig),
     Sumo(SumoDemand),
@@ -25,7 +23,7 @@ impl Generator {
     /// The generator of a part.
     ///
     /// Error: a generator or a version that this build does not have.
-    fn of(part: &MadePart) -> anyhow::Result<Self> {
+    fn of(part: &MadePart) -> Result<Self, EvalError> {
         let mut generator = Self::named(&part.generator)?;
         if let Some(asked) = part.density {
             let (Self::Procedural(SynthesisConfig { density, .. })
@@ -35,7 +33,7 @@ impl Generator {
         Ok(generator)
     }
 
-    fn named(name: &str) -> anyhow::Result<Self> {
+    fn named(name: &str) -> Result<Self, EvalError> {
         let known = name.split_once('/').and_then(|(kind, version)| {
             let version = version.parse().ok()?;
             match kind {
@@ -44,75 +42,79 @@ impl Generator {
                 _ => None,
             }
         });
-        known.with_context(|| {
+        known.ok_or_else(|| {
             let newest = gump_synthesis::GENERATOR_VERSION;
-            format!(
+            EvalError::Benchmark(format!(
                 "expected the generator procedural/N or sumo/N with N from 1 to {newest}, \
                  found {name}"
-            )
+            ))
         })
     }
 }
 
-/// Makes the file of a part below `folder`, where it is not there yet as it should be; true if it
-/// was made.
+/// Makes the file of a part below `folder`, unless it is there and verified; true if it was made. The
+/// monitor counts scenes.
 ///
-/// Error: SUMO is missing or of another version, a network differs, or scenes come out otherwise
-/// than the list says.
-pub(crate) fn make(
+/// # Errors
+/// SUMO is missing or of another version, a network differs, the scenes differ from the list's
+/// checksums, or [`EvalError::Stopped`].
+pub fn make(
     list: &BenchmarkList,
     part: &MadePart,
     folder: &Path,
-    progress: &Progress,
-) -> anyhow::Result<bool> {
-    if !part.scenes.is_empty() && verify_made(list, part, folder, &Unseen).is_ok() {
-        progress.advance(part.kept() as u64);
+    monitor: &dyn Monitor,
+) -> Result<bool, EvalError> {
+    let check = || verify_made(list, part, folder, monitor);
+    if !part.scenes.is_empty() && check().is_ok() {
+        monitor.advance(part.kept() as u64);
         return Ok(false);
     }
-    write(list, part, folder, progress)?;
-    verify_made(list, part, folder, &Unseen).with_context(|| {
+    write(list, part, folder, monitor)?;
+    check().map_err(|error| {
         let n = gump_synthesis::GENERATOR_VERSION;
-        format!(
+        error.at(&format!(
             "scenes of {} come out otherwise than they were frozen (newest version: {n})",
             part.generator
-        )
+        ))
     })?;
     Ok(true)
 }
 
-/// Makes the file of a part and returns what the list should say of its scenes.
+/// Makes the file of a part and returns the checksums and ids that the list should have for its
+/// scenes.
 ///
-/// Error: as [`make`], sums aside.
-pub(crate) fn freeze(
+/// # Errors
+/// As [`make`], checksums aside.
+pub fn freeze(
     list: &BenchmarkList,
     part: &MadePart,
     folder: &Path,
-    progress: &Progress,
-) -> anyhow::Result<Vec<String>> {
-    write(list, part, folder, progress)?;
-    Ok(checksums(&list.file(folder, part), &Unseen)?)
+    monitor: &dyn Monitor,
+) -> Result<Vec<String>, EvalError> {
+    write(list, part, folder, monitor)?;
+    checksums(&list.file(folder, part), monitor)
 }
 
 fn write(
     list: &BenchmarkList,
     part: &MadePart,
     folder: &Path,
-    progress: &Progress,
-) -> anyhow::Result<()> {
+    monitor: &dyn Monitor,
+) -> Result<(), EvalError> {
     let scenes = match Generator::of(part)? {
         Generator::Procedural(config) => (0..part.count as u64)
             .into_par_iter()
             .filter(|&k| part.keeps(k as usize))
             .map(|k| {
-                stop_if_interrupted()?;
+                monitor.check()?;
                 let scene = synthesize(&config, Seed(part.seed).fork(k));
-                progress.advance(1);
+                monitor.advance(1);
                 Ok(scene)
             })
-            .collect::<anyhow::Result<Vec<_>>>()?,
+            .collect::<Result<Vec<_>, EvalError>>()?,
         Generator::Sumo(demand) => {
             let path = list.file(folder, part).with_extension("work");
-            let mut scenes = Simulation::begin(list, part, demand, path)?.scenes(progress)?;
+            let mut scenes = Simulation::begin(list, part, demand, path)?.scenes(monitor)?;
             let mut index = 0;
             scenes.retain(|_| {
                 index += 1;
@@ -123,10 +125,13 @@ fn write(
     };
     let path = list.file(folder, part);
     let parent = path.parent().unwrap_or(folder);
-    std::fs::create_dir_all(parent)
-        .with_context(|| format!("cannot create the folder {}", parent.display()))?;
+    create_folder(parent)?;
     gump_data::womd::write_scenarios(&path, scenes)?;
     Ok(())
+}
+
+fn create_folder(path: &Path) -> Result<(), EvalError> {
+    std::fs::create_dir_all(path).map_err(|cause| EvalError::io("create the folder", path, cause))
 }
 
 /// SUMO at work on a part.
@@ -135,7 +140,7 @@ struct Simulation<'a> {
     sumo: Sumo,
     demand: SumoDemand,
     /// Networks to take in turn; none: made anew for every run.
-    places: Vec<Place>,
+    places: Vec<SumoNetwork>,
     work: PathBuf,
 }
 
@@ -145,30 +150,31 @@ impl<'a> Simulation<'a> {
         part: &'a MadePart,
         demand: SumoDemand,
         work: PathBuf,
-    ) -> anyhow::Result<Self> {
-        let sumo = Sumo::find().with_context(|| format!("cannot make the part {}", part.file))?;
+    ) -> Result<Self, EvalError> {
+        let place = format!("cannot make the part {}", part.file);
+        let sumo = Sumo::find().map_err(|error| error.at(&place))?;
         let (expected, found) = (part.sumo.as_deref().unwrap_or_default(), sumo.version()?);
-        anyhow::ensure!(
-            found
-                .split_whitespace()
-                .any(|word| { word.trim_start_matches(['v', 'V']) == expected }),
-            "the part {} of {} expects SUMO {expected} \
-             (`pip install eclipse-sumo=={expected}`), found \"{found}\"",
-            part.file,
-            list.path().display()
-        );
-        std::fs::create_dir_all(&work)
-            .with_context(|| format!("cannot create the folder {}", work.display()))?;
+        let mut words = found.split_whitespace();
+        if !words.any(|word| word.trim_start_matches(['v', 'V']) == expected) {
+            return Err(EvalError::Sumo(format!(
+                "the part {} of {} expects SUMO {expected} \
+                 (`pip install eclipse-sumo=={expected}`), found \"{found}\"",
+                part.file,
+                list.path().display()
+            )));
+        }
+        create_folder(&work)?;
         let mut places = Vec::new();
         for network in &part.networks {
             let path = list.beside(&network.path);
             let found = sha256(&path)?;
-            anyhow::ensure!(
-                found == network.sha256,
-                "expected a network of SHA-256 {}, found {found}: {}",
-                network.sha256,
-                path.display()
-            );
+            if found != network.sha256 {
+                return Err(EvalError::Benchmark(format!(
+                    "expected a network of SHA-256 {}, found {found}: {}",
+                    network.sha256,
+                    path.display()
+                )));
+            }
             places.push(sumo.prepare(&path, &work)?);
         }
         Ok(Self {
@@ -182,40 +188,40 @@ impl<'a> Simulation<'a> {
 
     /// Run `r` comes from `seed.fork(r)` and scenes are taken in the order of their runs, so the
     /// number of threads changes nothing.
-    fn scenes(self, progress: &Progress) -> anyhow::Result<Vec<Scenario>> {
+    fn scenes(self, monitor: &dyn Monitor) -> Result<Vec<Scenario>, EvalError> {
         let (count, per_run) = (self.part.count, self.part.per_run.unwrap_or(1).max(1));
         let (mut scenes, mut next) = (Vec::new(), 0_u64);
         let most = count.div_ceil(per_run) as u64 + SPARE_RUNS;
         while scenes.len() < count {
-            anyhow::ensure!(
-                next < most,
-                "{next} runs of SUMO gave {} scenes of the {count} of part {}: \
-                 is there room to drive?",
-                scenes.len(),
-                self.part.file
-            );
+            if next >= most {
+                return Err(EvalError::Sumo(format!(
+                    "{next} runs of SUMO gave {} scenes of the {count} of part {}: \
+                     is there room to drive?",
+                    scenes.len(),
+                    self.part.file
+                )));
+            }
             let runs = (count - scenes.len()).div_ceil(per_run) as u64;
             let found = (next..next + runs).into_par_iter().map(|r| {
+                monitor.check()?;
                 let found = self.run(r, per_run)?;
-                progress.advance(found.len() as u64);
+                monitor.advance(found.len() as u64);
                 Ok(found)
             });
-            let found = found.collect::<anyhow::Result<Vec<_>>>()?;
+            let found = found.collect::<Result<Vec<_>, EvalError>>()?;
             scenes.extend(found.into_iter().flatten());
             next += runs;
         }
         scenes.truncate(count);
         std::fs::remove_dir_all(&self.work)
-            .with_context(|| format!("cannot remove {}", self.work.display()))?;
+            .map_err(|cause| EvalError::io("remove", &self.work, cause))?;
         Ok(scenes)
     }
 
     /// A few scenes of a run, from its whole length.
-    fn run(&self, r: u64, few: usize) -> anyhow::Result<Vec<Scenario>> {
-        stop_if_interrupted()?;
+    fn run(&self, r: u64, few: usize) -> Result<Vec<Scenario>, EvalError> {
         let folder = self.work.join(format!("run-{r:05}"));
-        std::fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        create_folder(&folder)?;
         let seed = Seed(self.part.seed).fork(r);
         let fresh;
         let place = match self.places.get(r as usize % self.places.len().max(1)) {
@@ -243,7 +249,7 @@ impl<'a> Simulation<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::machine::repository;
+    use crate::benchmarks::tests::repository;
 
     fn shipped(name: &str) -> BenchmarkList {
         BenchmarkList::read(&repository().join(format!("datasets/benchmarks/{name}.toml"))).unwrap()
@@ -252,7 +258,6 @@ mod tests {
     /// The first scenes of the parts that are `wanted` come out as the lists say.
     fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&MadePart) -> bool) {
         let folder = tempfile::tempdir().unwrap();
-        let silent = Progress::begin(true, "", 0, "");
         let mut parts = 0;
         for name in ["synthetic-tune", "synthetic-test"] {
             let list = shipped(name);
@@ -262,9 +267,9 @@ mod tests {
                     scenes: part.scenes[..n].to_vec(),
                     ..part.clone()
                 };
-                assert!(make(&list, &first, folder.path(), &silent).unwrap());
-                // What is there as it should be is left alone.
-                assert!(!make(&list, &first, folder.path(), &silent).unwrap());
+                assert!(make(&list, &first, folder.path(), &()).unwrap());
+                // A verified file is left alone.
+                assert!(!make(&list, &first, folder.path(), &()).unwrap());
                 parts += 1;
             }
         }
@@ -297,7 +302,6 @@ mod tests {
     #[test]
     fn scenes_that_differ_and_generators_that_are_not_there_are_told() {
         let folder = tempfile::tempdir().unwrap();
-        let silent = Progress::begin(true, "", 0, "");
         let list = shipped("synthetic-tune");
         let part = MadePart {
             count: 1,
@@ -305,10 +309,8 @@ mod tests {
             ..list.made[0].clone()
         };
         let error = |part: &MadePart| {
-            format!(
-                "{:#}",
-                make(&list, part, folder.path(), &silent).unwrap_err()
-            )
+            let made = make(&list, part, folder.path(), &());
+            made.unwrap_err().to_string()
         };
         let told = error(&part);
         assert!(told.contains("expected scene 0 of procedural"), "{told}");

@@ -1,46 +1,52 @@
 //! Draws a list from a larger one: at random, or by what planners scored in its scenes.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
-use anyhow::Context as _;
-use gump_eval::benchmarks::{BenchmarkList, MadePart, RecordedPart};
-use gump_eval::datasets::Split;
 use gump_scene::Seed;
 use rand::Rng as _;
-use serde_json::Value;
 
-/// Which scenes are drawn.
-pub(crate) struct Draw<'a> {
+use super::{BenchmarkList, MadePart, RecordedPart};
+use crate::EvalError;
+use crate::datasets::Split;
+
+/// The choice of scenes for a new list.
+#[derive(Clone, Debug)]
+pub struct ListDraw<'a> {
     /// The name of the new list.
-    pub(crate) name: String,
-    pub(crate) rule: Rule<'a>,
-    /// Of every split at most so many, by chance.
-    pub(crate) at_most: usize,
-    pub(crate) seed: Seed,
+    pub name: String,
+    /// The scenes that may be drawn.
+    pub rule: DrawRule<'a>,
+    /// Number of scenes of each split at most.
+    pub at_most: usize,
+    /// The seed of the choice.
+    pub seed: Seed,
 }
 
-/// Which scenes may be drawn.
-pub(crate) enum Rule<'a> {
+/// The scenes that may be drawn.
+#[derive(Clone, Copy, Debug)]
+pub enum DrawRule<'a> {
     /// All of them.
     Any,
-    /// Those whose worst score is below a bound.
+    /// Those whose worst score is below a bound; scores by the ids of scenes.
     Below(f64, &'a BTreeMap<String, f64>),
 }
 
-impl Draw<'_> {
+impl ListDraw<'_> {
     /// The scenes of `list` that are drawn, in their order.
     ///
-    /// Error: a list without sums, or nothing that may be drawn.
-    pub(crate) fn of(&self, list: &BenchmarkList) -> anyhow::Result<BenchmarkList> {
+    /// # Errors
+    /// [`EvalError::Benchmark`] for a list without checksums, or if nothing may be drawn.
+    pub fn of(&self, list: &BenchmarkList) -> Result<BenchmarkList, EvalError> {
         let mut drawn: BTreeMap<Split, Vec<(u64, usize, usize)>> = BTreeMap::new();
         let made = list.made.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
         for (p, (split, scenes)) in made.chain(recorded).enumerate() {
-            anyhow::ensure!(
-                !scenes.is_empty(),
-                "expected a list with sums, found a part without: `data benchmark --freeze`"
-            );
+            if scenes.is_empty() {
+                return Err(EvalError::Benchmark(
+                    "expected a list with sums, found a part without: `data benchmark --freeze`"
+                        .into(),
+                ));
+            }
             for (i, scene) in scenes.iter().enumerate() {
                 let id = scene.rsplit(' ').next().unwrap_or_default();
                 if self.rule.admits(id) {
@@ -50,7 +56,10 @@ impl Draw<'_> {
                 }
             }
         }
-        anyhow::ensure!(!drawn.is_empty(), "no scene of {} may be drawn", list.name);
+        if drawn.is_empty() {
+            let none = format!("no scene of {} may be drawn", list.name);
+            return Err(EvalError::Benchmark(none));
+        }
         for scenes in drawn.values_mut() {
             scenes.sort_unstable();
             scenes.truncate(self.at_most);
@@ -88,7 +97,7 @@ impl Draw<'_> {
     }
 }
 
-impl Rule<'_> {
+impl DrawRule<'_> {
     fn admits(&self, id: &str) -> bool {
         match self {
             Self::Any => true,
@@ -105,32 +114,6 @@ impl Rule<'_> {
             ),
         }
     }
-}
-
-/// The worst score of every scenario of a closed-loop report, over its planners and worlds. Drives
-/// that failed do not count.
-///
-/// Error: a file that is no report of `evaluate closed-loop`.
-pub(crate) fn worst_scores(report: &Path) -> anyhow::Result<BTreeMap<String, f64>> {
-    let text = std::fs::read_to_string(report)
-        .with_context(|| format!("cannot read {}", report.display()))?;
-    let report_json: Value = serde_json::from_str(&text)
-        .with_context(|| format!("expected a report, found {}", report.display()))?;
-    let scenarios = report_json["results"]["scenarios"].as_array();
-    let scenarios = scenarios.with_context(|| {
-        format!(
-            "expected results.scenarios of evaluate closed-loop in {}",
-            report.display()
-        )
-    })?;
-    let mut worst = BTreeMap::new();
-    for scenario in scenarios {
-        if let (Some(id), Some(score)) = (scenario["id"].as_str(), scenario["score"].as_f64()) {
-            let known = worst.entry(id.to_owned()).or_insert(score);
-            *known = score.min(*known);
-        }
-    }
-    Ok(worst)
 }
 
 #[cfg(test)]
@@ -157,10 +140,10 @@ mod tests {
         BenchmarkList::read(&path).unwrap()
     }
 
-    fn draw(rule: Rule<'_>, at_most: usize, seed: u64) -> anyhow::Result<BenchmarkList> {
+    fn draw(rule: DrawRule<'_>, at_most: usize, seed: u64) -> Result<BenchmarkList, EvalError> {
         let name = "drawn".into();
         let seed = Seed(seed);
-        let draw = Draw {
+        let draw = ListDraw {
             name,
             rule,
             at_most,
@@ -173,7 +156,7 @@ mod tests {
     fn scenes_below_the_bound_are_kept_with_their_sums_and_places() {
         let worst = [("a-1", 0.5), ("a-4", 0.95), ("b-0", 0.0), ("b-5", 0.89)];
         let worst = worst.map(|(id, score)| (id.to_owned(), score)).into();
-        let list = draw(Rule::Below(0.9, &worst), 10, 0).unwrap();
+        let list = draw(DrawRule::Below(0.9, &worst), 10, 0).unwrap();
         let parts: Vec<_> = list
             .made
             .iter()
@@ -190,13 +173,13 @@ mod tests {
         let text = toml::to_string_pretty(&list).unwrap();
         let again: BenchmarkList = toml::from_str(&text).unwrap();
         assert_eq!(again.made[1].keep, [0, 5]);
-        assert!(draw(Rule::Below(-1.0, &worst), 10, 0).is_err());
+        assert!(draw(DrawRule::Below(-1.0, &worst), 10, 0).is_err());
     }
 
     #[test]
     fn a_draw_by_chance_has_so_many_of_every_split_and_depends_on_the_seed() {
         let kept = |seed: u64| -> Vec<Vec<usize>> {
-            let list = draw(Rule::Any, 3, seed).unwrap();
+            let list = draw(DrawRule::Any, 3, seed).unwrap();
             list.made.into_iter().map(|part| part.keep).collect()
         };
         let all: Vec<_> = (0..8).map(kept).collect();

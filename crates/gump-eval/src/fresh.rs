@@ -1,4 +1,4 @@
-//! Scenes that are made up while they are learned from, none of which comes back: `fresh:PROFILE`.
+//! Synthetic scenes that are made while a training run uses them, each for a while: `fresh:PROFILE`.
 //!
 //! Scenes form an endless stream: number `k` comes from the stream's seed and `k` alone. Step `s`
 //! of a training run draws its samples from a window of the stream that moves on with `s`, so a run
@@ -11,15 +11,14 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-use gump_model::ModelError;
 use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, SynthesisConfig};
 use rayon::prelude::*;
 
-use crate::cli::WrongArguments;
+use crate::EvalError;
 
-/// What the name of a stream begins with.
-pub(crate) const PREFIX: &str = "fresh:";
+/// The beginning of a stream's name.
+pub const PREFIX: &str = "fresh:";
 /// Scenes that samples of one step are drawn from: enough that a batch shows as many scenes, few
 /// enough to be held (about 1.5 MB each).
 const WINDOW: usize = 128;
@@ -31,23 +30,23 @@ const TRAIN: u64 = 0;
 /// See [`TRAIN`].
 const VALIDATE: u64 = 1;
 
-/// A stream of scenes.
-pub(crate) struct Fresh {
-    stream: Stream,
+/// A stream of scenes in use: a window of it is held, and a thread makes scenes ahead.
+pub struct FreshScenes {
+    stream: SceneStream,
     shared: Arc<Shared>,
     /// Scenes by which the window moves on in a step, times [`USES`].
     batch: usize,
 }
 
-/// Which scenes the stream consists of.
+/// An endless stream of scenes: a profile and a seed.
 #[derive(Clone, Debug)]
-pub(crate) struct Stream {
+pub struct SceneStream {
     profile: Profile,
     config: SynthesisConfig,
     seed: Seed,
 }
 
-/// What the thread that makes scenes shares with those who ask.
+/// State that the thread that makes scenes shares with those who ask.
 struct Shared {
     held: Mutex<Held>,
     /// Told when the window moves on.
@@ -63,18 +62,19 @@ struct Held {
     scenes: BTreeMap<usize, Arc<Scenario>>,
 }
 
-impl Stream {
+impl SceneStream {
     /// The stream of this name, `fresh:PROFILE` or `fresh:PROFILE:SEED`; `None` for other names.
     ///
-    /// Error: [`WrongArguments`] for a profile that does not exist or a seed that is no number.
-    pub(crate) fn of_name(name: &Path) -> anyhow::Result<Option<Self>> {
+    /// # Errors
+    /// [`EvalError::Argument`] for a profile that does not exist or a seed that is no number.
+    pub fn of_name(name: &Path) -> Result<Option<Self>, EvalError> {
         let Some(asked) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
             return Ok(None);
         };
         let (profile, seed) = asked.split_once(':').unwrap_or((asked, "0"));
-        let profile = profile_of_name(profile).map_err(WrongArguments)?;
+        let profile = profile_of_name(profile).map_err(EvalError::Argument)?;
         let seed = seed.parse().map_err(|_| {
-            WrongArguments(format!(
+            EvalError::Argument(format!(
                 "expected a whole number as seed in {PREFIX}{asked}"
             ))
         })?;
@@ -91,8 +91,8 @@ impl Stream {
         self.profile.synthesize(&self.config, seed)
     }
 
-    /// Scenes to validate on, which are none of those to learn from.
-    pub(crate) fn validation(&self, n: usize) -> Vec<Scenario> {
+    /// `n` scenes to validate on, which are none of those to learn from.
+    pub fn validation(&self, n: usize) -> Vec<Scenario> {
         let seed = self.seed.fork(VALIDATE);
         let scene = |k: usize| self.profile.synthesize(&self.config, seed.fork(k as u64));
         (0..n).into_par_iter().map(scene).collect()
@@ -101,17 +101,18 @@ impl Stream {
 
 /// The profile of this name.
 ///
-/// Error: a sentence that names those there are.
-pub(crate) fn profile_of_name(name: &str) -> Result<Profile, String> {
+/// # Errors
+/// A sentence that names the profiles that exist.
+pub fn profile_of_name(name: &str) -> Result<Profile, String> {
     Profile::of_name(name).ok_or_else(|| {
         let known = Profile::ALL.map(Profile::name).join(", ");
         format!("expected one of the profiles {known}, found {name:?}")
     })
 }
 
-impl Fresh {
+impl FreshScenes {
     /// Starts to make the scenes that steps of `batch` samples are drawn from.
-    pub(crate) fn start(stream: Stream, batch: usize) -> Self {
+    pub fn start(stream: SceneStream, batch: usize) -> Self {
         let shared = Arc::new(Shared {
             held: Mutex::default(),
             moved: Condvar::new(),
@@ -128,26 +129,27 @@ impl Fresh {
         fresh
     }
 
-    /// Scenes to draw from at any step.
-    pub(crate) fn len(&self) -> usize {
+    /// Number of scenes to draw from at any step.
+    #[expect(clippy::len_without_is_empty, reason = "a stream is never empty")]
+    pub fn len(&self) -> usize {
         WINDOW
     }
 
-    /// The scene that a draw of a step means; moves the window on.
-    pub(crate) fn pick(&self, step: usize, draw: u64) -> usize {
+    /// The index of the scene that a draw of a step means; moves the window on.
+    pub fn pick(&self, step: usize, draw: u64) -> usize {
         let first = step * self.batch / USES;
         self.shared.move_to(first);
         first + (draw % WINDOW as u64) as usize
     }
 
     /// A scene of the stream.
-    pub(crate) fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    pub fn get(&self, index: usize) -> Cow<'_, Scenario> {
         if let Some(scene) = self.shared.lock().scenes.get(&index) {
-            return Ok(Cow::Owned(Scenario::clone(scene)));
+            return Cow::Owned(Scenario::clone(scene));
         }
         let scene = Arc::new(self.stream.scene(index));
         self.shared.keep(index, &scene);
-        Ok(Cow::Owned(Arc::unwrap_or_clone(scene)))
+        Cow::Owned(Arc::unwrap_or_clone(scene))
     }
 
     /// Scenes made so far, by anybody.
@@ -157,7 +159,7 @@ impl Fresh {
     }
 }
 
-impl Drop for Fresh {
+impl Drop for FreshScenes {
     fn drop(&mut self) {
         // Under the lock, so that the thread cannot begin to wait in between.
         let _held = self.shared.lock();
@@ -193,7 +195,7 @@ impl Shared {
 }
 
 /// Makes the scenes of the window, and as many again after it, until the stream is dropped.
-fn make_ahead(stream: &Stream, shared: &Shared) {
+fn make_ahead(stream: &SceneStream, shared: &Shared) {
     // Of a stream that nobody has asked yet nobody knows where it begins.
     let mut held = shared.lock();
     while !shared.ends.load(Ordering::Relaxed) {
@@ -217,16 +219,24 @@ fn make_ahead(stream: &Stream, shared: &Shared) {
 mod tests {
     use super::*;
 
-    fn stream(name: &str) -> Stream {
-        Stream::of_name(Path::new(name)).unwrap().unwrap()
+    fn stream(name: &str) -> SceneStream {
+        SceneStream::of_name(Path::new(name)).unwrap().unwrap()
     }
 
     #[test]
     fn names_are_understood_or_refused() {
-        assert!(Stream::of_name(Path::new("some/folder")).unwrap().is_none());
+        assert!(
+            SceneStream::of_name(Path::new("some/folder"))
+                .unwrap()
+                .is_none()
+        );
         assert_eq!(stream("fresh:recorded-like").profile, Profile::RecordedLike);
         assert_eq!(stream("fresh:plain:7").seed, Seed(7));
-        let told = |name: &str| Stream::of_name(Path::new(name)).unwrap_err().to_string();
+        let told = |name: &str| {
+            SceneStream::of_name(Path::new(name))
+                .unwrap_err()
+                .to_string()
+        };
         assert!(told("fresh:real").contains("plain, recorded-like, found \"real\""));
         assert!(told("fresh:plain:x").contains("a whole number as seed in fresh:plain:x"));
     }
@@ -234,7 +244,7 @@ mod tests {
     #[test]
     fn a_position_in_the_stream_is_all_that_counts() {
         let batch = 16;
-        let [one, two] = [(); 2].map(|()| Fresh::start(stream("fresh:plain:3"), batch));
+        let [one, two] = [(); 2].map(|()| FreshScenes::start(stream("fresh:plain:3"), batch));
         // The second begins in the middle, as a resumed run does.
         let draws = [5_u64, 130, 999];
         for step in [0, 1, 40] {
@@ -243,7 +253,7 @@ mod tests {
                 assert!((step * batch / USES..).contains(&index));
                 if step == 40 {
                     assert_eq!(two.pick(step, draw), index);
-                    let [a, b] = [&one, &two].map(|fresh| fresh.get(index).unwrap().into_owned());
+                    let [a, b] = [&one, &two].map(|fresh| fresh.get(index).into_owned());
                     assert_eq!((a.id, a.log), (b.id, b.log));
                 }
             }
@@ -253,14 +263,14 @@ mod tests {
 
     #[test]
     fn what_the_window_has_left_is_not_held_and_never_picked_again() {
-        let fresh = Fresh::start(stream("fresh:plain:1"), 8 * USES);
+        let fresh = FreshScenes::start(stream("fresh:plain:1"), 8 * USES);
         let old = fresh.pick(0, 0);
-        assert!(!fresh.get(old).unwrap().log.is_empty());
+        assert!(!fresh.get(old).log.is_empty());
         let later = WINDOW / 8 + 1;
         assert!((0..500).all(|draw| fresh.pick(later, draw) > old));
         assert!(!fresh.shared.lock().scenes.contains_key(&old));
         // Drives of the network ask for scenes of the past: they are made again.
-        assert!(fresh.get(old).unwrap().id.ends_with(&format!("{:016x}", {
+        assert!(fresh.get(old).id.ends_with(&format!("{:016x}", {
             fresh.stream.seed.fork(TRAIN).fork(old as u64).0
         })));
     }

@@ -1,4 +1,4 @@
-//! The prompts part of `evaluate generation`: how often scenes are what their prompt says.
+//! The share of generated scenes that satisfy their prompt.
 //!
 //! A tag is asked for on maps that admit it, which is found out without the network; a tag that no
 //! map given admits (a car park, an all-way stop) is listed and does not count.
@@ -9,10 +9,10 @@ use gump_metrics::tags::{self, rules};
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rand::seq::SliceRandom as _;
 use rayon::prelude::*;
-use serde_json::{Value, json};
+use serde::Serialize;
 
-use crate::run::{Run, stop_if_interrupted};
-use crate::verbs::generate;
+use super::request;
+use crate::{EvalError, Monitor};
 
 /// Objects of the scenes that prompts are judged on.
 const PROMPTED: Counts = Counts {
@@ -25,17 +25,42 @@ const JUDGED_S: f64 = 4.0;
 /// Unprompted scenes per map that a tag is asked for on.
 const UNPROMPTED: usize = 16;
 
-/// How often tags hold: the mean over those that some map admits.
-#[derive(Default)]
-pub(super) struct Prompts {
-    /// Asked for, with every other clause.
-    pub(super) satisfaction: Option<f64>,
+/// The share of scenes in which tags hold: the mean over those that some map admits.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PromptSatisfaction {
+    /// Where they are asked for, with every other clause.
+    pub satisfaction: Option<f64>,
     /// In scenes of the model that were not asked for anything.
-    pub(super) unconditional: Option<f64>,
-    /// In what was recorded.
-    pub(super) logged: Option<f64>,
+    pub unconditional: Option<f64>,
+    /// In recorded scenes.
+    pub logged: Option<f64>,
     /// One per tag.
-    pub(super) rows: Vec<Value>,
+    pub rows: Vec<PromptRow>,
+}
+
+/// The results of one tag; `None` where no map admits it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PromptRow {
+    /// Name of the tag.
+    pub tag: &'static str,
+    /// Number of maps that it was asked for on.
+    pub maps: usize,
+    /// Number of maps looked at to find them.
+    pub looked_at: usize,
+    /// Share of scenes in which it holds with every other clause.
+    pub satisfaction: Option<f64>,
+    /// Share of scenes in which the tag holds.
+    pub tag_alone: Option<f64>,
+    /// Mean number of attempts.
+    pub attempts: Option<f64>,
+    /// Share of scenes whose agents were steered.
+    pub steered: Option<f64>,
+    /// Mean seconds from the generated scene to its present.
+    pub moment_s: Option<f64>,
+    /// Share of unprompted scenes in which it holds.
+    pub unconditional: f64,
+    /// Share of recorded scenes in which it holds.
+    pub log: f64,
 }
 
 /// A scene that was asked for.
@@ -48,19 +73,23 @@ struct Asked {
     moment_s: f64,
 }
 
-/// Every decidable tag on up to `n_maps` maps that admit it, against how often it holds without
-/// being asked for.
-pub(super) fn satisfaction(
-    run: &Run,
+/// Asks for every decidable tag on up to `n_maps` maps that admit it, and counts how often it holds
+/// without being asked for. The monitor gets a part that counts scenes.
+///
+/// # Errors
+/// [`EvalError::Stopped`]. A scene that cannot be generated counts as one that does not satisfy its
+/// prompt.
+pub fn prompt_satisfaction(
     worlds: GenerationWorlds<'_>,
     scenarios: &[Scenario],
     n_maps: usize,
     attempts: usize,
-) -> anyhow::Result<Prompts> {
+    seed: Seed,
+    monitor: &dyn Monitor,
+) -> Result<PromptSatisfaction, EvalError> {
     if n_maps == 0 {
-        return Ok(Prompts::default());
+        return Ok(PromptSatisfaction::default());
     }
-    let seed = run.seed();
     let decidable = rules().iter().filter(|rule| rule.is_decidable());
     let tags: Vec<ScenarioTag> = decidable.map(|rule| rule.tag()).collect();
     let mut shuffled: Vec<&Scenario> = scenarios.iter().collect();
@@ -69,11 +98,11 @@ pub(super) fn satisfaction(
         .par_iter()
         .map(|tag| admitting(&shuffled, *tag, n_maps, seed.fork(10)))
         .collect();
-    stop_if_interrupted()?;
+    monitor.check()?;
     let cases: Vec<(usize, &Scenario)> = (0..tags.len())
         .flat_map(|tag| places[tag].found.iter().map(move |place| (tag, *place)))
         .collect();
-    let progress = run.progress("prompts", cases.len() as u64, "scenes");
+    let progress = monitor.part("prompts", cases.len() as u64, "scenes");
     let asked: Vec<Asked> = (0..cases.len())
         .into_par_iter()
         .map(|number| {
@@ -122,7 +151,7 @@ fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> Gene
         request: GenerateRequest {
             prompts: tag.into_iter().collect(),
             counts: Some(PROMPTED),
-            ..generate::request(recorded)
+            ..request(recorded)
         },
         roams: tag.is_none(),
         seconds: JUDGED_S,
@@ -164,7 +193,7 @@ fn summed(
     asked: &[Asked],
     unasked: &[Vec<ScenarioTag>],
     logged: &[Vec<ScenarioTag>],
-) -> Prompts {
+) -> PromptSatisfaction {
     let share = |all: &[Vec<ScenarioTag>], tag: &ScenarioTag| {
         let n = all.iter().filter(|tags| tags.contains(tag)).count();
         n as f64 / all.len().max(1) as f64
@@ -182,24 +211,24 @@ fn summed(
             free.push(share(unasked, tag));
             log.push(share(logged, tag));
         }
-        rows.push(json!({
-            "tag": tag.name(),
-            "maps": own.len(),
-            "looked_at": places[i].looked_at,
-            "satisfaction": satisfaction,
-            "tag_alone": of(&|asked| f64::from(asked.is_tag)),
-            "attempts": of(&|asked| asked.attempts as f64),
-            "steered": of(&|asked| f64::from(asked.is_steered)),
-            "moment_s": of(&|asked| asked.moment_s),
-            "unconditional": share(unasked, tag),
-            "log": share(logged, tag),
-        }));
+        rows.push(PromptRow {
+            tag: tag.name(),
+            maps: own.len(),
+            looked_at: places[i].looked_at,
+            satisfaction,
+            tag_alone: of(&|asked| f64::from(asked.is_tag)),
+            attempts: of(&|asked| asked.attempts as f64),
+            steered: of(&|asked| f64::from(asked.is_steered)),
+            moment_s: of(&|asked| asked.moment_s),
+            unconditional: share(unasked, tag),
+            log: share(logged, tag),
+        });
     }
     let mean = |values: &[f64]| {
         let sum: f64 = values.iter().sum();
         (!values.is_empty()).then(|| sum / values.len() as f64)
     };
-    Prompts {
+    PromptSatisfaction {
         satisfaction: mean(&held),
         unconditional: mean(&free),
         logged: mean(&log),
@@ -228,12 +257,10 @@ mod tests {
         let prompts = summed(&tags, &places, &asked, &unasked, &[]);
         assert_eq!(prompts.satisfaction, Some(0.75));
         assert_eq!(prompts.unconditional, Some(0.5));
-        assert_eq!(prompts.rows[0]["satisfaction"], 0.5);
-        assert_eq!(prompts.rows[0]["tag_alone"], 1.0);
-        assert_eq!(
-            (&prompts.rows[1]["maps"], &prompts.rows[1]["satisfaction"]),
-            (&json!(0), &Value::Null)
-        );
+        assert_eq!(prompts.rows[0].satisfaction, Some(0.5));
+        assert_eq!(prompts.rows[0].tag_alone, Some(1.0));
+        let unadmitted = &prompts.rows[1];
+        assert_eq!((unadmitted.maps, unadmitted.satisfaction), (0, None));
         assert_eq!(summed(&tags, &places, &[], &[], &[]).satisfaction, None);
     }
 }

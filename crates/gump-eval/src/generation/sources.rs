@@ -1,4 +1,4 @@
-//! Where the scenes come from that `evaluate generation` holds against recorded ones.
+//! Sources of scenes that are compared with recorded ones.
 
 use std::sync::Arc;
 
@@ -10,14 +10,14 @@ use gump_metrics::mmd::{MmdProtocol, scene_mmd};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario, Seed};
 use rand::Rng as _;
 
-use crate::verbs::generate;
+use super::request;
 
 /// Draws of a moment and a vehicle per scene that is to be found in a recording.
 const TRIES: usize = 20;
 
-/// Where scenes come from.
+/// A source of scenes.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Source {
+pub enum SceneSource {
     /// The model, with its own manner of drawing.
     Model(Placement),
     /// The model, with the manner of drawing of the paper.
@@ -26,7 +26,7 @@ pub(super) enum Source {
     Random,
     /// A recorded scene that the model may have learned from.
     Retrieval,
-    /// Another recorded scene of those that are asked for: often of the same network and day.
+    /// Another recorded scene of those that are compared: often of the same network and day.
     Oracle,
     /// The same recording, seconds earlier or later.
     Apart,
@@ -36,8 +36,9 @@ pub(super) enum Source {
     Log,
 }
 
-impl Source {
-    pub(super) const ALL: [Self; 9] = [
+impl SceneSource {
+    /// All sources, those of the model first.
+    pub const ALL: [Self; 9] = [
         Self::Model(Placement::Guided),
         Self::Model(Placement::Free),
         Self::Paper,
@@ -49,7 +50,8 @@ impl Source {
         Self::Log,
     ];
 
-    pub(super) fn name(self) -> &'static str {
+    /// Its name in reports.
+    pub fn name(self) -> &'static str {
         match self {
             Self::Model(Placement::Guided) => "model guided",
             Self::Model(Placement::Free) => "model free",
@@ -65,19 +67,19 @@ impl Source {
 }
 
 /// A recorded scene to be made again.
-pub(super) struct Case {
+pub struct ComparedScene {
     /// The scene is the present of this.
-    pub(super) recorded: Scenario,
+    pub recorded: Scenario,
     /// The frame of its recording that is farthest in time.
     apart: Frame,
     /// Index of the recording.
-    pub(super) recording: usize,
+    pub recording: usize,
 }
 
-impl Case {
+impl ComparedScene {
     /// The present of a recording and `further` scenes that other vehicles of it have around them at
     /// other times, as far as the protocol admits them.
-    pub(super) fn of(
+    pub fn of(
         recording: usize,
         scenario: Scenario,
         further: usize,
@@ -158,37 +160,40 @@ impl Case {
     }
 }
 
-/// What scenes are made of.
-pub(super) struct Makers<'a> {
-    pub(super) world: &'a TransformerWorld,
-    pub(super) cases: &'a [Case],
+/// Everything that scenes are made of.
+pub struct SceneMakers<'a> {
+    /// The world that generates.
+    pub world: &'a TransformerWorld,
+    /// The recorded scenes.
+    pub cases: &'a [ComparedScene],
     /// Recordings that are retrieved.
-    pub(super) bank: &'a [Scenario],
-    pub(super) protocol: MmdProtocol,
+    pub bank: &'a [Scenario],
+    /// The vehicles that count.
+    pub protocol: MmdProtocol,
 }
 
-impl Makers<'_> {
+impl SceneMakers<'_> {
     /// The scene that a source makes in place of case `i`, vehicles only; `None` if it fails.
-    pub(super) fn make(&self, source: Source, i: usize, seed: Seed) -> Option<Frame> {
+    pub fn make(&self, source: SceneSource, i: usize, seed: Seed) -> Option<Frame> {
         let case = &self.cases[i];
         let vehicles = case.vehicles(&self.protocol);
         let n = (vehicles.len() - 1).min(self.protocol.max_vehicles);
         let present = case.recorded.present();
         match source {
-            Source::Log => Some(Frame::new(vehicles, Vec::new())),
-            Source::Apart => Some(case.apart.clone()),
-            Source::Resampled => Some(resampled(&vehicles, present.ego, n, seed)),
-            Source::Random => Some(random_along_lanes(
+            SceneSource::Log => Some(Frame::new(vehicles, Vec::new())),
+            SceneSource::Apart => Some(case.apart.clone()),
+            SceneSource::Resampled => Some(resampled(&vehicles, present.ego, n, seed)),
+            SceneSource::Random => Some(random_along_lanes(
                 &present,
                 n,
                 self.protocol.half_side,
                 seed,
             )),
-            Source::Retrieval => {
+            SceneSource::Retrieval => {
                 let other = pick(self.bank.iter(), seed)?;
                 Some(retrieved(&present, &other.present(), n))
             }
-            Source::Oracle => {
+            SceneSource::Oracle => {
                 let others = self.cases.iter();
                 let others = others.filter(|other| other.recording != case.recording);
                 Some(retrieved(
@@ -197,7 +202,7 @@ impl Makers<'_> {
                     n,
                 ))
             }
-            Source::Model(placement) => self.generate(
+            SceneSource::Model(placement) => self.generate(
                 &case.recorded,
                 n,
                 seed,
@@ -206,7 +211,7 @@ impl Makers<'_> {
                     ..GenerateConfig::default()
                 },
             ),
-            Source::Paper => self.generate(&case.recorded, n, seed, GenerateConfig::paper()),
+            SceneSource::Paper => self.generate(&case.recorded, n, seed, GenerateConfig::paper()),
         }
     }
 
@@ -235,7 +240,7 @@ impl Makers<'_> {
             objects: (0..n).map(object).collect(),
             config,
             map: Arc::clone(&recorded.map),
-            ..generate::request(recorded)
+            ..request(recorded)
         };
         let present = recorded.present();
         let ego = present.ego_now();
@@ -298,7 +303,7 @@ mod tests {
 
     #[test]
     fn further_scenes_are_seen_by_other_vehicles_at_other_times() {
-        let cases = Case::of(7, scenario(), 5, &protocol(), Seed(1));
+        let cases = ComparedScene::of(7, scenario(), 5, &protocol(), Seed(1));
         assert_eq!(cases.len(), 6);
         let own = cases.last().unwrap();
         assert_eq!((own.recorded.ego, own.recorded.now), (AgentId(0), 10));
@@ -310,12 +315,12 @@ mod tests {
             min_vehicles: 3,
             ..protocol()
         };
-        assert!(Case::of(7, scenario(), 5, &none, Seed(1)).is_empty());
+        assert!(ComparedScene::of(7, scenario(), 5, &none, Seed(1)).is_empty());
     }
 
     #[test]
     fn resampled_scenes_have_as_many_vehicles_of_the_same_kind() {
-        let cases = Case::of(0, scenario(), 0, &protocol(), Seed(1));
+        let cases = ComparedScene::of(0, scenario(), 0, &protocol(), Seed(1));
         let vehicles = cases[0].vehicles(&protocol());
         let frame = resampled(&vehicles, AgentId(0), 2, Seed(2));
         assert_eq!(frame.agents().len(), 3);

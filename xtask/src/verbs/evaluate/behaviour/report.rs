@@ -1,8 +1,10 @@
-//! The report of an evaluation, from the entries of its ledger alone.
+//! The report of an evaluation, from stored results alone.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use gump_eval::behaviour::{BehaviourSettings, ScenarioCounts, ScenarioTallies};
+use gump_eval::decoding::DecodedWorldName;
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::behaviour::{Count, Key, Measure, Tally};
 use gump_metrics::{Interval, intervals};
@@ -10,8 +12,7 @@ use gump_scene::Seed;
 use gump_viz::Bars;
 use serde_json::{Map, Value, json};
 
-use super::super::ways::Named;
-use super::{Counted, Settings};
+use super::super::columns::label;
 use crate::run::Run;
 use crate::{charts, table};
 
@@ -39,32 +40,32 @@ const CHARTS: [Chart; 3] = [
     ),
 ];
 
-/// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(
+/// Reports on the shards in some folders.
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Counted>(folders, missing)?;
-    tell(run, &header.settings.try_into()?, &entries)
+    let (header, entries) = results::merge::<ScenarioCounts>(folders, missing)?;
+    report(run, &header.settings.try_into()?, &entries)
 }
 
 /// One number of one column.
 #[derive(Clone, Copy, Default)]
-struct Told {
+struct Number {
     count: Count,
     span: Option<Interval>,
 }
 
 /// The log or a world, over all scenarios.
 struct Column {
-    name: Option<Named>,
-    told: Vec<Told>,
+    name: Option<DecodedWorldName>,
+    numbers: Vec<Number>,
 }
 
 impl Column {
     /// Adds up `tallies`, one per scenario, for every key.
-    fn of(name: Option<Named>, keys: &[Key], tallies: &[Tally]) -> Self {
+    fn of(name: Option<DecodedWorldName>, keys: &[Key], tallies: &[Tally]) -> Self {
         let sums = |drawn: &mut dyn Iterator<Item = usize>| {
             let mut sums = vec![Count::default(); keys.len()];
             for i in drawn {
@@ -82,56 +83,44 @@ impl Column {
             sums.into_iter().map(Count::rate).collect()
         });
         let counts = sums(&mut (0..tallies.len())).into_iter().enumerate();
-        let told = counts.map(|(i, count)| Told {
+        let numbers = counts.map(|(i, count)| Number {
             count,
             span: spans.get(i).copied().flatten(),
         });
         Self {
             name,
-            told: told.collect(),
+            numbers: numbers.collect(),
         }
     }
 
     fn is_same(&self, other: &Self) -> bool {
-        let mut counts = self.told.iter().zip(&other.told);
+        let mut counts = self.numbers.iter().zip(&other.numbers);
         counts.all(|(a, b)| a.count == b.count)
     }
 
-    /// What it is called beside the others.
+    /// Its heading.
     fn label(&self) -> String {
-        self.name.as_ref().map_or("log".into(), Named::label)
+        self.name.as_ref().map_or("log".into(), label)
     }
 }
 
 /// Totals, intervals, the table and the charts.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
-    settings: &Settings,
-    entries: &[Entry<Counted>],
+    settings: &BehaviourSettings,
+    entries: &[Entry<ScenarioCounts>],
 ) -> anyhow::Result<()> {
-    let tallies = |pick: &dyn Fn(&Counted) -> Option<Tally>| -> Vec<Tally> {
-        let counted = entries.iter().map(|entry| pick(&entry.scores));
-        counted.map(Option::unwrap_or_default).collect()
-    };
-    for entry in entries {
-        for cells in entry.scores.worlds.iter().chain([&entry.scores.log]) {
-            cells.tally()?;
-        }
-    }
-    let logged = tallies(&|counted| counted.log.tally().ok());
-    let worlds: Vec<Vec<Tally>> = (0..settings.worlds.len())
-        .map(|i| tallies(&|counted| counted.worlds.get(i)?.tally().ok()))
-        .collect();
-    let all = worlds.iter().flatten().chain(&logged);
+    let tallies = ScenarioTallies::of(entries, settings.worlds.len())?;
+    let all = tallies.worlds.iter().flatten().chain(&tallies.log);
     let counted = all.flat_map(|tally| &tally.0);
     let counted = counted.filter(|(_, count)| count.of > 0.0);
     let keys: BTreeSet<Key> = counted.map(|(key, _)| *key).collect();
     let keys: Vec<Key> = keys.into_iter().collect();
-    let log = Column::of(None, &keys, &logged);
+    let log = Column::of(None, &keys, &tallies.log);
     let worlds: Vec<Column> = settings
         .worlds
         .iter()
-        .zip(&worlds)
+        .zip(&tallies.worlds)
         .map(|(name, tallies)| Column::of(Some(name.clone()), &keys, tallies))
         .collect();
     run.result("scenarios", entries.len())?;
@@ -158,9 +147,10 @@ fn rows<'a>(
     log: &'a Column,
     keys: &'a [Key],
 ) -> impl Iterator<Item = Value> + 'a {
-    let told = keys.iter().zip(&world.told).zip(&log.told);
-    told.filter(|((_, told), _)| told.count.of > 0.0)
-        .map(|((key, told), logged)| {
+    let numbers = keys.iter().zip(&world.numbers).zip(&log.numbers);
+    numbers
+        .filter(|((_, number), _)| number.count.of > 0.0)
+        .map(|((key, number), logged)| {
             let name = world.name.as_ref();
             json!({
                 "world": name.map(|name| &name.world),
@@ -169,14 +159,14 @@ fn rows<'a>(
                 "measure": key.measure.name(),
                 "seconds": key.seconds,
                 "per": key.measure.per(),
-                "value": told.count.rate(),
+                "value": number.count.rate(),
                 "log": logged.count.rate(),
-                "low": told.span.map(|span| span.low),
-                "high": told.span.map(|span| span.high),
+                "low": number.span.map(|span| span.low),
+                "high": number.span.map(|span| span.high),
                 "log_low": logged.span.map(|span| span.low),
                 "log_high": logged.span.map(|span| span.high),
-                "events": told.count.events,
-                "of": told.count.of,
+                "events": number.count.events,
+                "of": number.count.of,
             })
         })
 }
@@ -195,7 +185,7 @@ fn lines(columns: &[&Column], keys: &[Key]) -> Vec<Value> {
             .into_iter()
             .collect();
         for column in columns {
-            line.insert(column.label(), json!(cell(column.told[i])));
+            line.insert(column.label(), json!(cell(column.numbers[i])));
         }
         Value::Object(line)
     };
@@ -203,8 +193,8 @@ fn lines(columns: &[&Column], keys: &[Key]) -> Vec<Value> {
 }
 
 /// A number with its interval if it has any width, `-` where nothing was counted.
-fn cell(told: Told) -> String {
-    let Some(rate) = told.count.rate() else {
+fn cell(number: Number) -> String {
+    let Some(rate) = number.count.rate() else {
         return "-".into();
     };
     let short = |x: f64| {
@@ -220,7 +210,7 @@ fn cell(told: Told) -> String {
         };
         format!("{x:.digits$}")
     };
-    match told.span.filter(|span| span.low < span.high) {
+    match number.span.filter(|span| span.low < span.high) {
         Some(span) => format!("{} ({}-{})", short(rate), short(span.low), short(span.high)),
         None => short(rate),
     }
@@ -243,9 +233,9 @@ fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure)
     });
     let legend = columns.iter().map(|column| column.label()).collect();
     charts::bars(label, names.collect(), legend, |row, column| {
-        let told = columns[column].told[shown[row]];
-        let span = told.span.map(|span| (span.low, span.high));
-        let value = told.count.rate()?;
+        let number = columns[column].numbers[shown[row]];
+        let span = number.span.map(|span| (span.low, span.high));
+        let value = number.count.rate()?;
         Some(gump_viz::Bar { value, span })
     })
 }

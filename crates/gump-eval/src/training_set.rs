@@ -1,102 +1,102 @@
 //! Scenarios to train on: held in memory, in a cache, or streamed as they are made up.
 //!
-//! Which files a set has and which scenes are for training is in [`gump_eval::datasets`].
+//! The files of a set, and which of its scenes are for training, are in [`datasets`](crate::datasets).
 
 use std::borrow::Cow;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use gump_data::cache::Cache;
-use gump_eval::datasets::{Part, read};
-use gump_model::ModelError;
 use gump_scene::{Scenario, Seed};
-use gump_train::ScenarioSource;
+use gump_train::{ScenarioSource, TrainError};
 
-use crate::fresh::{Fresh, Stream};
-use crate::progress::Progress;
+use crate::datasets::{Part, read};
+use crate::fresh::{FreshScenes, SceneStream};
+use crate::{EvalError, Monitor};
 
 /// Scenarios to train on: those in a cache stay there until they are asked for, others are held;
 /// or a stream of scenes that are made up.
-pub(crate) struct Training {
+pub struct TrainingSet {
     /// Each with the number of the first scenario after it.
-    sources: Vec<(usize, Source)>,
-    /// Takes the place of all sources.
-    fresh: Option<Fresh>,
+    stores: Vec<(usize, ScenarioStore)>,
+    /// Takes the place of all stores.
+    fresh: Option<FreshScenes>,
     /// Takes the place of both: sets of which samples are drawn in these shares.
-    mixed: Vec<(f64, Training)>,
+    mixed: Vec<(f64, Self)>,
 }
 
-enum Source {
+enum ScenarioStore {
     Held(Vec<Scenario>),
     Cached { cache: Cache, start: usize },
 }
 
-impl Training {
-    /// Opens the parts, and reads those that are no cache.
+impl TrainingSet {
+    /// Opens the parts, and reads those that are no cache; the monitor counts scenarios.
     ///
-    /// Error: the first record that cannot be read, a damaged index of a cache, or Ctrl-C.
-    pub(crate) fn open(parts: &[Part], progress: &Progress) -> anyhow::Result<Self> {
-        let (mut sources, mut end) = (Vec::new(), 0);
+    /// # Errors
+    /// The first record that cannot be read, a damaged index of a cache, or [`EvalError::Stopped`].
+    pub fn open(parts: &[Part], monitor: &dyn Monitor) -> Result<Self, EvalError> {
+        let (mut stores, mut end) = (Vec::new(), 0);
         for part in parts {
-            let source = if Cache::is_at(&part.path)? {
+            let store = if Cache::is_at(&part.path)? {
                 let cache = Cache::open(&part.path)?;
                 let Range { start, end: stop } = part.scenes;
                 end += stop.min(cache.len()).saturating_sub(start);
-                Source::Cached { cache, start }
+                ScenarioStore::Cached { cache, start }
             } else {
-                let held = read(std::slice::from_ref(part), progress)?;
+                let held = read(std::slice::from_ref(part), monitor)?;
                 end += held.len();
-                Source::Held(held)
+                ScenarioStore::Held(held)
             };
-            sources.push((end, source));
+            stores.push((end, store));
         }
         Ok(Self {
-            sources,
+            stores,
             fresh: None,
             mixed: Vec::new(),
         })
     }
 
     /// A stream, for steps of `batch` samples.
-    pub(crate) fn fresh(stream: Stream, batch: usize) -> Self {
+    pub fn fresh(stream: SceneStream, batch: usize) -> Self {
         Self {
-            sources: Vec::new(),
-            fresh: Some(Fresh::start(stream, batch)),
+            stores: Vec::new(),
+            fresh: Some(FreshScenes::start(stream, batch)),
             mixed: Vec::new(),
         }
     }
 
-    /// Samples of several sets, each with its share.
-    pub(crate) fn mixed(mut sets: Vec<(f64, Self)>) -> Self {
+    /// Several sets, of which samples are drawn in proportion to their shares.
+    pub fn mixed(mut sets: Vec<(f64, Self)>) -> Self {
         if sets.len() == 1 {
             return sets.remove(0).1;
         }
         Self {
-            sources: Vec::new(),
+            stores: Vec::new(),
             fresh: None,
             mixed: sets,
         }
     }
 
-    /// The ids of all.
-    pub(crate) fn ids(&self) -> Box<dyn Iterator<Item = &str> + '_> {
+    /// The ids of all scenarios; of a stream none.
+    pub fn ids(&self) -> Box<dyn Iterator<Item = &str> + '_> {
         let of_mixed = self.mixed.iter().flat_map(|(_, set)| set.ids());
-        let starts = std::iter::once(0).chain(self.sources.iter().map(|(end, _)| *end));
-        let sources = self.sources.iter().zip(starts);
-        let own = sources.flat_map(|((end, source), begin)| {
-            (0..end - begin).filter_map(move |i| match source {
-                Source::Held(held) => held.as_slice().get(i).map(|scene| scene.id.as_str()),
-                Source::Cached { cache, start } => cache.id(start + i),
+        let starts = std::iter::once(0).chain(self.stores.iter().map(|(end, _)| *end));
+        let stores = self.stores.iter().zip(starts);
+        let own = stores.flat_map(|((end, store), begin)| {
+            (0..end - begin).filter_map(move |i| match store {
+                ScenarioStore::Held(held) => held.as_slice().get(i).map(|scene| scene.id.as_str()),
+                ScenarioStore::Cached { cache, start } => cache.id(start + i),
             })
         });
         Box::new(own.chain(of_mixed))
     }
 }
 
-impl ScenarioSource for Training {
+impl ScenarioSource for TrainingSet {
     fn len(&self) -> usize {
-        let held = self.sources.last().map_or(0, |(end, _)| *end);
-        let own = self.fresh.as_ref().map_or(held, Fresh::len);
+        let held = self.stores.last().map_or(0, |(end, _)| *end);
+        let own = self.fresh.as_ref().map_or(held, FreshScenes::len);
         own + self.mixed.iter().map(|(_, set)| set.len()).sum::<usize>()
     }
 
@@ -117,23 +117,23 @@ impl ScenarioSource for Training {
         }
     }
 
-    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, ModelError> {
+    fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError> {
         if let Some(fresh) = &self.fresh {
-            return fresh.get(index);
+            return Ok(fresh.get(index));
         }
         if !self.mixed.is_empty() {
             let n = self.mixed.len();
             return self.mixed[index % n].1.get(index / n);
         }
-        let missing = || ModelError::Scene(format!("there is no scenario {index}"));
-        let i = self.sources.partition_point(|(end, _)| *end <= index);
-        let begin = i.checked_sub(1).map_or(0, |before| self.sources[before].0);
-        match self.sources.get(i).map(|(_, source)| source) {
+        let missing = || TrainError::Source(format!("there is no scenario {index}").into());
+        let i = self.stores.partition_point(|(end, _)| *end <= index);
+        let begin = i.checked_sub(1).map_or(0, |before| self.stores[before].0);
+        match self.stores.get(i).map(|(_, store)| store) {
             None => Err(missing()),
-            Some(Source::Held(held)) => Ok(Cow::Borrowed(&held[index - begin])),
-            Some(Source::Cached { cache, start }) => {
+            Some(ScenarioStore::Held(held)) => Ok(Cow::Borrowed(&held[index - begin])),
+            Some(ScenarioStore::Cached { cache, start }) => {
                 let found = cache.get(start + index - begin);
-                let found = found.map_err(|error| ModelError::Scene(error.to_string()))?;
+                let found = found.map_err(|error| TrainError::Source(error.into()))?;
                 found.map(Cow::Owned).ok_or_else(missing)
             }
         }
@@ -148,7 +148,7 @@ fn uniform_and_rest(draw: u64) -> (f64, u64) {
 }
 
 /// `PATH=SHARE` as a path and a share; a path alone has 1.
-pub(crate) fn with_share(named: &Path) -> (PathBuf, f64) {
+pub fn with_share(named: &Path) -> (PathBuf, f64) {
     let split = named.to_str().and_then(|text| text.rsplit_once('='));
     let share = split.and_then(|(path, share)| Some((path, share.parse::<f64>().ok()?)));
     match share {
@@ -176,9 +176,8 @@ mod tests {
             path: path.to_owned(),
             scenes,
         };
-        let silent = Progress::begin(true, "", 0, "");
         let numbers = |parts: &[Part]| {
-            let scenes = Training::open(parts, &silent).unwrap();
+            let scenes = TrainingSet::open(parts, &()).unwrap();
             let ids: Vec<&str> = scenes.ids().collect();
             let read = (0..scenes.len()).map(|i| scenes.get(i).unwrap().id.clone());
             assert_eq!(ids, read.collect::<Vec<_>>());

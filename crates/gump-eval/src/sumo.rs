@@ -1,13 +1,12 @@
-//! The real SUMO: found, asked for if it is missing, and run.
+//! The real SUMO: found and run.
 //!
-//! What a run is told comes from `gump_synthesis`, what it puts out is read by `gump_data::sumo`;
-//! here are the programs, the folders, and one run from a seed to scenes.
+//! [`Sumo`] has the programs, the folders, and one run from a seed to scenes. The demand of a run
+//! comes from `gump_synthesis`; `gump_data::sumo` reads its output.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-use anyhow::Context as _;
 use gump_data::ReadOptions;
 use gump_data::sumo::{CutOptions, Demand, Network, Roads, open_on};
 use gump_metrics::overlapping;
@@ -15,13 +14,15 @@ use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion};
 use rand::Rng as _;
 
+use crate::EvalError;
+
 /// Simulated seconds before the first window, so that queues have formed.
 const WARMUP_S: f64 = 60.0;
-/// How long scenes go on after their present unless told otherwise, seconds.
-pub(crate) const FUTURE_S: f64 = 8.0;
+/// Default length of a scene after its present, seconds.
+pub const FUTURE_S: f64 = 8.0;
 /// Windows per run.
 const WINDOWS: usize = 6;
-/// Seconds between two windows: scenes of one run shall differ.
+/// Seconds between two windows, so that scenes of one run differ.
 const PAUSE_S: f64 = 5.0;
 /// Seconds between frames.
 const STEP_S: f64 = 0.1;
@@ -36,14 +37,15 @@ const CURVE_POINTS: u32 = 12;
 
 /// The programs of a SUMO installation.
 #[derive(Clone, Debug)]
-pub(crate) struct Sumo {
+pub struct Sumo {
     programs: PathBuf,
     home: Option<PathBuf>,
 }
 
-/// A network to simulate on, and its name in scene ids.
-pub(crate) struct Place {
-    pub(crate) name: String,
+/// A network to simulate on.
+pub struct SumoNetwork {
+    /// Its name in scene ids.
+    pub name: String,
     file: PathBuf,
     network: Network,
     roads: Arc<Roads>,
@@ -52,8 +54,9 @@ pub(crate) struct Place {
 impl Sumo {
     /// Looks for SUMO in `SUMO_HOME`, on the path, and among the packages of Python.
     ///
-    /// Error: a sentence that tells how to install it.
-    pub(crate) fn find() -> anyhow::Result<Self> {
+    /// # Errors
+    /// [`EvalError::Sumo`], which says how to install it.
+    pub fn find() -> Result<Self, EvalError> {
         let has = |folder: &Path| folder.join("sumo").is_file();
         if let Some(home) = std::env::var_os("SUMO_HOME").map(PathBuf::from) {
             let programs = home.join("bin");
@@ -74,23 +77,30 @@ impl Sumo {
                 return Ok(Self { programs, home });
             }
         }
-        anyhow::bail!(
+        Err(EvalError::Sumo(
             "--kind sumo needs SUMO and found none in SUMO_HOME, on the PATH or in Python: \
              install it with `pip install eclipse-sumo` or `apt-get install sumo`; \
              --kind procedural needs nothing"
-        )
+                .into(),
+        ))
     }
 
-    /// What `sumo --version` says first.
-    pub(crate) fn version(&self) -> anyhow::Result<String> {
+    /// The first line of `sumo --version`.
+    ///
+    /// # Errors
+    /// SUMO cannot be started.
+    pub fn version(&self) -> Result<String, EvalError> {
         let output = self.command("sumo").arg("--version").output();
-        let output = output.context("cannot start sumo")?;
+        let output = output.map_err(|cause| EvalError::io("start", Path::new("sumo"), cause))?;
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
         Ok(text.lines().next().unwrap_or_default().trim().to_owned())
     }
 
     /// Makes a network from a seed: a grid, a spider's web, or something irregular.
-    pub(crate) fn generate(&self, seed: Seed, folder: &Path) -> anyhow::Result<Place> {
+    ///
+    /// # Errors
+    /// SUMO cannot be started or fails.
+    pub fn generate(&self, seed: Seed, folder: &Path) -> Result<SumoNetwork, EvalError> {
         let mut rng = seed.rng();
         let shape = ["grid", "spider", "random"][rng.random_range(0..3)];
         let length = rng.random_range(90..190).to_string();
@@ -136,32 +146,39 @@ impl Sumo {
         let mut command = self.command("netgenerate");
         command.args(arguments).args(["--seed", &seed]);
         run(curves(&mut command).arg("-o").arg(&file))?;
-        Place::read(format!("made-{shape}"), file)
+        SumoNetwork::read(format!("made-{shape}"), file)
     }
 
     /// Prepares a network for simulation: finer and slower curves through junctions.
-    pub(crate) fn prepare(&self, network: &Path, folder: &Path) -> anyhow::Result<Place> {
+    ///
+    /// # Errors
+    /// SUMO cannot be started, or does not understand the network.
+    pub fn prepare(&self, network: &Path, folder: &Path) -> Result<SumoNetwork, EvalError> {
         let name = name_of(network);
         let file = folder.join(format!("{name}.net.xml"));
         let mut command = self.command("netconvert");
         command.arg("-s").arg(network);
         run(curves(&mut command).arg("-o").arg(&file))?;
-        Place::read(name, file)
+        SumoNetwork::read(name, file)
     }
 
-    /// Simulates once on a network and cuts scenes out, each of so many seconds after its present;
-    /// the same for the same seed.
-    pub(crate) fn scenes(
+    /// Simulates once on a network and cuts scenes out, each with `future_s` seconds after its
+    /// present; the same for the same seed. Their ids begin with `id`; `folder` is for files of the
+    /// run and is removed at its end.
+    ///
+    /// # Errors
+    /// SUMO cannot be started or fails, or its files cannot be written or read.
+    pub fn scenes(
         &self,
-        place: &Place,
+        place: &SumoNetwork,
         demand: &SumoDemand,
         future_s: f64,
         seed: Seed,
         id: &str,
         folder: &Path,
-    ) -> anyhow::Result<Vec<Scenario>> {
+    ) -> Result<Vec<Scenario>, EvalError> {
         std::fs::create_dir_all(folder)
-            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+            .map_err(|cause| EvalError::io("create the folder", folder, cause))?;
         let cut = CutOptions {
             pause_s: PAUSE_S,
             future_s,
@@ -221,8 +238,7 @@ impl Sumo {
             scene.tags = gump_metrics::tags::mine(&scene);
             scenes.push(scene);
         }
-        std::fs::remove_dir_all(folder)
-            .with_context(|| format!("cannot remove {}", folder.display()))?;
+        std::fs::remove_dir_all(folder).map_err(|cause| EvalError::io("remove", folder, cause))?;
         Ok(scenes)
     }
 
@@ -236,8 +252,8 @@ impl Sumo {
     }
 }
 
-impl Place {
-    fn read(name: String, file: PathBuf) -> anyhow::Result<Self> {
+impl SumoNetwork {
+    fn read(name: String, file: PathBuf) -> Result<Self, EvalError> {
         let network = Network::read(&file)?;
         let roads = Arc::new(Roads::new(&network));
         Ok(Self {
@@ -263,32 +279,32 @@ fn is_odd(scene: &Scenario) -> bool {
 
 /// The networks of a file or folder, in the order of their paths.
 ///
-/// Error: a folder that cannot be listed or holds no network.
-pub(crate) fn networks(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+/// # Errors
+/// A folder that cannot be listed or holds no network.
+pub fn networks(path: &Path) -> Result<Vec<PathBuf>, EvalError> {
     let mut found = Vec::new();
     if path.is_dir() {
         list(path, &mut found)?;
         found.sort();
     } else {
-        anyhow::ensure!(
-            path.is_file(),
-            "expected a network, found none: {}",
-            path.display()
-        );
+        if !path.is_file() {
+            let none = format!("expected a network, found none: {}", path.display());
+            return Err(EvalError::Sumo(none));
+        }
         found.push(path.to_owned());
     }
-    let folder = path.display();
-    anyhow::ensure!(
-        !found.is_empty(),
-        "expected *.net.xml or *.net.xml.gz, found none: {folder}"
-    );
+    if found.is_empty() {
+        let folder = path.display();
+        let none = format!("expected *.net.xml or *.net.xml.gz, found none: {folder}");
+        return Err(EvalError::Sumo(none));
+    }
     Ok(found)
 }
 
-fn list(folder: &Path, found: &mut Vec<PathBuf>) -> anyhow::Result<()> {
-    let cannot = || format!("cannot list {}", folder.display());
-    for entry in std::fs::read_dir(folder).with_context(cannot)? {
-        let path = entry.with_context(cannot)?.path();
+fn list(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), EvalError> {
+    let cannot = |cause| EvalError::io("list", folder, cause);
+    for entry in std::fs::read_dir(folder).map_err(cannot)? {
+        let path = entry.map_err(cannot)?.path();
         let name = path
             .file_name()
             .unwrap_or_default()
@@ -332,17 +348,21 @@ fn curves(command: &mut Command) -> &mut Command {
 /// Runs a program to its end.
 ///
 /// Error: it cannot be started, or fails; then with the last line it wrote.
-fn run(command: &mut Command) -> anyhow::Result<()> {
+fn run(command: &mut Command) -> Result<(), EvalError> {
     let program = command.get_program().to_string_lossy().into_owned();
     let output = command
         .output()
-        .with_context(|| format!("cannot start {program}"))?;
+        .map_err(|cause| EvalError::io("start", Path::new(&program), cause))?;
     if output.status.success() {
         return Ok(());
     }
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     let lines: Vec<_> = said.lines().filter(|line| line.contains("rror")).collect();
-    anyhow::bail!("{program} failed ({}): {}", output.status, lines.join(" "))
+    Err(EvalError::Sumo(format!(
+        "{program} failed ({}): {}",
+        output.status,
+        lines.join(" ")
+    )))
 }
 
 fn home_of_python_package() -> Option<PathBuf> {

@@ -1,0 +1,265 @@
+//! Counts what a driver would notice, in worlds and in the log.
+//!
+//! [`BehaviourEvaluation`] simulates the futures of one scenario in every world and counts; the
+//! counts are stored as [`ScenarioCounts`], which [`ScenarioTallies`] reads back. What is counted,
+//! and per what, is in [`gump_metrics::behaviour`].
+
+use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
+use gump_model::Device;
+use gump_scene::{Scenario, Seed};
+use serde::{Deserialize, Serialize};
+
+use crate::decoding::{DecodedWorld, DecodedWorldName};
+use crate::imagine::{frames, imagine};
+use crate::results::Entry;
+use crate::worlds::Worlds;
+use crate::{EvalError, Monitor};
+
+/// Name of the benchmark in stored results.
+pub const BENCHMARK: &str = "behaviour";
+
+/// The settings that the counts of a scenario depend on, as they are stored.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BehaviourSettings {
+    /// The set, or the name of the file or folder.
+    pub scenarios: String,
+    /// Length of the futures, seconds.
+    pub seconds: u32,
+    /// Futures of each scenario.
+    pub futures: usize,
+    /// Number of scenarios at most.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub limit: Option<usize>,
+    /// How learned worlds decode, as JSON.
+    pub sampling: String,
+    /// The seed, in decimal digits.
+    pub seed: String,
+    /// The worlds, in order.
+    pub worlds: Vec<DecodedWorldName>,
+}
+
+/// The counts of one scenario.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScenarioCounts {
+    /// Of the log.
+    pub log: StoredTally,
+    /// Of the worlds, in the order of the settings.
+    pub worlds: Vec<StoredTally>,
+}
+
+/// A [`Tally`] as it is stored.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StoredTally {
+    /// One for each key.
+    #[serde(default)]
+    pub cells: Vec<StoredCount>,
+}
+
+/// A [`Count`] with its [`Key`], as it is stored.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StoredCount {
+    /// [`Measure::name`].
+    pub measure: String,
+    /// [`Class::name`].
+    pub class: String,
+    /// Seconds after the present.
+    pub seconds: u32,
+    /// Number of events.
+    pub events: f64,
+    /// Number of agents, or minutes, that the events are divided by.
+    pub of: f64,
+}
+
+impl StoredTally {
+    /// The stored form of a tally.
+    pub fn of(tally: &Tally) -> Self {
+        let cell = |(key, count): (&Key, &Count)| StoredCount {
+            measure: key.measure.name().into(),
+            class: key.class.name().into(),
+            seconds: key.seconds,
+            events: count.events,
+            of: count.of,
+        };
+        let cells = tally.0.iter().map(cell).collect();
+        Self { cells }
+    }
+
+    /// The tally.
+    ///
+    /// # Errors
+    /// [`EvalError::Results`] for an unknown measure or class.
+    pub fn tally(&self) -> Result<Tally, EvalError> {
+        let mut tally = Tally::default();
+        for cell in &self.cells {
+            let measure = Measure::of_name(&cell.measure);
+            let class = Class::of_name(&cell.class);
+            let (measure, class) = measure.zip(class).ok_or_else(|| {
+                EvalError::Results(format!(
+                    "expected a known measure and class in the ledger, found {} of {}",
+                    cell.measure, cell.class
+                ))
+            })?;
+            let key = Key {
+                measure,
+                class,
+                seconds: cell.seconds,
+            };
+            let (events, of) = (cell.events, cell.of);
+            tally.add(key, Count { events, of });
+        }
+        Ok(tally)
+    }
+}
+
+/// The tallies of several scenarios.
+#[derive(Clone, Debug)]
+pub struct ScenarioTallies {
+    /// Of the log, one for each scenario.
+    pub log: Vec<Tally>,
+    /// World by world, one for each scenario.
+    pub worlds: Vec<Vec<Tally>>,
+}
+
+impl ScenarioTallies {
+    /// The tallies of stored results of `n_worlds` worlds; a world that an entry lacks counts
+    /// nothing there.
+    ///
+    /// # Errors
+    /// As [`StoredTally::tally`].
+    pub fn of(entries: &[Entry<ScenarioCounts>], n_worlds: usize) -> Result<Self, EvalError> {
+        let mut tallies = Self {
+            log: Vec::with_capacity(entries.len()),
+            worlds: vec![Vec::with_capacity(entries.len()); n_worlds],
+        };
+        for Entry { scores, .. } in entries {
+            tallies.log.push(scores.log.tally()?);
+            for (i, world) in tallies.worlds.iter_mut().enumerate() {
+                let stored = scores.worlds.get(i).map(StoredTally::tally);
+                world.push(stored.transpose()?.unwrap_or_default());
+            }
+        }
+        Ok(tallies)
+    }
+}
+
+/// How futures are made and how far they are looked at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BehaviourConfig {
+    /// Length of the futures, seconds; the log is looked at only as far as it goes.
+    pub seconds: u32,
+    /// Futures of each scenario; worlds without chance have one.
+    pub futures: usize,
+    /// Whether agents that a world spawns are counted too.
+    pub spawning: bool,
+    /// The seed, from which that of every scenario is forked by its position.
+    pub seed: Seed,
+}
+
+/// Counts in several worlds, each loaded once.
+pub struct BehaviourEvaluation<'a> {
+    config: BehaviourConfig,
+    worlds: Vec<(&'a DecodedWorld, Worlds<'a>)>,
+}
+
+impl<'a> BehaviourEvaluation<'a> {
+    /// Nothing is loaded yet.
+    pub fn new(device: &Device, worlds: &'a [DecodedWorld], config: BehaviourConfig) -> Self {
+        let load = |world: &'a DecodedWorld| {
+            let sampling = world.decoding.sampling.clone();
+            (world, Worlds::new(device, &world.world, sampling))
+        };
+        let worlds = worlds.iter().map(load).collect();
+        Self { config, worlds }
+    }
+
+    /// The counts of the scenario at position `index` of the set; the monitor gets a part for each
+    /// simulation.
+    ///
+    /// # Errors
+    /// As [`Worlds::of`] and [`imagine`].
+    pub fn count(
+        &mut self,
+        index: usize,
+        scenario: &Scenario,
+        monitor: &dyn Monitor,
+    ) -> Result<ScenarioCounts, EvalError> {
+        let config = self.config;
+        let mut behaviour = Behaviour::new(scenario, config.seconds);
+        if config.spawning {
+            behaviour = behaviour.with_newcomers();
+        }
+        let seed = config.seed.fork(index as u64);
+        let mut counts = ScenarioCounts {
+            log: StoredTally::of(&behaviour.log().tally),
+            worlds: Vec::with_capacity(self.worlds.len()),
+        };
+        for (column, worlds) in &mut self.worlds {
+            let world = worlds.of(scenario)?;
+            let n = column.futures(config.futures);
+            let simulate = column.decoding.frames(config.seconds.into());
+            let part = monitor.part("simulating", frames(scenario, n, &simulate), "frames");
+            let imagined = imagine(world, scenario, n, &simulate, seed, &*part)?;
+            let tally = behaviour.tally(&imagined.rollouts);
+            counts.worlds.push(StoredTally::of(&tally));
+        }
+        Ok(counts)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_engine::SamplingConfig;
+
+    use super::*;
+    use crate::decoding::Decoding;
+    use crate::worlds::WorldName;
+
+    #[test]
+    fn the_log_replayed_counts_as_the_log_and_reads_back_as_it_was_stored() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 250,0\nego vehicle 3: 10,0 velocity 10,0\n\
+             agent vehicle 4: 30,0 velocity 10,0\nhistory 1 future 8 dt 0.1",
+        )
+        .unwrap();
+        let columns = [WorldName::Log, WorldName::ConstantVelocity].map(|world| DecodedWorld {
+            decoding: Decoding::of(SamplingConfig::default()).for_world(&world),
+            world,
+        });
+        let config = BehaviourConfig {
+            seconds: 8,
+            futures: 4,
+            spawning: false,
+            seed: Seed(0),
+        };
+        let mut evaluation = BehaviourEvaluation::new(&Device::Cpu, &columns, config);
+        let counts = evaluation.count(0, &scenario, &()).unwrap();
+        assert!(!counts.log.cells.is_empty());
+        assert_eq!(counts.worlds.len(), 2);
+        assert_eq!(counts.worlds[0], counts.log);
+        let text = toml::to_string(&counts).unwrap();
+        assert_eq!(toml::from_str::<ScenarioCounts>(&text).unwrap(), counts);
+        let entry = Entry {
+            index: 0,
+            id: scenario.id.clone(),
+            scores: counts,
+        };
+        let tallies = ScenarioTallies::of(&[entry], 3).unwrap();
+        assert_eq!(tallies.worlds[0][0].0, tallies.log[0].0);
+        assert!(tallies.worlds[2][0].0.is_empty());
+    }
+
+    #[test]
+    fn an_unknown_measure_is_named() {
+        let stored = StoredTally {
+            cells: vec![StoredCount {
+                measure: "grace".into(),
+                class: "vehicle".into(),
+                seconds: 8,
+                events: 1.0,
+                of: 2.0,
+            }],
+        };
+        let error = stored.tally().unwrap_err().to_string();
+        assert!(error.ends_with("found grace of vehicle"), "{error}");
+    }
+}

@@ -1,0 +1,112 @@
+//! Open-loop planning: plans along a log against what was driven, with nuPlan's scores.
+//!
+//! [`plan`] lets a planner plan along recordings; one comparison is
+//! [`gump_planner::closed_loop::plan_and_compare`].
+
+use gump_nuplan::closed_loop::Replayed;
+use gump_nuplan::metrics::{OpenLoop, Scoring};
+use gump_planner::closed_loop::{evaluate, plan_and_compare};
+use gump_rollout::WorldModel;
+use gump_scene::Seed;
+
+use crate::planners::{PlannerConfig, PlannerName};
+use crate::recordings::{Case, Named};
+use crate::{EvalError, Monitor};
+
+/// Seconds that plans are compared over.
+pub const HORIZON_S: f64 = 8.0;
+
+/// The comparison in one scenario, or why there is none.
+pub struct OpenLoopOutcome {
+    /// The scenario's id.
+    pub id: String,
+    /// The comparison.
+    pub compared: Result<OpenLoop, EvalError>,
+}
+
+/// Lets a planner plan along recordings, several at a time; outcomes are in their order. `imagination`
+/// is the world that planners with rollouts use; the seed of a recording is forked from `seed` by its
+/// position. The monitor counts recordings.
+///
+/// # Errors
+/// [`EvalError::Stopped`]. A failed comparison is an outcome.
+pub fn plan(
+    cases: impl Iterator<Item = Named> + Send,
+    planner: PlannerName,
+    imagination: &dyn WorldModel,
+    config: &PlannerConfig,
+    seed: Seed,
+    monitor: &dyn Monitor,
+) -> Result<Vec<OpenLoopOutcome>, EvalError> {
+    let outcomes = evaluate(cases, |i, named: Named| {
+        let compared = named.case.and_then(|case| {
+            let mut driver = planner.build(&case, imagination, seed.fork(i as u64), config)?;
+            let (recording, after) = (&case.recording, &case.after);
+            let seconds = comparable_seconds(&case);
+            let compared =
+                plan_and_compare(recording, after, &mut Replayed, &mut *driver, seconds)?;
+            Ok(compared)
+        });
+        monitor.advance(1);
+        OpenLoopOutcome {
+            id: named.id,
+            compared,
+        }
+    });
+    monitor.check()?;
+    Ok(outcomes)
+}
+
+/// How long plans can be made so that each still has what was driven to be compared with.
+fn comparable_seconds(case: &Case) -> f64 {
+    let scenario = case.recording.scenario();
+    let known = (scenario.future().len() + case.after.len()) as f64 * scenario.dt;
+    // One more second than plans start in, because they start at every whole one.
+    (known - HORIZON_S + 1.0).clamp(2.0 * scenario.dt, 15.0)
+}
+
+/// The numbers of a comparison by their names in reports: nuPlan's score first, distances in metres.
+pub fn numbers(open: &OpenLoop) -> [(&'static str, f64); 6] {
+    let [three, five, eight] = &open.horizons;
+    [
+        ("score", Scoring::open_loop().score(&open.scores)),
+        ("ade_8s", eight.ade),
+        ("fde_3s", three.fde),
+        ("fde_5s", five.fde),
+        ("fde_8s", eight.fde),
+        ("miss_rate", eight.miss_rate),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_rollout::worlds::Idm;
+
+    use super::*;
+    use crate::recordings::of_boxes;
+
+    #[test]
+    fn the_recorded_driver_plans_what_was_driven() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 450,0\nego vehicle 0: 0,0 velocity 8,0\nhistory 1 future 20 dt 0.1",
+        )
+        .unwrap();
+        let named = |id: &str, case| Named {
+            id: id.into(),
+            log_name: "log".into(),
+            scenario_type: "unknown".into(),
+            case,
+        };
+        let broken = Err(EvalError::Recording("no map".into()));
+        let cases = [named("a", of_boxes(scenario)), named("b", broken)];
+        let world = Idm::default();
+        let config = PlannerConfig::default();
+        let log = PlannerName::Log;
+        let outcomes = plan(cases.into_iter(), log, &world, &config, Seed(0), &()).unwrap();
+        let numbers = numbers(outcomes[0].compared.as_ref().unwrap());
+        assert_eq!(numbers[0].0, "score");
+        assert!(numbers[0].1 > 0.9 && numbers[1].1 < 0.1, "{numbers:?}");
+        assert_eq!((&*outcomes[0].id, &*outcomes[1].id), ("a", "b"));
+        assert!(outcomes[1].compared.is_err());
+    }
+}

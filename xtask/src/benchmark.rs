@@ -1,0 +1,70 @@
+//! Frozen sets of this checkout: their folders and lists.
+//!
+//! Lists, and how their scenes are found, made and drawn, are in [`gump_eval::benchmarks`].
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use gump_eval::benchmarks::{self, BenchmarkFolders, ScenarioSet, ScenarioSetName};
+use serde_json::Value;
+
+use crate::installed::home;
+use crate::machine::repository;
+use crate::run::{Run, Unseen};
+
+/// Where `data benchmark` puts what it makes, unless told otherwise.
+const MADE: &str = "out/data-benchmark";
+
+/// Finds the scenarios of `--scenarios`.
+///
+/// Error: as [`ScenarioSetName::find`].
+pub(crate) fn find(run: &mut Run, name: &ScenarioSetName) -> anyhow::Result<ScenarioSet> {
+    let folders = BenchmarkFolders {
+        made: MADE.into(),
+        recorded: recorded_data(),
+    };
+    run.phase("find", |_| Ok(name.find(&folders, &Unseen)?))
+}
+
+/// Ids of the scenes that nothing may learn from, each with its set, by the lists that come with
+/// the driver.
+///
+/// Error: a list that cannot be read.
+pub(crate) fn frozen_ids() -> anyhow::Result<BTreeMap<String, String>> {
+    Ok(benchmarks::frozen_ids(&home().join("datasets/benchmarks"))?)
+}
+
+/// The folder of recorded data: `GUMP_RECORDED`, else `shared/data` beside the checkout.
+pub(crate) fn recorded_data() -> PathBuf {
+    match std::env::var_os("GUMP_RECORDED") {
+        Some(folder) => folder.into(),
+        None => repository().join("../shared/data"),
+    }
+}
+
+/// The worst score of every scenario of a closed-loop report, over its planners and worlds. Drives
+/// that failed do not count.
+///
+/// Error: a file that is no report of `evaluate closed-loop`.
+pub(crate) fn worst_scores(report: &Path) -> anyhow::Result<BTreeMap<String, f64>> {
+    let text = std::fs::read_to_string(report)
+        .with_context(|| format!("cannot read {}", report.display()))?;
+    let report_json: Value = serde_json::from_str(&text)
+        .with_context(|| format!("expected a report, found {}", report.display()))?;
+    let scenarios = report_json["results"]["scenarios"].as_array();
+    let scenarios = scenarios.with_context(|| {
+        format!(
+            "expected results.scenarios of evaluate closed-loop in {}",
+            report.display()
+        )
+    })?;
+    let mut worst = BTreeMap::new();
+    for scenario in scenarios {
+        if let (Some(id), Some(score)) = (scenario["id"].as_str(), scenario["score"].as_f64()) {
+            let known = worst.entry(id.to_owned()).or_insert(score);
+            *known = score.min(*known);
+        }
+    }
+    Ok(worst)
+}
