@@ -50,7 +50,7 @@ const REMEMBERED_S: f64 = 9.0;
 /// vehicles that wait at a junction would look like parked ones and never start.
 const WAITED_S: f64 = 4.0;
 /// An agent that has stood in a lane for longer than this although nothing holds it is shown as
-/// having stood for [`RELEASED_S`], and under rules it is redrawn until it starts, seconds. Longer
+/// having stood for [`RELEASED_S`], and under rules it is redrawn once if it stays, seconds. Longer
 /// than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute (result 23).
 const PATIENCE_S: f64 = 9.0;
 const RELEASED_S: f64 = 1.0;
@@ -629,7 +629,7 @@ impl Future {
         let driven = driven.map(|(i, _)| i);
         let could_go = |i: &usize| self.members[*i].could_go && driven != Some(*i);
         let standing = (0..agents.len()).filter(could_go).collect();
-        start(standing, redraws, &mut moves, &mut again);
+        start(standing, &mut moves, &mut again);
         let lines = self.scene.lines.iter().filter_map(|line| {
             let lights = &self.lights_now;
             let i = lights.binary_search_by_key(&line.lane, |light| light.lane);
