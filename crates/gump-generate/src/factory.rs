@@ -273,7 +273,7 @@ fn judged(
                 found = takes::moment(futures, holds);
             }
         }
-        if let (None, Some(stage)) = (&found, stage) {
+        if let (None, Some(stage), true) = (&found, stage, order.request.config.steers) {
             let drive = stage.drive_from(made.scenario.present().ego_now());
             let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;
             found = takes::moment(steered, holds);

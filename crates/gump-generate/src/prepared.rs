@@ -53,7 +53,11 @@ impl<'a> Prepared<'a> {
             return Err(GenerateError::NoLane);
         }
         let lanes = lane_grounds(request)?;
-        let prompts = request.prompts.iter().copied().map(Some).collect();
+        let read = request
+            .prompts
+            .iter()
+            .filter(|_| request.config.prompt_tokens);
+        let prompts = read.copied().map(Some).collect();
         let scene = scene_of_ego(world, request)?;
         let scene_from_world = scene.world_from_scene.inverse();
         let fixtures = request.fixtures.iter().map(|agent| {

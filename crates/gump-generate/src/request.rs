@@ -102,6 +102,11 @@ pub struct GenerateConfig {
     /// another agent ahead. In guided placement only. It makes scenes less like recorded ones, but
     /// their rollouts better.
     pub standing_has_reasons: bool,
+    /// Whether the network reads the prompts as tokens. Without them, prompts still choose the place
+    /// and which scenes are accepted.
+    pub prompt_tokens: bool,
+    /// Whether the ego may be steered where no rollout satisfies the prompts.
+    pub steers: bool,
     /// Draws per object before the scene is started again.
     pub tries: usize,
     /// Restarts of a scene before it is given up.
@@ -140,6 +145,8 @@ impl Default for GenerateConfig {
             standing_has_reasons: false,
             top_k: 1000,
             placement: Placement::Guided,
+            prompt_tokens: true,
+            steers: true,
             tries: 24,
             restarts: 4,
             max_agents: 64,

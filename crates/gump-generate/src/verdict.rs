@@ -10,6 +10,9 @@ use crate::Counts;
 /// Sampling interval of futures, seconds.
 const LOOK_S: f64 = 0.5;
 
+/// The clause that no agents overlap.
+pub const NOBODY_OVERLAPS: &str = "nobody overlaps";
+
 /// One clause of a request.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clause {
@@ -87,7 +90,7 @@ fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
         clauses.push(Clause::new(clause, Some(found.count() == asked)));
     }
     let clear = overlaps_in(present.now()) == 0;
-    clauses.push(Clause::new("nobody overlaps".into(), Some(clear)));
+    clauses.push(Clause::new(NOBODY_OVERLAPS.into(), Some(clear)));
     let on_road = off_road_in(present) == 0;
     clauses.push(Clause::new(
         "vehicles are on the road".into(),

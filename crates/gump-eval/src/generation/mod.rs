@@ -28,7 +28,7 @@ use crate::{EvalError, Monitor};
 pub use long::{
     LongObservation, LongSummary, long_scenes, observe_logs, observe_world, summarize_long,
 };
-pub use prompts::{PromptRow, PromptSatisfaction, prompt_satisfaction};
+pub use prompts::{PromptConfig, PromptRow, PromptSatisfaction, prompt_satisfaction};
 pub use sources::{ComparedScene, SceneMakers, SceneSource};
 
 /// Draws of recordings for an interval.

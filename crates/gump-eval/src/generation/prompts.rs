@@ -4,7 +4,8 @@
 //! map given admits (a car park, an all-way stop) is listed and does not count.
 
 use gump_generate::factory::{GenerationJob, GenerationWorlds, admits, make};
-use gump_generate::{Counts, GenerateRequest};
+use gump_generate::verdict::{Clause, NOBODY_OVERLAPS};
+use gump_generate::{Counts, GenerateConfig, GenerateRequest};
 use gump_metrics::tags::{self, rules};
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rand::seq::SliceRandom as _;
@@ -20,10 +21,23 @@ const PROMPTED: Counts = Counts {
     pedestrians: 4,
     bicycles: 3,
 };
-/// Seconds imagined of unprompted scenes to see which tags hold.
-const JUDGED_S: f64 = 4.0;
+/// Seconds simulated of every scene, to see which tags hold and whether it stays free of overlaps.
+const JUDGED_S: f64 = 8.0;
 /// Unprompted scenes per map that a tag is asked for on.
 const UNPROMPTED: usize = 16;
+
+/// How scenes are asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PromptConfig {
+    /// Maps per tag, among those that admit it; 0 asks for nothing.
+    pub maps: usize,
+    /// Attempts per scene; the last one counts.
+    pub attempts: usize,
+    /// Whether the ego may be steered.
+    pub steers: bool,
+    /// Whether the network reads the prompt.
+    pub tokens: bool,
+}
 
 /// The share of scenes in which tags hold: the mean over those that some map admits.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -51,6 +65,12 @@ pub struct PromptRow {
     pub satisfaction: Option<f64>,
     /// Share of scenes in which the tag holds.
     pub tag_alone: Option<f64>,
+    /// Share of scenes that satisfy their prompt at the first attempt.
+    pub first_attempt: Option<f64>,
+    /// Share of scenes that satisfy it at the first attempt without steering.
+    pub first_unsteered: Option<f64>,
+    /// Share of scenes in which no agents overlap in the 8 s after the present.
+    pub clear_throughout: Option<f64>,
     /// Mean number of attempts.
     pub attempts: Option<f64>,
     /// Share of scenes whose agents were steered.
@@ -68,12 +88,19 @@ struct Asked {
     tag: usize,
     holds: bool,
     is_tag: bool,
+    is_clear: bool,
     attempts: usize,
     is_steered: bool,
     moment_s: f64,
 }
 
-/// Asks for every decidable tag on up to `n_maps` maps that admit it, and counts how often it holds
+impl Asked {
+    fn holds_at_first(&self) -> bool {
+        self.holds && self.attempts == 1
+    }
+}
+
+/// Asks for every decidable tag on maps that admit it, and counts how often it holds
 /// without being asked for. The monitor gets a part that counts scenes.
 ///
 /// # Errors
@@ -82,11 +109,11 @@ struct Asked {
 pub fn prompt_satisfaction(
     worlds: GenerationWorlds<'_>,
     scenarios: &[Scenario],
-    n_maps: usize,
-    attempts: usize,
+    config: PromptConfig,
     seed: Seed,
     monitor: &dyn Monitor,
 ) -> Result<PromptSatisfaction, EvalError> {
+    let n_maps = config.maps;
     if n_maps == 0 {
         return Ok(PromptSatisfaction::default());
     }
@@ -107,7 +134,7 @@ pub fn prompt_satisfaction(
         .into_par_iter()
         .map(|number| {
             let (tag, recorded) = cases[number];
-            let order = order(recorded, Some(tags[tag]), attempts);
+            let order = order(recorded, Some(tags[tag]), config);
             let asked = ask(worlds, &order, tag, number as u64, seed.fork(7));
             progress.advance(1);
             asked
@@ -116,13 +143,29 @@ pub fn prompt_satisfaction(
     let unasked: Vec<Vec<ScenarioTag>> = (0..n_maps * UNPROMPTED)
         .into_par_iter()
         .filter_map(|i| {
-            let order = order(shuffled[i % shuffled.len()], None, 1);
+            let order = order(shuffled[i % shuffled.len()], None, once(config));
             let made = make(worlds, &order, i as u64, seed.fork(8)).ok()?;
             Some(tags::mine(&made.scenario))
         })
         .collect();
     let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
     Ok(summed(&tags, &places, &asked, &unasked, &logged))
+}
+
+/// What places are looked for with; nothing is generated there.
+const ANY: PromptConfig = PromptConfig {
+    maps: 1,
+    attempts: 1,
+    steers: true,
+    tokens: true,
+};
+
+/// The same with one attempt.
+fn once(config: PromptConfig) -> PromptConfig {
+    PromptConfig {
+        attempts: 1,
+        ..config
+    }
 }
 
 /// The first scenes whose maps admit a tag, and how many were looked at until then.
@@ -139,23 +182,29 @@ fn admitting<'a>(scenarios: &[&'a Scenario], tag: ScenarioTag, n: usize, seed: S
             break;
         }
         places.looked_at += 1;
-        if admits(&order(recorded, Some(tag), 1).request, seed) {
+        if admits(&order(recorded, Some(tag), ANY).request, seed) {
             places.found.push(recorded);
         }
     }
     places
 }
 
-fn order(recorded: &Scenario, tag: Option<ScenarioTag>, attempts: usize) -> GenerationJob {
+fn order(recorded: &Scenario, tag: Option<ScenarioTag>, config: PromptConfig) -> GenerationJob {
+    let plain = request(recorded);
     GenerationJob {
         request: GenerateRequest {
             prompts: tag.into_iter().collect(),
             counts: Some(PROMPTED),
-            ..request(recorded)
+            config: GenerateConfig {
+                steers: config.steers,
+                prompt_tokens: config.tokens,
+                ..plain.config.clone()
+            },
+            ..plain
         },
         roams: tag.is_none(),
         seconds: JUDGED_S,
-        attempts,
+        attempts: config.attempts,
     }
 }
 
@@ -172,6 +221,7 @@ fn ask(
             tag,
             holds: made.holds(),
             is_tag: tags::holds(prompt, &made.scenario) == Some(true),
+            is_clear: stays_clear(&made.clauses),
             attempts: made.attempts,
             is_steered: made.is_steered,
             moment_s: made.moment_s,
@@ -180,11 +230,20 @@ fn ask(
             tag,
             holds: false,
             is_tag: false,
+            is_clear: false,
             attempts: order.attempts,
             is_steered: false,
             moment_s: 0.0,
         },
     }
+}
+
+/// Whether no agents overlap from the present on.
+fn stays_clear(clauses: &[Clause]) -> bool {
+    let overlaps = clauses
+        .iter()
+        .find(|clause| clause.clause == NOBODY_OVERLAPS);
+    overlaps.and_then(|clause| clause.holds_throughout) == Some(true)
 }
 
 fn summed(
@@ -217,6 +276,9 @@ fn summed(
             looked_at: places[i].looked_at,
             satisfaction,
             tag_alone: of(&|asked| f64::from(asked.is_tag)),
+            first_attempt: of(&|asked| f64::from(asked.holds_at_first())),
+            first_unsteered: of(&|asked| f64::from(asked.holds_at_first() && !asked.is_steered)),
+            clear_throughout: of(&|asked| f64::from(asked.is_clear)),
             attempts: of(&|asked| asked.attempts as f64),
             steered: of(&|asked| f64::from(asked.is_steered)),
             moment_s: of(&|asked| asked.moment_s),
@@ -247,7 +309,8 @@ mod tests {
             tag,
             holds,
             is_tag: true,
-            attempts: 3,
+            is_clear: !holds,
+            attempts: if holds { 1 } else { 3 },
             is_steered: holds,
             moment_s: 0.5,
         };
@@ -259,6 +322,9 @@ mod tests {
         assert_eq!(prompts.unconditional, Some(0.5));
         assert_eq!(prompts.rows[0].satisfaction, Some(0.5));
         assert_eq!(prompts.rows[0].tag_alone, Some(1.0));
+        assert_eq!(prompts.rows[0].first_attempt, Some(0.5));
+        assert_eq!(prompts.rows[0].first_unsteered, Some(0.0));
+        assert_eq!(prompts.rows[0].clear_throughout, Some(0.5));
         let unadmitted = &prompts.rows[1];
         assert_eq!((unadmitted.maps, unadmitted.satisfaction), (0, None));
         assert_eq!(summed(&tags, &places, &[], &[], &[]).satisfaction, None);

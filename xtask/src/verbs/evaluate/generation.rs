@@ -10,8 +10,8 @@ use gump_engine::SamplingConfig;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::datasets::{self, Split};
 use gump_eval::generation::{
-    ATTRIBUTES, ComparedScene, GenerationTally, LongObservation, SceneMakers, SceneSource,
-    long_scenes, observe_logs, observe_world, prompt_satisfaction, recorded_scenarios,
+    ATTRIBUTES, ComparedScene, GenerationTally, LongObservation, PromptConfig, SceneMakers,
+    SceneSource, long_scenes, observe_logs, observe_world, prompt_satisfaction, recorded_scenarios,
     summarize_long,
 };
 use gump_eval::worlds::{self, World};
@@ -53,6 +53,12 @@ pub(crate) struct Args {
     /// Attempts per prompt; the last one counts
     #[arg(long, value_name = "N", default_value_t = 12)]
     attempts: usize,
+    /// Never steer the ego towards its prompt
+    #[arg(long)]
+    no_steering: bool,
+    /// Do not show prompts to the network; they still choose places and scenes
+    #[arg(long)]
+    no_prompt_token: bool,
     /// Generated scenes rolled out for 30 s, with and without agents that spawn and leave
     #[arg(long, value_name = "N", default_value_t = 8)]
     long_scenes: usize,
@@ -122,9 +128,16 @@ impl Args {
                 scenes: &world,
                 traffic: traffic.model(),
             };
-            let (n_maps, attempts, monitor) = (self.prompt_maps, self.attempts, run.monitor());
-            let found = prompt_satisfaction(worlds, &scenarios, n_maps, attempts, seed, &monitor);
-            Ok(found?)
+            let config = PromptConfig {
+                maps: self.prompt_maps,
+                attempts: self.attempts,
+                steers: !self.no_steering,
+                tokens: !self.no_prompt_token,
+            };
+            let monitor = run.monitor();
+            Ok(prompt_satisfaction(
+                worlds, &scenarios, config, seed, &monitor,
+            )?)
         })?;
         let rows = tallies.iter().map(|(source, tally)| {
             let satisfaction = match source {
