@@ -12,6 +12,7 @@ use clap::Command;
 use toml::{Table, Value};
 
 use crate::cli::WrongArguments;
+use crate::words;
 
 /// Puts the flags of the `--config` file right after the verb, before the flags given by hand, so
 /// that the latter win.
@@ -118,6 +119,7 @@ fn flags(path: &Path, table: &Table, verb: &Command) -> anyhow::Result<Vec<OsStr
     for (key, value) in table {
         // TOML habit writes top_k where a flag is --top-k; both are understood.
         let name = key.replace('_', "-");
+        let name = words::present_name(&name).to_owned();
         if holds_keys(value) {
             continue;
         }
