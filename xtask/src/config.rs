@@ -119,11 +119,11 @@ fn flags(path: &Path, table: &Table, verb: &Command) -> anyhow::Result<Vec<OsStr
     for (key, value) in table {
         // TOML habit writes top_k where a flag is --top-k; both are understood.
         let name = key.replace('_', "-");
-        let name = words::present_name(&name).to_owned();
         if holds_keys(value) {
             continue;
         }
-        if !known.contains(&name.as_str()) {
+        // A former name stays as it is, so that the command line says what it is now.
+        if !known.contains(&words::present_name(&name)) {
             return Err(unknown_key(path, key, known.iter().copied()));
         }
         match value {

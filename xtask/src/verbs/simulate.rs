@@ -46,8 +46,8 @@ pub(crate) struct Args {
     /// Also write the futures in these formats
     #[arg(long, value_enum, value_name = "F", value_delimiter = ',')]
     format: Vec<Format>,
-    /// Show in the viewer the distributions the model sampled from, for the first N futures
-    /// [default N: 1]
+    /// Show in the viewer the distributions the model sampled from, for the first N futures; these
+    /// draws count in frames per second [default N: 1]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]
     heat: Option<NonZeroUsize>,
     #[command(flatten)]
