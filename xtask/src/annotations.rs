@@ -1,14 +1,9 @@
 //! Annotations of the viewer: [`gump_eval::annotations`] as it shows them.
 
-use gump_engine::{PredictiveSamples, ProbeConfig};
-use gump_eval::annotations::{Annotations, predictive_samples};
-use gump_eval::imagine::frames;
-use gump_eval::worlds::World;
-use gump_rollout::SimulateConfig;
+use gump_eval::annotations::Annotations;
+use gump_rollout::{PredictiveSamples, ProbeConfig};
 use gump_scene::{Rollout, Scenario};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
-
-use crate::run::Run;
 
 /// Draws per agent and step of a heat map.
 const DRAWS: usize = 128;
@@ -34,34 +29,25 @@ pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[R
     }
 }
 
-/// Shows what each agent might have done at every step of the first `n_futures`, which are simulated
-/// once more.
-///
-/// Error: as [`predictive_samples`].
-pub(crate) fn heat(
-    run: &Run,
-    viewer: &mut Viewer<'_>,
-    world: World,
-    scenario: &Scenario,
-    n_futures: usize,
-    config: &SimulateConfig,
-) -> anyhow::Result<()> {
-    let probe = ProbeConfig {
+/// The predictive samples that heat maps of the first `n_futures` are made of.
+pub(crate) fn probe(n_futures: usize) -> ProbeConfig {
+    ProbeConfig {
         futures: n_futures,
         draws: DRAWS,
-    };
-    let progress = run.simulating(Some(frames(scenario, n_futures, config)));
-    let samples = predictive_samples(world, scenario, probe, config, run.seed(), &progress)?;
+    }
+}
+
+/// Shows what each agent might have done at every step of the futures that were probed.
+pub(crate) fn heat(viewer: &mut Viewer<'_>, samples: Vec<PredictiveSamples>) {
     for sample in samples {
         viewer.heat(HeatMap {
             agent: sample.agent,
             future: sample.future,
             from_s: sample.from_s(),
-            ahead_s: PredictiveSamples::AHEAD_S,
+            ahead_s: sample.step_s,
             draws: sample.draws,
         });
     }
-    Ok(())
 }
 
 #[cfg(test)]

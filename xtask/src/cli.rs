@@ -90,8 +90,10 @@ pub(crate) struct WrongArguments(pub(crate) String);
 pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Asked> {
     let mut command = command();
     let arguments = config::splice(&command, arguments)?;
+    let notes = words::notes_on_former_names(&arguments);
     let matches = command.try_get_matches_from_mut(arguments);
     let matches = matches.map_err(words::plainer)?;
+    notes.iter().for_each(|note| print_error(note));
     words::check_device(&matches)?;
     Ok(Asked {
         name: name_of(&matches),

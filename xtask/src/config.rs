@@ -12,6 +12,7 @@ use clap::Command;
 use toml::{Table, Value};
 
 use crate::cli::WrongArguments;
+use crate::words;
 
 /// Puts the flags of the `--config` file right after the verb, before the flags given by hand, so
 /// that the latter win.
@@ -121,7 +122,8 @@ fn flags(path: &Path, table: &Table, verb: &Command) -> anyhow::Result<Vec<OsStr
         if holds_keys(value) {
             continue;
         }
-        if !known.contains(&name.as_str()) {
+        // A former name stays as it is, so that the command line says what it is now.
+        if !known.contains(&words::present_name(&name)) {
             return Err(unknown_key(path, key, known.iter().copied()));
         }
         match value {

@@ -2,7 +2,7 @@
 
 use gump_eval::imagine as eval;
 use gump_eval::worlds::World;
-use gump_rollout::{Policy, SimulateConfig};
+use gump_rollout::{ProbeConfig, SimulateConfig};
 use gump_scene::{Scenario, Seed};
 
 use crate::run::Run;
@@ -20,23 +20,26 @@ pub(crate) fn imagine(
     config: &SimulateConfig,
     seed: Seed,
 ) -> anyhow::Result<Imagined> {
-    imagine_around(run, world, scenario, n_futures, config, seed, None)
+    let progress = run.simulating(Some(eval::frames(scenario, n_futures, config)));
+    let imagined = eval::imagine(world, scenario, n_futures, config, seed, &progress);
+    Ok(imagined?)
 }
 
-/// The same around an ego that `driver` drives, if there is one.
+/// As [`imagine`], with predictive samples where some are asked for.
 ///
-/// Error: as [`imagine`], and what the driver reports.
-pub(crate) fn imagine_around(
+/// Error: as [`imagine`], and a world that draws nothing.
+pub(crate) fn imagine_probed(
     run: &Run,
     world: &World,
     scenario: &Scenario,
     n_futures: usize,
     config: &SimulateConfig,
-    seed: Seed,
-    driver: Option<&mut dyn Policy>,
+    probe: ProbeConfig,
 ) -> anyhow::Result<Imagined> {
-    let progress = run.simulating(Some(eval::frames(scenario, n_futures, config)));
-    let imagined =
-        eval::imagine_around(world, scenario, n_futures, config, seed, driver, &progress);
+    let (seed, progress) = (
+        run.seed(),
+        run.simulating(Some(eval::frames(scenario, n_futures, config))),
+    );
+    let imagined = eval::imagine_probed(world, scenario, n_futures, config, seed, probe, &progress);
     Ok(imagined?)
 }

@@ -57,7 +57,7 @@ pub(crate) struct Draw {
     #[arg(long)]
     ruled: bool,
     /// Spawn and remove agents at the scene's boundary, as many as at the start
-    #[arg(long, visible_alias = "spawn")]
+    #[arg(long = "spawn", alias = "life")]
     life: bool,
     /// Traffic lights after the present
     #[arg(long, value_enum, default_value_t = LightsName::Model)]

@@ -6,6 +6,7 @@
 //! first name is a contract with scripts and never changes here. Start with [`dressed`].
 
 use std::error::Error as _;
+use std::ffi::OsString;
 use std::num::{IntErrorKind, ParseFloatError, ParseIntError};
 use std::sync::OnceLock;
 
@@ -28,6 +29,9 @@ const ALIASES: [(&str, &[&str]); 9] = [
     ("world", &["weights"]),
     ("weights", &["world"]),
 ];
+
+/// Flags under their former names, which work for a release more, and under their present ones.
+const FORMER: [(&str, &str); 1] = [("life", "spawn")];
 
 /// Short names; a verb's first flag with a letter has it.
 const SHORT: [(char, &[&str]); 7] = [
@@ -194,6 +198,26 @@ fn dress(mut command: Command, verb: &str) -> Command {
     })
 }
 
+/// The present name of a flag or of a key of a `--config` file.
+pub(crate) fn present_name(name: &str) -> &str {
+    let former = FORMER.iter().find(|(former, _)| *former == name);
+    former.map_or(name, |(_, present)| present)
+}
+
+/// A sentence for each flag that is given under its former name.
+pub(crate) fn notes_on_former_names(arguments: &[OsString]) -> Vec<String> {
+    let given = |name: &str| {
+        let mut words = arguments.iter().take_while(|word| *word != "--");
+        words.any(|word| word.to_str() == Some(&format!("--{name}")))
+    };
+    let notes = FORMER.iter().filter(|(former, _)| given(former));
+    notes
+        .map(|(former, present)| {
+            format!("note: --{former} is now --{present}; the former name works until 0.3")
+        })
+        .collect()
+}
+
 /// Takes `-3` for a number rather than a flag: then whoever wants another number says so.
 fn signed(arg: Arg) -> Arg {
     match arg.get_action().takes_values() {
@@ -309,6 +333,19 @@ mod tests {
             assert_eq!(of.get_one::<String>("scenario").unwrap(), "a");
         }
         assert!(parse("xtask simulate --rollouts-per-scenario 3").is_ok());
+    }
+
+    #[test]
+    fn former_names_are_noted() {
+        let words = |text: &str| text.split(' ').map(OsString::from).collect::<Vec<_>>();
+        let notes = notes_on_former_names(&words("xtask simulate --life --futures 2"));
+        assert_eq!(notes.len(), 1);
+        assert!(notes[0].contains("--life is now --spawn"), "{}", notes[0]);
+        assert!(notes_on_former_names(&words("xtask simulate --spawn -- --life")).is_empty());
+        assert_eq!(
+            (present_name("life"), present_name("seed")),
+            ("spawn", "seed")
+        );
     }
 
     #[test]

@@ -11,12 +11,13 @@ use gump_model::decoder::Bins;
 use gump_model::exact::ExactFrames;
 use gump_model::local_context::Survey;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
+use gump_rollout::ProbeConfig;
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
 use crate::EngineError;
 use crate::cpu::{Context, Engine, Job, SceneMemory};
-use crate::predictive_samples::{ProbeConfig, Seen};
+use crate::predictive_samples::{Seen, requests};
 use crate::redraw::Clearance;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
@@ -109,7 +110,7 @@ impl Step<'_> {
         if window >= self.watch.futures || request.is_driven() {
             return None;
         }
-        let requests: Vec<Request> = self.watch.requests(request).collect();
+        let requests: Vec<Request> = requests(self.watch, request).collect();
         let requests: Vec<&Request> = requests.iter().collect();
         let rows = hidden.repeat(requests.len());
         Some(Seen {

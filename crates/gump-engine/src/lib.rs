@@ -54,6 +54,7 @@ pub mod kinematic_limits;
 pub mod nucleus;
 #[cfg(feature = "tensors")]
 pub mod placement;
+#[cfg(feature = "tensors")]
 mod predictive_samples;
 #[cfg(feature = "tensors")]
 mod redraw;
@@ -84,7 +85,7 @@ pub mod world;
 
 pub use error::EngineError;
 pub use gump_kernels::panels::Precision;
-pub use predictive_samples::{PredictiveSamples, ProbeConfig};
+pub use gump_rollout::{PredictiveSamples, ProbeConfig};
 pub use sampling::{CacheMode, LightSource, Mode, RateScale, SamplingConfig, Surrogate};
 #[cfg(feature = "tensors")]
 pub use trajectories::{AgentTrajectories, TrajectoryMode};

@@ -1,55 +1,16 @@
-//! Predictive samples: the distributions of agents' next states, represented by draws.
+//! How the sequence network makes predictive samples.
 //!
 //! A state is decoded field by field, each given those before, so its distribution has no closed
 //! form; many draws represent it, including truncation and temporal averaging. They come from
 //! separate random streams, so simulated futures do not change.
 
-#[cfg(feature = "tensors")]
 use gump_model::decoder::Bins;
-use gump_model::steps::TOKEN_DT;
-use gump_scene::{AgentId, AgentState};
+use gump_rollout::ProbeConfig;
 
-#[cfg(feature = "tensors")]
 use crate::request::Request;
-
-/// Which predictive samples a session records; none by default.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ProbeConfig {
-    /// Number of futures of a session to record, the first ones.
-    pub futures: usize,
-    /// Draws per agent and step.
-    pub draws: usize,
-}
-
-/// The possible states of one agent half a second later.
-///
-/// Draws that overlap other agents are included; the world itself redraws those
-/// ([`SamplingConfig::redraws`](crate::SamplingConfig::redraws)).
-#[derive(Clone, Debug, PartialEq)]
-pub struct PredictiveSamples {
-    /// Index of the future in the session.
-    pub future: usize,
-    /// Number of steps of the session before it: 0 is sampled from the start.
-    pub step: usize,
-    /// The agent.
-    pub agent: AgentId,
-    /// States, world frame, all equally likely.
-    pub draws: Vec<AgentState>,
-}
-
-impl PredictiveSamples {
-    /// Time from the frame it is sampled from to the draws, seconds.
-    pub const AHEAD_S: f64 = TOKEN_DT;
-
-    /// Time of the frame it is sampled from, seconds after the start.
-    pub fn from_s(&self) -> f64 {
-        self.step as f64 * TOKEN_DT
-    }
-}
 
 /// Draws of an object: its window, its index there, and a chunk of bins each.
 #[derive(Debug)]
-#[cfg(feature = "tensors")]
 pub(crate) struct Seen {
     pub(crate) window: usize,
     pub(crate) place: usize,
@@ -57,25 +18,20 @@ pub(crate) struct Seen {
 }
 
 /// Separates the streams of predictive samples from those of fields and redraws.
-#[cfg(feature = "tensors")]
 const WATCH: u64 = 1 << 40;
 
-#[cfg(feature = "tensors")]
-impl ProbeConfig {
-    /// The same request many times, each with its own random stream.
-    pub(crate) fn requests(self, request: &Request) -> impl Iterator<Item = Request> {
-        (0..self.draws as u64).map(|i| Request {
-            stream: request.stream.fork(WATCH + i),
-            ..request.clone()
-        })
-    }
+/// The same request many times, each with its own random stream.
+pub(crate) fn requests(probe: ProbeConfig, request: &Request) -> impl Iterator<Item = Request> {
+    (0..probe.draws as u64).map(|i| Request {
+        stream: request.stream.fork(WATCH + i),
+        ..request.clone()
+    })
 }
 
 #[cfg(test)]
-#[cfg(feature = "tensors")]
 mod tests {
     use gump_model::testing::{network, scenario};
-    use gump_rollout::{Start, WorldModel};
+    use gump_rollout::{PredictiveSamples, Start, WorldModel};
     use gump_scene::{Frame, Seed};
 
     use super::*;
@@ -84,12 +40,12 @@ mod tests {
 
     const STEPS: usize = 3;
 
-    fn world(sampling: SamplingConfig, watch: ProbeConfig) -> TransformerWorld {
-        TransformerWorld::new(network(), sampling).watching(watch)
-    }
-
-    /// Frames of two futures, step by step.
-    fn imagined(world: &TransformerWorld) -> Vec<Vec<Frame>> {
+    /// Frames of two futures, step by step, and what was recorded of them.
+    fn imagined(
+        sampling: &SamplingConfig,
+        probe: ProbeConfig,
+    ) -> (Vec<Vec<Frame>>, Vec<PredictiveSamples>) {
+        let world = TransformerWorld::new(network(), sampling.clone());
         let scenario = scenario();
         let start = Start {
             scene: scenario.present(),
@@ -97,7 +53,11 @@ mod tests {
             seed: Seed(5),
         };
         let mut session = world.open(&[start]).unwrap();
-        (0..STEPS).map(|_| session.step(None).unwrap()).collect()
+        assert!(session.probe(probe));
+        let frames = (0..STEPS).map(|_| session.step(None).unwrap()).collect();
+        let samples = session.take_predictive_samples();
+        assert!(session.take_predictive_samples().is_empty());
+        (frames, samples)
     }
 
     #[test]
@@ -108,27 +68,24 @@ mod tests {
                 temperature: Some(1.0),
                 ..SamplingConfig::default()
             };
-            let watch = ProbeConfig {
+            let probe = ProbeConfig {
                 futures: 1,
                 draws: 20,
             };
-            let watched = world(sampling.clone(), watch);
-            let frames = imagined(&watched);
-            assert_eq!(frames, imagined(&world(sampling, ProbeConfig::default())));
-            let outlooks = watched.take_predictive_samples();
-            assert!(watched.take_predictive_samples().is_empty());
+            let (frames, samples) = imagined(&sampling, probe);
+            assert_eq!(frames, imagined(&sampling, ProbeConfig::default()).0);
             // One future of two, every step, all five agents, none forgotten.
-            let told: Vec<_> = outlooks.iter().map(|o| (o.future, o.step)).collect();
+            let found: Vec<_> = samples.iter().map(|o| (o.future, o.step)).collect();
             let expected = (0..STEPS).flat_map(|step| [(0, step); 5]);
-            assert_eq!(told, expected.collect::<Vec<_>>(), "{mode:?}");
-            let mut ids: Vec<i64> = outlooks[..5].iter().map(|o| o.agent.0).collect();
+            assert_eq!(found, expected.collect::<Vec<_>>(), "{mode:?}");
+            let mut ids: Vec<i64> = samples[..5].iter().map(|o| o.agent.0).collect();
             ids.sort_unstable();
             assert_eq!(ids, [0, 1, 2, 4, 7]);
             // The network is random, so its draws are apart.
-            for outlook in &outlooks {
-                let first = outlook.draws[0];
-                assert_eq!(outlook.draws.len(), 20);
-                assert!(outlook.draws.iter().any(|draw| *draw != first));
+            for sample in &samples {
+                let first = sample.draws[0];
+                assert_eq!(sample.draws.len(), 20);
+                assert!(sample.draws.iter().any(|draw| *draw != first));
             }
         }
     }
@@ -142,20 +99,18 @@ mod tests {
                 redraws: 0,
                 ..SamplingConfig::default()
             };
-            let watch = ProbeConfig {
+            let probe = ProbeConfig {
                 futures: 2,
                 draws: 4,
             };
-            let world = world(sampling, watch);
-            let frames = imagined(&world);
-            let outlooks = world.take_predictive_samples();
-            assert_eq!(outlooks.len(), 2 * 5 * STEPS);
-            for outlook in outlooks {
-                let state = frames[outlook.step][outlook.future]
-                    .agent(outlook.agent)
+            let (frames, samples) = imagined(&sampling, probe);
+            assert_eq!(samples.len(), 2 * 5 * STEPS);
+            for sample in samples {
+                let state = frames[sample.step][sample.future]
+                    .agent(sample.agent)
                     .unwrap()
                     .state;
-                assert_eq!(outlook.draws, [state; 4], "{mode:?}");
+                assert_eq!(sample.draws, [state; 4], "{mode:?}");
             }
         }
     }

@@ -5,14 +5,14 @@ use std::sync::Arc;
 use gump_model::decoder::Bins;
 use gump_model::mct::VisualMemory;
 use gump_model::steps::TOKEN_DT;
-use gump_rollout::{BoxError, Session, Start};
+use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start};
 use gump_scene::{AgentState, Frame};
 use rayon::prelude::*;
 
 use crate::EngineError;
 use crate::cpu::SceneMemory;
 use crate::decode::{Step, Window, present_all};
-use crate::predictive_samples::{PredictiveSamples, Seen};
+use crate::predictive_samples::Seen;
 use crate::reference::{Passes, decode};
 use crate::rollout_state::Future;
 use crate::scene::Scene;
@@ -29,6 +29,9 @@ pub(crate) struct TransformerSession<'a> {
     pub(crate) world: &'a TransformerWorld,
     pub(crate) scenes: Vec<Scene>,
     pub(crate) futures: Vec<Future>,
+    /// Settings of predictive samples, and those recorded.
+    pub(crate) probe: ProbeConfig,
+    pub(crate) samples: Vec<PredictiveSamples>,
 }
 
 impl Session for TransformerSession<'_> {
@@ -79,6 +82,16 @@ impl Session for TransformerSession<'_> {
             .retain(|_| index.next().is_some_and(|i| futures.contains(&i)));
         self.forget_unused_scenes();
         true
+    }
+
+    /// Only the engine records them: on devices other than a CPU there are none.
+    fn probe(&mut self, config: ProbeConfig) -> bool {
+        self.probe = config;
+        self.world.engine().is_some()
+    }
+
+    fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
+        std::mem::take(&mut self.samples)
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
@@ -156,22 +169,22 @@ impl TransformerSession<'_> {
             memories: &memories,
             windows,
             placed,
-            watch: self.world.watch(),
+            watch: self.probe,
         };
         let decoded = step.decode(&mut contexts);
         self.world.count_passes(decoded.passes);
         let kept = contexts.iter().map(|context| context.bytes()).sum();
         self.world.note_context_bytes(kept);
         let seen = decoded.seen.iter();
-        self.world.keep_outlooks(
-            seen.filter_map(|seen| self.outlook(seen, windows))
-                .collect(),
-        );
+        let samples: Vec<_> = seen
+            .filter_map(|seen| self.samples_of(seen, windows))
+            .collect();
+        self.samples.extend(samples);
         Ok(decoded.bins)
     }
 
     /// Draws of an object in the world frame.
-    fn outlook(&self, seen: &Seen, windows: &[Window]) -> Option<PredictiveSamples> {
+    fn samples_of(&self, seen: &Seen, windows: &[Window]) -> Option<PredictiveSamples> {
         let future = &self.futures[seen.window];
         let scene = &self.scenes[future.scene];
         let window = &windows[seen.window];
@@ -189,6 +202,7 @@ impl TransformerSession<'_> {
         Some(PredictiveSamples {
             future: seen.window,
             step: future.index - future.begun,
+            step_s: TOKEN_DT,
             agent: future.identities.agent(object.key.id)?,
             draws: draws.collect(),
         })

@@ -10,22 +10,21 @@
 //! one that moves into the window is controlled by the network from then on.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
 
 use candle_core::Tensor;
 use gump_model::Network;
 use gump_model::decoder::{Bins, STEPS};
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
-use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_rollout::{BoxError, ProbeConfig, Session, Start, WorldModel};
 use gump_scene::{SceneState, Seed};
 use gump_tokenizer::{QuantizedState, Slot, Tokenizer, TokenizerConfig};
 use rayon::prelude::*;
 
 use crate::EngineError;
 use crate::cpu::{Engine, Job};
-use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::reference::sample_states;
 use crate::request::Request;
 use crate::rollout_state::{Future, stream};
@@ -34,9 +33,6 @@ use crate::scene::{Memory, Scene};
 use crate::session::TransformerSession;
 use crate::spawning::Phases;
 use crate::temporal_ensemble::{Chunk, ChunkBuffer};
-
-/// Why the list of outlooks can be trusted.
-const WHOLE: &str = "nobody panics between taking and giving back the list";
 
 /// A trained sequence network as a world model.
 #[derive(Debug)]
@@ -48,8 +44,6 @@ pub struct TransformerWorld {
     engine: Option<Engine>,
     passes: AtomicU64,
     context_bytes: AtomicUsize,
-    watch: ProbeConfig,
-    outlooks: Mutex<Vec<PredictiveSamples>>,
 }
 
 impl TransformerWorld {
@@ -76,23 +70,7 @@ impl TransformerWorld {
             engine: None,
             passes: AtomicU64::new(0),
             context_bytes: AtomicUsize::new(0),
-            watch: ProbeConfig::default(),
-            outlooks: Mutex::default(),
         }
-    }
-
-    /// The same world, recording predictive samples; simulated futures do not change.
-    ///
-    /// Only the engine records them; on devices other than a CPU there are none.
-    #[must_use]
-    pub fn watching(self, watch: ProbeConfig) -> Self {
-        Self { watch, ..self }
-    }
-
-    /// Takes the predictive samples recorded since the last call: step by step, futures in order,
-    /// and agents in the order in which they are decoded.
-    pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
-        std::mem::take(&mut self.outlooks.lock().expect(WHOLE))
     }
 
     /// Transformer passes so far, whatever their batch size; the first of a session computes the
@@ -142,14 +120,6 @@ impl TransformerWorld {
         self.context_bytes.fetch_max(bytes, Ordering::Relaxed);
     }
 
-    pub(crate) fn watch(&self) -> ProbeConfig {
-        self.watch
-    }
-
-    pub(crate) fn keep_outlooks(&self, seen: Vec<PredictiveSamples>) {
-        self.outlooks.lock().expect(WHOLE).extend(seen);
-    }
-
     /// Adds passes of the network to those counted.
     pub fn count_passes(&self, n: u64) {
         self.passes.fetch_add(n, Ordering::Relaxed);
@@ -195,6 +165,8 @@ impl TransformerWorld {
             world: self,
             scenes,
             futures: futures.into_iter().flatten().collect(),
+            probe: ProbeConfig::default(),
+            samples: Vec::new(),
         })
     }
 

@@ -1,15 +1,9 @@
-//! Annotations of agents beside where they are: how plausible their futures are, metrics over time,
-//! what a learned world sampled from.
+//! Annotations of agents beside where they are: how plausible their futures are, and metrics over
+//! time.
 
-use gump_engine::{PredictiveSamples, ProbeConfig};
 use gump_metrics::behaviour::{Behaviour, Judged, judge};
-use gump_rollout::SimulateConfig;
-use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState, Seed};
+use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_wosac::realism::{Component, Config, Features, Log, Reference, Rollouts, Year};
-
-use crate::imagine::imagine;
-use crate::worlds::World;
-use crate::{EvalError, Monitor};
 
 /// Agents with annotations, those nearest to the ego: more would make pages larger than they need
 /// to be.
@@ -105,26 +99,6 @@ impl Annotations {
         }
         Some(Self { agents, series })
     }
-}
-
-/// Simulates the first futures, as many as `probe` says, with predictive samples of each agent and
-/// step; a future is the same whatever is simulated beside it.
-///
-/// # Errors
-/// A world that is not learned, and as [`imagine`].
-pub fn predictive_samples(
-    world: World,
-    scenario: &Scenario,
-    probe: ProbeConfig,
-    config: &SimulateConfig,
-    seed: Seed,
-    monitor: &dyn Monitor,
-) -> Result<Vec<PredictiveSamples>, EvalError> {
-    let n_futures = probe.futures;
-    let world = world.watching(probe);
-    imagine(&world, scenario, n_futures, config, seed, monitor)?;
-    let ruled = || EvalError::Recording("a world that follows rules draws nothing".into());
-    world.take_predictive_samples().ok_or_else(ruled)
 }
 
 /// What an agent does that a driver would not, in words; empty if it does nothing such.

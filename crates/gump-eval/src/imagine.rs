@@ -9,7 +9,10 @@
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use gump_rollout::{BoxError, Policy, Session, SimulateConfig, Start, WorldModel, simulate};
+use gump_rollout::{
+    BoxError, Policy, PredictiveSamples, ProbeConfig, Session, SimulateConfig, Start, WorldModel,
+    simulate,
+};
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, Rollout, Scenario, Seed};
 
 use crate::worlds::World;
@@ -26,6 +29,8 @@ pub struct Imagined {
     /// Passes of the network per step of the world, whatever their batch, without those over the
     /// history; 0 for worlds that follow rules.
     pub passes_per_frame: f64,
+    /// Predictive samples that were asked for, of [`imagine_probed`].
+    pub samples: Vec<PredictiveSamples>,
 }
 
 impl Imagined {
@@ -71,6 +76,45 @@ pub fn imagine_around(
     driver: Option<&mut dyn Policy>,
     monitor: &dyn Monitor,
 ) -> Result<Imagined, EvalError> {
+    let probe = ProbeConfig::default();
+    simulate_watched(
+        world, scenario, n_futures, config, seed, driver, probe, monitor,
+    )
+}
+
+/// As [`imagine`], with predictive samples of the first futures, which stay the same; the time that
+/// the samples take counts as the world's.
+///
+/// # Errors
+/// As [`imagine`], and [`EvalError::Recording`] for a world that draws nothing.
+pub fn imagine_probed(
+    world: &World,
+    scenario: &Scenario,
+    n_futures: usize,
+    config: &SimulateConfig,
+    seed: Seed,
+    probe: ProbeConfig,
+    monitor: &dyn Monitor,
+) -> Result<Imagined, EvalError> {
+    simulate_watched(
+        world, scenario, n_futures, config, seed, None, probe, monitor,
+    )
+}
+
+#[expect(
+    clippy::too_many_arguments,
+    reason = "the public functions leave out one of the last"
+)]
+fn simulate_watched(
+    world: &World,
+    scenario: &Scenario,
+    n_futures: usize,
+    config: &SimulateConfig,
+    seed: Seed,
+    driver: Option<&mut dyn Policy>,
+    probe: ProbeConfig,
+    monitor: &dyn Monitor,
+) -> Result<Imagined, EvalError> {
     if world.follows_lanes() && scenario.map.lanes().is_empty() {
         return Err(EvalError::Recording(format!(
             "scenario {}: expected a map with lanes to drive on, found none",
@@ -87,6 +131,7 @@ pub fn imagine_around(
         world,
         monitor,
         scene_dt: scene.dt,
+        probe,
         cost: Mutex::new(Cost::default()),
     };
     let rollouts =
@@ -99,6 +144,7 @@ pub fn imagine_around(
         frames: cost.frames,
         elapsed: cost.elapsed,
         passes_per_frame: passes as f64 / cost.steps.max(1) as f64,
+        samples: cost.samples,
     })
 }
 
@@ -107,6 +153,7 @@ struct Watched<'a> {
     /// Told in units of the scene's step, since the world's own is not known before it is open.
     monitor: &'a dyn Monitor,
     scene_dt: f64,
+    probe: ProbeConfig,
     cost: Mutex<Cost>,
 }
 
@@ -117,6 +164,7 @@ struct Cost {
     elapsed: Duration,
     /// Passes of the world once its session was open.
     passes_before: u64,
+    samples: Vec<PredictiveSamples>,
 }
 
 impl Watched<'_> {
@@ -134,7 +182,11 @@ impl WorldModel for Watched<'_> {
 
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
         let began = Instant::now();
-        let session = self.world.model().open(starts)?;
+        let mut session = self.world.model().open(starts)?;
+        if self.probe.futures > 0 && !session.probe(self.probe) {
+            let ruled = "a world that follows rules draws nothing";
+            return Err(EvalError::Recording(ruled.into()).into());
+        }
         self.add(|cost| {
             cost.elapsed += began.elapsed();
             cost.passes_before = self.world.passes();
@@ -164,10 +216,12 @@ impl Session for WatchedSession<'_> {
         self.watched
             .monitor
             .advance((stride * frames.len() as f64) as u64);
+        let samples = self.session.take_predictive_samples();
         self.watched.add(|cost| {
             cost.elapsed += began.elapsed();
             cost.frames += frames.len();
             cost.steps += 1;
+            cost.samples.extend(samples);
         });
         Ok(frames)
     }
@@ -184,7 +238,67 @@ impl Session for WatchedSession<'_> {
         self.session.exchange(future, leave, come)
     }
 
+    fn probe(&mut self, config: ProbeConfig) -> bool {
+        self.session.probe(config)
+    }
+
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
         self.session.replace(future, start)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_engine::SamplingConfig;
+    use gump_model::Device;
+
+    use super::*;
+    use crate::worlds::WorldName;
+
+    #[test]
+    fn samples_are_of_the_same_futures_and_rules_have_none() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 250,0\nego vehicle 0: 0,0 velocity 8,0\n\
+             agent vehicle 1: 30,0 velocity 8,0\nhistory 1 future 1 dt 0.1",
+        )
+        .unwrap();
+        let weights = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../datasets/weights/gump-relative.safetensors"
+        );
+        let learned = WorldName::Model(weights.into());
+        let (config, seed) = (
+            SimulateConfig {
+                seconds: 1.0,
+                ..SimulateConfig::default()
+            },
+            Seed(1),
+        );
+        let probe = ProbeConfig {
+            futures: 1,
+            draws: 4,
+        };
+        let load = |name: &WorldName| {
+            let sampling = SamplingConfig::default();
+            World::without_log(&Device::Cpu, name, &sampling).unwrap()
+        };
+        let world = load(&learned);
+        let plain = imagine(&world, &scenario, 2, &config, seed, &()).unwrap();
+        let probed = imagine_probed(&world, &scenario, 2, &config, seed, probe, &()).unwrap();
+        assert!(plain.samples.is_empty());
+        let frames = |imagined: &Imagined| -> Vec<Vec<Frame>> {
+            imagined
+                .rollouts
+                .iter()
+                .map(|one| one.imagined().to_vec())
+                .collect()
+        };
+        assert_eq!(frames(&plain), frames(&probed));
+        // Two steps of two agents.
+        assert_eq!(probed.samples.len(), 4);
+        assert!(probed.samples.iter().all(|sample| sample.future == 0));
+        let ruled = load(&WorldName::Idm);
+        let error = imagine_probed(&ruled, &scenario, 2, &config, seed, probe, &());
+        assert!(error.is_err_and(|error| error.to_string().contains("draws nothing")));
     }
 }

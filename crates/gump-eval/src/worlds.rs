@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use gump_data::ReadOptions;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
-use gump_engine::{LightSource, PredictiveSamples, ProbeConfig, SamplingConfig, TransformerWorld};
+use gump_engine::{LightSource, SamplingConfig, TransformerWorld};
 use gump_model::{Device, checkpoint, relative};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
@@ -211,24 +211,6 @@ impl World {
         match self {
             Self::Rule(world) => world.name() == "idm",
             Self::Learned(_) | Self::Relative(_) => true,
-        }
-    }
-
-    /// The same world, recording predictive samples of its agents; rule-based worlds have none.
-    pub fn watching(self, watch: ProbeConfig) -> Self {
-        match self {
-            Self::Learned(world) => Self::Learned(Box::new(world.watching(watch))),
-            Self::Relative(world) => Self::Relative(Box::new(world.map(|w| w.watching(watch)))),
-            rule => rule,
-        }
-    }
-
-    /// The recorded predictive samples; `None` for rule-based worlds.
-    pub fn take_predictive_samples(&self) -> Option<Vec<PredictiveSamples>> {
-        match self {
-            Self::Rule(_) => None,
-            Self::Learned(world) => Some(world.take_predictive_samples()),
-            Self::Relative(world) => Some(world.world().take_predictive_samples()),
         }
     }
 

@@ -1,5 +1,6 @@
 //! The whole network with its parameters, as stored in a checkpoint.
 
+use std::borrow::Borrow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -131,12 +132,13 @@ impl Network {
     }
 
     /// Rasters of several scenes as one tensor, [S, P, side, side].
-    pub fn raster_tensor(&self, rasters: &[Raster]) -> Result<Tensor, ModelError> {
+    pub fn raster_tensor<R: Borrow<Raster>>(&self, rasters: &[R]) -> Result<Tensor, ModelError> {
         let side = self.raster_spec.side_px;
-        let data: Vec<f32> = rasters
-            .iter()
-            .flat_map(|raster| raster.data.iter().copied())
-            .collect();
+        let n = rasters.iter().map(|raster| raster.borrow().data.len());
+        let mut data: Vec<f32> = Vec::with_capacity(n.sum());
+        for raster in rasters {
+            data.extend_from_slice(&raster.borrow().data);
+        }
         let shape = (rasters.len(), self.raster_spec.layers.len(), side, side);
         Ok(Tensor::from_vec(data, shape, self.device())?)
     }
@@ -191,9 +193,9 @@ impl Network {
     }
 
     /// Encodes the maps once, for any number of passes.
-    pub fn look(
+    pub fn look<R: Borrow<Raster>>(
         &self,
-        rasters: &[Raster],
+        rasters: &[R],
         surveys: Vec<Arc<Survey>>,
     ) -> Result<VisualMemory, ModelError> {
         let features = self.visual.features(&self.raster_tensor(rasters)?, false)?;

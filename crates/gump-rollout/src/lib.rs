@@ -26,6 +26,7 @@
 pub mod dynamics;
 mod error;
 mod policy;
+mod predictive_samples;
 mod resample;
 mod scripted;
 mod simulate;
@@ -34,6 +35,7 @@ pub mod worlds;
 
 pub use error::RolloutError;
 pub use policy::{Command, Policy};
+pub use predictive_samples::{PredictiveSamples, ProbeConfig};
 pub use scripted::Scripted;
 pub use simulate::{Interpolation, SimulateConfig, fill, simulate};
 pub use world::{BoxError, Session, Start, WorldModel};

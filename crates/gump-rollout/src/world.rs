@@ -4,6 +4,8 @@ use std::error::Error;
 
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, SceneState, Seed};
 
+use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
+
 /// The error type of implementations of worlds and policies.
 pub type BoxError = Box<dyn Error + Send + Sync>;
 
@@ -138,6 +140,19 @@ pub trait Session {
     fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
         let (_, _, _) = (future, leave, come);
         false
+    }
+
+    /// Records predictive samples in later steps; true if it does. Futures do not change.
+    ///
+    /// A session whose states are not drawn from distributions returns false, as the default does.
+    fn probe(&mut self, config: ProbeConfig) -> bool {
+        let _ = config;
+        false
+    }
+
+    /// Takes the predictive samples recorded since the last call: step by step, futures in order.
+    fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
+        Vec::new()
     }
 
     /// Reuses the slot of a finished future for a fresh start (of one future).

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use gump_geometry::Pose;
-use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start, WorldModel};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Frame, Light, MapGraph, Scenario, SceneState,
 };
@@ -256,6 +256,14 @@ impl Session for LivingSession<'_> {
 
     fn exchange(&mut self, future: usize, leave: &[AgentId], come: &[Agent]) -> bool {
         self.session.exchange(future, leave, come)
+    }
+
+    fn probe(&mut self, config: ProbeConfig) -> bool {
+        self.session.probe(config)
+    }
+
+    fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
+        self.session.take_predictive_samples()
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {

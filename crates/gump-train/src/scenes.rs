@@ -1,8 +1,9 @@
 //! Sources of training scenarios: memory, or files larger than memory.
 
 use std::borrow::Cow;
+use std::sync::Arc;
 
-use gump_scene::Scenario;
+use gump_scene::{Frame, Scenario};
 
 use crate::TrainError;
 
@@ -32,6 +33,20 @@ pub trait ScenarioSource: Send + Sync {
     /// # Errors
     /// [`TrainError::Source`] for one that cannot be read.
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError>;
+}
+
+/// The scenario with another log, of which nothing is copied before.
+pub(crate) fn with_log(scenario: &Scenario, log: Vec<Frame>) -> Scenario {
+    Scenario {
+        id: scenario.id.clone(),
+        map: Arc::clone(&scenario.map),
+        route: scenario.route.clone(),
+        log,
+        targets: scenario.targets.clone(),
+        objects_of_interest: scenario.objects_of_interest.clone(),
+        tags: scenario.tags.clone(),
+        ..*scenario
+    }
 }
 
 impl ScenarioSource for Vec<Scenario> {

@@ -64,7 +64,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     simulate: f64,
     /// Spawn and remove agents at the scene's boundary, as many as at the start
-    #[arg(long, visible_alias = "spawn")]
+    #[arg(long = "spawn", alias = "life")]
     life: bool,
     /// Traffic model of the simulated future
     #[arg(long, value_name = "WORLD", default_value_t = shipped::world())]

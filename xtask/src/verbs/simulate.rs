@@ -9,6 +9,7 @@ use gump_data::{find, submission};
 use gump_eval::digest;
 use gump_eval::worlds::{World, WorldName};
 use gump_metrics::{Part, Summary, summarize};
+use gump_rollout::ProbeConfig;
 use gump_scene::{Rollout, Scenario};
 use gump_viz::Viewer;
 use serde::Serialize;
@@ -16,7 +17,7 @@ use serde_json::{Value, json};
 
 use crate::cli::WrongArguments;
 use crate::films::{self, FilmArgs};
-use crate::imagine::{Imagined, imagine};
+use crate::imagine::{Imagined, imagine_probed};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::{annotations, futures, tables};
@@ -45,8 +46,8 @@ pub(crate) struct Args {
     /// Also write the futures in these formats
     #[arg(long, value_enum, value_name = "F", value_delimiter = ',')]
     format: Vec<Format>,
-    /// Show in the viewer the distributions the model sampled from, for the first N futures
-    /// [default N: 1]
+    /// Show in the viewer the distributions the model sampled from, for the first N futures; these
+    /// draws count in frames per second [default N: 1]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "1")]
     heat: Option<NonZeroUsize>,
     #[command(flatten)]
@@ -104,6 +105,12 @@ impl Args {
         }
     }
 
+    /// The predictive samples of `--heat`.
+    fn probe(&self) -> ProbeConfig {
+        let n = self.heat.map_or(0, NonZeroUsize::get);
+        annotations::probe(n.min(self.futures.get()))
+    }
+
     /// One scene, and all that is written of it.
     fn execute_one(&self, run: &mut Run) -> anyhow::Result<()> {
         let decoding = self.sampling.decoding(&self.world)?;
@@ -117,25 +124,19 @@ impl Args {
                 &decoding.sampling,
             )?)
         })?;
-        let imagined = run.phase("imagine", |run| {
-            let (n, seed) = (self.futures.get(), run.seed());
-            imagine(run, &world, &scenario, n, &config, seed)
+        let mut imagined = run.phase("imagine", |run| {
+            let n = self.futures.get();
+            imagine_probed(run, &world, &scenario, n, &config, self.probe())
                 .with_context(|| format!("cannot simulate {}", self.scenario))
         })?;
         let summary = run.phase("score", |_| {
             Ok(summarize(&imagined.rollouts, Some(&scenario)))
         })?;
         let mut viewer = Viewer::new(&scenario);
-        run.phase("look closer", |run| {
+        run.phase("look closer", |_| {
             annotations::realism(&mut viewer, &scenario, &imagined.rollouts);
-            let n = self
-                .heat
-                .map_or(0, NonZeroUsize::get)
-                .min(self.futures.get());
-            match n {
-                0 => Ok(()),
-                n => annotations::heat(run, &mut viewer, world, &scenario, n, &config),
-            }
+            annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
+            Ok(())
         })?;
         run.phase("write", |run| {
             self.write(run, &scenario, &imagined.rollouts, viewer)

@@ -21,7 +21,7 @@ use gump_model::relative::graph::{Body, Lights, Shown};
 use gump_model::relative::grid::{FIELDS, dequantize};
 use gump_model::relative::map::{Hidden, VectorMap};
 use gump_model::steps::TOKEN_DT;
-use gump_rollout::{BoxError, Session, Start, WorldModel};
+use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start, WorldModel};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Frame, Lane, Light, LightState, MapGraph, SceneState,
     Seed,
@@ -30,7 +30,6 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::EngineError;
-use crate::predictive_samples::{PredictiveSamples, ProbeConfig};
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
 use crate::relative::rules::{Driven, StopLine, heed, held_back, runs_red, settle, start};
 use crate::relative::seen::{Seen, add_presents};
@@ -141,9 +140,6 @@ pub struct RelativeWorld {
     sampling: RelativeSampling,
     /// Steps made so far, of all sessions.
     passes: AtomicU64,
-    /// Settings of predictive samples, and the recorded ones.
-    watch: ProbeConfig,
-    outlooks: Mutex<Vec<PredictiveSamples>>,
     /// Scenes of open sessions: further sessions from the same present share them.
     scenes: Mutex<Vec<(Laid, Weak<Scene>)>>,
 }
@@ -183,27 +179,13 @@ impl RelativeWorld {
             engine: Engine::new(weights, sampling.precision)?,
             sampling,
             passes: AtomicU64::new(0),
-            watch: ProbeConfig::default(),
-            outlooks: Mutex::default(),
             scenes: Mutex::default(),
         })
-    }
-
-    /// The same world, recording predictive samples.
-    pub fn watching(self, watch: ProbeConfig) -> Self {
-        Self { watch, ..self }
     }
 
     /// Sets the divisor of the logits; above 1 gives more varied draws.
     pub fn set_temperature(&mut self, temperature: f64) {
         self.sampling.temperature = temperature;
-    }
-
-    /// Takes the predictive samples recorded since the last call: step by step, futures in order,
-    /// and agents in the order of their ids.
-    pub fn take_predictive_samples(&self) -> Vec<PredictiveSamples> {
-        let mut kept = self.outlooks.lock().unwrap_or_else(PoisonError::into_inner);
-        std::mem::take(&mut *kept)
     }
 
     /// Steps made so far, whatever the number of futures.
@@ -287,6 +269,8 @@ impl WorldModel for RelativeWorld {
             world: self,
             futures: begun.into_iter().flatten().collect(),
             step: 0,
+            probe: ProbeConfig::default(),
+            samples: Vec::new(),
         }))
     }
 }
@@ -678,6 +662,7 @@ impl Future {
         let outlook = |(i, member): (usize, &Member)| PredictiveSamples {
             future,
             step,
+            step_s: TOKEN_DT,
             agent: member.agent.id,
             draws: draws
                 .iter()
@@ -824,6 +809,9 @@ struct RelativeSession<'a> {
     futures: Vec<Future>,
     /// Steps made so far.
     step: usize,
+    /// Settings of predictive samples, and those recorded.
+    probe: ProbeConfig,
+    samples: Vec<PredictiveSamples>,
 }
 
 impl Session for RelativeSession<'_> {
@@ -833,19 +821,15 @@ impl Session for RelativeSession<'_> {
 
     fn step(&mut self, ego: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
         let (engine, sampling) = (&self.world.engine, &self.world.sampling);
-        let watch = self.world.watch;
-        if watch.futures > 0 && watch.draws > 0 {
-            let watched = self.futures.iter().take(watch.futures).enumerate();
-            let seen = watched.flat_map(|(i, future)| {
+        let probe = self.probe;
+        if probe.futures > 0 && probe.draws > 0 {
+            let probed = self.futures.iter().take(probe.futures).enumerate();
+            let seen = probed.flat_map(|(i, future)| {
                 let driven = ego.is_some().then_some(future.scene.ego);
-                let draws = 0..watch.draws as u64;
+                let draws = 0..probe.draws as u64;
                 future.outlooks(engine, sampling, (draws, i, self.step), driven)
             });
-            let mut kept = self.world.outlooks.lock();
-            let kept = kept
-                .as_mut()
-                .map_err(|_| "a thread panicked while watching")?;
-            kept.extend(seen);
+            self.samples.extend(seen);
         }
         self.step += 1;
         self.world.passes.fetch_add(1, Ordering::Relaxed);
@@ -867,6 +851,15 @@ impl Session for RelativeSession<'_> {
             futures.binary_search(&(at - 1)).is_ok()
         });
         true
+    }
+
+    fn probe(&mut self, config: ProbeConfig) -> bool {
+        self.probe = config;
+        true
+    }
+
+    fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
+        std::mem::take(&mut self.samples)
     }
 
     fn show(&mut self, future: usize, lights: &[Light]) -> bool {

@@ -2,9 +2,9 @@
 //! determined from the log.
 
 use gump_geometry::angle_difference;
-use gump_scene::{Agent, Lane, MapGraph, Scenario};
+use gump_scene::{Agent, Lane, MapGraph};
 
-use super::situation::{is_on_intersection, lane_of};
+use super::situation::{View, is_on_intersection, lane_of};
 
 /// Time window around the present in which entering an intersection counts, seconds.
 const ENTRY_S: [f64; 2] = [0.5, 1.0];
@@ -47,8 +47,8 @@ impl Turn {
 }
 
 /// The turn (or straight path) that the ego begins at the present.
-pub(super) fn turn(scenario: &Scenario) -> Option<Turn> {
-    let map: &MapGraph = &scenario.map;
+pub(super) fn turn(scenario: View<'_>) -> Option<Turn> {
+    let map: &MapGraph = scenario.map;
     let ego = |step: usize| scenario.log.get(step)?.agent(scenario.ego);
     let steps = |seconds: f64| (seconds / scenario.dt).round() as usize;
     let first = scenario.now.saturating_sub(steps(ENTRY_S[0]));
@@ -60,7 +60,7 @@ pub(super) fn turn(scenario: &Scenario) -> Option<Turn> {
         .unwrap_or(scenario.log.len() - 1);
     let (before, after) = (ego(entry)?, last_there(scenario, exit)?);
     let lit = lane_of(map, ego(entry + 1)?);
-    let frame = scenario.present().now();
+    let frame = scenario.at(scenario.now).now();
     Some(Turn {
         angle: turned(scenario, entry, exit).unwrap_or_else(|| {
             angle_difference(after.state.pose.heading, before.state.pose.heading)
@@ -72,7 +72,7 @@ pub(super) fn turn(scenario: &Scenario) -> Option<Turn> {
 
 /// The sum of the changes of heading, which distinguishes a U-turn to the left from one to the
 /// right.
-fn turned(scenario: &Scenario, from: usize, to: usize) -> Option<f64> {
+fn turned(scenario: View<'_>, from: usize, to: usize) -> Option<f64> {
     let headings: Option<Vec<f64>> = (from..=to)
         .map(|step| Some(scenario.log[step].agent(scenario.ego)?.state.pose.heading))
         .collect();
@@ -83,7 +83,7 @@ fn turned(scenario: &Scenario, from: usize, to: usize) -> Option<f64> {
     Some(changes.sum())
 }
 
-fn last_there(scenario: &Scenario, until: usize) -> Option<&Agent> {
+fn last_there(scenario: View<'_>, until: usize) -> Option<&Agent> {
     (0..=until)
         .rev()
         .find_map(|step| scenario.log[step].agent(scenario.ego))
@@ -91,9 +91,9 @@ fn last_there(scenario: &Scenario, until: usize) -> Option<&Agent> {
 
 /// The side of the lane change that begins at the present, positive to the left, with the metres
 /// moved in the next second.
-pub(super) fn lane_change(scenario: &Scenario, lane: Option<&Lane>) -> Option<f64> {
+pub(super) fn lane_change(scenario: View<'_>, lane: Option<&Lane>) -> Option<f64> {
     let lane = lane.filter(|lane| !lane.in_intersection)?;
-    let map: &MapGraph = &scenario.map;
+    let map: &MapGraph = scenario.map;
     let n = (CHANGE_S / scenario.dt).round() as usize;
     let ego = |step: usize| scenario.log.get(step)?.agent(scenario.ego);
     let side = (1..=n).find_map(|k| {

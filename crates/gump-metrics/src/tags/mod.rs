@@ -13,9 +13,9 @@ mod maneuver;
 mod situation;
 
 use gump_geometry::angle_difference;
-use gump_scene::{AgentKind, AreaKind, Scenario, ScenarioTag};
+use gump_scene::{AgentId, AgentKind, AreaKind, Scenario, ScenarioTag};
 
-use situation::{Other, Situation, footprint, touches};
+use situation::{Other, Situation, View, footprint, touches};
 
 /// A tag, its meaning, and its rule.
 #[derive(Clone, Copy)]
@@ -49,7 +49,17 @@ pub fn rules() -> &'static [Rule] {
 
 /// The tags that hold at the present of a scenario, sorted.
 pub fn mine(scenario: &Scenario) -> Vec<ScenarioTag> {
-    let situation = Situation::of(scenario);
+    of_view(View::of(scenario))
+}
+
+/// The tags that hold at frame `now` of a scenario with `agent` as the ego, whose route is not known;
+/// sorted. The agent must be in that frame.
+pub fn around(scenario: &Scenario, agent: AgentId, now: usize) -> Vec<ScenarioTag> {
+    of_view(View::around(scenario, agent, now))
+}
+
+fn of_view(view: View<'_>) -> Vec<ScenarioTag> {
+    let situation = Situation::of(view);
     let holds = |rule: &&Rule| rule.decide.is_some_and(|decide| decide(&situation));
     RULES.iter().filter(holds).map(Rule::tag).collect()
 }
@@ -57,7 +67,7 @@ pub fn mine(scenario: &Scenario) -> Vec<ScenarioTag> {
 /// Whether one tag holds; `None` if that cannot be decided.
 pub fn holds(tag: ScenarioTag, scenario: &Scenario) -> Option<bool> {
     let decide = RULES[tag.index()].decide?;
-    Some(decide(&Situation::of(scenario)))
+    Some(decide(&Situation::of(View::of(scenario))))
 }
 
 const fn rule(

@@ -1,9 +1,12 @@
 //! The facts that tags depend on, computed once per scenario: the ego, the agents around it, the
 //! areas it is on and the road ahead.
 
+use std::sync::Arc;
+
 use gump_geometry::{DVec2, Polygon, angle_difference};
 use gump_scene::{
-    Agent, AgentKind, AreaKind, Frame, Lane, LightState, MapGraph, Scenario, SceneState,
+    Agent, AgentId, AgentKind, AreaKind, Frame, Lane, LightState, MapGraph, Route, Scenario,
+    SceneState,
 };
 
 use super::maneuver::{Turn, lane_change, turn};
@@ -43,9 +46,54 @@ pub(super) struct Ahead<T> {
     pub(super) what: T,
 }
 
+/// A scenario as seen from some agent at some time.
+#[derive(Clone, Copy)]
+pub(super) struct View<'a> {
+    pub(super) map: &'a Arc<MapGraph>,
+    route: Option<&'a Arc<Route>>,
+    pub(super) log: &'a [Frame],
+    pub(super) dt: f64,
+    pub(super) now: usize,
+    pub(super) ego: AgentId,
+}
+
+impl<'a> View<'a> {
+    /// The view of the ego at the present.
+    pub(super) fn of(scenario: &'a Scenario) -> Self {
+        Self {
+            map: &scenario.map,
+            route: scenario.route.as_ref(),
+            log: &scenario.log,
+            dt: scenario.dt,
+            now: scenario.now,
+            ego: scenario.ego,
+        }
+    }
+
+    /// The view of another agent or time, without the ego's route.
+    pub(super) fn around(scenario: &'a Scenario, agent: AgentId, now: usize) -> Self {
+        Self {
+            route: None,
+            now,
+            ego: agent,
+            ..Self::of(scenario)
+        }
+    }
+
+    pub(super) fn at(&self, index: usize) -> SceneState<'a> {
+        SceneState {
+            map: self.map,
+            route: self.route,
+            history: &self.log[..=index],
+            ego: self.ego,
+            dt: self.dt,
+        }
+    }
+}
+
 /// The facts.
 pub(super) struct Situation<'a> {
-    pub(super) scenario: &'a Scenario,
+    pub(super) scenario: View<'a>,
     pub(super) ego: &'a Agent,
     pub(super) speed: f64,
     /// Along the heading, metres per second squared.
@@ -69,10 +117,10 @@ pub(super) struct Situation<'a> {
 }
 
 impl<'a> Situation<'a> {
-    pub(super) fn of(scenario: &'a Scenario) -> Self {
-        let scene = scenario.present();
+    pub(super) fn of(scenario: View<'a>) -> Self {
+        let scene = scenario.at(scenario.now);
         let ego = scene.ego_now();
-        let map: &MapGraph = &scenario.map;
+        let map: &MapGraph = scenario.map;
         let frame = scene.now();
         let lane = lane_of(map, ego);
         let on_intersection = is_on_intersection(map, ego);
@@ -172,7 +220,8 @@ impl<'a> Situation<'a> {
 
     fn slowest_within(&self, seconds: f64) -> f64 {
         let n = (seconds / self.scenario.dt).round() as usize;
-        let states = self.scenario.future().iter().take(n);
+        let future = &self.scenario.log[self.scenario.now + 1..];
+        let states = future.iter().take(n);
         let speeds = states.filter_map(|frame| frame.agent(self.ego.id));
         speeds
             .map(|ego| ego.state.speed())
@@ -246,7 +295,7 @@ fn others<'a>(frame: &'a Frame, ego: &Agent) -> Vec<Other<'a>> {
 }
 
 /// Along and across the ego's heading, over [`MOTION_S`] before and after the present.
-fn acceleration(scenario: &Scenario, scene: &SceneState<'_>) -> (f64, f64) {
+fn acceleration(scenario: View<'_>, scene: &SceneState<'_>) -> (f64, f64) {
     let n = (MOTION_S / scenario.dt).round().max(1.0) as usize;
     let velocity = |step: usize| {
         let ego = scenario.log.get(step)?.agent(scenario.ego)?;
@@ -264,7 +313,7 @@ fn acceleration(scenario: &Scenario, scene: &SceneState<'_>) -> (f64, f64) {
     (acceleration.dot(ahead), acceleration.dot(ahead.perp()))
 }
 
-fn jerk(scenario: &Scenario) -> f64 {
+fn jerk(scenario: View<'_>) -> f64 {
     let n = (MOTION_S / scenario.dt).round().max(1.0) as usize;
     let at = |step: usize| {
         let scene = (step < scenario.log.len()).then(|| scenario.at(step))?;
@@ -280,17 +329,13 @@ fn jerk(scenario: &Scenario) -> f64 {
 }
 
 /// The lanes the ego drives next, with the distances from its front to their starts.
-fn ways_ahead<'a>(
-    scenario: &'a Scenario,
-    ego: &Agent,
-    lane: Option<&'a Lane>,
-) -> Vec<(&'a Lane, f64)> {
-    let map: &MapGraph = &scenario.map;
+fn ways_ahead<'a>(scenario: View<'a>, ego: &Agent, lane: Option<&'a Lane>) -> Vec<(&'a Lane, f64)> {
+    let map: &MapGraph = scenario.map;
     let Some(lane) = lane else {
         return Vec::new();
     };
     let on_route = |lane: &Lane| {
-        let route = scenario.route.as_ref();
+        let route = scenario.route;
         route.is_some_and(|route| route.lanes.contains(&lane.id))
     };
     let driven = lane.centerline.project(ego.state.pose.position).arc_length;

@@ -617,3 +617,22 @@ fn places() {
     scenario.map = std::sync::Arc::new(gump_scene::MapGraph::new(parts).unwrap());
     check_scene(&scenario, &["on_carpark"], &["traversing_narrow_lane"]);
 }
+
+#[test]
+fn another_agent_at_another_time_has_the_tags_of_a_scenario_retold() {
+    let scenario = fixture::scenario(
+        "lane 1: -50,0 250,0\nego vehicle 0: 0,0 velocity 8,0\n\
+         agent vehicle 1: -15,0 velocity 8,0\nagent vehicle 2: 20,0 velocity 6,0\n\
+         history 1 future 6 dt 0.1",
+    )
+    .unwrap();
+    for (agent, now) in [(1, 4), (2, 30), (0, scenario.now)] {
+        let retold = Scenario {
+            now,
+            ego: AgentId(agent),
+            route: None,
+            ..scenario.clone()
+        };
+        assert_eq!(around(&scenario, AgentId(agent), now), mine(&retold));
+    }
+}

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use candle_core::Tensor;
 use gump_model::decoder::STEPS;
 use gump_model::{ModelError, Network};
+use gump_raster::Raster;
 use serde_json::{Value, json};
 
 use super::counts::weight;
@@ -25,7 +26,7 @@ pub(crate) fn export(
     config: &LossConfig,
 ) -> Result<(BTreeMap<String, Tensor>, Value), ModelError> {
     let device = network.device();
-    let rasters: Vec<_> = samples.iter().map(|sample| sample.raster.clone()).collect();
+    let rasters: Vec<&Raster> = samples.iter().map(|sample| &sample.raster).collect();
     let raster = network.raster_tensor(&rasters)?;
     let surveys = samples.iter().map(|sample| sample.survey.clone());
     let memory = network.look(&rasters, surveys.collect())?;

@@ -24,6 +24,7 @@ use gump_model::decoder::{STEPS, StateDecoder};
 use gump_nn::layers::Dropout;
 use gump_nn::ops;
 use gump_nn::ops::Targets;
+use gump_raster::Raster;
 
 use self::counts::weight;
 use self::trajectory::{at_agents, trajectory_loss, trajectory_targets};
@@ -198,7 +199,7 @@ pub(crate) fn loss(
 ) -> Result<(Tensor, LossParts), ModelError> {
     let device = network.device();
     let width = network.config().width;
-    let rasters: Vec<_> = samples.iter().map(|sample| sample.raster.clone()).collect();
+    let rasters: Vec<&Raster> = samples.iter().map(|sample| &sample.raster).collect();
     let raster = network.raster_tensor(&rasters)?;
     let features = network.visual.features(&raster, training)?;
     let surveys = samples.iter().map(|sample| Arc::clone(&sample.survey));

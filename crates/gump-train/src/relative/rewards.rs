@@ -19,6 +19,7 @@ use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Y
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::scenes::with_log;
 
 /// Returns are clipped to this many standard deviations.
 const MOST: f64 = 3.0;
@@ -155,9 +156,8 @@ fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     let log = scenario.log.iter().map(crop).collect();
     let targets = kept.iter().copied().filter(|id| *id != scenario.ego);
     Scenario {
-        log,
         targets: targets.collect(),
-        ..scenario.clone()
+        ..with_log(scenario, log)
     }
 }
 
@@ -181,10 +181,7 @@ fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Opti
     let samples = futures.iter().zip(&earnings).map(|(future, earned)| {
         let mut log = scenario.log[..=scenario.now].to_vec();
         log.extend(future.imagined().iter().cloned());
-        let driven = Scenario {
-            log,
-            ..scenario.clone()
-        };
+        let driven = with_log(scenario, log);
         let mut sample = whole(&driven, start, &ids, &map)?;
         sample.weigh(|agent, frame| {
             let own = scored[agent].zip(frame.checked_sub(first_move));

@@ -327,13 +327,7 @@ fn prompts(window: &Window<'_>, config: &SampleConfig, rng: &mut Rng) -> Vec<Opt
     let mut tags = if is_own && !scenario.tags.is_empty() {
         scenario.tags.clone()
     } else {
-        let seen = Scenario {
-            now: window.start,
-            ego: window.centre,
-            route: None,
-            ..scenario.clone()
-        };
-        gump_metrics::tags::mine(&seen)
+        gump_metrics::tags::around(scenario, window.centre, window.start)
     };
     for i in (1..tags.len()).rev() {
         tags.swap(i, rng.random_range(0..=i));

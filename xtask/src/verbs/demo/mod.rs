@@ -18,6 +18,7 @@ use gump_viz::{CandidatePath, Page, Viewer};
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::imagine::imagine_probed;
 use crate::run::{Common, Run};
 use crate::{annotations, machine, shipped};
 
@@ -132,7 +133,10 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
         &demo.sampling,
     )?;
     let config = Decoding::of(demo.sampling.clone()).frames(imagine::SECONDS);
-    annotations::heat(run, &mut viewer, world, &demo.scenario, 1, &config)?;
+    // By itself, so that the frames per second of the table are those of futures alone.
+    let probe = annotations::probe(1);
+    let probed = imagine_probed(run, &world, &demo.scenario, 1, &config, probe)?;
+    annotations::heat(&mut viewer, probed.samples);
     for candidate in &demo.candidates {
         viewer.candidate(candidate.clone());
     }

@@ -9,20 +9,20 @@ use super::super::rl;
 use super::{behaviour, closed_loop, motion, reactions, wosac};
 use crate::run::{Common, Run};
 
-/// How the report of a benchmark is made from the folders of its shards.
-type Tell = fn(&mut Run, &[PathBuf], MissingShards) -> anyhow::Result<()>;
+/// Reports on a benchmark from the folders of its shards.
+type ReportMerged = fn(&mut Run, &[PathBuf], MissingShards) -> anyhow::Result<()>;
 
 /// Benchmarks that can be sharded, by the name in their ledgers.
-const BENCHMARKS: &[(&str, Tell)] = &[
+const BENCHMARKS: &[(&str, ReportMerged)] = &[
     (gump_eval::behaviour::BENCHMARK, behaviour::report_merged),
     (
         gump_eval::closed_loop::BENCHMARK,
         closed_loop::report_merged,
     ),
-    (motion::NAME, motion::tell_merged),
+    (motion::NAME, motion::report_merged),
     (gump_eval::reactions::BENCHMARK, reactions::report_merged),
-    (rl::evaluate::BENCHMARK, rl::columns::tell_merged),
-    (wosac::BENCHMARK, wosac::tell_merged),
+    (rl::evaluate::BENCHMARK, rl::columns::report_merged),
+    (wosac::BENCHMARK, wosac::report_merged),
 ];
 
 /// Arguments of `evaluate merge`.
@@ -42,7 +42,7 @@ pub(crate) struct Args {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let benchmark = results::header(&self.folders[0])?.benchmark;
-        let Some((_, tell)) = BENCHMARKS.iter().find(|(name, _)| *name == benchmark) else {
+        let Some((_, report)) = BENCHMARKS.iter().find(|(name, _)| *name == benchmark) else {
             let known: Vec<_> = BENCHMARKS.iter().map(|(name, _)| *name).collect();
             anyhow::bail!(
                 "expected shards of {}, found {benchmark}: {}",
@@ -54,7 +54,7 @@ impl Args {
             true => MissingShards::Allow,
             false => MissingShards::Refuse,
         };
-        tell(run, &self.folders, missing)?;
+        report(run, &self.folders, missing)?;
         if self.incomplete {
             let mut shards = Vec::new();
             for folder in &self.folders {

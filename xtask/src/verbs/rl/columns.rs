@@ -99,7 +99,7 @@ impl DriveRecord {
 }
 
 /// Puts shards together and reports on the whole.
-pub(crate) fn tell_merged(
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,

@@ -16,7 +16,7 @@ use serde::Serialize;
 use super::{Args, by_class};
 use crate::annotations;
 use crate::cli::WrongArguments;
-use crate::imagine::{Imagined, imagine};
+use crate::imagine::{Imagined, imagine_probed};
 use crate::run::Run;
 
 /// A scene in the report.
@@ -90,24 +90,15 @@ fn add(
     gallery: &mut Gallery,
 ) -> anyhow::Result<(Imagined, Summary)> {
     let world = World::build(run.device(), &args.world, scenario, &decoding.sampling)?;
-    let imagined = imagine(
-        run,
-        &world,
-        scenario,
-        args.futures.get(),
-        config,
-        run.seed(),
-    )
-    .with_context(|| format!("cannot simulate {}", scenario.id))?;
+    let n = args.futures.get();
+    let mut imagined = imagine_probed(run, &world, scenario, n, config, args.probe())
+        .with_context(|| format!("cannot simulate {}", scenario.id))?;
     let summary = summarize(&imagined.rollouts, Some(scenario));
     let mut viewer = Viewer::new(scenario);
     viewer.note(note(args, &summary.total()));
     viewer.futures(&imagined.rollouts);
     annotations::realism(&mut viewer, scenario, &imagined.rollouts);
-    if let Some(n) = args.heat {
-        let n = n.min(args.futures).get();
-        annotations::heat(run, &mut viewer, world, scenario, n, config)?;
-    }
+    annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
     gallery.add(&viewer);
     Ok((imagined, summary))
 }

@@ -8,12 +8,11 @@ use std::ops::Range;
 
 use gump_geometry::Pose;
 use gump_model::steps::TOKEN_DT;
-use gump_rollout::Start;
+use gump_rollout::{PredictiveSamples, Start};
 use gump_scene::{AgentId, AgentState, Frame, Light, SceneState, Seed};
 
 use super::{Future, RelativeWorld, Workspace};
 use crate::EngineError;
-use crate::predictive_samples::PredictiveSamples;
 
 #[cfg(doc)]
 use gump_rollout::Session;

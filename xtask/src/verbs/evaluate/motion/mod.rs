@@ -1,8 +1,8 @@
 //! `evaluate motion`: motion prediction as the Waymo challenge measures it, of predictions in a
 //! file or of a world's futures.
 
+mod report;
 mod scores;
-mod tell;
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -28,7 +28,7 @@ use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 
-pub(crate) use self::tell::tell_merged;
+pub(crate) use self::report::report_merged;
 
 /// Name of the benchmark in ledgers.
 pub(crate) const NAME: &str = "motion";
@@ -161,7 +161,7 @@ impl Args {
         source.check_all_used(&ids)?;
         let entries = ledger.close()?;
         left_out.tell(run, entries.len())?;
-        tell::tell(run, &scenarios.name, &entries, &config, source.decoding())
+        report::report(run, &scenarios.name, &entries, &config, source.decoding())
     }
 
     fn open(&self, scenarios: &ScenarioSet) -> anyhow::Result<gump_data::Reader> {

@@ -2,9 +2,9 @@
 //!
 //! Scenarios stream through one at a time; each gets three scores (what is evaluated, the log
 //! itself as an oracle, constant velocity), which the ledger keeps. Scenarios, their rollouts and
-//! their scores are [`gump_eval::realism`]'s; `tell` makes the report.
+//! their scores are [`gump_eval::realism`]'s; `report` sums them up.
 
-mod tell;
+mod report;
 mod worst;
 
 use std::io::Write as _;
@@ -30,7 +30,7 @@ use crate::run::{Common, Run, interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 use crate::tables;
-pub(crate) use tell::tell_merged;
+pub(crate) use report::report_merged;
 use worst::Worst;
 
 /// Name of the benchmark in ledgers.
@@ -206,7 +206,7 @@ impl Args {
             "expected scenarios in shard {shard}, found none: {}",
             self.scenarios
         );
-        tell::tell(run, &settings, &entries)?;
+        report::report(run, &settings, &entries)?;
         if self.world.is_some() {
             // Scenarios of an earlier run of the same evaluation had as many.
             fewest = fewest.min(self.rollouts_per_scenario.get());

@@ -22,15 +22,15 @@ const ORACLE: &str = "logged-oracle";
 /// The name of the baseline.
 const CONSTANT_VELOCITY: &str = "constant-velocity";
 
-/// Puts shards together and tells the whole.
-pub(crate) fn tell_merged(
+/// Reports on the shards in some folders.
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
     let (header, entries) = results::merge::<ScenarioScores>(folders, missing)?;
     let settings: Settings = header.settings.try_into()?;
-    tell(run, &settings, &entries)
+    report(run, &settings, &entries)
 }
 
 /// A world under one decoding: what it got in every scenario.
@@ -81,7 +81,7 @@ fn told(settings: &Settings, entries: &[Entry<ScenarioScores>]) -> Vec<Told> {
 }
 
 /// Totals, intervals and the time it took.
-pub(crate) fn tell(
+pub(crate) fn report(
     run: &mut Run,
     settings: &Settings,
     entries: &[Entry<ScenarioScores>],

@@ -32,7 +32,7 @@ const CHARTS: [(&str, &str, &[&str]); 2] = [
 ];
 
 /// Fills the report of a run.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
     set: &str,
     entries: &[Entry<Scores>],
@@ -70,7 +70,7 @@ pub(super) fn tell(
 }
 
 /// Fills the report of shards put together.
-pub(crate) fn tell_merged(
+pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
@@ -87,7 +87,7 @@ pub(crate) fn tell_merged(
     let set = setting("scenarios").unwrap_or_default();
     let decoding = setting("decoding").unwrap_or(Decoding::NONE);
     let config = Shapes::deserialize(shapes)?.config();
-    tell(run, set, &entries, &config, decoding)
+    report(run, set, &entries, &config, decoding)
 }
 
 fn merged<'a>(tallies: impl Iterator<Item = &'a MotionTally>) -> MotionTally {
@@ -98,7 +98,7 @@ fn merged<'a>(tallies: impl Iterator<Item = &'a MotionTally>) -> MotionTally {
 
 type Key = (Option<AgentKind>, Option<u64>);
 
-/// What tells a row from the others.
+/// The key of a row.
 fn key(row: &MotionRow) -> Key {
     (row.kind, row.seconds.map(f64::to_bits))
 }
