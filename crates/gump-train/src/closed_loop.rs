@@ -158,7 +158,7 @@ fn drive_one(
         let draws = world
             .open(&[start])
             .and_then(|mut session| session.step(None))
-            .map_err(|error| TrainError::Rollout(error))?;
+            .map_err(TrainError::Rollout)?;
         history.push(nearest(&draws, logged));
     }
     Ok(Some(Drive {

@@ -299,7 +299,7 @@ const RULES: [Rule; 73] = [
         |s| s.on_intersection && !s.lit_here && is_all_way_stop(s),
     ),
     rule("on_carpark", "on a car park", |s| {
-        touches(&s.scenario.map, s.ego, AreaKind::Carpark)
+        touches(s.scenario.map, s.ego, AreaKind::Carpark)
     }),
     rule("on_intersection", "on an intersection", |s| {
         s.on_intersection

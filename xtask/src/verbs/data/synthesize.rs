@@ -193,8 +193,8 @@ impl Args {
             Some(path) => sumo::networks(path)?,
             None => Vec::new(),
         };
-        let places = files.iter().map(|file| sumo.prepare(file, &work));
-        let places = places.collect::<Result<Vec<_>, _>>()?;
+        let places = files.iter().map(|file| Ok(sumo.prepare(file, &work)?));
+        let places = places.collect::<anyhow::Result<Vec<_>>>()?;
         let demand = SumoDemand {
             density: self.density,
             ..SumoDemand::standard()

@@ -170,13 +170,16 @@ impl Args {
     /// The recordings that are retrieved.
     fn bank(&self, run: &Run, protocol: &MmdProtocol) -> anyhow::Result<Vec<Scenario>> {
         let monitor = run.monitor();
-        let read = |path| recorded_scenarios(&ScenarioSet::of_path(path), None, protocol, &monitor);
+        let read = |path| -> anyhow::Result<Vec<Scenario>> {
+            let set = ScenarioSet::of_path(path);
+            Ok(recorded_scenarios(&set, None, protocol, &monitor)?)
+        };
         if let Some(path) = &self.bank {
-            return Ok(read(path)?);
+            return read(path);
         }
         let parts = datasets::parts(&shipped::data(), Split::Train)?;
         let parts = parts.iter().map(|part| read(&part.path));
-        Ok(parts.collect::<Result<Vec<_>, _>>()?.concat())
+        Ok(parts.collect::<anyhow::Result<Vec<_>>>()?.concat())
     }
 
     /// One row per world: the log, traffic without and with agents that come and leave.

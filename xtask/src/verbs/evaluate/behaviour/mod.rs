@@ -63,6 +63,10 @@ fn horizon(text: &str) -> Result<u32, String> {
 }
 
 impl Args {
+    #[expect(
+        clippy::result_large_err,
+        reason = "the store takes the error of the library as it is, once for each scenario"
+    )]
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let columns = columns(&self.world, &self.sampling)?;
         let scenarios = benchmark::find(run, &self.scenarios)?;

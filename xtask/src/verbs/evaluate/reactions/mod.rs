@@ -74,6 +74,10 @@ fn manoeuvre(name: &str) -> Result<&'static str, String> {
 }
 
 impl Args {
+    #[expect(
+        clippy::result_large_err,
+        reason = "the store takes the error of the library as it is, once for each scenario"
+    )]
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let columns = columns(&self.world, &self.sampling)?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
