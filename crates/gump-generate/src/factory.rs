@@ -18,6 +18,10 @@ use crate::stage::Stage;
 use crate::verdict::{Clause, through_time, verdict};
 use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
 
+/// Number of further attempts for a scene in which nobody comes to overlap, once one satisfies the
+/// request.
+const FURTHER: usize = 3;
+
 /// A job of the factory.
 #[derive(Clone, Debug)]
 pub struct GenerationJob {
@@ -42,8 +46,11 @@ pub struct Made {
     pub scenario: Scenario,
     /// The check of the present.
     pub clauses: Vec<Clause>,
-    /// Number of attempts; this scene is the last one, whether it satisfies the request or not.
+    /// The attempt that made this scene, from 1.
     pub attempts: usize,
+    /// The first attempt that satisfied the request, from 1, and whether its ego was steered. A
+    /// later one may have been taken because nobody comes to overlap in it.
+    pub first_satisfied: Option<(usize, bool)>,
     /// Whether the ego was steered to match the prompts, rather than driven by the world.
     pub is_steered: bool,
     /// Seconds from the generated scene to the present.
@@ -112,6 +119,7 @@ pub fn make_many(
             scene,
             scenario,
             attempts: 1,
+            first_satisfied: None,
             is_steered: false,
             moment_s: 0.0,
         })
@@ -146,7 +154,8 @@ pub fn make(
     let seed = seed.fork(number);
     let mut place = Place::new(order);
     let mut failure = None;
-    let mut last: Option<Made> = None;
+    let (mut held, mut last): (Option<Made>, Option<Made>) = (None, None);
+    let mut further = 0;
     for attempt in 0..order.attempts.max(1) {
         let stream = seed.fork(attempt as u64);
         let (request, stage) = match place.next(attempt, stream.fork(0)) {
@@ -177,16 +186,27 @@ pub fn make(
             scene,
             clauses: Vec::new(),
             attempts: attempt + 1,
+            first_satisfied: None,
             is_steered: false,
             moment_s: 0.0,
         };
-        let made = judged(worlds.traffic, order, made, stage.as_ref(), stream)?;
-        if made.holds() {
+        let mut made = judged(worlds.traffic, order, made, stage.as_ref(), stream)?;
+        if !made.holds() {
+            last = Some(made);
+            continue;
+        }
+        let before = held.as_ref().and_then(|held| held.first_satisfied);
+        made.first_satisfied = before.or(Some((attempt + 1, made.is_steered)));
+        if takes::stays_clear(&made.scenario) {
             return Ok(made);
         }
-        last = Some(made);
+        held.get_or_insert(made);
+        further += 1;
+        if further > FURTHER {
+            break;
+        }
     }
-    match (last, failure) {
+    match (held.or(last), failure) {
         (Some(made), _) => Ok(made),
         (None, Some(error)) => Err(error),
         (None, None) => unreachable!("the first attempt makes a scene or fails"),
@@ -265,14 +285,18 @@ fn judged(
         is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
     };
     if !prompts.is_empty() {
-        let mut found = None;
-        // One future shows who is there; what happens may take several.
+        // One future shows who is there; what happens may take several, and so may that nobody
+        // comes to overlap.
+        let (mut found, mut first) = (None, None);
         for (n, i) in [(1, 0), (takes::FUTURES, 1)] {
             if found.is_none() {
                 let futures = takes::free(world, &made.scenario, n, stream.fork(2).fork(i))?;
-                found = takes::moment(futures, holds);
+                let is_good = |scenario: &Scenario| holds(scenario) && takes::stays_clear(scenario);
+                found = takes::moment(futures.clone(), is_good);
+                first = first.or_else(|| takes::moment(futures, holds));
             }
         }
+        let mut found = found.or(first);
         if let (None, Some(stage), true) = (&found, stage, order.request.config.steers) {
             let drive = stage.drive_from(made.scenario.present().ego_now());
             let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;

@@ -2,10 +2,14 @@
 //! is about an instant, so any instant may become the present of the scenario.
 
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
-use gump_scene::{Rollout, Scenario, Seed};
+use gump_scene::{Frame, Rollout, Scenario, Seed};
 
 use crate::GenerateError;
 use crate::drive::{Drive, Steered};
+use crate::verdict::{LOOK_S, overlaps_in};
+
+#[cfg(doc)]
+use crate::verdict::through_time;
 
 /// Number of futures simulated of a scene, after a first one that is often sufficient.
 pub(super) const FUTURES: usize = 4;
@@ -15,6 +19,21 @@ pub(super) const JUDGED_S: f64 = 4.0;
 const MOMENTS_S: f64 = 2.0;
 /// Seconds before the instant that are kept, as long as recorded histories.
 const HISTORY_S: f64 = 1.0;
+
+/// Separates the streams of further futures.
+const AGAIN: u64 = 1 << 20;
+
+/// Whether no agents overlap from the present of a scenario on.
+pub(super) fn stays_clear(scenario: &Scenario) -> bool {
+    are_clear(&scenario.log[scenario.now..], scenario.dt)
+}
+
+/// Whether no agents overlap in these frames, looked at as often as [`through_time`] does.
+fn are_clear(frames: &[Frame], dt: f64) -> bool {
+    let stride = (LOOK_S / dt).round().max(1.0) as usize;
+    let mut looked_at = frames.iter().step_by(stride).chain(frames.last());
+    looked_at.all(|frame| overlaps_in(frame) == 0)
+}
 
 /// Futures in which the world drives all agents, including the ego.
 pub(super) fn free(
@@ -87,7 +106,8 @@ pub(super) fn moment(
     Some((take, seconds))
 }
 
-/// Continues the rollout until there are this many seconds after the present.
+/// Continues the rollout until there are this many seconds after the present: by the first of a few
+/// futures in which nobody comes to overlap, or by the first.
 pub(super) fn extend(
     world: &dyn WorldModel,
     scenario: &mut Scenario,
@@ -99,14 +119,28 @@ pub(super) fn extend(
     if missing == 0 {
         return Ok(());
     }
-    let start = Start {
-        scene: scenario.at(scenario.log.len() - 1),
-        n_futures: 1,
-        seed,
-    };
-    let rollouts = imagine(world, &[start], None, missing as f64 * scenario.dt)?;
-    let future = rollouts.first().map_or(&[][..], Rollout::imagined);
-    scenario.log.extend_from_slice(future);
+    let mut first = None;
+    for attempt in 0..FUTURES as u64 {
+        let start = Start {
+            scene: scenario.at(scenario.log.len() - 1),
+            n_futures: 1,
+            seed: if attempt == 0 {
+                seed
+            } else {
+                seed.fork(AGAIN + attempt)
+            },
+        };
+        let rollouts = imagine(world, &[start], None, missing as f64 * scenario.dt)?;
+        let future = rollouts.first().map_or(&[][..], Rollout::imagined);
+        let is_clear = are_clear(future, scenario.dt);
+        if is_clear || first.is_none() {
+            first = Some(future.to_vec());
+        }
+        if is_clear {
+            break;
+        }
+    }
+    scenario.log.extend(first.into_iter().flatten());
     Ok(())
 }
 

@@ -8,7 +8,7 @@ use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, SceneState};
 use crate::Counts;
 
 /// Sampling interval of futures, seconds.
-const LOOK_S: f64 = 0.5;
+pub(crate) const LOOK_S: f64 = 0.5;
 
 /// The clause that no agents overlap.
 pub const NOBODY_OVERLAPS: &str = "nobody overlaps";
@@ -104,7 +104,7 @@ pub fn overlaps(scenario: &Scenario) -> usize {
     overlaps_in(scenario.present().now())
 }
 
-fn overlaps_in(frame: &Frame) -> usize {
+pub(crate) fn overlaps_in(frame: &Frame) -> usize {
     let hit = |agent: &&gump_scene::Agent| overlapping(frame, agent).next().is_some();
     frame.agents().iter().filter(hit).count()
 }

@@ -89,15 +89,11 @@ struct Asked {
     holds: bool,
     is_tag: bool,
     is_clear: bool,
+    /// The first attempt that satisfied it, and whether the ego was steered then.
+    first: Option<(usize, bool)>,
     attempts: usize,
     is_steered: bool,
     moment_s: f64,
-}
-
-impl Asked {
-    fn holds_at_first(&self) -> bool {
-        self.holds && self.attempts == 1
-    }
 }
 
 /// Asks for every decidable tag on maps that admit it, and counts how often it holds
@@ -222,6 +218,7 @@ fn ask(
             holds: made.holds(),
             is_tag: tags::holds(prompt, &made.scenario) == Some(true),
             is_clear: stays_clear(&made.clauses),
+            first: made.first_satisfied,
             attempts: made.attempts,
             is_steered: made.is_steered,
             moment_s: made.moment_s,
@@ -231,6 +228,7 @@ fn ask(
             holds: false,
             is_tag: false,
             is_clear: false,
+            first: None,
             attempts: order.attempts,
             is_steered: false,
             moment_s: 0.0,
@@ -276,8 +274,10 @@ fn summed(
             looked_at: places[i].looked_at,
             satisfaction,
             tag_alone: of(&|asked| f64::from(asked.is_tag)),
-            first_attempt: of(&|asked| f64::from(asked.holds_at_first())),
-            first_unsteered: of(&|asked| f64::from(asked.holds_at_first() && !asked.is_steered)),
+            first_attempt: of(&|asked| {
+                f64::from(asked.first.is_some_and(|(attempt, _)| attempt == 1))
+            }),
+            first_unsteered: of(&|asked| f64::from(asked.first == Some((1, false)))),
             clear_throughout: of(&|asked| f64::from(asked.is_clear)),
             attempts: of(&|asked| asked.attempts as f64),
             steered: of(&|asked| f64::from(asked.is_steered)),
@@ -310,7 +310,8 @@ mod tests {
             holds,
             is_tag: true,
             is_clear: !holds,
-            attempts: if holds { 1 } else { 3 },
+            first: holds.then_some((1, holds)),
+            attempts: 3,
             is_steered: holds,
             moment_s: 0.5,
         };
