@@ -177,7 +177,9 @@ fn meets_somebody(take: &Scenario) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use gump_scene::fixture;
+    use gump_geometry::Pose;
+    use gump_rollout::{BoxError, Session};
+    use gump_scene::{AgentState, fixture};
 
     use super::*;
 
@@ -189,6 +191,69 @@ mod tests {
 
     fn beyond(x: f64) -> impl Fn(&Scenario) -> bool {
         move |take| take.present().ego_now().state.pose.position.x > x
+    }
+
+    /// Everybody stands; with one seed all move to one place.
+    struct Fickle(Seed);
+
+    struct FickleSession {
+        frame: Frame,
+        gathers: bool,
+    }
+
+    impl WorldModel for Fickle {
+        fn name(&self) -> &str {
+            "fickle"
+        }
+
+        fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+            Ok(Box::new(FickleSession {
+                frame: starts[0].scene.now().clone(),
+                gathers: starts[0].seed == self.0,
+            }))
+        }
+    }
+
+    impl Session for FickleSession {
+        fn dt(&self) -> f64 {
+            0.5
+        }
+
+        fn step(&mut self, _: Option<&[AgentState]>) -> Result<Vec<Frame>, BoxError> {
+            let mut agents = self.frame.agents().to_vec();
+            if self.gathers {
+                agents
+                    .iter_mut()
+                    .for_each(|agent| agent.state.pose = Pose::IDENTITY);
+            }
+            Ok(vec![Frame::new(agents, Vec::new())])
+        }
+    }
+
+    #[test]
+    fn a_future_without_overlaps_goes_on() {
+        let text = "ego vehicle 0: 0,0\nagent vehicle 1: 20,0\nhistory 0 future 1 dt 0.1";
+        let scene = fixture::scenario(text).unwrap();
+        for seed in [Seed(3), Seed(4)] {
+            let mut longer = scene.clone();
+            extend(&Fickle(Seed(3)), &mut longer, 4.0, seed).unwrap();
+            assert_eq!(longer.future().len(), 40);
+            assert!(stays_clear(&longer), "{seed:?}");
+        }
+        let gathered = with_overlap(&scene);
+        assert!(!stays_clear(&gathered));
+    }
+
+    /// The scene with a last frame in which all are in one place.
+    fn with_overlap(scene: &Scenario) -> Scenario {
+        let mut gathered = scene.clone();
+        let last = scene.log[scene.now].agents().iter().map(|agent| {
+            let mut agent = *agent;
+            agent.state.pose = Pose::IDENTITY;
+            agent
+        });
+        gathered.log.push(Frame::new(last.collect(), Vec::new()));
+        gathered
     }
 
     #[test]
