@@ -228,6 +228,11 @@ mod tests {
             }
             Ok(vec![Frame::new(agents, Vec::new())])
         }
+
+        fn replace(&mut self, _: usize, start: Start<'_>) -> Result<(), BoxError> {
+            self.frame = start.scene.now().clone();
+            Ok(())
+        }
     }
 
     #[test]
