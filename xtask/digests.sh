@@ -68,7 +68,8 @@ scenes=$out/scenes.tfrecord
 run evaluate-wosac evaluate wosac --scenarios $scenes --world $relative --futures 8
 run evaluate-motion evaluate motion --scenarios $scenes --world idm
 run evaluate-behaviour evaluate behaviour --scenarios $scenes --world $relative --futures 4
-run evaluate-reactions evaluate reactions --scenarios $scenes --world log,idm,$relative --futures 2
+# Scenes in which somebody is near an ego that leaves its log.
+run evaluate-reactions evaluate reactions --scenarios $mini/procedural.tfrecord.gz --limit 2 --world log,idm,$relative --futures 2
 run evaluate-closed-loop evaluate closed-loop --scenarios $scenes --planner pdm-closed --world idm
 
 # A few steps of training, of both networks; the weights themselves are digested, without the headers

@@ -9,7 +9,7 @@ use gump_model::Device;
 use gump_scene::{Scenario, Seed};
 use serde::{Deserialize, Serialize};
 
-use crate::decoding::{DecodedWorld, DecodedWorldName};
+use crate::decoding::{DecodedWorld, DecodedWorldName, columns};
 use crate::imagine::{frames, imagine};
 use crate::results::Entry;
 use crate::worlds::Worlds;
@@ -164,11 +164,7 @@ pub struct BehaviourEvaluation<'a> {
 impl<'a> BehaviourEvaluation<'a> {
     /// Nothing is loaded yet.
     pub fn new(device: &Device, worlds: &'a [DecodedWorld], config: BehaviourConfig) -> Self {
-        let load = |world: &'a DecodedWorld| {
-            let sampling = world.decoding.sampling.clone();
-            (world, Worlds::new(device, &world.world, sampling))
-        };
-        let worlds = worlds.iter().map(load).collect();
+        let worlds = columns(device, worlds);
         Self { config, worlds }
     }
 

@@ -4,10 +4,11 @@
 //! same edges and boxes as a score raise the score by themselves.
 
 use gump_engine::SamplingConfig;
+use gump_model::Device;
 use gump_rollout::SimulateConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::worlds::WorldName;
+use crate::worlds::{WorldName, Worlds};
 
 /// A way to make the futures of a world.
 #[derive(Clone, Debug, PartialEq)]
@@ -114,6 +115,18 @@ impl DecodedWorld {
             decoding: self.decoding.name.into(),
         }
     }
+}
+
+/// Every column with its world, of which nothing is loaded yet.
+pub(crate) fn columns<'a>(
+    device: &Device,
+    worlds: &'a [DecodedWorld],
+) -> Vec<(&'a DecodedWorld, Worlds<'a>)> {
+    let load = |world: &'a DecodedWorld| {
+        let sampling = world.decoding.sampling.clone();
+        (world, Worlds::new(device, &world.world, sampling))
+    };
+    worlds.iter().map(load).collect()
 }
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ use gump_scene::{Rollout, Scenario, Seed};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::decoding::{DecodedWorld, DecodedWorldName};
+use crate::decoding::{DecodedWorld, DecodedWorldName, columns};
 use crate::imagine::{frames, imagine_around};
 use crate::results::Entry;
 use crate::worlds::Worlds;
@@ -198,11 +198,7 @@ pub struct ReactionEvaluation<'a> {
 impl<'a> ReactionEvaluation<'a> {
     /// Nothing is loaded yet.
     pub fn new(device: &Device, worlds: &'a [DecodedWorld], config: ReactionConfig) -> Self {
-        let load = |world: &'a DecodedWorld| {
-            let sampling = world.decoding.sampling.clone();
-            (world, Worlds::new(device, &world.world, sampling))
-        };
-        let worlds = worlds.iter().map(load).collect();
+        let worlds = columns(device, worlds);
         Self { config, worlds }
     }
 

@@ -35,6 +35,34 @@ pub struct GenerateRequest {
     pub config: GenerateConfig,
 }
 
+impl GenerateRequest {
+    /// A request for scenes in place of a recorded one: its map, lights and fixtures, and its ego,
+    /// whose speed is open.
+    pub fn in_place_of(recorded: &Scenario) -> Self {
+        let present = recorded.present();
+        let ego = present.ego_now();
+        let agents = present.now().agents().iter();
+        Self {
+            map: Arc::clone(&recorded.map),
+            ego: EgoStart {
+                pose: ego.state.pose,
+                length: ego.length,
+                width: ego.width,
+                velocity: None,
+            },
+            lights: present.now().lights().to_vec(),
+            fixtures: agents
+                .filter(|agent| !agent.kind.is_moving())
+                .copied()
+                .collect(),
+            prompts: Vec::new(),
+            counts: None,
+            objects: Vec::new(),
+            config: GenerateConfig::default(),
+        }
+    }
+}
+
 /// The ego of a requested scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EgoStart {

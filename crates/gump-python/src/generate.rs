@@ -1,10 +1,8 @@
 //! Scenes out of nothing, on the map of any scenario.
 
-use std::sync::Arc;
-
 use gump_generate::constraint::parse_constraints;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
-use gump_generate::{Counts, EgoStart, GenerateConfig, GenerateRequest, Placement};
+use gump_generate::{Counts, GenerateConfig, GenerateRequest, Placement};
 use gump_scene::{ScenarioTag, Seed};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -51,23 +49,8 @@ impl Wish {
             None => Vec::new(),
         };
         let counts = [self.vehicles, self.pedestrians, self.bicycles];
-        let present = recorded.present();
-        let ego = present.ego_now();
-        let agents = present.now().agents().iter();
         Ok(GenerationJob {
             request: GenerateRequest {
-                map: Arc::clone(&recorded.map),
-                ego: EgoStart {
-                    pose: ego.state.pose,
-                    length: ego.length,
-                    width: ego.width,
-                    velocity: None,
-                },
-                lights: present.now().lights().to_vec(),
-                fixtures: agents
-                    .filter(|agent| !agent.kind.is_moving())
-                    .copied()
-                    .collect(),
                 prompts: self.prompts.iter().map(tag).collect::<PyResult<_>>()?,
                 counts: counts.iter().any(Option::is_some).then(|| Counts {
                     vehicles: self.vehicles.unwrap_or(0),
@@ -83,6 +66,7 @@ impl Wish {
                     },
                     ..GenerateConfig::default()
                 },
+                ..GenerateRequest::in_place_of(recorded)
             },
             roams: self.anywhere,
             seconds: self.seconds,

@@ -33,6 +33,7 @@ mod agent;
 mod ego_state;
 pub mod fixture;
 mod frame;
+mod lanes_ahead;
 mod light_index;
 mod map;
 mod map_graph;
@@ -48,6 +49,7 @@ pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
 pub use gump_seed::{Rng, Seed};
+pub use lanes_ahead::{LaneAhead, lanes_ahead};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,

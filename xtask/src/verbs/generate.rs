@@ -8,7 +8,6 @@ use anyhow::Context as _;
 use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{SamplingConfig, TransformerWorld};
-use gump_eval::generation::request;
 use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::constraint::parse_constraints;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
@@ -157,7 +156,7 @@ impl Args {
                 counts: self.counts(),
                 objects,
                 config: self.config(),
-                ..request(&recorded)
+                ..GenerateRequest::in_place_of(&recorded)
             },
             roams: self.start == StartName::Anywhere,
             seconds: self.simulate,

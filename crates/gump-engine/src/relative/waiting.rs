@@ -7,7 +7,9 @@
 //! stopped. Whether and how they start remains the network's decision.
 
 use gump_geometry::{DVec2, angle_difference};
-use gump_scene::{Agent, AgentKind, Lane, Light, LightState, MapGraph, stop_line};
+use gump_scene::{
+    Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead, stop_line,
+};
 
 /// How near to a lane's centre an agent stands in the lane, metres: vehicles, and bicycles, which
 /// keep to the side.
@@ -33,9 +35,6 @@ const MOVES: f64 = 0.5;
 /// radians.
 const MEETING_M: f64 = 25.0;
 const CROSSES: f64 = 0.52;
-
-/// A lane ahead, with the distance from the front bumper to its start, metres.
-type Ahead<'m> = (&'m Lane, f64);
 
 /// Which of the agents stand in a lane, have waited for more than `patience_s` and could drive on:
 /// nobody is on the path ahead or about to cross it, no light forbids it, and of those that meet
@@ -71,8 +70,8 @@ pub(super) fn held_by_nothing(
 }
 
 /// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
-/// agents beside the lanes.
-fn ahead<'m>(map: &'m MapGraph, agent: &Agent) -> Vec<Ahead<'m>> {
+/// agents beside the lanes. Distances are from its front bumper.
+fn ahead<'m>(map: &'m MapGraph, agent: &Agent) -> Vec<LaneAhead<'m>> {
     let beside = match agent.kind {
         AgentKind::Vehicle => IN_LANE_M,
         AgentKind::Bicycle => BESIDE_M,
@@ -88,30 +87,16 @@ fn ahead<'m>(map: &'m MapGraph, agent: &Agent) -> Vec<Ahead<'m>> {
     let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
         return Vec::new();
     };
-    let mut reached = vec![(lane, -at - agent.length / 2.0)];
-    let mut i = 0;
-    while let Some(&(lane, base)) = reached.get(i) {
-        i += 1;
-        let end = base + lane.centerline.length();
-        if end >= LOOK_M {
-            continue;
-        }
-        for next in map.successors(lane.id) {
-            if reached.iter().all(|(known, _)| known.id != next.id) {
-                reached.push((next, end));
-            }
-        }
-    }
-    reached
+    lanes_ahead(map, lane, at + agent.length / 2.0, LOOK_M).0
 }
 
 /// Whether the lights ahead forbid every way on.
-fn is_shut(reached: &[Ahead<'_>], lights: &[Light]) -> bool {
+fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light]) -> bool {
     let mut is_one_shut = false;
-    for (lane, base) in reached {
+    for LaneAhead { lane, base_m } in reached {
         for light in lights.iter().filter(|light| light.lane == lane.id) {
             let line = stop_line(lane, light).position;
-            let at = base + lane.centerline.project(line).arc_length;
+            let at = base_m + lane.centerline.project(line).arc_length;
             if !(-1.0..LOOK_M).contains(&at) {
                 continue;
             }
@@ -125,7 +110,7 @@ fn is_shut(reached: &[Ahead<'_>], lights: &[Light]) -> bool {
 }
 
 /// Whether another agent is in the way, or will be when it crosses.
-fn holds(reached: &[Ahead<'_>], agent: &Agent, other: &Agent) -> bool {
+fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent) -> bool {
     let (pose, at) = (other.state.pose, other.state.pose.position);
     let own = agent.state.pose;
     let reach = LOOK_M + agent.length + other.length + GAP_S * other.state.speed();
@@ -138,15 +123,14 @@ fn holds(reached: &[Ahead<'_>], agent: &Agent, other: &Agent) -> bool {
     };
     let corners = other.oriented_box().corners();
     let is_ahead = |point: DVec2, beside: f64, metres: f64| {
-        reached.iter().any(|(lane, base)| {
-            let foot = lane.centerline.project(point);
-            let ahead = base + foot.arc_length;
+        reached.iter().any(|part| {
+            let foot = part.lane.centerline.project(point);
+            let ahead = part.base_m + foot.arc_length;
             foot.distance <= beside && (0.0..metres).contains(&ahead)
         })
     };
     // Bicycles keep to the side of their lane.
-    let (lane, _) = reached[0];
-    let aside = lane.centerline.project(own.position).distance;
+    let aside = reached[0].lane.centerline.project(own.position).distance;
     let mut body = corners.into_iter().chain([at]);
     if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, ROOM_M)) {
         return true;

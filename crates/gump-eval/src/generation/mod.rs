@@ -11,12 +11,10 @@ mod long;
 mod prompts;
 mod sources;
 
-use std::sync::Arc;
-
 use gump_data::ReadOptions;
 use gump_generate::baseline::{overlapping_vehicles, wrong_way};
 use gump_generate::verdict::off_road;
-use gump_generate::{EgoStart, GenerateConfig, GenerateRequest};
+
 use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
 use gump_metrics::{Interval, intervals};
 use gump_scene::{Frame, Scenario, Seed};
@@ -40,32 +38,6 @@ pub const ATTRIBUTES: [&str; 4] = ["position", "heading", "speed", "size"];
 /// The discrepancies of [`ATTRIBUTES`].
 pub fn attributes(mmd: &SceneMmd) -> [Option<f64>; 4] {
     [mmd.position, mmd.heading, mmd.velocity, mmd.size]
-}
-
-/// A request for scenes in place of a recorded one: its map, lights and fixtures, and its ego, whose
-/// speed is open.
-pub fn request(recorded: &Scenario) -> GenerateRequest {
-    let present = recorded.present();
-    let ego = present.ego_now();
-    let agents = present.now().agents().iter();
-    GenerateRequest {
-        map: Arc::clone(&recorded.map),
-        ego: EgoStart {
-            pose: ego.state.pose,
-            length: ego.length,
-            width: ego.width,
-            velocity: None,
-        },
-        lights: present.now().lights().to_vec(),
-        fixtures: agents
-            .filter(|agent| !agent.kind.is_moving())
-            .copied()
-            .collect(),
-        prompts: Vec::new(),
-        counts: None,
-        objects: Vec::new(),
-        config: GenerateConfig::default(),
-    }
 }
 
 /// The first `limit` scenarios of a set that the protocol admits.

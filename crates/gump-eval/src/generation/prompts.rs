@@ -12,7 +12,6 @@ use rand::seq::SliceRandom as _;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::request;
 use crate::{EvalError, Monitor};
 
 /// Objects of the scenes that prompts are judged on.
@@ -186,7 +185,7 @@ fn admitting<'a>(scenarios: &[&'a Scenario], tag: ScenarioTag, n: usize, seed: S
 }
 
 fn order(recorded: &Scenario, tag: Option<ScenarioTag>, config: PromptConfig) -> GenerationJob {
-    let plain = request(recorded);
+    let plain = GenerateRequest::in_place_of(recorded);
     GenerationJob {
         request: GenerateRequest {
             prompts: tag.into_iter().collect(),

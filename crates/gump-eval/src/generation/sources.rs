@@ -10,8 +10,6 @@ use gump_metrics::mmd::{MmdProtocol, scene_mmd};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario, Seed};
 use rand::Rng as _;
 
-use super::request;
-
 /// Draws of a moment and a vehicle per scene that is to be found in a recording.
 const TRIES: usize = 20;
 
@@ -240,7 +238,7 @@ impl SceneMakers<'_> {
             objects: (0..n).map(object).collect(),
             config,
             map: Arc::clone(&recorded.map),
-            ..request(recorded)
+            ..GenerateRequest::in_place_of(recorded)
         };
         let present = recorded.present();
         let ego = present.ego_now();

@@ -10,9 +10,11 @@
 use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
-use gump_scene::{Agent, AgentKind, Frame, LightState, MapGraph, stop_line};
+use gump_scene::{
+    Agent, AgentKind, Frame, LaneAhead, LightState, MapGraph, lanes_ahead, stop_line,
+};
 
-use super::reach::{Ahead, ahead, nearest};
+use super::reach::nearest;
 use super::track::Track;
 use super::{Counter, MOVES, STANDS};
 
@@ -61,8 +63,8 @@ fn has_no_reason(
         return false;
     };
     let front_m = place.arc_length + track.length / 2.0;
-    let (way, goes_on) = ahead(map, lane, front_m, ROAD_M);
-    let asks = |part: &Ahead<'_>| {
+    let (way, goes_on) = lanes_ahead(map, lane, front_m, ROAD_M);
+    let asks = |part: &LaneAhead<'_>| {
         is_ruled(map, frame, part)
             || others
                 .iter()
@@ -72,7 +74,7 @@ fn has_no_reason(
 }
 
 /// A light that is not green, a stop line or a stop sign.
-fn is_ruled(map: &MapGraph, frame: &Frame, part: &Ahead<'_>) -> bool {
+fn is_ruled(map: &MapGraph, frame: &Frame, part: &LaneAhead<'_>) -> bool {
     let line = &part.lane.centerline;
     let is_ahead = |arc_m: f64| (-BEHIND_M..=ROAD_M).contains(&(part.base_m + arc_m));
     let light = frame.light(part.lane.id).is_some_and(|light| {
@@ -93,7 +95,7 @@ fn is_ruled(map: &MapGraph, frame: &Frame, part: &Ahead<'_>) -> bool {
         })
 }
 
-fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
+fn is_in_way(part: &LaneAhead<'_>, other: &Agent, width: f64) -> bool {
     let is_soft = matches!(other.kind, AgentKind::Pedestrian | AgentKind::Bicycle);
     let beside = if is_soft { PEOPLE_BESIDE_M } else { BESIDE_M };
     let within = width / 2.0 + beside;
@@ -112,8 +114,8 @@ fn is_in_way(part: &Ahead<'_>, other: &Agent, width: f64) -> bool {
 }
 
 /// True if, at an intersection, an agent on another path approaches.
-fn gives_way(way: &[Ahead<'_>], others: &[&Agent], pose: Pose) -> bool {
-    let junction = |part: &Ahead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
+fn gives_way(way: &[LaneAhead<'_>], others: &[&Agent], pose: Pose) -> bool {
+    let junction = |part: &LaneAhead<'_>| part.lane.in_intersection && part.base_m <= JUNCTION_M;
     let crosses = |other: &&Agent| {
         let state = other.state;
         let speed = if other.kind == AgentKind::Vehicle {

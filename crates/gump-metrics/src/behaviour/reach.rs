@@ -1,4 +1,4 @@
-//! Lanes under a pose and ahead of it.
+//! Lanes under a pose.
 
 use gump_geometry::{Pose, Projection, angle_difference};
 use gump_scene::{Lane, LaneKind, MapGraph};
@@ -21,43 +21,4 @@ pub(crate) fn nearest(
     let near = map.lanes_near(pose.position, metres);
     near.filter(|(lane, _)| lane.kind != LaneKind::BikeLane)
         .find_map(|(lane, _)| Some((lane, along(lane, pose, turn)?)))
-}
-
-/// A lane that a vehicle may reach.
-pub(crate) struct Ahead<'a> {
-    pub(crate) lane: &'a Lane,
-    /// Metres from the vehicle to the start of the lane, below 0 for the lane it is on.
-    pub(crate) base_m: f64,
-}
-
-/// The lane of a vehicle, `arc_m` metres from its start, all its successors within `metres`, and
-/// whether any of them reaches that far.
-pub(crate) fn ahead<'a>(
-    map: &'a MapGraph,
-    lane: &'a Lane,
-    arc_m: f64,
-    metres: f64,
-) -> (Vec<Ahead<'a>>, bool) {
-    let mut reached = vec![Ahead {
-        lane,
-        base_m: -arc_m,
-    }];
-    let (mut i, mut goes_on) = (0, false);
-    while let Some(Ahead { lane, base_m }) = reached.get(i) {
-        let (id, end_m) = (lane.id, base_m + lane.centerline.length());
-        i += 1;
-        if end_m >= metres {
-            goes_on = true;
-            continue;
-        }
-        for next in map.successors(id) {
-            if reached.iter().all(|known| known.lane.id != next.id) {
-                reached.push(Ahead {
-                    lane: next,
-                    base_m: end_m,
-                });
-            }
-        }
-    }
-    (reached, goes_on)
 }

@@ -1,6 +1,5 @@
 //! A scene from a prompt, on the scenario's map.
 
-use gump_eval::generation::request;
 use gump_eval::worlds::World;
 use gump_generate::factory::{GenerationJob, GenerationWorlds, make_many};
 use gump_generate::verdict::{off_road, overlaps};
@@ -43,7 +42,7 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
                 standing_has_reasons: true,
                 ..GenerateConfig::default()
             },
-            ..request(&demo.scenario)
+            ..GenerateRequest::in_place_of(&demo.scenario)
         },
         roams: false,
         seconds: SECONDS,
