@@ -33,8 +33,8 @@ fn main() -> anyhow::Result<()> {
         let last = encoded.sequence.frames().last();
         for token in last.into_iter().flat_map(|frame| frame.agents()) {
             let agent = ids.agent(token.key.id).and_then(|id| scene.now().agent(id));
-            let said = world_from_scene * token.state.pose().position;
-            errors.extend(agent.map(|agent| agent.state.pose.position.distance(said)));
+            let decoded = world_from_scene * token.state.pose().position;
+            errors.extend(agent.map(|agent| agent.state.pose.position.distance(decoded)));
         }
     }
     lengths.sort_unstable();

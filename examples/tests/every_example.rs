@@ -86,7 +86,7 @@ fn sources() -> BTreeMap<String, PathBuf> {
     sources
 }
 
-/// Runs an example in a folder of its own; what is wrong with it, if anything.
+/// Runs an example in a separate folder; returns what is wrong with it, if anything.
 fn run(name: &str, source: &Path) -> Option<String> {
     let test = std::env::current_exe().unwrap();
     let built = test
@@ -109,7 +109,7 @@ fn run(name: &str, source: &Path) -> Option<String> {
         .current_dir(place.path())
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&output.stdout);
+    let printed = String::from_utf8_lossy(&output.stdout);
     if !output.status.success() {
         return wrong(format!(
             "{}: {}",
@@ -117,22 +117,26 @@ fn run(name: &str, source: &Path) -> Option<String> {
             String::from_utf8_lossy(&output.stderr)
         ));
     }
-    if said.trim().is_empty() || said.contains("NaN") {
+    if printed.trim().is_empty() || printed.contains("NaN") {
         return wrong(format!(
-            "expected it to say something that makes sense, found: {said}"
+            "expected it to say something that makes sense, found: {printed}"
         ));
     }
     if let Some((_, words)) = SAYS
         .iter()
-        .find(|(known, words)| *known == name && !said.contains(words))
+        .find(|(known, words)| *known == name && !printed.contains(words))
     {
-        return wrong(format!("expected \"{words}\" in its output, found: {said}"));
+        return wrong(format!(
+            "expected \"{words}\" in its output, found: {printed}"
+        ));
     }
     let quoted = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/guide/src/output");
     if let Ok(quoted) = fs::read_to_string(quoted.join(format!("{name}.txt")))
-        && quoted != said
+        && quoted != printed
     {
-        return wrong(format!("the guide quotes other output than this: {said}"));
+        return wrong(format!(
+            "the guide quotes other output than this: {printed}"
+        ));
     }
     let text = fs::read_to_string(source).unwrap();
     let announced = text.lines().take_while(|line| line.starts_with("//!"));

@@ -1,4 +1,4 @@
-//! What every target does: reads each input with the reader of its name.
+//! Body of every target: reads each input with the reader of that name.
 
 #[path = "../../crates/gump-data/tests/common/hostile.rs"]
 mod hostile;

@@ -13,7 +13,7 @@ use crate::installed::home;
 use crate::machine::repository;
 use crate::run::{Run, Unseen};
 
-/// Where `data benchmark` puts what it makes, unless told otherwise.
+/// Default output folder of `data benchmark`.
 const MADE: &str = "out/data-benchmark";
 
 /// Finds the scenarios of `--scenarios`.

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::run::Run;
 
-/// A chart of a table: what stands in a row for a column, if anything.
+/// A chart of a table; `cell` returns the bar of a row and a column, if there is one.
 pub(crate) fn bars(
     label: &str,
     rows: Vec<String>,
@@ -35,7 +35,7 @@ pub(crate) fn bar(value: &Value, low: &Value, high: &Value) -> Option<Bar> {
     })
 }
 
-/// What a world is called in a legend: a network by its file's name without folders.
+/// Name of a world in a legend: of a network, the name of its file without folders.
 pub(crate) fn legend(world: &str) -> String {
     match world.strip_prefix("model:") {
         Some(path) => {

@@ -32,7 +32,7 @@ struct Cli {
 
 /// A verb with its arguments and its name.
 #[derive(Debug)]
-pub(crate) struct Asked {
+pub(crate) struct Invocation {
     name: String,
     verb: Verb,
 }
@@ -87,7 +87,7 @@ pub(crate) struct WrongArguments(pub(crate) String);
 /// Parses the command line, after a `--config` file has been turned into flags before it.
 ///
 /// Error: clap's own, or [`WrongArguments`] for a config file that does not fit the verb.
-pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Asked> {
+pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Invocation> {
     let mut command = command();
     let arguments = config::splice(&command, arguments)?;
     let notes = words::notes_on_former_names(&arguments);
@@ -95,7 +95,7 @@ pub(crate) fn parse(arguments: Vec<OsString>) -> anyhow::Result<Asked> {
     let matches = matches.map_err(words::plainer)?;
     notes.iter().for_each(|note| print_error(note));
     words::check_device(&matches)?;
-    Ok(Asked {
+    Ok(Invocation {
         name: name_of(&matches),
         verb: Cli::from_arg_matches(&matches)?.verb,
     })
@@ -106,8 +106,8 @@ fn command() -> Command {
     words::dressed(Cli::command())
 }
 
-impl Asked {
-    /// Does what was asked.
+impl Invocation {
+    /// Runs the verb.
     pub(crate) fn execute(self) -> anyhow::Result<()> {
         let name = self.name;
         // A row runs the verbs of one group. They take nothing but their arguments, which they all
@@ -180,7 +180,7 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
     }
     print_error(&format!("error: {error:#}"));
     ExitCode::from(match error {
-        // As shells tell of a program that a signal ended: 128 and the signal's number.
+        // As shells report a program that a signal ended: 128 plus the signal's number.
         _ if run::interrupted() => 130,
         error if error.is::<WrongArguments>() || names_nothing(error) => 2,
         error if error.downcast_ref().is_some_and(EvalError::is_argument) => 2,

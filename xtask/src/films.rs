@@ -59,7 +59,7 @@ impl FilmArgs {
         Ok(())
     }
 
-    /// These and, if `apng` is asked for in another way, animated PNGs.
+    /// These arguments, with animated PNGs added if `apng`.
     pub(crate) fn and(&self, apng: bool) -> Self {
         let mut this = self.clone();
         if apng && !this.video.contains(&Video::Apng) {

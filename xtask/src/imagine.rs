@@ -25,7 +25,7 @@ pub(crate) fn imagine(
     Ok(imagined?)
 }
 
-/// As [`imagine`], with predictive samples where some are asked for.
+/// As [`imagine`], with predictive samples where they are requested.
 ///
 /// Error: as [`imagine`], and a world that draws nothing.
 pub(crate) fn imagine_probed(

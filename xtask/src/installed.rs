@@ -1,5 +1,5 @@
-//! The driver outside of a checkout: what it is called, where the files lie that come with it, and
-//! what cargo would have told it.
+//! The driver outside of a checkout: its name, the folder of the files shipped with it, and the
+//! environment variables that cargo would have set.
 //!
 //! An archive holds the driver under the name `gump`, beside the folders `datasets` and `configs`
 //! (`.ci/release` packs it). Started by that name it behaves as `cargo xtask` does in a checkout.
@@ -13,10 +13,11 @@ use crate::machine::repository;
 /// The name of the driver in an archive.
 const NAME: &str = "gump";
 
-/// What a folder holds that comes with the driver.
+/// Subfolder that marks a folder of shipped files.
 const MARK: &str = "datasets/weights";
 
-/// What `.cargo/config.toml` sets for `cargo xtask`; the reasons stand there.
+/// Environment variables that `.cargo/config.toml` sets for `cargo xtask`; that file gives the
+/// reasons.
 const SETTINGS: [(&str, &str); 2] = [("CANDLE_NUM_THREADS", "1"), ("MIMALLOC_PURGE_DELAY", "-1")];
 
 /// The folder of the shipped files: the one that `GUMP_HOME` names, the checkout that cargo runs the
@@ -32,9 +33,9 @@ pub(crate) fn home() -> PathBuf {
 }
 
 /// The folder of the shipped files; `None` if it is the checkout.
-fn home_of(told: Option<OsString>, by_cargo: bool, program: Option<&Path>) -> Option<PathBuf> {
-    if let Some(told) = told.filter(|told| !told.is_empty()) {
-        return Some(told.into());
+fn home_of(named: Option<OsString>, by_cargo: bool, program: Option<&Path>) -> Option<PathBuf> {
+    if let Some(named) = named.filter(|named| !named.is_empty()) {
+        return Some(named.into());
     }
     let folder = program.filter(|_| !by_cargo)?.parent()?;
     let above = folder.parent().unwrap_or(folder);
@@ -53,13 +54,13 @@ fn names_it(word: &OsStr) -> bool {
     Path::new(word).file_stem().is_some_and(|stem| stem == NAME)
 }
 
-/// What the driver is called where a name is one word.
+/// The name of the driver where a single word is needed.
 pub(crate) fn name() -> &'static str {
     if is_installed() { NAME } else { "xtask" }
 }
 
-/// Starts an installed driver over with the settings that cargo would have made, where nobody has
-/// made others: the allocator reads its own before `main` begins.
+/// Restarts an installed driver with those of [`SETTINGS`] that the environment does not set yet,
+/// if any: the allocator reads its variable before `main` begins.
 #[cfg(unix)]
 pub(crate) fn settle() {
     use std::os::unix::process::CommandExt as _;
@@ -80,7 +81,7 @@ pub(crate) fn settle() {
     let _ = command.args(words).envs(missing).exec();
 }
 
-/// Elsewhere a program cannot be started over in its own place.
+/// Does nothing: other systems cannot replace the program of a running process.
 #[cfg(not(unix))]
 pub(crate) fn settle() {}
 
@@ -105,7 +106,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir_all(folder.path().join(MARK)).unwrap();
         let program = folder.path().join("gump");
-        let home = |told: &str, by_cargo| home_of(Some(told.into()), by_cargo, Some(&program));
+        let home = |named: &str, by_cargo| home_of(Some(named.into()), by_cargo, Some(&program));
         assert_eq!(home("elsewhere", true), Some("elsewhere".into()));
         assert_eq!(home("", false), Some(folder.path().to_owned()));
         assert_eq!(home("", true), None);

@@ -9,7 +9,7 @@ use gump_train::StepReport;
 use gump_viz::{Chart, Series};
 use gump_wosac::realism::Scores;
 
-/// Points of a drawn curve; more cannot be told apart.
+/// Points of a drawn curve; more cannot be distinguished.
 const DRAWN: usize = 300;
 
 /// One optimiser step.
@@ -29,12 +29,12 @@ struct Row {
     validation: Option<Validation>,
 }
 
-/// What held-out scenes said after a step.
+/// Validation after a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Validation {
     loss: f64,
-    /// Where they were imagined: realism (2025), and the distance of the best future from the log in
-    /// metres.
+    /// Realism (2025), and the distance of the best future from the log in metres; `None` if the
+    /// scenes were not simulated.
     imagined: Option<(f64, f64)>,
 }
 
@@ -84,7 +84,7 @@ impl Losses {
         self.last = Some(report);
     }
 
-    /// Notes the validation loss after the last step, and the scores of what was imagined.
+    /// Records the validation loss after the last step, and the scores of the simulations.
     pub(crate) fn push_validation(&mut self, step: usize, loss: f64, scores: Option<&Scores>) {
         if let Some(row) = self.rows.last_mut().filter(|row| row.step == step) {
             let imagined = scores.map(|scores| (scores.metametric, scores.min_ade));
@@ -274,11 +274,11 @@ impl Row {
             rollouts,
             validation,
         } = self;
-        let (realism, min_ade) = validation.and_then(|said| said.imagined).unzip();
-        let told = |number: Option<f64>| number.map_or(String::new(), |number| number.to_string());
-        let validation = validation.map(|said| said.loss);
+        let (realism, min_ade) = validation.and_then(|v| v.imagined).unzip();
+        let cell = |number: Option<f64>| number.map_or(String::new(), |number| number.to_string());
+        let validation = validation.map(|v| v.loss);
         let [rollouts, validation, realism, min_ade] =
-            [*rollouts, validation, realism, min_ade].map(told);
+            [*rollouts, validation, realism, min_ade].map(cell);
         writeln!(
             text,
             "{step},{total},{state},{control},{trajectory},{reconstruction},{learning_rate},\

@@ -1,4 +1,4 @@
-//! What the work ran on, and how much memory it took.
+//! The machine that the work ran on, and the memory that it took.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,15 +9,15 @@ use serde::Serialize;
 /// The machine as a report names it.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Machine {
-    /// Model name of the processor; "unknown" where the system does not tell.
+    /// Model name of the processor; "unknown" where the system does not report it.
     pub(crate) cpu: String,
     /// Threads the system grants this process.
     pub(crate) cores: usize,
-    /// Main memory, GB; null where the system does not tell.
+    /// Main memory, GB; null where the system does not report it.
     pub(crate) memory_gb: Option<f64>,
-    /// Where tensors live.
+    /// Device of the tensors.
     pub(crate) device: String,
-    /// What multiplies matrices on the processor.
+    /// Kernel of matrix products on the processor.
     pub(crate) kernel: Choice,
     /// Operating system and architecture.
     pub(crate) system: String,
@@ -43,14 +43,14 @@ pub(crate) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-/// The most main memory this process has held, MB; `None` where the system does not tell.
+/// Peak main memory of this process, MB; `None` where the system does not report it.
 pub(crate) fn peak_rss_mb() -> Option<f64> {
     let kib = kibibytes(&field("/proc/self/status", "VmHWM")?)?;
     Some((kib * 1024.0 / 1e5).round() / 10.0)
 }
 
 /// Seconds of processor time this process has used, over all threads, to a hundredth; `None` where
-/// the system does not tell.
+/// the system does not report it.
 pub(crate) fn cpu_seconds() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
     // The second field is a name in parentheses, which may hold spaces; user and system time are
@@ -61,8 +61,8 @@ pub(crate) fn cpu_seconds() -> Option<f64> {
     Some((user + system) / 100.0)
 }
 
-/// The commit the checkout is at, with `-modified` if files differ from it; "unknown" without git.
-/// A driver that was built to be handed out says what it was built from, whatever surrounds it.
+/// The commit of the checkout, with `-modified` if files differ from it; "unknown" without git. A
+/// driver that was built for distribution reports the commit it was built from.
 pub(crate) fn commit() -> String {
     if let Some(commit) = option_env!("GUMP_COMMIT") {
         return commit.into();

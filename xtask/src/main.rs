@@ -45,7 +45,7 @@ fn main() -> ExitCode {
     installed::settle();
     run::catch_interrupts();
     let arguments = std::env::args_os().collect();
-    match cli::parse(arguments).and_then(cli::Asked::execute) {
+    match cli::parse(arguments).and_then(cli::Invocation::execute) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => cli::explain(&error),
     }

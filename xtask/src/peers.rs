@@ -27,7 +27,7 @@ fn join() -> anyhow::Result<Processes> {
 #[cfg(not(feature = "mpi"))]
 fn join() -> anyhow::Result<Processes> {
     use crate::cli::WrongArguments;
-    // What Open MPI and what MPICH and its kin tell their processes.
+    // Set by Open MPI, and by MPICH and its derivatives.
     for name in ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE"] {
         let size = std::env::var(name).ok().and_then(|size| size.parse().ok());
         if let Some(size) = size.filter(|&size: &usize| size > 1) {

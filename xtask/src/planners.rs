@@ -1,5 +1,5 @@
-//! Planners on the command line: ours by name, those in other processes by `grpc:HOST:PORT`, and how
-//! those imagine who do.
+//! Planners on the command line: ours by name, those in other processes by `grpc:HOST:PORT`, and
+//! the settings of planners with rollouts.
 
 use std::ffi::OsStr;
 use std::fmt;
@@ -49,7 +49,7 @@ impl TypedValueParser for PlannerParser {
     }
 }
 
-/// Who plans: one of ours, or whoever serves nuPlan's planner protocol.
+/// A planner: one of ours, or a process that serves nuPlan's planner protocol.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Chosen {
     /// One of ours.
@@ -89,7 +89,7 @@ impl Serialize for Chosen {
     }
 }
 
-/// How planners in other processes begin.
+/// Prefix of the names of planners in other processes.
 const REMOTE: &str = "grpc:";
 
 /// Reads a [`Chosen`], and lists ours in the help.
@@ -105,13 +105,13 @@ impl TypedValueParser for ChosenParser {
         arg: Option<&Arg>,
         value: &OsStr,
     ) -> Result<Chosen, clap::Error> {
-        let told = value.to_str().unwrap_or_default();
-        if told.starts_with(REMOTE) {
+        let name = value.to_str().unwrap_or_default();
+        if name.starts_with(REMOTE) {
             return remote.parse_ref(command, arg, value);
         }
-        let known = || ours().into_iter().any(|known| known.get_name() == told);
-        if !known() && told != "model" {
-            // The names of ours, and how others are called.
+        let known = || ours().into_iter().any(|known| known.get_name() == name);
+        if !known() && name != "model" {
+            // The names of ours, and the form of the others.
             let all: Vec<String> = self
                 .possible_values()
                 .into_iter()
@@ -119,7 +119,7 @@ impl TypedValueParser for ChosenParser {
                 .map(|value| value.get_name().to_owned())
                 .collect();
             let wrong = format!(
-                "--planner: expected one of {}, found {told}\n",
+                "--planner: expected one of {}, found {name}\n",
                 all.join(", ")
             );
             return Err(clap::Error::raw(
@@ -139,8 +139,8 @@ impl TypedValueParser for ChosenParser {
 }
 
 /// `grpc:HOST:PORT`.
-fn remote(told: &str) -> Result<Chosen, String> {
-    let address = told.strip_prefix(REMOTE).unwrap_or(told);
+fn remote(text: &str) -> Result<Chosen, String> {
+    let address = text.strip_prefix(REMOTE).unwrap_or(text);
     let port = address
         .rsplit_once(':')
         .filter(|(host, _)| !host.is_empty());
@@ -179,16 +179,16 @@ enum YieldingName {
     Learned,
 }
 
-/// How planners that imagine do it.
+/// Settings of planners with rollouts.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct ImaginationArgs {
     /// Futures that planners with rollouts simulate
     #[arg(long, value_name = "N", default_value_t = 4)]
     futures: usize,
-    /// How the interactive planner allocates futures to candidates
+    /// Allocation of futures to the interactive planner's candidates
     #[arg(long, value_enum, default_value_t = AllocationName::Halving)]
     allocation: AllocationName,
-    /// How a candidate's scores over its futures are aggregated
+    /// Aggregation of a candidate's scores over its futures
     #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
     aggregate: AggregateName,
     /// Weight of a future in which the others keep their velocity, 0 to 1
@@ -209,7 +209,7 @@ pub(crate) struct ImaginationArgs {
     /// Planners with rollouts decide at every N-th step
     #[arg(long, value_name = "N", default_value_t = 5)]
     replan_every: usize,
-    /// How simulated agents make way for the interactive planner's ego
+    /// Reaction of simulated agents to the interactive planner's ego
     #[arg(long, value_enum, default_value_t = YieldingName::Ruled)]
     yielding: YieldingName,
     /// Discount per half second; without it a future's score is that of the whole drive
@@ -218,7 +218,7 @@ pub(crate) struct ImaginationArgs {
 }
 
 impl ImaginationArgs {
-    /// How the world of the rollouts decodes: as otherwise, but for `--yielding`.
+    /// Sampling of the world of the rollouts: `sampling` with the choice of `--yielding`.
     pub(crate) fn sampling(&self, sampling: &SamplingConfig) -> SamplingConfig {
         SamplingConfig {
             yields_to_driven: matches!(self.yielding, YieldingName::Ruled),
@@ -226,9 +226,9 @@ impl ImaginationArgs {
         }
     }
 
-    /// The same for a library.
+    /// Converts the arguments to a [`PlannerConfig`].
     ///
-    /// Error: a limit that is no time, counts of none.
+    /// Error: [`WrongArguments`] for a number out of its range.
     pub(crate) fn config(&self) -> anyhow::Result<PlannerConfig> {
         let wall = match self.think_ms {
             Some(ms) if !(ms > 0.0 && ms.is_finite()) => {

@@ -1,4 +1,4 @@
-//! How far long work has come: a bar on a terminal, a line every few seconds otherwise.
+//! Progress of long work: a bar on a terminal, a line every few seconds otherwise.
 
 use std::io::IsTerminal as _;
 use std::sync::Mutex;
@@ -31,7 +31,7 @@ struct Lines {
 }
 
 impl Progress {
-    /// Begins work of `total` units, for instance "frames"; 0 if nobody knows how many.
+    /// Begins work of `total` units, for instance "frames"; 0 if the number is unknown.
     pub(crate) fn begin(quiet: bool, what: &str, total: u64, unit: &'static str) -> Self {
         Self(if quiet {
             Form::Silent
@@ -78,7 +78,7 @@ impl Progress {
         }
     }
 
-    /// Changes the words in front.
+    /// Changes the message in front of the bar.
     pub(crate) fn message(&self, what: &str) {
         match &self.0 {
             Form::Silent => {}

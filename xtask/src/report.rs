@@ -1,4 +1,4 @@
-//! `report.json`: what was asked, on what machine, how long it took, what came out.
+//! `report.json`: the command, the machine, the times and the results of a run.
 
 use std::collections::BTreeSet;
 use std::io::Write as _;
@@ -21,22 +21,22 @@ pub(crate) struct Report {
     pub(crate) args: Vec<String>,
     /// Commit of the checkout.
     pub(crate) commit: String,
-    /// Where all randomness comes from.
+    /// Seed of all randomness.
     pub(crate) seed: u64,
-    /// Every setting with the value it had, wherever it came from.
+    /// Every setting with its value, wherever it was set.
     pub(crate) config: Value,
-    /// What it ran on.
+    /// The machine that it ran on.
     pub(crate) machine: Machine,
     /// Wall seconds per phase in order, then the total.
     pub(crate) seconds: Map<String, Value>,
-    /// The most main memory held, MB; null where the system does not tell.
+    /// Peak main memory, MB; null where the system does not report it.
     pub(crate) peak_rss_mb: Option<f64>,
-    /// What came out; the same for the same seed and machine, clocks aside.
+    /// Results; the same for the same seed and machine, except for times.
     pub(crate) results: Map<String, Value>,
     /// Keys of results that the terminal does not show.
     #[serde(skip)]
-    pub(crate) untold: BTreeSet<String>,
-    /// The sentence it failed with.
+    pub(crate) hidden: BTreeSet<String>,
+    /// The error message, if it failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) error: Option<String>,
 }
@@ -57,7 +57,7 @@ impl Report {
             seconds: Map::new(),
             peak_rss_mb: None,
             results: Map::new(),
-            untold: BTreeSet::new(),
+            hidden: BTreeSet::new(),
             error: None,
         }
     }
@@ -93,15 +93,15 @@ impl Report {
     }
 
     /// True if there is a result that the terminal shows.
-    pub(crate) fn has_something_to_tell(&self) -> bool {
-        self.results.keys().any(|key| !self.untold.contains(key))
+    pub(crate) fn has_something_to_show(&self) -> bool {
+        self.results.keys().any(|key| !self.hidden.contains(key))
     }
 
     /// The results and times as a terminal of so many columns shows them.
     pub(crate) fn text(&self, width: usize) -> String {
-        let mut told = self.results.clone();
-        told.retain(|key, _| !self.untold.contains(key));
-        let results = table::text(&Value::Object(told), width);
+        let mut shown = self.results.clone();
+        shown.retain(|key, _| !self.hidden.contains(key));
+        let results = table::text(&Value::Object(shown), width);
         let seconds = self.seconds.iter().map(|(phase, seconds)| {
             let seconds = seconds.as_f64().unwrap_or_default();
             format!("{phase} {seconds:.2}")

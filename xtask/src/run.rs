@@ -48,7 +48,7 @@ pub(crate) struct Common {
     wide: bool,
 }
 
-/// Where tensors live.
+/// Compute device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Device {
@@ -89,8 +89,8 @@ impl Device {
     }
 }
 
-/// What `open` returns; why it failed, in one line. Libraries of a GPU are loaded at their first use,
-/// and where one is missing that panics.
+/// Returns the result of `open`, or the reason for its failure in one line. The libraries of a GPU
+/// are loaded on first use, which panics if one is missing.
 fn quietly<T, E: std::fmt::Display>(open: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| ()));
@@ -121,7 +121,7 @@ pub(crate) struct Run {
     width: usize,
     threads: usize,
     device: gump_model::Device,
-    /// False for a process that helps another one, which tells and writes for both.
+    /// False for a process that helps another one, which prints and writes for both.
     leads: bool,
     report: Report,
     began: Instant,
@@ -164,8 +164,8 @@ impl Run {
         })
     }
 
-    /// Does the work on the asked number of threads, then writes and shows the report, of failed
-    /// work too.
+    /// Does the work on the requested number of threads, then writes and shows the report, also if
+    /// the work failed.
     pub(crate) fn execute(
         mut self,
         work: impl FnOnce(&mut Self) -> anyhow::Result<()>,
@@ -185,8 +185,8 @@ impl Run {
         self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
         let path = self.out.join("report.json");
         let written = self.report.write(&path);
-        let has_something_to_tell = done.is_ok() || self.report.has_something_to_tell();
-        if !self.quiet && has_something_to_tell {
+        let has_something_to_show = done.is_ok() || self.report.has_something_to_show();
+        if !self.quiet && has_something_to_show {
             print_line(&format!(
                 "{}report: {}",
                 self.report.text(self.width),
@@ -224,8 +224,8 @@ impl Run {
         Progress::begin(quiet, "simulating", frames.unwrap_or(0), "frames")
     }
 
-    /// Tells the reader something that is no result.
-    pub(crate) fn say(&self, line: &str) {
+    /// Prints a message that is not a result.
+    pub(crate) fn print(&self, line: &str) {
         if !self.quiet {
             print_line(line);
         }
@@ -244,13 +244,13 @@ impl Run {
         Ok(())
     }
 
-    /// Adds a result that the terminal does not show: the same stands there in another form.
-    pub(crate) fn result_untold(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
-        self.report.untold.insert(key.into());
+    /// Adds a result that the terminal does not show because it is printed there in another form.
+    pub(crate) fn result_hidden(&mut self, key: &str, value: impl Serialize) -> anyhow::Result<()> {
+        self.report.hidden.insert(key.into());
         self.result(key, value)
     }
 
-    /// From here on this process only helps another one, which tells and writes for both.
+    /// Marks this process as a helper of another one, which prints and writes for both.
     pub(crate) fn follow(&mut self) {
         self.leads = false;
         self.quiet = true;
@@ -282,7 +282,7 @@ impl Run {
         &self.out
     }
 
-    /// Where tensors live.
+    /// Device of the tensors.
     pub(crate) fn device(&self) -> &gump_model::Device {
         &self.device
     }
@@ -292,18 +292,18 @@ impl Run {
         self.threads
     }
 
-    /// Where all randomness comes from.
+    /// Seed of all randomness.
     pub(crate) fn seed(&self) -> Seed {
         self.seed
     }
 }
 
-/// Prints a line; whether anybody still listens is not the work's business.
+/// Prints a line; a closed standard output is not an error.
 pub(crate) fn print_line(line: &str) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }
 
-/// A line beside the results; who reads them may have left.
+/// Prints a line to standard error; a closed stream is not an error.
 pub(crate) fn print_error(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -1,4 +1,4 @@
-//! How a learned world decodes, as flags.
+//! Flags of a learned world's decoding.
 
 use gump_engine::{CacheMode, LightSource, Mode, Precision, SamplingConfig};
 use gump_eval::decoding::Decoding;
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::cli::WrongArguments;
 
-/// How a learned world decodes.
+/// Flags of a learned world's decoding.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Sampling {
     /// Decode all agents of a frame at once or one after another
@@ -18,7 +18,7 @@ pub(crate) struct Sampling {
     pub(crate) draw: Draw,
 }
 
-/// How a learned world decodes, whatever the order.
+/// Flags of a learned world's decoding that do not depend on the decoding order.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Draw {
     /// Key/value cache of the network
@@ -131,15 +131,15 @@ impl Sampling {
         self.draw.resolve(self.mode())
     }
 
-    /// How the futures of a world are made.
+    /// The decoding of a world.
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decoding(&self, world: &WorldName) -> anyhow::Result<Decoding> {
         Ok(self.draw.decoding(self.mode())?.for_world(world))
     }
 
-    /// Every way that a table shows of a world: of a network under rules also the network alone,
-    /// unless one way is asked for.
+    /// Every decoding of a world that a table shows: for a network under rules also the network
+    /// alone, unless the flags request one decoding.
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decodings(&self, world: &WorldName) -> anyhow::Result<Vec<Decoding>> {
@@ -210,7 +210,7 @@ impl Draw {
         Err(WrongArguments(wrong).into())
     }
 
-    /// How futures are made: under rules unless something else is asked for.
+    /// The decoding: under rules, unless `--paper` is given.
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decoding(&self, mode: Mode) -> anyhow::Result<Decoding> {
@@ -221,8 +221,8 @@ impl Draw {
         })
     }
 
-    /// Every way that a table shows: beside rules also the network alone, unless one way is asked
-    /// for.
+    /// Every decoding that a table shows: beside the rules also the network alone, unless the flags
+    /// request one decoding.
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decodings(&self, mode: Mode) -> anyhow::Result<Vec<Decoding>> {
@@ -239,7 +239,7 @@ impl Draw {
             ("--paper", self.paper),
             ("--ruled", self.ruled),
         ];
-        let mut ways = ways.iter().filter(|(_, is_asked)| *is_asked);
+        let mut ways = ways.iter().filter(|(_, is_requested)| *is_requested);
         let (way, _) = ways.next()?;
         if let Some((other, _)) = ways.next() {
             return Some(format!(

@@ -1,4 +1,4 @@
-//! What comes with the driver: a small data set and small weights.
+//! Files shipped with the driver: a small data set and small weights.
 
 use std::path::{Path, PathBuf};
 
@@ -12,8 +12,8 @@ pub(crate) fn data() -> PathBuf {
     from_here(&home().join("datasets/mini"))
 }
 
-/// The shipped scenario that verbs use unless told otherwise: a crossing with traffic lights, which
-/// the shipped weights did not learn from.
+/// The shipped scenario that verbs use by default: a crossing with traffic lights, which the
+/// shipped weights were not trained on.
 pub(crate) fn scenario() -> String {
     format!("{}#20", data().join("procedural.tfrecord.gz").display())
 }
@@ -24,12 +24,13 @@ pub(crate) fn demo() -> String {
     format!("{}#0", from_here(&path).display())
 }
 
-/// The shipped weights of the sequence network, which generates scenes and says who comes and leaves.
+/// The shipped weights of the sequence network, which generates scenes and spawns and removes
+/// agents.
 pub(crate) fn weights() -> PathBuf {
     from_here(&home().join("datasets/weights/gump-tiny.safetensors"))
 }
 
-/// The shipped weights of the relative network, which drives whoever is there.
+/// The shipped weights of the relative network, which drives the agents of a scene.
 pub(crate) fn traffic() -> PathBuf {
     from_here(&home().join("datasets/weights/gump-relative.safetensors"))
 }

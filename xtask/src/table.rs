@@ -1,9 +1,9 @@
 //! JSON results as aligned text.
 //!
-//! Objects become `name  value` lines with dotted names; a list of objects becomes a table with
-//! one row each, its columns in order of first appearance; of long tables only the start is shown,
-//! `report.json` has all. A table that is too wide lies on its side if that fits; what does not fit
-//! then is left out and said so.
+//! Objects become `name  value` lines with dotted names; a list of objects becomes a table with one
+//! row each, its columns in order of first appearance; of long tables only the start is shown,
+//! `report.json` has all. A table that is too wide is transposed if that fits; otherwise columns
+//! are left out, with a note.
 
 use serde_json::Value;
 
@@ -188,7 +188,7 @@ fn transposed(rows: &Rows) -> Rows {
     (0..n_columns).map(column).collect()
 }
 
-/// The end of a long name, which tells files of one folder apart.
+/// The end of a long name, which distinguishes files of one folder.
 fn shortened(name: &str) -> String {
     let n = name.chars().count();
     match n > LONGEST_NAME {
@@ -275,16 +275,16 @@ log        0  oracle
             json!({"world": world, "metametric": 0.7, "components": components})
         };
         let results = json!({"rows": [row("log"), row("idm")]});
-        let told = text(&results, 120);
+        let shown = text(&results, 120);
         assert!(
-            told.lines().all(|line| line.chars().count() <= 120),
-            "{told}"
+            shown.lines().all(|line| line.chars().count() <= 120),
+            "{shown}"
         );
         assert!(
-            told.contains("\nmetametric               0.7000  0.7000\n"),
-            "{told}"
+            shown.contains("\nmetametric               0.7000  0.7000\n"),
+            "{shown}"
         );
-        assert!(told.contains("components.component_11"), "{told}");
+        assert!(shown.contains("components.component_11"), "{shown}");
         let wide = text(&results, usize::MAX);
         assert!(
             wide.lines().any(|line| line.chars().count() > 120),
@@ -296,10 +296,10 @@ log        0  oracle
     fn intervals_are_one_column_where_room_is_scarce() {
         let line = |score: &str| json!({"score": score, "my world": 0.7, "my world low": 0.65, "my world high": 0.75});
         let results = json!({"intervals": [line("a"), line("b")]});
-        let told = text(&results, 36);
+        let shown = text(&results, 36);
         let expected = "\nintervals\nscore  my world\na      0.7000 [0.6500, 0.7500]\n\
                         b      0.7000 [0.6500, 0.7500]\n";
-        assert_eq!(told, expected);
+        assert_eq!(shown, expected);
     }
 
     #[test]
@@ -307,13 +307,14 @@ log        0  oracle
         let rows: Vec<Value> = (0..9)
             .map(|i| json!({"name": format!("a world {i}"), "x": i, "y": i}))
             .collect();
-        let told = text(&json!({"rows": rows}), 12);
+        let shown = text(&json!({"rows": rows}), 12);
         assert!(
-            told.lines()
+            shown
+                .lines()
                 .all(|line| line.starts_with("...") || line.chars().count() <= 14),
-            "{told}"
+            "{shown}"
         );
-        assert!(told.contains("more columns"), "{told}");
+        assert!(shown.contains("more columns"), "{shown}");
     }
 
     #[test]

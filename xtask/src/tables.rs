@@ -206,7 +206,7 @@ mod tests {
             json!({"name": "b", "n": 4, "x": 2, "is": null, "mixed": "one", "more": [1, 2]}),
         ];
         let table = of_rows(&rows);
-        let told: Vec<_> = table.names().zip(table.kinds()).collect();
+        let columns: Vec<_> = table.names().zip(table.kinds()).collect();
         let expected = [
             ("name", "text"),
             ("n", "integer"),
@@ -216,7 +216,7 @@ mod tests {
             ("mixed", "text"),
             ("more", "text"),
         ];
-        assert_eq!(told, expected);
+        assert_eq!(columns, expected);
         assert_eq!(table.n_rows(), 2);
     }
 

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Targets {
-    /// How the numbers came about.
+    /// Source of the numbers.
     provenance: String,
     scenes: u64,
     #[serde(rename = "distribution")]
@@ -153,26 +153,26 @@ mod tests {
     fn a_table_that_does_not_fit_is_told() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("targets.toml");
-        let told = |text: &str| {
+        let error = |text: &str| {
             std::fs::write(&path, text).unwrap();
             format!("{:#}", read(&path).unwrap_err())
         };
         let head = "provenance = \"\"\nscenes = 1\n[[distribution]]\nmean = 0.0\ndeviation = 0.0\n";
-        let wrong = told(&format!(
+        let wrong = error(&format!(
             "{head}measure = \"sped\"\nclass = \"vehicle\"\ncounts = []"
         ));
         assert!(
             wrong.ends_with("expected the name of a measure, found \"sped\""),
             "{wrong}"
         );
-        let wrong = told(&format!(
+        let wrong = error(&format!(
             "{head}measure = \"standing\"\nclass = \"vehicle\"\ncounts = [1, 2, 3]"
         ));
         assert!(
             wrong.ends_with("standing has 3 counts, expected at most 2"),
             "{wrong}"
         );
-        assert!(told("scenes = 1").contains("provenance"));
+        assert!(error("scenes = 1").contains("provenance"));
     }
 
     #[test]

@@ -52,7 +52,7 @@ const OF_THE_RUN: [&str; 8] = [
     "out", "seed", "config", "threads", "device", "kernel", "quiet", "wide",
 ];
 
-/// How a network decodes.
+/// Flags of a network's decoding.
 const DECODING: [&str; 12] = [
     "mode",
     "cache",
@@ -68,10 +68,10 @@ const DECODING: [&str; 12] = [
     "ruled",
 ];
 
-/// What traffic does after the present, in every world.
+/// Flags of traffic after the present, in every world.
 const TRAFFIC: [&str; 2] = ["life", "lights"];
 
-/// How the interactive planner simulates and chooses.
+/// Flags of the interactive planner's simulations and choices.
 const THINKING: [&str; 11] = [
     "futures",
     "allocation",
@@ -86,7 +86,7 @@ const THINKING: [&str; 11] = [
     "discount",
 ];
 
-/// How a drive goes.
+/// Flags of a drive.
 const DRIVING: [&str; 3] = ["seconds", "controller", "budget_ms"];
 
 /// Verbs without tensors: there is no device to choose.
@@ -117,12 +117,12 @@ pub(crate) fn dressed(root: Command) -> Command {
     dress(root, "")
 }
 
-/// The version, and the commit where somebody asks for it.
+/// The version, with the commit if the arguments request it.
 fn version() -> &'static str {
     static VERSION: OnceLock<String> = OnceLock::new();
     VERSION.get_or_init(|| {
         let version = env!("CARGO_PKG_VERSION");
-        // Asking git takes milliseconds, which only those who want to know should wait.
+        // Calling git takes milliseconds, so it is done only on request.
         match std::env::args().any(|word| word == "--version" || word == "-V") {
             true => format!("{version} ({})", machine::commit()),
             false => version.into(),
@@ -151,7 +151,7 @@ fn dress(mut command: Command, verb: &str) -> Command {
     let plans = has("replan_every");
     let mut taken = longs.clone();
     for (id, aliases) in ALIASES {
-        // Futures that a planner imagines are not those of a scenario.
+        // The futures of a planner's rollouts are not those of a scenario.
         if !has(id) || (id == "futures" && plans) {
             continue;
         }
@@ -218,7 +218,7 @@ pub(crate) fn notes_on_former_names(arguments: &[OsString]) -> Vec<String> {
         .collect()
 }
 
-/// Takes `-3` for a number rather than a flag: then whoever wants another number says so.
+/// Parses `-3` as a number rather than a flag, so that the error is about the number.
 fn signed(arg: Arg) -> Arg {
     match arg.get_action().takes_values() {
         true => arg.allow_negative_numbers(true),
@@ -253,15 +253,15 @@ pub(crate) fn check_device(matches: &ArgMatches) -> Result<(), WrongArguments> {
     }
 }
 
-/// A sentence in place of what clap says about a number that is none or out of range.
+/// Replaces clap's error about a number that is invalid or out of range by one plain sentence.
 pub(crate) fn plainer(error: clap::Error) -> anyhow::Error {
-    let said = |kind| match error.get(kind) {
+    let context = |kind| match error.get(kind) {
         Some(ContextValue::String(text)) => Some(text.as_str()),
         _ => None,
     };
     let (argument, value) = (
-        said(ContextKind::InvalidArg),
-        said(ContextKind::InvalidValue),
+        context(ContextKind::InvalidArg),
+        context(ContextKind::InvalidValue),
     );
     let (ErrorKind::ValueValidation, Some(argument), Some(value)) = (error.kind(), argument, value)
     else {
@@ -315,14 +315,14 @@ mod tests {
 
     #[test]
     fn numbers_out_of_range_are_told_plainly() {
-        let told = |words: &str| parse(words).unwrap_err();
+        let message = |words: &str| parse(words).unwrap_err();
         let zero = "--futures: expected at least 1, found 0";
-        assert_eq!(told("xtask simulate --futures 0"), zero);
-        assert_eq!(told("xtask simulate -n 0"), zero);
+        assert_eq!(message("xtask simulate --futures 0"), zero);
+        assert_eq!(message("xtask simulate -n 0"), zero);
         let below = "--futures: expected a whole number, not below 0, found -3";
-        assert_eq!(told("xtask simulate --futures -3"), below);
+        assert_eq!(message("xtask simulate --futures -3"), below);
         let word = "--futures: expected a whole number, found many";
-        assert_eq!(told("xtask simulate --futures many"), word);
+        assert_eq!(message("xtask simulate --futures many"), word);
     }
 
     #[test]

@@ -508,7 +508,7 @@ fn behaviour_is_counted_in_worlds_beside_the_log() {
             .is_none_or(|((low, high), value)| low <= value + 1e-9 && value <= high + 1e-9);
         assert!(inside, "{one}");
     }
-    // Who goes on with the velocity of the present and has none stays, and runs into others.
+    // At constant velocity, standing agents stay, and moving ones run into others.
     let parked = row(rows, "constant-velocity", "parked_move", "vehicle", 8);
     assert_eq!(parked["value"], 0.0);
     let overlaps = |world| {
@@ -623,7 +623,7 @@ fn who_reacts_runs_into_the_ego_less_than_who_does_not() {
     let rate = |world, manoeuvre| number(reaction(&found, world, manoeuvre), "run_into_ego");
     assert!(rate("log", "stop") > 0.05, "{}", found["rows"]);
     assert!(rate("idm", "stop") < 0.5 * rate("log", "stop"));
-    // Where the ego does as in its log nobody of the log runs into it.
+    // Where the ego follows its log, no agent of the log runs into it.
     assert_eq!(rate("log", "log"), 0.0);
     let cases = found["cases"].as_array().unwrap();
     let replayed = cases.iter().filter(|case| {

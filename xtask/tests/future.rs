@@ -74,12 +74,12 @@ impl Workplace {
     }
 }
 
-/// How a recording goes on after a present that it shares with others.
+/// Future of a recording after a present that it shares with others.
 #[derive(Clone, Copy)]
 enum Way {
     /// The ego turns left; the light it waits for was red and stays so.
     Left,
-    /// The ego turns right, the light turns green, and somebody appears.
+    /// The ego turns right, the light turns green, and another agent appears.
     Right,
 }
 
@@ -236,7 +236,7 @@ fn no_world_and_no_verb_sees_what_comes_after_the_present() {
         check(8, &|f| {
             format!("ablate history --scenarios {f} --world {model} {rollouts}")
         });
-        // The recordings do differ: whoever replays them shows it.
+        // The recordings do differ, as a replay shows.
         let [left, right] = files.each_ref().map(|file| {
             let words = format!("simulate --scenario {file} --world log --futures 1");
             place.results(&words)["digest"].clone()

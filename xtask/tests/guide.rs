@@ -2,7 +2,7 @@
 //! is what its source says, its links lead somewhere in the book, and commands that cannot run here
 //! at least have flags that exist.
 //!
-//! What the fences of a chapter mean:
+//! Meaning of the fences of a chapter:
 //!
 //! | fence | meaning |
 //! |---|---|
@@ -20,7 +20,7 @@ use std::process::{Command, Output};
 
 /// A fenced block of a chapter.
 struct Block {
-    /// What stands after the fence, `console` for instance.
+    /// Info string of the fence, `console` for instance.
     info: String,
     /// Number of its first line, from 1.
     line: usize,
@@ -48,7 +48,7 @@ fn every_command_runs() {
 
 /// Runs the commands of a block and looks for the lines below them; how many commands there were.
 fn run_session(chapter: &Path, block: &Block, place: &Path) -> usize {
-    let (mut said, mut n_commands) = (String::new(), 0);
+    let (mut printed, mut n_commands) = (String::new(), 0);
     for (i, line) in block.lines.iter().enumerate() {
         let at = format!("{}:{}", chapter.display(), block.line + i);
         if let Some(command) = line.strip_prefix("$ ") {
@@ -57,13 +57,13 @@ fn run_session(chapter: &Path, block: &Block, place: &Path) -> usize {
             let output = xtask(words.split_whitespace(), place);
             let error = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(output.status.success(), "{at}: {command}: {error}");
-            said = squeezed(&(String::from_utf8_lossy(&output.stdout) + &*error));
+            printed = squeezed(&(String::from_utf8_lossy(&output.stdout) + &*error));
             n_commands += 1;
         } else {
             let expected = squeezed(line);
             assert!(
-                said.contains(&expected),
-                "{at}: {expected} does not occur in:\n{said}"
+                printed.contains(&expected),
+                "{at}: {expected} does not occur in:\n{printed}"
             );
         }
     }
@@ -165,8 +165,8 @@ fn flags_of(verb: &str) -> BTreeSet<String> {
         .collect()
 }
 
-/// Chapters are read as plain Markdown on the web, too: what they quote stands in them, and is what
-/// stands in its source now. `UPDATE_GUIDE=1` writes it anew.
+/// Chapters are also read as plain Markdown on the web, so they contain the text that they quote,
+/// equal to its source. `UPDATE_GUIDE=1` updates it.
 #[test]
 fn quotes_are_what_their_sources_say() {
     let (mut n_quotes, mut stale) = (0, Vec::new());
@@ -207,7 +207,7 @@ fn quotes_are_what_their_sources_say() {
     assert!(n_quotes >= 12, "only {n_quotes} quotes found");
 }
 
-/// `FILE` or what stands in `FILE` between the marks of an `ANCHOR`, less the indent of all lines.
+/// `FILE`, or the part of `FILE` between the marks of an `ANCHOR`, without the common indent.
 fn quoted(chapter: &Path, quote: &str) -> String {
     let (file, anchor) = quote.split_once(':').unwrap_or((quote, ""));
     let path = chapter.with_file_name(file);

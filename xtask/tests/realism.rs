@@ -25,7 +25,7 @@ const SCENES: [&str; 4] = [
 /// Futures of each scene.
 const ROLLOUTS: usize = 6;
 
-/// What a way of drawing must reach on average, by the metric of 2025.
+/// Average scores that a way of sampling must reach, by the metric of 2025.
 struct Floor {
     name: &'static str,
     redraws: usize,
@@ -38,8 +38,8 @@ struct Floor {
     min_ade: f64,
 }
 
-/// What was measured when they were set, less about 0.02 (0.4 m) for other rounding and other draws:
-/// raw 0.831, 0.707, 0.784, 0.962 and 1.89 m, ruled 0.870, 0.711, 0.855, 0.979 and 1.62 m.
+/// The values measured when they were set, less about 0.02 (0.4 m) for other rounding and other
+/// draws: raw 0.831, 0.707, 0.784, 0.962 and 1.89 m, ruled 0.870, 0.711, 0.855, 0.979 and 1.62 m.
 const FLOORS: [Floor; 2] = [
     Floor {
         name: "raw",

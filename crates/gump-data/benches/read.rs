@@ -1,6 +1,6 @@
-//! How fast scenarios are read: framing alone, with decoding, with everything inferred.
+//! Speed of reading scenarios: framing alone, with decoding, with everything inferred.
 //!
-//! Reads the real file of the shared data if it is there, otherwise a made one.
+//! Reads the recorded file of the shared data if it is there, otherwise a generated one.
 
 use std::hint::black_box;
 use std::path::PathBuf;

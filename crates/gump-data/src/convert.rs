@@ -94,7 +94,7 @@ pub fn convert<E: From<DataError>>(
     each: impl FnMut(&Scenario) -> Result<(), E>,
 ) -> Result<Converted, E> {
     let options = ReadOptions {
-        // Messages state what was seen; what was not is held again by who reads them.
+        // Messages state what was observed; readers fill the gaps again.
         infer_light_gaps: options.infer_light_gaps && format != OutputFormat::Waymo,
         ..options
     };

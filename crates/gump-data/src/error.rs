@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use gump_scene::{MapError, ScenarioError};
 
-/// Which record of which file.
+/// The location of a record: its file, index and offset.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
     /// Index of the record in its file, from 0.
     pub record: usize,
-    /// Where the record starts, bytes from the start of the (uncompressed) content.
+    /// Start of the record, bytes from the start of the (uncompressed) content.
     pub offset: u64,
     /// The file.
     pub path: PathBuf,
@@ -90,7 +90,7 @@ pub enum DataError {
     /// A document is not JSON, or has the wrong structure.
     #[error("expected {what}: {source}: {}", path.display())]
     Json {
-        /// What was expected.
+        /// The expectation.
         what: &'static str,
         /// The parser's message, with line and column.
         source: serde_json::Error,
@@ -100,9 +100,9 @@ pub enum DataError {
     /// A table is damaged or lacks a column.
     #[error("expected {expected}, found {found}: {}", path.display())]
     Table {
-        /// What was expected.
+        /// The expectation.
         expected: String,
-        /// What was found.
+        /// The content found.
         found: String,
         /// The file.
         path: PathBuf,
@@ -118,9 +118,9 @@ pub enum DataError {
     /// A valid file contains nothing that a scenario can be made from.
     #[error("expected {expected}, found {found}: {}", path.display())]
     NoScenarios {
-        /// What scenarios are made from.
+        /// The content that scenarios are made from.
         expected: &'static str,
-        /// What was found.
+        /// The content found.
         found: String,
         /// The file.
         path: PathBuf,
@@ -149,13 +149,13 @@ pub enum DataError {
     /// The file ends inside a record.
     #[error("expected {expected} more bytes of {part}, found {found} before the end: {place}")]
     Truncated {
-        /// What was being read.
+        /// The part being read.
         part: &'static str,
         /// Bytes required.
         expected: u64,
         /// Bytes present.
         found: u64,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A checksum does not match.
@@ -167,7 +167,7 @@ pub enum DataError {
         expected: u32,
         /// The computed checksum.
         found: u32,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A record has an implausible length.
@@ -177,17 +177,17 @@ pub enum DataError {
         limit: u64,
         /// The length found, bytes.
         length: u64,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A file of the cache is damaged, truncated or of another version.
     #[error("expected {expected}, found {found}: at byte {offset} of {}", path.display())]
     Cache {
-        /// What was expected.
+        /// The expectation.
         expected: String,
-        /// What was found.
+        /// The content found.
         found: String,
-        /// Where, bytes from the start of the file.
+        /// Position of the problem, bytes from the start of the file.
         offset: u64,
         /// The file.
         path: PathBuf,
@@ -197,7 +197,7 @@ pub enum DataError {
     Xml {
         /// The problem.
         problem: String,
-        /// Where, bytes from the start of the (uncompressed) content.
+        /// Position of the problem, bytes from the start of the (uncompressed) content.
         offset: u64,
         /// The file.
         path: PathBuf,
@@ -215,17 +215,17 @@ pub enum DataError {
         message: &'static str,
         /// The decoder's message.
         source: prost::DecodeError,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A message contains an invalid value.
     #[error("expected {expected}, found {found}: {place}")]
     Field {
-        /// What was expected.
+        /// The expectation.
         expected: &'static str,
-        /// What was found.
+        /// The content found.
         found: String,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A record can be decoded but is not a usable scenario.
@@ -235,7 +235,7 @@ pub enum DataError {
         id: String,
         /// The problem.
         problem: Problem,
-        /// Where.
+        /// The record.
         place: Place,
     },
     /// A scenario cannot be expressed in the format to be written.
@@ -284,7 +284,7 @@ pub enum DataError {
     },
 }
 
-/// What was expected of a path that is not there; one scenario's name may be where files are.
+/// Returns the expectation for a missing path: the name of one scenario may stand for a file.
 fn missing(path: &Path) -> &'static str {
     let names_one = |text: &str| {
         text.rsplit_once('#')
@@ -296,7 +296,7 @@ fn missing(path: &Path) -> &'static str {
     }
 }
 
-/// The request after `#`, and what there is instead.
+/// Returns the message for a request after `#` that no scenario matches.
 fn no_such_scenario(wanted: &str, found: usize) -> String {
     let is_number = wanted.parse::<usize>().is_ok();
     match found {
@@ -347,7 +347,7 @@ pub enum Problem {
     /// An index points past the end of its list.
     #[error("expected {what} below {len}, found {index}")]
     Index {
-        /// What it indexes.
+        /// The name of the index.
         what: &'static str,
         /// Length of the list.
         len: usize,
@@ -416,11 +416,11 @@ pub enum Problem {
     /// A value violates the format.
     #[error("expected {expected}, found {found} in {place}")]
     Unexpected {
-        /// What was expected.
+        /// The expectation.
         expected: &'static str,
-        /// What was found.
+        /// The content found.
         found: Box<str>,
-        /// Which part of the record.
+        /// The part of the record.
         place: Box<str>,
     },
     /// Rollouts do not fit their scenario.

@@ -100,7 +100,7 @@ pub fn open_files(files: Vec<PathBuf>, options: ReadOptions) -> Reader {
 pub struct Reader {
     source: BoxedSource,
     format: &'static str,
-    /// Why the first of several files could not be opened, until it is told.
+    /// The error from opening the first of several files, until it has been returned.
     unopened: Option<DataError>,
     files: VecDeque<PathBuf>,
     is_folder: bool,
@@ -119,7 +119,8 @@ impl Reader {
         &self.skipped
     }
 
-    /// What the file being read has for `ask`, or else the first of the files after it that has.
+    /// Returns the first answer to `ask` from the file being read or the files after it, or the
+    /// error of opening one of them.
     fn first_of<T>(
         &mut self,
         mut ask: impl FnMut(&mut dyn Source) -> Option<Result<T, DataError>>,
@@ -310,7 +311,7 @@ fn find_id(path: &Path, wanted: &str, options: ReadOptions) -> Result<ScenarioRe
     }))
 }
 
-// Here rather than beside the cache: what else a directory holds takes every format to tell.
+// Here rather than beside the cache: recognising the other files of a directory takes every format.
 impl Cache {
     /// True for a shard, and for a directory with shards and no scenarios in other formats.
     ///

@@ -16,13 +16,13 @@ use crate::io::{stream, tfrecord};
 use crate::source::Source as _;
 use crate::{DataError, Place, ReadOptions, ReadReport};
 
-/// Bytes of the beginning that tell formats apart.
+/// Number of bytes from the start that distinguish the formats.
 const HEAD_BYTES: usize = 64 << 10;
 
 /// Reads the first scenario of a file's bytes: Waymo's TFRecord, Scenario-JSON or GPUDrive's JSON,
 /// detected from content, plain or gzip. Gaps are filled with [`ReadOptions::ALL`].
 ///
-/// `name` stands for the file in errors, and is the id of a scenario without one.
+/// `name` replaces the path in errors, and is the id of a scenario without one.
 ///
 /// # Errors
 /// As for [`open`](crate::open) and reading the first record.

@@ -14,7 +14,7 @@ pub struct ScenarioRecord {
     pub scenario: Scenario,
     /// Dropped and inferred items.
     pub report: ReadReport,
-    /// Where its record starts, bytes from the start of the (uncompressed) content.
+    /// Start of its record, bytes from the start of the (uncompressed) content.
     pub offset: u64,
     /// The file it came from.
     pub path: Arc<PathBuf>,
@@ -84,12 +84,12 @@ fn add(counts: &mut BTreeMap<&'static str, usize>, key: &'static str, n: usize) 
     }
 }
 
-/// Which gaps of a format a reader fills by inference.
+/// The gaps of a format that a reader fills by inference.
 ///
 /// The default fills all of them: planners need routes and drivable surfaces. Smoothing changes
 /// stated values and is off by default.
 ///
-/// # What the present tells of the future
+/// # Information about the future in the present
 ///
 /// States, sizes and lights up to the present are inferred only from frames up to the present: two
 /// recordings that are equal until then have equal pasts. Four items do use the future, each with

@@ -20,7 +20,7 @@ pub(crate) struct Format {
 }
 // ANCHOR_END: format
 
-/// A kind of file without scenarios of its own.
+/// A kind of file that contains no scenarios.
 pub(crate) struct Companion {
     /// Its description in reports.
     pub(crate) what: &'static str,

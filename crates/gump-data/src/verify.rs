@@ -189,7 +189,7 @@ pub fn verify_one_of_many(file: &Path) -> Verification {
         }
         Ok(Role::Scenarios(format)) => match verify_file(file) {
             Ok(verification) => return verification,
-            // Nothing is wrong with such a file, but whoever put it there expects something of it.
+            // Such a file is valid, but a user who keeps it there expects scenarios in it.
             Err(error @ DataError::NoScenarios { .. }) => {
                 let (odd, detail) = (Severity::Suspicious, error.to_string());
                 result.add(format.name, found(odd, "file without scenarios", detail));
@@ -204,7 +204,7 @@ pub fn verify_one_of_many(file: &Path) -> Verification {
     result
 }
 
-/// The format of files that cannot be told.
+/// The format name of files that are not recognised.
 const UNKNOWN: &str = "unknown";
 
 fn verify_file(path: &Path) -> Result<Verification, DataError> {

@@ -264,8 +264,8 @@ fn shards_must_agree_on_who_made_them() {
     }
     tar.finish().unwrap();
     let found = check_archive(&path, &expected(&scenarios)).unwrap();
-    let told = "s.binproto-00001-of-00002 says other things of its makers than the first shard";
-    assert_eq!(found.problems, [told, "scenario c is missing"]);
+    let problem = "s.binproto-00001-of-00002 says other things of its makers than the first shard";
+    assert_eq!(found.problems, [problem, "scenario c is missing"]);
 }
 
 #[test]

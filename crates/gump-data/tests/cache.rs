@@ -1,4 +1,4 @@
-//! The cache gives back what went in, to the bit, and says what is wrong with a damaged file.
+//! The cache gives back what went in, bit for bit, and reports what is wrong with a damaged file.
 
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 

@@ -10,7 +10,7 @@ use gump_geometry::dvec2;
 use gump_scene::{Agent, AgentId, Frame, LaneId, Light, LightState, Scenario};
 use tempfile::TempDir;
 
-/// What `verify` says about these scenarios in one file.
+/// The result of `verify` on one file with these scenarios.
 fn verified(scenarios: &[Scenario]) -> Verification {
     let folder = TempDir::new().expect("there is a temporary folder");
     let path = folder.path().join("some.tfrecord");
@@ -49,7 +49,7 @@ fn a_sound_scenario_has_no_findings() {
 #[test]
 fn agents_inside_each_other_are_found() {
     let scenario = with(10, 9, |agent| agent.state.pose.position = dvec2(-40.0, 0.0));
-    // The box that should stand elsewhere also jumps there and back.
+    // The misplaced box also jumps there and back.
     check(&scenario, &[("overlapping start", 1), ("jump", 2)]);
 }
 

@@ -1,4 +1,4 @@
-//! What nuPlan's readers say about logs and maps that are damaged, missing or of another place.
+//! Errors of nuPlan's readers on logs and maps that are damaged, missing or of another place.
 
 use std::fs;
 use std::path::Path;

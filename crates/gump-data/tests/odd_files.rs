@@ -75,7 +75,7 @@ fn ten_gigabytes_of_any_format_are_told_without_holding_them() {
         };
         let path = folder.path().join(seed.file_name().unwrap());
         fs::write(&path, &bytes).unwrap();
-        // No block of the disk is taken for the zeros.
+        // The zeros take no disk blocks.
         let file = fs::OpenOptions::new().write(true).open(&path).unwrap();
         if let Err(error) = file.set_len(HUGE) {
             eprintln!("SKIPPED: no sparse file of 10 GB can be made here: {error}");
@@ -96,7 +96,7 @@ fn is_seed(file: &Path) -> bool {
     name.starts_with("seed")
 }
 
-/// The most memory that this process has held, bytes, where the system tells.
+/// The peak memory of this process, bytes, where the system reports it.
 fn peak_memory() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
@@ -106,9 +106,9 @@ fn peak_memory() -> Option<u64> {
 
 #[test]
 fn names_do_not_decide_what_a_file_is() {
-    let (folder, made) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    let (folder, sources) = (TempDir::new().unwrap(), TempDir::new().unwrap());
     let data = |name: &str| Path::new(TESTS).join("data").join(name);
-    let [plain, packed] = ["a.tfrecord", "a.tfrecord.gz"].map(|name| made.path().join(name));
+    let [plain, packed] = ["a.tfrecord", "a.tfrecord.gz"].map(|name| sources.path().join(name));
     for path in [&plain, &packed] {
         womd::write_scenarios(path, [common::crossing()]).unwrap();
     }

@@ -1,4 +1,4 @@
-//! What is written reads back as the same scenario.
+//! Written scenarios read back as the same scenario.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! Rollouts as a table: everything that was imagined stands in it, and reads back to the bit.
+//! Rollouts as a table: it contains everything that was simulated, and reads back bit for bit.
 
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -71,7 +71,7 @@ fn rollouts_stand_in_the_table_to_the_bit() {
     let names = "x y z heading vx vy speed length width height";
     let numbers: Vec<_> = names.split(' ').map(number).collect();
     let mut keys = Vec::new();
-    let mut told = BTreeSet::new();
+    let mut recorded = BTreeSet::new();
     for row in 0..table.num_rows() {
         assert_eq!(ids.value(row), if row < n_first { "one" } else { "two" });
         let at = step.value(row) as usize;
@@ -99,14 +99,14 @@ fn rollouts_stand_in_the_table_to_the_bit() {
             .map(|c| c.is_valid(row).then(|| c.value(row)));
         assert_eq!(found.collect::<Option<Vec<f64>>>(), expected, "row {row}");
         if events.is_valid(row) && row < n_first {
-            told.insert((rollout.value(row), id.0, at, events.value(row).to_owned()));
+            recorded.insert((rollout.value(row), id.0, at, events.value(row).to_owned()));
         }
         keys.push((row >= n_first, rollout.value(row), id, at));
     }
     assert!(keys.is_sorted() && keys.windows(2).all(|pair| pair[0] != pair[1]));
     let leaves = (0..3).map(|k| (k, 2, 3, "departure".to_owned()));
     let expected: BTreeSet<_> = leaves.chain([(2, 9, 2, "birth".to_owned())]).collect();
-    assert_eq!(told, expected);
+    assert_eq!(recorded, expected);
 }
 
 #[test]

@@ -25,34 +25,34 @@ const SLACK_M_PER_S: f64 = 0.3;
 /// finest chunk.
 const SHORT_M: f64 = 0.1;
 
-/// The velocity of an object that was at `from`, was decoded to the state `said`, and is at `pose`;
-/// `steers` states whether it moves along its heading.
-pub(crate) fn follow(from: Pose, said: AgentState, pose: Pose, steers: bool) -> DVec2 {
-    let (meant, made) = (
-        said.pose.position - from.position,
+/// The velocity of an object that was at `from`, was decoded to the state `decoded`, and is at
+/// `pose`; `steers` states whether it moves along its heading.
+pub(crate) fn follow(from: Pose, decoded: AgentState, pose: Pose, steers: bool) -> DVec2 {
+    let (intended, moved) = (
+        decoded.pose.position - from.position,
         pose.position - from.position,
     );
-    let long = meant.length() > SHORT_M && made.length() > SHORT_M;
+    let long = intended.length() > SHORT_M && moved.length() > SHORT_M;
     let turn = match (steers, long) {
-        (true, _) => angle_difference(pose.heading, said.pose.heading),
-        (false, true) => meant.angle_to(made),
+        (true, _) => angle_difference(pose.heading, decoded.pose.heading),
+        (false, true) => intended.angle_to(moved),
         (false, false) => 0.0,
     };
     let stretch = match long {
-        true => made.length() / meant.length(),
+        true => moved.length() / intended.length(),
         false => 1.0,
     };
-    DVec2::from_angle(turn).rotate(said.velocity) * stretch
+    DVec2::from_angle(turn).rotate(decoded.velocity) * stretch
 }
 
 /// The velocity nearest to `velocity` that a motion of half a second from `from` to `pose` allows;
 /// zero for an object that has not moved at all.
 pub(crate) fn allowed(from: Pose, pose: Pose, velocity: DVec2) -> DVec2 {
-    let made = pose.position - from.position;
-    if made == DVec2::ZERO {
+    let moved = pose.position - from.position;
+    if moved == DVec2::ZERO {
         return DVec2::ZERO;
     }
-    let mean = made.length() / TOKEN_DT;
+    let mean = moved.length() / TOKEN_DT;
     let most = (mean + REACH_M_PER_S).min(2.0 * mean) + SLACK_M_PER_S;
     let least = (mean - REACH_M_PER_S - SLACK_M_PER_S).max(0.0);
     let speed = velocity.length();
@@ -63,7 +63,7 @@ pub(crate) fn allowed(from: Pose, pose: Pose, velocity: DVec2) -> DVec2 {
     } else if speed > SLACK_M_PER_S {
         velocity * (least / speed)
     } else {
-        made.normalize() * least
+        moved.normalize() * least
     }
 }
 
@@ -73,7 +73,7 @@ mod tests {
 
     use super::*;
 
-    fn said(x: f64, y: f64, heading: f64, velocity: DVec2) -> AgentState {
+    fn moving_to(x: f64, y: f64, heading: f64, velocity: DVec2) -> AgentState {
         AgentState {
             pose: Pose::new(x, y, heading),
             velocity,
@@ -82,7 +82,7 @@ mod tests {
 
     #[test]
     fn what_goes_where_it_said_keeps_its_velocity() {
-        let state = said(4.0, 0.3, 0.1, dvec2(8.2, 0.9));
+        let state = moving_to(4.0, 0.3, 0.1, dvec2(8.2, 0.9));
         let velocity = follow(Pose::default(), state, state.pose, true);
         assert!(velocity.distance(state.velocity) < 1e-12);
         assert_eq!(allowed(Pose::default(), state.pose, velocity), velocity);
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn a_shorter_way_is_a_lower_speed_and_a_turn_turns_it() {
-        let state = said(4.0, 0.0, 0.2, dvec2(8.0, 0.0));
+        let state = moving_to(4.0, 0.0, 0.2, dvec2(8.0, 0.0));
         let half = follow(Pose::default(), state, Pose::new(2.0, 0.0, 0.2), true);
         assert!(half.distance(dvec2(4.0, 0.0)) < 1e-12);
         // A car goes where it faces, a person where it goes.

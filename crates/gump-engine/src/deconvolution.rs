@@ -12,12 +12,12 @@ const ROUNDS: usize = 20;
 pub(crate) fn unsmoothed(logits: &[f32], smoothing: OrdinalSmoothing) -> Vec<f32> {
     let n = logits.len();
     let peak = logits.iter().copied().fold(f32::MIN, f32::max);
-    let said: Vec<f32> = logits.iter().map(|logit| (logit - peak).exp()).collect();
+    let observed: Vec<f32> = logits.iter().map(|logit| (logit - peak).exp()).collect();
     let mut spreads = vec![Vec::new(); n];
     for (bin, spread) in spreads.iter_mut().enumerate() {
         smoothing.spread(bin, n, spread);
     }
-    let mut sharp = said.clone();
+    let mut sharp = observed.clone();
     let mut blurred = vec![0.0f32; n];
     for _ in 0..ROUNDS {
         blurred.fill(0.0);
@@ -27,7 +27,8 @@ pub(crate) fn unsmoothed(logits: &[f32], smoothing: OrdinalSmoothing) -> Vec<f32
             }
         }
         for (mass, spread) in sharp.iter_mut().zip(&spreads) {
-            let ratio = |&(bin, share): &(usize, f32)| share * said[bin] / blurred[bin].max(1e-30);
+            let ratio =
+                |&(bin, share): &(usize, f32)| share * observed[bin] / blurred[bin].max(1e-30);
             *mass *= spread.iter().map(ratio).sum::<f32>();
         }
     }

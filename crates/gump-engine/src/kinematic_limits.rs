@@ -42,10 +42,10 @@ impl Limits {
         }
     }
 
-    /// The pose nearest to `said` that an object at `from` can reach.
-    pub(crate) fn keep(self, from: Pose, said: AgentState) -> AgentState {
-        let step = from.inverse() * said.pose;
-        if step.position.length() <= STILL_M && said.velocity.length() <= STILL_M_PER_S {
+    /// The pose nearest to `state` that an object at `from` can reach.
+    pub(crate) fn keep(self, from: Pose, state: AgentState) -> AgentState {
+        let step = from.inverse() * state.pose;
+        if step.position.length() <= STILL_M && state.velocity.length() <= STILL_M_PER_S {
             return AgentState {
                 pose: from,
                 velocity: DVec2::ZERO,
@@ -58,7 +58,7 @@ impl Limits {
         let heading = wrap_angle(step.heading).clamp(-most, most);
         AgentState {
             pose: from * Pose { position, heading },
-            velocity: said.velocity,
+            velocity: state.velocity,
         }
     }
 }
@@ -67,7 +67,7 @@ impl Limits {
 mod tests {
     use super::*;
 
-    fn said(x: f64, y: f64, heading: f64, speed: f64) -> AgentState {
+    fn moving_to(x: f64, y: f64, heading: f64, speed: f64) -> AgentState {
         AgentState {
             pose: Pose::new(x, y, heading),
             velocity: DVec2::new(speed, 0.0),
@@ -78,10 +78,10 @@ mod tests {
     fn what_stands_does_not_turn() {
         let limits = Limits::of(AgentKind::Vehicle).expect("vehicles have limits");
         let from = Pose::new(3.0, -2.0, 1.0);
-        let kept = limits.keep(from, said(3.02, -1.98, 1.3, 0.1));
+        let kept = limits.keep(from, moving_to(3.02, -1.98, 1.3, 0.1));
         assert_eq!((kept.pose, kept.velocity), (from, DVec2::ZERO));
         // Setting off is not standing.
-        let kept = limits.keep(from, said(3.02, -1.97, 1.0, 0.5));
+        let kept = limits.keep(from, moving_to(3.02, -1.97, 1.0, 0.5));
         assert_eq!(kept.velocity, DVec2::new(0.5, 0.0));
         assert!(kept.pose.position.distance(DVec2::new(3.02, -1.97)) < 0.01);
     }
@@ -90,11 +90,11 @@ mod tests {
     fn turns_and_slips_are_held_back_and_the_feasible_is_left_alone() {
         let limits = Limits::of(AgentKind::Vehicle).expect("vehicles have limits");
         let from = Pose::default();
-        let kept = limits.keep(from, said(2.0, 3.0, 2.0, 4.0));
+        let kept = limits.keep(from, moving_to(2.0, 3.0, 2.0, 4.0));
         assert!((kept.pose.position - DVec2::new(2.0, 1.04)).length() < 1e-9);
         assert!((kept.pose.heading - 0.22 * DVec2::new(2.0, 1.04).length()).abs() < 1e-9);
         // A quarter of a circle of 12 m in steps of half a second at 8 m/s.
-        let step = said(
+        let step = moving_to(
             12.0 * (1.0f64 / 3.0).sin(),
             12.0 * (1.0 - (1.0f64 / 3.0).cos()),
             1.0 / 3.0,

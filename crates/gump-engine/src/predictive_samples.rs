@@ -1,4 +1,4 @@
-//! How the sequence network makes predictive samples.
+//! Predictive samples of the sequence network.
 //!
 //! A state is decoded field by field, each given those before, so its distribution has no closed
 //! form; many draws represent it, including truncation and temporal averaging. They come from

@@ -96,19 +96,19 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
 
 /// The future positions of an object, scene frame.
 fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
-    let said = request.anchor.poses(bins);
+    let poses = request.anchor.poses(bins);
     let first = request.settle(bins, config).pose;
-    way(request.from(), [first, said[1], said[2]])
+    way(request.from(), [first, poses[1], poses[2]])
 }
 
 impl Member {
     /// The chunk of braking along the path of `bins`; `None` for an object that hardly moves.
     pub(crate) fn brake(&self, request: &Request, bins: &Bins) -> Option<Bins> {
         let before = self.before.filter(|_| self.speed > 0.5)?;
-        let said = request.anchor.poses(bins);
+        let poses = request.anchor.poses(bins);
         let at = |s: f64| {
             let mut from = (before, 0.0);
-            for pose in said {
+            for pose in poses {
                 let step = from.0.position.distance(pose.position);
                 if s <= from.1 + step && step > 0.0 {
                     return from.0.interpolate(pose, (s - from.1) / step);

@@ -61,8 +61,8 @@ pub(crate) struct Member {
     pub(crate) is_driven: bool,
     /// Others do not keep clear of it.
     pub(crate) is_ignored: bool,
-    /// Somebody on foot, who does not keep clear of others on foot: the boxes of people who walk
-    /// side by side overlap in recordings.
+    /// Whether it is a pedestrian, which does not keep clear of other pedestrians: the boxes of
+    /// people side by side overlap in recordings.
     pub(crate) walks: bool,
     reach: f64,
 }

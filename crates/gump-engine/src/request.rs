@@ -59,7 +59,7 @@ impl Request {
         self.forced[..7].iter().all(Option::is_some)
     }
 
-    /// Where the object was, scene frame; `None` if that is not known.
+    /// The previous pose of the object, scene frame; `None` if it is not known.
     pub(crate) fn from(&self) -> Option<Pose> {
         let limited = self.limits.map(|(from, _)| from);
         limited.or(self.anchor.origin())
@@ -68,19 +68,19 @@ impl Request {
     /// The final state of a decoded object: sampled, averaged over chunks, within its limits, with
     /// a consistent velocity; scene frame, not quantised.
     pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
-        let said = AgentState {
+        let decoded = AgentState {
             pose: self.anchor.poses(bins)[0],
             velocity: self.anchor.velocity(bins),
         };
-        let average = self.ring.aggregate(self.frame, said.pose, config.decay);
+        let average = self.ring.aggregate(self.frame, decoded.pose, config.decay);
         let Some(from) = self.from().filter(|_| !self.is_driven()) else {
             return AgentState {
                 pose: average,
-                ..said
+                ..decoded
             };
         };
         let steers = self.limits.is_some();
-        let velocity = agreement::follow(from, said, average, steers);
+        let velocity = agreement::follow(from, decoded, average, steers);
         let mut settled = AgentState {
             pose: average,
             velocity,

@@ -43,7 +43,7 @@ pub(crate) struct Future {
     pub(crate) recent: Vec<Frame>,
     /// The keys of agents, including those that entered in this future.
     pub(crate) identities: Identities,
-    /// How long lights have shown their colour, with spawning.
+    /// The time for which lights have shown their colour, with spawning.
     pub(crate) phases: Phases,
     /// The engine's cache of its window.
     pub(crate) context: Context,
@@ -66,7 +66,7 @@ impl Future {
             newborn: Vec::new(),
         };
         let mut requests = Vec::new();
-        // Who was newborn is tracked now, and takes its place in the canonical order.
+        // Newborn agents of the last frame are tracked now, in their place of the canonical order.
         let mut agents: Vec<&TokenAgent> = last.agents().collect();
         agents.sort_by_key(|agent| agent.key.order());
         for agent in agents {
@@ -162,7 +162,7 @@ impl Future {
             position: pose.position + velocity * TOKEN_DT,
             ..pose
         };
-        let said = match sampling.surrogate {
+        let predicted = match sampling.surrogate {
             Surrogate::Chunk => self
                 .rings
                 .get(&agent.key.id)
@@ -170,9 +170,10 @@ impl Future {
             Surrogate::Copy => Some(pose),
             Surrogate::ConstantVelocity => None,
         };
-        // Half a second moves nobody farther from a straight line: such a word is noise.
-        let said = said.filter(|said| said.position.distance(moved.position) <= GUARD_M);
-        set_pose(agent.state, said.unwrap_or(moved))
+        // No agent deviates farther from a straight line in half a second: that would be noise.
+        let predicted =
+            predicted.filter(|predicted| predicted.position.distance(moved.position) <= GUARD_M);
+        set_pose(agent.state, predicted.unwrap_or(moved))
     }
 
     /// Makes the decoded states the present and returns it in world coordinates.
@@ -224,7 +225,7 @@ impl Future {
         let kept = history.max(self.frames.len());
         self.recent.drain(..self.recent.len().saturating_sub(kept));
         self.rings.retain(|id, _| moved.contains_key(id));
-        // In the first frame of a window nobody is newborn: who was, counts as tracked.
+        // In the first frame of a window no agent is newborn: those that were count as tracked.
         let first = std::mem::take(&mut self.frames[0]);
         self.frames[0] = first.into_first();
         frame
@@ -237,7 +238,8 @@ impl Future {
         all + last > world.network().config().block_size
     }
 
-    /// How far the ego is from the origin of its scene frame along either axis, metres.
+    /// Returns the distance of the ego from the origin of its scene frame along the farther axis,
+    /// metres.
     pub(crate) fn ego_reach(&self) -> f64 {
         let ego = self.frames.last().and_then(|frame| frame.tracked.first());
         ego.map_or(0.0, |ego| ego.state.pose().position.abs().max_element())

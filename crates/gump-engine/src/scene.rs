@@ -162,7 +162,7 @@ impl Scene {
         last.map_or(LocalFrame::SCENE, LocalFrame::at)
     }
 
-    /// The slots of its own history.
+    /// The slots of its history.
     pub fn slots(&self) -> Result<Vec<PlacedSlot>, EngineError> {
         let sequence =
             TokenSequence::new(Vec::new(), self.history.clone()).map_err(EngineError::Grammar)?;

@@ -90,7 +90,7 @@ impl TransformerSession<'_> {
             })
             .collect();
         let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
-        let mut said = engine.say(&hidden).into_iter();
+        let mut successors = engine.say(&hidden).into_iter();
         for &w in &members {
             let window = &mut windows[w];
             let scene = &self.scenes[window.scene];
@@ -102,8 +102,8 @@ impl TransformerSession<'_> {
                 .collect();
             let mut kept = vec![true];
             for (i, &id) in ids.iter().enumerate().skip(1) {
-                let said = said.next().expect("one word per tracked agent");
-                let stay = stays(&said, id, &ids[i + 1..]);
+                let successor = successors.next().expect("one word per tracked agent");
+                let stay = stays(&successor, id, &ids[i + 1..]);
                 let (place, kind) = places[i];
                 let is_far = place.distance(places[0].0) >= SEEN_M;
                 let may_leave = is_far && scene.ground(kind).ends_at(place);
@@ -171,7 +171,7 @@ impl TransformerSession<'_> {
                 .collect::<Result<_, _>>()?;
             let hidden = self.read(engine, &mut contexts, &before, &slots);
             let mut coming = Vec::new();
-            for (&f, said) in before.iter().zip(engine.say(&hidden)) {
+            for (&f, successor) in before.iter().zip(engine.say(&hidden)) {
                 let future = &mut self.futures[f];
                 let longest = self.world.longest_frame();
                 let seed = future.decision(About::Coming).fork(birth as u64);
@@ -179,7 +179,7 @@ impl TransformerSession<'_> {
                 let has_room = last.len_slots() + 2 <= longest;
                 let used: BTreeSet<u16> = future.identities.iter().map(|(id, _)| id).collect();
                 let before = last.newborn.last().map(|agent| agent.key);
-                let key = next_key(&said, BEGIN_AT, &used, before, seed, arrivals);
+                let key = next_key(&successor, BEGIN_AT, &used, before, seed, arrivals);
                 match key.filter(|_| has_room) {
                     Some(key) => coming.push((f, key.kind, seed)),
                     None => open.retain(|open| *open != f),
@@ -236,7 +236,7 @@ impl TransformerSession<'_> {
         for (f, kind, seed) in coming {
             let future = &mut self.futures[f];
             let may_come = !self.scenes[future.scene].entries(kind).is_closed();
-            // Who drifted in stands in the list already, perhaps with an id above the lowest free.
+            // Agents that drifted in are in the list already, perhaps with higher ids than free.
             let newborn = future.frames.last().and_then(|now| now.newborn.last());
             let last = newborn.filter(|last| last.key.kind == kind);
             let last = last.map_or(0, |last| last.key.id);

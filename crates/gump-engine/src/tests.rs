@@ -47,7 +47,7 @@ fn a_token_changes_nothing_before_it() {
     let after = &hidden(&network, &[&changed], &memory)[0];
     assert_eq!(largest_difference(&before[..value], &after[..value]), 0.0);
     assert!(largest_difference(&before[value..], &after[value..]) > 1e-4);
-    // The key of the same object stands before its value: it cannot know it.
+    // The key of the same object precedes its value and so cannot depend on it.
     assert!(matches!(slots[value - 1].slot, Slot::Key(_)));
 }
 
@@ -239,7 +239,7 @@ fn starts_of_one_scene_share_what_they_look_at() {
         assert_ne!(frames[..2], frames[4..]);
         assert_eq!(frames[4..], single.step(None).unwrap());
     }
-    // Those that are kept go on as if nobody had left.
+    // Futures that are kept continue as if none had been dropped.
     assert!(shared.keep(&[4]));
     let alone = shared.step(None).unwrap();
     assert_eq!(alone[..], single.step(None).unwrap()[..1]);
@@ -257,7 +257,7 @@ fn nothing_looks_at_the_logged_future() {
                 velocity: gump_geometry::dvec2(f64::NAN, f64::NAN),
             })
         });
-        // Everyone is nowhere, a light changes, and somebody appears.
+        // All agents have undefined states, a light changes, and an agent appears.
         let mut agents: Vec<_> = agents.collect();
         agents.push(gump_scene::Agent {
             id: AgentId(99),
@@ -275,16 +275,16 @@ fn nothing_looks_at_the_logged_future() {
 #[test]
 fn a_driven_ego_goes_where_it_is_told_and_others_notice() {
     let scenario = scenario();
-    let mut told = scenario.present().ego_now().state;
-    told.pose.position.x += 1.2345;
-    let (driven, _) = imagine(SamplingConfig::default(), &scenario, 2, 2, Some(told));
+    let mut ego = scenario.present().ego_now().state;
+    ego.pose.position.x += 1.2345;
+    let (driven, _) = imagine(SamplingConfig::default(), &scenario, 2, 2, Some(ego));
     assert!(
         driven
             .iter()
             .flatten()
-            .all(|frame| frame.agent(AgentId(0)).unwrap().state == told)
+            .all(|frame| frame.agent(AgentId(0)).unwrap().state == ego)
     );
-    let mut elsewhere = told;
+    let mut elsewhere = ego;
     elsewhere.pose.position.x += 15.0;
     let (other, _) = imagine(SamplingConfig::default(), &scenario, 2, 2, Some(elsewhere));
     let others = |frames: &[Vec<Frame>]| -> Vec<AgentState> {
@@ -344,17 +344,17 @@ fn a_long_drive_never_reaches_the_edge_of_the_window() {
         seed: Seed(5),
     };
     let mut session = world.open(&[start]).unwrap();
-    let mut told = scenario.present().ego_now().state;
+    let mut ego = scenario.present().ego_now().state;
     for step in 0..30 {
-        told.pose.position.x = 10.0 * f64::from(step + 1);
-        let frames = session.step(Some(&[told; 2])).unwrap();
+        ego.pose.position.x = 10.0 * f64::from(step + 1);
+        let frames = session.step(Some(&[ego; 2])).unwrap();
         for frame in &frames {
             assert_eq!(frame.agents().len(), 3);
-            assert_eq!(frame.agent(AgentId(0)).unwrap().state, told);
+            assert_eq!(frame.agent(AgentId(0)).unwrap().state, ego);
         }
     }
-    // The window came to the parked car: it is a token now, and moves as the network says.
-    let frames = session.step(Some(&[told; 2])).unwrap();
+    // The window has reached the parked car: it is a token now, and moves as predicted.
+    let frames = session.step(Some(&[ego; 2])).unwrap();
     let parked = |i: usize| frames[i].agent(AgentId(2)).unwrap().state;
     assert_ne!(parked(0), parked(1));
 }

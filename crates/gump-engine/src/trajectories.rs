@@ -65,7 +65,7 @@ impl TransformerWorld {
                 _ => None,
             })
             .collect();
-        // The engine keeps the map in a form of its own, without what heads read.
+        // The engine keeps the map in another form, without the features that heads read.
         let encoded;
         let memory = match scene.memory.plain() {
             Some(memory) => memory,

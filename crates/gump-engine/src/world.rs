@@ -263,8 +263,8 @@ impl TransformerWorld {
         Ok(bins.chunks(keys.len().max(1)).map(per_future).collect())
     }
 
-    /// Hidden vectors `[places, C]` of the history of a scene, in one pass; the engine keeps what
-    /// futures go on from.
+    /// Hidden vectors `[places, C]` of the history of a scene, in one pass; the engine keeps the
+    /// cache that futures continue from.
     fn read_history(
         &self,
         scene: &mut Scene,
@@ -301,15 +301,15 @@ impl TransformerWorld {
         let slots = scene.slots()?;
         let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
         let key = key.expect("the ego is in every frame of the window");
-        let mut said = self.read_history(&mut scene, &slots, vec![key])?;
+        let mut values = self.read_history(&mut scene, &slots, vec![key])?;
         let network = &self.network;
-        let hidden = Tensor::from_slice(&said, (1, said.len()), network.device())?;
+        let hidden = Tensor::from_slice(&values, (1, values.len()), network.device())?;
         let decoder = &network.decoder;
         let table = decoder.input_table(&network.mct.token_table()?)?;
         let output = decoder.step(&table, &mut decoder.begin(&hidden), 0, None)?;
         let logits = decoder.logits(&output, STEPS[0])?;
-        said.extend(logits.flatten_all()?.to_vec1::<f32>()?);
-        Ok(said)
+        values.extend(logits.flatten_all()?.to_vec1::<f32>()?);
+        Ok(values)
     }
 }
 

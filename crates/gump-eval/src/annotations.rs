@@ -8,9 +8,9 @@ use gump_wosac::realism::{Component, Config, Features, Log, Reference, Rollouts,
 /// Agents with annotations, those nearest to the ego: more would make pages larger than they need
 /// to be.
 const AGENTS: usize = 32;
-/// How far the futures that the challenge is defined on go, seconds.
+/// Length of the futures in the challenge, seconds.
 const HORIZON_S: u32 = 8;
-/// Beyond that a distance means that there is nothing, metres.
+/// Distances beyond this mean that there is no object, metres.
 const NOTHING: f32 = 1e9;
 
 /// Metrics with their names, by the benchmark's components.
@@ -35,7 +35,7 @@ pub struct Annotations {
     pub series: Vec<MetricSeries>,
 }
 
-/// How plausible the futures of an agent are.
+/// Plausibility of an agent's futures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AgentAnnotation {
     /// Its id.
@@ -44,7 +44,7 @@ pub struct AgentAnnotation {
     /// measures it, times the share of futures in which it does nothing that a driver would not do;
     /// 0 to 1.
     pub plausibility: f64,
-    /// What it does that a driver would not, in words; empty if it does nothing such.
+    /// Its implausible actions, in words; empty if there are none.
     pub deeds: String,
 }
 
@@ -53,7 +53,7 @@ pub struct AgentAnnotation {
 pub struct MetricSeries {
     /// The metric, with its unit.
     pub name: &'static str,
-    /// Whose it is.
+    /// Id of the agent.
     pub agent: AgentId,
     /// The future it is of; `None` for the log.
     pub future: Option<usize>,
@@ -101,7 +101,7 @@ impl Annotations {
     }
 }
 
-/// What an agent does that a driver would not, in words; empty if it does nothing such.
+/// Implausible actions of an agent, in words; empty if there are none.
 fn deeds(judged: &Judged) -> String {
     let deeds = judged.conduct.deeds.iter();
     let words = deeds.map(|(deed, share)| {

@@ -1,4 +1,4 @@
-//! Counts what a driver would notice, in worlds and in the log.
+//! Counts of implausible actions, in worlds and in the log.
 //!
 //! [`BehaviourEvaluation`] simulates the futures of one scenario in every world and counts; the
 //! counts are stored as [`ScenarioCounts`], which [`ScenarioTallies`] reads back. What is counted,
@@ -30,7 +30,7 @@ pub struct BehaviourSettings {
     /// Number of scenarios at most.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limit: Option<usize>,
-    /// How learned worlds decode, as JSON.
+    /// Sampling of learned worlds, as JSON.
     pub sampling: String,
     /// The seed, in decimal digits.
     pub seed: String,
@@ -142,12 +142,12 @@ impl ScenarioTallies {
     }
 }
 
-/// How futures are made and how far they are looked at.
+/// Settings of the futures and of the counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BehaviourConfig {
-    /// Length of the futures, seconds; the log is looked at only as far as it goes.
+    /// Length of the futures, seconds; of a shorter log, only what there is counts.
     pub seconds: u32,
-    /// Futures of each scenario; worlds without chance have one.
+    /// Futures of each scenario; deterministic worlds have one.
     pub futures: usize,
     /// Whether agents that a world spawns are counted too.
     pub spawning: bool,

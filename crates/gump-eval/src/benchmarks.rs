@@ -1,9 +1,9 @@
-//! Frozen sets: lists of scenes that everybody scores on.
+//! Frozen sets: lists of scenes that all evaluations share.
 //!
-//! A list names scenes, it holds none: made ones by generator version, seed, network and checksum,
-//! recorded ones by id, file and checksum. [`ScenarioSetName::find`] finds the scenes of a list and
-//! holds them to it; [`make()`] makes those that are made, and [`ListDraw`] draws a list from a larger
-//! one.
+//! A list names scenes and holds none: generated ones by generator version, seed, network and
+//! checksum, recorded ones by id, file and checksum. [`ScenarioSetName::find`] finds the scenes of
+//! a list and verifies them; [`make()`] makes the generated ones, and [`ListDraw`] draws a list
+//! from a larger one.
 
 mod checksum;
 mod draw;
@@ -35,15 +35,15 @@ pub const RESERVED_SEEDS: Range<u64> = 900_000_000..1_000_000_000;
 pub struct BenchmarkList {
     /// The name that results carry.
     pub name: String,
-    /// Why these scenes.
+    /// Reason for the choice of these scenes.
     pub about: String,
-    /// Scenes that are made.
+    /// Generated scenes.
     #[serde(default, rename = "made", skip_serializing_if = "Vec::is_empty")]
     pub made: Vec<MadePart>,
-    /// Scenes that somebody recorded.
+    /// Recorded scenes.
     #[serde(default, rename = "recorded", skip_serializing_if = "Vec::is_empty")]
     pub recorded: Vec<RecordedPart>,
-    /// Where the list was read from.
+    /// Path of the list.
     #[serde(skip)]
     path: PathBuf,
 }
@@ -54,30 +54,30 @@ pub struct BenchmarkList {
 pub struct MadePart {
     /// Its name, without the ending.
     pub file: String,
-    /// What its scenes are for.
+    /// Split of its scenes.
     pub split: Split,
     /// "procedural" or "sumo", a slash, and its version.
     pub generator: String,
     /// Version of SUMO, where the generator needs it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sumo: Option<String>,
-    /// From which the generator draws.
+    /// Seed of the generator.
     pub seed: u64,
-    /// Multiplies the number of agents; else the generator's own.
+    /// Factor of the number of agents; by default the generator's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub density: Option<f64>,
-    /// How many scenes.
+    /// Number of scenes that the generator makes.
     pub count: usize,
-    /// Which of them, in order; none: all.
+    /// Indices of the scenes that are kept, in order; all if empty.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub keep: Vec<usize>,
-    /// Scenes taken of a run of SUMO, at most.
+    /// Maximum number of scenes from one run of SUMO.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub per_run: Option<usize>,
     /// Sum and id of every scene, in order.
     #[serde(default)]
     pub scenes: Vec<String>,
-    /// Networks to take in turn; none: made anew for every run.
+    /// Networks to use in turn; if empty, one is generated for every run.
     #[serde(default, rename = "network", skip_serializing_if = "Vec::is_empty")]
     pub networks: Vec<NetworkFile>,
 }
@@ -86,13 +86,13 @@ pub struct MadePart {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkFile {
-    /// From the list.
+    /// Path relative to the list.
     pub path: PathBuf,
     /// Lower-case hexadecimal.
     pub sha256: String,
     /// An SPDX expression.
     pub licence: String,
-    /// Where it is from, and what must be passed on with it.
+    /// Source, and the notice that must be passed on with it.
     pub notice: String,
 }
 
@@ -100,11 +100,11 @@ pub struct NetworkFile {
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedPart {
-    /// What its scenes are for.
+    /// Split of its scenes.
     pub split: Split,
-    /// From the folder of recorded data.
+    /// Path relative to the folder of recorded data.
     pub folder: PathBuf,
-    /// Why they are of this split.
+    /// Reason why they are in this split.
     pub about: String,
     /// SHA-256, file and id of every scene, in order; the id is left out where a file holds several.
     pub scenes: Vec<String>,
@@ -112,9 +112,9 @@ pub struct RecordedPart {
 
 /// A recorded scene of a list.
 pub struct RecordedScene<'a> {
-    /// Of its file, lower-case hexadecimal.
+    /// SHA-256 of its file, lower-case hexadecimal.
     pub sha256: &'a str,
-    /// From the folder.
+    /// Path relative to the folder.
     pub file: &'a str,
     /// Left out where the file holds several scenes.
     pub id: Option<&'a str>,
@@ -124,7 +124,7 @@ impl BenchmarkList {
     /// Reads a list.
     ///
     /// # Errors
-    /// A file that cannot be read, or that is no list.
+    /// A file that cannot be read or is not a list.
     pub fn read(path: &Path) -> Result<Self, EvalError> {
         let text = std::fs::read_to_string(path)
             .map_err(|cause| EvalError::io("read the list", path, cause))?;
@@ -170,17 +170,17 @@ impl BenchmarkList {
         }
     }
 
-    /// Where the list was read from.
+    /// Path of the list.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// A path that the list gives from itself.
+    /// Resolves a path of the list, which is relative to it.
     pub fn beside(&self, path: &Path) -> PathBuf {
         self.path.parent().unwrap_or(Path::new("")).join(path)
     }
 
-    /// The file of a part among what was made.
+    /// The generated file of a part.
     pub fn file(&self, folder: &Path, part: &MadePart) -> PathBuf {
         folder
             .join(&self.name)
@@ -189,7 +189,7 @@ impl BenchmarkList {
 }
 
 impl MadePart {
-    /// What is wrong with it, if anything.
+    /// Checks the part; the error says what is wrong.
     fn validate(&self) -> Result<(), String> {
         let expect = |is_met: bool, what: String| if is_met { Ok(()) } else { Err(what) };
         let (n, kept) = (self.scenes.len(), self.kept());
@@ -228,7 +228,7 @@ impl MadePart {
         )
     }
 
-    /// How many scenes its file has.
+    /// Number of scenes in its file.
     pub fn kept(&self) -> usize {
         match self.keep.len() {
             0 => self.count,
@@ -246,7 +246,7 @@ impl<'a> RecordedScene<'a> {
     /// Reads `SHA256 FILE [ID]`.
     ///
     /// # Errors
-    /// A line that is none.
+    /// A malformed line.
     pub fn parse(line: &'a str) -> Result<Self, EvalError> {
         let words: Vec<&str> = line.split(' ').collect();
         match words[..] {

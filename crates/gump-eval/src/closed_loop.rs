@@ -42,11 +42,11 @@ pub struct ClosedLoopSettings {
     pub planners: Vec<String>,
     /// Name of the world that planners roll out.
     pub imagination: String,
-    /// How long and with which controller planners drive, as JSON.
+    /// Length of the drives and controller, as JSON.
     pub driving: String,
     /// Settings of planners with rollouts, as JSON.
     pub thinking: String,
-    /// How learned worlds decode, as JSON.
+    /// Sampling of learned worlds, as JSON.
     pub sampling: String,
     /// The seed, in decimal digits.
     pub seed: String,
@@ -100,7 +100,7 @@ pub trait PlannerFactory: Sync {
     /// The planner for one case.
     ///
     /// # Errors
-    /// Any reason why there is none; the drive has failed then.
+    /// Any error; the drive then counts as failed.
     fn build(&self, case: &Case, seed: Seed) -> Result<Box<dyn Explain + '_>, BoxError>;
 
     /// Whether several planners may drive at the same time.
@@ -118,9 +118,9 @@ pub enum EvaluatedPlanner<'a> {
     Custom(&'a dyn PlannerFactory),
 }
 
-/// The planner of a row: one that was asked for, or a proposal alone.
+/// The planner of a row: a requested one, or a single proposal.
 enum RowPlanner<'a> {
-    Asked(EvaluatedPlanner<'a>),
+    Requested(EvaluatedPlanner<'a>),
     Proposal {
         speed_fraction: f64,
         lateral_offset: f64,
@@ -130,8 +130,8 @@ enum RowPlanner<'a> {
 impl RowPlanner<'_> {
     fn name(&self) -> String {
         match *self {
-            Self::Asked(EvaluatedPlanner::Named(planner)) => planner.name().into(),
-            Self::Asked(EvaluatedPlanner::Custom(planner)) => planner.name(),
+            Self::Requested(EvaluatedPlanner::Named(planner)) => planner.name().into(),
+            Self::Requested(EvaluatedPlanner::Custom(planner)) => planner.name(),
             Self::Proposal {
                 speed_fraction,
                 lateral_offset,
@@ -161,7 +161,7 @@ pub struct VisitedDrive<'a> {
 /// Sees drives while they are in memory.
 pub type DriveVisitor<'a> = &'a (dyn Fn(VisitedDrive<'_>) -> Result<(), BoxError> + Sync);
 
-/// Planners, the worlds they drive in and how they do it.
+/// Planners, the worlds that they drive in, and the settings of the drives.
 pub struct ClosedLoopEvaluation<'a> {
     /// The planners, in order.
     pub planners: &'a [EvaluatedPlanner<'a>],
@@ -287,9 +287,9 @@ impl ClosedLoopEvaluation<'_> {
     /// The planners of all rows.
     fn row_planners(&self) -> Vec<RowPlanner<'_>> {
         let mut planners = Vec::new();
-        for &asked in self.planners {
-            if !matches!(asked, EvaluatedPlanner::Named(PlannerName::Proposals)) {
-                planners.push(RowPlanner::Asked(asked));
+        for &planner in self.planners {
+            if !matches!(planner, EvaluatedPlanner::Named(PlannerName::Proposals)) {
+                planners.push(RowPlanner::Requested(planner));
                 continue;
             }
             let all = PdmConfig::default();
@@ -349,10 +349,10 @@ impl ClosedLoopEvaluation<'_> {
         seed: Seed,
     ) -> Result<Box<dyn Explain + 'p>, BoxError> {
         match planner {
-            RowPlanner::Asked(EvaluatedPlanner::Named(planner)) => {
+            RowPlanner::Requested(EvaluatedPlanner::Named(planner)) => {
                 Ok(planner.build(case, self.imagination, seed, self.config)?)
             }
-            RowPlanner::Asked(EvaluatedPlanner::Custom(planner)) => planner.build(case, seed),
+            RowPlanner::Requested(EvaluatedPlanner::Custom(planner)) => planner.build(case, seed),
             RowPlanner::Proposal {
                 speed_fraction,
                 lateral_offset,
@@ -368,14 +368,14 @@ impl ClosedLoopEvaluation<'_> {
     }
 }
 
-/// A driver that fails once its monitor wants the work to end.
+/// A driver that fails once its monitor asks it to stop.
 pub struct StoppableDriver<'a> {
     inner: &'a mut dyn Driver,
     monitor: &'a dyn Monitor,
 }
 
 impl<'a> StoppableDriver<'a> {
-    /// A driver that `monitor` may end.
+    /// A driver that `monitor` can stop.
     pub fn new(inner: &'a mut dyn Driver, monitor: &'a dyn Monitor) -> Self {
         Self { inner, monitor }
     }

@@ -1,6 +1,6 @@
 //! Data sets with splits: a folder with a `manifest.toml`, or any path for a set without.
 //!
-//! [`parts`] says where the scenarios of a split are, [`read`] reads them. Frozen test sets are in
+//! [`parts`] lists the files of a split, [`read`] reads their scenarios. Frozen test sets are in
 //! [`benchmarks`](crate::benchmarks).
 
 use std::ops::Range;
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{EvalError, Monitor};
 
-/// `manifest.toml`: what a data set consists of, where it is from and who may use it.
+/// `manifest.toml`: contents, source and licence of a data set.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[non_exhaustive]
@@ -20,7 +20,7 @@ pub struct Manifest {
     pub name: String,
     /// An SPDX expression.
     pub licence: String,
-    /// How the files came about.
+    /// Origin of the files.
     pub provenance: String,
     /// Its files.
     #[serde(rename = "file")]
@@ -40,11 +40,11 @@ pub struct ManifestFile {
     pub sha256: String,
     /// An SPDX expression, where it is not that of the set.
     pub licence: Option<String>,
-    /// How it came about, where that is not how the set did.
+    /// Origin, if it differs from that of the set.
     pub provenance: Option<String>,
-    /// What must be passed on with it.
+    /// Notice that must be passed on with it.
     pub notice: Option<String>,
-    /// Which of its scenes are for what.
+    /// Assignment of its scenes to splits.
     pub split: SplitRanges,
 }
 
@@ -61,15 +61,15 @@ pub struct SplitRanges {
     pub test: [usize; 2],
 }
 
-/// What scenes are for.
+/// Purpose of scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// Weights learn from them.
+    /// Training of weights.
     Train,
-    /// Choices are made on them: weights, temperatures, rules.
+    /// Choice of weights, temperatures and rules.
     Tune,
-    /// Nothing is chosen on them.
+    /// Final evaluation; nothing is chosen on them.
     Test,
 }
 
@@ -125,7 +125,7 @@ impl Manifest {
     }
 }
 
-/// Where the scenes of a split are; without a manifest, all of a path is for training.
+/// The files and scenes of a split; without a manifest, all scenes of a path are for training.
 ///
 /// # Errors
 /// A manifest that cannot be read.
@@ -200,8 +200,8 @@ mod tests {
         for file in &manifest.files {
             let is_ours = file.licence.is_none() || file.licence.as_deref() == Some("Apache-2.0");
             assert!(is_ours || file.notice.is_some(), "{}", file.path.display());
-            let made = file.provenance.as_ref();
-            assert!(made.is_none_or(|how| how.starts_with("cargo xtask data ")));
+            let provenance = file.provenance.as_ref();
+            assert!(provenance.is_none_or(|how| how.starts_with("cargo xtask data ")));
             let path = folder.join(&file.path);
             let digest = digest::of_bytes(&std::fs::read(&path).unwrap());
             assert_eq!(digest, file.sha256, "{}", path.display());

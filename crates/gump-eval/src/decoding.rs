@@ -15,9 +15,9 @@ use crate::worlds::{WorldName, Worlds};
 pub struct Decoding {
     /// `ruled`, `raw` or `paper`; `-` for worlds that decode nothing.
     pub name: &'static str,
-    /// How a network samples.
+    /// Sampling of the network.
     pub sampling: SamplingConfig,
-    /// How its frames become those of the scene, but for the length.
+    /// Conversion of its frames to those of the scene, except for the length.
     frames: SimulateConfig,
 }
 
@@ -25,7 +25,7 @@ impl Decoding {
     /// The name for worlds that decode nothing.
     pub const NONE: &'static str = "-";
 
-    /// A decoding with the name it deserves: `raw` if no rule corrects it.
+    /// A decoding with its name: `raw` if no rule corrects it, else `ruled`.
     pub fn of(sampling: SamplingConfig) -> Self {
         Self {
             name: if sampling.has_rules() { "ruled" } else { "raw" },
@@ -43,7 +43,7 @@ impl Decoding {
         }
     }
 
-    /// The same for a world: one that follows rules decodes nothing.
+    /// The same decoding for a world; a rule-based world decodes nothing.
     pub fn for_world(self, world: &WorldName) -> Self {
         match world {
             WorldName::Model(_) => self,
@@ -67,7 +67,7 @@ impl Decoding {
         changed
     }
 
-    /// How frames become those of the scene, for so many seconds.
+    /// Conversion of frames to those of the scene, for a number of seconds.
     pub fn frames(&self, seconds: f64) -> SimulateConfig {
         SimulateConfig {
             seconds,
@@ -103,7 +103,7 @@ pub struct DecodedWorldName {
 }
 
 impl DecodedWorld {
-    /// The number of futures to simulate where `n` are asked for: worlds without chance have one.
+    /// Number of futures to simulate where `n` are requested: deterministic worlds have one.
     pub fn futures(&self, n: usize) -> usize {
         self.world.distinct_futures(n)
     }
@@ -117,7 +117,7 @@ impl DecodedWorld {
     }
 }
 
-/// Every column with its world, of which nothing is loaded yet.
+/// Every column with its world, which is not loaded yet.
 pub(crate) fn columns<'a>(
     device: &Device,
     worlds: &'a [DecodedWorld],

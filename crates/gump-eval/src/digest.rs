@@ -1,4 +1,4 @@
-//! Digests of futures and of predictions: equal ones were made by equal arithmetic.
+//! Digests of futures and of predictions, which are equal only for equal arithmetic.
 
 use gump_scene::{Agent, Prediction, Rollout};
 use sha2::{Digest, Sha256};

@@ -41,7 +41,7 @@ pub enum EvalError {
     /// A data set's manifest cannot be understood.
     #[error("{0}")]
     Dataset(String),
-    /// A list of scenes is none, or scenes are missing or not what it says.
+    /// A file is not a list of scenes, or scenes are missing or differ from the list.
     #[error("{0}")]
     Benchmark(String),
     /// Rollouts in files are missing, or there twice.

@@ -1,9 +1,9 @@
 //! Synthetic scenes that are made while a training run uses them, each for a while: `fresh:PROFILE`.
 //!
 //! Scenes form an endless stream: number `k` comes from the stream's seed and `k` alone. Step `s`
-//! of a training run draws its samples from a window of the stream that moves on with `s`, so a run
-//! that is resumed goes on exactly where it was, and nothing about the stream is saved. A thread
-//! makes scenes ahead of the window; what is not ready is made by whoever asks.
+//! of a training run draws its samples from a window of the stream that moves on with `s`, so a
+//! resumed run continues exactly where it was, and nothing about the stream is saved. A thread
+//! makes scenes ahead of the window; a scene that is not ready is made by the caller.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -46,10 +46,10 @@ pub struct SceneStream {
     seed: Seed,
 }
 
-/// State that the thread that makes scenes shares with those who ask.
+/// State shared by the thread that makes scenes and the threads that use them.
 struct Shared {
     held: Mutex<Held>,
-    /// Told when the window moves on.
+    /// Notified when the window moves on.
     moved: Condvar,
     ends: AtomicBool,
     made: AtomicUsize,
@@ -68,15 +68,13 @@ impl SceneStream {
     /// # Errors
     /// [`EvalError::Argument`] for a profile that does not exist or a seed that is no number.
     pub fn of_name(name: &Path) -> Result<Option<Self>, EvalError> {
-        let Some(asked) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
+        let Some(rest) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
             return Ok(None);
         };
-        let (profile, seed) = asked.split_once(':').unwrap_or((asked, "0"));
+        let (profile, seed) = rest.split_once(':').unwrap_or((rest, "0"));
         let profile = profile_of_name(profile).map_err(EvalError::Argument)?;
         let seed = seed.parse().map_err(|_| {
-            EvalError::Argument(format!(
-                "expected a whole number as seed in {PREFIX}{asked}"
-            ))
+            EvalError::Argument(format!("expected a whole number as seed in {PREFIX}{rest}"))
         })?;
         Ok(Some(Self {
             profile,
@@ -152,7 +150,7 @@ impl FreshScenes {
         Cow::Owned(Arc::unwrap_or_clone(scene))
     }
 
-    /// Scenes made so far, by anybody.
+    /// Scenes made so far, by any thread.
     #[cfg(test)]
     fn made(&self) -> usize {
         self.shared.made.load(Ordering::Relaxed)
@@ -196,7 +194,7 @@ impl Shared {
 
 /// Makes the scenes of the window, and as many again after it, until the stream is dropped.
 fn make_ahead(stream: &SceneStream, shared: &Shared) {
-    // Of a stream that nobody has asked yet nobody knows where it begins.
+    // Starts with the first window; the first request of a resumed run moves it on.
     let mut held = shared.lock();
     while !shared.ends.load(Ordering::Relaxed) {
         let first = held.first;
@@ -232,13 +230,13 @@ mod tests {
         );
         assert_eq!(stream("fresh:recorded-like").profile, Profile::RecordedLike);
         assert_eq!(stream("fresh:plain:7").seed, Seed(7));
-        let told = |name: &str| {
+        let error = |name: &str| {
             SceneStream::of_name(Path::new(name))
                 .unwrap_err()
                 .to_string()
         };
-        assert!(told("fresh:real").contains("plain, recorded-like, found \"real\""));
-        assert!(told("fresh:plain:x").contains("a whole number as seed in fresh:plain:x"));
+        assert!(error("fresh:real").contains("plain, recorded-like, found \"real\""));
+        assert!(error("fresh:plain:x").contains("a whole number as seed in fresh:plain:x"));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Futures of one scene, with what they cost and an ear for who wants them to end.
+//! Futures of one scene, with their cost, and with a monitor that can stop the simulation.
 //!
 //! The engine in `gump-rollout` knows no clock, so the world is watched from outside.
 #![allow(
@@ -18,7 +18,7 @@ use gump_scene::{Agent, AgentId, AgentState, Frame, Light, Rollout, Scenario, Se
 use crate::worlds::World;
 use crate::{EvalError, Monitor};
 
-/// Futures of one scene, and what they cost.
+/// Futures of one scene, and their cost.
 pub struct Imagined {
     /// The futures.
     pub rollouts: Vec<Rollout>,
@@ -29,7 +29,7 @@ pub struct Imagined {
     /// Passes of the network per step of the world, whatever their batch, without those over the
     /// history; 0 for worlds that follow rules.
     pub passes_per_frame: f64,
-    /// Predictive samples that were asked for, of [`imagine_probed`].
+    /// Requested predictive samples, of [`imagine_probed`].
     pub samples: Vec<PredictiveSamples>,
 }
 
@@ -40,7 +40,7 @@ impl Imagined {
     }
 }
 
-/// Frames that the monitor of a simulation is told of: in steps of the scene, over all futures.
+/// Frames that the monitor of a simulation counts: in steps of the scene, over all futures.
 pub fn frames(scenario: &Scenario, n_futures: usize, config: &SimulateConfig) -> u64 {
     let steps = (config.seconds / scenario.dt).round().max(1.0);
     steps as u64 * n_futures as u64
@@ -50,7 +50,7 @@ pub fn frames(scenario: &Scenario, n_futures: usize, config: &SimulateConfig) ->
 /// not get its route, which comes from what is to be imagined. The monitor counts [`frames`].
 ///
 /// # Errors
-/// A map without lanes for a world that follows them, what the world reports, or
+/// A map without lanes for a world that follows them, an error of the world, or
 /// [`EvalError::Stopped`].
 pub fn imagine(
     world: &World,
@@ -66,7 +66,7 @@ pub fn imagine(
 /// The same around an ego that `driver` drives, if there is one.
 ///
 /// # Errors
-/// As [`imagine`], and what the driver reports.
+/// As [`imagine`], and errors of the driver.
 pub fn imagine_around(
     world: &World,
     scenario: &Scenario,
@@ -150,7 +150,7 @@ fn simulate_watched(
 
 struct Watched<'a> {
     world: &'a World,
-    /// Told in units of the scene's step, since the world's own is not known before it is open.
+    /// Counts in steps of the scene, since the world's own step is not known before it is open.
     monitor: &'a dyn Monitor,
     scene_dt: f64,
     probe: ProbeConfig,

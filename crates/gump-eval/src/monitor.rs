@@ -2,9 +2,9 @@
 
 use crate::EvalError;
 
-/// Hears how far long work has come, and may end it.
+/// Receives the progress of long work, and can stop it.
 ///
-/// `()` is the monitor of work that nobody watches.
+/// `()` is the monitor of unobserved work.
 pub trait Monitor: Sync {
     /// `n` more units are done: scenarios, or frames of a simulation.
     fn advance(&self, n: u64);
@@ -23,14 +23,14 @@ pub trait Monitor: Sync {
         }
     }
 
-    /// Begins a part of the work, `total` units long: "simulating", 3200, "frames". Its monitor counts
-    /// those units and ends with this one. By default nobody counts them.
+    /// Begins a part of the work, `total` units long: "simulating", 3200, "frames". Its monitor
+    /// counts those units and stops with this one. By default they are not counted.
     fn part<'a>(&'a self, _name: &str, _total: u64, _unit: &'static str) -> Box<dyn Monitor + 'a> {
         Box::new(Uncounted(self))
     }
 }
 
-/// A part of work whose units nobody counts.
+/// A part of the work whose units are not counted.
 struct Uncounted<'a, M: ?Sized>(&'a M);
 
 impl<M: Monitor + ?Sized> Monitor for Uncounted<'_, M> {
@@ -40,7 +40,7 @@ impl<M: Monitor + ?Sized> Monitor for Uncounted<'_, M> {
         self.0.is_stopped()
     }
 
-    // Without this, each part would have a type of its own, without end.
+    // Without this, each nested part would have another type, without end.
     fn part<'a>(&'a self, _: &str, _: u64, _: &'static str) -> Box<dyn Monitor + 'a> {
         Box::new(Uncounted(self.0))
     }

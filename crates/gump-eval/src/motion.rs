@@ -19,7 +19,7 @@ use crate::imagine::{frames, imagine};
 use crate::worlds::{WorldName, Worlds};
 use crate::{EvalError, Monitor, digest};
 
-/// Where predictions come from.
+/// A source of predictions.
 pub struct PredictionSource<'a>(Kind<'a>);
 
 enum Kind<'a> {
@@ -37,7 +37,7 @@ enum Kind<'a> {
 pub struct Predicted {
     /// One for each target, or for each pair of them.
     pub predictions: Vec<Prediction>,
-    /// Of the futures, or of the heads' predictions; nothing is known of a file's.
+    /// Digest of the futures, or of the heads' predictions; `None` for files.
     pub digest: Option<String>,
 }
 
@@ -96,9 +96,10 @@ impl<'a> PredictionSource<'a> {
         }
     }
 
-    /// Leaves out targets that nobody can imagine because they are absent now; how many.
+    /// Removes targets that no world can simulate because they are absent now, and returns their
+    /// number.
     ///
-    /// A file is held to all targets, as the challenge holds it.
+    /// Removes none for a file, which must predict all targets, as in the challenge.
     pub fn drop_absent(&self, scenario: &mut Scenario) -> usize {
         let before = scenario.targets.len();
         if !matches!(self.0, Kind::Files(_)) {
@@ -108,7 +109,7 @@ impl<'a> PredictionSource<'a> {
         before - scenario.targets.len()
     }
 
-    /// Frames that the monitor of [`predict`](Self::predict) is told of; `None` where nothing is
+    /// Frames that the monitor of [`predict`](Self::predict) counts; `None` where nothing is
     /// simulated.
     pub fn frames(&self, scenario: &Scenario, config: &MotionConfig) -> Option<u64> {
         match &self.0 {
@@ -128,8 +129,8 @@ impl<'a> PredictionSource<'a> {
     /// Predictions of a scenario, which is the `index`-th.
     ///
     /// # Errors
-    /// A scenario that the files lack, what the world reports, a scenario whose steps do not fit,
-    /// or [`EvalError::Stopped`].
+    /// A scenario that the files lack, an error of the world, a scenario whose steps do not fit, or
+    /// [`EvalError::Stopped`].
     pub fn predict(
         &mut self,
         scenario: &Scenario,
@@ -178,7 +179,7 @@ impl<'a> PredictionSource<'a> {
     }
 }
 
-/// How far predictions reach.
+/// Horizon of the predictions, seconds.
 fn seconds(config: &MotionConfig) -> f64 {
     config.n_steps as f64 * config.step_seconds
 }

@@ -13,7 +13,7 @@ use gump_scene::VehicleParameters;
 use crate::EvalError;
 use crate::recordings::{Case, Named};
 
-/// What an SQLite file starts with.
+/// First bytes of an SQLite file.
 const MAGIC: &[u8] = b"SQLite format 3\0";
 
 /// The nuPlan logs of a path, if it is one or a folder of some.
@@ -56,7 +56,7 @@ pub(crate) fn open(paths: &[PathBuf]) -> Result<Box<dyn Iterator<Item = Named> +
     let mut maps = Maps::default();
     Ok(Box::new(selected.into_iter().map(move |selected| Named {
         id: selected.event.token.to_string(),
-        // A log's name has dots of its own.
+        // The name of a log itself contains dots.
         log_name: stem(logs[selected.log].path()),
         scenario_type: selected.scenario_type.clone(),
         case: case(&logs[selected.log], &selected, &mut maps),

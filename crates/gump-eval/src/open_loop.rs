@@ -57,7 +57,8 @@ pub fn plan(
     Ok(outcomes)
 }
 
-/// How long plans can be made so that each still has what was driven to be compared with.
+/// Seconds of the log during which plans can be made so that each can still be compared with the
+/// whole logged drive over its horizon.
 fn comparable_seconds(case: &Case) -> f64 {
     let scenario = case.recording.scenario();
     let known = (scenario.future().len() + case.after.len()) as f64 * scenario.dt;

@@ -41,7 +41,7 @@ pub enum PlannerName {
     Imitation,
     /// Policies, lane changes among them, and imitation, each rolled out among reactive agents.
     Interactive,
-    /// PDM's 15 proposals, each a planner of its own.
+    /// PDM's 15 proposals, each as a separate planner.
     Proposals,
 }
 
@@ -148,9 +148,9 @@ impl Serialize for PlannerName {
 pub struct PlannerConfig {
     /// Number of futures.
     pub futures: usize,
-    /// How rollouts are distributed over the candidates of the interactive planner.
+    /// Distribution of rollouts over the candidates of the interactive planner.
     pub allocation: Allocation,
-    /// How the values of a candidate's futures are combined into one.
+    /// Aggregation of the values of a candidate's futures into one.
     pub aggregate: Aggregate,
     /// Weight of a future in which other agents keep their velocity, 0 to 1.
     pub hedge: f64,

@@ -1,8 +1,8 @@
-//! Lets the ego leave its log in several worlds and notes who runs into it.
+//! Lets the ego leave its log in several worlds and records the agents that run into it.
 //!
-//! [`ReactionEvaluation`] tries every manoeuvre of a scenario in every world; what came of them is
-//! stored as [`ScenarioReactions`]. Manoeuvres, the agents they concern and what counts are in
-//! [`gump_metrics::reactions`].
+//! [`ReactionEvaluation`] tries every manoeuvre of a scenario in every world; the results are
+//! stored as [`ScenarioReactions`]. Manoeuvres, the agents that they concern and the definition of
+//! a contact are in [`gump_metrics::reactions`].
 
 use std::collections::BTreeMap;
 
@@ -36,7 +36,7 @@ pub struct ReactionSettings {
     /// Number of scenarios at most.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limit: Option<usize>,
-    /// How learned worlds decode, as JSON.
+    /// Sampling of learned worlds, as JSON.
     pub sampling: String,
     /// The seed, in decimal digits.
     pub seed: String,
@@ -79,7 +79,7 @@ pub struct TriedManoeuvre {
 pub struct WorldReaction {
     /// Number of futures.
     pub futures: usize,
-    /// Number of futures in which the ego itself ran into somebody.
+    /// Number of futures in which the ego itself ran into another agent.
     pub ego_at_fault: usize,
     /// Agents that ran into the ego, future by future, in order of time.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -162,7 +162,7 @@ impl WorldReaction {
         near as f64 / self.futures.max(1) as f64
     }
 
-    /// Share of futures in which anybody ran into the ego.
+    /// Share of futures in which any agent ran into the ego.
     pub fn struck(&self) -> f64 {
         let mut futures: Vec<usize> = self.hits.iter().map(|hit| hit.future).collect();
         futures.sort_unstable();
@@ -170,13 +170,13 @@ impl WorldReaction {
         futures.len() as f64 / self.futures.max(1) as f64
     }
 
-    /// Share of futures in which the ego ran into somebody.
+    /// Share of futures in which the ego ran into another agent.
     pub fn at_fault(&self) -> f64 {
         self.ego_at_fault as f64 / self.futures.max(1) as f64
     }
 }
 
-/// What is tried, and how futures are made.
+/// Manoeuvres to try, and settings of the futures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReactionConfig {
     /// The manoeuvres, in the order of tables.

@@ -1,8 +1,8 @@
 //! Waymo's realism of recorded scenarios: of a world or of files of rollouts, beside an oracle and
 //! constant velocity.
 //!
-//! [`recordings`] reads scenarios as the metric sees them, [`RolloutSource`] finds or makes their
-//! rollouts, [`evaluate`] scores those of one scenario. The metric itself is in `gump-wosac`.
+//! [`recordings`] reads scenarios as the metric sees them, [`RolloutSource`] reads or simulates
+//! their rollouts, [`evaluate`] scores those of one scenario. The metric itself is in `gump-wosac`.
 //!
 //! ```no_run
 //! use gump_engine::SamplingConfig;
@@ -44,10 +44,10 @@ use crate::EvalError;
 pub use recordings::{Recorded, Recordings, recordings};
 pub use rollouts::{FoundRollouts, RolloutSource};
 
-/// What one scenario got.
+/// Scores of one scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ScenarioScores {
-    /// Wall seconds that scoring took, without imagining.
+    /// Wall seconds that scoring took, without simulation.
     pub seconds: f64,
     /// One for each decoding, in order.
     pub evaluated: Vec<DecodingScores>,
@@ -57,12 +57,12 @@ pub struct ScenarioScores {
     pub constant_velocity: Scores,
 }
 
-/// What is evaluated, decoded in one way.
+/// Scores of the evaluated rollouts under one decoding.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DecodingScores {
     /// `ruled`, `raw` or `paper`; `-` where nothing is decoded.
     pub decoding: String,
-    /// Of the rollouts, if a world imagined them.
+    /// Digest of the rollouts, if a world simulated them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub digest: Option<String>,
     /// Of the rollouts.
@@ -107,7 +107,7 @@ pub fn evaluate(
     })
 }
 
-/// Everyone keeps its velocity: one rollout, since all would be equal.
+/// Rollouts at constant velocity: a single one, since all would be equal.
 fn constant_velocity(recorded: &Recorded, mode: Mode) -> Result<Rollouts, EvalError> {
     let start = Start {
         scene: recorded.scenario.present().unguided(),

@@ -20,7 +20,7 @@ use crate::{EvalError, Monitor};
 /// Name of a complete store in an output folder.
 const NAME: &str = "scenarios.toml";
 
-/// How the table of a scenario starts.
+/// Header of the table of a scenario.
 const ENTRY: &str = "[[scenario]]";
 
 /// Identifies the evaluation; the first table of the file.
@@ -28,7 +28,7 @@ const ENTRY: &str = "[[scenario]]";
 pub struct Header {
     /// Name of the benchmark, for instance "wosac".
     pub benchmark: String,
-    /// Which scenarios.
+    /// The shard of the scenarios.
     pub shard: Shard,
     /// Everything that the entries depend on; the same for all shards of one evaluation.
     pub settings: toml::Table,
@@ -136,7 +136,7 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
         self.entries.contains_key(&index)
     }
 
-    /// Number of scenarios already done.
+    /// Indices of the scenarios already done.
     pub fn indices(&self) -> BTreeSet<usize> {
         self.entries.keys().copied().collect()
     }
@@ -192,7 +192,7 @@ pub fn header(folder: &Path) -> Result<Header, EvalError> {
     parse::<toml::Table>(start, folder).map(|(header, _)| header)
 }
 
-/// What to do about shards that are not there.
+/// Treatment of missing shards.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MissingShards {
     /// An error.

@@ -144,7 +144,7 @@ mod tests {
         assert_eq!(auto(&array).unwrap(), "4/8");
         let tasks = [("SLURM_PROCID", "2"), ("SLURM_NTASKS", "3")];
         assert_eq!(auto(&tasks).unwrap(), "3/3");
-        // Tasks within an array; a job of one task is no part of its own.
+        // Tasks within an array; a job of one task is not split further.
         assert_eq!(auto(&[&array[..], &tasks[..]].concat()).unwrap(), "12/24");
         let one = [("SLURM_PROCID", "0"), ("SLURM_NTASKS", "1")];
         assert_eq!(auto(&[&array[..], &one[..]].concat()).unwrap(), "4/8");

@@ -1,4 +1,4 @@
-//! The real SUMO: found and run.
+//! Finds and runs the external simulator SUMO.
 //!
 //! [`Sumo`] has the programs, the folders, and one run from a seed to scenes. The demand of a run
 //! comes from `gump_synthesis`; `gump_data::sumo` reads its output.
@@ -30,7 +30,7 @@ const STEP_S: f64 = 0.1;
 /// Lateral acceleration at which curves of junctions are driven, metres per second squared.
 /// SUMO's default of 5.5 makes the yaw rates of a race; see docs/results/0006-factory.md.
 const TURN_ACCELERATION: f64 = 2.2;
-/// Nobody of SUMO's people runs: more is a jump, metres per second.
+/// Highest speed of a SUMO pedestrian, metres per second: none of them runs, so more is a jump.
 const FASTEST_WALK: f64 = 4.0;
 /// Points of a curve through a junction; SUMO's default of 5 leaves corners.
 const CURVE_POINTS: u32 = 12;
@@ -196,7 +196,7 @@ impl Sumo {
         draw_sumo_demand(&place.network, &demand, seed).write(&routes)?;
         let orders = folder.join("signals.add.xml");
         let systems = place.network.signal_systems();
-        // SUMO takes the path from the folder of the orders.
+        // SUMO resolves the path relative to the folder of the orders.
         Demand::write_signal_log(&systems, "states.xml", &orders)?;
         let cars = folder.join(format!("{id}.fcd.xml"));
         let mut command = self.command("sumo");
@@ -265,8 +265,8 @@ impl SumoNetwork {
     }
 }
 
-/// Boxes overlap at the present, or somebody on foot jumps, as SUMO's people do now and then where
-/// sidewalks end.
+/// Whether boxes overlap at the present or a pedestrian jumps, as SUMO's pedestrians sometimes do
+/// where sidewalks end.
 fn is_odd(scene: &Scenario) -> bool {
     let present = scene.present().now();
     let mut agents = present.agents().iter();
@@ -319,7 +319,7 @@ fn list(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), EvalError> {
     Ok(())
 }
 
-/// A network's name: its file's, or its folder's where the file is named after nothing.
+/// Name of a network: that of its file, or of its folder if the file's name says nothing.
 fn name_of(network: &Path) -> String {
     let stem = |path: &Path| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -356,8 +356,11 @@ fn run(command: &mut Command) -> Result<(), EvalError> {
     if output.status.success() {
         return Ok(());
     }
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    let lines: Vec<_> = said.lines().filter(|line| line.contains("rror")).collect();
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    let lines: Vec<_> = stderr
+        .lines()
+        .filter(|line| line.contains("rror"))
+        .collect();
     Err(EvalError::Sumo(format!(
         "{program} failed ({}): {}",
         output.status,
@@ -366,13 +369,13 @@ fn run(command: &mut Command) -> Result<(), EvalError> {
 }
 
 fn home_of_python_package() -> Option<PathBuf> {
-    let asked = Command::new("python3")
+    let output = Command::new("python3")
         .args(["-c", "import sumo; print(sumo.SUMO_HOME)"])
         .stdin(Stdio::null())
         .output()
         .ok()?;
-    let home = String::from_utf8_lossy(&asked.stdout).trim().to_owned();
-    (asked.status.success() && !home.is_empty()).then(|| PathBuf::from(home))
+    let home = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+    (output.status.success() && !home.is_empty()).then(|| PathBuf::from(home))
 }
 
 #[cfg(test)]

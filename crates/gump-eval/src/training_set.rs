@@ -1,4 +1,4 @@
-//! Scenarios to train on: held in memory, in a cache, or streamed as they are made up.
+//! Scenarios to train on: held in memory, in a cache, or streamed as they are generated.
 //!
 //! The files of a set, and which of its scenes are for training, are in [`datasets`](crate::datasets).
 
@@ -14,8 +14,8 @@ use crate::datasets::{Part, read};
 use crate::fresh::{FreshScenes, SceneStream};
 use crate::{EvalError, Monitor};
 
-/// Scenarios to train on: those in a cache stay there until they are asked for, others are held;
-/// or a stream of scenes that are made up.
+/// Scenarios to train on: those in a cache are read when needed, others are held in memory; or a
+/// stream of synthetic scenes.
 pub struct TrainingSet {
     /// Each with the number of the first scenario after it.
     stores: Vec<(usize, ScenarioStore)>,

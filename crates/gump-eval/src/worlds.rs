@@ -40,7 +40,7 @@ impl FromStr for WorldName {
             "constant-velocity" => Ok(Self::ConstantVelocity),
             _ => match name.strip_prefix("model:") {
                 Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
-                // Nothing else is named like that: what is meant is clear.
+                // No other world has such a name, so the meaning is clear.
                 None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
                 _ => Err(no_world(name)),
             },
@@ -49,7 +49,7 @@ impl FromStr for WorldName {
 }
 
 impl WorldName {
-    /// How many of `n` futures differ: worlds without chance have one.
+    /// Number of distinct futures among `n`: deterministic worlds have one.
     pub fn distinct_futures(&self, n: usize) -> usize {
         match self {
             Self::Log | Self::ConstantVelocity => n.min(1),
@@ -57,7 +57,7 @@ impl WorldName {
         }
     }
 
-    /// Which gaps of Waymo's messages matter to the world.
+    /// Options for reading Waymo's messages: the gaps that matter to the world.
     pub fn read_options(&self) -> ReadOptions {
         match self {
             Self::Log | Self::ConstantVelocity => ReadOptions::STATED,

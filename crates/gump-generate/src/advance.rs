@@ -38,11 +38,11 @@ pub(crate) fn advance(
     }
     let asking: Vec<bool> = open.iter().map(|draft| draft.asks()).collect();
     let hidden = read(world, engine, &mut open, |i| asking[i].then_some(None))?;
-    let mut said = engine.say(&hidden).into_iter();
+    let mut successors = engine.say(&hidden).into_iter();
     let mut keys = Vec::with_capacity(open.len());
     for (draft, asks) in open.iter_mut().zip(&asking) {
-        let said = if *asks { said.next() } else { None };
-        let key = draft.next_key(said.as_ref());
+        let successor = if *asks { successors.next() } else { None };
+        let key = draft.next_key(successor.as_ref());
         if key.is_none() {
             draft.outcome = Some(Ok(()));
         }
@@ -136,7 +136,7 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
         let bins = engine.sample_state(&hidden, &references, sampling);
         drawn += n;
         let is_last = drawn >= tries;
-        // Where nobody can be but in a queue without a head, a queue it is.
+        // Where only a queue without a head is possible, it is accepted.
         let is_late = 2 * drawn > tries;
         let judged: Vec<Vec<Result<Found, String>>> = queries
             .par_iter()

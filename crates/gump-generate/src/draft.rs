@@ -82,12 +82,12 @@ impl<'a> Draft<'a> {
     }
 
     /// The network's decision on the next object, unless it is given; `None` ends the scene.
-    pub(super) fn next_key(&mut self, said: Option<&Successor>) -> Option<Key> {
+    pub(super) fn next_key(&mut self, successor: Option<&Successor>) -> Option<Key> {
         if self.agents.is_empty() {
             let kind = AgentKind::Vehicle;
             return Some(Key { id: 0, kind });
         }
-        let Some(said) = said else {
+        let Some(successor) = successor else {
             return self.keys.pop_front();
         };
         if self.agents.len() > self.prepared.request.config.max_agents {
@@ -98,11 +98,11 @@ impl<'a> Draft<'a> {
         let last = self.agents.last().map(|agent| agent.key);
         let last = last.filter(|key| !key.is_ego());
         let seed = self.stream(2 * self.agents.len() as u64 + 1);
-        let drawn = births::next_key(said, NEWBORN_AT, &used, last, seed, 1.0);
+        let drawn = births::next_key(successor, NEWBORN_AT, &used, last, seed, 1.0);
         let Some(due) = self.wished.front().map(|object| object.class.kind()) else {
             return drawn;
         };
-        // Whoever is wished for comes first in its class, and at the latest then.
+        // A requested object comes first in its class, or at the latest then.
         if drawn.is_some_and(|key| key.kind < due) {
             return drawn;
         }
@@ -130,7 +130,7 @@ impl<'a> Draft<'a> {
         };
         let mut spec = spec.unwrap_or(&none).clone();
         if key.is_ego() {
-            // It defines the frame of reference: nobody can be there before it.
+            // It defines the frame of reference, so no object can be there before it.
             let zero = Bounds::new(0.0, 0.0);
             (spec.x, spec.y, spec.heading) = (Some(zero), Some(zero), Some(zero));
             (spec.behind, spec.ahead_of) = (None, None);

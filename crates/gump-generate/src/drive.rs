@@ -46,8 +46,8 @@ pub(crate) struct Change {
 }
 
 impl Maneuver {
-    /// How long the ego is steered, seconds: the duration of the manoeuvre, or long enough to show
-    /// the world the ego's intention.
+    /// Duration of steering the ego, seconds: that of the manoeuvre, or enough to show the ego's
+    /// intention to the world.
     pub(crate) fn seconds(&self) -> f64 {
         if self.jolts || self.acceleration > 0.0 {
             PULL_S
@@ -57,7 +57,7 @@ impl Maneuver {
     }
 }
 
-/// Where along, and how fast.
+/// A path to drive, with a start and a speed.
 #[derive(Clone, Debug)]
 pub(crate) struct Drive {
     path: Polyline,
@@ -66,7 +66,7 @@ pub(crate) struct Drive {
     /// At the beginning, metres per second.
     pub(crate) speed: f64,
     maneuver: Maneuver,
-    /// The lanes it comes to with the metres along the path at which they begin.
+    /// The lanes it enters, with the metres along the path at which they begin.
     entered: Vec<(LaneId, f64)>,
     /// The neighbouring lane it changes to.
     pub(crate) neighbor: Option<LaneId>,
@@ -101,7 +101,7 @@ impl Drive {
             points = changed(&own, &Polyline::new(other)?, at, speed * change.seconds)?;
             drive.neighbor = Some(there.id);
         }
-        // Of a neighbour's lights those of the own lane tell enough.
+        // The lights of the start lane represent those of the neighbour.
         drive.entered = entered;
         let path = Polyline::new(points).filter(|path| path.length() >= needed - ENDS_M)?;
         drive.path = if offset.abs() > 0.05 {
@@ -130,7 +130,7 @@ impl Drive {
         }
     }
 
-    /// How long the ego is steered.
+    /// Duration of steering the ego, seconds.
     pub(crate) fn seconds(&self) -> f64 {
         self.maneuver.seconds()
     }

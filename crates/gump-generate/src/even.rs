@@ -2,7 +2,7 @@
 //!
 //! With few objects, independent draws may give scenes with lorries only, or with all agents on one
 //! side. Where the number of objects of a class is known, every field of each is decided by a
-//! number of its own stratum: each draw has its usual distribution, and together they cover it.
+//! number from a separate stratum: each draw has its usual distribution, and all together cover it.
 //!
 //! Source: Latin hypercube sampling (McKay, Beckman and Conover 1979).
 

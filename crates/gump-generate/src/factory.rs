@@ -18,7 +18,7 @@ use crate::stage::Stage;
 use crate::verdict::{Clause, through_time, verdict};
 use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
 
-/// Number of further attempts for a scene in which nobody comes to overlap, once one satisfies the
+/// Number of further attempts for a scene without a later overlap, once one satisfies the
 /// request.
 const FURTHER: usize = 3;
 
@@ -49,7 +49,7 @@ pub struct Made {
     /// The attempt that made this scene, from 1.
     pub attempts: usize,
     /// The first attempt that satisfied the request, from 1, and whether its ego was steered. A
-    /// later one may have been taken because nobody comes to overlap in it.
+    /// later one may have been taken because no agents overlap in it.
     pub first_satisfied: Option<(usize, bool)>,
     /// Whether the ego was steered to match the prompts, rather than driven by the world.
     pub is_steered: bool,
@@ -97,8 +97,8 @@ pub fn make_many(
 ) -> Result<Vec<Result<Made, GenerateError>>, GenerateError> {
     let request = &order.request;
     if order.roams || !request.prompts.is_empty() {
-        let made = numbers.into_par_iter();
-        return Ok(made
+        let numbers = numbers.into_par_iter();
+        return Ok(numbers
             .map(|number| make(worlds, order, number, seed))
             .collect());
     }
@@ -107,7 +107,7 @@ pub fn make_many(
     let seeds: Vec<Seed> = numbers.clone().map(|n| stream(n).fork(1)).collect();
     let scenes = generate(worlds.scenes, request, &seeds)?;
     let numbered: Vec<_> = numbers.zip(scenes).collect();
-    let made = numbered.into_par_iter().map(|(number, scene)| {
+    let results = numbered.into_par_iter().map(|(number, scene)| {
         let scene = scene?;
         let mut scenario = scene.scenario(name(number), &request.map, &[]);
         let stream = stream(number).fork(2);
@@ -124,7 +124,7 @@ pub fn make_many(
             moment_s: 0.0,
         })
     });
-    Ok(made.collect())
+    Ok(results.collect())
 }
 
 /// Whether a map admits the prompts of a request: somewhere within 150 m of the request's ego, an
@@ -163,14 +163,14 @@ pub fn make(
             Err(_) if attempt > 0 => break,
             next => next?,
         };
-        let made = generate(worlds.scenes, &request, &[stream.fork(1)]);
-        let scene = match made.map(|mut scenes| scenes.remove(0)) {
+        let generated = generate(worlds.scenes, &request, &[stream.fork(1)]);
+        let scene = match generated.map(|mut scenes| scenes.remove(0)) {
             Ok(Ok(scene)) => scene,
             // Another place or another draw may do, but never for what contradicts itself.
             Ok(Err(error)) | Err(error) => {
                 let is_of_place = match error {
                     GenerateError::NoLane | GenerateError::NoPlace { .. } => true,
-                    // At this place nobody may be where the prompt wants somebody.
+                    // At this place no object may be where the prompt requires one.
                     GenerateError::Constraints(_) => stage.is_some(),
                     _ => false,
                 };
@@ -285,8 +285,8 @@ fn judged(
         is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
     };
     if !prompts.is_empty() {
-        // One future shows who is there; what happens may take several, and so may that nobody
-        // comes to overlap.
+        // One future shows the agents present; an event, or a future without overlaps, may take
+        // several.
         let (mut found, mut first) = (None, None);
         for (n, i) in [(1, 0), (takes::FUTURES, 1)] {
             if found.is_none() {

@@ -49,7 +49,7 @@ pub(crate) enum Need {
     Carpark,
 }
 
-/// Which lane changes satisfy a tag.
+/// The lane changes that satisfy a tag.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Changes {
     /// To the left (true), to the right, to either side.

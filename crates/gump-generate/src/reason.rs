@@ -14,12 +14,12 @@ const STANDS: f64 = 0.5;
 /// otherwise it is parked. Metres and radians.
 const IN_LANE_M: f64 = 1.0;
 const ALONG: f64 = 0.35;
-/// How far ahead of the front bumper a reason may be, metres: a light or sign, a junction, another
-/// agent.
+/// Maximum distance of a reason ahead of the front bumper, metres: a light or sign, a junction,
+/// another agent.
 const LINE_M: f64 = 25.0;
 const JUNCTION_M: f64 = 10.0;
 const NEXT_M: f64 = 12.0;
-/// How far beside the path another agent may be to be in it, metres.
+/// Maximum distance beside the path of another agent that blocks it, metres.
 const BESIDE_M: f64 = 1.8;
 
 /// True if a box, world frame, stands in a lane without a reason.
@@ -41,7 +41,7 @@ pub(crate) fn stands_without(
     if lane.in_intersection {
         return false;
     }
-    // Every way ahead needs to be free: who waits for a turn has one that is not.
+    // Every path ahead must be free: a vehicle that waits to turn has one that is not.
     !ways(map, lane, from).iter().any(|(lanes, way)| {
         let is_held_by_line = lanes.iter().any(|lane| {
             let ahead = |at: DVec2| {
@@ -129,7 +129,7 @@ mod tests {
         check("light 1 green:", (110.0, 0.2), None, true);
         check("light 1 red:", (110.0, 0.2), None, false);
         check("light 1 red:", (30.0, 0.2), None, true);
-        // Parked beside the lane, behind somebody, before somebody, next to somebody.
+        // Parked beside the lane, behind another, in front of another, next to another.
         check("", (30.0, 2.4), None, false);
         check("", (30.0, 0.2), Some((38.0, 0.0)), false);
         check("", (30.0, 0.2), Some((22.0, 0.0)), true);

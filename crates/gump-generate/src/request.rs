@@ -124,7 +124,7 @@ pub struct GenerateConfig {
     pub even: bool,
     /// Bins that may be drawn per field (paper: 200 in the text, 400 in the table).
     pub top_k: usize,
-    /// Where objects may be placed.
+    /// The places allowed for objects.
     pub placement: Placement,
     /// Whether a vehicle that stands in a lane needs a reason: a light, a sign, a junction or
     /// another agent ahead. In guided placement only. It makes scenes less like recorded ones, but
@@ -182,7 +182,7 @@ impl Default for GenerateConfig {
     }
 }
 
-/// Where objects may be placed.
+/// The places allowed for objects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Placement {

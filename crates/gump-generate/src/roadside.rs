@@ -45,7 +45,7 @@ pub(super) fn put(
             return None;
         }
         if works == WorkZone::Sign {
-            // It announces the works to whoever comes.
+            // It announces the works to approaching traffic.
             let first = row[0].state.pose;
             row[0] = fixture(map, AgentKind::Sign, [0.2, 0.7], first, 0);
         }

@@ -309,7 +309,7 @@ mod tests {
         let stage = found(&request, &["starting_left_turn"]).unwrap();
         let speed = stage.ego.velocity.unwrap().length();
         assert!((5.0..=5.5).contains(&speed), "{speed}");
-        // The truck is the lead that is asked for, and nobody else is put there.
+        // The truck is the requested lead, and no other vehicle is placed there.
         let stage = found(&request, &["behind_long_vehicle"]).unwrap();
         assert_eq!(stage.objects.len(), 2);
         assert!(found(&request, &["following_lane_without_lead"]).is_none());

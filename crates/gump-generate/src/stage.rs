@@ -176,7 +176,7 @@ impl Stage {
     fn put_cast(&mut self, cast: &PromptSpec, map: &MapGraph, rng: &mut Rng) -> Option<()> {
         let own = self.objects.clone();
         let leaders = leaders(&own);
-        // Where somebody is already, the prompt needs nobody else.
+        // If there is a leader already, the prompt needs no other.
         let wanted = cast.objects.iter();
         let wanted = wanted.filter(|object| leaders.is_empty() || object.ahead_of.is_none());
         let gap = |object: &ObjectSpec| object.ahead_of.as_ref().map(|relation| relation.metres);
@@ -189,7 +189,7 @@ impl Stage {
             let way = if let Some(gap) = gap {
                 let ahead = self.ego.length / 2.0 + gap + size[0] / 2.0;
                 let there = (pose * Pose::new(ahead, 0.0, 0.0)).position;
-                // A row is straight, and whoever heads it is on the road, too.
+                // A row is straight, and its head is on the road, too.
                 map.lanes_near(there, 1.0).next()?;
                 Way::Ahead(ahead)
             } else {
@@ -281,7 +281,7 @@ impl Stage {
     /// An agent that drives along a lane from now on.
     fn put_along(&mut self, id: &str, class: Class, lane: &Lane, drive: Drive) {
         let start = self.ego.pose.inverse() * drive.pose_ahead(0.0).position;
-        // Wider than what is taken for a fixed place: the lane says the rest.
+        // Wider than the bounds of a fixed place: the lane determines the rest.
         let near = |at: f64| Some(Bounds::new(at - 0.8, at + 0.8));
         let spec = ObjectSpec {
             id: id.into(),

@@ -107,7 +107,7 @@ pub(super) fn moment(
 }
 
 /// Continues the rollout until there are this many seconds after the present: by the first of a few
-/// futures in which nobody comes to overlap, or by the first.
+/// futures in which no agents overlap, or by the first.
 pub(super) fn extend(
     world: &dyn WorldModel,
     scenario: &mut Scenario,
@@ -193,7 +193,7 @@ mod tests {
         move |take| take.present().ego_now().state.pose.position.x > x
     }
 
-    /// Everybody stands; with one seed all move to one place.
+    /// A world in which all agents stand still, except that with one seed all move to one place.
     struct Fickle(Seed);
 
     struct FickleSession {

@@ -237,7 +237,7 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
     };
     let error = make(&order("on_carpark", Placement::Guided)).unwrap_err();
     assert!(error.to_string().contains("can hold on_carpark"), "{error}");
-    // Where the network has its way nothing is looked for, and the verdict says what is wrong.
+    // With free placement no stage is searched, and the verdict reports what is wrong.
     let made = make(&order("on_carpark", Placement::Free));
     assert!(!matches!(made, Err(GenerateError::NoStage { .. })));
 }
@@ -342,7 +342,7 @@ fn traffic_lives_where_it_is_let() {
     assert!(still.iter().all(|frame| ids(frame) == ids(&scene.frame)));
     let alive = frames(true);
     assert!(alive.iter().all(|frame| frame.agent(scene.ego).is_some()));
-    // A network that has learned nothing finds everybody's leaving and coming likely, out there.
+    // An untrained network finds departures and arrivals near the border likely.
     assert_ne!(ids(&alive[alive.len() - 1]), ids(&scene.frame));
     assert_eq!(alive, frames(true));
 }

@@ -81,13 +81,13 @@ pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<
 fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
     let mut clauses = Vec::new();
     for kind in AgentKind::MOVING {
-        let Some(asked) = counts.map(|counts| counts.of(kind)) else {
+        let Some(requested) = counts.map(|counts| counts.of(kind)) else {
             continue;
         };
         let agents = present.now().agents().iter();
         let found = agents.filter(|agent| agent.kind == kind && agent.id != present.ego);
-        let clause = format!("{} {asked}", kind.name());
-        clauses.push(Clause::new(clause, Some(found.count() == asked)));
+        let clause = format!("{} {requested}", kind.name());
+        clauses.push(Clause::new(clause, Some(found.count() == requested)));
     }
     let clear = overlaps_in(present.now()) == 0;
     clauses.push(Clause::new(NOBODY_OVERLAPS.into(), Some(clear)));
@@ -152,7 +152,7 @@ mod tests {
 
     #[test]
     fn what_holds_now_need_not_hold_later() {
-        // In four seconds the ego has come to the one who stands.
+        // In four seconds the ego has reached the standing vehicle.
         let scenario = fixture::scenario(
             "lane 1: -50,0 90,0\nego vehicle 0: 0,0 velocity 8,0\nagent vehicle 1: 36,0",
         )

@@ -1,4 +1,4 @@
-//! Two cars at a crossing: who is first where their paths meet, and by how much.
+//! Two cars at a crossing: which one is first at the point where their paths meet, and by how much.
 //!
 //! Post-encroachment time is how long that place lies empty in between; below a second or two it
 //! counts as a conflict. `cargo run -p gump-geometry --example conflict_point`
@@ -20,7 +20,7 @@ impl Car {
         }
     }
 
-    /// When it enters and leaves an area, seconds; `None` if it never touches it.
+    /// Times at which it enters and leaves an area, seconds; `None` if it never touches it.
     fn within(&self, area: &Polygon) -> Option<(f64, f64)> {
         let mut inside = (0..400).map(|i| f64::from(i) * 0.05).filter(|time| {
             let footprint = Polygon::new(self.at(*time).corners().to_vec());

@@ -32,7 +32,7 @@ impl LineIndex {
         }
     }
 
-    /// What [`Polyline::project`] answers for the line this was made of.
+    /// Same as [`Polyline::project`] of `line`, which must be the line of this index.
     pub fn project(&self, line: &Polyline, point: DVec2) -> Projection {
         let gap = |&(min, max): &(DVec2, DVec2)| {
             (min - point)
@@ -92,7 +92,7 @@ impl PolygonIndex {
         (self.min, self.max)
     }
 
-    /// What [`Polygon::contains`] answers for the polygon this was made of.
+    /// Same as [`Polygon::contains`] of the polygon of this index.
     pub fn contains(&self, point: DVec2) -> bool {
         if point.cmplt(self.min).any() || point.cmpgt(self.max).any() {
             return false;

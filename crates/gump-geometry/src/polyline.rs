@@ -15,7 +15,7 @@ pub struct Polyline {
     arc_lengths: Vec<f64>,
 }
 
-/// Where a point falls on a [`Polyline`].
+/// The projection of a point onto a [`Polyline`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Projection {
     /// Index of the nearest segment (from point `segment` to point `segment + 1`).

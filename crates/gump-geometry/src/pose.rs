@@ -44,7 +44,7 @@ impl Pose {
         }
     }
 
-    /// Rotates a vector (a velocity, say) without translating it.
+    /// Rotates a vector (a velocity, for example) without translating it.
     pub fn rotate(self, vector: DVec2) -> DVec2 {
         self.direction().rotate(vector)
     }

@@ -56,7 +56,7 @@ impl Quad {
         if self.min.cmpgt(max).any() || self.max.cmplt(min).any() {
             return false;
         }
-        // Most of a long polygon is nowhere near: bounds tell at once.
+        // Most of a long polygon is far away: bounds reject it at once.
         let is_near =
             |low: DVec2, high: DVec2| low.cmple(self.max).all() && high.cmpge(self.min).all();
         let mut points = polygon.ring().iter();
@@ -228,7 +228,7 @@ pub fn widen(points: &[DVec2], half_width: f64, overhang: f64) -> Vec<Quad> {
     pieces
 }
 
-/// What lies between two rectangles that meet at `point` on the outer side of the bend.
+/// The wedge between two rectangles that meet at `point`, on the outer side of the bend.
 ///
 /// `before` and `after` point from the line to the left borders. The arc is approximated by its
 /// middle: 2 mm at a bend of 20 degrees and a half width of 1 m.

@@ -1,4 +1,4 @@
-//! Calls of nuPlan's planner protocol, with a clock.
+//! Calls of nuPlan's planner protocol, with time limits.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use tonic_prost::ProstCodec;
 
 use super::RemoteError;
 
-/// A planner that is not there is known after so long.
+/// Time limit for connecting.
 const REACH: Duration = Duration::from_secs(5);
 
 /// A connection to one planner.
@@ -25,7 +25,7 @@ impl Client {
     /// Connects to `HOST:PORT`.
     ///
     /// # Errors
-    /// [`RemoteError::Unreachable`] if nobody is there within 5 s.
+    /// [`RemoteError::Unreachable`] if the connection fails or takes more than 5 s.
     pub(super) fn connect(address: &str) -> Result<Self, RemoteError> {
         let unreachable = |error: &dyn std::error::Error| RemoteError::Unreachable {
             address: address.into(),
@@ -42,11 +42,11 @@ impl Client {
         })
     }
 
-    /// The answer to one call.
+    /// Makes one call and returns the answer.
     ///
     /// # Errors
-    /// [`RemoteError::Late`] after `limit`, [`RemoteError::Refused`] for an answer that says why
-    /// there is none.
+    /// [`RemoteError::Late`] after `limit`, [`RemoteError::Refused`] if the planner
+    /// returns an error status or the connection breaks.
     pub(super) fn call<M, R>(
         &mut self,
         call: &'static str,
@@ -84,7 +84,7 @@ impl Client {
     }
 }
 
-/// What an error comes from: outer ones only say where it was noticed.
+/// Message of the root cause of an error: outer ones only state where it was noticed.
 fn innermost(error: &dyn std::error::Error) -> String {
     let mut error = error;
     while let Some(source) = error.source() {

@@ -1,9 +1,9 @@
 //! Planners in other processes, by nuPlan's planner protocol.
 //!
-//! [`RemoteDriver`] drives as a server at `HOST:PORT` says. The protocol is the one that nuPlan's
-//! challenges called planners by (gRPC service `DetectionTracksChallenge`): the mission is sent once
-//! per drive, and at every step a trajectory is requested. A server plans for one drive at a time, so
-//! one drive has to end before the next begins. nuplan-devkit's own servicer and
+//! [`RemoteDriver`] follows the plans of a server at `HOST:PORT`. The protocol is the one that
+//! nuPlan's challenges called planners by (gRPC service `DetectionTracksChallenge`): the mission is
+//! sent once per drive, and at every step a trajectory is requested. A server plans for one drive
+//! at a time, so one drive has to end before the next begins. nuplan-devkit's own servicer and
 //! `python/nuplan_planner.py` are such servers.
 //!
 //! The history is sent as pickled objects of nuplan-devkit, which open wherever the devkit is
@@ -35,49 +35,49 @@ use gump_scene::{EgoState, LightState, VehicleParameters};
 
 use self::client::Client;
 
-/// How long a planner may load maps and weights before it drives.
+/// Time limit for loading maps and weights before the drive.
 const TO_INITIALIZE: Duration = Duration::from_secs(60);
-/// How long it may think about a step where no budget is set; the challenges allowed one second.
+/// Time limit per step if no budget is set; the challenges allowed one second.
 const TO_PLAN: Duration = Duration::from_secs(30);
 /// Moments that nuPlan's planners see: the present and 2.1 s before it, at 10 Hz.
 const BUFFER: usize = 22;
 
-/// Why a planner elsewhere has no plan.
+/// Why a remote planner returned no plan.
 #[derive(Debug, thiserror::Error)]
 pub enum RemoteError {
-    /// Nobody is there.
+    /// No planner could be reached.
     #[error("expected a planner at {address}, found none: {what}")]
     Unreachable {
-        /// Where it was looked for.
+        /// The address, `HOST:PORT`.
         address: String,
-        /// What the network says.
+        /// The error of the network.
         what: String,
     },
-    /// It thinks for too long.
+    /// The answer exceeded the time limit.
     #[error("expected an answer to {call} within {seconds} s, found none")]
     Late {
-        /// What was asked.
+        /// Name of the call.
         call: &'static str,
-        /// How long was waited.
+        /// The time limit, seconds.
         seconds: f64,
     },
-    /// It says why there is no answer.
+    /// The call failed with a gRPC status.
     #[error("expected an answer to {call}, found the error {code}: {message}")]
     Refused {
-        /// What was asked.
+        /// Name of the call.
         call: &'static str,
-        /// gRPC's name of the error.
+        /// The gRPC status code.
         code: String,
-        /// What the planner says.
+        /// The message of the status, on one line.
         message: String,
     },
     /// A state without a pose.
     #[error("state {state} of the trajectory: expected a rear_axle_pose, found none")]
     NoPose {
-        /// Which one.
+        /// Index of the state.
         state: usize,
     },
-    /// A trajectory of another time.
+    /// A trajectory that does not cover the next step.
     #[error(
         "expected a trajectory over {now_us} to {next_us} µs, found one over {from_us} to {to_us}"
     )]
@@ -96,12 +96,12 @@ pub enum RemoteError {
         "the light of lane {0}: expected a lane below 2147483648, as the protocol has 32 bits for it"
     )]
     Lane(i64),
-    /// Asked to drive before it was told where to go.
+    /// A plan was requested before the mission was set.
     #[error("the planner was asked to drive before it was given a mission")]
     NoMission,
 }
 
-/// Drives as a planner in another process says.
+/// A driver that follows the plans of another process.
 pub struct RemoteDriver {
     name: String,
     address: String,
@@ -140,8 +140,8 @@ impl Driver for RemoteDriver {
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let (client, vehicle) = self.begun.as_mut().ok_or(RemoteError::NoMission)?;
         let message = input(moment, vehicle)?;
-        let told: proto::Trajectory = client.call("ComputeTrajectory", message, self.to_plan)?;
-        trajectory(&told, moment)
+        let plan: proto::Trajectory = client.call("ComputeTrajectory", message, self.to_plan)?;
+        trajectory(&plan, moment)
     }
 }
 
@@ -165,7 +165,7 @@ fn initialization(mission: &Mission<'_>, map_name: &str) -> proto::PlannerInitia
     }
 }
 
-/// What is new: at first the past too, then the present alone.
+/// The input of a step: the past and present in the first step, then the present alone.
 fn input(
     moment: &Moment<'_>,
     vehicle: &VehicleParameters,
@@ -219,9 +219,9 @@ fn lights(moment: &Moment<'_>) -> Result<Vec<proto::TrafficLightStatusData>, Rem
     lights.collect()
 }
 
-/// A trajectory that can be driven from now on.
-fn trajectory(told: &proto::Trajectory, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-    let states = told.ego_states.iter().enumerate();
+/// Converts a plan to a trajectory that covers the next step.
+fn trajectory(plan: &proto::Trajectory, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    let states = plan.ego_states.iter().enumerate();
     let states = states.map(|(i, state)| ego_state(i, state));
     let trajectory = Trajectory::new(states.collect::<Result<_, _>>()?)?;
     let now_us = moment.ego.time_us;
@@ -238,8 +238,8 @@ fn trajectory(told: &proto::Trajectory, moment: &Moment<'_>) -> Result<Trajector
     Ok(trajectory)
 }
 
-fn ego_state(i: usize, told: &proto::EgoState) -> Result<EgoState, RemoteError> {
-    let pose = told
+fn ego_state(i: usize, state: &proto::EgoState) -> Result<EgoState, RemoteError> {
+    let pose = state
         .rear_axle_pose
         .ok_or(RemoteError::NoPose { state: i })?;
     let vector = |vector: Option<proto::StateVector2D>| {
@@ -247,13 +247,13 @@ fn ego_state(i: usize, told: &proto::EgoState) -> Result<EgoState, RemoteError> 
         dvec2(vector.x.into(), vector.y.into())
     };
     Ok(EgoState {
-        time_us: told.time_us,
+        time_us: state.time_us,
         rear_axle: Pose::new(pose.x.into(), pose.y.into(), pose.heading.into()),
-        velocity: vector(told.rear_axle_velocity_2d),
-        acceleration: vector(told.rear_axle_acceleration_2d),
-        steering_angle: told.tire_steering_angle.into(),
+        velocity: vector(state.rear_axle_velocity_2d),
+        acceleration: vector(state.rear_axle_acceleration_2d),
+        steering_angle: state.tire_steering_angle.into(),
         steering_rate: 0.0,
-        yaw_rate: told.angular_vel.into(),
-        yaw_acceleration: told.angular_accel.into(),
+        yaw_rate: state.angular_vel.into(),
+        yaw_acceleration: state.angular_accel.into(),
     })
 }

@@ -1,9 +1,9 @@
-//! What nuPlan's planners unpickle: an `EgoState` and a `DetectionsTracks` of nuplan-devkit.
+//! Pickles for nuPlan's planners: an `EgoState` and a `DetectionsTracks` of nuplan-devkit.
 //!
 //! The protocol carries both as pickled Python objects. These pickles (protocol 4) do not list
 //! attributes of the devkit's classes but call their constructors, by name and in the order of their
-//! arguments. So they open wherever the devkit is installed, and whoever goes without it may read
-//! them with an `Unpickler` that knows these dozen names; `python/nuplan_planner.py` does.
+//! arguments. So they open wherever the devkit is installed, and can be read without it by an
+//! `Unpickler` that knows these dozen names; `python/nuplan_planner.py` does.
 
 use gump_geometry::{DVec2, Pose};
 use gump_scene::{Agent, AgentId, AgentKind, EgoState, Frame, VehicleParameters};
@@ -31,7 +31,7 @@ pub(super) fn ego_state(ego: &EgoState, vehicle: &VehicleParameters) -> Vec<u8> 
     pickle.done()
 }
 
-/// Everybody but the ego at one moment, a `DetectionsTracks`.
+/// All agents but the ego at one moment, a `DetectionsTracks`.
 pub(super) fn detections(frame: &Frame, ego: AgentId, time_us: i64) -> Vec<u8> {
     let mut pickle = Pickle::default();
     let module = "nuplan.planning.simulation.observation.observation_type";
@@ -48,15 +48,15 @@ pub(super) fn detections(frame: &Frame, ego: AgentId, time_us: i64) -> Vec<u8> {
 /// Instructions of a pickle machine, which leave one object.
 struct Pickle {
     bytes: Vec<u8>,
-    /// Names that were said, by their place in the machine's memory.
-    said: Vec<(&'static str, &'static str)>,
+    /// Names already written, by their index in the memo of the pickle machine.
+    names: Vec<(&'static str, &'static str)>,
 }
 
 impl Default for Pickle {
     fn default() -> Self {
         Self {
             bytes: vec![0x80, 4],
-            said: Vec::new(),
+            names: Vec::new(),
         }
     }
 }
@@ -67,19 +67,19 @@ impl Pickle {
         self.bytes
     }
 
-    /// A class, or what belongs to one.
+    /// Pushes a class, or a member of one.
     fn name(&mut self, module: &'static str, name: &'static str) {
-        if let Some(i) = self.said.iter().position(|&said| said == (module, name)) {
+        if let Some(i) = self.names.iter().position(|&known| known == (module, name)) {
             self.bytes.extend([b'h', i as u8]);
             return;
         }
         self.text(module);
         self.text(name);
         self.bytes.extend([0x93, 0x94]);
-        self.said.push((module, name));
+        self.names.push((module, name));
     }
 
-    /// What a class or function gives for some arguments.
+    /// Pushes the result of calling a class or function with some arguments.
     fn call(
         &mut self,
         module: &'static str,

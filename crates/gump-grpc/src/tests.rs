@@ -11,7 +11,7 @@ use prost::Message as _;
 
 use super::*;
 
-/// What the server says to one call.
+/// Answer of the server to one call.
 #[derive(Clone)]
 enum Answer {
     Empty,
@@ -22,22 +22,26 @@ enum Answer {
     Silence,
 }
 
-/// A server for one connection: calls get the answers in turn, the last one again and again.
-/// HTTP/2 as far as one unary call after another needs it.
+/// A server for one connection: calls get the answers in turn, the last one repeatedly. It
+/// implements only the HTTP/2 that successive unary calls need.
 fn serve(answers: Vec<Answer>) -> (String, Receiver<Vec<u8>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    let (asked, requests) = channel();
+    let (sender, requests) = channel();
     std::thread::spawn(move || {
         if let Ok((stream, _)) = listener.accept() {
-            // The client leaves when it likes.
-            let _ = talk(stream, &answers, &asked);
+            // The client may disconnect at any time.
+            let _ = talk(stream, &answers, &sender);
         }
     });
     (address, requests)
 }
 
-fn talk(mut stream: TcpStream, answers: &[Answer], asked: &Sender<Vec<u8>>) -> std::io::Result<()> {
+fn talk(
+    mut stream: TcpStream,
+    answers: &[Answer],
+    sender: &Sender<Vec<u8>>,
+) -> std::io::Result<()> {
     stream.read_exact(&mut [0; 24])?;
     stream.write_all(&frame(4, 0, 0, &[]))?;
     let (mut body, mut calls) = (Vec::new(), 0);
@@ -59,8 +63,8 @@ fn talk(mut stream: TcpStream, answers: &[Answer], asked: &Sender<Vec<u8>>) -> s
                     let request = std::mem::take(&mut body);
                     let answer = &answers[calls.min(answers.len() - 1)];
                     calls += 1;
-                    stream.write_all(&said(answer, id, &request[5..]))?;
-                    let _ = asked.send(request[5..].to_vec());
+                    stream.write_all(&response(answer, id, &request[5..]))?;
+                    let _ = sender.send(request[5..].to_vec());
                 }
             }
             4 | 6 if flags & 1 == 0 => {
@@ -92,15 +96,15 @@ fn headers(pairs: &[(&str, &str)]) -> Vec<u8> {
     bytes
 }
 
-fn said(answer: &Answer, id: u32, request: &[u8]) -> Vec<u8> {
+fn response(answer: &Answer, id: u32, request: &[u8]) -> Vec<u8> {
     let message = match answer {
         Answer::Silence => return Vec::new(),
         Answer::Empty | Answer::Error(_) => Vec::new(),
         Answer::Ahead(seconds) => ahead(request, seconds).encode_to_vec(),
         Answer::NoPose => {
-            let mut told = ahead(request, &[0.0, 1.0]);
-            told.ego_states[1].rear_axle_pose = None;
-            told.encode_to_vec()
+            let mut plan = ahead(request, &[0.0, 1.0]);
+            plan.ego_states[1].rear_axle_pose = None;
+            plan.encode_to_vec()
         }
     };
     let mut opening = vec![0x88];
@@ -193,7 +197,7 @@ fn a_planner_across_a_socket_drives() {
     let inputs = inputs.map(|bytes| proto::PlannerInput::decode(&bytes[..]).unwrap());
     let inputs: Vec<_> = inputs.collect();
     let buffer = |i: usize| inputs[i].simulation_history_buffer.as_ref().unwrap();
-    // The past once, then what is new.
+    // The past once, then the present alone.
     assert_eq!(
         (buffer(0).ego_states.len(), buffer(0).observations.len()),
         (3, 3)

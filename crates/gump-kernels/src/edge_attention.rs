@@ -12,7 +12,7 @@ use std::sync::Arc;
 use crate::rows::{exp_shifted_sum, max};
 use crate::wide;
 
-/// Which sources every node attends to.
+/// The sources that each node attends to.
 ///
 /// The edges of node `i` are `offsets[i]..offsets[i + 1]`; `sources` holds a row of the keys and
 /// values per edge.
@@ -40,7 +40,7 @@ impl Edges {
     /// `n_sources`.
     ///
     /// # Errors
-    /// A sentence that says what does not fit.
+    /// A sentence that describes the mismatch.
     pub fn check(&self, n_nodes: usize, n_sources: usize) -> Result<(), String> {
         let ascend = self.offsets.first() == Some(&0) && self.offsets.is_sorted();
         let ends = self.offsets.last().map_or(0, |&end| end as usize);
@@ -63,7 +63,7 @@ impl Edges {
 /// Sizes that all rows share.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Heads {
-    /// How many.
+    /// Number of heads.
     pub n: usize,
     /// Channels per head.
     pub d: usize,
@@ -77,7 +77,7 @@ impl Heads {
         self.n * (self.d + self.f)
     }
 
-    /// What products of queries and keys are multiplied by.
+    /// Factor of the products of queries and keys: 1 / √d.
     pub fn scale(self) -> f32 {
         1.0 / (self.d.max(1) as f32).sqrt()
     }
@@ -166,8 +166,8 @@ type Lanes = [f32; 16];
 
 /// Sums of products of all heads and edges, `[H, edges]`, whose lanes `add` fills.
 ///
-/// Lanes are summed in a pass of their own. Where the compiler sees them summed right after they were
-/// filled it fills them in the order of the sum, a few at a time.
+/// Lanes are summed in a separate pass: if the compiler sees them summed right after they were
+/// filled, it fills them in the order of the sum, a few at a time.
 #[inline(always)]
 fn dots(
     n: usize,
@@ -260,7 +260,7 @@ fn add_both_scaled(out: &mut [f32], by: f32, x: &[f32], again: f32, y: &[f32]) {
 /// The operation on slices.
 #[derive(Clone, Debug)]
 pub struct EdgeAttention {
-    /// Which sources every node attends to.
+    /// The sources that each node attends to.
     pub edges: Arc<Edges>,
     /// Sizes.
     pub heads: Heads,

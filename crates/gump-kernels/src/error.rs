@@ -1,4 +1,4 @@
-//! What can go wrong in this crate.
+//! Errors of this crate.
 
 /// A kernel that this processor does not have, or that multiplies wrongly.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

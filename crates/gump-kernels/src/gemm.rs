@@ -92,7 +92,7 @@ impl<'a> MatMut<'a> {
         Self::strided(data, rows, cols, cols)
     }
 
-    /// How many columns it has.
+    /// Number of columns.
     pub fn columns(&self) -> usize {
         self.cols
     }
@@ -113,7 +113,7 @@ fn check_extent(len: usize, rows: usize, cols: usize, row_stride: usize) {
     assert!(needed <= len, "matrix of {needed} elements over {len}");
 }
 
-/// What a product does with the values already in its destination.
+/// Whether a product replaces its destination or is added to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Store {
     /// `dst = scale * lhs rhs`
@@ -122,7 +122,7 @@ pub enum Store {
     Add,
 }
 
-/// Who computes a product.
+/// Threads that compute a product.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Threads {
     /// The calling thread.
@@ -159,7 +159,7 @@ pub fn gemm(
 #[derive(Debug)]
 pub struct Right<'a>(Form<'a>);
 
-/// In which form a right matrix is kept.
+/// Storage of a right matrix.
 #[derive(Debug)]
 enum Form<'a> {
     /// Multiplied as it is.

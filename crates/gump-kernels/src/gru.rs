@@ -16,7 +16,7 @@ pub fn gru_row(x_gates: &[f32], h_gates: &[f32], h: &mut [f32]) {
     }
 }
 
-/// As [`gru_row`], which also keeps what the gradient asks for: `[4C]`, both sigmoids, the candidate
+/// As [`gru_row`], which also keeps what the gradient needs: `[4C]`, both sigmoids, the candidate
 /// and the candidate's hidden gate. One loop per gate, each over slices of one length, so that all
 /// are compiled to vectors.
 #[inline(always)]
@@ -74,8 +74,8 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
-/// `dh` comes as the gradient of the state after the step and leaves as what reaches the state
-/// before directly; `kept` is as [`kept_row`] left it.
+/// `dh` is the gradient of the state after the step on entry, and the part that reaches the state
+/// before it directly on return; `kept` is as [`kept_row`] left it.
 #[inline(always)]
 pub fn backward_row(kept: &[f32], h: &[f32], dx: &mut [f32], dg: &mut [f32], dh: &mut [f32]) {
     let c = h.len();

@@ -1,17 +1,17 @@
-//! In which form numbers enter matrix products.
+//! Number format of the operands of matrix products.
 //!
 //! What lives here: the choice and its scope. What does not: the products.
 //!
-//! Whoever computes a loss says once in which form ([`Operands::during`]), and every operation that
-//! is built in that scope multiplies so, forward and backward: an operation keeps the form it was
+//! The code that computes a loss sets the format once ([`Operands::during`]), and every operation
+//! built in that scope multiplies in it, forward and backward: an operation keeps the format it was
 //! built with. Layers need not know.
 
 use std::cell::Cell;
 
-/// In which form numbers enter matrix products; sums are always f32.
+/// Number format of the operands of matrix products; sums are always f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Operands {
-    /// As they are.
+    /// Not rounded.
     #[default]
     F32,
     /// Rounded to bfloat16.
@@ -23,14 +23,14 @@ thread_local! {
 }
 
 impl Operands {
-    /// What operations that the calling thread builds now multiply.
+    /// The format of operations that the calling thread builds now.
     pub fn current() -> Self {
         CURRENT.get()
     }
 
-    /// Runs `f`, whose operations multiply operands of this form.
+    /// Runs `f`, whose operations multiply operands in this format.
     pub fn during<R>(self, f: impl FnOnce() -> R) -> R {
-        /// Restores what was before, however `f` ends.
+        /// Restores the previous format when dropped, even if `f` panics.
         struct Before(Operands);
         impl Drop for Before {
             fn drop(&mut self) {

@@ -5,7 +5,7 @@
 //! kernels of `gemm`. What does not: products with a gradient, which are `gump-nn`'s.
 //!
 //! Every element of a product is one chain of fused multiply-adds in the order of the inner index,
-//! whatever rows stand around it: a row's bits depend neither on the batch nor on the threads.
+//! whatever the neighbouring rows: a row's bits depend neither on the batch nor on the threads.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -22,7 +22,7 @@ const ROWS: usize = 8;
 /// Rows that are multiplied together where fewer are left.
 const FEW_ROWS: usize = 4;
 
-/// In which form the weights of linear layers are kept and multiplied.
+/// Number format in which the weights of linear layers are stored and multiplied.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
@@ -54,7 +54,7 @@ pub struct Panels {
     n_in: usize,
     n_out: usize,
     weights: Weights,
-    /// As many as the panels have columns; 0 where there is no bias.
+    /// One per column of the panels; 0 without a bias.
     bias: Vec<f32>,
 }
 
@@ -77,7 +77,7 @@ enum Weights {
     },
 }
 
-/// Memory that products borrow; kept from call to call, so that none is asked for twice.
+/// Scratch memory of products, kept from call to call so that it is allocated only once.
 #[derive(Debug, Default)]
 pub struct Scratch {
     panel: Vec<f32>,
@@ -85,7 +85,7 @@ pub struct Scratch {
     scales: Vec<f32>,
 }
 
-/// What quantised inputs of 0 are stored as.
+/// Quantised value of an input of 0.
 const ZERO_POINT: i32 = 128;
 
 impl Panels {
@@ -111,7 +111,7 @@ impl Panels {
         }
     }
 
-    /// Columns of what is multiplied.
+    /// Columns of the matrix that it is multiplied with.
     pub fn n_in(&self) -> usize {
         self.n_in
     }
@@ -375,7 +375,7 @@ fn bytes(weight: &[f32], n_in: usize) -> Weights {
     }
 }
 
-/// A row as bytes around [`ZERO_POINT`]; returns what a unit of them is worth.
+/// Quantises a row to bytes around [`ZERO_POINT`]; returns the scale.
 fn quantize_row(x: &[f32], bytes: &mut [u8]) -> f32 {
     wide(
         #[inline(always)]

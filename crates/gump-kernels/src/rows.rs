@@ -239,7 +239,7 @@ pub fn max(x: &[f32]) -> f32 {
         .fold(f32::NEG_INFINITY, |a, &b| if b > a { b } else { a })
 }
 
-/// How many elements of a row are at least `low`.
+/// Number of elements of a row that are at least `low`.
 pub fn count_from(x: &[f32], low: f32) -> usize {
     wide(
         #[inline(always)]

@@ -1,4 +1,4 @@
-//! What the tests share.
+//! Helpers shared by the tests.
 
 /// Values in about -1..1 that look random and are the same everywhere.
 pub(crate) fn values(n: usize, salt: u32) -> Vec<f32> {

@@ -19,7 +19,7 @@ pub trait Metric: Send + Sync {
     /// too little history, not a vehicle).
     fn at(&self, scene: &SceneState<'_>, agent: &Agent) -> Option<f64>;
 
-    /// How values over time are reduced to one.
+    /// Reduction of the values over time to one.
     fn reduce(&self) -> Reduce;
 }
 

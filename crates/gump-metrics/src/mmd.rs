@@ -10,9 +10,9 @@
 //! let scene = |x: f64| gump_scene::fixture::scenario(&format!(
 //!     "ego vehicle 0: 0,0\nagent vehicle 1: {x},3 velocity 5,0\nagent vehicle 2: 20,-3",
 //! )).unwrap();
-//! let (recorded, made) = (scene(10.0), scene(30.0));
+//! let (recorded, generated) = (scene(10.0), scene(30.0));
 //! let protocol = MmdProtocol { min_vehicles: 2, ..MmdProtocol::gump() };
-//! let found = scene_mmd(&recorded.present(), made.present().now(), &protocol).unwrap();
+//! let found = scene_mmd(&recorded.present(), generated.present().now(), &protocol).unwrap();
 //! assert!(found.position.unwrap() > 0.0);
 //! assert_eq!(found.velocity, Some(0.0));
 //! ```
@@ -67,20 +67,20 @@ pub struct SceneMmd {
 /// `None` if the recorded scene has too few vehicles, or the generated one has none.
 pub fn scene_mmd(
     recorded: &SceneState<'_>,
-    made: &Frame,
+    generated: &Frame,
     protocol: &MmdProtocol,
 ) -> Option<SceneMmd> {
     let ego = recorded.ego_now();
     let recorded = vehicles(recorded.now(), ego, protocol);
-    let made = vehicles(made, ego, protocol);
-    if recorded.len() < protocol.min_vehicles.max(1) || made.is_empty() {
+    let generated = vehicles(generated, ego, protocol);
+    if recorded.len() < protocol.min_vehicles.max(1) || generated.is_empty() {
         return None;
     }
     let ego_from_world = ego.state.pose.inverse();
     let pair = |v: DVec2| [v.x, v.y];
     let compare = |of: &dyn Fn(&Agent) -> [f64; 2]| {
         let values = |agents: &[Agent]| agents.iter().map(of).collect::<Vec<_>>();
-        mmd_squared(&values(&made), &values(&recorded))
+        mmd_squared(&values(&generated), &values(&recorded))
     };
     Some(SceneMmd {
         position: compare(&|a| pair(ego_from_world * a.state.pose.position)),
@@ -243,14 +243,14 @@ mod tests {
         .unwrap()
     }
 
-    fn check(recorded: &str, made: &str) -> Option<SceneMmd> {
+    fn check(recorded: &str, generated: &str) -> Option<SceneMmd> {
         let protocol = MmdProtocol {
             min_vehicles: 2,
             max_vehicles: 3,
             ..MmdProtocol::gump()
         };
-        let (recorded, made) = (scene(recorded), scene(made));
-        scene_mmd(&recorded.present(), made.present().now(), &protocol)
+        let (recorded, generated) = (scene(recorded), scene(generated));
+        scene_mmd(&recorded.present(), generated.present().now(), &protocol)
     }
 
     const TWO: &str = "agent vehicle 1: 100,60 size 4,2\nagent vehicle 2: 103,40 size 5,2";
@@ -278,7 +278,7 @@ mod tests {
     fn moving_and_turning_the_world_changes_nothing() {
         let recorded = "ego vehicle 0: 0,0\nagent vehicle 1: 10,3 velocity 5,0
              agent vehicle 2: 20,-3 heading 3.0";
-        let made = "ego vehicle 0: 0,0\nagent vehicle 1: 12,3 velocity 2,1
+        let generated = "ego vehicle 0: 0,0\nagent vehicle 1: 12,3 velocity 2,1
              agent vehicle 2: 20,4 heading 0.3";
         let turned = |text: &str| {
             let pose = gump_geometry::Pose::new(1000.0, -500.0, 2.5);
@@ -303,9 +303,9 @@ mod tests {
         };
         let plain = of(
             &fixture::scenario(recorded).unwrap(),
-            &fixture::scenario(made).unwrap(),
+            &fixture::scenario(generated).unwrap(),
         );
-        let moved = of(&turned(recorded), &turned(made));
+        let moved = of(&turned(recorded), &turned(generated));
         let all = |m: &SceneMmd| [m.position, m.heading, m.velocity].map(Option::unwrap);
         for (a, b) in all(&plain).into_iter().zip(all(&moved)) {
             assert_abs_diff_eq!(a, b, epsilon = 1e-9);

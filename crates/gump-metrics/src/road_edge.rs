@@ -52,7 +52,7 @@ pub fn signed_distance_to_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Opt
     Some(distance * side(&Spot::new(map, edge, segment, point)))
 }
 
-/// How far `point` lies on the right of the nearest edge, off the road, metres, else 0. 0 past the
+/// Distance of `point` to the right of the nearest edge, off the road, metres, else 0. 0 past the
 /// open end of an edge, where the border is unknown. `None` on a map without road edges.
 pub(crate) fn metres_beyond_road_edge(map: &MapGraph, point: DVec2, z: f64) -> Option<f64> {
     let (distance, edge, segment) = nearest(map, point, z)?;

@@ -31,7 +31,7 @@ const FORMAT: &str = "gump-1";
 /// The matrix that reads local contexts, marks last.
 const SURROUNDINGS_IN: &str = "mct.surroundings.in.weight";
 
-/// How numbers are stored.
+/// The precision of stored numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
     /// Half precision, for shipping.

@@ -28,7 +28,7 @@ pub struct ModelConfig {
     /// Blocks (0-based) after which a trajectory head reads, shallow to deep; the last is the
     /// deepest. Empty: no trajectory heads.
     pub trajectory_heads: Vec<usize>,
-    /// How gated cross-attention is gated.
+    /// The gates of gated cross-attention.
     pub gate: Gate,
     /// Whether the two tokens of an object share their content: the value also has the key's id and
     /// class, and the key the object's last value in the window (the paper: neither), so that
@@ -61,7 +61,7 @@ pub struct ModelConfig {
     pub visual: VisualConfig,
 }
 
-/// How gated cross-attention is gated.
+/// The gates of gated cross-attention.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Gate {

@@ -304,7 +304,7 @@ impl StateDecoder {
         self.smooth.as_ref().map_or(&[], |smooth| &smooth.sines)
     }
 
-    /// Which of [`StateDecoder::all_output_rows`] are the bins of a field.
+    /// Returns the rows of [`StateDecoder::all_output_rows`] that are the bins of a field.
     pub fn rows_of(field: Field) -> Range<usize> {
         let first = field.first_token() as usize - field_rows().start;
         first..first + field.n_bins()

@@ -17,7 +17,7 @@ const N_LIGHT_INDICES: usize = 64;
 /// frame.
 pub(crate) const ROWS_PER_TOKEN: usize = 12;
 
-/// Where each table starts in the stack of tables.
+/// First rows of the tables in the stack of tables.
 #[derive(Clone, Copy, Debug)]
 pub struct Tables {
     block_size: usize,

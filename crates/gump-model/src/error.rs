@@ -47,7 +47,7 @@ pub enum ModelError {
     /// A file that is not a checkpoint of this crate, or has another vocabulary.
     #[error("{what}: {path}")]
     Checkpoint {
-        /// What was expected and found.
+        /// The expectation and the content found.
         what: String,
         /// The file.
         path: PathBuf,

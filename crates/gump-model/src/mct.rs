@@ -274,11 +274,11 @@ pub struct TokenBatch {
 }
 
 impl TokenBatch {
-    /// What the transformer reads, by name, for code of another language: `rows`,
+    /// Returns the inputs of the transformer by name, for code in other languages: `rows`,
     /// `sine_positions`, `sines`, `lookers`, `seers` and `surroundings` as stored, and `places`
     /// \[places, K\], rows of the visual tokens of all sequences, of which each has `visual_tokens`.
     ///
-    /// Every sequence must have a scene of its own.
+    /// Every sequence must have a separate scene.
     ///
     /// # Errors
     /// The tensor library failed.

@@ -104,8 +104,8 @@ impl Network {
         &self.raster_spec
     }
 
-    /// How many of `n` samples should be differentiated as one batch: on a CPU threads process
-    /// single samples, on a device they do not, and batch statistics need all.
+    /// Returns how many of `n` samples should be differentiated as one batch: on a CPU threads
+    /// process single samples, on a device they do not, and batch statistics need all.
     pub fn samples_together(&self, n: usize) -> usize {
         let is_free = self.parameters.statistics().next().is_none();
         if is_free && self.device().is_cpu() {

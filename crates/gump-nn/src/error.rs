@@ -1,4 +1,4 @@
-//! What can go wrong in this crate.
+//! Errors of this crate.
 
 /// An error of parameters, of the optimizer's configuration, or of the tensor library below.
 #[derive(Debug, thiserror::Error)]
@@ -15,14 +15,14 @@ pub enum NnError {
         /// Its name.
         name: String,
     },
-    /// A tensor has another shape than is asked for.
+    /// A tensor has another shape than requested.
     #[error("tensor \"{name}\" has shape {found:?}, expected {expected:?}")]
     TensorShape {
         /// Its name.
         name: String,
-        /// What is asked for.
+        /// The requested shape.
         expected: Vec<usize>,
-        /// What there is.
+        /// The shape found.
         found: Vec<usize>,
     },
 }

@@ -51,12 +51,12 @@ impl LayerNorm {
 pub struct Linear {
     weight: Tensor,
     bias: Option<Tensor>,
-    /// In what the product is computed.
+    /// Number type in which the product is computed.
     product: DType,
 }
 
 impl Linear {
-    /// A layer that PyTorch would build: uniform start.
+    /// Creates a layer initialised as in PyTorch: uniform.
     pub fn new(
         scope: &mut Scope<'_>,
         name: &str,
@@ -73,7 +73,7 @@ impl Linear {
         )
     }
 
-    /// A layer whose matrix and bias start as told; `None` for no bias.
+    /// Creates a layer whose matrix and bias are initialised as given; `None` for no bias.
     ///
     /// # Errors
     /// Weights to be loaded that lack its tensors.
@@ -112,7 +112,7 @@ impl Linear {
         &self.weight
     }
 
-    /// What is added, `[out]`, if anything is.
+    /// The bias, `[out]`, if there is one.
     pub fn bias(&self) -> Option<&Tensor> {
         self.bias.as_ref()
     }
@@ -137,7 +137,7 @@ impl Dropout {
     }
 }
 
-/// Drops entries of `x` and scales the rest up, if training asks for it.
+/// Drops entries of `x` and scales the rest up; returns `x` unchanged without dropout.
 pub fn drop_out(x: Tensor, dropout: Option<&Dropout>) -> Result<Tensor> {
     let Some(Dropout {
         probability,

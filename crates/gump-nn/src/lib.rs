@@ -25,7 +25,7 @@ pub mod ops;
 pub mod optimizer;
 pub mod parameters;
 
-/// Where tensors live, and a tensor, so that users need not name the tensor library.
+/// The device and tensor types, so that users need not name the tensor library.
 pub use candle_core::{Device, Tensor};
 pub use error::NnError;
 pub use optimizer::{AdamW, Gradients, OptimizerConfig};

@@ -22,10 +22,10 @@ pub struct OptimizerConfig {
     pub warmup: usize,
     /// Learning rate at the end of the cosine, as a fraction of the peak.
     pub final_fraction: f64,
-    /// Where in the run, as fractions of it, the rate is multiplied by `drop`; with any, the rate is
-    /// constant between them and there is no cosine.
+    /// Points of the run, as fractions of it, at which the rate is multiplied by `drop`; with any,
+    /// the rate is constant between them and there is no cosine.
     pub milestones: Vec<f64>,
-    /// What the rate is multiplied by at each milestone.
+    /// Factor of the rate at each milestone.
     pub drop: f64,
     /// Decoupled weight decay of matrices (paper: 1e-3); norms, biases, tables and gates have none.
     pub weight_decay: f64,
@@ -156,7 +156,7 @@ impl AdamW {
         config: &OptimizerConfig,
         rate: f64,
     ) -> Result<f64> {
-        // Each tensor on a thread of its own; the sum over tensors keeps their order.
+        // Each tensor on its own thread; the sum over tensors keeps their order.
         let all: Vec<&Tensor> = gradients.values().collect();
         let squares = all.into_par_iter().map(ops::sum_of_squares);
         let squares: Vec<f64> = squares.collect::<Result<_>>()?;
@@ -338,7 +338,7 @@ mod tests {
     use super::*;
     use candle_core::Device;
 
-    /// What devices other than a CPU compute is what a CPU computes.
+    /// The fused pass on a CPU agrees with the tensor operations used on other devices.
     #[test]
     fn one_pass_is_what_tensors_say() {
         let var = |salt: f32| {

@@ -11,7 +11,7 @@ use rand::Rng as _;
 
 use crate::NnError;
 
-/// How a parameter starts.
+/// Initialisation of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
     /// Every entry the same.
@@ -32,12 +32,12 @@ pub struct Parameters {
     loaded: Option<BTreeMap<String, Tensor>>,
     device: Device,
     seed: Seed,
-    /// In what the network's matrices are multiplied.
+    /// Number type in which the network's matrices are multiplied.
     products: DType,
 }
 
 impl Parameters {
-    /// An empty store; parameters asked of it are drawn from `seed`.
+    /// Creates an empty store; parameters requested from it are drawn from `seed`.
     pub fn random(seed: Seed, device: &Device) -> Self {
         Self {
             variables: BTreeMap::new(),
@@ -49,7 +49,7 @@ impl Parameters {
         }
     }
 
-    /// An empty store; parameters asked of it are taken from `tensors`.
+    /// Creates an empty store; parameters requested from it are taken from `tensors`.
     pub fn loaded(tensors: BTreeMap<String, Tensor>, device: &Device) -> Self {
         Self {
             loaded: Some(tensors),
@@ -62,7 +62,7 @@ impl Parameters {
         Self { products, ..self }
     }
 
-    /// Where the parameters live.
+    /// Device of the parameters.
     pub fn device(&self) -> &Device {
         &self.device
     }
@@ -105,7 +105,7 @@ impl Parameters {
             .sum()
     }
 
-    /// Names in the file this store was loaded from that no part of the network asked for.
+    /// Names in the file this store was loaded from that no part of the network requested.
     pub fn unused(&self) -> Vec<&str> {
         let loaded = self.loaded.iter().flat_map(BTreeMap::keys);
         loaded
@@ -176,7 +176,7 @@ impl Scope<'_> {
         }
     }
 
-    /// In what matrices are multiplied.
+    /// Number type in which matrices are multiplied.
     pub fn products(&self) -> DType {
         self.store.products
     }

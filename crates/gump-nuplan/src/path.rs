@@ -8,7 +8,7 @@ use gump_scene::Lane;
 
 /// Points closer than this to the next are the same point, metres.
 const SAME: f64 = 1e-3;
-/// How far apart the points of a curvature are, metres.
+/// Distance between the points that a curvature is computed from, metres.
 const CURVATURE_SPAN: f64 = 2.0;
 /// Distance over which a baseline's direction is determined, metres.
 const HEADING_SPAN: f64 = 0.5;
@@ -166,8 +166,7 @@ pub fn nearest_on_baseline(lane: &Lane, point: DVec2) -> (f64, Pose) {
     (s, Pose { position, heading })
 }
 
-/// Curvature where a lane starts, radians per metre, positive to the left; 0 where it is too short
-/// to tell.
+/// Curvature where a lane starts, radians per metre, positive to the left; 0 if it is too short.
 ///
 /// Source: nuPlan's three-point estimate.
 pub fn curvature_at_start(lane: &Lane) -> f64 {

@@ -53,7 +53,7 @@ fn main() -> Result<(), BoxError> {
             closed.map_or(String::new(), |(name, _)| format!(" ({name})")),
         );
     }
-    // It may brake all the same.
+    // It may still brake.
     println!("chosen: {}", decision.prospects[decision.chosen].kind);
     Ok(())
 }

@@ -30,7 +30,7 @@ pub struct Scored {
 /// do.
 ///
 /// `map` is the map used for scoring, usually that of the recording. Passing the map without
-/// derived roadblocks scores the drive on what was really stated.
+/// derived roadblocks scores the drive on the map as it was stated.
 ///
 /// # Errors
 /// [`PlanError::Drive`] with the iteration if the loop cannot continue, [`PlanError::Score`] if the

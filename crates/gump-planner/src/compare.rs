@@ -182,7 +182,7 @@ mod tests {
     use gump_rollout::worlds::{ConstantVelocity, IdmConfig, idm_acceleration};
     use gump_scene::{Agent, fixture};
 
-    /// Holds an acceleration whatever happens.
+    /// Holds an acceleration unconditionally.
     struct Holds(&'static str, f64);
 
     impl Policy for Holds {
@@ -199,7 +199,7 @@ mod tests {
         }
     }
 
-    /// Keeps the law's distance to the only other, who is ahead on a road along the x-axis.
+    /// Keeps the law's distance to the only other agent, which is ahead on a road along the x-axis.
     struct Careful;
 
     impl Policy for Careful {
@@ -319,11 +319,11 @@ mod tests {
         };
         let n = truth.scenes_needed(1).unwrap() as u64;
         assert_eq!(n, 88);
-        let told = (0..100).filter(|&k| {
+        let sure = (0..100).filter(|&k| {
             let found = Comparison::of_scenes(&sample(Seed(k), n), &zeros(n), Seed(k));
             found.unwrap().is_sure()
         });
-        let told = told.count();
-        assert!((68..=92).contains(&told), "{told} of 100");
+        let n_sure = sure.count();
+        assert!((68..=92).contains(&n_sure), "{n_sure} of 100");
     }
 }

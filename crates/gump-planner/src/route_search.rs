@@ -17,9 +17,9 @@ const HERE: f64 = 1.0;
 const NEAR: f64 = 3.0;
 /// ... in this direction, radians.
 const ALIGNED: f64 = FRAC_PI_4;
-/// How many roadblocks back from the start of the route the ego is searched.
+/// Number of roadblocks back from the start of the route that are searched for the ego.
 const DEPTH_BACK: usize = 15;
-/// How many roadblocks ahead of the ego the route is searched.
+/// Number of roadblocks ahead of the ego that are searched for the route.
 const DEPTH_AHEAD: usize = 30;
 /// Connectors that overlap by more than this are the same place, square metres.
 const SHARED_AREA: f64 = 1.0;

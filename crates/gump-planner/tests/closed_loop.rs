@@ -147,7 +147,7 @@ fn the_log_replayed_is_the_log() {
     assert_eq!(other.now().agents().len(), logged.agents().len());
 }
 
-/// Answers with whatever it was made of, from the iteration given on.
+/// Stays in place until iteration `from`, then plans the states that `answer` returns.
 struct Odd {
     from: usize,
     answer: fn(&EgoState) -> Result<Vec<EgoState>, BoxError>,

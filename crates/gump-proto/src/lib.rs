@@ -3,7 +3,7 @@
 //! Those of nuPlan's planner protocol are in [`nuplan`].
 //!
 //! Fields are named as in the schema. Optional fields keep proto2's meaning: absent is `None`.
-//! Repeated numbers are read packed and unpacked alike; each is written as the schema says.
+//! Repeated numbers are read packed and unpacked; each is written as in the schema.
 
 pub mod motion;
 pub mod nuplan;
@@ -44,7 +44,7 @@ pub struct Track {
     pub states: Vec<ObjectState>,
 }
 
-/// What an object is.
+/// Kind of an object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum ObjectType {
@@ -82,7 +82,7 @@ pub struct ObjectState {
     pub valid: Option<bool>,
 }
 
-/// A track a benchmark asks to predict.
+/// A track that a benchmark requires to be predicted.
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are Waymo's")]
 pub struct RequiredPrediction {
@@ -92,7 +92,7 @@ pub struct RequiredPrediction {
     pub difficulty: Option<i32>,
 }
 
-/// How hard a track is to predict.
+/// Difficulty of predicting a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum DifficultyLevel {
@@ -121,7 +121,7 @@ pub struct TrafficSignalLaneState {
     pub stop_point: Option<MapPoint>,
 }
 
-/// What a signal shows.
+/// State of a signal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum SignalState {
@@ -146,7 +146,7 @@ pub struct MapFeature {
     pub feature_data: Option<FeatureData>,
 }
 
-/// What a map element is.
+/// Data of a map element, by kind.
 #[derive(Clone, PartialEq, prost::Oneof)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum FeatureData {
@@ -204,7 +204,7 @@ pub struct LaneCenter {
     pub right_boundaries: Vec<BoundarySegment>,
 }
 
-/// What a lane is for.
+/// Kind of a lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum LaneType {
@@ -256,7 +256,7 @@ pub struct RoadEdge {
     pub polyline: Vec<MapPoint>,
 }
 
-/// What a border is.
+/// Kind of a road edge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum RoadEdgeType {
@@ -275,7 +275,7 @@ pub struct RoadLine {
     pub polyline: Vec<MapPoint>,
 }
 
-/// How a line is painted.
+/// Paint of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum RoadLineType {
@@ -352,7 +352,7 @@ pub struct ScenarioRollouts {
     pub joint_scenes: Vec<JointScene>,
 }
 
-/// A shard of a challenge submission: futures of many scenarios and who made them.
+/// A shard of a challenge submission: futures of many scenarios and their authors.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are Waymo's")]
 pub struct SimAgentsChallengeSubmission {
@@ -386,7 +386,7 @@ pub struct SimAgentsChallengeSubmission {
     pub acknowledge_complies_with_closed_loop_requirement: Option<bool>,
 }
 
-/// Which challenge a submission is for.
+/// Challenge that a submission is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum SubmissionType {

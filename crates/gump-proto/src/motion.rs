@@ -87,7 +87,7 @@ pub enum PredictionKind {
     JointPrediction(JointPrediction),
 }
 
-/// Predictions of many scenarios and who made them.
+/// Predictions of many scenarios and their authors.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are Waymo's")]
 pub struct MotionChallengeSubmission {
@@ -119,7 +119,7 @@ pub struct MotionChallengeSubmission {
     pub public_model_names: Vec<String>,
 }
 
-/// Which challenge a submission is for.
+/// Challenge that a submission is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, prost::Enumeration)]
 #[allow(missing_docs, reason = "the names are Waymo's")]
 pub enum MotionSubmissionType {

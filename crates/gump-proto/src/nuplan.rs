@@ -6,14 +6,14 @@
 //! Metres, seconds, radians; poses of the ego are those of its rear axle, in the world frame. The
 //! protocol has 32-bit numbers, 6 cm apart 1,000 km from the origin and 25 cm at 4,000 km.
 
-/// Where the calls are found: `/PACKAGE.SERVICE/CALL`.
+/// Path of the service; calls are at `/PACKAGE.SERVICE/CALL`.
 pub const SERVICE: &str = "/challenge_protocol.DetectionTracksChallenge";
 
-/// Nothing to say.
+/// A message without fields.
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 pub struct Empty {}
 
-/// Where to go.
+/// The mission: route, goal and map.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are nuPlan's")]
 pub struct PlannerInitializationLight {
@@ -37,7 +37,7 @@ pub struct PlannerInput {
     pub traffic_light_data: Vec<TrafficLightStatusData>,
 }
 
-/// Which step it is.
+/// Time and index of a step.
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are nuPlan's")]
 pub struct SimulationIteration {
@@ -47,7 +47,7 @@ pub struct SimulationIteration {
     pub index: i32,
 }
 
-/// What is new since the last call, oldest first: pickled Python objects, an `EgoState` and a
+/// History since the last call, oldest first: pickled Python objects, an `EgoState` and a
 /// `DetectionsTracks` of nuplan-devkit for each moment.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are nuPlan's")]
@@ -122,7 +122,7 @@ pub struct EgoState {
     pub angular_accel: f32,
 }
 
-/// What the ego is to drive.
+/// The plan: states that the ego is to follow.
 #[derive(Clone, PartialEq, prost::Message)]
 #[allow(missing_docs, reason = "the field names are nuPlan's")]
 pub struct Trajectory {

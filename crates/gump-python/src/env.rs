@@ -21,7 +21,7 @@ use crate::world::World;
 /// Seconds that an action is held: a frame of the world model, as in the paper.
 const STEP: f64 = 0.5;
 
-/// What an environment is asked for.
+/// A request to an environment.
 enum Request {
     Reset {
         seeds: Option<Vec<u64>>,
@@ -31,7 +31,7 @@ enum Request {
     Expert,
 }
 
-/// What came of it.
+/// The answer to a [`Request`].
 #[derive(Default)]
 struct Answer {
     observations: Observations,
@@ -135,8 +135,8 @@ impl Env {
         let courses = courses.map_err(errors::value)?;
         let n_scenarios = courses.len();
         let model = world.kind.model();
-        let (tell, told) = channel();
-        let (asks, asked) = channel();
+        let (ready_sender, ready) = channel();
+        let (asks, requests) = channel();
         threads::alone(move || {
             let traffic = match &model {
                 Some(model) => Traffic::World(&**model),
@@ -144,15 +144,15 @@ impl Env {
             };
             match DrivingEnv::new(courses, traffic, config) {
                 Ok(env) => {
-                    if tell.send(Ok(env.action_len())).is_ok() {
-                        serve(env, &asked);
+                    if ready_sender.send(Ok(env.action_len())).is_ok() {
+                        serve(env, &requests);
                     }
                 }
-                // Nobody is left to be told if this fails.
-                Err(error) => drop(tell.send(Err(error))),
+                // If this fails, nobody is waiting for the error.
+                Err(error) => drop(ready_sender.send(Err(error))),
             }
         })?;
-        let action_len = py.detach(move || told.recv()).map_err(|_| gone())?;
+        let action_len = py.detach(move || ready.recv()).map_err(|_| gone())?;
         Ok(Self {
             asks: Mutex::new(Some(asks)),
             process: std::process::id(),
@@ -187,7 +187,7 @@ impl Env {
         STEP
     }
 
-    /// Starts episodes; the observations `[n, ...]`.
+    /// Starts episodes and returns the observations `[n, ...]`.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -219,17 +219,17 @@ impl Env {
         let n = self.n_envs;
         let ended = PyList::empty(py);
         for episode in answer.ended {
-            let told = PyDict::new(py);
-            told.set_item("row", episode.row)?;
-            told.set_item("scenario", episode.scenario)?;
-            told.set_item("steps", episode.steps)?;
-            told.set_item("return", episode.totals.reward)?;
-            told.set_item("progress", episode.totals.progress)?;
-            told.set_item("collided", episode.totals.collided)?;
-            told.set_item("off_road", episode.totals.off_road)?;
-            told.set_item("uncomfortable", episode.totals.uncomfortable)?;
-            told.set_item("last", self.observations(py, episode.last, None)?)?;
-            ended.append(told)?;
+            let dict = PyDict::new(py);
+            dict.set_item("row", episode.row)?;
+            dict.set_item("scenario", episode.scenario)?;
+            dict.set_item("steps", episode.steps)?;
+            dict.set_item("return", episode.totals.reward)?;
+            dict.set_item("progress", episode.totals.progress)?;
+            dict.set_item("collided", episode.totals.collided)?;
+            dict.set_item("off_road", episode.totals.off_road)?;
+            dict.set_item("uncomfortable", episode.totals.uncomfortable)?;
+            dict.set_item("last", self.observations(py, episode.last, None)?)?;
+            ended.append(dict)?;
         }
         Ok((
             self.observations(py, answer.observations, Some(n))?,
@@ -246,7 +246,7 @@ impl Env {
         Ok(array(py, [self.n_envs, self.action_len], answer.actions)?.into_any())
     }
 
-    /// Lets the environment go; `ValueError` from then on.
+    /// Closes the environment; later calls raise `ValueError`.
     fn close(&self) {
         let mut asks = self.asks.lock().unwrap_or_else(PoisonError::into_inner);
         *asks = None;
@@ -298,8 +298,8 @@ fn gone() -> PyErr {
     errors::runtime("expected an environment in progress, found that it has failed")
 }
 
-fn serve(mut env: DrivingEnv<'_>, asked: &Receiver<Ask>) {
-    while let Ok(ask) = asked.recv() {
+fn serve(mut env: DrivingEnv<'_>, requests: &Receiver<Ask>) {
+    while let Ok(ask) = requests.recv() {
         let answer = answer(&mut env, ask.request);
         if ask.answer.send(answer).is_err() {
             return;
@@ -360,7 +360,7 @@ fn whole(env: &DrivingEnv<'_>) -> Observations {
     }
 }
 
-/// What the last step of a row led to.
+/// Observations after the last step of a row's finished episode.
 fn last(env: &DrivingEnv<'_>, row: usize) -> Observations {
     let part = |len: usize| row * len / env.n_envs()..(row + 1) * len / env.n_envs();
     match env.packed_final_observations() {

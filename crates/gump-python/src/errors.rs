@@ -13,7 +13,7 @@ pyo3::create_exception!(
     "A file or message that is not what it should be; the sentence names the place."
 );
 
-/// What a reader reports: a missing file, the operating system's refusal, or damage.
+/// An error of a reader: a missing file, an error of the operating system, or damaged data.
 pub(crate) fn data(error: &gump_data::DataError) -> PyErr {
     match error {
         gump_data::DataError::Missing { .. } => PyFileNotFoundError::new_err(error.to_string()),
@@ -25,17 +25,17 @@ pub(crate) fn data(error: &gump_data::DataError) -> PyErr {
     }
 }
 
-/// An argument that makes no sense.
+/// An invalid argument.
 pub(crate) fn value(error: impl Display) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-/// Work that could not be done with arguments that do make sense.
+/// Work that failed with valid arguments.
 pub(crate) fn runtime(error: impl Display) -> PyErr {
     PyRuntimeError::new_err(error.to_string())
 }
 
-/// A message that is none.
+/// A malformed message.
 pub(crate) fn data_problem(problem: gump_data::Problem) -> PyErr {
     DataError::new_err(problem.to_string())
 }

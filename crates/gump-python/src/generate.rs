@@ -14,7 +14,7 @@ use crate::{errors, threads};
 /// Scenes made together.
 const BATCH: u64 = 32;
 
-/// What is to be made; see `gump.generate`.
+/// Arguments of `gump.generate`.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 struct Wish {
@@ -103,23 +103,23 @@ pub(crate) fn generate<'py>(
             )
         })?;
         for made in made.map_err(errors::value)? {
-            list.append(told(py, made.map_err(errors::runtime)?)?)?;
+            list.append(scene_dict(py, made.map_err(errors::runtime)?)?)?;
         }
     }
     Ok(list)
 }
 
-fn told(py: Python<'_>, made: Made) -> PyResult<Bound<'_, PyDict>> {
-    let told = PyDict::new(py);
-    told.set_item("holds", made.holds())?;
-    told.set_item("attempts", made.attempts)?;
-    told.set_item("is_steered", made.is_steered)?;
+fn scene_dict(py: Python<'_>, made: Made) -> PyResult<Bound<'_, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("holds", made.holds())?;
+    dict.set_item("attempts", made.attempts)?;
+    dict.set_item("is_steered", made.is_steered)?;
     let clauses = made
         .clauses
         .iter()
         .map(|clause| (&clause.clause, clause.holds));
-    told.set_item("clauses", clauses.collect::<Vec<_>>())?;
+    dict.set_item("clauses", clauses.collect::<Vec<_>>())?;
     let scenario = Scenario::new(Scene::of(made.scenario));
-    told.set_item("scenario", Bound::new(py, scenario)?)?;
-    Ok(told)
+    dict.set_item("scenario", Bound::new(py, scenario)?)?;
+    Ok(dict)
 }

@@ -27,7 +27,7 @@ mod wosac;
 
 use pyo3::prelude::*;
 
-/// What the package does in Rust.
+/// The native module of the package.
 #[pymodule(name = "_native")]
 mod native {
     use super::{Bound, PyModule, PyModuleMethods as _, PyResult};

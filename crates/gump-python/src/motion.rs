@@ -51,11 +51,11 @@ impl Tally {
             scores.iter().for_each(|score| tally.add(score));
             Ok::<_, gump_wosac::motion::MotionError>(scores)
         });
-        let told = PyList::empty(py);
+        let list = PyList::empty(py);
         for score in &scores.map_err(errors::value)? {
-            told.append(self.told(py, score)?)?;
+            list.append(self.score_dict(py, score)?)?;
         }
-        Ok(told)
+        Ok(list)
     }
 
     /// Adds the measurements of another tally; the order of additions changes nothing.
@@ -75,7 +75,7 @@ impl Tally {
             let tally = self.tally.lock().unwrap_or_else(PoisonError::into_inner);
             tally.rows(&self.config)
         };
-        let told = PyList::empty(py);
+        let list = PyList::empty(py);
         for row in rows {
             let line = PyDict::new(py);
             line.set_item("kind", row.kind.map(|kind| kind.name()))?;
@@ -84,19 +84,23 @@ impl Tally {
             for (name, number) in row.numbers() {
                 line.set_item(name, number)?;
             }
-            told.append(line)?;
+            list.append(line)?;
         }
-        Ok(told)
+        Ok(list)
     }
 }
 
 impl Tally {
-    fn told<'py>(&self, py: Python<'py>, score: &PredictionScore) -> PyResult<Bound<'py, PyDict>> {
-        let told = PyDict::new(py);
+    fn score_dict<'py>(
+        &self,
+        py: Python<'py>,
+        score: &PredictionScore,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let dict = PyDict::new(py);
         let ids: Vec<i64> = score.agents.iter().map(|agent| agent.0).collect();
-        told.set_item("agent_id", ids)?;
-        told.set_item("kind", score.kind.name())?;
-        told.set_item("shape", score.shape.map(|shape| shape.name()))?;
+        dict.set_item("agent_id", ids)?;
+        dict.set_item("kind", score.kind.name())?;
+        dict.set_item("shape", score.shape.map(|shape| shape.name()))?;
         let horizons = PyList::empty(py);
         for (horizon, found) in self.config.horizons.iter().zip(&score.horizons) {
             let line = PyDict::new(py);
@@ -107,8 +111,8 @@ impl Tally {
             line.set_item("overlaps", found.overlaps)?;
             horizons.append(line)?;
         }
-        told.set_item("horizons", horizons)?;
-        Ok(told)
+        dict.set_item("horizons", horizons)?;
+        Ok(dict)
     }
 }
 

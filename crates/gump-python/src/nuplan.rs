@@ -1,4 +1,4 @@
-//! nuPlan's closed loop and its scores, with planners of ours or of Python's.
+//! nuPlan's closed loop and its scores, with our planners or planners in Python.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -34,7 +34,8 @@ use crate::world::World;
 /// the vehicle's frame; steering angle and rate; yaw rate and acceleration.
 const EGO: usize = 11;
 
-/// What is driven through: roadblocks and a rear axle are derived where a scenario has none.
+/// The recording of a scenario to drive through; roadblocks and the rear axle are derived where a
+/// scenario has none.
 ///
 /// Error: a map without lanes, or no ego.
 fn recording(scene: &Scene) -> PyResult<Recording> {
@@ -115,10 +116,10 @@ pub(crate) fn nuplan_simulate<'py>(
         }
     };
     let (scored, milliseconds) = driven?;
-    let told = tell_scores(py, &scored.metrics)?;
-    told.set_item("milliseconds_per_step", milliseconds)?;
-    tell_drive(py, &scored, &scene.scenario, &told)?;
-    Ok(told)
+    let dict = scores_dict(py, &scored.metrics)?;
+    dict.set_item("milliseconds_per_step", milliseconds)?;
+    add_drive(py, &scored, &scene.scenario, &dict)?;
+    Ok(dict)
 }
 
 /// A planner of ours.
@@ -150,7 +151,7 @@ fn named<'w>(
     })
 }
 
-/// A driver with a stopwatch.
+/// A driver whose steps are timed.
 struct Timed<'a> {
     inner: &'a mut dyn Driver,
     spent: Duration,
@@ -226,11 +227,11 @@ impl Traffic for Pooled<'_> {
     }
 }
 
-/// A planner in Python, called with the interpreter's lock on the thread that asked.
+/// A planner in Python, called with the interpreter's lock on the caller's thread.
 struct PythonDriver {
     bridge: Py<PyAny>,
     scenario: Py<Scenario>,
-    /// What it raised, to be raised again where it was called from.
+    /// The exception that it raised, to be raised again in the caller.
     raised: Option<PyErr>,
 }
 
@@ -248,20 +249,20 @@ impl Driver for PythonDriver {
 
     fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
         let started = Python::attach(|py| {
-            let told = PyDict::new(py);
-            told.set_item("scenario", &self.scenario)?;
+            let dict = PyDict::new(py);
+            dict.set_item("scenario", &self.scenario)?;
             let lanes = mission.route.iter().flat_map(|route| &route.lanes);
             let lanes: Vec<i64> = lanes.map(|lane| lane.0).collect();
-            told.set_item("route_lane_ids", lanes)?;
+            dict.set_item("route_lane_ids", lanes)?;
             let blocks = mission.route.iter().flat_map(|route| &route.roadblocks);
             let blocks: Vec<i64> = blocks.map(|block| block.0).collect();
-            told.set_item("route_roadblock_ids", blocks)?;
+            dict.set_item("route_roadblock_ids", blocks)?;
             let goal = mission
                 .goal
                 .map(|g| (g.position.x, g.position.y, g.heading));
-            told.set_item("mission_goal", goal)?;
-            told.set_item("vehicle", vehicle(py, &mission.vehicle)?)?;
-            self.bridge.call_method1(py, "initialize", (told,))?;
+            dict.set_item("mission_goal", goal)?;
+            dict.set_item("vehicle", vehicle(py, &mission.vehicle)?)?;
+            self.bridge.call_method1(py, "initialize", (dict,))?;
             Ok(())
         });
         started.map_err(|error| self.keep(error))
@@ -269,11 +270,11 @@ impl Driver for PythonDriver {
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
         let planned = Python::attach(|py| {
-            let told = PyDict::new(py);
-            told.set_item("iteration", moment.iteration)?;
-            told.set_item("time_us", moment.ego.time_us)?;
-            told.set_item("ego", ego_row(moment.ego).to_vec())?;
-            // What came before the first iteration is told once.
+            let dict = PyDict::new(py);
+            dict.set_item("iteration", moment.iteration)?;
+            dict.set_item("time_us", moment.ego.time_us)?;
+            dict.set_item("ego", ego_row(moment.ego).to_vec())?;
+            // The states before the first iteration are sent once.
             let before = if moment.iteration == 0 {
                 let history = &moment.scene.history[..moment.scene.history.len() - 1];
                 let frames = history.iter().map(|frame| observed(py, frame, moment));
@@ -286,9 +287,9 @@ impl Driver for PythonDriver {
             } else {
                 None
             };
-            told.set_item("before", before)?;
-            told.set_item("observed", observed(py, moment.scene.now(), moment)?)?;
-            let plan = self.bridge.call_method1(py, "plan", (told,))?;
+            dict.set_item("before", before)?;
+            dict.set_item("observed", observed(py, moment.scene.now(), moment)?)?;
+            let plan = self.bridge.call_method1(py, "plan", (dict,))?;
             let plan = plan.bind(py).cast::<PyArrayDyn<f64>>()?;
             trajectory(plan, moment.ego)
         });
@@ -297,16 +298,16 @@ impl Driver for PythonDriver {
 }
 
 fn vehicle<'py>(py: Python<'py>, vehicle: &VehicleParameters) -> PyResult<Bound<'py, PyDict>> {
-    let told = PyDict::new(py);
-    told.set_item("width", vehicle.width)?;
-    told.set_item("front_length", vehicle.front_length)?;
-    told.set_item("rear_length", vehicle.rear_length)?;
-    told.set_item("wheel_base", vehicle.wheel_base)?;
-    told.set_item("height", vehicle.height)?;
-    Ok(told)
+    let dict = PyDict::new(py);
+    dict.set_item("width", vehicle.width)?;
+    dict.set_item("front_length", vehicle.front_length)?;
+    dict.set_item("rear_length", vehicle.rear_length)?;
+    dict.set_item("wheel_base", vehicle.wheel_base)?;
+    dict.set_item("height", vehicle.height)?;
+    Ok(dict)
 }
 
-/// Everybody but the ego, and the lights.
+/// All agents but the ego, and the lights.
 fn observed<'py>(
     py: Python<'py>,
     frame: &Frame,
@@ -314,22 +315,22 @@ fn observed<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let agents = frame.agents().iter();
     let others: Vec<_> = agents.filter(|a| a.id != moment.scene.ego).collect();
-    let told = PyDict::new(py);
+    let dict = PyDict::new(py);
     let ids: Vec<i64> = others.iter().map(|agent| agent.id.0).collect();
     let kinds: Vec<&str> = others.iter().map(|agent| agent.kind.name()).collect();
     let n = others.len();
     let states = others.iter().flat_map(|agent| state(agent));
     let velocities = others.iter().flat_map(|a| a.state.velocity.to_array());
     let sizes = others.iter().flat_map(|a| [a.length, a.width, a.height]);
-    told.set_item("agent_id", array(py, n, ids)?)?;
-    told.set_item("kind", kinds)?;
-    told.set_item("states", array(py, [n, 4], states.collect())?)?;
-    told.set_item("velocity", array(py, [n, 2], velocities.collect())?)?;
-    told.set_item("size", array(py, [n, 3], sizes.collect())?)?;
+    dict.set_item("agent_id", array(py, n, ids)?)?;
+    dict.set_item("kind", kinds)?;
+    dict.set_item("states", array(py, [n, 4], states.collect())?)?;
+    dict.set_item("velocity", array(py, [n, 2], velocities.collect())?)?;
+    dict.set_item("size", array(py, [n, 3], sizes.collect())?)?;
     let lights = frame.lights().iter();
     let lights = lights.map(|light| (light.lane.0, light_name(light.state)));
-    told.set_item("lights", lights.collect::<Vec<_>>())?;
-    Ok(told)
+    dict.set_item("lights", lights.collect::<Vec<_>>())?;
+    Ok(dict)
 }
 
 fn light_name(state: gump_scene::LightState) -> &'static str {
@@ -450,7 +451,7 @@ pub(crate) fn nuplan_score<'py>(
             vehicle: *recording.vehicle(),
         })
     });
-    tell_scores(py, &found.map_err(errors::value)?)
+    scores_dict(py, &found.map_err(errors::value)?)
 }
 
 /// Frames of others that were simulated elsewhere: kinds, sizes and lights are those of the log.
@@ -503,29 +504,29 @@ fn replayed(
 }
 
 /// The score and its parts, by nuPlan's names.
-fn tell_scores<'py>(py: Python<'py>, metrics: &ClosedLoop) -> PyResult<Bound<'py, PyDict>> {
-    let told = PyDict::new(py);
-    told.set_item("score", metrics.score(&Scoring::closed_loop()))?;
+fn scores_dict<'py>(py: Python<'py>, metrics: &ClosedLoop) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("score", metrics.score(&Scoring::closed_loop()))?;
     let parts = PyDict::new(py);
     for (name, score) in metrics.scores() {
         parts.set_item(name, score)?;
     }
-    told.set_item("metrics", parts)?;
-    Ok(told)
+    dict.set_item("metrics", parts)?;
+    Ok(dict)
 }
 
-/// Who was where.
-fn tell_drive(
+/// Adds the states of the ego and of the other agents to `dict`.
+fn add_drive(
     py: Python<'_>,
     scored: &Scored,
     recorded: &Recorded,
-    told: &Bound<'_, PyDict>,
+    dict: &Bound<'_, PyDict>,
 ) -> PyResult<()> {
     let ego = &scored.driven.ego;
     let times: Vec<i64> = ego.iter().map(|state| state.time_us).collect();
     let rows: Vec<f64> = ego.iter().flat_map(ego_row).collect();
-    told.set_item("time_us", array(py, ego.len(), times)?)?;
-    told.set_item("ego", array(py, [ego.len(), EGO], rows)?)?;
+    dict.set_item("time_us", array(py, ego.len(), times)?)?;
+    dict.set_item("ego", array(py, [ego.len(), EGO], rows)?)?;
     let present = recorded.present();
     let ids: Vec<_> = present
         .now()
@@ -544,12 +545,13 @@ fn tell_drive(
         }
     }
     let numbers: Vec<i64> = ids.iter().map(|id| id.0).collect();
-    told.set_item("agent_id", array(py, ids.len(), numbers)?)?;
-    told.set_item("others", array(py, [ids.len(), steps, 6], states)?)?;
+    dict.set_item("agent_id", array(py, ids.len(), numbers)?)?;
+    dict.set_item("others", array(py, [ids.len(), steps, 6], states)?)?;
     Ok(())
 }
 
-/// What a planner of ours would drive now; float64 `[N, 12]`: seconds from now and the ego's state.
+/// The plan of one of our planners for the present; float64 `[N, 12]`: seconds from now and the
+/// ego's state.
 #[pyfunction]
 pub(crate) fn nuplan_plan<'py>(
     py: Python<'py>,

@@ -21,7 +21,7 @@ const OPTIONS: ReadOptions = ReadOptions {
 
 /// Iterates over the scenarios of a file or folder.
 ///
-/// Holds one scenario in memory. A damaged record raises `DataError`; the next call goes on after
+/// Holds one scenario in memory. A damaged record raises `DataError`; the next call continues after
 /// it.
 #[pyclass(frozen, module = "gump")]
 pub(crate) struct Reader {
@@ -47,7 +47,7 @@ impl Reader {
     #[new]
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         py.detach(|| {
-            // A file or folder without scenarios is told at once, not by an iterator that is empty.
+            // A file or folder without scenarios is an error at once, not an empty iterator.
             drop(gump_data::open_with(&path, OPTIONS)?);
             let files = list_files(&path)?.into();
             let open = Open::Nothing;

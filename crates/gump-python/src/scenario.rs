@@ -12,29 +12,29 @@ use crate::arrays::{Numbers, array};
 use crate::errors;
 use crate::scenario_arrays as convert;
 
-/// A scenario and what the realism metric reads of it.
+/// A scenario and its log as the realism metric reads it.
 pub(crate) struct Scene {
     pub(crate) scenario: gump_scene::Scenario,
-    /// Of Waymo's messages as they stand; of other formats made of the scenario when first asked
-    /// for.
+    /// For Waymo's messages, taken from the message; for other formats, computed from the scenario
+    /// on first use.
     log: OnceLock<Result<Log, WosacError>>,
 }
 
 impl Scene {
-    /// A scenario whose log is made of it.
+    /// A scenario whose log is computed from it.
     pub(crate) fn of(scenario: gump_scene::Scenario) -> Self {
         Self::with_log(scenario, None)
     }
 
-    /// A scenario with a log of its own, if there is one.
+    /// A scenario with a separate log, if there is one.
     pub(crate) fn with_log(scenario: gump_scene::Scenario, log: Option<Log>) -> Self {
         let log = log.map_or_else(OnceLock::new, |log| OnceLock::from(Ok(log)));
         Self { scenario, log }
     }
 
-    /// What the realism metric reads.
+    /// The log that the realism metric reads.
     ///
-    /// Error: a scenario of another clock than the challenge's.
+    /// Error: a scenario with another frame rate or length than the challenge's.
     pub(crate) fn log(&self) -> Result<&Log, WosacError> {
         let log = self.log.get_or_init(|| Log::of(&self.scenario));
         log.as_ref().map_err(Clone::clone)
@@ -117,7 +117,7 @@ impl Scenario {
         ids(py, self.scene.present())
     }
 
-    /// What kind of situation it is, nuPlan's names; empty if not known.
+    /// Kinds of situation, by nuPlan's names; empty if not known.
     #[getter]
     fn tags(&self) -> Vec<&'static str> {
         self.inner().tags.iter().map(|tag| tag.name()).collect()
@@ -149,7 +149,7 @@ impl Scenario {
         convert::map(py, &self.inner().map)
     }
 
-    /// What really happened to the agents of `simulated`, float64 `[A, T, 4]`: x, y, z, heading of
+    /// The recorded future of the agents of `simulated`, float64 `[A, T, 4]`: x, y, z, heading of
     /// the frames after the present, NaN where an agent is absent.
     #[getter]
     fn future<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
@@ -164,8 +164,8 @@ impl Scenario {
         Ok(array(py, [ids.len(), frames.len(), 4], numbers)?.into_any())
     }
 
-    /// The same scenario with these agents and nobody else, int64 `[A]`; others are no targets
-    /// either.
+    /// The same scenario with only these agents, int64 `[A]`; other agents are removed from the
+    /// targets too.
     fn only(&self, agent_id: &Bound<'_, PyArrayDyn<i64>>) -> PyResult<Self> {
         let ids = Numbers::new("agent_id", agent_id, &["A"])?;
         let kept: BTreeSet<AgentId> = ids.slice()?.iter().map(|&id| AgentId(id)).collect();

@@ -84,7 +84,7 @@ pub(crate) fn lights<'py>(py: Python<'py>, scenario: &Scenario) -> PyResult<Boun
     named("Lights", &fields)
 }
 
-/// The number that stands for a colour; -1 is a light that was not seen.
+/// The code of a colour; -1 is a light that was not seen.
 fn code(state: LightState) -> i8 {
     match state {
         LightState::Unknown => 0,

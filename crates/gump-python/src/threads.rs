@@ -1,7 +1,7 @@
-//! The threads that work is done on: a pool per process, made when it is first needed.
+//! The threads that do the work: a pool per process, created on first use.
 //!
-//! A process that forks (data loaders do) leaves its threads behind, and work given to them would
-//! never be done; so a child makes a pool of its own.
+//! The child of a process that forks (data loaders do) does not have its threads, and work given to
+//! them would never be done; so a child creates its own pool.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -12,16 +12,16 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use crate::errors;
 
-/// The pool of the process that made it, and how many threads were asked for (0 for all cores).
+/// The pool of a process, and the requested number of threads (0 for all cores).
 struct Current {
     process: u32,
-    asked: usize,
+    requested: usize,
     pool: Option<Arc<ThreadPool>>,
 }
 
 static CURRENT: Mutex<Current> = Mutex::new(Current {
     process: 0,
-    asked: 0,
+    requested: 0,
     pool: None,
 });
 
@@ -32,21 +32,21 @@ pub(crate) fn pool() -> PyResult<Arc<ThreadPool>> {
     let mut current = CURRENT.lock().unwrap_or_else(PoisonError::into_inner);
     let process = std::process::id();
     if current.process != process {
-        // The threads of the parent are not here to be joined.
+        // The threads of the parent do not exist in a forked process, so they cannot be joined.
         std::mem::forget(current.pool.take());
         current.process = process;
     }
     if let Some(pool) = &current.pool {
         return Ok(Arc::clone(pool));
     }
-    let builder = ThreadPoolBuilder::new().num_threads(current.asked);
+    let builder = ThreadPoolBuilder::new().num_threads(current.requested);
     let pool = builder.thread_name(|i| format!("gump {i}")).build();
     let pool = Arc::new(pool.map_err(errors::runtime)?);
     current.pool = Some(Arc::clone(&pool));
     Ok(pool)
 }
 
-/// Does work on the pool, while other Python threads go on.
+/// Does work on the pool, while other Python threads continue.
 ///
 /// Error: threads cannot be started.
 pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> PyResult<T> {
@@ -59,14 +59,14 @@ pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> 
 pub(crate) fn set_threads(n: usize) -> PyResult<()> {
     let old = {
         let mut current = CURRENT.lock().unwrap_or_else(PoisonError::into_inner);
-        current.asked = n;
+        current.requested = n;
         current.pool.take()
     };
     drop(old);
     pool().map(drop)
 }
 
-/// How many threads work is done on.
+/// Number of threads that do the work.
 #[pyfunction]
 pub(crate) fn n_threads() -> PyResult<usize> {
     Ok(pool()?.current_num_threads())
@@ -91,17 +91,17 @@ fn idle() -> MutexGuard<'static, Idle> {
     let mut idle = IDLE.lock().unwrap_or_else(PoisonError::into_inner);
     let process = std::process::id();
     if idle.process != process {
-        // Those of the process that this one was forked from are not here.
+        // The threads of the parent do not exist in a forked process.
         std::mem::forget(std::mem::take(&mut idle.threads));
         idle.process = process;
     }
     idle
 }
 
-/// Does a long job on a thread of its own, with a pool of the same size as everybody's.
+/// Does a long job on a separate thread, with a separate pool of the same size as the shared one.
 ///
-/// For what cannot move between threads once it is made, such as the session of a world. Threads
-/// are used again, since a pool that its maker takes part in can never be taken down.
+/// For values that cannot move between threads, such as the session of a world. Threads are reused,
+/// since a pool that includes the thread that built it can never be dropped.
 ///
 /// Error: threads cannot be started.
 pub(crate) fn alone(job: impl FnOnce() + Send + 'static) -> PyResult<()> {
@@ -117,7 +117,7 @@ pub(crate) fn alone(job: impl FnOnce() + Send + 'static) -> PyResult<()> {
     }
     drop(idle);
     let (jobs, waiting) = channel();
-    let (tell, told) = channel();
+    let (sender, receiver) = channel();
     let builder = std::thread::Builder::new().name("gump session".into());
     let own = jobs.clone();
     let thread = builder.spawn(move || {
@@ -125,12 +125,12 @@ pub(crate) fn alone(job: impl FnOnce() + Send + 'static) -> PyResult<()> {
         let pool = ThreadPoolBuilder::new().num_threads(size);
         let pool = pool.use_current_thread().build();
         let problem = pool.as_ref().err().map(ToString::to_string);
-        if tell.send(problem).is_ok() && pool.is_ok() {
+        if sender.send(problem).is_ok() && pool.is_ok() {
             serve(size, &own, &waiting);
         }
     });
     thread.map_err(errors::runtime)?;
-    if let Some(problem) = told.recv().map_err(errors::runtime)? {
+    if let Some(problem) = receiver.recv().map_err(errors::runtime)? {
         return Err(errors::runtime(problem));
     }
     jobs.send(job).map_err(errors::runtime)
@@ -139,7 +139,7 @@ pub(crate) fn alone(job: impl FnOnce() + Send + 'static) -> PyResult<()> {
 /// Does one job after another, waiting among the idle between them.
 fn serve(size: usize, jobs: &Sender<Job>, waiting: &Receiver<Job>) {
     while let Ok(job) = waiting.recv() {
-        // Whoever waits for a job that panicked learns it from the channel that it drops.
+        // A panic of the job drops its channel, which its caller notices.
         drop(catch_unwind(AssertUnwindSafe(job)));
         idle().threads.push((size, jobs.clone()));
     }

@@ -1,4 +1,4 @@
-//! Worlds by name, what they imagine, and sessions that go on step by step.
+//! Worlds by name, their simulations, and sessions that advance step by step.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -20,12 +20,12 @@ use crate::scenario::{Scenario, Scene};
 use crate::scenario_arrays::state;
 use crate::{errors, threads};
 
-/// What imagines.
+/// The model of a world.
 #[derive(Clone)]
 pub(crate) enum Kind {
-    /// What really happened: another world in every scenario.
+    /// The log, which is another world in every scenario.
     Log,
-    /// Rules that look at no log.
+    /// Rules that do not use the log.
     Rules(Arc<dyn WorldModel>),
     /// A network of the paper's kind, which also generates scenes.
     Transformer(Arc<TransformerWorld>),
@@ -33,16 +33,16 @@ pub(crate) enum Kind {
     Network(Arc<dyn WorldModel>),
 }
 
-/// A world: imagines how traffic goes on.
+/// A world: simulates the future of traffic.
 #[pyclass(frozen, module = "gump._native")]
 pub(crate) struct World {
     name: String,
     pub(crate) kind: Kind,
-    /// How its frames become those of the scene.
+    /// Conversion of its frames to those of the scene.
     frames: SimulateConfig,
 }
 
-/// How a network draws, as far as it is not the default; see `gump.World`.
+/// Sampling of a network, where it is not the default; see `gump.World`.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 struct Sampling {
@@ -155,13 +155,13 @@ impl World {
         })
     }
 
-    /// Its name, as it was asked for.
+    /// Its name, as it was given.
     #[getter]
     fn name(&self) -> &str {
         &self.name
     }
 
-    /// Imagines `futures` of what comes after the present; float64 `[R, A, T, 4]`.
+    /// Simulates `futures` futures after the present; float64 `[R, A, T, 4]`.
     fn simulate<'py>(
         &self,
         py: Python<'py>,
@@ -189,7 +189,7 @@ impl World {
         Ok(array(py, [futures, ids.len(), steps, 4], numbers)?.into_any())
     }
 
-    /// Opens a session that goes on step by step.
+    /// Opens a session that advances step by step.
     fn start(
         &self,
         py: Python<'_>,
@@ -204,7 +204,7 @@ impl World {
 }
 
 impl World {
-    /// Whether it was asked for by this name.
+    /// Whether it was given this name.
     pub(crate) fn name_is(&self, name: &str) -> bool {
         self.name == name
     }
@@ -232,7 +232,7 @@ impl World {
 }
 
 impl Kind {
-    /// What imagines in every scenario; `None` of the log.
+    /// The model for all scenarios; `None` for the log.
     pub(crate) fn model(&self) -> Option<Arc<dyn WorldModel>> {
         match self {
             Self::Log => None,
@@ -242,7 +242,7 @@ impl Kind {
     }
 }
 
-/// What goes on beside how agents move.
+/// Traffic lights and arrivals, which change beside the motion of agents.
 fn living(config: &SamplingConfig) -> LivingConfig {
     LivingConfig {
         lights: match config.lights {
@@ -280,7 +280,7 @@ fn check_futures(futures: usize) -> PyResult<()> {
     Ok(())
 }
 
-/// The present without the route, which comes from what is to be imagined.
+/// The present without the route, which is derived from the future to be simulated.
 fn start(scene: &Scene, n_futures: usize, seed: Seed) -> Start<'_> {
     Start {
         scene: scene.scenario.present().unguided(),
@@ -289,7 +289,7 @@ fn start(scene: &Scene, n_futures: usize, seed: Seed) -> Start<'_> {
     }
 }
 
-/// Arguments that a world refuses.
+/// The error for arguments that a world refuses.
 fn refusal(error: gump_rollout::BoxError) -> PyErr {
     errors::value(error)
 }
@@ -314,7 +314,7 @@ fn numbers(rollouts: &[Rollout], ids: &[AgentId], hold: bool) -> Vec<f64> {
     numbers
 }
 
-/// Asks a session to go on; the ego's next states, if it is driven.
+/// A request to advance a session; with the ego's next states, if it is driven.
 struct Ask {
     ego: Option<Vec<AgentState>>,
     answer: Sender<Result<Vec<Frame>, String>>,
@@ -339,10 +339,10 @@ impl Session {
         seed: Seed,
     ) -> PyResult<Self> {
         let ids = scene.present().collect();
-        let (tell, told) = channel();
-        let (asks, asked) = channel();
-        threads::alone(move || serve(&*world, &scene, futures, seed, &tell, &asked))?;
-        let dt = py.detach(move || told.recv()).map_err(|_| gone())?;
+        let (ready_sender, ready) = channel();
+        let (asks, requests) = channel();
+        threads::alone(move || serve(&*world, &scene, futures, seed, &ready_sender, &requests))?;
+        let dt = py.detach(move || ready.recv()).map_err(|_| gone())?;
         Ok(Self {
             asks: Mutex::new(Some(asks)),
             process: std::process::id(),
@@ -353,27 +353,27 @@ impl Session {
     }
 }
 
-/// Opens a session, tells its time step, and goes on whenever asked.
+/// Opens a session, sends its time step, and advances it at each request.
 fn serve(
     world: &dyn WorldModel,
     scene: &Scene,
     futures: usize,
     seed: Seed,
-    tell: &Sender<Result<f64, String>>,
-    asked: &Receiver<Ask>,
+    ready_sender: &Sender<Result<f64, String>>,
+    requests: &Receiver<Ask>,
 ) {
     let mut session = match world.open(&[start(scene, futures, seed)]) {
         Ok(session) => session,
         Err(error) => {
-            // Nobody is left to be told if this fails.
-            drop(tell.send(Err(error.to_string())));
+            // If this fails, nobody is waiting for the error.
+            drop(ready_sender.send(Err(error.to_string())));
             return;
         }
     };
-    if tell.send(Ok(session.dt())).is_err() {
+    if ready_sender.send(Ok(session.dt())).is_err() {
         return;
     }
-    while let Ok(ask) = asked.recv() {
+    while let Ok(ask) = requests.recv() {
         let frames = session.step(ask.ego.as_deref());
         if ask
             .answer
@@ -404,7 +404,7 @@ impl Session {
         Ok(array(py, ids.len(), ids)?.into_any())
     }
 
-    /// Imagines the next frame; float64 `[R, A, 6]`: x, y, z, heading and velocity, NaN where an
+    /// Simulates the next frame; float64 `[R, A, 6]`: x, y, z, heading and velocity, NaN where an
     /// agent is absent. `ego` is float64 `[R, 5]`: its next x, y, heading and velocity.
     fn step<'py>(
         &self,
@@ -441,7 +441,7 @@ impl Session {
         Ok(array(py, [frames.len(), self.ids.len(), 6], numbers)?.into_any())
     }
 
-    /// Lets the session go; `step` raises `ValueError` from then on.
+    /// Closes the session; `step` raises `ValueError` from then on.
     fn close(&self) {
         let mut asks = self.asks.lock().unwrap_or_else(PoisonError::into_inner);
         *asks = None;

@@ -18,7 +18,7 @@ use crate::errors;
 use crate::scenario::{Scenario, Scene};
 use crate::threads;
 
-/// The settings of a year, read once, or settings of one's own: TOML, which has more than one line.
+/// The settings of a year, read once, or custom settings: TOML, which has more than one line.
 fn config(year: &str) -> PyResult<Arc<Config>> {
     static CONFIGS: [OnceLock<Arc<Config>>; Year::ALL.len()] = [const { OnceLock::new() }; 5];
     if year.contains('\n') {
@@ -42,7 +42,7 @@ fn config(year: &str) -> PyResult<Arc<Config>> {
     }
 }
 
-/// What is wanted beside the scores.
+/// Results requested beside the scores.
 #[derive(Clone, Copy)]
 struct Wanted {
     leave_one_out: bool,
@@ -56,7 +56,7 @@ const SCORES_ALONE: Wanted = Wanted {
     explain: false,
 };
 
-/// What was found of one scenario.
+/// Results of one scenario.
 struct Found {
     scores: Scores,
     leave_one_out: Option<Vec<f64>>,
@@ -82,39 +82,39 @@ fn evaluate(
 }
 
 impl Found {
-    /// As the keyword arguments of `gump.wosac.Scores`.
-    fn tell<'py>(&self, py: Python<'py>, scenario: &str) -> PyResult<Bound<'py, PyDict>> {
-        let told = PyDict::new(py);
+    /// The results as the keyword arguments of `gump.wosac.Scores`.
+    fn to_dict<'py>(&self, py: Python<'py>, scenario: &str) -> PyResult<Bound<'py, PyDict>> {
+        let dict = PyDict::new(py);
         let scores = &self.scores;
-        told.set_item("scenario_id", scenario)?;
-        told.set_item("metametric", scores.metametric)?;
-        told.set_item("average_displacement_error", scores.ade)?;
-        told.set_item("min_average_displacement_error", scores.min_ade)?;
+        dict.set_item("scenario_id", scenario)?;
+        dict.set_item("metametric", scores.metametric)?;
+        dict.set_item("average_displacement_error", scores.ade)?;
+        dict.set_item("min_average_displacement_error", scores.min_ade)?;
         for (component, likelihood) in &scores.components {
-            told.set_item(field(*component), likelihood)?;
+            dict.set_item(field(*component), likelihood)?;
         }
-        told.set_item("simulated_collision_rate", scores.collision_rate)?;
-        told.set_item("simulated_offroad_rate", scores.offroad_rate)?;
+        dict.set_item("simulated_collision_rate", scores.collision_rate)?;
+        dict.set_item("simulated_offroad_rate", scores.offroad_rate)?;
         if let Some(rate) = scores.traffic_light_violation_rate {
-            told.set_item("simulated_traffic_light_violation_rate", rate)?;
+            dict.set_item("simulated_traffic_light_violation_rate", rate)?;
         }
-        told.set_item("kinematic_metrics", scores.kinematic)?;
-        told.set_item("interactive_metrics", scores.interactive)?;
-        told.set_item("map_based_metrics", scores.map_based)?;
+        dict.set_item("kinematic_metrics", scores.kinematic)?;
+        dict.set_item("interactive_metrics", scores.interactive)?;
+        dict.set_item("map_based_metrics", scores.map_based)?;
         if let Some(without) = &self.leave_one_out {
-            told.set_item("leave_one_out", array(py, without.len(), without.clone())?)?;
+            dict.set_item("leave_one_out", array(py, without.len(), without.clone())?)?;
         }
         if let Some(agents) = &self.per_agent {
-            told.set_item("per_agent", per_agent(py, agents)?)?;
+            dict.set_item("per_agent", per_agent(py, agents)?)?;
         }
         if let Some(attributions) = &self.attributions {
             let list = PyList::empty(py);
             for attribution in attributions {
                 list.append(attribution_dict(py, attribution)?)?;
             }
-            told.set_item("explanation", list)?;
+            dict.set_item("explanation", list)?;
         }
-        Ok(told)
+        Ok(dict)
     }
 }
 
@@ -128,32 +128,32 @@ fn field(component: Component) -> String {
 }
 
 fn per_agent<'py>(py: Python<'py>, agents: &[AgentRealism]) -> PyResult<Bound<'py, PyDict>> {
-    let told = PyDict::new(py);
+    let dict = PyDict::new(py);
     let n_steps = agents.first().map_or(0, |agent| agent.steps.len());
     let ids: Vec<i64> = agents.iter().map(|agent| agent.agent.0).collect();
     let realism: Vec<f64> = agents.iter().map(|agent| agent.realism).collect();
     let steps = agents.iter().flat_map(|agent| &agent.steps);
     let steps: Vec<f64> = steps.map(|step| step.unwrap_or(f64::NAN)).collect();
-    told.set_item("agent_id", array(py, ids.len(), ids)?)?;
-    told.set_item("realism", array(py, realism.len(), realism)?)?;
-    told.set_item("steps", array(py, [agents.len(), n_steps], steps)?)?;
-    Ok(told)
+    dict.set_item("agent_id", array(py, ids.len(), ids)?)?;
+    dict.set_item("realism", array(py, realism.len(), realism)?)?;
+    dict.set_item("steps", array(py, [agents.len(), n_steps], steps)?)?;
+    Ok(dict)
 }
 
 fn attribution_dict<'py>(
     py: Python<'py>,
     attribution: &Attribution,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let told = PyDict::new(py);
-    told.set_item("component", attribution.component.name())?;
-    told.set_item("agent_id", attribution.agent.0)?;
-    told.set_item("kind", attribution.kind.name())?;
-    told.set_item("cost", attribution.cost)?;
-    told.set_item("likelihood", attribution.likelihood)?;
-    told.set_item("step", attribution.step)?;
-    told.set_item("logged", attribution.logged)?;
-    told.set_item("imagined", attribution.imagined)?;
-    Ok(told)
+    let dict = PyDict::new(py);
+    dict.set_item("component", attribution.component.name())?;
+    dict.set_item("agent_id", attribution.agent.0)?;
+    dict.set_item("kind", attribution.kind.name())?;
+    dict.set_item("cost", attribution.cost)?;
+    dict.set_item("likelihood", attribution.likelihood)?;
+    dict.set_item("step", attribution.step)?;
+    dict.set_item("logged", attribution.logged)?;
+    dict.set_item("imagined", attribution.imagined)?;
+    Ok(dict)
 }
 
 /// Rollouts as arrays: states `[R, A, T, 4]`, and for scenario generation sizes `[R, A, T, 3]` and
@@ -283,7 +283,7 @@ fn kind(name: &str) -> PyResult<AgentKind> {
     })
 }
 
-/// Without one rollout of one, nothing is left.
+/// Leaving out one rollout requires at least two.
 fn check_leave_one_out(n_rollouts: usize) -> PyResult<()> {
     if n_rollouts < 2 {
         return Err(errors::value(format!(
@@ -328,7 +328,9 @@ pub(crate) fn wosac_score<'py>(
         let rollouts = arrays.rollouts(&scene.scenario.id, n_steps(config.mode).0);
         evaluate(scene.log()?, &rollouts, &config, wanted)
     })?;
-    found.map_err(errors::value)?.tell(py, &scene.scenario.id)
+    found
+        .map_err(errors::value)?
+        .to_dict(py, &scene.scenario.id)
 }
 
 /// Scores many scenarios over threads; a list each of ids `[A]` and states `[R, A, T, 4]`.
@@ -372,11 +374,11 @@ fn tell_all<'py>(
     scenes: &[Arc<Scene>],
 ) -> PyResult<Vec<Bound<'py, PyDict>>> {
     let pairs = found.into_iter().zip(scenes);
-    let told = pairs.map(|(found, scene)| {
+    let dicts = pairs.map(|(found, scene)| {
         let found = found.map_err(errors::value)?;
-        found.tell(py, &scene.scenario.id)
+        found.to_dict(py, &scene.scenario.id)
     });
-    told.collect()
+    dicts.collect()
 }
 
 /// Scores a batch in CAT-K's layout: positions `[A, R, T, 2]`, heights and headings `[A, R, T]`,
@@ -473,17 +475,19 @@ pub(crate) fn wosac_score_message<'py>(
         let rollouts = Rollouts::of_message(&message, config.mode);
         evaluate(scene.log()?, &rollouts, &config, wanted)
     })?;
-    found.map_err(errors::value)?.tell(py, &scene.scenario.id)
+    found
+        .map_err(errors::value)?
+        .to_dict(py, &scene.scenario.id)
 }
 
-/// What a year's components weigh, by Waymo's names of their likelihoods.
+/// Weights of a year's components, by Waymo's names of their likelihoods.
 #[pyfunction]
 pub(crate) fn wosac_weights<'py>(py: Python<'py>, year: &str) -> PyResult<Bound<'py, PyDict>> {
-    let (config, told) = (config(year)?, PyDict::new(py));
+    let (config, dict) = (config(year)?, PyDict::new(py));
     for component in Component::ALL {
         if let Some(feature) = config.feature(component) {
-            told.set_item(field(component), f64::from(feature.weight))?;
+            dict.set_item(field(component), f64::from(feature.weight))?;
         }
     }
-    Ok(told)
+    Ok(dict)
 }

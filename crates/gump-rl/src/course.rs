@@ -33,7 +33,7 @@ pub struct Course {
 #[derive(Clone, Copy, Debug)]
 struct RouteLight {
     lane: LaneId,
-    /// Where vehicles stop for it, metres along the route.
+    /// Stop position for its light, metres along the route.
     stop_at: f64,
 }
 

@@ -373,7 +373,7 @@ mod tests {
         }
         let next = trajectory.advance(&now, &action, DT, DT);
         assert_eq!(next.pose, intended[0]);
-        // What is not known goes straight on.
+        // Unknown targets continue straight on.
         trajectory.towards(&now, &targets[..2], DT, &mut action);
         let intended = trajectory.intended(&now, &action, DT);
         let expected = targets[1].pose.position + now.velocity * DT * 14.0;

@@ -18,8 +18,8 @@ const MOMENT: f64 = 0.1;
 /// Metres between two tests of road edges, about; these tests take most of a step's time.
 const ROAD_TEST_SPACING: f64 = 2.0;
 
-/// Metres per second that no agent exceeds: whoever is farther away than this allows is not
-/// looked for in the frame before.
+/// Metres per second that no agent exceeds: an agent farther away than this allows is not looked up
+/// in the frame before.
 const FASTEST: f64 = 60.0;
 
 /// Dynamics, rewards and horizon of an episode.
@@ -74,7 +74,7 @@ impl Default for RewardWeights {
     }
 }
 
-/// How an episode ended.
+/// The end of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
     /// By failure: the value after it is 0.
@@ -96,7 +96,7 @@ pub enum Failure {
 /// The state of an episode after some steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeState {
-    /// Steps made.
+    /// Number of steps.
     pub steps: usize,
     /// The ego now.
     pub ego: Agent,
@@ -108,7 +108,7 @@ pub struct EpisodeState {
     pub reward: f64,
     /// Totals of all steps.
     pub totals: Totals,
-    /// How it ended, if it did.
+    /// The end of the episode; `None` while it goes on.
     pub end: Option<End>,
 }
 
@@ -335,7 +335,7 @@ fn turn_rate(from: &AgentState, to: &AgentState, dt: f64) -> f64 {
 }
 
 /// [`gump_metrics::Collision`] of the ego at any moment of a step. `way` has the ego at evenly
-/// spaced moments, the last of them the step's end; nobody moves farther than `farthest` metres.
+/// spaced moments, the last of them the step's end; no agent moves farther than `farthest` metres.
 fn collides(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> bool {
     let own = way[way.len() - 1].oriented_box();
     let from_end = |ego: &Agent| ego.state.pose.position.distance(own.pose.position);

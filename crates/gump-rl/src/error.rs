@@ -25,7 +25,7 @@ pub enum RlError {
     /// A batch of another size than the environment's.
     #[error("{who} gave {found} values, expected {expected}")]
     Count {
-        /// What has the wrong size.
+        /// Name of the source of the values.
         who: &'static str,
         /// The required size.
         expected: usize,
@@ -97,10 +97,10 @@ pub enum RlError {
         source: BoxError,
     },
     /// Sampling from an empty buffer.
-    #[error("cannot sample {asked} transitions from an empty buffer")]
+    #[error("cannot sample {requested} transitions from an empty buffer")]
     EmptyBuffer {
         /// The requested number.
-        asked: usize,
+        requested: usize,
     },
     /// An environment whose shapes differ from the policy's.
     #[error("the environment has {found} numbers in its {what}, the policy expects {expected}")]

@@ -48,7 +48,7 @@ pub struct Drive {
     pub progress: f64,
     /// True if no comfort bound was exceeded.
     pub comfortable: bool,
-    /// Steps made.
+    /// Number of steps.
     pub steps: usize,
 }
 

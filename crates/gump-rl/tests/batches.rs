@@ -1,4 +1,4 @@
-//! What a batch of episodes must not do to any of them.
+//! Episodes in a batch do not affect each other.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -147,7 +147,7 @@ fn agents_far_away_follow_the_log() {
     assert_eq!(of(Some(2)), of(Some(2)));
 }
 
-/// Replaying the log needs no session; a session that replays it moves everyone alike.
+/// Replaying the log needs no session; a session that replays it gives the same motion.
 #[test]
 fn the_log_is_the_world_that_replays_it() {
     for course in busy(4).iter() {
@@ -268,7 +268,7 @@ fn a_finished_row_is_not_stepped() {
     assert!(matches!(error, RlError::Count { found: 3, .. }));
 }
 
-/// Constant velocity, which breaks when told to.
+/// Constant velocity; fails on request.
 #[derive(Default)]
 struct Fragile {
     broken: AtomicBool,
@@ -319,7 +319,7 @@ fn failures_of_the_world_are_reported() {
     world.broken.store(true, Ordering::Relaxed);
     let error = fragile.step(&[0.0; 4]).unwrap_err();
     assert!(matches!(error, RlError::World { ref world, .. } if world == "fragile"));
-    // Nobody knows what a session is worth after that.
+    // The state of the session is unknown after that.
     assert!(matches!(fragile.step(&[0.0; 4]), Err(RlError::NotReset)));
     world.broken.store(false, Ordering::Relaxed);
     world.drops_ego.store(true, Ordering::Relaxed);

@@ -22,14 +22,14 @@ fn socket(name: &str) -> PathBuf {
     std::env::temp_dir().join(format!("gump-rl-{}-{name}", std::process::id()))
 }
 
-/// Runs a server on the log while `talk` talks to it; what happened.
+/// Runs a server on the log while `talk` talks to it; returns its events.
 fn with_server(name: &str, courses: &Arc<[Course]>, talk: impl FnOnce(&Path)) -> Vec<Event> {
     let path = socket(name);
     let server = Server::bind(&path).unwrap();
     let events = Mutex::new(Vec::new());
-    let tell = |event| events.lock().unwrap().push(event);
+    let record = |event| events.lock().unwrap().push(event);
     std::thread::scope(|scope| {
-        let run = || server.run(courses, Traffic::Log, &config(1), &tell);
+        let run = || server.run(courses, Traffic::Log, &config(1), &record);
         let running = scope.spawn(run);
         let stop = StopOnDrop(&server);
         talk(&path);
@@ -127,7 +127,7 @@ fn numbers(body: &[u8]) -> Vec<f32> {
     body.chunks_exact(4).map(number).collect()
 }
 
-/// How the only client left.
+/// Returns the farewell of the only client.
 fn farewell(events: &[Event]) -> &gump_rl::server::Farewell {
     match events {
         [
@@ -209,10 +209,10 @@ fn refusals_change_nothing_and_the_talk_goes_on() {
     });
 }
 
-/// Sends garbage; what the server said to it and why it hung up.
+/// Sends garbage; returns the message of the server and the error it hung up with.
 fn garbage(name: &str, greeted: bool, bytes: &[u8]) -> (String, ServerError) {
     let courses = busy(1);
-    let mut said = String::new();
+    let mut message = String::new();
     let mut events = with_server(name, &courses, |path| {
         let mut client = if greeted {
             Client::greeted(path, 1)
@@ -222,14 +222,14 @@ fn garbage(name: &str, greeted: bool, bytes: &[u8]) -> (String, ServerError) {
         let (code, what) = client.refused(bytes);
         assert_eq!(code, 1);
         assert!(client.is_over());
-        said = what;
+        message = what;
         // The server lives on.
         Client::greeted(path, 1).reset([1, 2, 3]);
     });
     let of_first = |event: &Event| matches!(event, Event::Left { client: 0, .. });
     let left = events.iter().position(of_first).unwrap();
     match events.swap_remove(left) {
-        Event::Left { farewell, .. } => (said, farewell.error.unwrap()),
+        Event::Left { farewell, .. } => (message, farewell.error.unwrap()),
         Event::Came { .. } => unreachable!("it was found by its kind"),
     }
 }
@@ -237,9 +237,9 @@ fn garbage(name: &str, greeted: bool, bytes: &[u8]) -> (String, ServerError) {
 #[test]
 fn garbage_is_answered_and_the_server_lives_on() {
     let greeting = |name, bytes: &[u8]| {
-        let (said, error) = garbage(name, false, bytes);
+        let (message, error) = garbage(name, false, bytes);
         assert!(matches!(error, ServerError::Greeting { version: 1 }));
-        assert_eq!(said, error.to_string());
+        assert_eq!(message, error.to_string());
     };
     greeting("http", b"GET / HTTP/1.1\r\n\r\n");
     greeting(
@@ -248,14 +248,14 @@ fn garbage_is_answered_and_the_server_lives_on() {
     );
     greeting("early", &frame(3, &[0; 24]));
 
-    let (said, error) = garbage("many", false, &hello(1_000_000, 0));
+    let (message, error) = garbage("many", false, &hello(1_000_000, 0));
     assert!(matches!(error, ServerError::Choice { most: 4096, .. }));
-    assert!(said.contains("number of rows is 1000000"), "{said}");
+    assert!(message.contains("number of rows is 1000000"), "{message}");
     let (_, error) = garbage("mode", false, &hello(2, 9));
     assert!(matches!(error, ServerError::Choice { found: 9, .. }));
     let (_, error) = garbage("kind", true, &frame(77, &[]));
     assert!(matches!(error, ServerError::Kind { found: 77, .. }));
-    let (said, error) = garbage("length", true, &frame(3, &[0; 5]));
+    let (message, error) = garbage("length", true, &frame(3, &[0; 5]));
     assert!(matches!(
         error,
         ServerError::Length {
@@ -264,8 +264,8 @@ fn garbage_is_answered_and_the_server_lives_on() {
             ..
         }
     ));
-    assert_eq!(said, "a step has 24 bytes, found 5");
-    // Nobody allocates 4 GiB because a client says so.
+    assert_eq!(message, "a step has 24 bytes, found 5");
+    // A client cannot make the server allocate 4 GiB.
     let (_, error) = garbage("huge", true, &[255, 255, 255, 255, 2]);
     assert!(matches!(error, ServerError::Length { what: "reset", .. }));
     let (_, error) = garbage("reset", true, &frame(2, &[7]));
@@ -338,8 +338,8 @@ fn the_python_client_works() {
     with_server("python", &busy(8), |path| {
         let output = Command::new(&python).arg(&script).arg(path).output();
         let output = output.unwrap();
-        let said = String::from_utf8_lossy(&output.stderr);
-        eprintln!("{}{said}", String::from_utf8_lossy(&output.stdout));
-        assert!(output.status.success(), "{said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        eprintln!("{}{stderr}", String::from_utf8_lossy(&output.stdout));
+        assert!(output.status.success(), "{stderr}");
     });
 }

@@ -41,7 +41,7 @@ pub enum RolloutError {
         ego: AgentId,
         /// Index of the future.
         future: usize,
-        /// Session steps simulated by then.
+        /// Session steps simulated before the error.
         step: usize,
     },
     /// A trajectory command that cannot be followed.
@@ -66,7 +66,7 @@ pub enum RolloutError {
     /// A time that a trajectory does not cover.
     #[error("a trajectory from {start_us} to {end_us} µs says nothing of {time_us} µs")]
     OutsideTrajectory {
-        /// The time asked for, microseconds.
+        /// The requested time, microseconds.
         time_us: i64,
         /// Time of the first state, microseconds.
         start_us: i64,
@@ -82,7 +82,7 @@ pub enum RolloutError {
     /// A slot that the session does not have.
     #[error("the session has {n} futures, there is none with index {future}")]
     NoSuchFuture {
-        /// The index asked for.
+        /// The requested index.
         future: usize,
         /// Futures in the session.
         n: usize,
@@ -96,7 +96,7 @@ pub enum RolloutError {
     /// A planner or traffic failed during a closed loop.
     #[error("iteration {iteration}: {who}: {what}")]
     Loop {
-        /// Iterations completed by then.
+        /// Iterations completed before the error.
         iteration: usize,
         /// The component that failed.
         who: String,

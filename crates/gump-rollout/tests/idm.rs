@@ -127,7 +127,7 @@ fn it_stops_at_red_and_drives_at_green() {
     assert!(red.speed() < 0.1 && (74.0..77.6).contains(&red.pose.position.x));
     assert!(check("green", "10,0 velocity 12,0").pose.position.x > 150.0);
     assert!(check("unknown", "10,0 velocity 12,0").pose.position.x > 150.0);
-    // Whoever stands at a light waits for it, whatever its colour, unless it is seen to be green.
+    // A vehicle that stands at a light waits unless the light is seen to be green.
     assert!(check("unknown", "76,0").pose.position.x < 77.6);
     assert_eq!(check("red", "79,0").pose.position.x, 79.0);
     assert!(check("green", "76,0").pose.position.x > 120.0);

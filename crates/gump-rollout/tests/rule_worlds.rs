@@ -145,7 +145,7 @@ fn a_slot_can_be_replaced() {
 }
 
 /// A fork, and a log that goes on as `way` says: the ego takes that lane, which its route shows as
-/// readers infer it; on the third lane a light turns red and somebody appears. Equal up to now.
+/// readers infer it; on the third lane a light turns red and an agent appears. Equal up to now.
 fn recording(way: i64) -> Scenario {
     let text = format!(
         "lane 1: 0,0 50,0 next 2,3

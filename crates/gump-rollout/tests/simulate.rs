@@ -17,7 +17,7 @@ use std::f64::consts::PI;
 /// The script of a world: the frame of knot `k`, given the present.
 type Script = fn(&Frame, usize) -> Frame;
 
-/// A world that steps by 0.5 s and follows a script; a driven ego is where it was told.
+/// A world that steps by 0.5 s and follows a script; a driven ego is at the given state.
 struct Scripted(Script);
 
 impl WorldModel for Scripted {
@@ -349,7 +349,7 @@ fn agents_keep_their_height_over_the_road() {
     assert_eq!(rollouts[0].last().ego_now().elevation, 0.8);
 }
 
-/// Drives with one command for ever and checks what it is shown.
+/// Drives with one command forever and checks the scenes it gets.
 struct Constant(Command);
 
 impl Policy for Constant {

@@ -24,7 +24,7 @@ pub struct Light {
     pub lane: LaneId,
     /// Its colour now.
     pub state: LightState,
-    /// Where vehicles stop for it, world frame, metres; `None` where a format has none.
+    /// Point at which vehicles stop for it, world frame, metres; `None` if the format has none.
     pub stop_point: Option<DVec2>,
 }
 

@@ -214,15 +214,15 @@ pub enum AreaKind {
     SpeedBump,
     /// Access to a property.
     Driveway,
-    /// Where vehicles wait.
+    /// A place at which vehicles wait.
     StopLine,
-    /// Where vehicles wait before they turn across oncoming traffic.
+    /// A place at which vehicles wait before they turn across oncoming traffic.
     TurnStop,
     /// The area of an intersection.
     Intersection,
     /// For people on foot.
     Walkway,
-    /// Where vehicles park.
+    /// A place to park vehicles.
     Carpark,
 }
 

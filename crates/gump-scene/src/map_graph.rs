@@ -138,7 +138,7 @@ impl MapGraph {
     /// Lanes whose surface shares a point with the axis-aligned square of side `2 * half` metres
     /// around `center`, in the order of [`MapGraph::lanes`].
     ///
-    /// Source: the proximity query of nuPlan, which asks for a square where others ask for a disc.
+    /// Source: the proximity query of nuPlan, which uses a square where others use a disc.
     pub fn lanes_in_square(&self, center: DVec2, half: f64) -> impl Iterator<Item = &Lane> {
         let square = square(center, half);
         sorted(self.lane_boxes().intersecting(center - half, center + half))

@@ -21,7 +21,7 @@ pub struct Scenario {
     pub now: usize,
     /// The ego.
     pub ego: AgentId,
-    /// Agents a benchmark asks to predict, sorted; the ego need not be among them.
+    /// Agents that a benchmark requires to be predicted, sorted; the ego need not be among them.
     pub targets: Vec<AgentId>,
     /// Agents marked as interacting, in the order given.
     pub objects_of_interest: Vec<AgentId>,

@@ -1,4 +1,4 @@
-//! Where a light stops traffic, the path of that traffic, and whether two such paths cross.
+//! Stop lines of lights, the paths of traffic past them, and whether two such paths cross.
 
 use std::f64::consts::FRAC_PI_6;
 

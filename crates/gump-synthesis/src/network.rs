@@ -49,7 +49,7 @@ pub(crate) struct Network {
     pub(crate) hides_limits: bool,
     /// Lanes that are not on the map, often those of car parks.
     pub(crate) unmapped: BTreeSet<LaneIdx>,
-    /// Where car parks and yards open to a road.
+    /// Openings of car parks and yards to a road.
     pub(crate) mouths: Vec<Mouth>,
     /// Edges inside car parks and yards, as indices into [`Furniture::edges`].
     pub(crate) inner_edges: BTreeSet<usize>,
@@ -190,24 +190,24 @@ pub(crate) struct Connector {
 pub(crate) struct Conflict {
     /// The other connector.
     pub(crate) other: LaneIdx,
-    /// From where to where on this connector, metres.
+    /// Start and end on this connector, metres.
     pub(crate) mine: (f64, f64),
-    /// From where to where on the other, metres.
+    /// Start and end on the other, metres.
     pub(crate) theirs: (f64, f64),
 }
 
-/// Where a connector passes a crosswalk.
+/// The intersection of a connector with a crosswalk.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Crossing {
     /// Index into [`Network::crosswalks`].
     pub(crate) crosswalk: usize,
-    /// From where to where on the connector, metres.
+    /// Start and end on the connector, metres.
     pub(crate) along: (f64, f64),
-    /// From where to where on the crosswalk's walk, metres.
+    /// Start and end on the crosswalk's walk, metres.
     pub(crate) across: (f64, f64),
 }
 
-/// Where a lane shares its surface with another.
+/// A stretch on which a lane shares its surface with another.
 #[derive(Debug)]
 pub(crate) struct Overlap {
     /// The other lane.

@@ -39,7 +39,7 @@ pub(crate) struct NodePlan {
 /// The right-of-way rule of a junction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Control {
-    /// Nobody waits: lanes join or end without crossing.
+    /// No right-of-way rule: lanes join or end without crossing.
     Free,
     /// Traffic lights.
     Signals,
@@ -118,7 +118,7 @@ impl RoadPlan {
         self.half_width(forward) - GUTTER - self.parking_depth() / 2.0
     }
 
-    /// How far parked cars reach from the curb, metres.
+    /// Depth of parked cars from the curb, metres.
     fn parking_depth(&self) -> f64 {
         if self.bays { BAY_DEPTH } else { PARKING_WIDTH }
     }

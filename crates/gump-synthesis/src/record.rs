@@ -172,12 +172,12 @@ impl Recording {
 }
 
 impl Track {
-    /// Where the box is in a frame.
+    /// The pose in a frame.
     pub(crate) fn pose(&self, frame: usize) -> Option<Pose> {
         self.poses[frame + 1]
     }
 
-    /// Where the box is in a snapshot.
+    /// The pose in a snapshot.
     pub(crate) fn pose_at_snapshot(&self, snapshot: usize) -> Option<Pose> {
         self.poses[snapshot]
     }
@@ -222,7 +222,7 @@ impl Track {
         let pose = self.pose(frame)?;
         let [length, width, height] = self.body.size;
         let (before, after) = (self.poses[frame], self.poses[frame + 2]);
-        // Velocity is what the positions say, centred where both neighbours exist.
+        // The velocity is the difference of positions, centred where both neighbours exist.
         let velocity = match (before, after) {
             (Some(a), Some(b)) => (b.position - a.position) / (2.0 * dt),
             (Some(a), None) => (pose.position - a.position) / dt,

@@ -36,7 +36,7 @@ pub fn try_synthesize(config: &SynthesisConfig, seed: Seed) -> Option<Scenario> 
     let family = config
         .family
         .unwrap_or_else(|| RoadFamily::ALL[seed.rng().random_range(0..RoadFamily::ALL.len())]);
-    // Scenes that nobody drives through, or in which boxes touch, are drawn again.
+    // Scenes without traffic for an ego, or in which boxes touch, are drawn again.
     (0..ATTEMPTS).find_map(|attempt| draw_scenario(config, family, seed, attempt))
 }
 

@@ -54,7 +54,7 @@ impl SumoDemand {
     }
 }
 
-/// Minimum metres of lane per vehicle: with more vehicles traffic stands.
+/// Minimum metres of lane per vehicle: with more vehicles traffic jams.
 const METRES_PER_VEHICLE: f64 = 45.0;
 /// Share of the trips that begin in the first seconds, to fill empty streets.
 const FIRST_SHARE: f64 = 0.5;

@@ -1,4 +1,4 @@
-//! What holds for the road of every procedural scene.
+//! Properties of the road of every procedural scene.
 
 use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{AreaKind, LaneKind, Scenario, Seed};

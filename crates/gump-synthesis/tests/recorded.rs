@@ -1,4 +1,4 @@
-//! What holds for scenes like recorded ones, checked on fifty of them.
+//! Properties of scenes like recorded ones, checked on fifty of them.
 
 use std::sync::OnceLock;
 

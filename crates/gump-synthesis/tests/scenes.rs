@@ -1,4 +1,4 @@
-//! What holds for every procedural scene, checked on two hundred of them.
+//! Properties of every procedural scene, checked on two hundred of them.
 
 use std::collections::BTreeSet;
 use std::sync::OnceLock;

@@ -7,12 +7,12 @@
 //!
 //! In addition:
 //! * prompts are one "none" or different tags;
-//! * the indices of a frame's lights ascend, and an index never stands for two places;
+//! * the indices of a frame's lights ascend, and an index never denotes two places;
 //! * each of the two lists of agents is in canonical order, and the ego is the first of the tracked
 //!   ones;
 //! * an agent of the previous frame is tracked or gone, any other is newborn; the first frame has
 //!   no newborn agents;
-//! * an id occurs once per frame and never stands for two classes;
+//! * an id occurs once per frame and never denotes two classes;
 //! * every bin lies in its field's sub-vocabulary.
 //!
 //! Source: the frame layout of the GUMP paper and its released code, which emits BEGIN once per
@@ -39,7 +39,7 @@ pub enum GrammarError {
     Unexpected {
         /// Index of the slot in its sequence.
         position: usize,
-        /// What would have been allowed.
+        /// The slots that would have been allowed.
         expected: String,
         /// The slot found.
         found: String,
@@ -267,7 +267,7 @@ impl Allowed<'_> {
     }
 
     /// The tokens of all single-token slots that may come next, ascending; none before a value,
-    /// whose tokens are those of its fields. Prompts have a table of their own.
+    /// whose tokens are those of its fields. Prompts have a separate table.
     pub fn tokens(&self) -> Vec<u32> {
         let ids: BTreeSet<u16> = self.keys().map(|key| key.id).collect();
         let mut tokens: Vec<u32> = ids.into_iter().map(u32::from).collect();

@@ -15,7 +15,7 @@ use crate::{
     TokenFrame, TokenSequence,
 };
 
-/// Which parts of a scene become tokens.
+/// The parts of a scene that become tokens.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TokenizerConfig {
     /// An agent farther than this from the scene's origin along either axis has no token in that
@@ -264,7 +264,7 @@ impl Tokenizer {
     }
 
     fn range(&self, kind: AgentKind) -> f64 {
-        // What a token puts on the edge must not fall off it on its way through the world frame.
+        // A position on the edge of the grid must stay inside on its way through the world frame.
         let slack = SLACK * Field::X.step();
         match kind {
             AgentKind::Pedestrian => self.config.pedestrian_range_m + slack,
@@ -273,7 +273,7 @@ impl Tokenizer {
     }
 }
 
-/// Whose view the tokens take.
+/// The ego and frame of reference of the tokens.
 struct View<'a> {
     ego: AgentId,
     world_from_scene: Pose,

@@ -1,7 +1,7 @@
 //! The vocabulary: the meaning of tokens. The tokens of state fields are in [`Field`].
 //!
 //! 1 ego key, 320 agent keys, 4 light states, 2874 field values and 3 marks make 2972 tokens, the
-//! size stated in the GUMP paper; PAD is additional. Classes and prompts have tables of their own.
+//! size stated in the GUMP paper; PAD is additional. Classes and prompts have separate tables.
 //!
 //! [`Field`]: crate::Field
 
@@ -27,11 +27,11 @@ pub const PAD: u32 = 2972;
 pub const VOCABULARY_SIZE: u32 = 2972;
 /// Rows of a token table, including PAD.
 pub const TABLE_ROWS: u32 = 2973;
-/// Classes of agents, in a table of their own.
+/// Classes of agents, in a separate table.
 pub const N_CLASSES: usize = AgentKind::MOVING.len();
 /// Maximum number of lights of a frame; light indices run from 1 to this.
 pub const MAX_LIGHTS: usize = gump_scene::MAX_LIGHTS;
-/// Prompts, in a table of their own: the scenario tags, then "none".
+/// Prompts, in a separate table: the scenario tags, then "none".
 pub const N_PROMPTS: usize = ScenarioTag::COUNT + 1;
 
 /// Row of a kind in the class table: vehicle 0, pedestrian 1, bicycle 2.

@@ -16,7 +16,7 @@ use gump_scene::{
 };
 use rand::Rng as _;
 
-/// Where agents enter and leave.
+/// Distances at which agents enter and leave.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Arrivals {
     /// Radius of the windows around the start and around the ego, metres.
@@ -41,14 +41,14 @@ const KINDS: [AgentKind; 3] = AgentKind::MOVING;
 const USUAL_SPEED: [f64; 3] = [7.0, 1.3, 4.5];
 /// Share of the window's width that an entering agent crosses.
 const CROSSED: f64 = 0.6;
-/// How far the ego may move before it gets its own window, or its gates are determined again,
+/// Distance that the ego may move before it gets its own window, or its gates are determined again,
 /// metres.
 const MOVED_M: f64 = 20.0;
 /// An agent that is this far outside the window and moves away leaves, metres.
 const BEYOND_M: f64 = 12.0;
 /// Sampling distance along lanes, metres.
 const STEP_M: f64 = 5.0;
-/// Agents this many windows away leave, even if they stand.
+/// Agents this many windows away leave, even if they do not move.
 const FAR: f64 = 1.8;
 /// An agent nearer than this to the end of the map leaves there, metres.
 const END_M: f64 = 5.0;
@@ -452,7 +452,8 @@ fn aside(pose: Pose, left: f64) -> Pose {
     }
 }
 
-/// Where a lane enters circles around these centres, or leaves them if `inward` is -1.
+/// Arc lengths at which a lane enters circles around these centres, or leaves them if `inward` is
+/// -1, metres.
 fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f64> {
     let line = lane.centerline.resample(STEP_M);
     let beyond = |p: DVec2| inward * (nearest(centres, p).1 - radius);

@@ -10,7 +10,7 @@ use gump_scene::{AgentId, AgentKind, Frame, LightState, Rollout, Scenario, Seed,
 use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, RecordedLights};
 
 /// Half a kilometre of road with a lane in either direction, a junction with a light in its middle,
-/// and an ego that stands beside it.
+/// and an ego parked beside it.
 fn road(light: &str) -> Scenario {
     let vehicles: String = (0..6)
         .map(|i| {
@@ -71,14 +71,14 @@ fn two_minutes_later_as_many_are_there() {
     for future in &futures {
         let frames = future.imagined();
         let last = &frames[frames.len() - 1];
-        // Whoever drove there at first is gone.
+        // The initial vehicles are gone.
         assert!((1..=6).all(|id| last.agent(AgentId(id)).is_none()));
         for frame in frames.iter().skip(300).step_by(100) {
             let agents = frame.agents().iter();
             let n = agents.filter(|a| a.kind == AgentKind::Vehicle && a.id.0 != 0);
             vehicles.push(n.count() as f64);
         }
-        // Nobody comes twice, and nobody comes or leaves near the ego.
+        // No agent enters twice, and none enters or leaves near the ego.
         let mut seen: BTreeMap<AgentId, (usize, usize)> = BTreeMap::new();
         for (k, frame) in frames.iter().enumerate() {
             for id in others(frame) {
@@ -185,7 +185,7 @@ fn recorded_lights_are_shown_as_recorded() {
     {
         assert_eq!(frame.lights(), logged.lights());
     }
-    // The log shows its own whatever it is told.
+    // A log replay shows its own lights, whatever lights it is given.
     let signals = Living::new(LogReplay::new(&scenario), LivingConfig::default());
     for (frame, logged) in futures(&signals, &scenario, 1, 8.0)[0]
         .imagined()

@@ -70,7 +70,7 @@ impl BatchGradients {
         }
         let mut numbers = self.loss.numbers();
         numbers.push(self.tokens as f32);
-        let n_told = numbers.len();
+        let n_scalars = numbers.len();
         for (name, var) in parameters.trainable() {
             // Each gradient after whether there is one.
             match self.gradients.get(name) {
@@ -85,9 +85,9 @@ impl BatchGradients {
             numbers.extend(var.flatten_all()?.to_vec1::<f32>()?);
         }
         peers.sum(&mut numbers)?;
-        let (told, mut rest) = numbers.split_at(n_told);
-        self.tokens = told[n_told - 1].round() as usize;
-        self.loss = LossParts::of_numbers(&told[..n_told - 1]);
+        let (scalars, mut rest) = numbers.split_at(n_scalars);
+        self.tokens = scalars[n_scalars - 1].round() as usize;
+        self.loss = LossParts::of_numbers(&scalars[..n_scalars - 1]);
         let mut take = |n: usize| {
             let (taken, left) = rest.split_at(n);
             rest = left;

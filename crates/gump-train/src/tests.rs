@@ -343,7 +343,7 @@ impl ProcessGroup for Thread {
             assert_eq!(desk.len(), numbers.len());
             numbers.iter_mut().zip(&*desk).for_each(|(n, d)| *n += d);
         }
-        // Nobody writes before everybody has read.
+        // No process writes before all have read.
         self.barrier.wait();
         Ok(())
     }

@@ -336,8 +336,8 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainError::Peers`] if the connection to another process is lost.
-    pub fn any(&self, said: bool) -> Result<bool, TrainError> {
-        let mut number = [f32::from(u8::from(said))];
+    pub fn any(&self, flag: bool) -> Result<bool, TrainError> {
+        let mut number = [f32::from(u8::from(flag))];
         self.peers.sum(&mut number)?;
         Ok(number[0] > 0.0)
     }

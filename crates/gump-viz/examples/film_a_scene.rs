@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scene = scenario.present();
     std::fs::create_dir_all("out")?;
 
-    // A hundred metres around the ego, which looks up; thin lines show where everyone goes.
+    // A hundred metres around the ego, which looks up; thin lines show the paths of all agents.
     let camera = Camera::on_ego(&scene, 100.0, 640, 480);
     let spec = PictureSpec::new(camera)
         .with_theme(Theme::Dark)

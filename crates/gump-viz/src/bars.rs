@@ -1,4 +1,4 @@
-//! Bar charts of tables: a row of words, and a bar per column with how sure it is.
+//! Bar charts of tables: a name per row, and a bar per column with its uncertainty interval.
 
 use std::path::Path;
 
@@ -11,11 +11,11 @@ use crate::{Picture, Theme, VizError};
 /// Horizontal bars in groups, so that long names can be read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Bars {
-    /// Words above the chart, perhaps none; also what errors call it.
+    /// Title above the chart, may be empty; also names the chart in errors.
     pub title: String,
-    /// What is measured and its unit.
+    /// The measured quantity and its unit.
     pub label: String,
-    /// What the bars of a group are, in their order; the legend says so if there are several.
+    /// Names of the bars of a group, in order; shown in a legend if there are several.
     pub series: Vec<String>,
     /// Groups from top to bottom.
     pub groups: Vec<BarGroup>,
@@ -24,18 +24,18 @@ pub struct Bars {
 /// The bars of one row of a table.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BarGroup {
-    /// Stands on the left.
+    /// Label to the left of the bars.
     pub name: String,
-    /// One per series; `None` and what is not finite leaves a gap.
+    /// One per series; `None` and values that are not finite leave a gap.
     pub bars: Vec<Option<Bar>>,
 }
 
-/// A number and how sure it is.
+/// A number and its interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bar {
     /// Length of the bar.
     pub value: f64,
-    /// From where to where the value may be.
+    /// Lower and upper bound of the value.
     pub span: Option<(f64, f64)>,
 }
 
@@ -180,7 +180,7 @@ impl Bars {
         Ok(())
     }
 
-    /// What stands at a place of the vertical axis.
+    /// Returns the label at a place of the vertical axis.
     fn name_at(&self, y: f64) -> String {
         let is_whole = (y - y.round()).abs() < 1e-6 && y >= 1.0;
         let group = is_whole.then(|| self.groups.get(y.round() as usize - 1));

@@ -1,4 +1,4 @@
-//! Which part of the world is seen.
+//! The camera: the part of the world that is seen.
 
 use std::ops::RangeInclusive;
 
@@ -8,7 +8,7 @@ use gump_scene::{Agent, Rollout, SceneState};
 /// A view from straight above.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// The point in the middle of the picture, and which way is up.
+    /// The point in the middle of the picture, and the world direction that is up.
     pub world_from_camera: Pose,
     /// Metres visible across the width, > 0.
     pub metres: f64,
@@ -80,12 +80,12 @@ impl Camera {
         Self::framing(positions, heading, min_metres, size_px)
     }
 
-    /// Shows the ego's way and everyone who moves near it in any of these futures, the ego's present
-    /// heading up; fixed, so that the road need be drawn only once per film.
+    /// Shows the ego's path and all agents that move near it in any of these futures, the ego's
+    /// present heading up; fixed, so that the road need be drawn only once per film.
     ///
     /// Units: `metres` are the least and the most that may be visible across the width.
-    /// Error: none; `None` if the ego's own way takes more than that, so that the camera had better
-    /// go along.
+    /// Error: none; `None` if the ego's path alone takes more than that, so that the camera should
+    /// follow the ego.
     pub fn on_movement(
         rollouts: &[&Rollout],
         metres: RangeInclusive<f64>,
@@ -135,12 +135,12 @@ impl Camera {
     }
 }
 
-/// How near to the ego, metres, movement is worth seeing.
+/// Distance from the ego within which moving agents are framed, metres.
 const NEAR: f64 = 30.0;
-/// How far an agent goes at least that counts as moving, metres.
+/// An agent that goes farther than this counts as moving, metres.
 const MOVES: f64 = 2.0;
 
-/// Where the ego is, and everyone else while they are near it and have moved.
+/// Positions of the ego, and of all other agents while they are near it and have moved.
 fn moving(rollout: &Rollout) -> Vec<DVec2> {
     let start = rollout.start();
     let mut points = Vec::new();

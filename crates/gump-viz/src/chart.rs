@@ -13,7 +13,7 @@ use crate::{Picture, Theme, VizError};
 /// A line chart.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Chart {
-    /// Words above the chart, perhaps none; also what errors call it.
+    /// Title above the chart, may be empty; also names the chart in errors.
     pub title: String,
     /// Name and unit of the horizontal axis.
     pub x_label: String,
@@ -25,8 +25,7 @@ pub struct Chart {
     pub log_y: bool,
     /// Whether to mark each point with a disc: for few points that were measured.
     pub markers: bool,
-    /// What stands at 1, 2, ... of the horizontal axis, where these are no numbers but ways; empty
-    /// for an axis of numbers.
+    /// Labels at 1, 2, ... of a horizontal axis of categories; empty for an axis of numbers.
     pub ways: Vec<String>,
     /// The curves, in the order of the legend.
     pub series: Vec<Series>,
@@ -35,11 +34,11 @@ pub struct Chart {
 /// One curve.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Series {
-    /// What the legend calls it; without a name it is not in the legend.
+    /// Name in the legend; a curve without a name is not in the legend.
     pub name: String,
     /// Points from left to right; points that are not finite are left out.
     pub points: Vec<(f64, f64)>,
-    /// How sure they are: x, and from where to where the value may be.
+    /// Intervals: x, and the lower and upper bound of the value.
     pub spans: Vec<(f64, f64, f64)>,
 }
 
@@ -83,7 +82,7 @@ impl Chart {
         v.is_finite() && (!is_log || v > 0.0)
     }
 
-    /// What stands at a place of the horizontal axis.
+    /// Returns the label at a place of the horizontal axis.
     fn x_tick(&self, x: f64) -> String {
         if self.ways.is_empty() {
             return tick(x);

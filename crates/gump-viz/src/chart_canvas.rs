@@ -1,4 +1,4 @@
-//! Where charts are drawn as pixels: the lines and words of `plotters` by the means of pictures.
+//! A `plotters` backend that draws charts as pixels with the drawing code of pictures.
 
 use std::convert::Infallible;
 
@@ -19,13 +19,13 @@ use crate::theme::Rgb;
 pub(crate) const DENSITY: f32 = 2.0;
 /// Height of a capital as a share of the size of a font.
 const CAPITAL: f64 = 0.7;
-/// What the other backend divides sizes of fonts by.
+/// Divisor of font sizes in the other backend.
 const FONT_SCALE: f64 = 1.24;
 
 /// A pixmap in units of the drawing.
 pub(crate) struct ChartCanvas<'a> {
     pixmap: &'a mut Pixmap,
-    /// The colour that stands for that of text, and that.
+    /// The placeholder for the text colour, and the text colour.
     text: (Rgb, Rgb),
 }
 
@@ -71,7 +71,7 @@ impl<'a> ChartCanvas<'a> {
     }
 }
 
-/// A point of a grid of whole units as the middle of what it stands for.
+/// The middle of the cell at a point of the integer grid.
 fn middle((x, y): BackendCoord) -> (f32, f32) {
     (x as f32 + 0.5, y as f32 + 0.5)
 }

@@ -1,4 +1,4 @@
-//! What moves: agents, their trails, and lights.
+//! Drawing of agents, their trails, and lights.
 //!
 //! Shapes of one colour are gathered into one path each, which keeps films fast.
 
@@ -22,8 +22,8 @@ const KINDS: [AgentKind; 7] = [
 /// Boxes smaller than this are drawn as discs, pixels.
 const SMALLEST_BOX: f32 = 4.0;
 
-/// Boxes narrower than this have neither border nor round corners, pixels: nobody would see them,
-/// and they are half the cost of a film.
+/// Boxes narrower than this have neither border nor round corners, pixels: these would be
+/// invisible, and are half the cost of a film.
 const FINE: f32 = 5.0;
 
 /// Draws the agents of a frame, the ego last and set off, with an opacity in [0, 1].

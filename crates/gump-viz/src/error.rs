@@ -1,4 +1,4 @@
-//! What can go wrong: compressing and writing.
+//! Errors of compressing and writing.
 
 use std::io;
 use std::path::PathBuf;
@@ -50,7 +50,7 @@ pub enum VizError {
     Chart {
         /// Title of the chart.
         title: String,
-        /// What the backend says.
+        /// The backend's message.
         reason: String,
     },
     /// Rerun's library refused.

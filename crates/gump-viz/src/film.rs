@@ -1,7 +1,7 @@
 //! Films of futures, as animated GIFs or PNGs, and as MP4 where `ffmpeg` is installed.
 //!
-//! The road is drawn once unless the camera goes along with the ego; a frame stores only the pixels
-//! that differ from the frame before.
+//! The road is drawn once unless the camera follows the ego; a frame stores only the pixels that
+//! differ from the frame before.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -21,15 +21,15 @@ use crate::picture::{draw_label, draw_rectangle, recent};
 use crate::theme::{Colours, mix};
 use crate::{Camera, Theme, VizError, lettering, video};
 
-/// What a film shows and how.
+/// Content and style of a film.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FilmSpec {
-    /// What one panel shows.
+    /// View of one panel.
     pub camera: Camera,
-    /// Whether the camera goes along with the ego of a panel's first rollout, its heading up, and
-    /// only the size of `camera` counts; otherwise it is fixed in the world.
+    /// Whether the camera follows the ego of a panel's first rollout, its heading up, and only the
+    /// size of `camera` counts; otherwise it is fixed in the world.
     pub follow: bool,
-    /// On which ground.
+    /// Colour theme.
     pub theme: Theme,
     /// Panels side by side, > 0; an overlay has one panel.
     pub columns: usize,
@@ -37,7 +37,7 @@ pub struct FilmSpec {
     pub frame_s: f64,
     /// Seconds of traffic per second of film, > 0.
     pub speed: f64,
-    /// How far trails reach back, seconds; 0 for none. Overlays have none.
+    /// Length of trails, seconds; 0 for none. Overlays have none.
     pub past_s: f64,
 }
 
@@ -64,8 +64,8 @@ impl FilmSpec {
         }
     }
 
-    /// As [`FilmSpec::new`], from a camera that shows all the way of the ego in these rollouts and,
-    /// as far as they fit into 110 m, those who move near it.
+    /// As [`FilmSpec::new`], from a camera that shows the whole path of the ego in these rollouts
+    /// and, as far as they fit into 110 m, agents that move near it.
     ///
     /// Units: `size_px` is width and height of a panel.
     pub fn framing(rollouts: &[&Rollout], size_px: (u32, u32)) -> Self {
@@ -74,7 +74,7 @@ impl FilmSpec {
         Self::new(framed.unwrap_or_else(whole))
     }
 
-    /// As [`FilmSpec::new`], from a camera that goes along with the ego and shows 90 m.
+    /// As [`FilmSpec::new`], from a camera that follows the ego and shows 90 m.
     ///
     /// Units: `size_px` is width and height of a panel.
     pub fn following((width_px, height_px): (u32, u32)) -> Self {
@@ -93,15 +93,15 @@ impl FilmSpec {
 
 /// Metres across a panel whose camera is fixed.
 const FRAMED: RangeInclusive<f64> = 50.0..=110.0;
-/// Metres across a panel whose camera goes along with the ego.
+/// Metres across a panel whose camera follows the ego.
 const FOLLOWED: f64 = 90.0;
 
-/// A rollout and the words in the corner of its panel.
+/// A rollout and the label in the corner of its panel.
 #[derive(Clone, Debug)]
 pub struct Take<'a> {
-    /// What happens.
+    /// The rollout.
     pub rollout: &'a Rollout,
-    /// What it is called; empty for no words.
+    /// Label; empty for none.
     pub label: String,
 }
 
@@ -130,7 +130,7 @@ struct Patch {
     height: usize,
     /// Colours by number, row by row; [`UNCHANGED`] where nothing changes.
     pixels: Vec<u8>,
-    /// How long the frame stays, hundredths of a second.
+    /// Display time of the frame, hundredths of a second.
     delay: u16,
 }
 
@@ -148,8 +148,8 @@ pub fn grid_film(takes: &[Take<'_>], spec: &FilmSpec) -> Result<Film, VizError> 
     film(&panels.collect::<Vec<_>>(), spec)
 }
 
-/// A film of several rollouts over one another, each as faint as there are many: what all futures
-/// have in common is solid.
+/// A film of several rollouts drawn over one another, each fainter the more there are: what all
+/// futures have in common is solid.
 ///
 /// # Errors
 /// As [`grid_film`].
@@ -166,7 +166,7 @@ pub fn overlay_film(rollouts: &[&Rollout], spec: &FilmSpec) -> Result<Film, VizE
     film(&[panel], spec)
 }
 
-/// What really happened after the present, in the form in which futures come.
+/// Returns the logged future as a rollout.
 pub fn log_as_rollout(scenario: &Scenario) -> Rollout {
     let mut rollout = Rollout::begin(scenario.present());
     for frame in scenario.future() {
@@ -193,7 +193,7 @@ impl Film {
     }
 
     /// The bytes of an animated PNG that repeats for ever: the same frames and colours as the GIF,
-    /// by another compression. Whoever knows no animation shows the first frame.
+    /// with another compression. Software without support for animation shows the first frame.
     ///
     /// # Errors
     /// [`VizError::Apng`] if the encoder refuses.
@@ -226,7 +226,7 @@ impl Film {
     /// Writes the frames of the GIF as video, encoded by `ffmpeg`.
     ///
     /// # Errors
-    /// [`VizError::NoFfmpeg`] if that is not on the path, [`VizError::Ffmpeg`] with what it says.
+    /// [`VizError::NoFfmpeg`] if that is not on the path, [`VizError::Ffmpeg`] with its message.
     fn save_mp4(&self, path: &Path) -> Result<(), VizError> {
         let delay = self.patches.first().map_or(10, |patch| patch.delay);
         let mut canvas = vec![0; self.width * self.height];
@@ -242,7 +242,7 @@ impl Film {
 }
 
 impl Patch {
-    /// Writes what differs into the frame before, whose rows are `stride` long.
+    /// Writes the changed pixels into the frame before, whose rows are `stride` long.
     fn apply(&self, canvas: &mut [u8], stride: usize) {
         for (row, pixels) in self.pixels.chunks_exact(self.width).enumerate() {
             let start = (self.top + row) * stride + self.left;
@@ -281,7 +281,7 @@ struct Panel<'a> {
 const GAP: usize = 2;
 /// Height of the line with the clock, pixels.
 const FOOTER: usize = 24;
-/// How long the last frame stays, hundredths of a second.
+/// Minimum display time of the last frame, hundredths of a second.
 const LAST_DELAY: u16 = 120;
 
 fn film(panels: &[Panel<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
@@ -348,7 +348,7 @@ fn gif(layout: &Layout, palette: &[u8], patches: &[Patch]) -> Result<Vec<u8>, Vi
     Ok(bytes)
 }
 
-/// Where the panels are.
+/// The arrangement of the panels, sizes in pixels.
 struct Layout {
     columns: usize,
     panel: (usize, usize),

@@ -15,25 +15,25 @@ use crate::pen::{Pen, Shape, paint};
 use crate::theme::{Colours, Rgb, mix};
 use crate::{Camera, CandidatePath, Theme, VizError, lettering};
 
-/// What a picture shows and how.
+/// Content and style of a picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PictureSpec {
-    /// Which part of the world.
+    /// View of the world.
     pub camera: Camera,
-    /// On which ground.
+    /// Colour theme.
     pub theme: Theme,
-    /// How far trails reach back, seconds; 0 for none.
+    /// Length of trails, seconds; 0 for none.
     pub past_s: f64,
     /// Whether to draw a bar of a round number of metres, bottom left.
     pub scale_bar: bool,
     /// Whether to name the colours, bottom right.
     pub legend: bool,
-    /// Words for the top left corner; empty for none.
+    /// Label for the top left corner; empty for none.
     pub label: String,
 }
 
 impl PictureSpec {
-    /// A light picture with two seconds of trails, a scale bar and no words.
+    /// A light picture with two seconds of trails, a scale bar and no label.
     pub fn new(camera: Camera) -> Self {
         Self {
             camera,
@@ -45,12 +45,12 @@ impl PictureSpec {
         }
     }
 
-    /// The same picture on another ground.
+    /// The same picture in another theme.
     pub fn with_theme(self, theme: Theme) -> Self {
         Self { theme, ..self }
     }
 
-    /// The same picture with words in its corner.
+    /// The same picture with a label in its corner.
     pub fn with_label(self, label: impl Into<String>) -> Self {
         Self {
             label: label.into(),
@@ -297,7 +297,7 @@ fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
     }
 }
 
-/// Words in the top left corner.
+/// Draws the label in the top left corner.
 pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
     if label.is_empty() {
         return;

@@ -1,4 +1,4 @@
-//! What charts of every kind share: colours, ticks, and the two forms they are drawn in.
+//! Code common to all charts: colours, ticks, and the two formats they are drawn in.
 
 use std::path::Path;
 
@@ -9,8 +9,8 @@ use crate::chart_canvas::{ChartCanvas, DENSITY};
 use crate::files::write_whole;
 use crate::{Picture, Theme, VizError};
 
-/// Stands for "the colour of the text around"; plotters knows only fixed colours, so this one is
-/// replaced by `currentColor` when the drawing is done. No curve may use it.
+/// Placeholder for the colour of the surrounding text; plotters knows only fixed colours, so this
+/// one is replaced by `currentColor` when the drawing is done. No curve may use it.
 pub(crate) const TEXT: RGBColor = RGBColor(1, 2, 3);
 
 /// Colours in the order of Okabe and Ito, without their black and yellow, which vanish on dark or
@@ -24,7 +24,7 @@ pub(crate) const COLOURS: [RGBColor; 6] = [
     RGBColor(0x56, 0xB4, 0xE9),
 ];
 
-/// Words of this size; the backend writes 1/1.24 of the size it is given.
+/// Text style of this size, pixels; the backend writes 1/1.24 of the size it is given.
 pub(crate) fn font(px: f64) -> TextStyle<'static> {
     let font = ("system-ui, sans-serif", px * 1.24).into_font();
     font.color(&TEXT)

@@ -326,7 +326,7 @@ fn a_film_frames_who_moves_and_follows_whom_it_cannot_frame() {
     for frame in std::iter::once(log.start()).chain(log.imagined()) {
         assert!(seen(frame.agent(log.ego()).unwrap().state.pose.position));
     }
-    // At 40 m/s nobody can be framed for 8 s.
+    // At 40 m/s no path of 8 s fits into the frame.
     let fast = fixture::scenario(
         "lane 1: 0,0 600,0\nego vehicle 0: 0,0 velocity 40,0\nhistory 1 future 8 dt 0.1",
     )

@@ -115,12 +115,12 @@ impl Colours {
         }
     }
 
-    /// What things are drawn upon.
+    /// Background colours.
     pub(crate) fn grounds(&self) -> [Rgb; 4] {
         [self.road, self.ground, self.route, self.crosswalk]
     }
 
-    /// What is drawn upon them, the most frequent first.
+    /// Colours drawn on the backgrounds, the most frequent first.
     pub(crate) fn inks(&self) -> [Rgb; 15] {
         [
             self.vehicle,

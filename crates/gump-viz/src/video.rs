@@ -1,7 +1,7 @@
-//! Videos, by the program `ffmpeg`.
+//! Videos, encoded by the program `ffmpeg`.
 //!
-//! An encoder of our own or one in C would be a large dependency for a format that few need; those
-//! who do mostly have `ffmpeg`.
+//! A built-in encoder or one in C would be a large dependency for a format that few users need, and
+//! those mostly have `ffmpeg`.
 
 use std::io::{self, Read as _, Write as _};
 use std::path::Path;
@@ -24,7 +24,7 @@ pub fn can_encode_mp4() -> bool {
 /// `delay` hundredths of a second long.
 ///
 /// # Errors
-/// [`VizError::NoFfmpeg`] if there is none, [`VizError::Ffmpeg`] with what it says.
+/// [`VizError::NoFfmpeg`] if there is none, [`VizError::Ffmpeg`] with its message.
 pub(crate) fn encode(
     path: &Path,
     (width, height): (usize, usize),
@@ -32,7 +32,7 @@ pub(crate) fn encode(
     frames: impl Iterator<Item = Vec<u8>>,
 ) -> Result<(), VizError> {
     let refused = |error: io::Error| VizError::Ffmpeg(error.to_string());
-    // What plays everywhere has an even number of rows and columns, and colour at half the size.
+    // Players everywhere support even numbers of rows and columns with colour at half resolution.
     let filter = "pad=ceil(iw/2)*2:ceil(ih/2)*2,format=yuv420p";
     let mut child = Command::new("ffmpeg")
         .args(["-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"])
@@ -57,14 +57,14 @@ pub(crate) fn encode(
             }
         }
     }
-    let mut said = String::new();
+    let mut messages = String::new();
     if let Some(mut errors) = child.stderr.take() {
-        errors.read_to_string(&mut said).map_err(refused)?;
+        errors.read_to_string(&mut messages).map_err(refused)?;
     }
     let status = child.wait().map_err(refused)?;
     if !status.success() {
-        let said = said.lines().next_back().unwrap_or("it gave no reason");
-        return Err(VizError::Ffmpeg(said.to_owned()));
+        let reason = messages.lines().next_back().unwrap_or("it gave no reason");
+        return Err(VizError::Ffmpeg(reason.to_owned()));
     }
     written.map_err(refused)
 }

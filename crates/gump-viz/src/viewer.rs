@@ -1,9 +1,9 @@
 //! The viewer: one HTML file in which to play scenes, their logs and any number of futures.
 //!
-//! [`Viewer`] gathers what is to be seen of a scene, `viewer/told.rs` what is told of agents beside
-//! it; `viewer/pack.rs` makes it small; `viewer/gallery.rs` puts scenes and page together. The page
-//! itself is `viewer/*.js` and `traffic.js`, plain script without libraries. How a page looks is in
-//! `theme.rs` and `palette.css`, which it shares with pictures and pages.
+//! [`Viewer`] collects the content of a scene, `viewer/told.rs` the metrics, predictions and
+//! candidate paths shown beside it; `viewer/pack.rs` packs it; `viewer/gallery.rs` puts scenes and
+//! page together. The page itself is `viewer/*.js` and `traffic.js`, plain script without
+//! libraries. Its colours are in `theme.rs` and `palette.css`, shared with pictures and pages.
 
 mod gallery;
 mod pack;
@@ -27,7 +27,7 @@ use pack::{CENTI, Class, HEADINGS, Packer, units};
 use told::{CELL, SPEED, TURN_DEG};
 pub use told::{CandidatePath, HeatMap, MetricTrack};
 
-/// How far from any agent the map is kept, metres.
+/// The map is kept within this distance of any agent, metres.
 const MARGIN: f64 = 120.0;
 
 /// A scene under preparation for the browser.
@@ -97,26 +97,26 @@ impl<'a> Viewer<'a> {
         self
     }
 
-    /// Adds what an agent might do next, shown when it is chosen in that future.
+    /// Adds a distribution of the next states of an agent, shown when it is chosen in that future.
     pub fn heat(&mut self, heat: HeatMap) -> &mut Self {
         self.heat.push(heat);
         self
     }
 
-    /// Says how realistic an agent's futures are, 0 to 1, for a colour.
+    /// Sets how realistic an agent's futures are, 0 to 1, shown as a colour.
     pub fn realism(&mut self, agent: AgentId, realism: f64) -> &mut Self {
         self.realism.insert(agent, realism);
         self
     }
 
-    /// Says what an agent does in its futures that it should not, shown when it is chosen; empty
-    /// words say nothing.
+    /// Sets a description of the violations of an agent in its futures, shown when it is chosen;
+    /// empty for none.
     pub fn deeds(&mut self, agent: AgentId, words: impl Into<String>) -> &mut Self {
         self.deeds.insert(agent, words.into());
         self
     }
 
-    /// Adds what a planner considered.
+    /// Adds a path that a planner considered.
     pub fn candidate(&mut self, candidate: CandidatePath) -> &mut Self {
         self.candidates.push(candidate);
         self
@@ -142,7 +142,7 @@ impl<'a> Viewer<'a> {
         gallery
     }
 
-    /// What the page reads as JSON, and the bytes of road and traffic.
+    /// Returns the JSON description for the page, and the bytes of road and traffic.
     fn pack(&self) -> (Value, Vec<u8>) {
         let scenario = self.scenario;
         let takes = self.takes();
@@ -160,7 +160,7 @@ impl<'a> Viewer<'a> {
             }
         }
         let place = |id: AgentId| agents.iter().position(|agent| agent.id == id);
-        let names = self.pack_told(&mut packer, origin, &place);
+        let names = self.pack_metrics_and_heat(&mut packer, origin, &place);
         let local = |p: DVec2| {
             let p = p - origin;
             [units(p.x, CENTI), units(p.y, CENTI)]
@@ -203,9 +203,9 @@ impl<'a> Viewer<'a> {
         (facts, packer.into_bytes())
     }
 
-    /// Packs metrics and heat maps, each with their number before them; returns the names of the
-    /// metrics. What is of an agent that no take has is left out.
-    fn pack_told(
+    /// Packs metrics and heat maps, each list after its length; returns the names of the metrics.
+    /// Those of agents that no take has are left out.
+    fn pack_metrics_and_heat(
         &self,
         packer: &mut Packer,
         origin: DVec2,

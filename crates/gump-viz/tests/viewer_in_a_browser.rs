@@ -60,8 +60,8 @@ fn other() -> Scenario {
     scenario
 }
 
-/// Gaps that the ruler tells of, against those of boxes along the x axis.
-fn check_ruler(said: &Value, scenario: &Scenario) {
+/// Checks the gaps that the ruler shows against those of boxes along the x axis.
+fn check_ruler(report: &Value, scenario: &Scenario) {
     let agent = |id| {
         let found = scenario.log[scenario.now].agent(AgentId(id));
         *found.expect("an agent of the scene")
@@ -74,35 +74,38 @@ fn check_ruler(said: &Value, scenario: &Scenario) {
         "ego, vehicle 0 to vehicle 9: gap {gap:.2} m, centres {:.2} m",
         between.length()
     );
-    assert_eq!(said["agents"], expected);
-    assert_eq!(said["taps"], expected);
-    let address = said["address"].as_str().expect("a text");
+    assert_eq!(report["agents"], expected);
+    assert_eq!(report["taps"], expected);
+    let address = report["address"].as_str().expect("a text");
     assert!(address.ends_with("ruler=0%2C9"), "{address}");
-    let later = said["later"].as_str().expect("a text");
+    let later = report["later"].as_str().expect("a text");
     assert!(later.contains("gap") && later != expected, "{later}");
-    let starts = |key: &str, with: &str| said[key].as_str().is_some_and(|t| t.starts_with(with));
-    assert!(starts("asks", "Drag") && starts("half", "Now"), "{said}");
-    let places = said["places"].as_str().expect("a text");
+    let starts = |key: &str, with: &str| report[key].as_str().is_some_and(|t| t.starts_with(with));
+    assert!(starts("asks", "Drag") && starts("half", "Now"), "{report}");
+    let places = report["places"].as_str().expect("a text");
     let metres: f64 = places.trim_end_matches(" m").parse().expect("metres");
     assert!((metres - 10.0).abs() < 0.3, "{places}");
     assert_eq!(
-        (&said["cleared"], &said["drawn"], &said["still"]),
+        (&report["cleared"], &report["drawn"], &report["still"]),
         (&"".into(), &true.into(), &true.into())
     );
 }
 
 /// The second scene, by the list, the first, the second and the first again.
-fn check_scenes(said: &Value, first: &Scenario, second: &Scenario) {
+fn check_scenes(report: &Value, first: &Scenario, second: &Scenario) {
     let [first, second] = [(first, 4), (second, 1)]
         .map(|(scenario, n_agents)| serde_json::json!([scenario.id, n_agents, scenario.id]));
     let names = serde_json::json!([second, first, second, first]);
-    assert_eq!(said["names"], names);
-    assert_eq!((&said["listed"], &said["pressed"]), (&2.into(), &1.into()));
-    let address = said["address"].as_str().expect("a text");
+    assert_eq!(report["names"], names);
+    assert_eq!(
+        (&report["listed"], &report["pressed"]),
+        (&2.into(), &1.into())
+    );
+    let address = report["address"].as_str().expect("a text");
     assert!(address.starts_with("scene="), "{address}");
 }
 
-/// Futures in which everybody turns, each in another way.
+/// Futures in which all agents turn, differently in each.
 fn futures(scenario: &Scenario, n: usize) -> Vec<Rollout> {
     let turned = |k: usize| {
         let mut rollout = Rollout::begin(scenario.present());
@@ -123,7 +126,7 @@ fn futures(scenario: &Scenario, n: usize) -> Vec<Rollout> {
     (0..n).map(turned).collect()
 }
 
-/// What the page at `path` says of itself in a window of a size, on dark ground or on light.
+/// Report of the page at `path` about itself, in a window of a size and a dark or light theme.
 fn report(browser: &Path, path: &Path, profile: &Path, size: &str, dark: bool) -> Value {
     let scheme = if dark { 0 } else { 1 };
     let output = Command::new(browser)
@@ -139,11 +142,11 @@ fn report(browser: &Path, path: &Path, profile: &Path, size: &str, dark: bool) -
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr),
     );
-    let said: Vec<_> = log
+    let messages: Vec<_> = log
         .lines()
         .filter(|line| line.contains("CONSOLE"))
         .collect();
-    assert!(said.is_empty(), "{said:#?}");
+    assert!(messages.is_empty(), "{messages:#?}");
     let text = dom
         .split_once("<pre id=\"report\">")
         .and_then(|(_, rest)| rest.split_once("</pre>"))
@@ -162,11 +165,11 @@ fn report(browser: &Path, path: &Path, profile: &Path, size: &str, dark: bool) -
 fn the_viewer_plays_and_switches_in_a_browser() {
     let Some(browser) = browser() else {
         // Past the capture of output, so that it is seen without a flag.
-        let told = writeln!(
+        let written = writeln!(
             std::io::stderr(),
             "SKIPPED, the viewer was not tried: no browser on the path, looked for {BROWSERS:?}"
         );
-        told.expect("standard error can be written to");
+        written.expect("standard error can be written to");
         return;
     };
     let scenario = scenario();
@@ -227,7 +230,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         );
         assert_eq!(report["different_takes"], 5);
         let played = report["played_s"].as_f64().unwrap_or_default();
-        // Thirty sixtieths of a second, and what the browser drew of its own accord in between.
+        // Thirty sixtieths of a second, and the frames that the browser drew in between.
         assert!((0.499..0.9).contains(&played), "{played}");
         let changes = report["changes"].as_object().expect("a table of keys");
         assert!(
@@ -251,8 +254,8 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         // A candidate brings its future along.
         let shown = serde_json::json!([0, 4, "Futures: slow ahead"]);
         assert_eq!(report["candidate_shows"], shown);
-        // What its score is made of, and what is drawn, stand in the panel; so does what the tip
-        // says of an agent beside it.
+        // The panel shows the terms of its score and the marks drawn, and the text of the tip of an
+        // agent beside it.
         assert_eq!(
             report["parts"],
             serde_json::json!(["progress 0.250", "comfort 1.000"])

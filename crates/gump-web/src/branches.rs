@@ -1,4 +1,4 @@
-//! Eight futures from one moment, in which the network drives everyone.
+//! Eight futures from one moment, in which the network drives all agents.
 
 use gump_metrics::overlapping;
 use gump_scene::{AgentId, Frame, SceneState, Seed};
@@ -7,9 +7,9 @@ use crate::engine::{LiveFuture, RelativeWorld};
 use crate::game::{STRIDE, is_off_road};
 use crate::signals::Signals;
 
-/// How many futures.
+/// Number of futures.
 pub const FUTURES: usize = 8;
-/// How many half seconds each lasts: eight seconds.
+/// Half seconds of each future: eight seconds.
 pub const STEPS: usize = 16;
 /// Separates the randomness of futures from that of the drive.
 const STREAM: u64 = 1 << 32;
@@ -33,7 +33,7 @@ pub struct Branch {
     pub frames: Vec<Frame>,
     /// Metres that the ego has driven.
     pub metres: f64,
-    /// Half seconds until the ego first overlapped somebody.
+    /// Half seconds until the ego first overlapped another agent.
     pub collided: Option<usize>,
     /// Half seconds until the ego first left the road.
     pub off_road: Option<usize>,
@@ -79,13 +79,13 @@ impl Branches {
         &self.branches
     }
 
-    /// Half seconds imagined so far, of all futures together, and how many there will be.
+    /// Half seconds simulated so far, over all futures, and their final number.
     pub fn progress(&self) -> (usize, usize) {
         let done = self.branches.iter().map(|branch| branch.frames.len() - 1);
         (done.sum(), FUTURES * STEPS)
     }
 
-    /// Goes on with the future that is furthest behind by half a second; false once all are done.
+    /// Advances the shortest future by half a second; false once all are done.
     pub(crate) fn step(
         &mut self,
         world: &RelativeWorld,
@@ -104,9 +104,9 @@ impl Branches {
         let n = branch.frames.len();
         branch.live.show(&signals.at((self.knot + n) * STRIDE));
         branch.live.decide(world, None);
-        let told = branch.live.go_on(world, None);
+        let next = branch.live.go_on(world, None);
         let lights = signals.at((self.knot + n) * STRIDE);
-        let frame = Frame::new(told.agents().to_vec(), lights);
+        let frame = Frame::new(next.agents().to_vec(), lights);
         let before = branch.frames.last().and_then(|f| f.agent(scene.ego));
         if let (Some(before), Some(ego)) = (before, frame.agent(scene.ego)) {
             let step = ego.state.pose.position - before.state.pose.position;

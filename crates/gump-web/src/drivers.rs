@@ -1,4 +1,4 @@
-//! Who drives the ego when nobody's hands do: rules that plan at each half second.
+//! Rule-based drivers of the ego, which plan at each half second.
 
 use gump_geometry::dvec2;
 use gump_nuplan::closed_loop::{Driver as Planner, Moment, Recording};
@@ -12,7 +12,7 @@ use crate::tape::Driver;
 /// Microseconds between frames.
 const FRAME_US: i64 = 100_000;
 
-/// Where the ego is in the drive.
+/// Moment of the drive at which a driver plans.
 pub(crate) struct Place<'a> {
     pub(crate) recording: &'a Recording,
     pub(crate) scene: SceneState<'a>,
@@ -20,10 +20,10 @@ pub(crate) struct Place<'a> {
     pub(crate) ego: &'a [EgoState],
 }
 
-/// The ego's states over the next `n` frames, by box centre. A driver remembers nothing from one half
-/// second to the next, so that a drive that was taken back goes on as one that was not.
+/// The ego's states over the next `n` frames, by box centre. A driver keeps no state from one half
+/// second to the next, so that a rewound drive continues like one that was not rewound.
 ///
-/// Error: a driver that cannot drive here, or is none of these.
+/// Error: a driver that cannot drive here, or one that is not rule-based.
 pub(crate) fn plan(
     driver: Driver,
     place: &Place<'_>,

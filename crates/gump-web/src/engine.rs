@@ -1,4 +1,4 @@
-//! Where the network comes from. The game takes it from here and from nowhere else.
+//! The network of the game, which the game takes only from here.
 
 pub(crate) use gump_engine::relative::{LiveFuture, RelativeWorld};
 
@@ -9,15 +9,15 @@ use gump_model::relative::RelativeWeights;
 
 /// The world of some weights, with the rules that the driver's worlds have.
 ///
-/// Error: a sentence.
+/// Error: the reason, as a sentence.
 pub(crate) fn world(weights: &[u8]) -> Result<RelativeWorld, String> {
     let sampling = RelativeSampling::from(&SamplingConfig::default());
     let weights = RelativeWeights::read(weights).map_err(|error| error.to_string())?;
     RelativeWorld::of_weights(&weights, sampling).map_err(|error| error.to_string())
 }
 
-/// Lets this process multiply with the portable kernel, as the engine in a browser does. To be said
-/// before any game is opened.
+/// Makes this process multiply with the portable kernel, as the engine in a browser does. Must be
+/// called before any game is opened.
 ///
 /// # Errors
 /// A sentence if another kernel has been at work.

@@ -1,12 +1,12 @@
-//! What can go wrong, as sentences for the page.
+//! Errors of the game, as sentences for the page.
 
-/// Why the game cannot do what was asked. Each is one sentence for whoever plays.
+/// Errors of the game, each one sentence for the player.
 #[derive(Debug, thiserror::Error)]
 pub enum GameError {
     /// The file holds no scenario that can be read.
     #[error("This file cannot be read as a scene: {0}.")]
     Scene(String),
-    /// There is nobody to drive.
+    /// The scene has no agent to drive.
     #[error(
         "The scene {0} has no car to drive: its ego is not a vehicle, or not there at the start."
     )]
@@ -24,7 +24,7 @@ pub enum GameError {
         "The scene is too large: it has {found} agents, and the page drives among at most {limit}. Drive it with a lower density."
     )]
     TooManyAgents {
-        /// Those at the start, after thinning.
+        /// Number of agents at the start, after thinning.
         found: usize,
         /// The most there may be.
         limit: usize,
@@ -34,7 +34,7 @@ pub enum GameError {
         "The scene is too large: its map has {found} points, and the page draws at most {limit}."
     )]
     TooLargeMap {
-        /// Those there are.
+        /// Number of points.
         found: usize,
         /// The most there may be.
         limit: usize,
@@ -45,13 +45,13 @@ pub enum GameError {
     /// A setting out of its range.
     #[error("The {name} must be between {from} and {to}, and is {found}.")]
     Setting {
-        /// Which one.
+        /// Name of the setting.
         name: &'static str,
         /// The least it may be.
         from: f64,
         /// The most it may be.
         to: f64,
-        /// What it is.
+        /// The value found.
         found: f64,
     },
     /// A driver that cannot drive here.
@@ -68,15 +68,15 @@ pub enum GameError {
     /// A moment that has not been driven.
     #[error("The moment {asked:.1} s has not been driven: the drive is {driven:.1} s long.")]
     Moment {
-        /// Seconds asked for.
+        /// The requested moment, seconds.
         asked: f64,
-        /// Seconds there are.
+        /// Length of the drive, seconds.
         driven: f64,
     },
     /// A link that holds no drive.
     #[error("This link holds no drive that can be replayed: {0}.")]
     Link(&'static str),
-    /// Too little was driven for what was asked.
+    /// The drive is too short for the requested score.
     #[error("{0}")]
     TooShort(&'static str),
     /// A score that cannot be computed.

@@ -1,9 +1,9 @@
 //! The game: one drive through one scene, a tenth of a second at a time.
 //!
-//! The network answers every half second: at the start of each everyone decides, on the assumption
-//! that the ego goes on as it does; on the way the ego goes where it is driven; then the network is
-//! told where that was. What was asked of the ego is kept, so a drive can be taken back to any
-//! moment, led on from there in eight ways, or told in a link and driven again to the bit.
+//! The network runs every half second: at the start of each, all agents decide, on the assumption
+//! that the ego continues as before; during it, the ego goes where it is driven; at its end, the
+//! network gets the ego's actual state. The inputs are kept, so a drive can be rewound to any
+//! moment, continued from there in eight ways, or shared as a link and replayed to the bit.
 //!
 //! Start with [`Game::open`], then [`Game::tick`].
 
@@ -28,12 +28,12 @@ pub const DT: f64 = 0.1;
 pub(crate) const STRIDE: usize = 5;
 /// Frames of the longest drive, five minutes.
 pub const MAX_FRAMES: usize = 3000;
-/// Agents that a scene may have at its start: more would not be imagined in time on a phone.
+/// Agents that a scene may have at its start: more could not be simulated in time on a phone.
 pub const MAX_AGENTS: usize = 128;
 /// Points that a map may have; a scene of Waymo's has some ten thousand.
 pub const MAX_POINTS: usize = 200_000;
-/// Every so many half seconds a copy of what the network remembers is kept; those in between are
-/// made again from the copy before them. A copy for 40 agents takes a megabyte.
+/// Half seconds between two kept copies of the network's state; states in between are computed
+/// again from the copy before them. A copy for 40 agents takes a megabyte.
 const COPY_EVERY: usize = 16;
 
 /// Hardest braking and acceleration, metres per second squared: what a family car does on a dry
@@ -43,18 +43,18 @@ const PEDAL: [f64; 2] = [-7.0, 3.0];
 const MAX_CURVATURE: f64 = 0.2;
 /// Sharpest turn at speed, metres per second squared across.
 const MAX_LATERAL: f64 = 6.0;
-/// Nobody is faster, metres per second.
+/// Highest speed, metres per second.
 const MAX_SPEED: f64 = 40.0;
-/// Hardest acceleration backwards, metres per second squared, and the fastest, metres per second
-/// (18 km/h): what reverse gear and a look over the shoulder allow.
+/// Hardest acceleration in reverse, metres per second squared, and highest speed in reverse, metres
+/// per second (18 km/h).
 const REVERSE: (f64, f64) = (2.0, 5.0);
-/// What a car loses per second when no pedal is pressed, metres per second squared.
+/// Deceleration when no pedal is pressed, metres per second squared.
 const ROLLING: f64 = 0.3;
 
-/// How a drive is set up. The temperature is no part of it: it may change on the way.
+/// Settings of a drive. The temperature is an input instead, since it may change during the drive.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// Everything random comes from it.
+    /// Seed of all randomness.
     pub seed: u64,
     /// Share of the other agents that are kept, 0 to 1.
     pub density: f64,
@@ -74,14 +74,14 @@ impl Default for Settings {
 pub struct Event {
     /// Frames after the start.
     pub frame: usize,
-    /// What.
+    /// Kind of the event.
     pub kind: EventKind,
 }
 
-/// What can happen to the ego.
+/// Kinds of events of the ego.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EventKind {
-    /// Its box came to overlap that of somebody.
+    /// Its box began to overlap that of another agent.
     Collision(AgentId),
     /// A corner of it left the road.
     OffRoad,
@@ -89,14 +89,14 @@ pub enum EventKind {
     RedLight,
 }
 
-/// What is kept of a half second.
+/// State kept for a half second.
 #[derive(Clone, Debug)]
 pub(crate) struct Knot {
     driver: Driver,
     temperature: f64,
-    /// Where the ego was assumed to be at its end; `None` if the network decides.
+    /// Assumed state of the ego at its end; `None` if the network decides.
     assumed: Option<AgentState>,
-    /// What the network remembered at its start, where a copy is kept.
+    /// State of the network at its start, where a copy is kept.
     copy: Option<LiveFuture>,
 }
 
@@ -116,14 +116,14 @@ pub struct Game {
     inputs: Vec<Input>,
     /// One for each half second that has begun.
     knots: Vec<Knot>,
-    /// At the start of the last half second that has begun, or of the next.
+    /// State of the network at the start of the last half second that has begun, or of the next.
     live: LiveFuture,
     /// The frames of the half second that has begun.
     ahead: Vec<Frame>,
-    /// Where rules that drive the ego want to be in them.
+    /// States that rule-based drivers plan for the ego in them.
     planned: Vec<AgentState>,
     events: Vec<Event>,
-    /// Who overlapped the ego at the start: that is nobody's collision.
+    /// Agents that overlapped the ego at the start, which is not a collision.
     entangled: Vec<AgentId>,
     branches: Option<Branches>,
 }
@@ -190,7 +190,7 @@ impl Game {
         })
     }
 
-    /// The same scene from its start, set up anew.
+    /// The same scene from its start, with other settings.
     ///
     /// # Errors
     /// As [`Game::open`].
@@ -209,7 +209,7 @@ impl Game {
     ///
     /// # Errors
     /// [`GameError::Over`] after five minutes; [`GameError::Driver`] for a driver that cannot drive
-    /// here, after which another may go on.
+    /// here, after which another may continue.
     pub fn tick(&mut self, input: Input) -> Result<(), GameError> {
         let input = input.held();
         let (frame, into) = (self.driven(), self.driven() % STRIDE);
@@ -237,18 +237,19 @@ impl Game {
         self.frames.push(Frame::new(agents.collect(), lights));
         let state = ego_state(&self.recording, self.ego.last(), &next, DT);
         self.ego.push(state);
-        // A link tells what was asked; a change of driver that had to wait is told as it was made.
+        // A link stores the inputs as given: a change of driver is stored when it was made, not
+        // when it took effect.
         self.inputs.push(input);
         self.note();
         if into + 1 == STRIDE {
-            let told = (driver != Driver::Network).then_some(next);
-            self.live.go_on(&self.world, told);
+            let actual = (driver != Driver::Network).then_some(next);
+            self.live.go_on(&self.world, actual);
             self.ahead.clear();
         }
         Ok(())
     }
 
-    /// Lets everyone decide on the next half second.
+    /// Lets all agents decide on the next half second.
     fn begin_knot(&mut self, input: Input) -> Result<(), GameError> {
         let frame = self.driven();
         let now = self.scene().ego_now().state;
@@ -298,7 +299,7 @@ impl Game {
         Ok(())
     }
 
-    /// Notes what has happened in the last frame.
+    /// Records the events of the last frame.
     fn note(&mut self) {
         let frame = self.driven();
         let scene = self.scene();
@@ -326,7 +327,7 @@ impl Game {
         self.events.extend(events.collect::<Vec<_>>());
     }
 
-    /// Takes the drive back to so many frames after its start.
+    /// Rewinds the drive to so many frames after its start.
     ///
     /// # Errors
     /// [`GameError::Moment`] for a moment that has not been driven.
@@ -354,7 +355,7 @@ impl Game {
         Ok(())
     }
 
-    /// What a rule had planned for a half second that has begun: it is planned again.
+    /// Computes again what a rule-based driver had planned for a half second that has begun.
     fn rest_of_plan(&mut self, knot: usize) -> Vec<AgentState> {
         let frame = knot * STRIDE;
         let place = Place {
@@ -373,7 +374,7 @@ impl Game {
         planned.unwrap_or_default()
     }
 
-    /// What the network remembered at the start of a half second that has been driven.
+    /// State of the network at the start of a half second that has been driven.
     pub(crate) fn live_at(&mut self, knot: usize) -> LiveFuture {
         if knot == self.driven() / STRIDE {
             return self.live.clone();
@@ -423,7 +424,7 @@ impl Game {
         Ok(())
     }
 
-    /// Goes on with one of the eight futures for half a second; false once all are done.
+    /// Advances one of the eight futures by half a second; false once all are done.
     pub fn go_on_branching(&mut self) -> bool {
         let Some(mut branches) = self.branches.take() else {
             return false;
@@ -461,7 +462,7 @@ impl Game {
         })
     }
 
-    /// Everyone up to now.
+    /// The scene up to now.
     pub fn scene(&self) -> SceneState<'_> {
         SceneState {
             history: &self.frames,
@@ -477,27 +478,27 @@ impl Game {
         }
     }
 
-    /// The scene as it was opened, without those who were thinned out.
+    /// The scene as it was opened, without the agents that were removed by the density.
     pub fn scenario(&self) -> &Scenario {
         &self.scenario
     }
 
-    /// What has happened to the ego.
+    /// Events of the ego so far.
     pub fn events(&self) -> &[Event] {
         &self.events
     }
 
-    /// What was asked, frame by frame.
+    /// Inputs, one per frame.
     pub fn inputs(&self) -> &[Input] {
         &self.inputs
     }
 
-    /// How the drive is set up.
+    /// Settings of the drive.
     pub fn settings(&self) -> Settings {
         self.settings
     }
 
-    /// The drive as imagined traffic.
+    /// The drive as a rollout.
     pub(crate) fn rollout(&self, frames: usize) -> Rollout {
         let mut rollout = Rollout::begin(self.scenario.present());
         let first = self.scenario.now + 1;
@@ -507,9 +508,9 @@ impl Game {
         rollout
     }
 
-    /// What everyone else may do from the start of this half second on: these of any number of draws
-    /// for each of the moving agents, as places from where they were then to a second and a half later. The
-    /// network says half a second of it; the rest goes on as that did.
+    /// Possible motions of the other agents from the start of this half second on: the draws with
+    /// these numbers for each moving agent, as positions over the following second and a half. The
+    /// network gives the first half second; the rest continues that motion.
     pub fn fans(&self, draws: std::ops::Range<u64>) -> Vec<Fan> {
         let knot = self.driven() / STRIDE * STRIDE;
         let start = &self.frames[self.scenario.now + knot];
@@ -549,14 +550,14 @@ impl Game {
 /// Half seconds that a fan shows.
 pub const FAN_STEPS: usize = 3;
 
-/// What an agent may do next.
+/// Possible next motions of an agent.
 #[derive(Clone, Debug)]
 pub struct Fan {
-    /// Who.
+    /// Id of the agent.
     pub agent: AgentId,
-    /// Where it was at the start of this half second, world frame, metres.
+    /// Position at the start of this half second, world frame, metres.
     pub from: [f64; 2],
-    /// Where it may be after each of the next half seconds.
+    /// Possible positions after each of the next half seconds, world frame, metres.
     pub ways: Vec<[[f64; 2]; FAN_STEPS]>,
 }
 
@@ -566,7 +567,7 @@ pub(crate) fn is_off_road(scene: &SceneState<'_>) -> bool {
     ego.is_some_and(|ego| OffRoad.at(scene, ego) == Some(1.0))
 }
 
-/// Where pedal and wheel lead in `dt` seconds.
+/// State after `dt` seconds with this pedal and wheel.
 fn by_hand(now: &AgentState, input: Input, dt: f64) -> AgentState {
     let speed = now.velocity.dot(now.pose.direction());
     // A car that still rolls forwards is braked first, whatever the gear.
@@ -607,7 +608,7 @@ fn backwards(now: &AgentState, speed: f64, input: Input, dt: f64) -> AgentState 
     turned(&dynamics::drive(&turned(now), acceleration, bend, dt))
 }
 
-/// How sharply the wheel turns the car at a speed, radians per metre, to the left.
+/// Curvature of the path at a speed, radians per metre, positive to the left.
 fn curvature(speed: f64, input: Input) -> f64 {
     let sharpest = (MAX_LATERAL / (speed * speed).max(1e-6)).min(MAX_CURVATURE);
     f64::from(input.wheel) / 100.0 * sharpest

@@ -1,4 +1,4 @@
-//! What a drive is worth: nuPlan's parts, and how real the traffic was.
+//! Scores of a drive: nuPlan's closed-loop score, and the realism of the traffic.
 
 use gump_nuplan::metrics::{MetricScores, RolloutDrive, Scoring, score};
 use gump_wosac::realism::{self, Config, Log, N_FUTURE, Rollouts, Year};
@@ -60,8 +60,8 @@ impl Game {
         })
     }
 
-    /// How real the first eight seconds were, by Waymo's metric of 2025: the drive as the only
-    /// rollout, whoever drove the ego.
+    /// Realism of the first eight seconds, by Waymo's metric of 2025: the drive as the only
+    /// rollout, whichever driver drove the ego.
     ///
     /// # Errors
     /// [`GameError::TooShort`] for a drive or a recording of less than eight seconds.

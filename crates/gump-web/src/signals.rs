@@ -1,4 +1,4 @@
-//! Traffic lights over a drive: as recorded, then as signals of such junctions go on.
+//! Traffic lights over a drive: as recorded, then continued by the signal plans of such junctions.
 
 use std::sync::Arc;
 
@@ -10,8 +10,8 @@ const LONGEST_S: f64 = 900.0;
 /// Frames in which they may change, seconds.
 const STEP_S: f64 = 0.5;
 
-/// What the lights of a scene show, frame by frame of the drive: at any of them, since a drive can be
-/// wound back.
+/// States of the lights of a scene by frame of the drive, in any order, since a drive can be
+/// rewound.
 #[derive(Clone, Debug)]
 pub(crate) struct Signals {
     /// From the present to the end of the recording.

@@ -1,18 +1,18 @@
-//! What was asked of the ego, tenth of a second by tenth of a second, and how it travels in a link.
+//! Inputs of a drive, one per tenth of a second, and their encoding in a link.
 //!
-//! The code is base64 without padding for addresses: a version, then runs of equal inputs, each as
-//! its length (two bytes, low first), the driver, the pedal, the wheel and the temperature. Version
-//! 2 adds the gear, 1 for reverse; drives without it are written as version 1.
+//! The code is unpadded URL-safe base64: a version, then runs of equal inputs, each as its length
+//! (two bytes, low first), the driver, the pedal, the wheel and the temperature. Version 2 adds the
+//! gear, 1 for reverse; drives without it are written as version 1.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
 use crate::GameError;
 
-/// Who drives the ego.
+/// Driver of the ego.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Driver {
-    /// Whoever plays.
+    /// The player.
     #[default]
     Hand,
     /// The network, as it drives everyone else.
@@ -41,14 +41,14 @@ impl Driver {
 /// One tenth of a second of driving, in whole numbers so that a link replays it exactly.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Input {
-    /// Who drives; a change counts from the next half second on.
+    /// The driver; a change takes effect at the next half second.
     pub driver: Driver,
     /// From -100, the hardest braking, to 100, the hardest acceleration; in reverse, from -100, the
     /// hardest acceleration backwards, to 100, the hardest braking.
     pub pedal: i8,
     /// From -100, the sharpest turn to the right, to 100, to the left.
     pub wheel: i8,
-    /// The temperature of the world in twentieths; a change counts from the next half second on.
+    /// The temperature of the world in twentieths; a change takes effect at the next half second.
     pub temperature: u8,
     /// Whether the car is in reverse gear.
     pub reverse: bool,
@@ -70,7 +70,7 @@ impl Input {
     /// Steps of the temperature in 1.
     pub const PER_UNIT: f64 = 20.0;
 
-    /// Within their ranges: what a page or a link says may be anything.
+    /// Clamps the input to its ranges: a page or a link may send any number.
     pub(crate) fn held(self) -> Self {
         Self {
             pedal: self.pedal.clamp(-100, 100),
@@ -85,7 +85,7 @@ impl Input {
 const FORWARD: (u8, usize) = (1, 6);
 const GEARED: (u8, usize) = (2, 7);
 
-/// The inputs as a code for a link.
+/// Encodes the inputs for a link.
 pub fn encode(inputs: &[Input]) -> String {
     let is_geared = inputs.iter().any(|input| input.reverse);
     let (version, _) = if is_geared { GEARED } else { FORWARD };
@@ -106,7 +106,7 @@ pub fn encode(inputs: &[Input]) -> String {
     URL_SAFE_NO_PAD.encode(bytes)
 }
 
-/// The inputs of a code, of which there may be `limit`.
+/// Decodes at most `limit` inputs of a link.
 ///
 /// # Errors
 /// [`GameError::Link`] for anything that [`encode`] does not write.
@@ -134,7 +134,7 @@ pub fn decode(code: &str, limit: usize) -> Result<Vec<Input>, GameError> {
     Ok(inputs)
 }
 
-/// How often an input is repeated, and the input.
+/// Decodes a run: the number of repetitions, and the input.
 fn decode_run(run: &[u8]) -> Result<(usize, Input), GameError> {
     let &[low, high, driver, pedal, wheel, temperature, ref gear @ ..] = run else {
         return Err(GameError::Link("it was cut off"));

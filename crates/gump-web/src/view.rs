@@ -1,4 +1,4 @@
-//! What the page draws: the road as JSON, everyone as numbers.
+//! Data for the page to draw: the road as JSON, all agents as numbers.
 //!
 //! Places are metres from where the ego started, x to the east and y to the north, so that 32 bits
 //! are enough for them.
@@ -16,17 +16,17 @@ use crate::{GameError, tape};
 pub const HEAD: usize = 5;
 /// Numbers of an agent: x, y, heading, length, width, kind, speed, id.
 pub const AGENT: usize = 8;
-/// Numbers of a fan's way: kind of agent, then x and y from now on.
+/// Numbers of a path of a fan: kind of agent, then x and y from now on.
 pub const WAY: usize = 3 + 2 * FAN_STEPS;
 
-/// The SHA-256 of a file, as hexadecimal digits: what the page's manifest states.
+/// The SHA-256 of a file in hexadecimal digits, as in the page's manifest.
 pub fn checksum(bytes: &[u8]) -> String {
     use sha2::{Digest as _, Sha256};
     let digest = Sha256::digest(bytes);
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The road, and how long the recording is.
+/// The road, and the length of the recording.
 #[derive(Serialize)]
 struct Road {
     id: String,
@@ -40,7 +40,7 @@ struct Road {
     areas: Vec<Shape>,
     stop_signs: Vec<[f32; 2]>,
     route: Vec<f32>,
-    /// Where each light of a frame stands, in the order of its states: x, y, heading, lane width.
+    /// Position of each light of a frame, in the order of its states: x, y, heading, lane width.
     lights: Vec<[f32; 4]>,
 }
 
@@ -57,16 +57,16 @@ struct Shape {
     points: Vec<f32>,
 }
 
-/// A drive in numbers for people.
+/// Summary of a drive for display.
 #[derive(Serialize)]
-struct Told<'a> {
+struct DriveSummary<'a> {
     total: f64,
     seconds: f64,
     compared_seconds: f64,
     parts: Vec<(&'a str, Option<f64>)>,
     realism: Option<f64>,
     realism_missing: Option<String>,
-    events: Vec<ToldEvent>,
+    events: Vec<EventSummary>,
     metres: f64,
     collisions: usize,
     off_roads: usize,
@@ -74,13 +74,13 @@ struct Told<'a> {
 }
 
 #[derive(Serialize)]
-struct ToldEvent {
+struct EventSummary {
     second: f64,
     what: &'static str,
 }
 
 impl Game {
-    /// The road and what stands on it, as JSON.
+    /// The map, the route and the positions of the lights, as JSON.
     pub fn road(&self) -> String {
         let scenario = self.scenario();
         let map = &scenario.map;
@@ -163,7 +163,7 @@ impl Game {
         [at.x, at.y, pose.heading, lane.width].map(|v| v as f32)
     }
 
-    /// Everyone so many frames after the start: [`HEAD`] numbers, then [`AGENT`] for each agent,
+    /// All agents so many frames after the start: [`HEAD`] numbers, then [`AGENT`] for each agent,
     /// then the colour of each light (0 unknown, 1 red, 2 yellow, 3 green).
     ///
     /// # Errors
@@ -206,7 +206,7 @@ impl Game {
         Ok(numbers)
     }
 
-    /// What agents may do next, [`WAY`] numbers for each way.
+    /// Possible next motions of agents, [`WAY`] numbers for each.
     pub fn fan_numbers(&self, draws: std::ops::Range<u64>) -> Vec<f32> {
         let origin = self.origin();
         let now = self.scene();
@@ -225,7 +225,7 @@ impl Game {
         numbers
     }
 
-    /// The way of the ego so far, x and y of each frame.
+    /// Path of the ego so far, x and y of each frame.
     pub fn trail(&self) -> Vec<f32> {
         let origin = self.origin();
         let first = self.scenario().now;
@@ -238,7 +238,7 @@ impl Game {
         .collect()
     }
 
-    /// The ways of everyone in one of the eight futures: the number of agents and of moments, then
+    /// Paths of all agents in one of the eight futures: the number of agents and of moments, then
     /// for each agent its kind, length and width, and x, y and heading of each moment. The ego
     /// comes first.
     pub fn branch_numbers(&self, k: usize) -> Vec<f32> {
@@ -262,8 +262,8 @@ impl Game {
         numbers
     }
 
-    /// How the eight futures compare, as JSON: metres, seconds to the first overlap and to leaving
-    /// the road.
+    /// Comparison of the eight futures, as JSON: metres, seconds to the first overlap and to
+    /// leaving the road.
     pub fn branch_table(&self) -> String {
         #[derive(Serialize)]
         struct Row {
@@ -281,11 +281,11 @@ impl Game {
         serde_json::to_string(&rows.collect::<Vec<_>>()).unwrap_or_default()
     }
 
-    /// The drive so far in numbers for people, as JSON.
+    /// Summary of the drive so far for display, as JSON.
     ///
     /// # Errors
     /// As [`Game::score`].
-    pub fn told(&self) -> Result<String, GameError> {
+    pub fn summary(&self) -> Result<String, GameError> {
         let score = self.score()?;
         let realism = self.realism();
         let trail = self.trail();
@@ -296,26 +296,26 @@ impl Game {
         });
         let count =
             |is: fn(&EventKind) -> bool| self.events().iter().filter(|e| is(&e.kind)).count();
-        let told = Told {
+        let summary = DriveSummary {
             total: score.total,
             seconds: score.seconds,
             compared_seconds: score.compared_seconds,
             parts: score.parts.iter().map(|(n, v)| (n.as_str(), *v)).collect(),
             realism_missing: realism.as_ref().err().map(ToString::to_string),
             realism: realism.ok().filter(|value| value.is_finite()),
-            events: self.events().iter().map(told_event).collect(),
+            events: self.events().iter().map(event_summary).collect(),
             metres: metres.sum(),
             collisions: count(|kind| matches!(kind, EventKind::Collision(_))),
             off_roads: count(|kind| *kind == EventKind::OffRoad),
             red_lights: count(|kind| *kind == EventKind::RedLight),
         };
-        Ok(serde_json::to_string(&told).unwrap_or_default())
+        Ok(serde_json::to_string(&summary).unwrap_or_default())
     }
 
-    /// What has happened to the ego, as JSON.
-    pub fn events_told(&self) -> String {
-        let told: Vec<ToldEvent> = self.events().iter().map(told_event).collect();
-        serde_json::to_string(&told).unwrap_or_default()
+    /// Events of the ego so far, as JSON.
+    pub fn events_json(&self) -> String {
+        let events: Vec<EventSummary> = self.events().iter().map(event_summary).collect();
+        serde_json::to_string(&events).unwrap_or_default()
     }
 
     /// The inputs of the drive as a code for a link.
@@ -323,7 +323,7 @@ impl Game {
         tape::encode(self.inputs())
     }
 
-    /// A number that two drives share if everyone was at the same places at all times, to the bit
+    /// Hash that two drives share if all agents were at the same places at all times, to the bit
     /// (FNV-1a, 64 bits, as 16 hexadecimal digits).
     pub fn fingerprint(&self) -> String {
         let mut hash = 0xcbf2_9ce4_8422_2325_u64;
@@ -339,14 +339,14 @@ impl Game {
         format!("{hash:016x}")
     }
 
-    /// Where the ego started, world frame, metres.
+    /// Start position of the ego, world frame, metres.
     pub fn origin(&self) -> DVec2 {
         self.scenario().present().ego_now().state.pose.position
     }
 }
 
-fn told_event(event: &crate::game::Event) -> ToldEvent {
-    ToldEvent {
+fn event_summary(event: &crate::game::Event) -> EventSummary {
+    EventSummary {
         second: event.frame as f64 * DT,
         what: match event.kind {
             EventKind::Collision(_) => "collision",

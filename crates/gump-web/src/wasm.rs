@@ -1,7 +1,7 @@
-//! The game for JavaScript: the same methods with types that cross the border.
+//! The game for JavaScript: the same methods with types that both languages have.
 //!
-//! Numbers go out as `Float32Array`, the rest as JSON or words; what goes wrong is thrown as a
-//! sentence.
+//! Numbers are returned as `Float32Array`, the rest as JSON or strings; errors are thrown as
+//! sentences.
 
 use wasm_bindgen::prelude::*;
 
@@ -85,18 +85,18 @@ impl WebGame {
         self.game.road()
     }
 
-    /// Everyone at a moment.
+    /// All agents at a moment.
     pub fn numbers(&self, frame: usize) -> Result<Vec<f32>, JsError> {
         self.game.numbers(frame).map_err(sentence)
     }
 
-    /// What agents may do next, one draw for each.
+    /// Possible next motions of agents, one draw for each.
     pub fn fan(&self, draw: u32) -> Vec<f32> {
         let draw = u64::from(draw);
         self.game.fan_numbers(draw..draw + 1)
     }
 
-    /// The way of the ego so far.
+    /// Path of the ego so far.
     pub fn trail(&self) -> Vec<f32> {
         self.game.trail()
     }
@@ -121,30 +121,30 @@ impl WebGame {
         self.game.go_on_branching()
     }
 
-    /// How far they are, 0 to 1.
+    /// Progress of the eight futures, 0 to 1.
     pub fn branch_progress(&self) -> f64 {
         let progress = self.game.branches().map(crate::Branches::progress);
         progress.map_or(0.0, |(done, all)| done as f64 / all as f64)
     }
 
-    /// The ways of everyone in one of them.
+    /// Paths of all agents in one of them.
     pub fn branch_numbers(&self, k: usize) -> Vec<f32> {
         self.game.branch_numbers(k)
     }
 
-    /// How they compare, as JSON.
+    /// Comparison of the eight futures, as JSON.
     pub fn branch_table(&self) -> String {
         self.game.branch_table()
     }
 
-    /// The drive in numbers for people, as JSON.
+    /// Summary of the drive for display, as JSON.
     pub fn told(&self) -> Result<String, JsError> {
-        self.game.told().map_err(sentence)
+        self.game.summary().map_err(sentence)
     }
 
-    /// What has happened to the ego, as JSON.
+    /// Events of the ego so far, as JSON.
     pub fn events(&self) -> String {
-        self.game.events_told()
+        self.game.events_json()
     }
 
     /// The inputs as a code for a link.
@@ -152,7 +152,7 @@ impl WebGame {
         self.game.code()
     }
 
-    /// What two equal drives share.
+    /// Hash that two equal drives share.
     pub fn fingerprint(&self) -> String {
         self.game.fingerprint()
     }

@@ -1,4 +1,4 @@
-//! The game without a browser: shipped scenes and weights, driven by hand and by everyone else.
+//! The game without a browser: shipped scenes and weights, driven by hand and by the other drivers.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::fs;
@@ -123,7 +123,7 @@ fn reverse_gear_brakes_stands_and_drives_backwards() {
     let ego = |game: &Game| game.scene().ego_now().state;
     let forward = |game: &Game| ego(game).velocity.dot(ego(game).pose.direction());
     drive(&mut game, &[press(100, 0, false); 10]);
-    // The brake alone stands still for as long as it is held.
+    // With the brake alone, the car stands still for as long as it is held.
     drive(&mut game, &[press(-100, 0, false); 40]);
     assert_eq!(forward(&game), 0.0);
     let stood = ego(&game).pose;
@@ -141,7 +141,7 @@ fn reverse_gear_brakes_stands_and_drives_backwards() {
     assert!(game.numbers(90).unwrap()[1] < 0.0);
     drive(&mut game, &[press(100, 0, false); 10]);
     assert!(forward(&game) > 1.0);
-    // A link tells of the gear, and of nothing new where there was none.
+    // A link encodes the gear, and stays in version 1 without it.
     let mut again = self::game(Settings::default());
     drive(&mut again, &decode(&game.code(), MAX_FRAMES).unwrap());
     assert_eq!(again.fingerprint(), game.fingerprint());
@@ -241,9 +241,9 @@ fn a_drive_is_scored_and_drawn() {
     assert_eq!(score.parts.len(), 8);
     let realism = game.realism().unwrap();
     assert!((0.3..1.0).contains(&realism), "{realism}");
-    let told: serde_json::Value = serde_json::from_str(&game.told().unwrap()).unwrap();
-    assert_eq!(told["seconds"], 12.0);
-    assert_eq!(told["compared_seconds"], 8.0);
+    let summary: serde_json::Value = serde_json::from_str(&game.summary().unwrap()).unwrap();
+    assert_eq!(summary["seconds"], 12.0);
+    assert_eq!(summary["compared_seconds"], 8.0);
     let road: serde_json::Value = serde_json::from_str(&game.road()).unwrap();
     assert!(!road["lanes"].as_array().unwrap().is_empty());
     let numbers = game.numbers(120).unwrap();

@@ -1,7 +1,8 @@
-//! The engine in a browser says what the engine here says: the same scene, weights and seed, driven
-//! by the network, in Node and natively with the portable kernel.
+//! The engine in a browser gives the same results as the native engine: the same scene, weights and
+//! seed, driven by the network, in Node and natively with the portable kernel.
 //!
-//! It wants Node and the engine that `cargo xtask web` builds, and says so where it skips.
+//! The test needs Node and the engine that `cargo xtask web` builds; without them it is skipped
+//! with a message.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::fs;
@@ -24,7 +25,8 @@ fn scene() -> PathBuf {
     root().join("docs/live/scenes/crossing.tfrecord.gz")
 }
 
-/// Everyone's place at each half second, a line each: x, y and heading from where the ego began.
+/// Positions of all agents at each half second, a line each: x, y and heading relative to the ego's
+/// start.
 fn native() -> Vec<Vec<f64>> {
     let weights = fs::read(root().join("docs/live/gump-relative.safetensors")).unwrap();
     let scene = fs::read(scene()).unwrap();

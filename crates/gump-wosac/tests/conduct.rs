@@ -1,4 +1,4 @@
-//! Realism beside what a driver would notice.
+//! Realism scores compared with implausible conduct that a driver would notice.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use gump_geometry::Pose;
@@ -13,7 +13,8 @@ fn scenario(text: &str) -> Scenario {
     fixture::scenario(text).unwrap()
 }
 
-/// A future of 8 s in which every agent is where `drive` says that it is after so many seconds.
+/// A future of 8 s in which every agent is at the place that `drive` returns for the time in
+/// seconds.
 fn future(scenario: &Scenario, drive: impl Fn(&Agent, f64) -> Pose) -> Rollout {
     let present = scenario.present();
     let mut rollout = Rollout::begin(present);

@@ -26,7 +26,7 @@ fn golden() -> Value {
     serde_json::from_str(include_str!("golden/motion.json")).unwrap()
 }
 
-/// An f32 that was printed with the fewest digits that tell it.
+/// An f32 that was printed with the fewest digits that identify it.
 fn single(value: &Value) -> f64 {
     f64::from(value.as_f64().unwrap() as f32)
 }

@@ -104,7 +104,7 @@ fn who_runs_a_red_light_is_found() {
     let reference = Reference::new(&log, &config).unwrap();
     let evaluation = reference.evaluate(&rollouts(&[1.0, 0.1])).unwrap();
     let (logged, imagined) = evaluation.indications(Component::TrafficLightViolation);
-    // At a tenth of the speed nobody gets to the stop line, which the front car has 10 m ahead.
+    // At a tenth of the speed no car reaches the stop line, which the front car has 10 m ahead.
     assert_eq!(logged, [true, true]);
     assert_eq!(imagined, [[true, true], [false, false]]);
     assert_eq!(evaluation.scores.traffic_light_violation_rate, Some(0.5));
@@ -233,7 +233,7 @@ fn scenes_of_another_clock_are_refused() {
     ));
 }
 
-/// Scores what a change has made of good input and looks for the parts of the sentence.
+/// Scores a good input after `change` and checks the parts of the error message.
 #[track_caller]
 fn fails(change: impl Fn(&mut Log, &mut Rollouts), parts: &[&str]) {
     let (mut log, mut rollouts) = (log(), rollouts(&[1.0, 1.1]));
@@ -363,7 +363,7 @@ fn what_a_rollout_is_worth_is_the_score_less_that_of_the_others() {
             );
         }
         assert_eq!(worth.agents, [AgentId(3), AgentId(9)]);
-        // What keeps to the log is worth more than what stands nearly still.
+        // Keeping to the log scores higher than standing nearly still.
         let total = |i: usize| worth.credit[i].iter().sum::<f64>();
         assert!(total(1) > total(3), "{y:?}");
         let one = reference.evaluate(&rollouts(&[1.0])).unwrap();

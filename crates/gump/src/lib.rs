@@ -78,7 +78,7 @@ pub use gump_viz as viz;
 #[cfg(feature = "wosac")]
 pub use gump_wosac as wosac;
 
-/// What most programs need: `use gump::prelude::*;`.
+/// The items that most programs need: `use gump::prelude::*;`.
 pub mod prelude {
     pub use crate::geometry::{DVec2, OrientedBox, Polyline, Pose, dvec2};
     pub use crate::metrics::summarize;

@@ -56,14 +56,14 @@ pub(crate) fn problems(repository: &Path) -> anyhow::Result<Vec<String>> {
         .with_context(|| format!("cannot read {}", path.display()))?;
     let mut problems = problems_in(&workspace);
     problems.extend(problems_of_the_page(&workspace, &page));
-    // What is compiled differs by platform; the page tells of one.
+    // The number of compiled crates differs by platform; the page states those of one.
     if cfg!(all(target_os = "linux", target_arch = "x86_64")) {
         problems.extend(problems_of_counts(repository, &workspace, &page)?);
     }
     Ok(problems)
 }
 
-/// Where the table of ARCHITECTURE.md says another number of crates to compile than there are.
+/// Rows of the table in ARCHITECTURE.md whose number of crates to compile is wrong.
 fn problems_of_counts(
     repository: &Path,
     workspace: &Metadata,
@@ -75,19 +75,19 @@ fn problems_of_counts(
         let row = page
             .lines()
             .find(|line| line.starts_with(&format!("| `{name}` |")));
-        let told = row.and_then(|row| row.trim_end_matches(" |").rsplit(' ').next());
+        let stated = row.and_then(|row| row.trim_end_matches(" |").rsplit(' ').next());
         let counted = n_compiled(repository, name)?;
-        if told.and_then(|told| told.parse().ok()) != Some(counted) {
+        if stated.and_then(|stated| stated.parse().ok()) != Some(counted) {
             problems.push(format!(
                 "ARCHITECTURE.md says that {name} compiles {} crates, cargo tree says {counted}",
-                told.unwrap_or("no")
+                stated.unwrap_or("no")
             ));
         }
     }
     Ok(problems)
 }
 
-/// How many crates building a package takes, itself included.
+/// Number of crates that building a package compiles, itself included.
 fn n_compiled(repository: &Path, package: &str) -> anyhow::Result<usize> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = "tree --quiet --offline --locked --edges normal,build --prefix none --format {p}";
@@ -173,8 +173,8 @@ fn problems_in(workspace: &Metadata) -> Vec<String> {
     problems
 }
 
-/// Where ARCHITECTURE.md says otherwise than the manifests: its picture of the layers, and the
-/// outside crates in its table.
+/// Contradictions between ARCHITECTURE.md and the manifests: in its picture of the layers, and in
+/// the external crates of its table.
 fn problems_of_the_page(workspace: &Metadata, page: &str) -> Vec<String> {
     let mut problems = Vec::new();
     let layers = page.lines().filter_map(|line| {

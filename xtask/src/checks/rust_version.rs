@@ -1,7 +1,8 @@
-//! No outside crate asks for a newer Rust than the workspace promises.
+//! Checks that no external crate requires a newer Rust than the workspace promises.
 //!
-//! Cargo compares what a crate asks for with the compiler that is there, which is mostly newer than
-//! the promise. Newer functions of the standard library are clippy's business (`incompatible_msrv`).
+//! Cargo compares the version that a crate requires with the installed compiler, which is mostly
+//! newer than the promise. Newer functions of the standard library are left to clippy
+//! (`incompatible_msrv`).
 
 use std::path::Path;
 use std::process::Command;
@@ -9,7 +10,7 @@ use std::process::Command;
 use anyhow::Context as _;
 use serde::Deserialize;
 
-/// Every crate that asks for more, as a sentence; empty if all is well.
+/// A sentence for every crate that requires more; empty if there is none.
 ///
 /// Error: `cargo metadata` cannot be run or read.
 pub(crate) fn problems(repository: &Path) -> anyhow::Result<Vec<String>> {
@@ -41,7 +42,7 @@ struct Metadata {
 #[derive(Deserialize)]
 struct Package {
     name: String,
-    /// Where it comes from; nothing for a crate of the workspace.
+    /// Source of the crate; `None` for a crate of the workspace.
     source: Option<String>,
     rust_version: Option<String>,
 }
@@ -53,10 +54,10 @@ fn problems_in(workspace: &Metadata) -> anyhow::Result<Vec<String>> {
     let promised = promised.context("expected a rust-version in the workspace, found none")?;
     let mut problems = Vec::new();
     for package in &workspace.packages {
-        let asked = package.rust_version.as_deref().unwrap_or("1");
-        if package.source.is_some() && numbers(asked) > numbers(promised) {
+        let required = package.rust_version.as_deref().unwrap_or("1");
+        if package.source.is_some() && numbers(required) > numbers(promised) {
             problems.push(format!(
-                "{} asks for Rust {asked}, expected at most {promised}",
+                "{} asks for Rust {required}, expected at most {promised}",
                 package.name
             ));
         }

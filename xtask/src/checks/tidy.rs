@@ -22,7 +22,7 @@ const SKIPPED: [&str; 3] = [".git", "target", "out"];
 /// Endings of files that hold text.
 const TEXT: [&str; 8] = ["rs", "toml", "md", "txt", "css", "html", "yml", "run"];
 
-/// A rule looks at one file and tells what is wrong with it, a sentence per offence.
+/// A rule checks one file and returns a sentence per offence.
 type Rule = fn(&File) -> Vec<String>;
 
 const RULES: [(&str, Rule); 8] = [
@@ -47,7 +47,7 @@ struct File {
     text: String,
 }
 
-/// What [`check`] found.
+/// Result of [`check`].
 pub(crate) struct Tidied {
     /// Files looked at.
     pub(crate) files: usize,
@@ -218,7 +218,8 @@ fn links(file: &File) -> Vec<String> {
     found
 }
 
-/// What a crate's page shows in Rust stands in the crate's first documentation too, where it is tested.
+/// Checks that each Rust example of a crate's README is also in the crate's documentation, where it
+/// is tested.
 fn examples_are_tested(file: &File) -> Vec<String> {
     let Some(of_crate) = file.path.strip_suffix("/README.md") else {
         return Vec::new();

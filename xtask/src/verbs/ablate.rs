@@ -26,7 +26,7 @@ use crate::run::{Common, Run};
 use crate::sampling::Draw;
 use crate::{films, futures, shipped};
 
-/// Which ablation.
+/// The ablations.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Decoding one agent after another (full-AR) against all at once (partial-AR)
@@ -148,7 +148,7 @@ impl Args {
 
 type Rate = fn(&Part) -> Option<f64>;
 
-/// What is compared.
+/// Rates to compare.
 const RATES: [(&str, Rate); 6] = [
     ("collision_rate", Part::collision_rate),
     ("offroad_rate", Part::offroad_rate),

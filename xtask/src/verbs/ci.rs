@@ -40,12 +40,12 @@ impl Args {
         let mut done = Vec::new();
         for (name, words) in checks() {
             if name.starts_with("wasm") && !has_wasm {
-                run.say(&format!(
+                run.print(&format!(
                     "skipped: {name} (run `rustup target add {WASM}` for it)"
                 ));
                 continue;
             }
-            run.say(&format!("cargo {words}"));
+            run.print(&format!("cargo {words}"));
             run.phase(name, |_| cargo(words))?;
             done.push(name);
         }

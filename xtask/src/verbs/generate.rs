@@ -28,7 +28,7 @@ use crate::shipped;
 /// Scenes made together.
 const BATCH: u64 = 32;
 
-/// Prompts that a scene can be asked to satisfy.
+/// Maximum number of prompts of a scene.
 const MOST_PROMPTS: usize = 4;
 
 /// Slower is standing, metres per second.
@@ -104,9 +104,9 @@ pub(crate) struct Args {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum StartName {
-    /// Where the recorded ego is
+    /// Position of the recorded ego
     Recorded,
-    /// On any lane around there
+    /// Any lane around it
     Anywhere,
 }
 
@@ -164,7 +164,7 @@ impl Args {
         };
         let (made, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
         run.phase("write", |run| write(run, &made, &self.film))?;
-        tell(run, &made, elapsed)
+        report(run, &made, elapsed)
     }
 
     fn check_numbers(&self) -> anyhow::Result<()> {
@@ -209,7 +209,7 @@ impl Args {
             temperature: self.temperature.unwrap_or(manner.temperature),
             top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
             placement: self.placement.resolve(),
-            // Whoever stands in the way for nothing is still there half a minute later.
+            // Agents that stand without a reason would still be there half a minute later.
             standing_has_reasons: self.simulate > 0.0 && !self.paper,
             ..manner
         }
@@ -243,7 +243,7 @@ impl Args {
     }
 }
 
-/// What is asked of a scene that cannot hold it is wrong arguments.
+/// Turns a request for more objects than a scene can hold into [`WrongArguments`].
 fn too_many(error: GenerateError) -> anyhow::Error {
     match error {
         GenerateError::TooMany { asked, most } => WrongArguments(format!(
@@ -269,8 +269,8 @@ pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
             // A word in common says more than letters in common.
             let shared = |tag: &ScenarioTag| {
                 let words: Vec<&str> = tag.name().split('_').collect();
-                let asked = name.split(['_', ' ', '-']);
-                asked.filter(|word| words.contains(word)).count() as f64
+                let parts = name.split(['_', ' ', '-']);
+                parts.filter(|word| words.contains(word)).count() as f64
             };
             let nearness =
                 |tag: &ScenarioTag| strsim::jaro_winkler(tag.name(), name) + 0.5 * shared(tag);
@@ -345,7 +345,7 @@ fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn tell(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
+fn report(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
     let n = made.len() as f64;
     let agents: usize = made.iter().map(agents).sum();
     let vehicles: usize = made
@@ -377,7 +377,7 @@ fn tell(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
     run.result("scenes_per_second", n / elapsed.as_secs_f64().max(1e-9))
 }
 
-/// The share of vehicles that stand in the last frames of what was imagined, if anything was.
+/// Share of vehicles at standstill in the last frames of the simulated futures; `None` without any.
 fn standing_at_end(made: &[Made]) -> Option<f64> {
     let imagined = made
         .iter()

@@ -1,4 +1,4 @@
-//! `completions` and `manual`: what shells and `man` want to know of the command line.
+//! `completions` and `manual`: the command line for shells and for `man`.
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -20,7 +20,7 @@ pub(crate) struct Completions {
 impl Completions {
     /// Prints the script that completes words of the driver.
     ///
-    /// Error: nobody who listens.
+    /// Error: a closed standard output.
     pub(crate) fn execute(&self, mut root: Command) -> anyhow::Result<()> {
         let mut script = Vec::new();
         clap_complete::generate(self.shell, &mut root, installed::name(), &mut script);

@@ -57,11 +57,11 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// Which decision to explain.
+/// The decision to explain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(into = "String")]
 enum Step {
-    /// The one by which the choice was worth most more than what else there was.
+    /// The decision whose choice beats its alternatives by most.
     Decisive,
     /// The one that the ego followed at a step of the drive.
     Number(usize),
@@ -110,7 +110,7 @@ struct Noteworthy {
     step: usize,
     past: Vec<Frame>,
     decision: Decision,
-    /// How much it mattered.
+    /// Weight of the decision among those of the drive.
     weight: f64,
 }
 
@@ -133,11 +133,11 @@ impl Noted<'_> {
             .first()
             .is_some_and(begins_now);
         let weight = explain::weight(decision);
-        let is_asked = match explain {
+        let is_requested = match explain {
             Step::Number(step) => moment.iteration <= step,
             Step::Decisive => self.explained.as_ref().is_none_or(|e| weight > e.weight),
         };
-        if is_asked && (is_new || self.explained.is_none()) {
+        if is_requested && (is_new || self.explained.is_none()) {
             self.explained = Some(Noteworthy {
                 step: moment.iteration,
                 past: moment.scene.history.to_vec(),
@@ -158,7 +158,7 @@ impl Driver for Noted<'_> {
     }
 
     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        // A drive takes a minute, and what is left of it is of no use to who has stopped it.
+        // A drive takes a minute; after Ctrl-C its remainder is of no use.
         stop_if_interrupted()?;
         let plan = self.inner.drive(moment)?;
         self.steps.push(self.inner.candidates());
@@ -227,7 +227,7 @@ impl Args {
         run.result("world", self.world.to_string())?;
         run.result("steps", scored.driven.ego.len())?;
         run.result("milliseconds_per_step", milliseconds)?;
-        tell(run, &scored)?;
+        report(run, &scored)?;
         let step = noted
             .explained
             .as_ref()
@@ -240,28 +240,28 @@ impl Args {
             None => "film.gif",
         };
         if run.path(page).is_file() {
-            run.say(&format!("open {}", run.path(page).display()));
+            run.print(&format!("open {}", run.path(page).display()));
         }
         Ok(())
     }
 }
 
 impl Args {
-    /// Refuses to explain what there will be no decision of, before anything is driven.
+    /// Refuses `--explain` where there will be no decision to explain, before anything is driven.
     ///
-    /// Error: [`WrongArguments`] for a planner that imagines nothing, and for a step beyond the
-    /// drive through a scenario.
+    /// Error: [`WrongArguments`] for a planner without rollouts, and for a step beyond the drive
+    /// through a scenario.
     fn check_explain(&self, scenario: Option<&Scenario>) -> anyhow::Result<()> {
-        let Some(asked) = self.explain else {
+        let Some(requested) = self.explain else {
             return Ok(());
         };
         let wrong = if self.planner != PlannerName::Interactive {
             format!(
-                "--explain {asked}: expected --planner interactive, which decides by rollouts, \
+                "--explain {requested}: expected --planner interactive, which decides by rollouts, \
                  found {}",
                 self.planner.name()
             )
-        } else if let (Some(scenario), Step::Number(step)) = (scenario, asked) {
+        } else if let (Some(scenario), Step::Number(step)) = (scenario, requested) {
             let recorded = scenario.log.len() - scenario.now - 1;
             let steps = recorded.min((self.driving.seconds / scenario.dt).round() as usize);
             if step < steps {
@@ -277,11 +277,11 @@ impl Args {
         Err(WrongArguments(wrong).into())
     }
 
-    /// Writes the page of the decision that was asked for.
+    /// Writes the page of the requested decision.
     ///
-    /// Error: a planner that imagines nothing, a drive without a step.
+    /// Error: a planner without rollouts, a drive without a step.
     fn explain(&self, run: &mut Run, case: &Case, noted: &Noted<'_>) -> anyhow::Result<()> {
-        let Some(asked) = self.explain else {
+        let Some(requested) = self.explain else {
             return Ok(());
         };
         let Some(Noteworthy {
@@ -292,7 +292,7 @@ impl Args {
         }) = &noted.explained
         else {
             let wrong = format!(
-                "--explain {asked}: expected a step of the drive and --planner interactive, \
+                "--explain {requested}: expected a step of the drive and --planner interactive, \
                  found {} steps of {}",
                 noted.steps.len(),
                 self.planner.name()
@@ -316,7 +316,7 @@ impl Args {
     }
 }
 
-fn tell(run: &mut Run, scored: &Scored) -> anyhow::Result<()> {
+fn report(run: &mut Run, scored: &Scored) -> anyhow::Result<()> {
     run.result("score", scored.score)?;
     for (name, score) in scored.metrics.scores() {
         run.result(&name, score)?;
@@ -345,7 +345,7 @@ fn write_candidates(run: &Run, steps: &[Vec<Candidate>]) -> anyhow::Result<()> {
         .iter()
         .map(|step| {
             let full = step.iter().map(|candidate| {
-                let mut told = row(candidate);
+                let mut value = row(candidate);
                 let poses = candidate.poses.iter().map(|pose| {
                     let p = pose.position;
                     [
@@ -354,8 +354,8 @@ fn write_candidates(run: &Run, steps: &[Vec<Candidate>]) -> anyhow::Result<()> {
                         rounded(pose.heading, 1e-4),
                     ]
                 });
-                told["poses"] = json!(poses.collect::<Vec<_>>());
-                told
+                value["poses"] = json!(poses.collect::<Vec<_>>());
+                value
             });
             full.collect()
         })

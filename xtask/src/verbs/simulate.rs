@@ -142,7 +142,7 @@ impl Args {
             self.write(run, &scenario, &imagined.rollouts, viewer)
         })?;
         run.result("decoding", decoding.name)?;
-        self.tell(run, &scenario, &imagined, &summary)
+        self.report(run, &scenario, &imagined, &summary)
     }
 
     fn write<'a>(
@@ -184,7 +184,7 @@ impl Args {
         Ok(())
     }
 
-    fn tell(
+    fn report(
         &self,
         run: &mut Run,
         scenario: &Scenario,

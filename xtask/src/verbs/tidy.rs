@@ -22,7 +22,7 @@ impl Args {
         let problems = tidied.problems.into_iter().chain(layers).chain(rust);
         let problems: Vec<_> = problems.collect();
         for problem in &problems {
-            run.say(problem);
+            run.print(problem);
         }
         run.result("files", tidied.files)?;
         run.result("problems", problems.len())?;

@@ -1,8 +1,8 @@
 //! `web`: the page that lets one drive inside the learned world, as static files.
 //!
-//! What is made lies in `docs/live` and is committed, so that it can be served as it is. The page's
-//! sources are `crates/gump-web/page`, and what it shares with the viewer of `gump-viz`, copied
-//! unchanged; a test of `gump-web` compares them.
+//! The output is in `docs/live` and is committed, so that it can be served as it is. The page's
+//! sources are `crates/gump-web/page` and a script of the viewer of `gump-viz`, copied unchanged; a
+//! test of `gump-web` compares them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,15 +16,15 @@ use sha2::{Digest as _, Sha256};
 use crate::machine::repository;
 use crate::run::{Common, Run};
 
-/// What the program for browsers is compiled for.
+/// Target that the engine of the page is compiled for.
 const TARGET: &str = "wasm32-unknown-unknown";
-/// The version of `wasm-bindgen` that the workspace uses; its command must be of the same.
+/// The version of `wasm-bindgen` in the workspace; the command must have the same.
 const BINDGEN: &str = "0.2.130";
-/// The most that the page may weigh, bytes.
+/// Maximum size of the page, bytes.
 const MOST: u64 = 12_000_000;
-/// How roads and agents are drawn, in pages of `gump-viz` too.
+/// Script that draws roads and agents, shared with the pages of `gump-viz`.
 const DRAWING: &str = "crates/gump-viz/src/traffic.js";
-/// The list of scenes, of which the page sees what the manifest says.
+/// The list of scenes; the page gets its contents through the manifest.
 const SCENES: &str = "scenes.json";
 
 /// Arguments of `web`.
@@ -44,14 +44,14 @@ struct Scene {
     id: String,
     /// A file of `datasets/mini`.
     file: String,
-    /// Which of its scenes, from 0.
+    /// Index of the scene in the file.
     index: usize,
     title: String,
-    /// Where it is from; the notice of its file where there is none.
+    /// Source of the scene; by default the notice of its file.
     notice: Option<String>,
 }
 
-/// What of the mini set's manifest is passed on.
+/// The parts of the mini set's manifest that the page passes on.
 #[derive(Deserialize)]
 struct Mini {
     file: Vec<MiniFile>,
@@ -107,7 +107,7 @@ impl Args {
         let text = serde_json::to_string_pretty(&manifest)? + "\n";
         write(&live.join("manifest.json"), text.as_bytes())?;
         let bytes = weigh(&live)?;
-        run.say(&format!(
+        run.print(&format!(
             "{}: {:.1} MB, {} scenes; serve it with any server, `python3 -m http.server -d docs/live` say",
             live.display(),
             bytes as f64 / 1e6,
@@ -157,7 +157,8 @@ fn build(root: &Path, engine: &Path) -> anyhow::Result<()> {
     finish(&mut command, "wasm-bindgen")
 }
 
-/// Says what is missing, and how it is installed, before anything is compiled.
+/// Checks for the required tools before anything is compiled; the error says how to install what is
+/// missing.
 fn check_tools() -> anyhow::Result<()> {
     let libraries = Command::new("rustc")
         .args(["--print", "target-libdir", "--target", TARGET])
@@ -189,7 +190,7 @@ fn finish(command: &mut Command, name: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Copies the page's sources, all but the list of scenes, and lets nothing else lie beside them.
+/// Copies the page's sources except the list of scenes, and removes all other files beside them.
 fn copy_page(root: &Path, live: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(live).with_context(|| format!("cannot make {}", live.display()))?;
     for path in files_of(live)? {
@@ -216,11 +217,11 @@ fn scenes(root: &Path, live: &Path) -> anyhow::Result<Manifest> {
     let list = read(&root.join("crates/gump-web/page").join(SCENES))?;
     let list: Vec<Scene> = serde_json::from_slice(&list).context("page/scenes.json")?;
     let mini = root.join("datasets/mini");
-    let told = fs::read_to_string(mini.join("manifest.toml")).context("datasets/mini")?;
-    let told: Mini = toml::from_str(&told).context("datasets/mini/manifest.toml")?;
+    let manifest = fs::read_to_string(mini.join("manifest.toml")).context("datasets/mini")?;
+    let manifest: Mini = toml::from_str(&manifest).context("datasets/mini/manifest.toml")?;
     let mut listed = Vec::new();
     for scene in list {
-        let entry = told.file.iter().find(|file| file.path == scene.file);
+        let entry = manifest.file.iter().find(|file| file.path == scene.file);
         let entry = entry.with_context(|| format!("datasets/mini has no {}", scene.file))?;
         let name = format!("{}#{}", mini.join(&scene.file).display(), scene.index);
         let scenario = gump_data::find(&name)?;

@@ -10,7 +10,7 @@ use crate::{DataError, Place, Problem, ReadOptions, ReadReport, ScenarioRecord};
 
 /// A file that was read and understood, but not yet turned into a scenario.
 pub(crate) trait Document: Sized + Send + 'static {
-    /// What it is, in errors.
+    /// Its description in errors.
     const WHAT: &'static str;
 
     /// Reads the file.

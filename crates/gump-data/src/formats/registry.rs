@@ -71,8 +71,8 @@ static COMPANIONS: &[Companion] = &[
     taf_bw::MAP,
 ];
 
-/// What the name of a file of scenarios contains, where its content is binary: such a file that
-/// is not recognised is damaged rather than something else.
+/// Parts of the names of scenario files with binary content: such a file that is not recognised is
+/// damaged rather than something else.
 const BINARY_NAMES: [&str; 4] = [".tfrecord", ".parquet", ".feather", ".db"];
 
 /// The kind of a file.

@@ -65,10 +65,10 @@ fn read_feather(path: &Path) -> Result<Table, DataError> {
     collect(reader, path)
 }
 
-/// What the columns of a Feather file claim to unpack to, bytes; `None` if it has no sound footer,
-/// or one that tells of bytes beyond the file.
+/// Total unpacked size that the columns of a Feather file claim, bytes; `None` if it has no valid
+/// footer, or one that refers to bytes beyond the file.
 ///
-/// The crate that unpacks them allocates what a block or a column claims before it looks at it.
+/// The crate that unpacks them allocates the claimed size of a block or column before it checks it.
 ///
 /// Source: "Arrow columnar format", IPC file format and body compression: the footer lists blocks
 /// of a message and a body; a packed buffer of the body begins with its length, -1 if it is not.
@@ -87,7 +87,7 @@ fn unpacked_bytes(bytes: &[u8]) -> Option<u64> {
         let message = bytes.get(start..body)?;
         let end = body.checked_add(usize::try_from(block.bodyLength()).ok()?)?;
         bytes.get(body..end)?;
-        // Since version 0.15 a marker of four bytes stands before the length.
+        // Since version 0.15 a marker of four bytes precedes the length.
         let prefix = if message.starts_with(&[0xff; 4]) {
             8
         } else {

@@ -76,7 +76,7 @@ fn without_nan(bytes: &[u8]) -> Option<Vec<u8>> {
 pub(crate) struct Real(pub(crate) f64);
 
 impl Default for Real {
-    /// What is not stated.
+    /// NaN, for a number that is not stated.
     fn default() -> Self {
         Self(f64::NAN)
     }

@@ -36,7 +36,7 @@ pub fn write_atomically<T, E: From<DataError>>(
         Ok(value)
     });
     if finished.is_err() {
-        // The first error is the one to report; a leftover `.partial` misleads nobody.
+        // The first error is the one to report; a leftover `.partial` is harmless.
         let _ = fs::remove_file(&partial);
     }
     finished

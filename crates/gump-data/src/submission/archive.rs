@@ -23,7 +23,7 @@ use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType}
 const SHARD_BYTES: u64 = 1 << 30;
 /// Maximum number of problems kept as sentences; further ones are only counted.
 const MAX_SENTENCES: usize = 1000;
-/// What the names of shards start with.
+/// Prefix of the names of shards.
 const SHARD_STEM: &str = "submission.binproto";
 
 /// Writes an archive with the futures of many scenarios.
@@ -169,15 +169,15 @@ impl SubmissionCheck {
         self.scenarios += 1;
         let id = rollouts.scenario_id();
         if !self.seen.insert(id.into()) {
-            self.tell(format!("scenario {id} occurs twice"));
+            self.add_problem(format!("scenario {id} occurs twice"));
         }
         match expected.0.get(id) {
             Some(agents) => {
                 for problem in rollouts_problems(rollouts, agents) {
-                    self.tell(format!("scenario {id}: {problem}"));
+                    self.add_problem(format!("scenario {id}: {problem}"));
                 }
             }
-            None => self.tell(format!("scenario \"{id}\" is not one of those expected")),
+            None => self.add_problem(format!("scenario \"{id}\" is not one of those expected")),
         }
         self.n_problems == before
     }
@@ -186,11 +186,11 @@ impl SubmissionCheck {
     pub fn finish(&mut self, expected: &ExpectedScenarios) {
         let missing = expected.0.keys().filter(|id| !self.seen.contains(*id));
         for id in missing.cloned().collect::<Vec<_>>() {
-            self.tell(format!("scenario {id} is missing"));
+            self.add_problem(format!("scenario {id} is missing"));
         }
     }
 
-    fn tell(&mut self, problem: String) {
+    fn add_problem(&mut self, problem: String) {
         self.n_problems += 1;
         if self.problems.len() < MAX_SENTENCES {
             self.problems.push(problem);
@@ -281,11 +281,13 @@ pub fn check_archive(
         match &first {
             None => {
                 let problems = metadata_problems(&metadata);
-                problems.into_iter().for_each(|problem| check.tell(problem));
+                problems
+                    .into_iter()
+                    .for_each(|problem| check.add_problem(problem));
                 first = Some(metadata);
             }
             Some(first) if *first != metadata => {
-                check.tell(format!(
+                check.add_problem(format!(
                     "{name} says other things of its makers than the first shard"
                 ));
             }
@@ -294,13 +296,13 @@ pub fn check_archive(
         names.push(name);
     }
     for problem in name_problems(&names) {
-        check.tell(problem);
+        check.add_problem(problem);
     }
     check.finish(expected);
     Ok(check)
 }
 
-/// What is wrong with the names of the shards.
+/// Returns the problems with the names of the shards.
 ///
 /// Source: the challenge's rule `.*\.binproto(-\d{5}-of-\d{5})?`.
 fn name_problems(names: &[String]) -> Vec<String> {

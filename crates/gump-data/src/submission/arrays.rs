@@ -28,18 +28,17 @@ use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 
 /// The largest file that is read, and the most that a member of it may unpack to, bytes.
 const MAX_BYTES: u64 = 4 << 30;
-/// What an `.npy` file starts with.
+/// The first bytes of an `.npy` file.
 const NPY: &[u8] = b"\x93NUMPY";
-/// What a ZIP file starts with.
+/// The first bytes of a ZIP file.
 const ZIP: &[u8] = b"PK\x03\x04";
-/// What a Parquet file starts with.
+/// The first bytes of a Parquet file.
 #[cfg(feature = "parquet")]
 const PARQUET: &[u8] = b"PAR1";
 
 /// The rollouts of a file of arrays; `None` for content of another kind.
 ///
-/// Error: [`DataError::Table`] for arrays that are not what the table above says, and those of
-/// reading.
+/// Error: [`DataError::Table`] for arrays that do not match the table above, and those of reading.
 pub(crate) fn read(path: &Path) -> Result<Option<Vec<ScenarioRollouts>>, DataError> {
     let head = stream::head(path, 8)?;
     #[cfg(feature = "parquet")]
@@ -60,7 +59,7 @@ pub(crate) fn read(path: &Path) -> Result<Option<Vec<ScenarioRollouts>>, DataErr
     Ok(Some(vec![message]))
 }
 
-/// What should be there and what is.
+/// A mismatch between the expected and the actual content.
 #[derive(Debug, PartialEq)]
 struct Wrong {
     expected: String,
@@ -84,7 +83,7 @@ impl Wrong {
     }
 }
 
-/// An array of NumPy's.
+/// A NumPy array.
 #[derive(Debug, PartialEq)]
 struct NpyArray {
     shape: Vec<usize>,
@@ -287,7 +286,7 @@ fn npz(bytes: &[u8]) -> Result<ScenarioRollouts, Wrong> {
     rollouts(id, &ids, states.numbers("states")?, &axes)
 }
 
-/// What explains an `.npy` file; [`crate::submission`] does not look at more of it.
+/// The JSON file that describes an `.npy` file, as far as [`crate::submission`] reads it.
 #[derive(Deserialize)]
 struct Explanation {
     scenario: String,
@@ -345,7 +344,7 @@ fn npy(bytes: &[u8], path: &Path) -> Result<ScenarioRollouts, Wrong> {
     rollouts(explained.scenario, &ids, array.numbers("it")?, &axes)
 }
 
-/// Where in an array which number is.
+/// The layout of an array.
 struct Axes {
     /// Futures, steps, agents.
     lengths: [usize; 3],

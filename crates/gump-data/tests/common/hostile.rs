@@ -1,7 +1,7 @@
-//! Bytes from strangers: where each reader's go, what must lie beside them, how they are sealed.
+//! Untrusted bytes for each reader: the file they go to, the files needed beside it, the checksums.
 //!
 //! Shared by the fuzz targets (`fuzz/`) and the replay in the tests. Checksums are put right here,
-//! since no fuzzer guesses them and damage behind them is what readers must survive.
+//! since no fuzzer guesses them and readers must survive damage behind them.
 
 #![allow(dead_code, reason = "each user uses a part of this")]
 #![allow(clippy::unwrap_used, reason = "what is committed can be read")]
@@ -21,7 +21,7 @@ pub(crate) struct Target {
     seal: fn(&[u8]) -> Vec<u8>,
     /// The file to open, if it is not the one with the bytes.
     opened: Option<&'static str>,
-    /// What must lie beside: a name, and a path from the tests' folder.
+    /// Files needed beside it: a name, and a path from the tests' folder.
     beside: &'static [(&'static str, &'static str)],
 }
 
@@ -58,7 +58,7 @@ const TAF_META: (&str, &str) = (
 const TAF_MAP: (&str, &str) = ("maps/here.osm", "hostile/taf_bw_map/seed.osm");
 const MAP: (&str, &str) = ("map.gpkg", "hostile/nuplan_map/seed.gpkg");
 
-/// Every reader, and every part of one that has a file or a checksum of its own.
+/// Every reader, and every part of one that has a separate file or checksum.
 pub(crate) static TARGETS: [Target; 16] = [
     alone("womd", "some.tfrecord"),
     Target {
@@ -118,7 +118,7 @@ pub(crate) static TARGETS: [Target; 16] = [
     },
 ];
 
-/// The tests' folder, which who includes this file knows.
+/// The tests' folder, which the including file defines.
 fn tests() -> &'static Path {
     Path::new(super::TESTS)
 }

@@ -1,4 +1,4 @@
-//! What the integration tests share: paths of real data, and scenarios to write.
+//! Helpers of the integration tests: paths of real data, and scenarios to write.
 
 #![allow(dead_code, reason = "each test file uses a part of this")]
 

@@ -16,7 +16,7 @@ use gump_model::placed_slot::PlacedSlot;
 /// Tokens of a page.
 const PAGE: usize = PANEL;
 
-/// How channels are cut into heads.
+/// The division of channels into heads.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Heads {
     pub(crate) n: usize,
@@ -90,7 +90,7 @@ impl Context {
         self.slots.clear();
     }
 
-    /// How many of the first tokens of `slots` are cached, compared token by token.
+    /// Returns the number of leading tokens of `slots` that are cached, compared token by token.
     pub(crate) fn common(&self, slots: &[PlacedSlot]) -> usize {
         let pairs = self.slots.iter().zip(slots);
         pairs.take_while(|(held, wanted)| held == wanted).count()

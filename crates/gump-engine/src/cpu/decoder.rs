@@ -2,7 +2,7 @@
 //! steps.
 //!
 //! The input side of the first layer is one table lookup: its products with every token and every
-//! step are computed when the engine is built. Each step multiplies only the output rows of its own
+//! step are computed when the engine is built. Each step multiplies only the output rows of its
 //! field, which is exact because no other bins may be sampled.
 
 use gump_kernels::gru::gru_row;
@@ -23,8 +23,8 @@ use crate::sampling::SamplingConfig;
 #[derive(Debug)]
 pub(super) struct Decoder {
     width: usize,
-    /// What the first layer's gates make of every token, `[TABLE_ROWS, 3C]`, and of every step,
-    /// bias included, `[STEPS, 3C]`.
+    /// Input products of the first layer's gates for every token, `[TABLE_ROWS, 3C]`, and for every
+    /// step, bias included, `[STEPS, 3C]`.
     token_gates: Vec<f32>,
     step_gates: Vec<f32>,
     /// The hidden side of every layer, and the input side of those after the first.

@@ -90,7 +90,7 @@ pub struct Job<'a> {
     pub keep: bool,
 }
 
-/// Where a row stands: its job within the wave, its place in the job's sequence.
+/// The location of a row: its job within the wave, its place in the job's sequence.
 type Row = (usize, usize);
 
 impl Engine {
@@ -363,7 +363,8 @@ impl Engine {
         self.count(dense + attended);
     }
 
-    /// `x += gate * out(attention(query(norm(x))))`, where `keys` says what a row sees and how much.
+    /// `x += gate * out(attention(query(norm(x))))`, where `keys` returns the pages that a row
+    /// attends to and the number of tokens it sees.
     fn attend<'a>(
         &self,
         attention: &Attention,
@@ -456,14 +457,14 @@ pub(crate) struct Workspace {
     draws: Candidates,
 }
 
-/// What a wave works in: its vectors, `[R, C]`, and their keys and values, `[R, 2C]`.
+/// Memory that a wave works in: its vectors, `[R, C]`, and their keys and values, `[R, 2C]`.
 #[derive(Debug, Default)]
 struct Wave {
     x: Vec<f32>,
     kv: Vec<f32>,
 }
 
-/// Rooms that are free; tasks return them, so that none is built twice.
+/// Free workspaces; tasks return them, so that they are reused.
 #[derive(Debug, Default)]
 struct Pool<R = Workspace>(Mutex<Vec<R>>);
 

@@ -49,16 +49,16 @@ fn the_engine_says_what_the_network_says() {
 fn lower_precision_says_nearly_the_same() {
     let (network, scenario) = (network(), scenario());
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));
-    let said = |precision| {
+    let read_with = |precision| {
         let engine = Engine::new(&network, precision).unwrap();
         let packed = engine.remember(&memory).unwrap();
-        let said = all(&engine, &packed, &slots, &mut Context::default());
-        (said, engine.weight_bytes())
+        let vectors = all(&engine, &packed, &slots, &mut Context::default());
+        (vectors, engine.weight_bytes())
     };
-    let (exact, bytes) = said(Precision::F32);
+    let (exact, bytes) = read_with(Precision::F32);
     for (precision, tolerance, least) in [(Precision::Bf16, 0.05, 1.9), (Precision::Int8, 0.2, 3.2)]
     {
-        let (rounded, fewer) = said(precision);
+        let (rounded, fewer) = read_with(precision);
         let difference = largest_difference(&exact, &rounded);
         assert!(
             0.0 < difference && difference < tolerance,
@@ -109,7 +109,7 @@ fn a_context_changes_no_bit() {
         assert_eq!(context.slots.len(), end);
     }
     assert_eq!(pieces, whole);
-    // Another value in the middle: only what stands before it is kept, by this future alone.
+    // Another value in the middle: only the tokens before it are kept, by this future alone.
     let shared = context.clone();
     let value = slots.iter().rposition(|p| matches!(p.slot, Slot::Value(_)));
     let mut changed = slots.clone();
@@ -165,16 +165,16 @@ fn a_probe_is_the_same_by_engine_and_by_tensors() {
     let sampling = SamplingConfig::default();
     let fused = TransformerWorld::new(network(), sampling.clone());
     let plain = TransformerWorld::plain(network(), sampling);
-    let said = [fused, plain].map(|world| world.probe(scenario.present()).unwrap());
-    assert!(said[0].len() > 32);
-    assert!(largest_difference(&said[0], &said[1]) < 1e-4);
+    let outputs = [fused, plain].map(|world| world.probe(scenario.present()).unwrap());
+    assert!(outputs[0].len() > 32);
+    assert!(largest_difference(&outputs[0], &outputs[1]) < 1e-4);
 }
 
-/// What a rollout is to be exact under.
+/// Conditions of a rollout whose results must be exact.
 struct Course<'a> {
     scenario: &'a Scenario,
     steps: usize,
-    /// Where the ego is told to be after each step, relative to its start, metres ahead.
+    /// Distance that the ego is moved ahead in each step, metres; `None` if it is not driven.
     ego: Option<f64>,
 }
 
@@ -197,14 +197,14 @@ fn imagine(
         seed: Seed(5),
     };
     let mut session = world.open_session(&[start]).unwrap();
-    let mut told = course.scenario.present().ego_now().state;
+    let mut ego = course.scenario.present().ego_now().state;
     let step = |_| {
         if forget {
             session.forget();
         }
         let states: Option<Vec<AgentState>> = course.ego.map(|ahead| {
-            told.pose.position.x += ahead;
-            vec![told; n]
+            ego.pose.position.x += ahead;
+            vec![ego; n]
         });
         gump_rollout::Session::step(&mut session, states.as_deref()).unwrap()
     };
@@ -312,8 +312,8 @@ fn many_futures_equal_as_many_single_ones() {
         };
         let seed = Seed(11);
         let mut together = world.open(&[start(32, seed)]).unwrap();
-        // Future k of a start is drawn from `seed.fork(k)`; as a start of its own it would be
-        // drawn from that seed's fork 0, so each is taken out of a batch of its own length.
+        // Future k of a start is drawn from `seed.fork(k)`; as a separate start it would be drawn
+        // from that seed's fork 0, so each is the last future of a batch of another length.
         let mut alone: Vec<_> = (1..=32)
             .step_by(7)
             .map(|n| (n - 1, world.open(&[start(n, seed)]).unwrap()))

@@ -20,15 +20,15 @@ pub const NEWBORN_AT: usize = CONTROL_KEYS + 1;
 /// list. Classes ascend within a list, and ids within a class, which limits the keys that may
 /// follow. The odds of a further agent are multiplied by `pace`.
 pub fn next_key(
-    said: &Successor,
+    successor: &Successor,
     stop: usize,
     used: &BTreeSet<u16>,
     last: Option<Key>,
     seed: Seed,
     pace: f64,
 ) -> Option<Key> {
-    let peak = said.control.iter().copied().fold(f32::MIN, f32::max);
-    let weight = |i: usize| f64::from((said.control[i] - peak).exp());
+    let peak = successor.control.iter().copied().fold(f32::MIN, f32::max);
+    let weight = |i: usize| f64::from((successor.control[i] - peak).exp());
     let free = AGENT_KEYS
         .map(|id| id as u16)
         .filter(|id| !used.contains(id));
@@ -41,7 +41,7 @@ pub fn next_key(
         .map(|kind| keys_of(kind, used, last))
         .collect();
     let class = |kind: AgentKind| {
-        let logit = said.classes[class_index(kind)];
+        let logit = successor.classes[class_index(kind)];
         let is_open = !keys[class_index(kind)].is_empty();
         if is_open { f64::from(logit).exp() } else { 0.0 }
     };
@@ -65,8 +65,8 @@ fn keys_of(kind: AgentKind, used: &BTreeSet<u16>, last: Option<Key>) -> Vec<Key>
 
 /// The probability that an agent is still present, from the logits before its key: those of its own
 /// key, of the later tracked agents and of the end of their list.
-pub(crate) fn stays(said: &Successor, id: u16, later: &[u16]) -> f64 {
-    let weight = |i: usize| f64::from(said.control[i]);
+pub(crate) fn stays(successor: &Successor, id: u16, later: &[u16]) -> f64 {
+    let weight = |i: usize| f64::from(successor.control[i]);
     let others = later.iter().map(|id| weight(usize::from(*id)));
     let others = others.chain([weight(NEWBORN_AT)]);
     let own = weight(usize::from(id));
@@ -91,7 +91,7 @@ mod tests {
 
     use super::*;
 
-    fn said(likely: &[(usize, f32)]) -> Successor {
+    fn successor(likely: &[(usize, f32)]) -> Successor {
         let mut control = vec![-30.0; CONTROL_KEYS + 3];
         for (i, logit) in likely {
             control[*i] = *logit;
@@ -112,12 +112,12 @@ mod tests {
 
     #[test]
     fn the_end_and_new_keys_have_their_shares() {
-        let said = said(&[(BEGIN_AT, 0.0), (7, 3f32.ln())]);
+        let successor = successor(&[(BEGIN_AT, 0.0), (7, 3f32.ln())]);
         let none = BTreeSet::new();
         let draw = |pace: f64| -> Vec<Option<Key>> {
             let seeds = (0..4000).map(Seed);
             seeds
-                .map(|seed| next_key(&said, BEGIN_AT, &none, None, seed, pace))
+                .map(|seed| next_key(&successor, BEGIN_AT, &none, None, seed, pace))
                 .collect()
         };
         let drawn = draw(1.0);
@@ -134,18 +134,19 @@ mod tests {
 
     #[test]
     fn lists_ascend_and_ids_are_used_once() {
-        let said = said(&[(7, 5.0), (3, 5.0), (9, 0.0)]);
+        let successor = successor(&[(7, 5.0), (3, 5.0), (9, 0.0)]);
         let used = BTreeSet::from([7]);
         for i in 0..200 {
-            let key = next_key(&said, BEGIN_AT, &used, Some(vehicle(5)), Seed(i), 1.0).unwrap();
+            let key =
+                next_key(&successor, BEGIN_AT, &used, Some(vehicle(5)), Seed(i), 1.0).unwrap();
             assert!(vehicle(5) < key && key.id != 7, "{key}");
         }
     }
 
     #[test]
     fn who_is_skipped_has_left() {
-        let said = said(&[(4, 0.0), (6, 3f32.ln())]);
-        assert!((stays(&said, 4, &[6]) - 0.25).abs() < 1e-6);
-        assert!(stays(&said, 6, &[]) > 0.999);
+        let successor = successor(&[(4, 0.0), (6, 3f32.ln())]);
+        assert!((stays(&successor, 4, &[6]) - 0.25).abs() < 1e-6);
+        assert!(stays(&successor, 6, &[]) > 0.999);
     }
 }

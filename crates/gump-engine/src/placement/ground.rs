@@ -42,16 +42,16 @@ pub(crate) struct Cell {
     pub(crate) is_open: bool,
     /// Headings of traffic in the cell, scene frame; none where any heading is allowed.
     pub(crate) ways: Vec<f32>,
-    /// How an agent may enter the window there.
+    /// The way in which an agent may enter the window there.
     pub(crate) entry: Entry,
     /// Whether a lane ends there at the end of the map.
     pub(crate) is_end: bool,
 }
 
-/// How an agent enters the window.
+/// The way in which an agent enters the window.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Entry {
-    /// Not there.
+    /// No entry.
     #[default]
     Closed,
     /// Over the border, nearing the ego.

@@ -37,7 +37,8 @@ pub struct Rules {
     pub spec: ObjectSpec,
     /// Its valid positions; `None` if it may be anywhere.
     pub ground: Option<Arc<Ground>>,
-    /// The row it stands in: ahead (true) or behind of which object, and the gap in metres.
+    /// The row it belongs to: whether it is ahead of (true) or behind an object, the box of that
+    /// object, and the gap in metres.
     pub rows: Vec<(bool, OrientedBox, f64)>,
     /// Boxes of the objects already placed, scene frame.
     pub taken: Vec<OrientedBox>,
@@ -46,7 +47,7 @@ pub struct Rules {
     pub comes_to: Option<(DVec2, DVec2)>,
     /// Whether sizes and speeds stay within the usual range of the class.
     pub is_guided: bool,
-    /// How its draws differ from those of a rollout.
+    /// Differences of its draws from those of a rollout.
     pub manner: Manner,
 }
 
@@ -61,7 +62,7 @@ pub struct Manner {
     pub smoothing_bins: Option<f32>,
     /// Whether the targets of sizes were smoothed as widely.
     pub smoothed_sizes: bool,
-    /// The numbers that decide its fields, in place of its stream.
+    /// Random numbers for its fields, in place of its stream.
     pub numbers: Option<[f64; STATE_STEPS]>,
 }
 
@@ -311,7 +312,8 @@ impl Rules {
         !turns && (!self.rows.is_empty() || self.ground.as_ref().is_none_or(goes))
     }
 
-    /// Where on the axis of `field` its centre may be, given what is drawn before.
+    /// Returns weights for the bins of `field`, by where the centre may be on that axis given the
+    /// fields drawn before; `None` without constraints.
     fn place(&self, field: Field, value: &dyn Fn(usize) -> f64) -> Option<Vec<f32>> {
         let velocity = dvec2(value(2), value(3));
         let size = dvec2(value(1), value(0));
@@ -362,8 +364,8 @@ impl Rules {
         Some((0..field.n_bins() as u16).map(admits).collect())
     }
 
-    /// Whether the object could stand on a cell: inside its bounds, the way it moves, clear of
-    /// others, and nearing the ego if it comes over the border of what that sees.
+    /// Whether the object fits on a cell: inside its bounds, moving in a direction of the cell,
+    /// clear of others, and nearing the ego if it enters over the border of its window.
     fn fits(&self, at: DVec2, cell: &Cell, size: DVec2, velocity: DVec2) -> bool {
         let ways = &cell.ways;
         if !self.nears(at, cell, velocity) {
@@ -398,7 +400,7 @@ impl Rules {
         !self.taken.iter().any(|other| own.overlaps(other))
     }
 
-    /// False for what comes over the border of what the ego sees without nearing it.
+    /// False for an agent that enters over the border of the ego's window without nearing the ego.
     fn nears(&self, at: DVec2, cell: &Cell, velocity: DVec2) -> bool {
         let bordering = self.comes_to.filter(|_| cell.entry == Entry::Border);
         bordering.is_none_or(|(ego, moving)| {
@@ -406,7 +408,8 @@ impl Rules {
         })
     }
 
-    /// How well a heading keeps to the lane, from 0 to 1; 1 where there is none.
+    /// Returns the weight of a heading by its alignment with the lane, from 0 to 1; 1 without a
+    /// lane.
     fn keeps_lane(&self, heading: f64, at: DVec2) -> f32 {
         let cell = self.ground.as_ref().and_then(|ground| ground.cell(at));
         let ways = cell.map_or(&[][..], |cell| &cell.ways).iter();

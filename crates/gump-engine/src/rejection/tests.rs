@@ -152,7 +152,7 @@ fn a_thin_median_is_not_jumped() {
 
 #[test]
 fn who_is_off_the_road_may_come_back_but_go_no_farther() {
-    // The road is north of the edge; the car stands south of it.
+    // The road is north of the edge; the car is south of it.
     let edge: [&[(f64, f64)]; 1] = [&[(-40.0, 0.0), (40.0, 0.0)]];
     let north = std::f64::consts::FRAC_PI_2;
     for y in [-6.0, -1.0, 0.5] {
@@ -226,15 +226,15 @@ fn braking_stays_on_the_way_and_stops() {
             velocity: pose.direction() * 8.0,
         })
     };
-    let said = request
+    let bins = request
         .anchor
         .bins(QuantizedState::default(), std::array::from_fn(arc));
-    let said: Bins = said.map(|bin| bin.expect("all are within the grid"));
+    let bins: Bins = bins.map(|bin| bin.expect("all are within the grid"));
     let moving = Member {
         speed: 8.0,
         ..member(0.0, 4.0)
     };
-    let braking = moving.brake(&request, &said).expect("it moves");
+    let braking = moving.brake(&request, &bins).expect("it moves");
     let poses = request.anchor.poses(&braking);
     // 8 m/s and 5 m/s^2: 3.4 m after half a second, 6.4 m after 1.6 s for good.
     for (pose, s) in poses.iter().zip([3.375_f64, 5.5, 6.375, 6.4]) {
@@ -245,5 +245,5 @@ fn braking_stays_on_the_way_and_stops() {
         speed: 0.0,
         ..member(0.0, 0.0)
     };
-    assert!(stands.brake(&request, &said).is_none());
+    assert!(stands.brake(&request, &bins).is_none());
 }

@@ -31,8 +31,8 @@ pub struct Engine {
     edges: [Panels; 2],
     layers: Vec<Layer>,
     norm: Norm,
-    /// What the gates make of every bin that enters, `[ALL_BINS, 3C]`, and of every step, bias
-    /// included, `[FIELDS, 3C]`.
+    /// Input products of the gates for every bin that enters, `[ALL_BINS, 3C]`, and for every step,
+    /// bias included, `[FIELDS, 3C]`.
     bin_gates: Vec<f32>,
     step_gates: Vec<f32>,
     hidden: Panels,
@@ -370,7 +370,7 @@ impl Engine {
             }
             room.queries.resize(n * BINS[field], 0.0);
             self.heads[field].apply(states, &mut room.queries, &mut room.panels);
-            // Whether to stand is no tail of anything: who sets off rarely must still do so.
+            // The choice whether to stand is not truncated: rare starts must still occur.
             let draw = match field {
                 0 => Draw { top_p: 1.0, ..draw },
                 _ => draw,

@@ -18,7 +18,7 @@ use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 
 /// Below this speed braking has no effect, metres per second.
 const CREEPING: f64 = 0.5;
-/// How far a front bumper may be over a line before it counts as passed, metres.
+/// Distance that a front bumper may be over a line before it counts as passed, metres.
 const OVER_M: f64 = 0.5;
 /// Lines of one junction lie within this, metres.
 const ONE_LINE_M: f64 = 4.0;
@@ -39,12 +39,12 @@ pub(super) fn held_back(now: &Shown, step: Pose) -> Pose {
     let Some(limits) = Limits::of(now.body.kind) else {
         return step;
     };
-    let said = AgentState {
+    let moved = AgentState {
         pose: now.pose * step,
         velocity: step.position / TOKEN_DT,
     };
-    let kept = limits.keep(now.pose, said).pose;
-    if kept == said.pose {
+    let kept = limits.keep(now.pose, moved).pose;
+    if kept == moved.pose {
         return step;
     }
     now.pose.inverse() * kept
@@ -177,7 +177,7 @@ pub(super) fn heed(
         let now = &agents[i];
         let speed = now.velocity().length();
         let stands = speed < CREEPING;
-        // Whoever cannot stop before the line any more goes on.
+        // An agent that can no longer stop before the line drives on.
         let ahead = crossed(now, moves[i], lines);
         let room = ahead.iter().map(|(line, _)| line.room(now));
         let room = room.fold(f64::INFINITY, f64::min);
@@ -190,8 +190,8 @@ pub(super) fn heed(
 /// The attempt of [`start`], apart from those of other rules.
 const STARTS: usize = 1 << 10;
 
-/// Draws the moves of agents that stand although nothing holds them once more. With more draws all
-/// queues dissolve that recorded and simulated logs show (result 23).
+/// Draws the moves of agents that stand although nothing holds them once more. More draws would
+/// dissolve all queues that recorded and simulated logs show (result 23).
 pub(super) fn start(mut standing: Vec<usize>, moves: &mut [Pose], again: &mut Again<'_>) {
     standing.retain(|&i| moves[i].position == DVec2::ZERO);
     if standing.is_empty() {
@@ -328,7 +328,7 @@ mod tests {
     fn who_would_run_into_another_is_drawn_again() {
         let agents = [car(0.0, 4.0), car(9.0, 0.0)];
         let mut moves = [straight(4.0), Pose::IDENTITY];
-        let mut asked = Vec::new();
+        let mut calls = Vec::new();
         let survey = Survey::default();
         settle(
             &agents,
@@ -337,13 +337,13 @@ mod tests {
             4,
             &mut moves,
             &mut |who, attempt| {
-                asked.push((who.to_vec(), attempt));
+                calls.push((who.to_vec(), attempt));
                 who.iter()
                     .map(|_| straight([4.5, 1.0][attempt.min(1)]))
                     .collect()
             },
         );
-        assert_eq!(asked, [(vec![0], 0), (vec![0], 1)]);
+        assert_eq!(calls, [(vec![0], 0), (vec![0], 1)]);
         assert_eq!(moves, [straight(1.0), Pose::IDENTITY]);
     }
 
@@ -387,12 +387,12 @@ mod tests {
     #[test]
     fn who_could_go_is_drawn_once_more() {
         let mut moves = [Pose::IDENTITY, Pose::IDENTITY, straight(2.0)];
-        let mut asked = Vec::new();
+        let mut calls = Vec::new();
         start(vec![0, 2], &mut moves, &mut |who, attempt| {
-            asked.push((who.to_vec(), attempt));
+            calls.push((who.to_vec(), attempt));
             vec![straight(0.4); who.len()]
         });
-        assert_eq!(asked, [(vec![0], STARTS)]);
+        assert_eq!(calls, [(vec![0], STARTS)]);
         assert_eq!(moves, [straight(0.4), Pose::IDENTITY, straight(2.0)]);
         start(vec![2], &mut moves, &mut |_, _| unreachable!("it moves"));
     }
@@ -414,7 +414,7 @@ mod tests {
         let red = [(&line, LightState::Red)];
         // Its front is at 2 m and would be at 6.
         assert_eq!(settled(car(0.0, 1.0), 4.0, &red, 1.0), 1.0);
-        // It would stand before the line, but not be held there in the next half second.
+        // It would stop before the line, but could not stay there in the next half second.
         assert_eq!(settled(car(0.0, 2.0), 2.9, &red, 1.0), 1.0);
         assert_eq!(
             settled(car(0.0, 1.0), 4.0, &[(&line, LightState::Green)], 1.0),

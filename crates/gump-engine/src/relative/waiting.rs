@@ -1,23 +1,23 @@
 //! Agents that stand in a lane although nothing holds them.
 //!
-//! Training scenes last nine seconds, in which whoever stands throughout is usually parked or in a
-//! queue. In a longer rollout agents that have waited for each other, or for somebody who has gone,
-//! look like those and never start. Here it is decided from the map, the lights and the others
-//! whether an agent could drive on; the world then shows such agents to the network as having just
-//! stopped. Whether and how they start remains the network's decision.
+//! Training scenes last nine seconds, in which an agent that stands throughout is usually parked or
+//! in a queue. In a longer rollout agents that have waited for each other, or for one that has
+//! left, look like those and never start. Here it is decided from the map, the lights and the other
+//! agents whether an agent could drive on; the world then shows such agents to the network as
+//! having just stopped. Whether and how they start remains the network's decision.
 
 use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{
     Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead, stop_line,
 };
 
-/// How near to a lane's centre an agent stands in the lane, metres: vehicles, and bicycles, which
-/// keep to the side.
+/// Maximum distance from a lane's centre of an agent in the lane, metres: for vehicles, and for
+/// bicycles, which keep to the side.
 const IN_LANE_M: f64 = 1.0;
 const BESIDE_M: f64 = 2.0;
-/// How well aligned with it, radians.
+/// Maximum deviation from its direction, radians.
 const ALONG: f64 = 0.35;
-/// How far ahead lights and crossing traffic are considered, metres.
+/// Distance ahead within which lights and crossing traffic are considered, metres.
 const LOOK_M: f64 = 25.0;
 /// The free path that a start needs beyond the front bumper, metres.
 const ROOM_M: f64 = 5.0;
@@ -36,11 +36,11 @@ const MOVES: f64 = 0.5;
 const MEETING_M: f64 = 25.0;
 const CROSSES: f64 = 0.52;
 
-/// Which of the agents stand in a lane, have waited for more than `patience_s` and could drive on:
-/// nobody is on the path ahead or about to cross it, no light forbids it, and of those that meet
-/// there they have waited longest.
+/// Returns the indices of the agents that stand in a lane, have waited for more than `patience_s`
+/// and could drive on: no agent is on the path ahead or about to cross it, no light forbids it, and
+/// of those that meet there they have waited longest.
 ///
-/// `agents` are all of the frame, each with its waiting time in seconds. Returns indices.
+/// `agents` are all of the frame, each with its waiting time in seconds.
 pub(super) fn held_by_nothing(
     map: &MapGraph,
     lights: &[Light],
@@ -150,7 +150,7 @@ mod tests {
 
     use super::*;
 
-    /// Those who could go, everybody having waited as long as given.
+    /// Ids of the agents that could go, given their waiting times, seconds.
     fn free(scenario: &Scenario, waited: &[(i64, f64)]) -> Vec<i64> {
         let scene = scenario.present();
         let since = |id: AgentId| waited.iter().find(|(of, _)| *of == id.0);
@@ -194,7 +194,7 @@ mod tests {
             ))
         };
         assert!(free(&crossing(-20.0, 8.0), &waited).is_empty());
-        // It has passed, or stands.
+        // It has passed, or does not move.
         assert_eq!(free(&crossing(20.0, 8.0), &waited), [0]);
         assert_eq!(free(&crossing(-20.0, 0.0), &waited), [0]);
     }

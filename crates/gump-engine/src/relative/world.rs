@@ -338,7 +338,7 @@ impl Scene {
 struct Member {
     agent: Agent,
     seen: Seen,
-    /// How long it has stood, seconds, as far as it was observed.
+    /// Time that it has stood, seconds, as far as it was observed.
     waited: f64,
     /// Whether it stands in a lane although nothing holds it.
     could_go: bool,
@@ -352,15 +352,15 @@ struct Future {
     /// Frames read so far.
     frames: usize,
     members: Vec<Member>,
-    /// Those who are not predicted.
+    /// Agents that are not predicted.
     others: Vec<Agent>,
-    /// What lights show in the next frame.
+    /// Lights of the next frame.
     lights: Vec<Light>,
-    /// What the network sees of them.
+    /// The input of the network for them.
     shown_lights: Lights,
-    /// What they show now.
+    /// Lights of the present frame.
     lights_now: Vec<Light>,
-    /// What the present's nodes ended with, `[members, C]`.
+    /// Hidden vectors of the present's nodes, `[members, C]`.
     hidden: Vec<f32>,
 }
 
@@ -406,7 +406,7 @@ impl Future {
         Ok(future)
     }
 
-    /// Takes in a frame of history: of those who are there now, whoever is in it.
+    /// Reads a frame of history: the states of the present agents that are in it.
     fn see(&mut self, engine: &Engine, frame: &Frame, predicted: &[Agent]) {
         let mut before: BTreeMap<AgentId, Member> = std::mem::take(&mut self.members)
             .into_iter()
@@ -473,7 +473,7 @@ impl Future {
         }
     }
 
-    /// Several futures go on by half a second; the network computes them together, so that its
+    /// Advances several futures by half a second; the network computes them together, so that its
     /// weights are fetched once for all of them.
     fn step_all(
         futures: &mut [Self],
@@ -499,7 +499,7 @@ impl Future {
         }
     }
 
-    /// What everyone will do in the next half second, if the ego does what is given.
+    /// Returns the moves of all agents in the next half second, given the state of a driven ego.
     fn decide(
         &self,
         engine: &Engine,
@@ -512,15 +512,15 @@ impl Future {
         self.moves(engine, sampling, (&streams, &drawn), ego, room)
     }
 
-    /// Where the chance of every agent's next move comes from.
+    /// Returns the random stream of every agent's next move.
     fn streams(&self) -> Vec<Seed> {
         let seed = self.seed.fork(self.frames as u64);
         let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
         self.members.iter().map(stream).collect()
     }
 
-    /// Goes on by these moves, which the network has yet to read; an ego that is given is where it
-    /// is said to be.
+    /// Advances by these moves, which the network has not read yet; a driven ego takes the given
+    /// state.
     fn go(&mut self, moves: &[Pose], ego: Option<AgentState>) {
         let id = self.scene.ego;
         for (member, &step) in self.members.iter_mut().zip(moves) {
@@ -572,7 +572,7 @@ impl Future {
         }
     }
 
-    /// The next moves of all agents, each in its own frame: what was drawn from these streams, after
+    /// The next moves of all agents, each in its own frame: those drawn from these streams, after
     /// the rules.
     fn moves(
         &self,
@@ -621,7 +621,7 @@ impl Future {
         });
         let lines: Vec<_> = lines.collect();
         heed(&agents, driven, &lines, redraws, &mut moves, &mut again);
-        // Nobody comes to run a red light by keeping clear of somebody.
+        // Redraws that keep agents clear of others must not make them run a red light.
         let kept = moves.clone();
         let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
             let drawn = who.iter().zip(again(who, attempt));
@@ -639,7 +639,7 @@ impl Future {
         moves
     }
 
-    /// What agents might do next, from streams of their own.
+    /// Returns draws of the next states of all agents but the driven one, from separate streams.
     fn outlooks(
         &self,
         engine: &Engine,
@@ -658,7 +658,7 @@ impl Future {
             })
             .collect();
         let members = self.members.iter().enumerate();
-        let told = members.filter(|(_, member)| driven != Some(member.agent.id));
+        let predicted = members.filter(|(_, member)| driven != Some(member.agent.id));
         let outlook = |(i, member): (usize, &Member)| PredictiveSamples {
             future,
             step,
@@ -675,7 +675,7 @@ impl Future {
                 })
                 .collect(),
         };
-        told.map(outlook).collect()
+        predicted.map(outlook).collect()
     }
 
     /// Shows these lights in the next frame.

@@ -71,12 +71,12 @@ impl TransformerSession<'_> {
             .collect();
         let most = companions.iter().map(Vec::len).max().unwrap_or(0);
         for light in 0..most {
-            let asked = |w: &usize| companions[*w].get(light).is_some_and(Option::is_none);
-            let members: Vec<usize> = (0..windows.len()).filter(asked).collect();
+            let is_independent = |w: &usize| companions[*w].get(light).is_some_and(Option::is_none);
+            let members: Vec<usize> = (0..windows.len()).filter(is_independent).collect();
             let at = |w: usize| first_slot(&windows[w], &placed[w]) + light;
             let wanted: Vec<Vec<usize>> = members.iter().map(|w| vec![at(*w)]).collect();
             let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
-            let mut said = engine.say(&hidden).into_iter();
+            let mut successors = engine.say(&hidden).into_iter();
             for (w, window) in windows.iter_mut().enumerate() {
                 let Some(companion) = companions[w].get(light) else {
                     continue;
@@ -87,11 +87,18 @@ impl TransformerSession<'_> {
                 let state = match companion {
                     Some(other) => window.next.lights[*other].state,
                     None => {
-                        let said = said.next().expect("one word per light that is asked about");
+                        let successor = successors
+                            .next()
+                            .expect("one word per light that is asked about");
                         let seed = future.decision(About::Lights).fork(light as u64);
                         let changes = self.world.sampling().pace.light_changes;
                         let age = future.phases.age(lane);
-                        next_light(&said.lights, (token.state, age), changes, uniform(seed))
+                        next_light(
+                            &successor.lights,
+                            (token.state, age),
+                            changes,
+                            uniform(seed),
+                        )
                     }
                 };
                 future.phases.note(lane, state != token.state);
@@ -107,8 +114,8 @@ impl TransformerSession<'_> {
 fn companions(lights: &[TokenLight], scene: &Scene, now: &Frame) -> Vec<Option<usize>> {
     let stop = |light: &TokenLight| -> Option<DVec2> {
         let lane = *scene.lights.get(usize::from(light.index).checked_sub(1)?)?;
-        let told = now.light(lane).and_then(|light| light.stop_point);
-        told.or_else(|| Some(scene.map.lane(lane)?.centerline.pose_at(0.0).position))
+        let stated = now.light(lane).and_then(|light| light.stop_point);
+        stated.or_else(|| Some(scene.map.lane(lane)?.centerline.pose_at(0.0).position))
     };
     let stops: Vec<Option<DVec2>> = lights.iter().map(stop).collect();
     let goes_with = |i: usize, j: &usize| {
@@ -178,7 +185,7 @@ mod tests {
 
     #[test]
     fn phases_keep_their_order_and_their_times() {
-        // Whatever the network says, over and over again.
+        // With random logits, for many steps.
         let (mut phases, lane) = (Phases::default(), LaneId(1));
         let (mut state, mut seen) = (Yellow, Vec::new());
         for i in 0..4000 {

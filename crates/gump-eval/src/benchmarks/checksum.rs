@@ -1,4 +1,4 @@
-//! The checksum of a scene: of what its file says, whatever packed the file.
+//! The checksum of a scene: of the contents of its file, independent of the encoding.
 //!
 //! Taken of the stored message, before a reader infers anything, and of numbers rounded so far
 //! that the last bits of another machine's sine do not count.

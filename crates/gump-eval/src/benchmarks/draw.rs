@@ -1,4 +1,4 @@
-//! Draws a list from a larger one: at random, or by what planners scored in its scenes.
+//! Draws a list from a larger one: at random, or by the scores of planners in its scenes.
 
 use std::collections::BTreeMap;
 
@@ -50,7 +50,7 @@ impl ListDraw<'_> {
             for (i, scene) in scenes.iter().enumerate() {
                 let id = scene.rsplit(' ').next().unwrap_or_default();
                 if self.rule.admits(id) {
-                    // A rank by chance that does not depend on what else may be drawn.
+                    // A random rank that does not depend on the other scenes that may be drawn.
                     let rank = self.seed.fork(p as u64).fork(i as u64).rng().random();
                     drawn.entry(split).or_default().push((rank, p, i));
                 }

@@ -1,4 +1,4 @@
-//! Makes the scenes of a list and holds them to its checksums.
+//! Makes the scenes of a list and verifies them against its checksums.
 
 use std::path::{Path, PathBuf};
 
@@ -25,10 +25,10 @@ impl Generator {
     /// Error: a generator or a version that this build does not have.
     fn of(part: &MadePart) -> Result<Self, EvalError> {
         let mut generator = Self::named(&part.generator)?;
-        if let Some(asked) = part.density {
+        if let Some(requested) = part.density {
             let (Self::Procedural(SynthesisConfig { density, .. })
             | Self::Sumo(SumoDemand { density, .. })) = &mut generator;
-            *density = asked;
+            *density = requested;
         }
         Ok(generator)
     }
@@ -255,7 +255,7 @@ mod tests {
         BenchmarkList::read(&repository().join(format!("datasets/benchmarks/{name}.toml"))).unwrap()
     }
 
-    /// The first scenes of the parts that are `wanted` come out as the lists say.
+    /// Checks that the first scenes of the parts that are `wanted` have the checksums of the lists.
     fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&MadePart) -> bool) {
         let folder = tempfile::tempdir().unwrap();
         let mut parts = 0;
@@ -309,12 +309,15 @@ mod tests {
             ..list.made[0].clone()
         };
         let error = |part: &MadePart| {
-            let made = make(&list, part, folder.path(), &());
-            made.unwrap_err().to_string()
+            let result = make(&list, part, folder.path(), &());
+            result.unwrap_err().to_string()
         };
-        let told = error(&part);
-        assert!(told.contains("expected scene 0 of procedural"), "{told}");
-        assert!(told.contains("synthetic-tune.toml"), "{told}");
+        let message = error(&part);
+        assert!(
+            message.contains("expected scene 0 of procedural"),
+            "{message}"
+        );
+        assert!(message.contains("synthetic-tune.toml"), "{message}");
         let unknown = MadePart {
             generator: "procedural/99".into(),
             ..part

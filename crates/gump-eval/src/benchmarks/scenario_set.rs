@@ -25,17 +25,17 @@ pub struct ScenarioSet {
     pub paths: Vec<PathBuf>,
 }
 
-/// Where the scenes of lists are.
+/// Folders of the scenes of lists.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BenchmarkFolders {
-    /// The folder in which made scenes were made, one folder a list.
+    /// The folder of generated scenes, with one folder per list.
     pub made: PathBuf,
     /// The folder of recorded data.
     pub recorded: PathBuf,
 }
 
 impl ScenarioSetName {
-    /// The list and the split asked for; `None` if it is no list.
+    /// The list and the requested split; `None` if it is not a list.
     fn list(&self) -> Option<(&Path, Option<&str>)> {
         let (path, split) = match self.0.rsplit_once('#') {
             Some((path, split)) => (path, Some(split)),
@@ -44,11 +44,11 @@ impl ScenarioSetName {
         path.ends_with(".toml").then(|| (Path::new(path), split))
     }
 
-    /// Finds the scenarios; those of a list are held to its checksums.
+    /// Finds the scenarios; those of a list are verified against its checksums.
     ///
     /// # Errors
-    /// A list that is none, a split that it does not have, or scenes that are missing or differ.
-    /// Another file or folder is not looked at.
+    /// A file that is not a list, a split that the list does not have, or scenes that are missing
+    /// or differ. A path that is not a list is not checked.
     pub fn find(
         &self,
         folders: &BenchmarkFolders,
@@ -91,11 +91,11 @@ fn find_listed(
     Ok(ScenarioSet { name, paths })
 }
 
-/// The split asked for, or the only one.
-fn choose(list: &BenchmarkList, asked: Option<&str>) -> Result<Split, EvalError> {
+/// The requested split, or the only one.
+fn choose(list: &BenchmarkList, requested: Option<&str>) -> Result<Split, EvalError> {
     let splits = list.splits();
     let names: Vec<&str> = splits.iter().map(|split| split.name()).collect();
-    let found = match (asked, &splits[..]) {
+    let found = match (requested, &splits[..]) {
         (Some(name), _) => splits.iter().find(|split| split.name() == name).copied(),
         (None, [only]) => Some(*only),
         (None, _) => None,
@@ -105,7 +105,7 @@ fn choose(list: &BenchmarkList, asked: Option<&str>) -> Result<Split, EvalError>
         EvalError::Benchmark(format!(
             "expected {path}#SPLIT with {}, found {path}{}",
             names.join(" or "),
-            asked.map(|name| format!("#{name}")).unwrap_or_default()
+            requested.map(|name| format!("#{name}")).unwrap_or_default()
         ))
     })
 }
@@ -204,10 +204,10 @@ mod tests {
             let found = find_listed(Path::new(&path), split, &nowhere, &());
             found.unwrap_err().to_string()
         };
-        let told = error("synthetic-test.toml", None);
-        assert!(told.contains("data benchmark --list"), "{told}");
-        let told = error("recorded.toml", Some("test"));
-        assert!(told.contains("GUMP_RECORDED"), "{told}");
+        let message = error("synthetic-test.toml", None);
+        assert!(message.contains("data benchmark --list"), "{message}");
+        let message = error("recorded.toml", Some("test"));
+        assert!(message.contains("GUMP_RECORDED"), "{message}");
     }
 
     #[test]

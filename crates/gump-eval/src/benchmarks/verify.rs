@@ -1,4 +1,4 @@
-//! Holds scenes to the checksums of a list.
+//! Verifies scenes against the checksums of a list.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use gump_data::womd::decode_scenario;
 use super::{BenchmarkList, MadePart, RecordedPart, RecordedScene, checksum};
 use crate::{EvalError, Monitor, digest};
 
-/// Holds the file of a part below `folder` to the checksums of the list.
+/// Verifies the file of a part below `folder` against the checksums of the list.
 ///
 /// # Errors
 /// A file that is missing, or the first scene that differs.
@@ -64,7 +64,8 @@ pub fn checksums(path: &Path, monitor: &dyn Monitor) -> Result<Vec<String>, Eval
     TfRecordReader::open(path.to_owned())?.map(sum).collect()
 }
 
-/// The files of a part below the folder of recorded data, each once, held to their checksums.
+/// The files of a part below the folder of recorded data, each once, verified against their
+/// checksums.
 ///
 /// # Errors
 /// A file that is missing or differs.

@@ -23,14 +23,14 @@ const COUNTED_M: f64 = 80.0;
 pub struct LongObservation {
     /// Agents around the ego at the end.
     at_end: f64,
-    /// How far from the ego agents come, and leave, metres.
+    /// Distances from the ego at which agents come, and leave, metres.
     entries_m: Vec<f64>,
     exits_m: Vec<f64>,
     light_changes: f64,
     lights: f64,
     /// Changes from green to yellow, from there to red, from there to green.
     in_order: f64,
-    /// How long lights that were seen to change showed [`COLOURS`] until they changed again, seconds.
+    /// Durations of [`COLOURS`] between two observed changes of a light, seconds.
     phases_s: [Vec<f64>; 3],
 }
 
@@ -69,7 +69,7 @@ pub struct LongSummary {
     pub phase_off_s: Option<f64>,
 }
 
-/// What lights show, in the order in which they do.
+/// States of a traffic light in their order.
 const COLOURS: [LightState; 3] = [LightState::Green, LightState::Yellow, LightState::Red];
 
 /// At most `n` synthetic scenes with 30 s of future. There are fewer where more than half fail: few
@@ -93,11 +93,11 @@ pub fn observe_logs(scenarios: &[Scenario]) -> Vec<LongObservation> {
     scenarios.iter().map(of_log).collect()
 }
 
-/// The observations of one future of each scene in a world. The ego drives as it was recorded, because
-/// the number of agents around it depends on where it goes first of all.
+/// The observations of one future of each scene in a world. The ego drives as it was recorded,
+/// because the number of agents around it depends most on where it goes.
 ///
 /// # Errors
-/// What the world reports.
+/// An error of the world.
 pub fn observe_world(
     world: &dyn WorldModel,
     scenarios: &[Scenario],
@@ -229,8 +229,8 @@ pub fn summarize_long(seen: &[LongObservation], logged: &[LongObservation]) -> L
     }
 }
 
-/// How far apart two distributions are, in the unit of their values: the area between their
-/// quantiles (Wasserstein's first distance), at a hundred of them. `None` if one is empty.
+/// Distance of two distributions in the unit of their values: the area between their quantile
+/// functions (first Wasserstein distance), from a hundred quantiles. `None` if one is empty.
 fn apart(a: &[f64], b: &[f64]) -> Option<f64> {
     const N: usize = 100;
     if a.is_empty() || b.is_empty() {

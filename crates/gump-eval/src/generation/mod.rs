@@ -88,12 +88,12 @@ impl GenerationTally {
     /// Makes a scene in place of every recorded one and scores it; the seed of a scene is forked from
     /// `seed` by its position.
     pub fn of(makers: &SceneMakers<'_>, source: SceneSource, seed: Seed) -> Self {
-        let made: Vec<Option<Frame>> = (0..makers.cases.len())
+        let frames: Vec<Option<Frame>> = (0..makers.cases.len())
             .into_par_iter()
             .map(|i| makers.make(source, i, seed.fork(i as u64)))
             .collect();
         let mut tally = Self::default();
-        for (case, frame) in makers.cases.iter().zip(made) {
+        for (case, frame) in makers.cases.iter().zip(frames) {
             match frame {
                 Some(frame) => tally.add(case, frame, &makers.protocol),
                 None => tally.failed += 1,

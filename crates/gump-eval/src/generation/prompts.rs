@@ -1,7 +1,7 @@
 //! The share of generated scenes that satisfy their prompt.
 //!
-//! A tag is asked for on maps that admit it, which is found out without the network; a tag that no
-//! map given admits (a car park, an all-way stop) is listed and does not count.
+//! A tag is requested on maps that admit it, which is determined without the network; a tag that
+//! none of the maps admits (a car park, an all-way stop) is listed and does not count.
 
 use gump_generate::factory::{GenerationJob, GenerationWorlds, admits, make};
 use gump_generate::verdict::{Clause, NOBODY_OVERLAPS};
@@ -22,13 +22,13 @@ const PROMPTED: Counts = Counts {
 };
 /// Seconds simulated of every scene, to see which tags hold and whether it stays free of overlaps.
 const JUDGED_S: f64 = 8.0;
-/// Unprompted scenes per map that a tag is asked for on.
+/// Unprompted scenes per map on which a tag is requested.
 const UNPROMPTED: usize = 16;
 
-/// How scenes are asked for.
+/// Settings of the prompted scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PromptConfig {
-    /// Maps per tag, among those that admit it; 0 asks for nothing.
+    /// Maps per tag, among those that admit it; 0 prompts no scene.
     pub maps: usize,
     /// Attempts per scene; the last one counts.
     pub attempts: usize,
@@ -38,12 +38,12 @@ pub struct PromptConfig {
     pub tokens: bool,
 }
 
-/// The share of scenes in which tags hold: the mean over those that some map admits.
+/// Share of scenes in which tags hold, mean over the tags that some map admits.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PromptSatisfaction {
-    /// Where they are asked for, with every other clause.
+    /// In scenes that are prompted with the tag, with every other clause of the prompt.
     pub satisfaction: Option<f64>,
-    /// In scenes of the model that were not asked for anything.
+    /// In unprompted scenes of the model.
     pub unconditional: Option<f64>,
     /// In recorded scenes.
     pub logged: Option<f64>,
@@ -56,9 +56,9 @@ pub struct PromptSatisfaction {
 pub struct PromptRow {
     /// Name of the tag.
     pub tag: &'static str,
-    /// Number of maps that it was asked for on.
+    /// Number of maps on which it was requested.
     pub maps: usize,
-    /// Number of maps looked at to find them.
+    /// Number of maps searched to find them.
     pub looked_at: usize,
     /// Share of scenes in which it holds with every other clause.
     pub satisfaction: Option<f64>,
@@ -82,8 +82,8 @@ pub struct PromptRow {
     pub log: f64,
 }
 
-/// A scene that was asked for.
-struct Asked {
+/// A prompted scene.
+struct PromptedScene {
     tag: usize,
     holds: bool,
     is_tag: bool,
@@ -95,8 +95,8 @@ struct Asked {
     moment_s: f64,
 }
 
-/// Asks for every decidable tag on maps that admit it, and counts how often it holds
-/// without being asked for. The monitor gets a part that counts scenes.
+/// Prompts for every decidable tag on maps that admit it, and counts how often it holds in
+/// unprompted scenes. The monitor gets a part that counts scenes.
 ///
 /// # Errors
 /// [`EvalError::Stopped`]. A scene that cannot be generated counts as one that does not satisfy its
@@ -125,17 +125,17 @@ pub fn prompt_satisfaction(
         .flat_map(|tag| places[tag].found.iter().map(move |place| (tag, *place)))
         .collect();
     let progress = monitor.part("prompts", cases.len() as u64, "scenes");
-    let asked: Vec<Asked> = (0..cases.len())
+    let prompted: Vec<PromptedScene> = (0..cases.len())
         .into_par_iter()
         .map(|number| {
             let (tag, recorded) = cases[number];
             let order = order(recorded, Some(tags[tag]), config);
-            let asked = ask(worlds, &order, tag, number as u64, seed.fork(7));
+            let prompted = make_prompted(worlds, &order, tag, number as u64, seed.fork(7));
             progress.advance(1);
-            asked
+            prompted
         })
         .collect();
-    let unasked: Vec<Vec<ScenarioTag>> = (0..n_maps * UNPROMPTED)
+    let unprompted: Vec<Vec<ScenarioTag>> = (0..n_maps * UNPROMPTED)
         .into_par_iter()
         .filter_map(|i| {
             let order = order(shuffled[i % shuffled.len()], None, once(config));
@@ -144,10 +144,10 @@ pub fn prompt_satisfaction(
         })
         .collect();
     let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
-    Ok(summed(&tags, &places, &asked, &unasked, &logged))
+    Ok(summed(&tags, &places, &prompted, &unprompted, &logged))
 }
 
-/// What places are looked for with; nothing is generated there.
+/// Settings for the search for places, in which nothing is generated.
 const ANY: PromptConfig = PromptConfig {
     maps: 1,
     attempts: 1,
@@ -203,16 +203,16 @@ fn order(recorded: &Scenario, tag: Option<ScenarioTag>, config: PromptConfig) ->
     }
 }
 
-fn ask(
+fn make_prompted(
     worlds: GenerationWorlds<'_>,
     order: &GenerationJob,
     tag: usize,
     number: u64,
     seed: Seed,
-) -> Asked {
+) -> PromptedScene {
     let prompt = order.request.prompts[0];
     match make(worlds, order, number, seed) {
-        Ok(made) => Asked {
+        Ok(made) => PromptedScene {
             tag,
             holds: made.holds(),
             is_tag: tags::holds(prompt, &made.scenario) == Some(true),
@@ -222,7 +222,7 @@ fn ask(
             is_steered: made.is_steered,
             moment_s: made.moment_s,
         },
-        Err(_) => Asked {
+        Err(_) => PromptedScene {
             tag,
             holds: false,
             is_tag: false,
@@ -246,8 +246,8 @@ fn stays_clear(clauses: &[Clause]) -> bool {
 fn summed(
     tags: &[ScenarioTag],
     places: &[Places<'_>],
-    asked: &[Asked],
-    unasked: &[Vec<ScenarioTag>],
+    prompted: &[PromptedScene],
+    unprompted: &[Vec<ScenarioTag>],
     logged: &[Vec<ScenarioTag>],
 ) -> PromptSatisfaction {
     let share = |all: &[Vec<ScenarioTag>], tag: &ScenarioTag| {
@@ -256,15 +256,18 @@ fn summed(
     };
     let (mut held, mut free, mut log, mut rows) = (vec![], vec![], vec![], vec![]);
     for (i, tag) in tags.iter().enumerate() {
-        let own: Vec<&Asked> = asked.iter().filter(|asked| asked.tag == i).collect();
-        let of = |value: &dyn Fn(&Asked) -> f64| {
-            let sum: f64 = own.iter().map(|asked| value(asked)).sum();
+        let own: Vec<&PromptedScene> = prompted
+            .iter()
+            .filter(|prompted| prompted.tag == i)
+            .collect();
+        let of = |value: &dyn Fn(&PromptedScene) -> f64| {
+            let sum: f64 = own.iter().map(|prompted| value(prompted)).sum();
             (!own.is_empty()).then(|| sum / own.len() as f64)
         };
-        let satisfaction = of(&|asked| f64::from(asked.holds));
+        let satisfaction = of(&|prompted| f64::from(prompted.holds));
         if let Some(satisfaction) = satisfaction {
             held.push(satisfaction);
-            free.push(share(unasked, tag));
+            free.push(share(unprompted, tag));
             log.push(share(logged, tag));
         }
         rows.push(PromptRow {
@@ -272,16 +275,16 @@ fn summed(
             maps: own.len(),
             looked_at: places[i].looked_at,
             satisfaction,
-            tag_alone: of(&|asked| f64::from(asked.is_tag)),
-            first_attempt: of(&|asked| {
-                f64::from(asked.first.is_some_and(|(attempt, _)| attempt == 1))
+            tag_alone: of(&|prompted| f64::from(prompted.is_tag)),
+            first_attempt: of(&|prompted| {
+                f64::from(prompted.first.is_some_and(|(attempt, _)| attempt == 1))
             }),
-            first_unsteered: of(&|asked| f64::from(asked.first == Some((1, false)))),
-            clear_throughout: of(&|asked| f64::from(asked.is_clear)),
-            attempts: of(&|asked| asked.attempts as f64),
-            steered: of(&|asked| f64::from(asked.is_steered)),
-            moment_s: of(&|asked| asked.moment_s),
-            unconditional: share(unasked, tag),
+            first_unsteered: of(&|prompted| f64::from(prompted.first == Some((1, false)))),
+            clear_throughout: of(&|prompted| f64::from(prompted.is_clear)),
+            attempts: of(&|prompted| prompted.attempts as f64),
+            steered: of(&|prompted| f64::from(prompted.is_steered)),
+            moment_s: of(&|prompted| prompted.moment_s),
+            unconditional: share(unprompted, tag),
             log: share(logged, tag),
         });
     }
@@ -304,7 +307,7 @@ mod tests {
     #[test]
     fn tags_that_no_map_admits_do_not_count() {
         let tags: Vec<ScenarioTag> = ScenarioTag::all().take(3).collect();
-        let asked = |tag, holds| Asked {
+        let prompted = |tag, holds| PromptedScene {
             tag,
             holds,
             is_tag: true,
@@ -314,10 +317,10 @@ mod tests {
             is_steered: holds,
             moment_s: 0.5,
         };
-        let asked = [asked(0, true), asked(0, false), asked(2, true)];
-        let unasked = [vec![tags[0], tags[1]], vec![tags[0]]];
+        let prompted = [prompted(0, true), prompted(0, false), prompted(2, true)];
+        let unprompted = [vec![tags[0], tags[1]], vec![tags[0]]];
         let places: Vec<_> = tags.iter().map(|_| Places::default()).collect();
-        let prompts = summed(&tags, &places, &asked, &unasked, &[]);
+        let prompts = summed(&tags, &places, &prompted, &unprompted, &[]);
         assert_eq!(prompts.satisfaction, Some(0.75));
         assert_eq!(prompts.unconditional, Some(0.5));
         assert_eq!(prompts.rows[0].satisfaction, Some(0.5));

@@ -243,8 +243,8 @@ impl SceneMakers<'_> {
         let present = recorded.present();
         let ego = present.ego_now();
         request.ego.velocity = Some(ego.state.velocity);
-        let made = gump_generate::generate(self.world, &request, &[seed]).ok()?;
-        let scene = made.into_iter().next()?.ok()?;
+        let generated = gump_generate::generate(self.world, &request, &[seed]).ok()?;
+        let scene = generated.into_iter().next()?.ok()?;
         // The recorded ego has its own id, by which both scenes are seen.
         let agents = scene.frame.agents().iter().map(|agent| {
             let mut agent = *agent;

@@ -102,8 +102,8 @@ fn messages(file: &Path) -> Result<Vec<(String, Message)>, EvalError> {
         .collect())
 }
 
-/// True if this is what it was decoded as: messages do not say their type, and rollouts may decode
-/// as predictions without paths.
+/// Whether the message really holds predictions: messages do not state their type, and rollouts may
+/// decode as predictions without paths.
 fn holds_predictions(submission: &MotionChallengeSubmission) -> bool {
     let holds = |message: &ChallengeScenarioPredictions| match &message.prediction_set {
         Some(PredictionKind::SinglePredictions(set)) => {

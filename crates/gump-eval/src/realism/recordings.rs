@@ -29,8 +29,8 @@ pub struct Recorded {
 /// The `wanted` scenarios of files or directories in order; holds one at a time. Their indices go on
 /// from one path to the next.
 ///
-/// Waymo's messages are filled as `options` say, other formats as far as can be: some state
-/// neither an ego nor whom to predict nor edges of the road.
+/// Gaps of Waymo's messages are filled as `options` say, those of other formats as far as possible:
+/// some have no ego, no agents to predict or no road edges.
 ///
 /// # Errors
 /// A first path without scenarios. Errors of later paths and of single scenarios are items.

@@ -1,4 +1,4 @@
-//! Where rollouts of a scenario come from: a world that imagines them, or files.
+//! Sources of rollouts of a scenario: a world that simulates them, or files.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use crate::imagine::{frames, imagine};
 use crate::worlds::{World, WorldName};
 use crate::{EvalError, Monitor, digest};
 
-/// Seconds that the challenge asks for.
+/// Seconds that the challenge requires.
 const HORIZON_S: f64 = 8.0;
 
 /// Rollouts of one scenario.
@@ -25,11 +25,11 @@ pub struct FoundRollouts {
     pub decoding: &'static str,
     /// As the metric takes them.
     pub rollouts: Rollouts,
-    /// Of what a world imagined; nothing is known of a file's rollouts but their paths.
+    /// Digest of simulated rollouts; `None` for those of a file, of which only the paths are known.
     pub digest: Option<String>,
 }
 
-/// Where rollouts come from: a world that imagines them, or files.
+/// A source of rollouts: a world that simulates them, or files.
 pub struct RolloutSource(Kind);
 
 enum Kind {
@@ -93,7 +93,7 @@ impl RolloutSource {
         }))
     }
 
-    /// Which gaps of Waymo's messages matter.
+    /// Options for reading Waymo's messages: which gaps are filled.
     pub fn read_options(&self) -> ReadOptions {
         match &self.0 {
             Kind::World { name, .. } => name.read_options(),
@@ -101,7 +101,7 @@ impl RolloutSource {
         }
     }
 
-    /// Frames that the monitor of [`rollouts`](Self::rollouts) is told of; `None` of files.
+    /// Frames that the monitor of [`rollouts`](Self::rollouts) counts; `None` for files.
     pub fn frames(&self, scenario: &Scenario) -> Option<u64> {
         match &self.0 {
             Kind::World {
@@ -120,7 +120,7 @@ impl RolloutSource {
     /// Rollouts of one scenario.
     ///
     /// # Errors
-    /// What the world reports, a scenario without rollouts, or [`EvalError::Stopped`].
+    /// An error of the world, a scenario without rollouts, or [`EvalError::Stopped`].
     pub fn rollouts(
         &mut self,
         device: &Device,

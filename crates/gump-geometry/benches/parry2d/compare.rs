@@ -134,7 +134,7 @@ fn in_frames_distance(a: &OrientedBox, b: &OrientedBox) -> f64 {
     nearest(a, b).min(nearest(b, a)).sqrt()
 }
 
-/// When two boxes first touch, as `gump-nuplan` has it.
+/// Time at which two boxes first touch, by the method of `gump-nuplan`.
 fn our_contact(a: &Vehicle, b: &Vehicle) -> Option<f64> {
     let offset = b.ours.pose.position - a.ours.pose.position;
     let velocity = b.velocity - a.velocity;
@@ -181,7 +181,8 @@ fn their_contact(a: &Vehicle, b: &Vehicle) -> Option<f64> {
     hit.map(|hit| hit.time_of_impact)
 }
 
-/// How often two answers differ by more than a micrometre (or a microsecond), and the most.
+/// Prints how often two answers differ by more than a micrometre (or a microsecond), and the
+/// largest difference.
 fn compare(what: &str, pairs: impl Iterator<Item = (Option<f64>, Option<f64>)>) {
     let (mut n, mut other, mut far, mut most) = (0, 0, 0, 0.0f64);
     for (ours, theirs) in pairs {

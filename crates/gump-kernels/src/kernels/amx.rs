@@ -3,8 +3,8 @@
 //!
 //! A block is 32 rows of the left matrix, `[steps, 2, 16, 16]` pairs, a step being 16 pairs of the
 //! inner index; with a panel of 32 columns that makes four sums, two tiles of the left and two of
-//! the right matrix: all eight registers. The system lends the registers to a process that asks for
-//! them ([`Amx::detect`]), and a thread says how they are cut before it uses them ([`Tiles`]).
+//! the right matrix: all eight registers. The system lends the registers to a process that
+//! requests them ([`Amx::detect`]), and a thread configures them before it uses them ([`Tiles`]).
 //!
 //! Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 1, chapter 18, and
 //! volume 2; the Linux kernel's documentation of dynamically enabled features.
@@ -97,7 +97,7 @@ fn are_tiles_lent() -> bool {
     false
 }
 
-/// How a thread's tiles are cut: all eight as 16 rows of 64 bytes; given back when dropped.
+/// Tile configuration of a thread: all eight as 16 rows of 64 bytes; released when dropped.
 struct Tiles(());
 
 impl Tiles {
@@ -136,7 +136,7 @@ impl Tiles {
 
 impl Drop for Tiles {
     fn drop(&mut self) {
-        // SAFETY: who cut them has the instruction; nothing of worth is left in them.
+        // SAFETY: the thread that configured them has the instruction; their contents are unused.
         unsafe {
             asm!(
                 "tilerelease",

@@ -1,8 +1,8 @@
 //! Products of matrices in f32 whose numbers are rounded to bfloat16 on the way in and summed in
 //! f32: the part that all processors share.
 //!
-//! What lives here: cutting a product into blocks, and who packs what when. What does not: packing
-//! and multiplying themselves, which a [`Unit`] does; one file per processor.
+//! What lives here: cutting a product into blocks, and the schedule of packing. What does not:
+//! packing and multiplying themselves, which a [`Unit`] does; one file per processor.
 //!
 //! Two neighbours along the inner dimension make a *pair*, 32 bits, the earlier one in the lower
 //! half. The left matrix is packed as blocks of a few rows, the right one as panels of [`PANEL`]
@@ -20,7 +20,7 @@ use crate::panels::PANEL;
 /// Inner indices packed at a time: a panel of 32 KB stays in the first-level cache.
 const DEPTH: usize = 512;
 
-/// Rows packed at a time, a multiple of every unit's block; also what a thread takes at once.
+/// Rows packed at a time, a multiple of every unit's block; also the share of a thread at a time.
 const ROWS_AT_ONCE: usize = 128;
 
 /// Multiplications below which sharing out costs more than it saves.
@@ -85,7 +85,7 @@ pub(super) trait Unit: Copy + Send + Sync {
     fn multiply(self, block: &[u32], panel: &[u32], to: &mut Target<'_>);
 }
 
-/// Where the product of a block with a panel goes.
+/// Destination of the product of a block with a panel.
 #[derive(Debug)]
 pub(super) struct Target<'a> {
     /// From the first element on, rows `stride` apart.
@@ -122,7 +122,7 @@ pub(super) struct Line([u32; 16]);
 pub(super) struct Pairs(Vec<Line>);
 
 impl Pairs {
-    /// Room for `n` pairs, whatever stood there.
+    /// Returns room for `n` pairs, with unspecified contents.
     pub(super) fn room(&mut self, n: usize) -> &mut [u32] {
         self.0.resize(n.div_ceil(16), Line([0; 16]));
         &mut super::flat_mut(&mut self.0)[..n]
@@ -139,8 +139,8 @@ impl Pairs {
 }
 
 thread_local! {
-    /// Room for packed operands, kept from product to product. Whoever works takes it: while a
-    /// thread waits for others, it may begin another product.
+    /// Buffers for packed operands, kept from product to product. A running product takes them out:
+    /// while a thread waits for others, it may begin another product.
     static LEFT: RefCell<Pairs> = const { RefCell::new(Pairs(Vec::new())) };
     static RIGHT: RefCell<Pairs> = const { RefCell::new(Pairs(Vec::new())) };
 }

@@ -1,5 +1,5 @@
-//! Which kernels a processor has, and which of them works: the best one that multiplies a small
-//! matrix rightly, or the one asked for.
+//! The choice of a kernel: the best one that the processor has and that multiplies a small matrix
+//! correctly, or the one requested.
 
 use std::fmt;
 use std::sync::OnceLock;
@@ -50,7 +50,7 @@ impl Kernel {
         Self::Portable,
     ];
 
-    /// How it is written: `avx512-bf16`, say.
+    /// Its name, for example `avx512-bf16`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Portable => "portable",
@@ -103,7 +103,7 @@ impl Kernel {
         }
     }
 
-    /// Whether it multiplies a small matrix of odd sizes as rounding says it should.
+    /// Whether it multiplies a small matrix of odd sizes correctly, up to rounding.
     fn is_right(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         {
@@ -136,31 +136,31 @@ impl fmt::Display for Kernel {
     }
 }
 
-/// The kernel that a process multiplies with, and how it came to be chosen.
+/// The kernel that a process multiplies with, and how it was chosen.
 #[derive(Clone, Debug, Serialize)]
 pub struct Choice {
-    /// What multiplies.
+    /// The kernel in use.
     pub kernel: Kernel,
-    /// Whether somebody asked for it.
+    /// Whether it was set by [`Choice::force`] instead of detected.
     pub forced: bool,
     /// Kernels that the processor has and that failed their test.
     pub wrong: Vec<Kernel>,
 }
 
-/// Made once: a process whose kernel changed midway would contradict itself.
-static MADE: OnceLock<Choice> = OnceLock::new();
+/// Set once: results would change midway if the kernel of a process did.
+static CHOSEN: OnceLock<Choice> = OnceLock::new();
 
 impl Choice {
-    /// The choice of this process: by then made, or made now.
+    /// Returns the choice of this process; the first call makes it.
     pub fn made() -> &'static Self {
-        MADE.get_or_init(Self::best)
+        CHOSEN.get_or_init(Self::best)
     }
 
-    /// Lets this process multiply with a certain kernel. To be said before the first product.
+    /// Makes this process multiply with a certain kernel. Must be called before the first product.
     ///
     /// # Errors
     /// [`KernelError`] if the processor does not have it, if it fails its test, or if
-    /// another one has been at work.
+    /// another one is already in use.
     pub fn force(kernel: Kernel) -> Result<&'static Self, KernelError> {
         let best = Self::best();
         let refuse = |why: String| Err(KernelError(why));
@@ -180,14 +180,14 @@ impl Choice {
             forced: true,
             wrong: best.wrong,
         };
-        let made = MADE.get_or_init(|| forced);
-        if made.kernel != kernel {
-            let other = made.kernel;
+        let choice = CHOSEN.get_or_init(|| forced);
+        if choice.kernel != kernel {
+            let other = choice.kernel;
             return refuse(format!(
                 "kernel {kernel} comes too late, {other} is at work"
             ));
         }
-        Ok(made)
+        Ok(choice)
     }
 
     fn best() -> Self {

@@ -1,4 +1,4 @@
-//! What multiplies matrices on this processor.
+//! The matrix multiplication kernels and the choice among them.
 //!
 //! What lives here: the choice among the kernels, once per process, and the products that depend on
 //! it. One file per kernel; `bf16` is what those for bfloat16 share, `rounded` what processors
@@ -260,7 +260,7 @@ fn flat(lines: &[bf16::Line]) -> &[u32] {
     unsafe { std::slice::from_raw_parts(lines.as_ptr().cast(), 16 * lines.len()) }
 }
 
-/// As [`flat`], to be written.
+/// As [`flat`], mutable.
 #[cfg(target_arch = "x86_64")]
 fn flat_mut(lines: &mut [bf16::Line]) -> &mut [u32] {
     // SAFETY: as above; any bits are pairs, and the borrow is unique.

@@ -1,4 +1,4 @@
-//! Sums of products in what every processor has: also what the others are tested against.
+//! Sums of products in portable code; the reference that the other kernels are tested against.
 
 use crate::panels::PANEL;
 

@@ -33,7 +33,7 @@ fn ways() -> Vec<(&'static str, Way)> {
                 bf16::product(unit, dst, store, scale, (lhs, rhs), threads);
             }));
             ways.push(("tiles as told", |dst, store, scale, lhs, rhs, threads| {
-                let unit = tiles::AsTold(Avx512Bf16::detect().unwrap());
+                let unit = tiles::Emulated(Avx512Bf16::detect().unwrap());
                 bf16::product(unit, dst, store, scale, (lhs, rhs), threads);
             }));
         } else {
@@ -53,14 +53,14 @@ fn ways() -> Vec<(&'static str, Way)> {
 
 #[cfg(target_arch = "x86_64")]
 mod tiles {
-    //! The tiles' packing on any processor: what the instructions do with them, in numbers, after
-    //! their description, with the same offsets in bytes as the assembly's.
+    //! The tiles' packing on any processor: the tile instructions emulated after their description,
+    //! with the same byte offsets as the assembly's.
 
     use super::super::avx512_bf16::Avx512Bf16;
     use super::super::bf16::{Lanes, Target, Unit};
 
     #[derive(Clone, Copy)]
-    pub(super) struct AsTold(pub(super) Avx512Bf16);
+    pub(super) struct Emulated(pub(super) Avx512Bf16);
 
     /// A tile of 16 rows of 16 pairs, its rows `stride` bytes apart from a byte on.
     fn load(memory: &[u32], byte: usize, stride: usize) -> [[u32; 16]; 16] {
@@ -83,7 +83,7 @@ mod tiles {
         }
     }
 
-    impl Unit for AsTold {
+    impl Unit for Emulated {
         const ROWS: usize = 32;
 
         fn pairs(depth: usize) -> usize {
@@ -281,12 +281,12 @@ fn infinities_stay_and_the_smallest_vanish() {
 
 #[test]
 fn the_best_kernel_is_one_the_processor_has() {
-    let made = Choice::made();
-    assert!(made.kernel.is_present());
-    assert!(made.wrong.is_empty(), "{made:?}");
+    let choice = Choice::made();
+    assert!(choice.kernel.is_present());
+    assert!(choice.wrong.is_empty(), "{choice:?}");
     for kernel in Kernel::ALL {
         assert_eq!(Kernel::named(kernel.name()).unwrap(), kernel);
-        if kernel == made.kernel {
+        if kernel == choice.kernel {
             assert!(Choice::force(kernel).is_ok());
         } else {
             let why = Choice::force(kernel).unwrap_err().to_string();

@@ -139,7 +139,7 @@ pub fn judge(
     let mut judged: Vec<Judged> = judged.collect();
     judged.sort_by(|a, b| {
         let order = a.plausibility.total_cmp(&b.plausibility);
-        // Of several who are as implausible as can be, who does most comes first.
+        // Among equally implausible agents, the one with the highest sum comes first.
         let sum = |judged: &Judged| {
             judged
                 .conduct

@@ -20,11 +20,12 @@ use super::{Counter, MOVES, STANDS};
 
 /// A vehicle farther than this beside the centre line is not on the lane, metres.
 const ON_LANE_M: f64 = 1.0;
-/// How far ahead of the front bumper agents are considered, and lights, signs and the end of the
-/// road.
+/// Distance ahead of the front bumper within which agents are considered, and lights, signs and the
+/// end of the road, metres.
 const OTHERS_M: f64 = 15.0;
 const ROAD_M: f64 = 25.0;
-/// How far beside the path agents are considered, from the side of the vehicle, metres.
+/// Distance beside the path within which agents are considered, from the side of the vehicle,
+/// metres.
 const BESIDE_M: f64 = 0.5;
 const PEOPLE_BESIDE_M: f64 = 3.0;
 /// Distance to an intersection within which vehicles give way, and distance of the agents they give
@@ -64,13 +65,13 @@ fn has_no_reason(
     };
     let front_m = place.arc_length + track.length / 2.0;
     let (way, goes_on) = lanes_ahead(map, lane, front_m, ROAD_M);
-    let asks = |part: &LaneAhead<'_>| {
+    let blocks = |part: &LaneAhead<'_>| {
         is_ruled(map, frame, part)
             || others
                 .iter()
                 .any(|other| is_in_way(part, other, track.width))
     };
-    goes_on && !way.iter().any(asks) && !gives_way(&way, others, pose)
+    goes_on && !way.iter().any(blocks) && !gives_way(&way, others, pose)
 }
 
 /// A light that is not green, a stop line or a stop sign.

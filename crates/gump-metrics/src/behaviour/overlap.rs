@@ -12,7 +12,7 @@ impl Counter<'_> {
     pub(super) fn overlaps(&mut self) {
         let tracks = self.tracks;
         let bounds: Vec<_> = tracks.iter().map(Track::bounds).collect();
-        // Every class is held against everyone, so that classes add up to all.
+        // Every class is compared with all agents, so that classes add up to all.
         for class in [
             Class::All,
             Class::Vehicle,

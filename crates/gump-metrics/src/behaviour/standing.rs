@@ -62,8 +62,8 @@ impl Counter<'_> {
             }
             let ahead = self.take.steps(seconds.into());
             let k = self.take.now + ahead;
-            // Where the log goes on, agents count that it still sees: who drives out of its sight
-            // moves, and would be missed in the log only.
+            // While the log lasts, only agents that it still sees count: one that drives out of
+            // sight is moving, and would be missing from the log alone.
             let logged = scenario.log.get(scenario.now + ahead);
             let newcomers = self.behaviour.newcomers;
             for track in self.tracks {
@@ -157,7 +157,7 @@ impl Counter<'_> {
             if stands {
                 has_stood = true;
                 let first = *since.get_or_insert(k);
-                // It stands since before the pace says so for the first time.
+                // It has stood since before the pace first shows it.
                 let began = first.saturating_sub(track.pace_steps());
                 if has_moved && k - first >= stop_steps {
                     has_moved = false;

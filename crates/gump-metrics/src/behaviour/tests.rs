@@ -8,7 +8,8 @@ use gump_scene::{Agent, AgentId, Frame, Light, LightState, Rollout, Scenario, fi
 use super::*;
 use crate::logged;
 
-/// A future of 8 s in which every agent is where `drive` says that it is after so many seconds.
+/// A future of 8 s in which every agent is at the place that `drive` returns for the time in
+/// seconds.
 fn future(scenario: &Scenario, drive: impl Fn(&Agent, f64) -> Pose) -> Rollout {
     let present = scenario.present();
     let mut rollout = Rollout::begin(present);
@@ -24,7 +25,7 @@ fn future(scenario: &Scenario, drive: impl Fn(&Agent, f64) -> Pose) -> Rollout {
     rollout
 }
 
-/// Everyone goes on as now, except agent `id`.
+/// All agents continue as now, except agent `id`.
 fn only(scenario: &Scenario, id: i64, drive: impl Fn(Pose, f64) -> Pose) -> Rollout {
     future(scenario, |agent, t| {
         let pose = agent.state.pose;
@@ -42,7 +43,7 @@ fn ahead(pose: Pose, metres: f64) -> Pose {
     pose * Pose::new(metres, 0.0, 0.0)
 }
 
-/// How far one gets that brakes from `speed` with 3 m/s² until it stands.
+/// Distance covered in `t` seconds by a vehicle that brakes from `speed` with 3 m/s² to a stop.
 fn braking(speed: f64, t: f64) -> f64 {
     let t = t.min(speed / 3.0);
     speed * t - 1.5 * t * t
@@ -205,7 +206,7 @@ fn overlaps_are_counted_by_pair_and_class() {
         .iter()
         .map(|incident| (incident.agent, incident.other))
         .collect();
-    // Who stands is run into and runs into nobody.
+    // A standing agent is run into and runs into no other.
     assert_eq!(by, [(AgentId(0), Some(AgentId(1)))]);
     assert!((seen.incidents[0].at_s - 5.1).abs() < 1e-9, "{seen:?}");
 }

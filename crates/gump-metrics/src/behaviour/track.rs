@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use gump_geometry::{DVec2, OrientedBox, Pose};
 use gump_scene::{AgentId, AgentKind, Frame, Rollout, Scenario};
 
-/// Length of the past that is used, seconds: enough to tell who moves in the present.
+/// Length of the past that is used, seconds: enough to determine which agents move in the present.
 const PAST_S: f64 = 2.0;
 /// Time over which speed is measured, seconds: a tracker's jitter of 10 cm then is 0.1 m/s, which
 /// separates standing from slow agents.

@@ -12,7 +12,7 @@ use crate::encounter::classify;
 
 /// Shallower overlaps do not count, metres: they are within tracker errors.
 const DEEP_M: f64 = 0.1;
-/// An agent slower than this stands and runs into nobody, m/s: trackers have as much jitter.
+/// An agent slower than this stands and runs into no other, m/s: trackers have as much jitter.
 const STANDS: f64 = 0.3;
 /// The ego keeps its lane within this distance of the centre line, metres: a car of 2 m is then
 /// still on a lane of usual width.
@@ -29,7 +29,7 @@ const AXLE: f64 = 0.28;
 pub struct Contact {
     /// The other agent.
     pub agent: AgentId,
-    /// When the boxes began to overlap, seconds after the present.
+    /// Time at which the boxes began to overlap, seconds after the present.
     pub at_s: f64,
 }
 
@@ -60,7 +60,7 @@ impl Attempt<'_> {
             return outcome;
         };
         let mut met = self.touching(ego);
-        // Where the overlap began that goes on, by agent.
+        // Start of the current overlap, by agent.
         let mut began: BTreeMap<AgentId, (usize, Agent)> = BTreeMap::new();
         for (k, frame) in (1..self.plan.len()).zip(frames) {
             let ego = self.ego_in(frame, ego, k);

@@ -54,7 +54,7 @@ fn comes_near(own: &[OrientedBox], agent: &Agent, track: &[Option<&Agent>], dt: 
             return false;
         };
         let its = agent.with_state(there.state).oriented_box();
-        // Who is there at frame j concerns an ego that is there from 3 s before to 1 s after it.
+        // An agent at frame j matters if the ego is there from 3 s before to 1 s after it.
         let from = j.saturating_sub(steps(AFTER_S));
         let until = (j + steps(BEFORE_S) + 1).min(own.len());
         own[from..until].iter().any(|own| {

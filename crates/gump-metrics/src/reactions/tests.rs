@@ -21,7 +21,7 @@ fn ids(outcome: &Outcome) -> Vec<i64> {
     outcome.run_into_ego.iter().map(|c| c.agent.0).collect()
 }
 
-/// A future of the attempt in which agents do as `moved` says at each frame.
+/// A future of the attempt whose frames `moved` computes from the present and the time in seconds.
 fn future(attempt: &Attempt<'_>, moved: impl Fn(&Frame, f64) -> Frame) -> Rollout {
     let scenario = attempt.scenario;
     let mut rollout = Rollout::begin(scenario.present());
@@ -71,7 +71,7 @@ fn the_front_of_the_ego_is_its_own_fault() {
          agent vehicle 1: 20,0 velocity 10,0",
     );
     assert_eq!(why(&scenario, Manoeuvre::SpeedUp), Some(Reason::OwnFault));
-    // And where it happens in a future, it is told as what it is, and ends it.
+    // In a future it is reported as such, and ends the future.
     let scenario = scene(
         "ego vehicle 0: 0,0 velocity 10,0
          agent vehicle 1: 60,0 velocity 10,0
@@ -125,7 +125,7 @@ fn into_the_side_of_an_ego_in_its_lane_is_the_fault_of_the_other() {
 
 #[test]
 fn who_changes_lane_is_to_blame_until_it_is_on_the_other() {
-    // On the left lane, ahead of the gap that is asked for, and slower: the ego moves into its side.
+    // On the left lane, ahead of the required gap, and slower: the ego moves into its side.
     let scenario = scene(
         "ego vehicle 0: 0,0 velocity 12,0
          agent vehicle 1: 10,3.5 velocity 7,0",
@@ -145,7 +145,7 @@ fn who_changes_lane_is_to_blame_until_it_is_on_the_other() {
     assert_eq!(ids(&replayed), [1]);
     let at = (40.0 - 4.8) / 6.0;
     assert!((replayed.run_into_ego[0].at_s - at).abs() < 0.15);
-    // Nobody may be beside.
+    // No agent may be beside the ego.
     let scenario = scene(
         "ego vehicle 0: 0,0 velocity 10,0
          agent vehicle 1: -5,3.5 velocity 10,0",
@@ -324,7 +324,7 @@ fn manoeuvres_are_scored_only_where_they_apply() {
     )
     .unwrap();
     assert_eq!(why(&alone, Manoeuvre::ChangeLane), Some(Reason::NoLane));
-    // Parked cars concern nobody, however near.
+    // Parked cars do not count, however near.
     let parked = scene("ego vehicle 0: 0,0 velocity 10,0\nagent vehicle 1: 12,-2.5");
     assert_eq!(why(&parked, Manoeuvre::Brake), Some(Reason::Nobody));
 }

@@ -22,7 +22,7 @@ fn small() -> ModelConfig {
     }
 }
 
-/// A file in a folder of its own, removed at the end.
+/// Runs a test with a file in a temporary folder.
 fn with_file(test: impl FnOnce(&Path)) {
     let folder = tempfile::tempdir().unwrap();
     test(&folder.path().join("weights.safetensors"));
@@ -104,13 +104,13 @@ fn weights_without_marks_grow_them_and_say_the_same() {
         )
         .unwrap();
         let slots = crate::testing::slots(&scenario);
-        let said = |network: &Network| {
+        let outputs = |network: &Network| {
             let memory = crate::testing::memory(network, &scenario);
             crate::testing::hidden(network, &[&slots], &memory)
                 .concat()
                 .concat()
         };
-        let pairs = said(&network).into_iter().zip(said(&grown));
+        let pairs = outputs(&network).into_iter().zip(outputs(&grown));
         let off = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-5, "{off}");
         // The other way round, and into another model, nothing grows.

@@ -1,4 +1,4 @@
-//! Road edges with sides, and how far a box reaches off the road.
+//! Road edges with sides, and the distance by which a box reaches off the road.
 //!
 //! An edge is directed, with the road on its left (`gump_scene::RoadEdge`), as in Waymo's maps and
 //! in the metric `gump_metrics::DistanceToRoadEdge`. Here it is cut into stretches of at most a
@@ -14,7 +14,7 @@ const CLOSED_M: f64 = 1.0;
 /// A straight stretch of a road edge, scene frame; the road is on its left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Edge {
-    /// Where the edge begins, metres.
+    /// Start of the edge, metres.
     pub from: DVec2,
     pub(crate) to: DVec2,
     /// True if the border is unknown before its start, after its end.
@@ -43,8 +43,8 @@ impl Edge {
         (0..n - 1).map(stretch).collect()
     }
 
-    /// How far a point lies on the right of the line through the stretch, metres; negative on the
-    /// left.
+    /// Signed distance of a point to the right of the line through the stretch, metres; negative on
+    /// the left.
     fn metres_right(&self, point: DVec2) -> f64 {
         let along = (self.to - self.from).normalize_or_zero();
         -along.perp_dot(point - self.from)
@@ -68,8 +68,8 @@ impl Edge {
     }
 }
 
-/// How far a box reaches over the edges that it crosses, metres; 0 if it crosses none, on whichever
-/// side of them it is. `reach` is half its diagonal.
+/// Returns the distance by which a box reaches over the edges that it crosses, metres; 0 if it
+/// crosses none, whichever side of them it is on. `reach` is half its diagonal.
 pub fn metres_across(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
     let centre = body.pose.position;
     let near = (reach + EDGE_STEP_M).powi(2);
@@ -81,12 +81,12 @@ pub fn metres_across(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// How far a box reaches off the road, metres, whether it crosses an edge or is beyond it; 0 on the
-/// road, and where the nearest edge has no known side there.
+/// Returns the distance by which a box reaches off the road, metres, whether it crosses an edge or
+/// is beyond it; 0 on the road, and where the nearest edge has no known side there.
 pub fn metres_off(body: &OrientedBox, reach: f64, edges: &[Edge]) -> f64 {
     let centre = body.pose.position;
-    // Two stretches are equally near beside their joint: the one that the point is farther beside
-    // tells the side.
+    // Two stretches are equally near beside their joint: the one with the larger lateral distance
+    // determines the side.
     let key = |edge: &&Edge| (edge.distance(centre), edge.metres_right(centre).abs());
     let nearest = edges.iter().min_by(|a, b| {
         let ((a, beside_a), (b, beside_b)) = (key(a), key(b));

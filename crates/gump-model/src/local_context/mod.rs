@@ -333,7 +333,7 @@ impl Around<'_> {
         }
     }
 
-    /// How near the road edges are in each direction, 1 at the object and 0 out of reach.
+    /// Writes the proximity of road edges in each direction, 1 at the object and 0 out of reach.
     fn edges(&self, own_from_scene: Pose, position: DVec2, out: &mut [f32]) {
         let mut nearest = [EDGE_REACH_M * EDGE_REACH_M; SECTORS];
         for edge in self.survey.edges_near(position, EDGE_REACH_M) {

@@ -49,7 +49,7 @@ pub(super) struct LaneRun {
     successors: Vec<u32>,
     /// Metres per second.
     speed_limit: Option<f64>,
-    /// Where a stop sign requires a stop.
+    /// Index of the point at which a stop sign requires a stop.
     stop: Option<u32>,
 }
 
@@ -286,7 +286,7 @@ impl Survey {
     }
 }
 
-/// Which points lie in which cell: the points of cell `i` are `items[starts[i]..starts[i + 1]]`.
+/// Points by cell: the points of cell `i` are `items[starts[i]..starts[i + 1]]`.
 #[derive(Debug, Default)]
 struct Cells {
     starts: Vec<u32>,

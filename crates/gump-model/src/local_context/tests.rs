@@ -149,7 +149,7 @@ fn an_unknown_limit_is_a_mark_and_no_zero() {
     };
     let known = ego_sees(&fixture::scenario(&text("speed 13.4")).unwrap());
     let unknown = ego_sees(&fixture::scenario(&text("")).unwrap());
-    // Without marks a limit that nobody states is a usual one.
+    // Without marks an unstated limit has the usual value.
     assert_eq!(known[..N_PLAIN], unknown[..N_PLAIN]);
     let marks = |seen: LocalContext| seen[N_PLAIN..N_PLAIN + N_PATHS].to_vec();
     assert_eq!(marks(known), [0.0; N_PATHS]);
@@ -164,7 +164,7 @@ fn what_the_source_has_no_word_for_is_marked() {
     let mut parts = scenario.map.parts().clone();
     parts.unstated.lights = true;
     scenario.map = std::sync::Arc::new(gump_scene::MapGraph::new(parts).unwrap());
-    // The first neighbour is said to be of the usual size, by whoever could not measure it.
+    // The first neighbour has the usual size, as in sources that could not measure it.
     for frame in &mut scenario.log {
         let agents = frame.agents().iter().map(|agent| {
             let mut agent = *agent;

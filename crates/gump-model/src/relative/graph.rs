@@ -22,7 +22,7 @@ pub const EDGE_NUMBERS: usize = 46;
 pub const PAST: usize = 6;
 /// Number of neighbours of a node: the nearest ones now and soon.
 const NEIGHBOURS: usize = 16;
-/// How soon, seconds.
+/// Time ahead that counts as soon, seconds.
 const SOON_S: f64 = 2.0;
 /// Maximum distance of a neighbour, metres.
 const NEIGHBOUR_REACH_M: f64 = 60.0;
@@ -62,7 +62,7 @@ pub struct Shown {
     pub(super) earlier: Option<Pose>,
     /// Whether `step` was observed.
     pub(super) tracked: bool,
-    /// How long it has stood, seconds.
+    /// Time that it has stood, seconds.
     pub(super) stood: f64,
 }
 
@@ -113,7 +113,7 @@ impl Shown {
 
     /// World frame, metres per second: the mean over the last half second.
     pub fn velocity(&self) -> DVec2 {
-        // The step is told in the frame it began in, which is turned by as much as it turned.
+        // The step is in the frame of its start, whose heading is the present one less the turn.
         let began = self.pose.heading - self.step.heading;
         DVec2::from_angle(began).rotate(self.step.position) / TOKEN_DT
     }
@@ -299,7 +299,7 @@ type Paths = [Vec<(u32, f64)>];
 fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: &mut View) {
     let own = &agents[i];
     let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
-    // Of a row of parked cars the next few say enough; who comes closer counts as nearer.
+    // A few of a row of parked cars suffice; approaching agents count as nearer.
     let mut near: Vec<(f64, usize)> = agents
         .iter()
         .enumerate()
@@ -542,7 +542,7 @@ mod tests {
         let beside = |x, y, turn: f64| gap(CAR, CAR, DVec2::new(x, y), DVec2::from_angle(turn));
         assert!((beside(6.0, 0.3, 0.0) - 1.5).abs() < 1e-9);
         assert!((beside(0.5, -3.0, std::f64::consts::PI) - 1.0).abs() < 1e-9);
-        // One that stands across is as wide as it is long.
+        // Across the lane, the extent of a box is its length.
         assert!((beside(1.0, 4.0, std::f64::consts::FRAC_PI_2) - 0.75).abs() < 1e-9);
         for (x, y, turn) in [(3.0, 1.0, 0.4), (4.6, 1.9, 0.8), (-4.0, 2.6, 2.3)] {
             let shape = |pose| gump_geometry::OrientedBox {

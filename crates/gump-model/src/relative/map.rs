@@ -26,7 +26,7 @@ const LANE_TURN: f64 = 1.05;
 const METRES_PER_RADIAN: f64 = 3.0;
 /// A lane this much worse than the best is not an alternative, metres.
 const ALTERNATIVE_M: f64 = 1.0;
-/// How far a path ahead reaches, metres.
+/// Length of a path ahead, metres.
 const PATH_M: f64 = 64.0;
 /// Number of distinct paths ahead.
 pub(super) const PATHS: usize = 3;
@@ -139,7 +139,7 @@ impl VectorMap {
     }
 
     fn add_lanes(&mut self, map: &MapGraph, near: impl Fn(DVec2) -> bool, hidden: Hidden) {
-        // Stop signs are a property of a format: a map without any tells nothing of its lanes.
+        // Some formats have no stop signs: a map without any does not show which lanes lack one.
         let tells_stops = !hidden.stop_signs && !map.stop_signs().is_empty();
         let mut firsts: BTreeMap<LaneId, u32> = BTreeMap::new();
         let mut lasts: Vec<(u32, LaneId)> = Vec::new();

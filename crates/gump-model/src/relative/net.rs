@@ -109,7 +109,7 @@ impl Layer {
 pub(super) struct MoveDecoder {
     /// Rows by which bins enter, [ALL_BINS, C].
     pub(super) table: Tensor,
-    /// What each step adds, [FIELDS, C].
+    /// Input added at each step, [FIELDS, C].
     pub(super) slots: Tensor,
     pub(super) input: Linear,
     pub(super) hidden: Linear,
@@ -130,7 +130,7 @@ impl MoveDecoder {
     }
 
     /// Outputs of all steps with the true bins as input, [FIELDS, K, C]; `rows` are those of the
-    /// table that the first three bins of each node stand in, [FIELDS - 1, K].
+    /// table for the first three bins of each node, [FIELDS - 1, K].
     fn forced(&self, hidden: &Tensor, rows: &Tensor) -> Result<Tensor> {
         let (k, c) = hidden.dims2()?;
         let embedded = ops::embedding_sum(&self.table, &rows.reshape(((), 1))?)?
@@ -328,8 +328,8 @@ impl RelativeNetwork {
             let counts = field == 0 || target.bins[0] != crate::relative::grid::STANDS;
             if counts { weigh(target.weight) } else { 0.0 }
         };
-        let asked = (0..FIELDS).map(|field| {
-            let asked = Targets {
+        let by_field = (0..FIELDS).map(|field| {
+            let field_targets = Targets {
                 bins: targets.iter().map(|t| u32::from(t.bins[field])).collect(),
                 weights: targets.iter().map(|t| weight(field, t)).collect(),
                 smoothing: (field > 0 && smoothing_bins > 0.0).then_some(OrdinalSmoothing {
@@ -339,10 +339,10 @@ impl RelativeNetwork {
                 exact: Vec::new(),
             };
             let first = first_bin(field);
-            (first..first + BINS[field], asked)
+            (first..first + BINS[field], field_targets)
         });
         let matrix = self.decoder.head.weight();
-        let means = ops::linear_cross_entropy(outputs, matrix, asked.collect())?; // [FIELDS]
+        let means = ops::linear_cross_entropy(outputs, matrix, by_field.collect())?; // [FIELDS]
         let shares: Vec<f64> = (0..FIELDS)
             .map(|field| targets.iter().map(|t| f64::from(weight(field, t))).sum())
             .collect();

@@ -81,7 +81,7 @@ pub struct Sample {
     pub(super) edge_numbers: Vec<f32>,
     /// Sources are nodes, then pieces.
     pub(super) edges: Arc<Edges>,
-    /// `[pieces, PIECE_NUMBERS]`: those that somebody sees.
+    /// `[pieces, PIECE_NUMBERS]`: those that some node sees.
     pub(super) pieces: Vec<f32>,
     /// The target moves.
     pub targets: Vec<Target>,
@@ -293,7 +293,7 @@ fn chosen(
     let on_their_way = || moving().filter(|agent| agent.state.speed() > WALKING);
     let (n, n_on_their_way) = (moving().count(), on_their_way().count());
     let own = moving().find(|agent| agent.id == ego);
-    // Most of what is recorded is parked; there is more to learn around those who are not.
+    // Most recorded agents are parked; there is more to learn around the others.
     let centre = match rng.random_range(0..10) {
         0..6 if n_on_their_way > 0 => on_their_way().nth(rng.random_range(0..n_on_their_way))?,
         6..9 if own.is_some() => own?,
@@ -509,7 +509,7 @@ fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
     let moved = state.logged.inverse() * next.logged;
     let stops = moved.position.length() < STILL_M;
     let step = if stops {
-        // Who is behind goes on to where the log stands, if that is on the way.
+        // An agent behind the log drives on to where the log stops, if that is on its way.
         let left = (-state.off.ahead_m).clamp(0.0, BRAKING * own.step.position.x.max(0.0));
         Pose::new(left, 0.0, 0.0)
     } else {
@@ -551,7 +551,7 @@ mod tests {
                 assert!(is_piece || frame(source as usize) <= frame(node));
             }
         }
-        // Everybody but those of the last frame has a next move; the parked car stands.
+        // All agents but those of the last frame have a next move; the parked car stands.
         assert_eq!(sample.targets.len(), nodes - 3);
         let stands = |target: &&Target| target.bins[0] == crate::relative::grid::STANDS;
         let standing = sample.targets.iter().filter(stands).count();

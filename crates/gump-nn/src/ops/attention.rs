@@ -230,7 +230,7 @@ impl View {
         self.key_lengths.is_none() && self.causal_offset.is_none()
     }
 
-    /// How many keys, from the first on, query `i` of batch entry `b` sees.
+    /// Number of keys, from the first on, that query `i` of batch entry `b` sees.
     fn visible(&self, b: usize, i: usize) -> usize {
         let length = self.key_lengths.as_ref().map_or(self.tk, |l| l[b]);
         let reach = self.causal_offset.map_or(self.tk, |o| i + o + 1);
@@ -439,7 +439,7 @@ impl CustomOp1 for Attention {
     }
 }
 
-/// What the gradient reads.
+/// Inputs of the gradient.
 struct Inputs<'a> {
     q: &'a [f32],
     k: &'a [f32],

@@ -30,15 +30,15 @@ pub fn batch_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<(Tensor,
     }
     let x = x.contiguous()?;
     let (mean, variance) = statistics(&x)?;
-    let told = [&mean, &variance].map(|of| Tensor::from_slice(of, channels, x.device()));
-    let [told_mean, told_variance] = told;
+    let tensors = [&mean, &variance].map(|of| Tensor::from_slice(of, channels, x.device()));
+    let [mean_tensor, variance_tensor] = tensors;
     let deviation = |v: &f32| 1.0 / (v + EPS).sqrt();
     let op = BatchNorm {
         inverse: variance.iter().map(deviation).collect(),
         mean,
     };
     let y = x.apply_op3(&weight.contiguous()?, &bias.contiguous()?, op)?;
-    Ok((y, [told_mean?, told_variance?]))
+    Ok((y, [mean_tensor?, variance_tensor?]))
 }
 
 fn composed(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<(Tensor, [Tensor; 2])> {
@@ -51,8 +51,8 @@ fn composed(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<(Tensor, [Tens
     let y = y
         .broadcast_mul(&spread(weight)?)?
         .broadcast_add(&spread(bias)?)?;
-    let told = |t: &Tensor| t.detach().flatten_all();
-    Ok((y, [told(&mean)?, told(&variance)?]))
+    let flat = |t: &Tensor| t.detach().flatten_all();
+    Ok((y, [flat(&mean)?, flat(&variance)?]))
 }
 
 /// Mean and variance per channel.
@@ -76,7 +76,7 @@ fn at(all: &[f32], plane: usize, pixels: usize) -> &[f32] {
     &all[plane * pixels..(plane + 1) * pixels]
 }
 
-/// Sums over the images of what `f` says of channel and plane, by channel.
+/// Sums `f` of channel and plane over the images, by channel.
 fn per_channel(s: usize, channels: usize, f: &(impl Fn(usize, usize) -> f32 + Sync)) -> Vec<f64> {
     let mut parts = vec![0.0; s * channels];
     for_pieces(&mut parts, 1, |plane, part| {

@@ -134,7 +134,7 @@ impl Conv {
         (self.kh, self.kw, self.stride, self.padding) == (1, 1, 1, 0)
     }
 
-    /// Who works on one image: with several images each has its own thread.
+    /// Threads that work on one image: one per image, or all of them on a lone image.
     fn threads(&self) -> Threads {
         if self.b == 1 {
             Threads::Pool

@@ -1,11 +1,11 @@
-//! Gradients of matrices, put off until all samples of a step are differentiated.
+//! Gradients of matrices, deferred until all samples of a step are differentiated.
 //!
-//! The gradient of a weight matrix is a product of two tensors that the backward pass has at hand;
-//! that of a table of embeddings, a few of its rows. Computed there and then, it is a matrix per
-//! sample: zeroed, added to, kept, and added to those of the other samples, which for millions of
-//! parameters and a few hundred tokens costs as much as the products. So an operation that is built
-//! within [`Deferred::during`] only notes the tensors, and [`Deferred::take_in`] adds all parts of a
-//! matrix's gradient up in one place.
+//! The gradient of a weight matrix is a product of two tensors that the backward pass has in
+//! memory; that of a table of embeddings, a few of its rows. Computed immediately, it is a matrix
+//! per sample: zeroed, added to, kept, and added to those of the other samples, which for millions
+//! of parameters and a few hundred tokens costs as much as the products. So an operation that is
+//! built within [`Deferred::during`] only notes the tensors, and [`Deferred::take_in`] adds all
+//! parts of a matrix's gradient up in one place.
 //!
 //! What lives here: the notes and their sum. What does not: who notes (`linear`, `table`), and when
 //! the sums are due, which training knows.
@@ -36,7 +36,7 @@ pub(super) enum Part {
     Scattered { rows: Tensor, slopes: Tensor },
 }
 
-/// What one backward pass has put off, in its order.
+/// The parts of gradients that one backward pass has deferred, in its order.
 #[derive(Clone, Debug, Default)]
 pub struct Deferred(Arc<Mutex<Vec<(TensorId, Part)>>>);
 
@@ -45,14 +45,15 @@ thread_local! {
 }
 
 impl Deferred {
-    /// Where operations that the calling thread builds now put gradients off, if they may.
+    /// The collector of gradients deferred by operations that the calling thread builds now, if
+    /// any.
     pub(super) fn current() -> Option<Self> {
         CURRENT.with_borrow(Clone::clone)
     }
 
     /// Runs `f`, whose operations note gradients here.
     pub fn during<R>(&self, f: impl FnOnce() -> R) -> R {
-        /// Restores what was before, however `f` ends.
+        /// Restores the previous collector when dropped, even if `f` panics.
         struct Before(Option<Deferred>);
         impl Drop for Before {
             fn drop(&mut self) {
@@ -69,14 +70,14 @@ impl Deferred {
         parts.push((matrix.id(), part));
     }
 
-    /// What was noted for `matrix`; the notes are free again for other threads meanwhile.
+    /// Returns the parts noted for `matrix`; the lock is released before they are used.
     fn parts_of(&self, matrix: &Tensor) -> Vec<Part> {
         let parts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let own = parts.iter().filter(|(of, _)| *of == matrix.id());
         own.map(|(_, part)| part.clone()).collect()
     }
 
-    /// Adds what was noted for `matrix`, in the order of `all`, to its gradient so far; `None` where
+    /// Adds the parts noted for `matrix`, in the order of `all`, to its gradient so far; `None` if
     /// there is neither.
     ///
     /// Error: a tensor error.

@@ -47,31 +47,31 @@ pub fn masked_cross_entropy(
     if !fusible(&[logits, weights]) {
         return composed(logits, targets, weights, smoothing);
     }
-    let asked = Targets {
+    let targets = Targets {
         bins: targets.to_device(&Device::Cpu)?.to_vec1::<u32>()?,
         weights: weights.to_vec1::<f32>()?,
         smoothing,
         exact: Vec::new(),
     };
-    asked.check(n, v)?;
+    targets.check(n, v)?;
     let op = CrossEntropy {
-        scale: asked.scale(),
-        asked,
+        scale: targets.scale(),
+        targets,
         log_sums: OnceLock::new(),
     };
     logits.contiguous()?.apply_op1(op)
 }
 
-/// What rows of logits should say.
+/// Target classes of rows of logits.
 #[derive(Clone, Debug)]
 pub struct Targets {
     /// The class of each row.
     pub bins: Vec<u32>,
-    /// How much each row counts; one of weight 0 counts for nothing, whatever its class.
+    /// Weight of each row; one of weight 0 has no effect, whatever its class.
     pub weights: Vec<f32>,
-    /// How each class is spread over its neighbours, if it is.
+    /// Distribution of each class over its neighbours; `None` for hard targets.
     pub smoothing: Option<OrdinalSmoothing>,
-    /// Rows whose class is not spread all the same; none if it is empty.
+    /// Rows whose target is the class alone despite `smoothing`; none if it is empty.
     pub exact: Vec<bool>,
 }
 
@@ -198,7 +198,7 @@ fn composed(
 }
 
 struct CrossEntropy {
-    asked: Targets,
+    targets: Targets,
     /// One over the sum of the weights.
     scale: f64,
     /// Logarithm of the softmax sum of each row, kept for the gradient.
@@ -223,9 +223,9 @@ impl CustomOp1 for CrossEntropy {
                 let mut bins = Vec::new();
                 for (j, (loss, log_sum)) in losses.iter_mut().zip(log_sums).enumerate() {
                     let row = i * step + j;
-                    if self.asked.weights[row] != 0.0 {
+                    if self.targets.weights[row] != 0.0 {
                         let logits = &logits[row * v..(row + 1) * v];
-                        (*loss, *log_sum) = self.asked.loss(row, logits, &mut bins);
+                        (*loss, *log_sum) = self.targets.loss(row, logits, &mut bins);
                     }
                 }
             },
@@ -247,9 +247,9 @@ impl CustomOp1 for CrossEntropy {
             let mut bins = Vec::new();
             for (j, d) in d.chunks_exact_mut(v).enumerate() {
                 let row = i * step + j;
-                if self.asked.weights[row] != 0.0 {
+                if self.targets.weights[row] != 0.0 {
                     d.copy_from_slice(&all[row * v..(row + 1) * v]);
-                    self.asked.slope(row, d, log_sums[row], factor, &mut bins);
+                    self.targets.slope(row, d, log_sums[row], factor, &mut bins);
                 }
             }
         });
@@ -261,31 +261,31 @@ impl CustomOp1 for CrossEntropy {
 /// has the logits `x[s] weight[rows]^T`. Logits are never held for all steps twice, and rows that
 /// several steps share are not copied.
 ///
-/// Shape: `x` `[S, N, C]`; `weight` `[R, C]`; `asked` per step its rows of the matrix and the
-/// targets of the `N` rows; the result `[S]`, a mean per step.
+/// Shape: `x` `[S, N, C]`; `weight` `[R, C]`; `targets` holds per step its rows of the matrix and
+/// the targets of the `N` rows; the result `[S]`, a mean per step.
 ///
 /// Error: when the shapes do not fit, or as [`masked_cross_entropy`].
 pub fn linear_cross_entropy(
     x: &Tensor,
     weight: &Tensor,
-    asked: Vec<(Range<usize>, Targets)>,
+    targets: Vec<(Range<usize>, Targets)>,
 ) -> Result<Tensor> {
     let (steps, n, c) = x.dims3()?;
     let (n_rows, width) = weight.dims2()?;
     let is_inside = |rows: &Range<usize>| !rows.is_empty() && rows.end <= n_rows;
-    if asked.len() != steps || width != c || !asked.iter().all(|(rows, _)| is_inside(rows)) {
-        let rows: Vec<_> = asked.iter().map(|(rows, _)| rows).collect();
+    if targets.len() != steps || width != c || !targets.iter().all(|(rows, _)| is_inside(rows)) {
+        let rows: Vec<_> = targets.iter().map(|(rows, _)| rows).collect();
         let (x, weight) = (x.shape(), weight.shape());
         bail!("linear_cross_entropy: x {x:?}, weight {weight:?}, rows {rows:?}");
     }
-    for (rows, asked) in &asked {
-        asked.check(n, rows.len())?;
+    for (rows, targets) in &targets {
+        targets.check(n, rows.len())?;
     }
     if !fusible(&[x, weight]) {
-        return composed_steps(x, weight, &asked);
+        return composed_steps(x, weight, &targets);
     }
     let op = LinearCrossEntropy {
-        asked,
+        targets,
         learns: x.track_op() || weight.track_op(),
         operands: Operands::current(),
         slopes: OnceLock::new(),
@@ -296,26 +296,26 @@ pub fn linear_cross_entropy(
 fn composed_steps(
     x: &Tensor,
     weight: &Tensor,
-    asked: &[(Range<usize>, Targets)],
+    targets: &[(Range<usize>, Targets)],
 ) -> Result<Tensor> {
-    let step = |(step, (rows, asked)): (usize, &(Range<usize>, Targets))| {
+    let step = |(step, (rows, targets)): (usize, &(Range<usize>, Targets))| {
         let rows = weight.narrow(0, rows.start, rows.len())?;
         let logits = linear(&x.get(step)?, &rows, None)?;
-        let bins = Tensor::from_slice(&asked.bins, asked.bins.len(), x.device())?;
+        let bins = Tensor::from_slice(&targets.bins, targets.bins.len(), x.device())?;
         // The mean over all rows from those of the exact ones and of the others.
         let part = |exact: bool, smoothing| {
-            let of_part = |row: usize| asked.is_exact(row) == exact;
-            let kept = asked.weights.iter().enumerate();
+            let of_part = |row: usize| targets.is_exact(row) == exact;
+            let kept = targets.weights.iter().enumerate();
             let weights: Vec<f32> = kept
                 .map(|(i, w)| if of_part(i) { *w } else { 0.0 })
                 .collect();
             let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
             let weights = Tensor::new(weights, x.device())?;
-            masked_cross_entropy(&logits, &bins, &weights, smoothing)? * (sum * asked.scale())
+            masked_cross_entropy(&logits, &bins, &weights, smoothing)? * (sum * targets.scale())
         };
-        part(false, asked.smoothing)? + part(true, None)?
+        part(false, targets.smoothing)? + part(true, None)?
     };
-    let losses = asked.iter().enumerate().map(step);
+    let losses = targets.iter().enumerate().map(step);
     Tensor::stack(&losses.collect::<Result<Vec<_>>>()?, 0)
 }
 
@@ -335,11 +335,11 @@ fn packed_once<'a, 'b>(
 }
 
 struct LinearCrossEntropy {
-    asked: Vec<(Range<usize>, Targets)>,
-    /// Whether anything asks for gradients.
+    targets: Vec<(Range<usize>, Targets)>,
+    /// Whether gradients are needed.
     learns: bool,
     operands: Operands,
-    /// Gradients of the logits per step, `[N, V]`, as they are where the loss itself is asked for.
+    /// Gradients of the logits per step, `[N, V]`, as they are for a gradient of 1 of the loss.
     slopes: OnceLock<Vec<Vec<f32>>>,
 }
 
@@ -360,7 +360,7 @@ impl CustomOp2 for LinearCrossEntropy {
         let mut means = Vec::new();
         let mut slopes = Vec::new();
         let mut packed = Vec::new();
-        for (step, (rows, asked)) in self.asked.iter().enumerate() {
+        for (step, (rows, targets)) in self.targets.iter().enumerate() {
             let v = rows.len();
             let mut logits = vec![0.0; n * v];
             let turned = Mat::new(&weight[rows.start * c..rows.end * c], v, c).t();
@@ -371,7 +371,7 @@ impl CustomOp2 for LinearCrossEntropy {
                 Mat::new(&x[step * n * c..(step + 1) * n * c], n, c),
                 Threads::Pool,
             );
-            let scale = asked.scale();
+            let scale = targets.scale();
             let mut losses = vec![0.0; n];
             let piece = rows_per_task(v);
             for_pieces2(
@@ -382,14 +382,14 @@ impl CustomOp2 for LinearCrossEntropy {
                     let rows = logits.chunks_exact_mut(v).zip(losses);
                     for (j, (logits, loss)) in rows.enumerate() {
                         let row = i * piece + j;
-                        if asked.weights[row] == 0.0 {
+                        if targets.weights[row] == 0.0 {
                             logits.fill(0.0);
                             continue;
                         }
                         let log_sum;
-                        (*loss, log_sum) = asked.loss(row, logits, &mut bins);
+                        (*loss, log_sum) = targets.loss(row, logits, &mut bins);
                         if self.learns {
-                            asked.slope(row, logits, log_sum, scale as f32, &mut bins);
+                            targets.slope(row, logits, log_sum, scale as f32, &mut bins);
                         }
                     }
                 },
@@ -420,7 +420,7 @@ impl CustomOp2 for LinearCrossEntropy {
         let mut dx = vec![0.0; x_all.len()];
         let mut dw = vec![0.0; w.len()];
         let mut packed = Vec::new();
-        for (step, ((rows, _), slope)) in self.asked.iter().zip(slopes).enumerate() {
+        for (step, ((rows, _), slope)) in self.targets.iter().zip(slopes).enumerate() {
             let v = rows.len();
             let (at, of_rows) = (step * n * c, rows.start * c..rows.end * c);
             let slope = Mat::new(slope, n, v);
@@ -489,31 +489,31 @@ mod tests {
     #[test]
     fn steps_over_one_matrix_agree_with_the_composition() {
         let (x, weight) = (var(&[3, 33, 12], 5), var(&[40, 12], 6));
-        let asked = |of: Range<usize>, smoothing| {
+        let target = |of: Range<usize>, smoothing| {
             let (bins, weights) = rows(33, of.len());
-            let asked = Targets {
+            let targets = Targets {
                 bins: bins.to_vec1().unwrap(),
                 weights: weights.to_vec1().unwrap(),
                 smoothing,
                 // Every third is exact.
                 exact: (0..33).map(|row| row % 3 == 0).collect(),
             };
-            (of, asked)
+            (of, targets)
         };
-        let asked = vec![
-            asked(0..13, Some(SPEED)),
-            asked(13..40, Some(HEADING)),
-            asked(0..13, None),
+        let targets = vec![
+            target(0..13, Some(SPEED)),
+            target(13..40, Some(HEADING)),
+            target(0..13, None),
         ];
         let sharp = || x.affine(8.0, -3.0);
         check(
             &[&x, &weight],
-            || linear_cross_entropy(&sharp()?, &weight, asked.clone()),
-            || composed_steps(&sharp()?, &weight, &asked),
+            || linear_cross_entropy(&sharp()?, &weight, targets.clone()),
+            || composed_steps(&sharp()?, &weight, &targets),
         );
-        let short = asked[..2].to_vec();
+        let short = targets[..2].to_vec();
         assert!(linear_cross_entropy(&x, &weight, short).is_err());
-        let mut outside = asked;
+        let mut outside = targets;
         outside[1].0 = 20..41;
         assert!(linear_cross_entropy(&x, &weight, outside).is_err());
     }

@@ -113,7 +113,7 @@ fn gradient(elements: Vec<f32>, like: &Tensor) -> Result<Tensor> {
 
 #[cfg(test)]
 mod testing {
-    //! What the tests of the operations share.
+    //! Helpers shared by the tests of the operations.
 
     use candle_core::{Device, Result, Tensor, Var};
 

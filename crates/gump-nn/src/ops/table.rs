@@ -1,6 +1,6 @@
 //! Rows of a table: some that lie together, or sums of some for each of many tokens.
 //!
-//! The tensor library's gradient of a slice is as large as what it was cut from, and so is that of a
+//! The tensor library's gradient of a slice is as large as the whole tensor, and so is that of a
 //! gather; within [`Deferred::during`] only the rows that were touched are kept.
 
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};

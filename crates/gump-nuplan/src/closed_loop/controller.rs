@@ -9,7 +9,7 @@ use gump_rollout::RolloutError;
 /// A faster tracked speed means that the plan cannot be driven, metres per second.
 const IMPOSSIBLE_SPEED: f64 = 50.0;
 
-/// How the ego follows its plan.
+/// The way in which the ego follows its plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tracking {
     /// As a car: the LQR tracker steers the kinematic bicycle.

@@ -40,7 +40,7 @@ pub struct Driven {
 /// Settings of a loop.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DriveConfig {
-    /// How plans are turned into motion.
+    /// The way in which plans are turned into motion.
     pub tracking: Tracking,
     /// Maximum duration in seconds, > 0; a recording may be shorter.
     pub seconds: f64,

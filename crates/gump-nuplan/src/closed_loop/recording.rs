@@ -131,8 +131,8 @@ impl Recording {
         if !(seconds > 0.0 && seconds.is_finite()) {
             return Err(RolloutError::Duration(seconds));
         }
-        let asked = (seconds / self.scenario.dt).round() as usize;
-        let n = asked.min(self.scenario.future().len());
+        let requested = (seconds / self.scenario.dt).round() as usize;
+        let n = requested.min(self.scenario.future().len());
         if n < 2 {
             let frames = self.scenario.future().len();
             let what = format!("has {frames} frames after the present, expected two or more");

@@ -9,11 +9,11 @@ use gump_scene::{
     Area, AreaKind, Lane, LaneId, MapGraph, MapParts, Roadblock, RoadblockId, Route, Scenario,
 };
 
-/// How far a route is extended past its end, metres: no planner looks farther ahead.
+/// Distance by which a route is extended past its end, metres: no planner looks farther ahead.
 const BEYOND: f64 = 200.0;
 /// Distance into a lane over which its turn is determined, metres.
 const TURN_SEEN: f64 = 10.0;
-/// How far a derived surface goes on past a linked end of its lane, metres.
+/// Distance that a derived surface goes on past a linked end of its lane, metres.
 const OVERLAP: f64 = 0.5;
 /// Ids of derived areas start here, above those of the formats.
 const FIRST_AREA: i64 = 1 << 40;
@@ -175,7 +175,7 @@ fn with_roadblocks(map: &MapGraph, route: &Route) -> Route {
     }
 }
 
-/// How far a lane turns away from `heading` in its first metres, radians.
+/// Angle by which a lane turns away from `heading` in its first metres, radians.
 fn turn_into(lane: &Lane, heading: f64) -> f64 {
     let line = &lane.centerline;
     let begun = line.pose_at(TURN_SEEN.min(line.length())).heading;

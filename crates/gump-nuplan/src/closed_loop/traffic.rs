@@ -92,10 +92,10 @@ fn all_but(ego: gump_scene::AgentId, frame: &Frame) -> Others {
 /// A world model as traffic.
 ///
 /// At every knot of the world, whatever its time step, the world is opened again on the executed
-/// history and asked for one step, given where the ego plans to be; in between, agents move
+/// history and simulated for one step, given where the ego plans to be; in between, agents move
 /// straight to their next positions. Agents that it drops stand still. Lights are those of the log.
 ///
-/// Source: the released observation class of the GUMP paper, which asks at every iteration.
+/// Source: the released observation class of the GUMP paper, which does so at every iteration.
 pub struct Imagined<'a> {
     world: &'a dyn WorldModel,
     seed: Seed,

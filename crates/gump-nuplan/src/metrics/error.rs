@@ -12,15 +12,15 @@ pub enum NuPlanError {
     /// A state is NaN or infinite.
     #[error("{who} has a state that is not a number at index {index}")]
     NotFinite {
-        /// Whose state it is.
+        /// Name of the series that the state belongs to.
         who: &'static str,
-        /// Index into its states.
+        /// Index into the states of the series.
         index: usize,
     },
     /// Times do not increase.
     #[error("the times of {who} do not increase at index {index}")]
     TimeOrder {
-        /// Whose times they are.
+        /// Name of the series that the times belong to.
         who: &'static str,
         /// Index of the later state.
         index: usize,

@@ -49,7 +49,7 @@ pub fn followed_lanes<'a>(map: &'a MapGraph, points: &[DVec2]) -> Vec<Lanes<'a>>
     route
 }
 
-/// Where several lanes are kept, drops those that are inconsistent with later ones.
+/// Drops lanes that are inconsistent with later ones, at points with several lanes.
 fn drop_side_branches(route: &mut [Lanes<'_>]) {
     for i in (0..route.len().saturating_sub(1)).rev() {
         let (before, after) = route.split_at_mut(i + 1);

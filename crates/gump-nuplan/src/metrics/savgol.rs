@@ -7,7 +7,7 @@ pub struct SavitzkyGolay {
     pub window: usize,
     /// Degree of the polynomial.
     pub polynomial: usize,
-    /// Which derivative; 0 smooths.
+    /// Order of the derivative; 0 smooths.
     pub derivative: usize,
     /// Distance between samples, in the unit that the derivative is taken by.
     pub delta: f64,

@@ -11,7 +11,7 @@ use super::NuPlanError;
 /// Scores by the names of nuPlan's metrics; `None` where a metric has no score.
 pub type MetricScores = BTreeMap<String, Option<f64>>;
 
-/// How the scores of metrics are combined.
+/// Combination of the scores of metrics into one.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scoring {

@@ -21,7 +21,7 @@ pub(super) struct Vehicle {
     index: usize,
     lanes: VecDeque<LaneId>,
     corridor: Corridor,
-    /// How often the corridor has been renewed.
+    /// Number of times the corridor has been renewed.
     renewals: u32,
     /// Arc length of the box centre on the path, metres.
     progress: f64,
@@ -29,13 +29,13 @@ pub(super) struct Vehicle {
     target_speed: f64,
     /// The box and, once it has moved, its position in 1.5 s.
     footprint: Footprint,
-    /// Which of the others, the fixed ones first, was the leader in the last step.
+    /// Index among the others, the fixed ones first, of the leader in the last step.
     led_by: Option<usize>,
     /// Kept between steps for its memory: see [`Vehicle::nearest`].
     near: Vec<(f64, usize)>,
 }
 
-/// All that may be in the way of a vehicle: the fixed obstacles, then the vehicles but itself.
+/// All possible obstacles of a vehicle: the fixed ones, then all other vehicles.
 #[derive(Clone, Copy)]
 pub(super) struct Others<'a> {
     pub(super) fixed: &'a [Obstacle],
@@ -71,7 +71,7 @@ impl<'a> Others<'a> {
     }
 }
 
-/// What may be in the way of a vehicle.
+/// A fixed obstacle or vehicle that may be in the way of a vehicle.
 #[derive(Clone, Copy)]
 struct InTheWay<'a> {
     footprint: &'a Footprint,
@@ -288,8 +288,8 @@ impl Vehicle {
     /// several as near as each other the first. `near` is overwritten.
     ///
     /// They are looked at in the order of the gaps between bounding boxes, up to the first gap
-    /// larger than the least distance. Who was nearest in the last step is looked at before: mostly
-    /// it still is, and few have a smaller gap than its distance.
+    /// larger than the least distance. The nearest of the last step is tested first: mostly it
+    /// still is, and few have a smaller gap than its distance.
     fn nearest(
         &self,
         others: Others<'_>,

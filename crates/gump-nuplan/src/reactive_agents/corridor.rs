@@ -8,8 +8,8 @@ use crate::path::Path;
 const CHUNK: usize = 16;
 /// Pieces of a footprint that share bounds.
 const BLOCK: usize = 8;
-/// What bounds along a chunk are wider than what they hold, metres: far more than rounding costs at
-/// coordinates of 10^7 m.
+/// Margin of the bounds along a chunk, metres: far above the rounding errors at coordinates of
+/// 10^7 m.
 const SLACK: f64 = 1e-6;
 
 /// The corners of an axis-aligned bounding box, (min, max).
@@ -34,7 +34,7 @@ pub(super) struct Corridor {
     chunks: Vec<Chunk>,
 }
 
-/// Where a vehicle is in its corridor.
+/// Position of a vehicle in its corridor.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Start {
     /// Arc length, metres.
@@ -419,11 +419,11 @@ impl Footprint {
 
     /// Metres between two footprints, 0 if they intersect.
     pub(super) fn distance(&self, other: &Self) -> f64 {
-        // Most that is asked for overlaps, which is found out sooner than how far away it is.
+        // Most queries overlap, which is faster to find out than the distance.
         if self.intersects(other) {
             return 0.0;
         }
-        // Together with its square: roots are taken only of what the squares do not decide.
+        // Together with its square: a root is taken only if the squares do not decide.
         let (mut least, mut square) = (f64::INFINITY, f64::INFINITY);
         let is_nearer = |gap: f64, least: f64, square: f64| gap < square && gap.sqrt() < least;
         // From the front, since what counts is mostly ahead: then most pairs are too far to look at.
@@ -595,7 +595,7 @@ mod tests {
             let f = f64::from(i);
             let shape = OrientedBox {
                 pose: Pose::new(f * 0.73 % 26.0 - 3.0, f * 0.31 % 24.0 - 4.0, f * 0.17),
-                // Every tenth is a line, which the bounds along chunks have nothing to say about.
+                // Every tenth is a line, to which the bounds along chunks do not apply.
                 length: 4.0,
                 width: if i % 10 == 0 { 0.0 } else { 1.8 },
             };

@@ -1,4 +1,4 @@
-//! How nuPlan's ego follows its plan: a vehicle with a rear axle and actuator lag.
+//! Tracking of plans by nuPlan's ego: a vehicle with a rear axle and actuator lag.
 //!
 //! A [`Trajectory`] is the plan, [`LqrTracker`] turns it into [`Controls`], and [`propagate`]
 //! computes the next state.

@@ -35,7 +35,7 @@ pub fn propagate(state: &EgoState, controls: &Controls, wheel_base: f64, time_us
     propagate_by(state, controls, wheel_base, dt, time_us)
 }
 
-/// [`propagate`] over `dt` seconds exactly, whatever the clock says.
+/// [`propagate`] over exactly `dt` seconds, whatever the timestamps.
 pub fn propagate_by(
     state: &EgoState,
     controls: &Controls,

@@ -44,7 +44,7 @@ fn boxes_collide_alike() {
     }
 }
 
-/// Everybody goes straight on, cones and barriers too, though their speed counts as 0.
+/// All objects go straight on, cones and barriers too, though their speed counts as 0.
 fn moving_samples(case: &Value) -> Vec<Sample> {
     let (speed, heading) = (number(&case["ego"][0]), number(&case["ego"][1]));
     let dt = number(&case["dt"]);

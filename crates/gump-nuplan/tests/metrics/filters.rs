@@ -1,4 +1,4 @@
-//! The Savitzky–Golay filter and what comfort makes of it.
+//! The Savitzky–Golay filter and the comfort values derived with it.
 
 use gump_metrics::ComfortBounds;
 use gump_nuplan::metrics::{ComfortSeries, Motion, SavitzkyGolay, Statistics};

@@ -19,7 +19,7 @@ use crate::open_loop::assert_metric;
 /// Recorded outputs have 6 decimals.
 const TOLERANCE: f64 = 1e-5;
 
-/// What a scene records of its outcome.
+/// Recorded results of a scene.
 struct Expected<'a> {
     /// Rows of name, type and value.
     rows: &'a [Value],
@@ -141,7 +141,7 @@ fn check_comfort(
     let states: Vec<_> = drive.samples.iter().map(|s| s.ego).collect();
     let series = ComfortSeries::of(&Motion::of(&VehicleParameters::PACIFICA, &states)).unwrap();
     if metric == "ego_is_comfortable" {
-        // The devkit's test asks this metric alone: its parts are not computed and it reports
+        // The devkit's test calls this metric alone: its parts are not computed and it reports
         // discomfort whatever the drive. In the simulation, where they are, a drive that never
         // accelerates by more than 1 m/s2 nor turns is comfortable.
         assert_eq!(number(&expected.rows[0][2]), 0.0);

@@ -71,7 +71,7 @@ impl CandidateScore {
     }
 }
 
-/// How the drives of a decision are scored: by PDM's score with the terms and weights of nuPlan's.
+/// Scorer of the drives of a decision: PDM's score with the terms and weights of nuPlan's.
 #[derive(Clone, Copy)]
 pub(super) struct Reward<'a> {
     pub(super) judge: Judge<'a>,
@@ -271,8 +271,8 @@ impl Tally {
     }
 
     fn score(&self) -> CandidateScore {
-        let told = self.scores.iter().map(told).collect();
-        CandidateScore::new(told).expect("every candidate has a future")
+        let scores = self.scores.iter().map(score_of).collect();
+        CandidateScore::new(scores).expect("every candidate has a future")
     }
 
     fn standing(&self, config: &InteractiveDriverConfig) -> Standing {
@@ -319,7 +319,7 @@ impl Tally {
     ) -> Prospect {
         let standing = self.standing(config);
         let score = self.score();
-        let hedge = self.hedge.as_ref().map(told);
+        let hedge = self.hedge.as_ref().map(score_of);
         let (mut futures, mut drives) = (Vec::new(), Vec::new());
         for row in self.rows {
             futures.push(film(row.frames));
@@ -358,8 +358,8 @@ pub(super) fn best_of(
     kept
 }
 
-/// A score in the form that all planners report.
-fn told(judged: &Judged) -> Score {
+/// Converts a score into the form that all planners report.
+fn score_of(judged: &Judged) -> Score {
     let parts = &judged.parts;
     let gate = |name, factor| Gate { name, factor };
     let sum: f64 = WEIGHTS.iter().sum();

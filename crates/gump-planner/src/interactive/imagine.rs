@@ -49,15 +49,15 @@ const ROUND: u64 = 1 << 32;
 /// Some futures of some candidates, simulated together.
 #[derive(Clone, Copy)]
 struct Round<'a> {
-    /// When the decision began.
+    /// Time at which the decision began.
     began: Duration,
     scene: SceneState<'a>,
     proposer: &'a Proposer<'a>,
-    /// Of every line.
+    /// The corridor of every line.
     corridors: &'a [Corridor],
-    /// Indices in their order; imitation, which is the last, has no policy.
+    /// Indices of the candidates in order; imitation, which is the last, has no policy.
     candidates: &'a [usize],
-    /// Of every candidate.
+    /// Number of futures of every candidate.
     n_futures: usize,
     /// Half seconds to imagine.
     n_decisions: usize,
@@ -88,9 +88,9 @@ pub(super) struct Row {
     pub(super) forecast: Forecast,
     /// The policy's own line so far; none for imitation.
     policy: Proposal,
-    /// How it follows its leader.
+    /// Car-following law of the policy.
     law: IdmConfig,
-    /// How the car follows it, from now on.
+    /// States of the car that tracks it, from now on.
     pub(super) drive: Vec<EgoState>,
     /// Frames of the world, one per decision; shorter where the future was dropped.
     pub(super) frames: Vec<Frame>,
@@ -239,7 +239,7 @@ impl<'a> Imagination<'a> {
         let per = frames_per_decision(&*ruled).map_err(|error| self.failed(error.into()))?;
         phases.open += (self.clock)() - time;
 
-        let mut asked: Vec<usize> = (0..n_ruled).collect();
+        let mut live: Vec<usize> = (0..n_ruled).collect();
         let mut imagined = 0;
         for decision in 1..=round.n_decisions {
             let time = (self.clock)();
@@ -248,14 +248,14 @@ impl<'a> Imagination<'a> {
                 break;
             }
             self.drive(round.proposer, round.corridors, &mut rows[..n_ruled]);
-            let open: Vec<usize> = (0..asked.len()).filter(|&i| !rows[asked[i]].lost).collect();
-            if open.len() < asked.len() && !open.is_empty() && ruled.keep(&open) {
-                asked = open.into_iter().map(|i| asked[i]).collect();
+            let open: Vec<usize> = (0..live.len()).filter(|&i| !rows[live[i]].lost).collect();
+            if open.len() < live.len() && !open.is_empty() && ruled.keep(&open) {
+                live = open.into_iter().map(|i| live[i]).collect();
             }
             let driven = (self.clock)();
             phases.policies += driven - time;
             let (ruled_rows, own_rows) = rows.split_at_mut(n_ruled);
-            self.answer(&mut *ruled, ruled_rows, &asked, per, true)?;
+            self.answer(&mut *ruled, ruled_rows, &live, per, true)?;
             if let Some(own) = &mut own {
                 let all: Vec<usize> = (0..own_rows.len()).collect();
                 self.answer(&mut **own, own_rows, &all, per, false)?;
@@ -357,12 +357,12 @@ impl<'a> Imagination<'a> {
             });
     }
 
-    /// Asks the world for the half second that was just driven, in the rows still simulated.
+    /// Steps the world through the half second that was just driven, in the rows still simulated.
     fn answer(
         &self,
         session: &mut (dyn Session + '_),
         rows: &mut [Row],
-        asked: &[usize],
+        live: &[usize],
         per: usize,
         driven: bool,
     ) -> Result<(), PlanError> {
@@ -375,12 +375,12 @@ impl<'a> Imagination<'a> {
                 let drive = &rows[i].drive;
                 drive[drive.len() - 1 - behind].agent_state(vehicle)
             };
-            let egos: Option<Vec<AgentState>> = driven.then(|| asked.iter().map(ego).collect());
+            let egos: Option<Vec<AgentState>> = driven.then(|| live.iter().map(ego).collect());
             let answered = session.step(egos.as_deref());
             frames = answered.map_err(|error| self.failed(error))?;
         }
         let who = "the world";
-        let (expected, found) = (asked.len(), frames.len());
+        let (expected, found) = (live.len(), frames.len());
         if expected != found {
             let wrong = RolloutError::Count {
                 who,
@@ -393,7 +393,7 @@ impl<'a> Imagination<'a> {
         if !agents.map(|agent| agent.state).all(|s| s.is_finite()) {
             return Err(self.failed(RolloutError::NotFinite { who }.into()));
         }
-        for (future, (&i, frame)) in asked.iter().zip(frames).enumerate() {
+        for (future, (&i, frame)) in live.iter().zip(frames).enumerate() {
             let row = &mut rows[i];
             let ego = self.moment.scene.ego;
             if !driven && frame.agent(ego).is_none() {
@@ -431,7 +431,7 @@ impl<'a> Imagination<'a> {
     }
 
     fn reward(&self) -> Reward<'_> {
-        // Of what was driven before the first iteration nothing is judged.
+        // The drive before the first iteration is not judged.
         let past = self.moment.past;
         let driven = self.moment.iteration.min(COMFORT_PAST).min(past.len());
         Reward {
@@ -512,7 +512,7 @@ fn frames_per_decision(session: &(dyn Session + '_)) -> Result<usize, RolloutErr
     }
 }
 
-/// The simulated future as a rollout of its own, from the present on.
+/// The simulated future as a separate rollout, from the present on.
 fn film(scene: SceneState<'_>, frames: Vec<Frame>) -> Rollout {
     let last = scene.history.len() - 1;
     let mut rollout = Rollout::begin(SceneState {

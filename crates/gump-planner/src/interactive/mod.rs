@@ -45,7 +45,7 @@ pub struct InteractiveDriverConfig {
     pub imitation: bool,
     /// Futures per candidate, > 0; fewer for candidates that drop out.
     pub n_futures: usize,
-    /// How rollouts are distributed over candidates.
+    /// Distribution of the rollouts over candidates.
     pub allocation: Allocation,
     /// The seed: future *k* of every candidate has the same random numbers.
     pub seed: Seed,
@@ -53,7 +53,7 @@ pub struct InteractiveDriverConfig {
     pub replan_every: usize,
     /// The value of a future.
     pub worth: Worth,
-    /// How the values of a candidate's futures are combined into one.
+    /// Combination of the values of a candidate's futures into one.
     pub aggregate: Aggregate,
     /// Number of standard deviations over the futures that are subtracted from the mean, at least
     /// 0.
@@ -92,7 +92,7 @@ impl Default for InteractiveDriverConfig {
     }
 }
 
-/// How rollouts are distributed over candidates.
+/// Distribution of the rollouts over candidates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Allocation {
     /// All futures of all candidates, as in the paper.
@@ -104,7 +104,7 @@ pub enum Allocation {
     Halving,
 }
 
-/// How the values of a candidate's futures are combined into one.
+/// Combination of the values of a candidate's futures into one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Aggregate {
     /// Their mean minus [`InteractiveDriverConfig::caution`] standard deviations.
@@ -235,7 +235,7 @@ pub struct Decision {
 /// not a fixed line, and the motion of other agents is not a fixed forecast.
 ///
 /// A future in which a gate of the score has closed for good can gain no further value, so the
-/// world is not asked for the rest of it. This bound is exact.
+/// rest of it is not simulated. This bound is exact.
 ///
 /// Ties of values (within 1e-6) are broken by fewer collisions, more progress, the previous choice,
 /// the lower index. If no candidate has a value above 0, the one that collides last is followed; if

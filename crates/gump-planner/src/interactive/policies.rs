@@ -21,7 +21,7 @@ pub(super) struct Policy {
 
 /// Shares of the limit that brisk drivers desire.
 const BRISK: [f64; 2] = [0.7, 1.0];
-/// Share of the limit that a driver desires who keeps a long distance.
+/// Fraction of the limit desired by a driver that keeps a long distance.
 const YIELDING: f64 = 0.8;
 /// Value that a change of lane without need has to gain.
 const CHANGE_COST: f64 = 0.02;

@@ -57,11 +57,11 @@ fn fraction(prospect: &Prospect) -> f64 {
     }
 }
 
-/// What everyone but the ego does in half a second, by the present frame, the ego's next state and
-/// the seed of the future.
+/// State of an agent other than the ego in half a second, from the agent now, the ego with its next
+/// state, and a seed.
 type Law = fn(&Agent, &Agent, Seed) -> AgentState;
 
-/// A world by a law, at 2 Hz; the ego goes straight on where nobody drives it.
+/// A world by a law, at 2 Hz; the ego goes straight on if it is not driven.
 struct ByLaw(Law);
 
 struct Futures {
@@ -119,7 +119,7 @@ fn coasted(agent: &Agent) -> AgentState {
     state
 }
 
-/// Stops at once if the ego comes on fast, else drives on.
+/// Stops at once if the ego approaches fast, else drives on.
 fn yields_to_the_bold(agent: &Agent, ego: &Agent, _: Seed) -> AgentState {
     if ego.state.speed() > 3.5 {
         return AgentState {
@@ -138,7 +138,7 @@ fn at_random_speed(agent: &Agent, _: &Agent, seed: Seed) -> AgentState {
     state
 }
 
-/// Someone comes from the right and would be in the way in three to four seconds.
+/// A vehicle comes from the right and would be in the way in three to four seconds.
 const CROSSING: &str = "ego vehicle 0: 2,0 velocity 3,0 size 5,2
     agent vehicle 1: 24,-22 velocity 0,6";
 
@@ -147,7 +147,7 @@ fn who_moves_first_is_let_in_and_a_forecast_does_not_know_it() {
     let mut pdm = PdmClosed::default();
     plan_once(&recording(CROSSING), &mut pdm).unwrap();
     let waits = pdm.scores()[pdm.best()].progress_m;
-    // Everyone who is fast hits the other in the forecast ...
+    // All fast policies hit the other in the forecast ...
     assert_eq!(
         pdm.scores()[4].no_at_fault_collision,
         0.0,
@@ -165,7 +165,7 @@ fn who_moves_first_is_let_in_and_a_forecast_does_not_know_it() {
     let chosen = &decision.prospects[decision.chosen];
     assert!(chosen.progress_m > waits + 5.0, "{}", chosen.progress_m);
     assert!(fraction(chosen) > 0.5 && chosen.collisions == 0);
-    // With others who do not answer it waits as well.
+    // With others that do not react it waits as well.
     let deaf = ByLaw(|agent, _, _| coasted(agent));
     let decision = decide(&deaf, trusting(), CROSSING);
     assert!(decision.prospects[decision.chosen].progress_m < waits + 2.0);
@@ -185,7 +185,7 @@ fn a_hedge_keeps_from_relying_on_others() {
     let (bold, careful) = (with(0.0), with(0.9));
     assert_eq!(bold.hedge, None);
     assert!(bold.progress_m > careful.progress_m + 5.0);
-    // Nothing happens to the careful among those who do not answer, either.
+    // The careful candidate has no collision among agents that do not react, either.
     let hedge = careful.hedge.unwrap();
     assert!(hedge.total > 0.5, "{hedge:?}");
     let value = 0.1 * careful.score.mean + 0.9 * hedge.total;
@@ -225,7 +225,7 @@ fn a_lane_that_ends_is_left() {
     assert_eq!(chosen.kind, left);
     let end = chosen.drives[0].last().unwrap().rear_axle;
     assert!((3.0..4.0).contains(&end.position.y), "{end:?}");
-    // Not into somebody who drives beside it.
+    // Not into a vehicle that drives beside it.
     let beside = merging("agent vehicle 1: 21,3.5 velocity 10,0", config.clone());
     let chosen = &beside.prospects[beside.chosen];
     assert_eq!(chosen.collisions, 0);
@@ -345,7 +345,7 @@ fn plans_repeat_and_do_not_depend_on_earlier_plans() {
     let world = Idm::default();
     let a = recording(&format!("{FREE}\n agent vehicle 1: 50,0 velocity 6,0"));
     let b = recording(FREE);
-    let told = |driver: &mut InteractiveDriver<'_>, recording: &Recording| {
+    let result = |driver: &mut InteractiveDriver<'_>, recording: &Recording| {
         let plan = plan_once(recording, driver).unwrap();
         let decision = driver.decision().unwrap();
         let of = |p: &Prospect| (p.kind, p.score.clone(), p.drives.clone());
@@ -354,10 +354,10 @@ fn plans_repeat_and_do_not_depend_on_earlier_plans() {
     };
     let new = || InteractiveDriver::new(&world, ruled()).unwrap();
     let mut driver = new();
-    let first = told(&mut driver, &a);
-    told(&mut driver, &b);
-    assert_eq!(told(&mut driver, &a), first);
-    assert_eq!(told(&mut new(), &a), first);
+    let first = result(&mut driver, &a);
+    result(&mut driver, &b);
+    assert_eq!(result(&mut driver, &a), first);
+    assert_eq!(result(&mut new(), &a), first);
 }
 
 #[test]
@@ -392,8 +392,8 @@ impl WorldModel for PullsOut {
     }
 
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
-        let told = starts.iter().map(|start| (start.n_futures, start.seed));
-        self.starts.lock().unwrap().extend(told);
+        let new = starts.iter().map(|start| (start.n_futures, start.seed));
+        self.starts.lock().unwrap().extend(new);
         Ok(Box::new(PullingOut(ConstantVelocity.open(starts)?)))
     }
 }
@@ -516,11 +516,11 @@ fn the_world_is_told_exactly_where_the_ego_is() {
     let recording = recording(text);
     for world in [&ByLaw(at_random_speed) as &dyn WorldModel, &Idm::default()] {
         let decision = decide(world, only(&[0.4, 1.0], &[0.0, -1.0]), text);
-        let mut told = 0;
+        let mut n_complete = 0;
         for prospect in &decision.prospects {
-            told += usize::from(prospect.futures[0].steps() == 8);
+            n_complete += usize::from(prospect.futures[0].steps() == 8);
             for (future, drive) in prospect.futures.iter().zip(&prospect.drives) {
-                // One that is lost is let go before its end.
+                // A lost future is dropped before its end.
                 assert_eq!(drive.len(), 41);
                 for (i, frame) in future.imagined().iter().enumerate() {
                     let expected = drive[5 * (i + 1)].agent_state(recording.vehicle());
@@ -528,7 +528,7 @@ fn the_world_is_told_exactly_where_the_ego_is() {
                 }
             }
         }
-        assert!(told > 0);
+        assert!(n_complete > 0);
     }
 }
 
@@ -542,11 +542,11 @@ fn threads_change_nothing() {
         let run = || {
             let decision = decide(&world, InteractiveDriverConfig::default(), text);
             let frames = |future: &Rollout| future.imagined().to_vec();
-            let told = |p: &Prospect| {
+            let summary = |p: &Prospect| {
                 let frames: Vec<_> = p.futures.iter().map(frames).collect();
                 (p.score.clone(), p.drives.clone(), frames)
             };
-            let all: Vec<_> = decision.prospects.iter().map(told).collect();
+            let all: Vec<_> = decision.prospects.iter().map(summary).collect();
             (decision.chosen, all)
         };
         pool.build().unwrap().install(run)
@@ -565,8 +565,9 @@ fn halving_imagines_the_better_candidates_more_often() {
     let world = ByLaw(at_random_speed);
     let decision = decide(&world, InteractiveDriverConfig::default(), BEHIND);
     let of = |p: &Prospect| (p.futures.len(), p.drives.len(), p.finalist);
-    let told: Vec<_> = decision.prospects.iter().map(of).collect();
-    let count = |n: usize, finalist: bool| told.iter().filter(|t| **t == (n, n, finalist)).count();
+    let counts: Vec<_> = decision.prospects.iter().map(of).collect();
+    let count =
+        |n: usize, finalist: bool| counts.iter().filter(|t| **t == (n, n, finalist)).count();
     // Of nineteen policies and imitation ten see a second future, five the third and fourth.
     assert_eq!(
         (count(1, false), count(2, false), count(4, true)),
@@ -678,7 +679,7 @@ fn a_round_that_time_does_not_allow_does_not_count() {
         time.set(time.get() + 1);
         Duration::from_millis(time.get())
     };
-    // The first round asks for the time some thirty times, the second runs out of it.
+    // The first round reads the clock some thirty times, the second runs out of time.
     let mut config = InteractiveDriverConfig::default();
     config.budget.wall = Some(Duration::from_millis(45));
     let mut driver = InteractiveDriver::new(&ConstantVelocity, config)
@@ -874,12 +875,12 @@ fn imitation_is_a_candidate_like_any_other() {
     assert_eq!(decision.prospects[1].kind, ProposalKind::Imitation);
     assert_eq!(decision.chosen, 1);
     assert!((decision.prospects[1].progress_m - 36.0).abs() < 0.5);
-    // What is driven is what was imagined, and it goes on past that.
+    // The drive equals the imagined future, and continues past its end.
     let end = way.states()[80].rear_axle.position.x - way.states()[0].rear_axle.position.x;
     assert!((end - 72.0).abs() < 1.0, "{end}");
 }
 
-/// Says something wrong from the first step on.
+/// A world with invalid frames from the first step on.
 struct Wrong(fn(&Frame) -> Vec<Frame>);
 
 struct WrongSession(fn(&Frame) -> Vec<Frame>, Frame);

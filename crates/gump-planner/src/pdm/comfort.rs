@@ -35,7 +35,7 @@ impl Filter {
             derivative,
             delta,
         };
-        // The filter is linear, so it is known by what it makes of single impulses; and it is the
+        // The filter is linear, so its impulse responses determine it; and it is the
         // metric's own.
         let mut columns = Vec::with_capacity(n);
         for i in 0..n {

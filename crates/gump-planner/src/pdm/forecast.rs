@@ -34,7 +34,7 @@ pub(crate) struct Object {
     swept: (DVec2, DVec2),
 }
 
-/// Where an object is at a moment.
+/// Pose, outline and speed of an object at a moment.
 #[derive(Clone, Copy, Debug)]
 struct Spot {
     quad: Quad,
@@ -183,7 +183,7 @@ impl Forecast {
             .filter(|(distance, _)| *distance < RADIUS)
             .collect();
         seen.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // Room for so many of each kind, as PDM has it.
+        // At most this many of each kind, as in PDM.
         let mut room = [50, 25, 10, 50];
         self.objects.clear();
         for (_, agent) in seen {

@@ -7,7 +7,7 @@ use gump_scene::{Lane, LaneId, MapGraph, RoadblockId};
 use super::propose::Line;
 use crate::route_search::shortest_lanes;
 
-/// How long a change takes, seconds. At a lane's width to the side the lateral acceleration then
+/// Duration of a change, seconds. At a lane's width to the side the lateral acceleration then
 /// stays below 2 m/s².
 const CHANGE_S: f64 = 3.5;
 /// The least length of a change, metres.
@@ -42,7 +42,7 @@ pub(crate) struct Change {
     pub(crate) target: Path,
     /// Whether that way gets to the end of the route.
     pub(crate) arrives: bool,
-    /// Whether it has a reason of its own: it was begun before, or the ego's own lane ends.
+    /// Whether there is a reason to change: it was begun before, or the ego's lane ends.
     pub(crate) is_due: bool,
 }
 

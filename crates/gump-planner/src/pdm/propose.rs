@@ -10,7 +10,7 @@ use super::forecast::{Forecast, Object};
 
 /// Seconds between the states of a proposal.
 pub(crate) const DT: f64 = 0.1;
-/// How far ahead a line is examined, seconds at the highest desired speed.
+/// Length over which a line is examined, seconds at the highest desired speed.
 const CORRIDOR_SECONDS: f64 = 8.0;
 /// Distance between points of a line beyond which a corridor does not begin and end at points but
 /// at the ends of its range, metres; nuPlan's lines have a point every metre.
@@ -179,7 +179,7 @@ impl Proposer<'_> {
         Corridor::new(self.lines[line].corridor(progress, end, half_width))
     }
 
-    /// [`Proposer::drive`] with the corridor at hand.
+    /// [`Proposer::drive`] with a precomputed corridor.
     pub(crate) fn drive_within(
         &self,
         corridor: &Corridor,

@@ -28,7 +28,7 @@ fn check(text: &str) -> (Recording, PdmClosed) {
     plan(fixture::scenario(text).unwrap())
 }
 
-/// Where the car's front bumper ends up that follows proposal `i`.
+/// Final position of the front bumper of the car that follows proposal `i`, metres.
 fn front(recording: &Recording, planner: &PdmClosed, i: usize) -> f64 {
     let drive = &planner.thought().drives[i];
     drive[STEPS].rear_axle.position.x + recording.vehicle().front_length
@@ -105,7 +105,7 @@ fn who_is_not_in_the_way_does_not_matter() {
 
 #[test]
 fn a_box_between_two_bends_of_the_way_is_on_one_of_them() {
-    // The way comes back 6 m beside itself; the parked truck stands between both.
+    // The route returns 6 m beside itself; the parked truck stands in between.
     let out = (0..=20).map(|i| format!("{},0 ", 2 * i));
     let back = (0..=20).rev().map(|i| format!("{},6 ", 2 * i));
     let line: String = out.chain(back).collect();

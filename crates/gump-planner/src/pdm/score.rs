@@ -117,7 +117,7 @@ impl Judge<'_> {
         }
     }
 
-    /// How far along the way the vehicle's centre is, metres.
+    /// Arc length of the vehicle's centre on the centre line, metres.
     pub(crate) fn place(&self, state: &EgoState) -> f64 {
         let center = self.vehicle.center_of(state.rear_axle);
         self.centerline.project(center.position)

@@ -21,7 +21,7 @@ fn rows(value: &Value) -> Vec<Vec<f64>> {
     value.as_array().unwrap().iter().map(numbers).collect()
 }
 
-/// Numbers; what is not one (infinities are words) comes as infinity.
+/// Numbers; anything else (infinities are words) is read as infinity.
 fn numbers(value: &Value) -> Vec<f64> {
     let list = value.as_array().unwrap().iter();
     list.map(|v| v.as_f64().unwrap_or(f64::INFINITY)).collect()

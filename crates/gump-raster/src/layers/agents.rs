@@ -4,7 +4,7 @@ use gump_scene::SceneState;
 
 use super::Plane;
 
-/// How far the fading history reaches back, seconds.
+/// Length of the fading history, seconds.
 const HISTORY: f64 = 2.0;
 
 pub(crate) fn draw_ego(plane: &mut Plane<'_>, scene: &SceneState<'_>) {

@@ -35,7 +35,7 @@ pub(crate) fn draw_route(plane: &mut Plane<'_>, scene: &SceneState<'_>) {
     }
 }
 
-/// Which piece of which lane covers each pixel, painted once and read by several layers.
+/// The lane piece that covers each pixel, painted once and read by several layers.
 ///
 /// Where lanes overlap the later one in the map wins, except on centre lines, which always belong
 /// to their own lane or another centre line.

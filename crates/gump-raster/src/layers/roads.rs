@@ -33,7 +33,7 @@ pub(crate) fn draw_drivable(plane: &mut Plane<'_>, map: &MapGraph) {
 }
 
 /// Stop lines as areas, where a format has them, otherwise as lines across the lanes that stop
-/// signs apply to: the sign itself stands beside the road.
+/// signs apply to: the sign itself is beside the road.
 pub(crate) fn draw_stop_lines(plane: &mut Plane<'_>, map: &MapGraph) {
     draw_areas(plane, map, AreaKind::StopLine, 1.0);
     for sign in map.stop_signs() {

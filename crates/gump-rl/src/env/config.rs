@@ -18,9 +18,9 @@ pub struct EnvConfig {
     pub rules: Rules,
     /// Observations.
     pub observation: ObservationSpec,
-    /// When a row whose episode ended gets its next one.
+    /// The moment at which a row whose episode ended gets its next one.
     pub autoreset: Autoreset,
-    /// How episodes choose their scenarios.
+    /// Rule by which episodes choose their scenarios.
     pub sampling: Sampling,
     /// Agents that a world simulates in each episode, those that come nearest to the ego in the
     /// log; all others follow the log, unseen by those simulated, and stand where it ends. `None`
@@ -44,7 +44,7 @@ impl Default for EnvConfig {
     }
 }
 
-/// When a row whose episode ended gets its next one.
+/// The moment at which a row whose episode ended gets its next one.
 ///
 /// Source: the modes and names of Gymnasium 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]

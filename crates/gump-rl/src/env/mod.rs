@@ -231,7 +231,7 @@ impl<'w> DrivingEnv<'w> {
         self.open()
     }
 
-    /// What a row holds until its first episode begins.
+    /// Placeholder state of a row until its first episode begins.
     fn blank(&self) -> EpisodeState {
         self.config.rules.reset(&self.courses[0])
     }
@@ -269,7 +269,7 @@ impl<'w> DrivingEnv<'w> {
         }
         let restarted = self.others.restart(&self.courses, &mut self.rows, chosen);
         if restarted.is_err() {
-            // Nobody knows what a world is worth that failed halfway.
+            // The state of a world that failed halfway is unknown.
             self.rows.clear();
         }
         restarted?;

@@ -20,11 +20,11 @@ pub struct EpisodeStart {
 pub struct Outcome {
     /// Repeats it with [`super::DrivingEnv::reset_to`].
     pub start: EpisodeStart,
-    /// Steps made.
+    /// Number of steps.
     pub steps: usize,
-    /// Their totals.
+    /// Totals of these steps.
     pub totals: Totals,
-    /// How it ended.
+    /// The end of the episode.
     pub end: End,
 }
 
@@ -33,7 +33,7 @@ pub struct Outcome {
 pub(super) struct Row {
     /// Source of the seeds of its episodes.
     seed: Seed,
-    /// How many it has started.
+    /// Number of episodes the row has started.
     pub(super) n_episodes: u64,
     pub(super) start: EpisodeStart,
     pub(super) state: EpisodeState,
@@ -186,7 +186,7 @@ mod tests {
             course.scenario().present().history.len()
         );
         assert_eq!(ids(seen.now()), [0, 1, 3]);
-        // The world leaves everyone in place.
+        // The world leaves all agents in place.
         let frame = row.complete(&course, seen.now().clone());
         assert_eq!(ids(&frame), [0, 1, 2, 3]);
         let x = |id| frame.agent(AgentId(id)).unwrap().state.pose.position.x;

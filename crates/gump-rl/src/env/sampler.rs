@@ -4,7 +4,7 @@ use gump_scene::Seed;
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
-/// How episodes choose their scenarios.
+/// Rule by which episodes choose their scenarios.
 #[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampling {

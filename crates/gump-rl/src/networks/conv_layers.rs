@@ -3,11 +3,11 @@
 use super::convolution::Convolution;
 use super::group_norm::GroupNorm;
 
-/// A convolution and the normalization of what it gives.
+/// A convolution and the normalization of its output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Unit {
     pub(super) convolution: Convolution,
-    /// Where its parameters begin: weights, scales, shifts.
+    /// Offset of its parameters: weights, scales, shifts.
     begin: usize,
 }
 
@@ -28,16 +28,16 @@ pub(super) enum Layer {
     },
 }
 
-/// What a layer remembers of some rows.
+/// Activations of a layer for some rows, kept for the backward pass.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LayerPass {
-    /// What it gave. Shape: `[channels, rows, side, side]`.
+    /// Its output. Shape: `[channels, rows, side, side]`.
     pub(super) output: Vec<f32>,
     /// By unit: first, second, shortcut.
     units: [UnitPass; 3],
     /// Between first and second unit. Shape: as the output.
     middle: Vec<f32>,
-    /// Which pixel of the input is the largest. Shape: as the output.
+    /// Index of the largest pixel of the input, for pooling. Shape: as the output.
     largest: Vec<u32>,
 }
 
@@ -56,7 +56,7 @@ impl Unit {
         self.convolution.n_weights()
     }
 
-    /// Where its parameters lie among all.
+    /// Range of its parameters among all of them.
     pub(super) fn range(&self) -> std::ops::Range<usize> {
         let n = self.n_weights() + GroupNorm::n_parameters(self.convolution.outputs);
         self.begin..self.begin + n

@@ -17,13 +17,13 @@ pub(super) struct Convolution {
     pub(super) side: usize,
 }
 
-/// Where a tap of the kernel reads: the pixels of a line or column that lie inside the map.
+/// The pixels of a line or column that a tap of the kernel reads: those inside the map.
 struct Taps {
     /// The first output pixel whose tap is inside.
     begin: usize,
     /// The first after it whose tap is not.
     end: usize,
-    /// What the first of them reads.
+    /// The input pixel that the tap of `begin` reads.
     first: usize,
 }
 
@@ -64,7 +64,7 @@ impl Convolution {
         );
     }
 
-    /// Adds the gradient of the weights to `weight_gradient` and that of the input, if asked for,
+    /// Adds the gradient of the weights to `weight_gradient` and that of the input, if requested,
     /// to `input_gradient`, given that of the output. Shape: as [`Convolution::forward`].
     pub(super) fn backward(
         &self,
@@ -87,7 +87,8 @@ impl Convolution {
         }
     }
 
-    /// What every tap reads, tap after tap. Shape: `[inputs, kernel, kernel, rows, y, x]`.
+    /// Collects the pixels that each tap reads, tap after tap. Shape:
+    /// `[inputs, kernel, kernel, rows, y, x]`.
     fn gather(&self, input: &[f32], rows: usize, columns: &mut Vec<f32>) {
         columns.clear();
         columns.resize(self.taps() * rows * self.side_out().pow(2), 0.0);

@@ -73,7 +73,7 @@ impl Mlp {
         }
     }
 
-    /// The network with these parameters; `None` if there are more or fewer than the sizes ask for.
+    /// The network with these parameters; `None` if their number does not match the sizes.
     pub fn from_parameters(sizes: &[usize], parameters: Vec<f32>) -> Option<Self> {
         let fits = sizes.len() > 1 && parameters.len() == n_parameters(sizes);
         fits.then(|| Self {

@@ -75,8 +75,8 @@ impl Critic {
         pass.output().to_vec()
     }
 
-    /// Values of what was done, and by the target of what would be done next: observations and
-    /// actions each.
+    /// Computes the values of the taken actions, and by the target critics those of the next
+    /// actions; each pair holds observations and actions.
     pub(super) fn run(&mut self, taken: (&[f32], &[f32]), next: (&[f32], &[f32])) {
         let taken = self.join(taken.0, taken.1);
         self.online.forward(&taken, &mut self.taken);
@@ -84,7 +84,7 @@ impl Critic {
         self.target.forward(&next, &mut self.future);
     }
 
-    /// Values of what the policy would do.
+    /// Computes the values of the policy's actions.
     pub(super) fn judge(&mut self, observations: &[f32], actions: &[f32]) {
         let input = self.join(observations, actions);
         self.online.forward(&input, &mut self.judged);
@@ -102,8 +102,8 @@ impl Critic {
         self.judged.output()
     }
 
-    /// Takes the gradient of the mean of `loss(row, value)`, also by what was seen if `through`;
-    /// that mean.
+    /// Takes the gradient of the mean of `loss(row, value)`, also by the input if `through`;
+    /// returns that mean.
     pub(super) fn learn(&mut self, through: bool, loss: impl Fn(usize, f32) -> (f64, f64)) -> f64 {
         let rows = self.taken.rows() as f64;
         let values = self.taken.output().iter().enumerate();

@@ -32,7 +32,7 @@ pub struct ReplayBuffer {
     pub(crate) form: ObservationForm,
     pub(crate) action_len: usize,
     pub(crate) capacity: usize,
-    /// Where the next transition goes once the buffer is full.
+    /// Index that the next transition overwrites once the buffer is full.
     pub(crate) head: usize,
     pub(crate) observations: Store,
     pub(crate) actions: Vec<f32>,
@@ -41,7 +41,7 @@ pub struct ReplayBuffer {
     pub(crate) terminated: Vec<bool>,
 }
 
-/// Observations one after another, in as little room as their form allows.
+/// Observations one after another, packed as tightly as their form allows.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Store {
     Numbers(Vec<f32>),
@@ -84,7 +84,7 @@ impl Store {
     }
 }
 
-/// Place `index` of values of `len` each, made if it is one behind the last.
+/// Slot `index` of values of `len` each, created if it is one past the last.
 fn room<T: Clone + Default>(values: &mut Vec<T>, index: usize, len: usize) -> &mut [T] {
     if values.len() == index * len {
         values.resize(values.len() + len, T::default());
@@ -159,7 +159,7 @@ impl ReplayBuffer {
     /// [`RlError::EmptyBuffer`] if the buffer is empty.
     pub fn sample(&self, n: usize, rng: &mut Rng) -> Result<Vec<usize>, RlError> {
         if self.is_empty() {
-            return Err(RlError::EmptyBuffer { asked: n });
+            return Err(RlError::EmptyBuffer { requested: n });
         }
         Ok((0..n).map(|_| rng.random_range(0..self.len())).collect())
     }
@@ -220,7 +220,7 @@ mod tests {
     use crate::networks::Picture;
     use gump_scene::Seed;
 
-    /// Transition `i` of a stream: every part of it tells `i`.
+    /// Transition `i` of a stream: every part of it encodes `i`.
     fn filled(capacity: usize, n: usize) -> ReplayBuffer {
         let mut buffer = ReplayBuffer::new(capacity, 2, 1).unwrap();
         for i in 0..n {
@@ -305,7 +305,7 @@ mod tests {
     fn empty_buffers_are_refused() {
         let buffer = filled(3, 0);
         let error = buffer.sample(4, &mut Seed(0).rng()).unwrap_err();
-        assert!(matches!(error, RlError::EmptyBuffer { asked: 4 }));
+        assert!(matches!(error, RlError::EmptyBuffer { requested: 4 }));
         assert!(ReplayBuffer::new(0, 2, 1).is_err());
     }
 }

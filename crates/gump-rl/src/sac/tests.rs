@@ -141,8 +141,9 @@ fn targets_move_once_per_period() {
     }
 }
 
-/// Finite differences of a loss by some parameters, one of so many. ReLU has kinks, on which the two sides
-/// disagree: where much, they are few and left out; the gradient lies between them.
+/// Checks a gradient against finite differences of the loss, by one parameter in `every`. At a kink
+/// of ReLU the two sides disagree and the gradient lies between them; the few with a large
+/// disagreement are left out.
 pub(super) fn check_gradient(found: &[f32], every: usize, loss: impl Fn(usize, f32) -> f64) {
     let h = 2e-3f32;
     let middle = loss(0, 0.0);
@@ -221,10 +222,10 @@ fn imitation_is_limited_to_a_multiple_of_the_rest() {
     let ratio = report.imitation_gradient / report.reward_gradient;
     assert!(ratio > 2.0, "{ratio}");
     // A limit of half the ratio is the same as half the weight.
-    let (limited, told) = after(50.0, Some(ratio / 2.0));
-    let (lighter, lighter_told) = after(25.0, None);
-    assert_eq!(told.imitation_gradient, report.imitation_gradient);
-    assert!((lighter_told.imitation_gradient / report.imitation_gradient - 0.5).abs() < 1e-6);
+    let (limited, limited_report) = after(50.0, Some(ratio / 2.0));
+    let (lighter, lighter_report) = after(25.0, None);
+    assert_eq!(limited_report.imitation_gradient, report.imitation_gradient);
+    assert!((lighter_report.imitation_gradient / report.imitation_gradient - 0.5).abs() < 1e-6);
     for (a, b) in limited.iter().zip(&lighter) {
         assert!((a - b).abs() < 1e-6 * (1.0 + b.abs()), "{a}, {b}");
     }

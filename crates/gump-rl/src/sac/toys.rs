@@ -258,7 +258,7 @@ impl Problem for Clock {
         vec![0.0]
     }
 
-    /// The clock is seen only where it matters.
+    /// The time is observed only in the problem where it matters.
     fn observe(&self, state: &[f64]) -> Vec<f32> {
         vec![if self.terminates {
             state[0] as f32 / 5.0

@@ -91,7 +91,7 @@ impl Training {
         config.check()?;
         if algorithm == Algorithm::Imitation && expert.is_empty() {
             return Err(RlError::EmptyBuffer {
-                asked: config.batch,
+                requested: config.batch,
             });
         }
         let (form, a) = (expert.form(), expert.action_len);

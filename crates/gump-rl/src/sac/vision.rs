@@ -15,16 +15,16 @@ use crate::networks::{Adam, ConvNet, ConvPass, clip};
 /// The encoders of a learner beside the actor's, and what trains them all.
 #[derive(Clone, Debug)]
 pub(crate) struct Vision {
-    /// Of the actor's encoder.
+    /// Training state of the actor's encoder.
     pub(crate) training: EncoderTraining,
     /// The critics' own encoder, if they have one.
     pub(crate) separate: Option<(ConvNet, EncoderTraining)>,
-    /// What the target critics see with.
+    /// Encoder of the target critics.
     pub(crate) target: ConvNet,
     future: ConvPass,
 }
 
-/// What one encoder is trained by.
+/// Optimizer, gradient and activations for training one encoder.
 #[derive(Clone, Debug)]
 pub(crate) struct EncoderTraining {
     pub(crate) optimizer: Adam,
@@ -33,7 +33,8 @@ pub(crate) struct EncoderTraining {
     next: ConvPass,
 }
 
-/// A batch as dense networks take it in: `[observations, nexts]` for each of them.
+/// A batch as the dense networks read it: `[observations, nexts]` for the actor and for the
+/// critics.
 pub(super) struct Seen<'a> {
     pub(super) by_actor: [Cow<'a, [f32]>; 2],
     by_critics: Option<[Cow<'a, [f32]>; 2]>,
@@ -42,7 +43,7 @@ pub(super) struct Seen<'a> {
 }
 
 impl<'a> Seen<'a> {
-    /// Numbers, which everyone takes as they are.
+    /// Vector observations, which all networks read unchanged.
     pub(super) fn unchanged(batch: &'a Batch) -> Self {
         let nexts = || Cow::Borrowed(batch.nexts.as_slice());
         Self {
@@ -108,7 +109,7 @@ impl Vision {
         })
     }
 
-    /// What everyone sees of a batch.
+    /// Encodes a batch for the actor, the critics and the target critics.
     pub(super) fn see(&mut self, encoder: &ConvNet, batch: &Batch) -> Seen<'static> {
         self.target.forward(&batch.nexts, &mut self.future);
         let separate = self.separate.as_mut();
@@ -168,7 +169,7 @@ impl Vision {
         }
     }
 
-    /// Lets the target follow what the critics see with.
+    /// Moves the target encoder towards the critics' encoder.
     pub(super) fn move_target(&mut self, encoder: &ConvNet, tau: f32) {
         let online = self.separate.as_ref().map_or(encoder, |(own, _)| own);
         self.target.follow(online, tau);

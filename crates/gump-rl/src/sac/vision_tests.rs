@@ -15,7 +15,7 @@ use super::{Algorithm, Batch, Learner, SacConfig, Training, UpdateReport};
 use crate::networks::{Architecture, Picture};
 use crate::{Actor, RlError};
 
-/// Of 60,000 parameters, one of so many is checked.
+/// One in this many of the 60,000 parameters is checked.
 const EVERY: usize = 211;
 
 const PICTURE: Picture = Picture { layers: 2, side: 8 };

@@ -26,19 +26,19 @@ pub struct Connection<'a, S> {
     config: EnvConfig,
 }
 
-/// How a connection ended.
+/// The end of a connection.
 #[derive(Debug)]
 pub struct Farewell {
-    /// Episodes that ended while it lasted.
+    /// Episodes that ended during the connection.
     pub episodes_finished: u64,
-    /// Episodes that were under way when it ended; they are lost.
+    /// Episodes in progress when the connection ended; they are lost.
     pub episodes_lost: usize,
-    /// Why it ended; `None` for a goodbye.
+    /// The reason for the end; `None` if the client said goodbye.
     pub error: Option<ServerError>,
 }
 
 impl<'a, S: Read + Write> Connection<'a, S> {
-    /// A conversation that has not begun.
+    /// Creates a connection whose handshake has not begun.
     pub fn new(
         stream: S,
         courses: &'a Arc<[Course]>,

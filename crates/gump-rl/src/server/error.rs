@@ -22,7 +22,7 @@ pub enum ServerError {
     /// The client closed the connection without a goodbye.
     #[error("the client hung up {during}")]
     Disconnected {
-        /// What was expected next.
+        /// The moment, for instance "between requests".
         during: &'static str,
     },
     /// The connection failed.
@@ -55,7 +55,7 @@ pub enum ServerError {
     /// An invalid byte.
     #[error("the {what} is {found}, expected at most {most}")]
     Choice {
-        /// What it selects.
+        /// Name of the setting that the byte selects.
         what: &'static str,
         /// The largest valid value.
         most: u32,

@@ -122,7 +122,7 @@ impl Server {
         courses: &Arc<[Course]>,
         traffic: Traffic<'_>,
         config: &EnvConfig,
-        tell: &(dyn Fn(Event) + Sync),
+        report: &(dyn Fn(Event) + Sync),
     ) -> Result<(), ServerError> {
         std::thread::scope(|scope| {
             loop {
@@ -146,11 +146,11 @@ impl Server {
                     self.lock().push((client, copy));
                 }
                 scope.spawn(move || {
-                    tell(Event::Came { client });
+                    report(Event::Came { client });
                     let connection = Connection::new(stream, courses, traffic, config);
                     let farewell = connection.serve();
                     self.lock().retain(|(other, _)| *other != client);
-                    tell(Event::Left { client, farewell });
+                    report(Event::Left { client, farewell });
                 });
             }
         })
@@ -159,7 +159,7 @@ impl Server {
     /// Disconnects all clients and lets [`Server::run`] return.
     pub fn stop(&self) {
         self.stopped.store(true, Ordering::SeqCst);
-        // Wakes it up; if that fails, nobody listens any more.
+        // Wakes it up; if that fails, it no longer listens.
         drop(UnixStream::connect(&self.path));
     }
 
@@ -178,7 +178,7 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        // Whoever removed it before us did what we wanted.
+        // It is no error if the socket is already gone.
         drop(std::fs::remove_file(&self.path));
     }
 }

@@ -42,7 +42,7 @@ pub(crate) fn env<'w>(
     DrivingEnv::new(Arc::clone(courses), traffic, config(n_envs)).unwrap()
 }
 
-/// What one row went through, from one observation to the next.
+/// One step of one row, from one observation to the next.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Transition {
     pub(crate) before: Vec<f32>,

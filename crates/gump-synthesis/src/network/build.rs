@@ -209,8 +209,8 @@ struct Link {
     turn: Turn,
 }
 
-/// Which lanes of leg `from` lead where; with `lanes_for_left` lanes or more the leftmost only turns
-/// left.
+/// Returns the links from the lanes of leg `from`; with `lanes_for_left` lanes or more the leftmost
+/// only turns left.
 fn links(legs: &[Leg], from: usize, lanes_for_left: usize) -> Vec<Link> {
     let leg = &legs[from];
     let inward = wrap_angle(leg.mouth.heading + std::f64::consts::PI);

@@ -1,4 +1,4 @@
-//! Where connectors share their surface with each other and with crosswalks.
+//! Surfaces that connectors share with each other and with crosswalks.
 
 use crate::curve::Track;
 use crate::network::leg::CROSSWALK_DEPTH;

@@ -19,7 +19,7 @@ pub(crate) struct Leg {
     pub(crate) road: usize,
     /// True if the road's reference starts here.
     pub(crate) at_start: bool,
-    /// Where the junction ends, on the reference, looking away from the junction.
+    /// The end of the junction on the reference, looking away from the junction.
     pub(crate) mouth: Pose,
     /// Curvature of the reference at the mouth when leaving, radians per metre.
     pub(crate) curvature: f64,
@@ -29,7 +29,7 @@ pub(crate) struct Leg {
     pub(crate) left: f64,
     /// From the reference to the right curb (traffic away from it), metres.
     pub(crate) right: f64,
-    /// Nobody waits at its end.
+    /// Traffic never waits at its end.
     pub(crate) is_open: bool,
     /// Joins the road beyond on its outside, as a ramp does.
     pub(crate) joins: bool,
@@ -119,8 +119,8 @@ fn outward(road: &RoadPlan, at_start: bool, distance: f64) -> Pose {
     }
 }
 
-/// How far from the node each leg must stop so that curbs can round the corners and crosswalks
-/// fit before the rounding.
+/// Returns the distance from the node, metres, at which each leg must stop so that curbs can round
+/// the corners and crosswalks fit before the rounding.
 fn setbacks(plan: &Plan, node: &NodePlan, ends: &[(usize, bool)]) -> Vec<f64> {
     let mut setbacks = vec![node.min_setback; ends.len()];
     for i in 0..ends.len() {

@@ -116,7 +116,7 @@ impl Network {
     }
 }
 
-/// Metres from the curb to the near end of a row: rows stand back to back in pairs, with an aisle
+/// Metres from the curb to the near end of a row: rows lie back to back in pairs, with an aisle
 /// between pairs.
 fn row_start(row: usize) -> f64 {
     SET_BACK + row as f64 * DEPTH + (row / 2) as f64 * AISLE

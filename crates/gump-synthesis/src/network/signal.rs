@@ -120,7 +120,7 @@ pub(crate) fn plan_cycle(legs: &[Leg], left_only: &[bool], rng: &mut Rng) -> Cyc
         });
     }
     if phases.iter().all(|phase| phase.walk.is_empty()) {
-        // A crossing away from any junction: people need a phase of their own.
+        // A crossing away from any junction: pedestrians need a separate phase.
         phases.push(Phase {
             green: Vec::new(),
             walk: (0..legs.len()).collect(),

@@ -124,7 +124,7 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
     true
 }
 
-/// A short way into a yard, from which nobody sees what becomes of a vehicle.
+/// Adds a short way into a yard, in which vehicles disappear out of sight.
 fn add_yard(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
     let style = RoadPlan {
         bays: false,
@@ -148,7 +148,7 @@ fn add_yard(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng)
     true
 }
 
-/// Several aisles side by side off one road, whose rows of bays stand back to back.
+/// Several aisles side by side off one road, whose rows of bays lie back to back.
 fn add_wide_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
     let (road, first, left) = at;
     let style = aisle(rng);

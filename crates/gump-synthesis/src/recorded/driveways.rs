@@ -75,7 +75,7 @@ pub(crate) fn lay(
     driveways
 }
 
-/// Vehicles that stand in yards behind the driveways, a `share` of them taken.
+/// Parked vehicles in yards behind the driveways, of which a `share` is occupied.
 pub(crate) fn parked(
     network: &Network,
     driveways: &[Driveway],

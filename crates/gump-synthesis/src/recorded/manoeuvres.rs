@@ -64,7 +64,7 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
     }
 }
 
-/// Poses of a vehicle that leaves `parked`, or comes to stand there, one per snapshot.
+/// Poses of a vehicle that leaves `parked`, or stops there, one per snapshot.
 fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose> {
     let axle = REAR_AXLE * length;
     let mut rear = parked * Pose::new(-axle, 0.0, 0.0);

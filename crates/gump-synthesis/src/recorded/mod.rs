@@ -204,7 +204,7 @@ fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option
     let suits = |track: &&Track| {
         let body = track.body;
         let near = |pose: gump_geometry::Pose| pose.position.length() < EGO_REACH;
-        // Who leaves a parking place has no lane.
+        // A vehicle that leaves a parking place has no lane.
         !track.places().is_empty()
             && body.is_mobile
             && body.kind == AgentKind::Vehicle

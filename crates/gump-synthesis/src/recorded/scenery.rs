@@ -56,7 +56,7 @@ pub(crate) fn draw(
     });
     let share = rng.random_range(0.0..0.9);
     standing.extend(driveways::parked(network, driveways, share, rng));
-    // The farthest are left out: nobody at the centre would see them.
+    // The farthest are left out: they are not visible from the centre.
     standing.sort_by(|a, b| {
         let far = |body: &Standing| body.pose.position.length();
         far(a).total_cmp(&far(b))

@@ -23,12 +23,12 @@ const LEAST_PARKED: usize = 6;
 const REACH_M: f64 = 70.0;
 /// Maximum length of a walk, metres.
 const WAY_M: std::ops::Range<f64> = 6.0..45.0;
-/// From the centre of a lane of a road, metres: where people are off it, and where they may stand,
-/// as at the door of a vehicle beside the lane.
+/// Distances from the centre of a lane of a road, metres: beyond the first people are off the road;
+/// from the second they may stand, as at the door of a vehicle beside the lane.
 const OFF_ROAD_M: f64 = 2.4;
 const ASIDE_ROAD_M: f64 = 1.3;
-/// Distance kept to standing and to moving agents, metres: off the road, and on it, where nobody
-/// gives way to them.
+/// Distance kept to standing and to moving agents, metres: off the road, and on it, where traffic
+/// does not give way to them.
 const ROOM_M: [[f64; 2]; 2] = [[0.05, 0.5], [0.05, 2.5]];
 /// Within this of a vehicle people step aside, metres.
 const ASIDE_M: f64 = 1.0;
@@ -72,7 +72,7 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
             }
             recording.add(person(id, size, shown[0]), poses.clone());
             if rng.random_bool(0.35) {
-                // Somebody beside, if there is room.
+                // A companion beside, if there is room.
                 let beside = Pose::new(
                     rng.random_range(-0.3..0.3),
                     rng.random_range(0.85..1.15),

@@ -86,7 +86,7 @@ pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
             });
             let position = agent.state.pose.position;
             let distance = ego.map_or(0.0, |ego| ego.distance(position));
-            // Errors go on out of sight, so that who is seen when changes no error.
+            // Errors continue out of sight, so that visibility changes no error.
             let shown = noise.step(agent, distance, dt);
             if is_ego || seen.is_tracked(agent.id, step) {
                 agents.push(shown);

@@ -104,7 +104,7 @@ impl Noise {
             (true, AgentKind::Vehicle) => 0.15,
             _ => 1.0,
         };
-        // Which way somebody looks who stands about is hard to tell.
+        // The heading of a standing person is hard to measure.
         let unsure = match (stands(agent), agent.kind) {
             (true, AgentKind::Pedestrian | AgentKind::Bicycle) => 4.0,
             _ => 1.0,

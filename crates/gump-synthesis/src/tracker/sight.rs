@@ -20,7 +20,7 @@ const SENSOR: f64 = 2.1;
 const CELL: f64 = 3.0;
 /// Interval of visibility checks, seconds.
 const LOOK_S: f64 = 0.1;
-/// Ground is open this far around everybody, metres.
+/// Ground is open this far around all agents, metres.
 const AROUND: f64 = 5.0;
 
 /// The steps at which agents are tracked.
@@ -112,14 +112,14 @@ fn keep_track(
     seed: Seed,
 ) -> Vec<bool> {
     let mut rng = seed.rng();
-    // Whoever is in sight at the beginning has mostly been so for a while.
+    // Agents in sight at the beginning have mostly been so for a while.
     let mut seen_s = if rng.random_bool(0.9) { 10.0 } else { 0.0 };
     let mut begins_after = rng.random_range(tracker.begins_after_s.clone());
     let mut coasts = rng.random_range(tracker.coasts_s.clone());
     let (mut hidden_s, mut lost_s) = (0.0, 0.0_f64);
     let mut on = false;
     let steps = shares.iter().enumerate().map(|(step, share)| {
-        // The farther, the more is needed, and the more often somebody is lost.
+        // With distance, more must be visible, and tracks are lost more often.
         let far = distance(step);
         let misses = tracker.misses_per_s * far.powi(2) * dt;
         if rng.random_bool(misses.clamp(0.0, 1.0)) {
@@ -195,7 +195,7 @@ fn bins(agent: &Agent, ego: DVec2) -> (usize, usize) {
     (first % BINS, n.min(BINS))
 }
 
-/// Ground that one can see across: roads, what is beside them, and where somebody stands.
+/// Ground that does not block the view: roads, their surroundings, and places of agents.
 struct Open {
     cells: BTreeSet<(i32, i32)>,
 }

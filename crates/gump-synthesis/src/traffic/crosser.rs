@@ -85,7 +85,7 @@ impl Crosser {
         }
     }
 
-    /// Somebody who goes along, this far to the left.
+    /// A companion this far to the left.
     pub(crate) fn companion(&self, id: i64, size: [f64; 3], aside: f64) -> Self {
         Self {
             id,
@@ -111,7 +111,7 @@ impl Crosser {
 }
 
 impl Traffic<'_> {
-    /// Moves those who cross, and puts them in the way of vehicles; after the lanes were filled.
+    /// Moves crossing people, and puts them in the way of vehicles; after the lanes were filled.
     pub(super) fn step_crossers(&mut self) {
         let ways = std::mem::take(&mut self.demand.scenery.jaywalks);
         for i in 0..self.crossers.len() {
@@ -140,7 +140,7 @@ impl Traffic<'_> {
         self.demand.scenery.jaywalks = ways;
     }
 
-    /// True if nobody on any lane of the way arrives before a person of this pace has passed.
+    /// True if no vehicle on any lane of the way arrives before a person of this pace has passed.
     fn has_gap(&self, way: &Jaywalk, pace: f64) -> bool {
         way.spans.iter().all(|span| {
             let (enters, leaves) = (span.across.0 / pace, span.across.1 / pace + 1.0);

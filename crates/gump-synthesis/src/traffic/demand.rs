@@ -46,7 +46,8 @@ pub(crate) struct Scenery {
     pub(crate) held: Vec<(LaneIdx, f64)>,
     /// Ways across the road away from crosswalks.
     pub(crate) jaywalks: Vec<Jaywalk>,
-    /// Which pedestrians use them, and from which second of the simulation on.
+    /// Pedestrians that use them: the index of the way, and the second of the simulation at which
+    /// they start.
     pub(crate) crossers: Vec<(usize, f64)>,
 }
 
@@ -60,7 +61,7 @@ pub(crate) struct Standing {
     pub(crate) pose: Pose,
 }
 
-/// How often drivers turn into a yard or car park, less than into another road.
+/// Weight of a turn into a yard or car park relative to one into another road.
 const INTO_YARDS: f64 = 0.5;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s.
 const FAST_LANE: f64 = 16.0;
@@ -260,7 +261,7 @@ impl Traffic<'_> {
         self.vehicles.push(vehicle);
     }
 
-    /// True if the road of this lane has a lane of its own for bicycles.
+    /// True if the road of this lane has a separate lane for bicycles.
     fn has_bike_lane(&self, lane: LaneIdx) -> bool {
         let start = self.network.lanes[lane].track.pose_at(0.0);
         self.network.lanes.iter().any(|other| {
@@ -369,7 +370,7 @@ impl Traffic<'_> {
             let mut walk = walks[self.rng.random_range(0..walks.len())];
             let mut forward = self.rng.random_bool(0.5);
             for _ in 0..4 {
-                // Those far from the centre are seen by nobody, and most are where roads are crossed.
+                // People far from the centre are not visible, and most are where roads are crossed.
                 let track = &self.network.walks[walk].track;
                 let near = track.pose_at(track.length() / 2.0).position.length() < 75.0;
                 let suits = near && self.leads_across(walk, forward);
@@ -393,7 +394,7 @@ impl Traffic<'_> {
         self.next_id += 1;
         let mut person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
         if self.demand.scenery.is_real {
-            // Most of those who walk are with somebody.
+            // Most pedestrians have company.
             let n = [0, 0, 0, 1, 1, 2, 2, 3, 4, 6][self.rng.random_range(0..10)];
             person.accompany(self.next_id, n, &mut self.rng);
             self.next_id += n as i64;

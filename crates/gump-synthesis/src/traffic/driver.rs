@@ -75,7 +75,7 @@ impl Driver {
     /// A driver with a random driving style: from the timid to those who roll through stop signs
     /// and over the line when the light has just turned red.
     pub(crate) fn of_any_temper(rng: &mut Rng) -> Self {
-        // One number for how much of a hurry somebody is in, and the rest around it.
+        // One number for the hurry of the driver, and the rest around it.
         let hurry: f64 = f64::midpoint(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0));
         let mut around = |middle: f64, by_hurry: f64, spread: f64| {
             middle + by_hurry * hurry + rng.random_range(-spread..spread)
@@ -192,7 +192,8 @@ mod tests {
     use super::*;
     use gump_scene::Seed;
 
-    /// Drives towards something that stands `distance` metres ahead; what is left when it rests.
+    /// Drives towards an obstacle `distance` metres ahead; returns the gap left at rest and the
+    /// hardest braking.
     fn approach(driver: &Driver, speed: f64, distance: f64) -> (f64, f64) {
         let (mut gap, mut speed, mut hardest) = (distance, speed, 0.0);
         for _ in 0..600 {

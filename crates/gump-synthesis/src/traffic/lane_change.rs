@@ -14,7 +14,8 @@ const ROOM_AFTER: f64 = 15.0;
 const IMPOSED_BRAKING: f64 = 2.0;
 /// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones.
 const GAIN: [f64; 2] = [0.25, 0.05];
-/// How often a vehicle changes lanes for reasons of its own when it thinks of it.
+/// Probability of a lane change without gain when a vehicle considers one: in plain scenes, and in
+/// those like recorded ones.
 const WHIM: [f64; 2] = [0.04, 0.7];
 
 impl Traffic<'_> {

@@ -32,7 +32,7 @@ pub(crate) struct Entry {
 #[derive(Debug)]
 pub(crate) struct Occupancy {
     entries: Vec<Vec<Entry>>,
-    /// Lane and arc length of what stands in the way without being a vehicle.
+    /// Lanes and arc lengths of obstacles other than vehicles.
     blocks: Vec<(LaneIdx, f64)>,
 }
 
@@ -132,7 +132,7 @@ impl Occupancy {
         }
     }
 
-    /// What `vehicle` has to follow, or where it has to stop.
+    /// Returns the vehicle that `vehicle` has to follow, or the point where it has to stop.
     pub(crate) fn leader(&self, network: &Network, vehicle: &Vehicle) -> Option<Leader> {
         let sides = {
             let (a, b) = (vehicle.offset(), vehicle.lateral);

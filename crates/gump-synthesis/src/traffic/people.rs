@@ -17,7 +17,7 @@ const TURN_RATE: f64 = 1.6;
 /// Fastest change of walking speed, m/s².
 const CHANGE: f64 = 1.2;
 
-/// What a person at a crosswalk does.
+/// The activity of a person at a crosswalk.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Activity {
     /// Stands at the curb; `may_go` if lights do not forbid it.
@@ -49,7 +49,7 @@ pub(crate) struct Person {
     activity: Option<Activity>,
     gone: bool,
     companions: Vec<Companion>,
-    /// How far they sway to the sides, metres, and where in its period that began.
+    /// Amplitude of swaying to the sides, metres, and its initial phase.
     sway: (f64, f64),
 }
 
@@ -63,7 +63,7 @@ struct Companion {
 }
 
 impl Person {
-    /// Somebody `progress` metres along a walk.
+    /// A person `progress` metres along a walk.
     pub(crate) fn new(
         id: i64,
         network: &Network,
@@ -112,7 +112,7 @@ impl Person {
         self.size = draw_person_size(rng);
         self.sway = (rng.random_range(0.0..0.14), rng.random_range(0.0..TAU));
         if n > 0 {
-            // Leaves room on the right, so that nobody walks off the sidewalk.
+            // Leaves room on the right, so that companions stay on the sidewalk.
             let shift = self.aside - rng.random_range(0.25..0.45);
             self.aside -= shift;
             self.pose.position += self.pose.direction().perp() * shift;
@@ -240,7 +240,8 @@ impl Traffic<'_> {
         self.people.retain(|person| !person.has_left());
     }
 
-    /// How fast the person may walk now; decides about stepping onto a crosswalk.
+    /// Returns the speed limit of the person, metres per second; decides about stepping onto a
+    /// crosswalk.
     fn walking_limit(&self, person: &mut Person, i: usize) -> f64 {
         let walk = &self.network.walks[person.walk];
         if let Some(crosswalk) = walk.crosswalk {
@@ -277,7 +278,7 @@ impl Traffic<'_> {
         self.limit_behind_others(person, i)
     }
 
-    /// Slows down behind a slower pedestrian; of two who meet, the one who came first goes first.
+    /// Slows down behind a slower pedestrian; of two that meet, the first in the list goes first.
     fn limit_behind_others(&self, person: &Person, i: usize) -> f64 {
         let mut limit = f64::INFINITY;
         for (j, other) in self.people.iter().enumerate() {
@@ -294,7 +295,7 @@ impl Traffic<'_> {
         limit.max(0.0)
     }
 
-    /// How far, in metres, people near by move the point that a person steers to.
+    /// Returns the displacement of the point that a person steers to by people near by, metres.
     fn push_from_others(&self, person: &Person, i: usize) -> DVec2 {
         let away = |(j, other): (usize, &Person)| {
             let gap = person.pose.position - other.pose.position;
@@ -331,7 +332,7 @@ impl Traffic<'_> {
             person.gone = true;
             return;
         }
-        // Where there is a crosswalk most people who have come to it cross.
+        // Most people that reach a crosswalk cross there.
         let crossing = choices
             .iter()
             .position(|(walk, _)| self.network.walks[*walk].crosswalk.is_some());

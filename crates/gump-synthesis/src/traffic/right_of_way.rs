@@ -66,7 +66,7 @@ impl Traffic<'_> {
             .expect("only connectors are claimed")
     }
 
-    /// Where a driver starts to react to a line at which to stop, metres.
+    /// Distance from a stop line at which a driver starts to react to it, metres.
     fn decision_distance(&self, vehicle: &Vehicle) -> f64 {
         vehicle.driver.wanted_gap(vehicle.speed, 0.0) + vehicle.driver.line_gap + 6.0
     }
@@ -101,7 +101,7 @@ impl Traffic<'_> {
         vehicle.speed * vehicle.speed < 2.0 * vehicle.driver.yellow_braking * left.max(0.01)
     }
 
-    /// Remembers since when a vehicle stands at its line.
+    /// Records the time since which a vehicle has been stopped at its line.
     fn note_waiting(&mut self, i: usize) {
         let vehicle = &self.vehicles[i];
         let at_line = vehicle
@@ -128,7 +128,7 @@ impl Traffic<'_> {
         let lane = vehicle.path[leg];
         let connector = self.connector(lane);
         let light = self.light(connector, self.time);
-        // Those who are late see yellow for a little longer than it is.
+        // Late drivers react to yellow for a little longer than it lasts.
         let was = self.light(connector, self.time - vehicle.driver.late);
         let light = match (light, was) {
             (LightState::Red, LightState::Yellow) => LightState::Yellow,

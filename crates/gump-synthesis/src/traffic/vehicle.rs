@@ -53,14 +53,14 @@ pub(crate) struct Vehicle {
     slope: f64,
     wander: f64,
     wander_left: f64,
-    /// Where it wants to be in its lane apart from wandering, metres to the left.
+    /// Preferred lateral position in its lane, without wandering, metres to the left.
     pub(crate) keep: f64,
     /// Added to `keep` while passing a bicycle.
     pub(crate) evade: f64,
     noise: f64,
     /// Connectors it may use.
     pub(crate) claims: Vec<LaneIdx>,
-    /// When it came to rest at the line it waits at.
+    /// Time at which it came to rest at the line it waits at, seconds.
     pub(crate) waiting_since: Option<f64>,
     pub(crate) change: Option<LaneChange>,
     /// Seconds until it thinks of changing lanes again.
@@ -241,7 +241,7 @@ impl Vehicle {
         self.lateral + change
     }
 
-    /// Where the box is now.
+    /// The present pose of the box.
     pub(crate) fn pose(&self, network: &Network) -> Pose {
         let on_lane = network.lanes[self.lane()].track.pose_at(self.s);
         let slope = self.slope

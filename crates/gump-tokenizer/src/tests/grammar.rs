@@ -251,7 +251,7 @@ fn check_mask(grammar: &Grammar) {
     let value = Slot::Value(QuantizedState::default());
     assert_eq!(accepts(value), allowed.value());
     assert_eq!(allowed.end(), grammar.finish().is_ok());
-    // The token mask says the same about every slot that is one token.
+    // The token mask agrees for every slot that is one token.
     let marks = [Slot::Begin, Slot::LightsEnd, Slot::Newborn, Slot::Pad];
     let lights = known.into_iter().map(Slot::Light);
     let slots = all_keys().map(Slot::Key).chain(marks).chain(lights);

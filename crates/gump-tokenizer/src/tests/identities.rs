@@ -30,7 +30,7 @@ const SCENE: &str = "
     agent other 40: 2,0
     agent pedestrian 5: 90,0";
 
-/// A crowd of `n` vehicles; number `i` stands `i` metres away.
+/// A crowd of `n` vehicles; number `i` is `i` metres away.
 fn crowd(n: usize) -> (Scenario, Pose) {
     let mut text = String::from("ego vehicle 0: 0,0\n");
     for i in 1..=n {

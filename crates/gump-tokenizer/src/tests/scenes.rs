@@ -1,4 +1,4 @@
-//! Scenes by example: what has tokens, where it stands, what is counted, what comes back.
+//! Scenes by example: agents with tokens, their order, counts, and decoding.
 
 use gump_geometry::dvec2;
 use gump_scene::{Agent, LaneId, Light, LightState};

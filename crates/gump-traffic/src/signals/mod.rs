@@ -13,7 +13,7 @@ pub use plan::SignalPlan;
 use plan::{Begun, Junction, Phase};
 use timing::{CLEARANCE_S, green_s, rest_s};
 
-/// Seconds for which a phase continues if nobody waits for another.
+/// Seconds for which a phase continues if no vehicle waits for another.
 const EXTENSION_S: f64 = 4.0;
 
 /// The lights of one future after the present.
@@ -30,7 +30,7 @@ pub struct Signals {
     shown: Vec<Light>,
 }
 
-/// Where a junction is.
+/// The phase and stage of a junction.
 #[derive(Clone, Debug)]
 struct Turn {
     phase: usize,
@@ -78,7 +78,7 @@ impl Signals {
             fading: vec![0.0; plan.lights.len()],
             shown: plan.lights.clone(),
         };
-        // Whoever is green or yellow against the phase that was found is yellow first.
+        // A light that is green or yellow against the phase found is yellow first.
         let planned = this.colours();
         for (light, state) in planned {
             let was_open = matches!(

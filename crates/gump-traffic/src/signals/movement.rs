@@ -1,5 +1,5 @@
-//! Movements: where a light stops traffic, which path the traffic takes, and which other paths that
-//! crosses.
+//! Movements: the line at which a light stops traffic, the paths of that traffic, and the other
+//! paths that these cross.
 
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
 use gump_scene::{
@@ -21,14 +21,14 @@ const JUNCTION_M: f64 = 70.0;
 const NEAR_M: f64 = 8.0;
 /// Sampling distance when paths are compared, metres.
 const STEP_M: f64 = 4.0;
-/// How far before the line a vehicle counts as waiting or approaching, metres.
+/// Distance before the line within which a vehicle counts as waiting or approaching, metres.
 const WAITING_M: f64 = 45.0;
 /// The maximum number of lanes searched for approaching vehicles.
 const MOST_LANES: usize = 32;
 /// A piece behind a line that is shorter than this, on a lane that leads up to a junction, is not
 /// the path through it, metres.
 const STUB_M: f64 = 15.0;
-/// How far beside the centre of a lane such a vehicle may be, metres.
+/// Maximum distance of such a vehicle from the centre of a lane, metres.
 const BESIDE_M: f64 = 2.5;
 
 /// The relation of two movements.
@@ -70,7 +70,7 @@ impl Movement {
             let mut beside = before.flat_map(|lane| map.successors(lane.id));
             beside.any(|lane| !turns_left(&lane.centerline))
         };
-        // A light of a lane that leads up to the junction rules all of its ways.
+        // A light of a lane that leads up to the junction controls all of its paths.
         let starts_there = lane.centerline.project(line.position).arc_length < 2.0;
         let is_left = !ways.is_empty() && ways.iter().all(turns_left);
         Self {
@@ -143,7 +143,7 @@ impl Movement {
             let along = way.pose_at(foot.arc_length).heading;
             foot.distance < BESIDE_M && angle_difference(at.heading, along).abs() < 1.0
         };
-        // Where nothing leads to it, who waits is not on the map.
+        // Without approaches, waiting vehicles are off the map.
         self.approaches.is_empty() || self.approaches.iter().any(comes)
     }
 }

@@ -155,7 +155,7 @@ impl Seen {
         pairs.any(|pair| pair == (&LightState::Green, &LightState::Green))
     }
 
-    /// How long a light has been in its present state.
+    /// Returns the time that a light has been in its present state.
     fn age(&self, light: usize) -> Age {
         let states = &self.states[light];
         let now = self.now(light);
@@ -366,7 +366,7 @@ impl<'a> Draft<'a> {
             phases.push(self.phase(&set));
         }
         let is_shut = phases[0].green.iter().all(|green| !green);
-        // Red for a moment only is between two phases; for longer, somebody else is served, unless
+        // Red for a moment only is between two phases; for longer, another road has green, unless
         // the lights of all roads are seen.
         let just_now = self.lights.iter().any(|&light| {
             let age = self.seen.age(light);
@@ -397,7 +397,7 @@ impl<'a> Draft<'a> {
             Begun::Green(age.unwrap_or(Age::AtLeast(0.0)))
         };
         if phases.len() == 1 {
-            // Nobody else has a light that is known: those of the cross street, or on foot.
+            // Others, on the cross street or on foot, have no known light.
             phases.push(self.phase(&[]));
         }
         let limits = self.movements.iter().map(|movement| movement.limit);

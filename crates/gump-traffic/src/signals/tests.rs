@@ -7,7 +7,7 @@ use super::*;
 use LightState::{Green, Red, Unknown, Yellow};
 
 /// A junction of two roads: through lanes 1 to 4 from west, east, south and north, and 5, a left turn
-/// from the west with a lane of its own.
+/// from the west with a separate lane.
 fn crossing(states: [&str; 5]) -> Scenario {
     let light = |(i, state): (usize, &&str)| format!("light {} {state}:", i + 1);
     let lights: Vec<String> = states.iter().enumerate().map(light).collect();
@@ -30,7 +30,7 @@ fn crossing(states: [&str; 5]) -> Scenario {
          ego vehicle 0: -20,-2",
         lights.join("\n")
     );
-    // Lanes of the fixture are not told to be in an intersection: lines are where lanes end.
+    // Lanes of the fixture are not marked as inside an intersection: lines are where lanes end.
     let mut scenario = fixture::scenario(&text).unwrap();
     let stop = [
         (-10.0, -2.0),
@@ -58,7 +58,7 @@ fn states(signals: &Signals) -> Vec<LightState> {
     signals.lights().iter().map(|light| light.state).collect()
 }
 
-/// Somebody waits everywhere.
+/// Positions of vehicles that wait on every approach.
 fn everywhere() -> Vec<Pose> {
     let at = |x: f64, y: f64, heading: f64| Pose {
         position: dvec2(x, y),
@@ -79,7 +79,7 @@ fn lights_of_one_junction_are_found_and_grouped() {
     let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
     let groups = plan.groups();
     assert_eq!(groups.len(), 1);
-    // Every approach is a group, and the left turn is one of its own.
+    // Every approach is a group, and the left turn is a separate one.
     let lanes: Vec<Vec<i64>> = groups[0]
         .iter()
         .map(|group| group.iter().map(|lane: &LaneId| lane.0).collect())
@@ -124,7 +124,7 @@ fn movements_that_cross_are_never_green_together() {
                 }
                 before = shown;
             }
-            // Five minutes: everybody has had a turn.
+            // Within five minutes every light has had its turns.
             assert!(greens.iter().all(|green| *green > 10), "{now:?} {greens:?}");
         }
     }

@@ -18,7 +18,7 @@ const LEFT_S: (f64, f64) = (5.0, 14.0);
 /// Number of draws of a duration consistent with the observations before the maximum is used.
 const TRIES: usize = 64;
 
-/// How long a phase has been green already, seconds.
+/// The time that a phase has been green already, seconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Age {
     Exactly(f64),

@@ -3,7 +3,7 @@
 use gump_model::decoder::STEPS;
 
 use super::LossConfig;
-use super::trajectory::asked;
+use super::trajectory::limited_targets;
 use crate::sample::{Sample, StateTarget};
 
 /// Targets of each kind.
@@ -30,7 +30,7 @@ impl Counts {
             control: sum(&|sample| sample.control.len()),
             lights: sum(&|sample| sample.lights.len()),
             classes: sum(&|sample| sample.classes.len()),
-            trajectories: sum(&|sample| asked(sample, config.max_trajectories).count()),
+            trajectories: sum(&|sample| limited_targets(sample, config.max_trajectories).count()),
             scenes: samples.len() as f64,
         }
     }

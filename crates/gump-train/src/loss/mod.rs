@@ -251,10 +251,11 @@ pub(crate) fn loss(
         own.lights / whole.lights,
         own.classes / whole.classes,
     ];
-    let said = [&mut parts.control, &mut parts.lights, &mut parts.classes];
-    for (((loss, weight), share), said) in spoken.into_iter().zip(weights).zip(shares).zip(said) {
+    let fields = [&mut parts.control, &mut parts.lights, &mut parts.classes];
+    for (((loss, weight), share), field) in spoken.into_iter().zip(weights).zip(shares).zip(fields)
+    {
         if let Some(loss) = loss {
-            *said = share * scalar(&loss)?;
+            *field = share * scalar(&loss)?;
             total = (total + (loss * (share * weight))?)?;
         }
     }
@@ -319,10 +320,10 @@ fn state_loss(
         &tokens,
     )?;
 
-    let asked = STEPS.into_iter().enumerate().map(|(step, field)| {
+    let by_field = STEPS.into_iter().enumerate().map(|(step, field)| {
         let bins = targets.iter().map(|t| t.bins[step].map_or(0, u32::from));
         let weights = targets.iter().map(|t| weight(t, step, config) as f32);
-        let asked = Targets {
+        let field_targets = Targets {
             bins: bins.collect(),
             weights: weights.collect(),
             smoothing: (config.smoothing_bins > 0.0).then(|| OrdinalSmoothing {
@@ -334,10 +335,10 @@ fn state_loss(
                 false => Vec::new(),
             },
         };
-        (StateDecoder::rows_of(field), asked)
+        (StateDecoder::rows_of(field), field_targets)
     });
     let matrix = network.decoder.all_output_rows()?;
-    let means = ops::linear_cross_entropy(&outputs, &matrix, asked.collect())?; // [STEPS]
+    let means = ops::linear_cross_entropy(&outputs, &matrix, by_field.collect())?; // [STEPS]
     let all = whole.states();
     let mut shares = Vec::with_capacity(STEPS.len());
     for (step, mean) in means.to_vec1::<f32>()?.into_iter().enumerate() {

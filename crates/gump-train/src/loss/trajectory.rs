@@ -14,13 +14,16 @@ pub(super) fn trajectory_targets(
 ) -> Vec<(u32, &TrajectoryTarget)> {
     let rows = samples.iter().enumerate();
     rows.flat_map(|(row, sample)| {
-        asked(sample, limit).map(move |target| ((row * t + target.key) as u32, target))
+        limited_targets(sample, limit).map(move |target| ((row * t + target.key) as u32, target))
     })
     .collect()
 }
 
-/// The targets of the heads in a sample.
-pub(super) fn asked(sample: &Sample, limit: usize) -> impl Iterator<Item = &TrajectoryTarget> {
+/// At most `limit` targets of the heads in a sample, spread evenly over it.
+pub(super) fn limited_targets(
+    sample: &Sample,
+    limit: usize,
+) -> impl Iterator<Item = &TrajectoryTarget> {
     let stride = sample.trajectories.len().div_ceil(limit.max(1)).max(1);
     sample.trajectories.iter().step_by(stride)
 }

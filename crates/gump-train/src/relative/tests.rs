@@ -60,7 +60,7 @@ fn rolled_out_it_computes_what_it_computes_in_training() {
     }
 }
 
-/// Layers that are added say nothing at first, and learn.
+/// Added layers change nothing at first, and learn.
 #[test]
 fn a_deeper_network_goes_on_from_what_it_said() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
@@ -201,7 +201,7 @@ fn driven_agents_leave_the_log_and_learn_the_way_back() {
     assert!(many.0 > 0, "{many:?}");
 }
 
-/// Under the rules agents go their own ways, and what they then did is what they learn.
+/// Under the rules agents deviate from the log, and their own moves are the targets.
 #[test]
 fn agents_that_go_their_own_ways_learn_what_they_did() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
@@ -216,8 +216,8 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
         let driver = drives::Driver::new(&network, &config).unwrap();
         draw(&alone, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap()
     };
-    // Metres ahead in the step that led to a node, and those that the node before should say; the
-    // first target is of the warm-up.
+    // Metres ahead in the step that led to a node, and in the target of the node before; the first
+    // target is of the warm-up.
     let differences = |sample: &sample::Sample| -> Vec<f64> {
         let targets = sample.targets.iter().skip(1);
         let difference = |target: &sample::Target| {
@@ -260,7 +260,7 @@ fn a_resumed_run_ends_in_the_same_weights() {
     }
 }
 
-/// What futures did is what is judged: every move of theirs, and no other.
+/// The rewards are for every move that the futures made, and for no other.
 #[test]
 fn rollouts_are_judged_by_the_moves_they_made() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
@@ -280,8 +280,8 @@ fn rollouts_are_judged_by_the_moves_they_made() {
             assert!((2..18).contains(&target.frame));
             let next = target.node as usize + 5;
             let done = 5.0 * f64::from(sample.nodes[next * NODE_NUMBERS + 8]);
-            let said = grid::dequantize(target.bins).position.x;
-            assert!((done - said).abs() < 1e-4, "{done} {said}");
+            let expected = grid::dequantize(target.bins).position.x;
+            assert!((done - expected).abs() < 1e-4, "{done} {expected}");
             sum += f64::from(target.weight);
             n += 1;
         }
@@ -301,8 +301,8 @@ fn rollouts_are_judged_by_the_moves_they_made() {
         rollouts: 1,
         ..RelativeRewards::default()
     };
-    let told = alone.validate().unwrap_err().to_string();
-    assert!(told.contains("rollouts must be at least 2"), "{told}");
+    let message = alone.validate().unwrap_err().to_string();
+    assert!(message.contains("rollouts must be at least 2"), "{message}");
 }
 
 fn resumes(config: &RelativeTrainConfig) {

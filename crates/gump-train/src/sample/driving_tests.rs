@@ -1,4 +1,4 @@
-//! One state of an object, wherever it is looked at: in training and driving.
+//! Tests that training and driving encode the same state of an object.
 
 use gump_engine::scene::Scene;
 use gump_engine::{SamplingConfig, TransformerWorld};
@@ -10,7 +10,7 @@ use gump_scene::{Seed, fixture};
 
 use super::{Reader, SampleConfig, draw};
 
-/// What the log says and what a network says of one and the same frames is told in the same numbers.
+/// Training on a log and driving with a network encode the same frames in the same numbers.
 #[test]
 fn training_and_driving_see_the_same() {
     // Poses between the bins; the log ends with the present, so that there is one window of it.
@@ -33,7 +33,7 @@ fn training_and_driving_see_the_same() {
     assert_eq!(shown.slots, slots);
     let seen = encode_local_context(&driven.survey, &slots, 0);
     assert_eq!(encode_local_context(&shown.survey, &shown.slots, 0), seen);
-    // Each looks from where its chunk is said, which is between the bins.
+    // Each has its context in the frame of its chunk, whose pose is between the bins.
     for (i, _) in seen {
         let key = &slots[i];
         let (exact, rounded) = (key.last_pose().unwrap(), key.last.unwrap().pose());

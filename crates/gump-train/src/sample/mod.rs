@@ -215,7 +215,7 @@ pub(crate) fn draw(
             Some(thin(frame, &window, most))
         })
         .collect();
-    // A stream of its own, so that what is hidden changes nothing else of the sample.
+    // A separate stream, so that hiding inputs changes nothing else of the sample.
     let hidden = Hidden::draw(config, &mut seed.fork(HIDDEN).rng());
     let frames: Vec<Frame> = frames.iter().map(|frame| hidden.frame(frame)).collect();
     let map = hidden.map(&scenario.map);
@@ -241,7 +241,7 @@ pub(crate) fn draw(
     let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
     let (mut states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
     if hidden.sizes {
-        // Nobody should learn that objects have these sizes.
+        // The network must not learn these sizes.
         states.iter_mut().for_each(StateTarget::forget_size);
     }
     let mut sample = Sample {

@@ -150,14 +150,14 @@ pub(super) fn class_targets(slots: &[PlacedSlot]) -> Vec<ControlTarget> {
     successors(slots, successor)
 }
 
-/// A target at every slot for whose successor `say` returns one.
+/// A target at every slot for whose successor `successor_of` returns one.
 fn successors(
     slots: &[PlacedSlot],
-    say: impl Fn(&PlacedSlot) -> Option<u32>,
+    successor_of: impl Fn(&PlacedSlot) -> Option<u32>,
 ) -> Vec<ControlTarget> {
     let pairs = slots.windows(2).enumerate();
     let target = |(slot, pair): (usize, &[PlacedSlot])| {
-        let successor = say(&pair[1])?;
+        let successor = successor_of(&pair[1])?;
         Some(ControlTarget { slot, successor })
     };
     pairs.filter_map(target).collect()

@@ -73,7 +73,7 @@ fn lights_and_classes_are_told_before_they_come() {
         assert_eq!(target.successor, 2, "the light is red");
     }
     let classes: Vec<u32> = sample.classes.iter().map(|t| t.successor).collect();
-    // The vehicle and the pedestrian of the first frame; nobody is new after it.
+    // The vehicle and the pedestrian of the first frame; no agent enters after it.
     assert_eq!(classes, [0, 1]);
 }
 
@@ -91,7 +91,7 @@ fn a_window_may_begin_with_its_reference() {
     });
     let ego = value.expect("the ego has a value");
     assert!(ego.position.length() < 0.2 && ego.heading.abs() < 0.02);
-    // 8 m/s behind a vehicle: what the tags say of it is the prompt.
+    // 8 m/s behind a vehicle: the matching tag is the prompt.
     assert!(matches!(sample.slots[0].slot, Slot::Prompt(Some(_))));
 }
 
@@ -190,11 +190,11 @@ fn a_drive_is_shown_and_the_way_back_is_asked_for() {
         panic!("a target stands at a key");
     };
     // Half of the two metres are left after one frame, a quarter after two.
-    let asked = [target.bins[5], target.bins[8]].map(lateral);
-    let back = seen.pose().position.y - asked[0];
+    let ys = [target.bins[5], target.bins[8]].map(lateral);
+    let back = seen.pose().position.y - ys[0];
     assert!((back - 1.0).abs() < 0.25, "{back}");
     // The pedestrian itself walks half a metre to the right in a frame.
-    let then = asked[0] - asked[1];
+    let then = ys[0] - ys[1];
     assert!((then - 1.0).abs() < 0.25, "{then}");
 }
 
@@ -240,12 +240,12 @@ fn what_is_hidden_is_unknown_and_what_is_asked_stays() {
         };
         draw(&scenario, None, &reader(), &config, Seed(1)).expect("a sample can be drawn")
     };
-    let (told, hidden) = (drawn(0.0), drawn(1.0));
+    let (visible, hidden) = (drawn(0.0), drawn(1.0));
     let lights = |sample: &Sample| {
         let is_light = |placed: &&PlacedSlot| matches!(placed.slot, Slot::Light(_));
         sample.slots.iter().filter(is_light).count()
     };
-    assert_eq!((lights(&told), lights(&hidden)), (4, 0));
+    assert_eq!((lights(&visible), lights(&hidden)), (4, 0));
     assert!(hidden.lights.is_empty());
     let layers = reader().spec.layers;
     let most = |sample: &Sample, layer: Layer| {
@@ -255,7 +255,7 @@ fn what_is_hidden_is_unknown_and_what_is_asked_stays() {
     };
     for layer in [Layer::StopLine, Layer::TrafficLightOccupancy] {
         assert_eq!(
-            (most(&told, layer), most(&hidden, layer)),
+            (most(&visible, layer), most(&hidden, layer)),
             (1.0, 0.0),
             "{layer}"
         );
@@ -272,13 +272,13 @@ fn what_is_hidden_is_unknown_and_what_is_asked_stays() {
         let exact = sample.slots.iter().filter_map(|placed| placed.exact);
         exact.filter(|exact| exact.has_size).count()
     };
-    assert!(sizes(&told) > 0);
+    assert!(sizes(&visible) > 0);
     assert_eq!(sizes(&hidden), 0);
-    // Without the lights, every target stands so much earlier; its words are the same, but sizes,
-    // which nobody is to learn.
-    assert_eq!(told.states.len(), hidden.states.len());
-    for (told, hidden) in told.states.iter().zip(&hidden.states) {
-        assert_eq!(told.bins[2..], hidden.bins[2..]);
+    // Without the lights, every target comes earlier; its bins are the same except sizes, which
+    // must not be learned.
+    assert_eq!(visible.states.len(), hidden.states.len());
+    for (visible, hidden) in visible.states.iter().zip(&hidden.states) {
+        assert_eq!(visible.bins[2..], hidden.bins[2..]);
         assert_eq!(hidden.bins[..2], [None, None]);
     }
 }

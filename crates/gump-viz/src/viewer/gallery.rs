@@ -38,7 +38,7 @@ pub struct Gallery {
 #[derive(Clone, Debug)]
 struct Packed {
     id: String,
-    /// What the scene says of itself, as JSON without "<".
+    /// Description of the scene, as JSON without "<".
     facts: String,
     /// Road and traffic, deflated, as base64.
     data: String,
@@ -57,7 +57,7 @@ impl Gallery {
         self
     }
 
-    /// How many scenes there are.
+    /// Number of scenes.
     pub fn len(&self) -> usize {
         self.scenes.len()
     }
@@ -101,7 +101,7 @@ impl Gallery {
         }
     }
 
-    /// Two elements for each scene: what it says of itself, then its bytes.
+    /// Two elements for each scene: its description, then its bytes.
     fn blocks(&self) -> String {
         let mut blocks = String::new();
         for (i, scene) in self.scenes.iter().enumerate() {
@@ -132,7 +132,7 @@ fn deflate(bytes: &[u8]) -> Vec<u8> {
     written.expect("writing to memory cannot fail")
 }
 
-/// Puts the parts where the template names them, as `@@name@@`; what the parts say is not read.
+/// Replaces each `@@name@@` of the template with the part of that name; parts are not expanded.
 fn fill(template: &str, parts: &[(&str, String)]) -> String {
     let pieces = template.split("@@").enumerate().map(|(i, piece)| {
         if i % 2 == 0 {

@@ -1,4 +1,4 @@
-//! Traffic and road as few bytes: quantised, differenced twice, written as variable-length
+//! Traffic and road in few bytes: quantised, differenced twice, written as variable-length
 //! integers. The page unpacks them (`unpack.js`, which must change with this file).
 //!
 //! An unsigned integer is written in groups of seven bits, the lowest first, the top bit set on
@@ -16,7 +16,7 @@ pub(super) const CENTI: f64 = 0.01;
 /// Headings per turn; a power of two, so that a full turn is a whole number of them.
 pub(super) const HEADINGS: i64 = 8192;
 
-/// What a map feature is, and so how it is drawn. The page knows them by number.
+/// The class of a map feature, which determines how it is drawn. The page knows classes by number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Class {
     Surface = 0,

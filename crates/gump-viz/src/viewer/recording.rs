@@ -43,13 +43,13 @@ const LIGHTS: [(LightState, &str); 4] = [
     (LightState::Unknown, "unknown light"),
 ];
 
-/// How high lines and lights are above the ground, metres.
+/// Heights of lines and lights above the ground, metres.
 const LINE_Z: f32 = 0.02;
 const LIGHT_Z: f32 = 0.5;
 
 impl Viewer<'_> {
     /// Writes map, log, futures and lights as a recording that the Rerun viewer opens; the
-    /// recording holds times of its making, so two of one scene differ in bytes.
+    /// recording contains the time of writing, so two recordings of one scene differ in bytes.
     ///
     /// Available with the feature `rerun`.
     ///
@@ -185,7 +185,7 @@ impl Viewer<'_> {
     }
 }
 
-/// What numbers of classes are called and how they look.
+/// Returns the names and colours of the class ids.
 fn classes() -> AnnotationContext {
     let colours = Theme::Dark.colours();
     let kinds = KINDS.map(|kind| (class(kind), kind.name(), colours.kind(kind)));

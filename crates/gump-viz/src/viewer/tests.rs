@@ -1,4 +1,4 @@
-//! What the page holds: traffic to within a unit, any number of futures, any text.
+//! Content of the page: traffic to within a unit, any number of futures, any text.
 
 use std::io::Read as _;
 

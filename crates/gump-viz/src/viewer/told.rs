@@ -1,5 +1,5 @@
-//! What a page tells of agents beside where they are: metrics over time, what they might do next,
-//! what a planner considered.
+//! Data of a page beside the positions of agents: metrics over time, predicted next states, and
+//! the candidate paths of a planner.
 
 use std::collections::BTreeMap;
 
@@ -11,11 +11,11 @@ use super::pack::{CENTI, Packer, heading_units, units};
 /// A metric of one agent over time; values are kept to two decimals.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MetricTrack {
-    /// What it is, with its unit: "time to collision, s".
+    /// Name and unit, such as "time to collision, s".
     pub name: String,
-    /// Whose it is.
+    /// The agent.
     pub agent: AgentId,
-    /// The future it is of, in the order added; `None` for the log.
+    /// Index of the future, in the order added; `None` for the log.
     pub future: Option<usize>,
     /// The frame of the first value: of the log, or of the future, whose frame 0 is the present.
     pub first: usize,
@@ -23,34 +23,34 @@ pub struct MetricTrack {
     pub values: Vec<Option<f64>>,
 }
 
-/// What a planner considered.
+/// A path that a planner considered.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CandidatePath {
-    /// What it is, in words.
+    /// Name, as shown on the page.
     pub name: String,
-    /// How it was judged, higher is better; `None` if it was not.
+    /// Score, higher is better; `None` if the path was not scored.
     pub score: Option<f64>,
-    /// What the score is made of: names and numbers, which the page shows of the candidate chosen.
+    /// Terms of the score by name, which the page shows for the chosen candidate.
     pub parts: Vec<(String, f64)>,
-    /// Whether it was the choice.
+    /// Whether the planner chose it.
     pub is_chosen: bool,
     /// Box centres of the ego, world frame, metres.
     pub path: Vec<DVec2>,
 }
 
-/// What an agent might be doing a moment later: a distribution, as draws from it.
+/// Distribution of the state of an agent a moment later, as draws from it.
 ///
-/// The page keeps how many of them lie in each cell of 10 cm along and across the mean heading, in
-/// steps of 0.5 m/s of speed, and in steps of 2° of heading.
+/// The page keeps the number of draws in each cell of 10 cm along and across the mean heading, in
+/// each step of 0.5 m/s of speed, and in each step of 2° of heading.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatMap {
-    /// Whose it is.
+    /// The agent.
     pub agent: AgentId,
-    /// The future it is of, in the order added.
+    /// Index of the future, in the order added.
     pub future: usize,
-    /// When it holds, seconds from the present.
+    /// Time from which it is predicted, seconds from the present.
     pub from_s: f64,
-    /// How much later the draws are, seconds.
+    /// Time from then to the draws, seconds.
     pub ahead_s: f64,
     /// States, world frame.
     pub draws: Vec<AgentState>,
@@ -149,7 +149,7 @@ impl HeatMap {
     }
 }
 
-/// How often each occurs, sorted.
+/// Counts how often each value occurs, sorted.
 fn counted<T: Ord>(values: impl Iterator<Item = T>) -> BTreeMap<T, u64> {
     let mut counts = BTreeMap::new();
     for value in values {
@@ -158,7 +158,7 @@ fn counted<T: Ord>(values: impl Iterator<Item = T>) -> BTreeMap<T, u64> {
     counts
 }
 
-/// The first bar, how many there are up to the last, and the height of each.
+/// Writes the first bar, the number of bars up to the last, and the height of each.
 fn bars(packer: &mut Packer, numbers: impl Iterator<Item = i64>) {
     let counts = counted(numbers);
     let first = counts.keys().next().copied().unwrap_or(0);

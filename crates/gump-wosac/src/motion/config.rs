@@ -12,9 +12,9 @@ pub struct MotionConfig {
     pub max_modes: usize,
     /// The horizons of measurement, in ascending order.
     pub horizons: Vec<Horizon>,
-    /// How the miss thresholds shrink for slow agents.
+    /// Scale of the miss thresholds for slow agents.
     pub speed_scale: SpeedScale,
-    /// How recorded paths are classified by shape.
+    /// Rules that classify recorded paths by shape.
     pub shapes: ShapeRules,
 }
 

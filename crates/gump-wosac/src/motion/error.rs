@@ -8,7 +8,7 @@ use gump_scene::AgentId;
 pub struct MotionError {
     /// The scenario's id.
     pub scenario: String,
-    /// What does not fit.
+    /// The mismatch.
     pub problem: MotionProblem,
 }
 

@@ -57,7 +57,7 @@ fn forecast_agent(
     })
 }
 
-/// Where an agent is at the times of a prediction.
+/// Positions of an agent at the times of a prediction.
 fn path(
     rollout: &Rollout,
     agent: AgentId,

@@ -32,7 +32,7 @@ impl Mean {
         (self.n > 0).then(|| self.sum as f64 / QUANTA / self.n as f64)
     }
 
-    /// How many measurements.
+    /// Number of measurements.
     pub fn count(&self) -> u64 {
         self.n
     }

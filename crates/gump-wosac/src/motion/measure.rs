@@ -130,7 +130,7 @@ impl<'a> Measured<'a> {
     fn is_match(&self, agent: AgentId, path: &[DVec2], horizon: &Horizon) -> Option<bool> {
         let logged = self.recorded(agent, horizon.step)?.state.pose;
         let error = DVec2::from_angle(-logged.heading).rotate(path[horizon.step] - logged.position);
-        // Who is absent now counts as standing.
+        // An agent that is absent now counts as standing.
         let now = self.scenario.present().now().agent(agent);
         let speed = now.map_or(0.0, |agent| agent.state.speed());
         let error = error / self.config.speed_scale.at(speed);

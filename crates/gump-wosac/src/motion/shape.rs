@@ -82,7 +82,7 @@ pub fn shape(scenario: &Scenario, agent: AgentId, rules: ShapeRules) -> Option<S
     Some(limits.shape(start, end))
 }
 
-/// Where one shape ends and the next begins.
+/// Thresholds between the shapes.
 struct Limits {
     rules: ShapeRules,
     /// Farther than this is not standing, metres.

@@ -124,7 +124,7 @@ pub(crate) fn nearest_object(
     let own = traffic.states(agent);
     let others = (0..traffic.n_agents()).filter(|&other| other != agent);
     let others: Vec<_> = others.map(|other| traffic.states(other)).collect();
-    // Who was nearest is likely near again; asking it first lets the others be skipped unasked.
+    // The last nearest is likely near again; testing it first lets the others be skipped.
     let mut hint = 0;
     let mut reaches = vec![0.0; others.len()];
     (first..own.len())

@@ -167,7 +167,7 @@ impl Component {
     }
 }
 
-/// How a distribution is estimated from samples.
+/// Estimator of a distribution from samples.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Estimator {
@@ -198,7 +198,7 @@ pub enum Estimator {
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FeatureConfig {
-    /// How its distribution is estimated.
+    /// Estimator of its distribution.
     pub estimator: Estimator,
     /// True: one distribution for all steps; false: one for each.
     #[serde(default)]

@@ -80,7 +80,7 @@ pub struct Signal {
     pub lane: i64,
     /// True if it shows red, as a disc or as an arrow, and does not flash.
     pub stop: bool,
-    /// Where vehicles stop for it, metres.
+    /// Point at which vehicles stop for it, metres.
     pub stop_point: [f32; 2],
 }
 
@@ -189,7 +189,7 @@ impl Log {
 /// One agent in one rollout.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {
-    /// Which agent.
+    /// Id of the agent.
     pub id: AgentId,
     /// Box centre per step, metres; [`N_FUTURE`] steps, [`N_STEPS`] for scenario generation.
     pub x: Vec<f32>,

@@ -29,8 +29,8 @@ pub struct LeaveOneOut {
     /// With components `c` of weight `w` and likelihood `L` over `n` values that count, the part of
     /// a value is `w L / n` times the difference of its log-likelihood with and without the
     /// rollout; to first order the parts of a rollout sum to its leave-one-out value. The part of
-    /// an indicator (a collision, say) counts at the step where it first holds in the rollout, and
-    /// at the last one if it never does.
+    /// an indicator (such as a collision) counts at the step where it first holds in the rollout,
+    /// and at the last one if it never does.
     pub credit: Vec<Vec<f64>>,
 }
 

@@ -140,7 +140,7 @@ impl<'a> Reference<'a> {
         self.scored.iter().map(of).collect()
     }
 
-    /// Which logged values of a component count, `[agent, step]`.
+    /// Mask of the logged values of a component that count, `[agent, step]`.
     pub(crate) fn mask(&self, component: Component) -> Vec<bool> {
         let n_steps = self.features.n_steps;
         let kinds = &self.features.kinds;

@@ -1,8 +1,8 @@
 //! Whole scenarios against the official evaluator: features, log-likelihoods and scores.
 //!
 //! Values are of wheels 1.6.0 (2023 V0), 1.6.1 (2023 V1), 1.6.4 (2024) and 1.6.7 (2025) of the
-//! Waymo Open Dataset. What is made up lies in `tests/golden/realism`; a recorded scenario is read
-//! from beside the checkout, where it is. Tolerances are those of the issue that asked for this;
+//! Waymo Open Dataset. Synthetic data lies in `tests/golden/realism`; a recorded scenario is read
+//! from beside the checkout, if it is there. Tolerances are those of the issue that asked for this;
 //! `cargo test -p gump-wosac --test realism_golden -- --nocapture` prints what is reached.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -42,7 +42,7 @@ impl Case {
         )
     }
 
-    /// `None`, said aloud, where recorded data is not at hand.
+    /// The recorded scenario; `None`, with a message, if recorded data is not available.
     fn recorded() -> Option<Self> {
         let path = shared_data::shared("data/waymo/scenario_a.tfrecord")?;
         Some(Self::read("637f20cafde22ff8", &path))
@@ -108,7 +108,7 @@ impl Case {
     }
 }
 
-/// A message as what is scored: sets of the scenario generation challenge say sizes, too.
+/// Converts a message to rollouts; sets of the scenario generation challenge state sizes, too.
 fn rollouts(message: &ScenarioRollouts, set: &str) -> Rollouts {
     let mode = match set.starts_with("scenariogen") {
         true => Mode::Generation,
@@ -117,7 +117,7 @@ fn rollouts(message: &ScenarioRollouts, set: &str) -> Rollouts {
     Rollouts::of_message(message, mode)
 }
 
-/// What lies beside a recorded scenario that is there.
+/// Path of a file beside a recorded scenario, which must exist.
 fn beside(name: &str) -> PathBuf {
     shared_data::shared(name).expect("golden values lie beside the recorded scenario")
 }

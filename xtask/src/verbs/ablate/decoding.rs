@@ -65,7 +65,7 @@ const FRAMES: f64 = 16.0;
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Cost {
     wall: f64,
-    /// Of processor time.
+    /// Seconds of processor time.
     cpu: f64,
 }
 
@@ -73,7 +73,7 @@ pub(super) struct Cost {
 type Setting = (String, f64, Decoding);
 
 impl Sweep {
-    /// What the horizontal axis says.
+    /// Label of the horizontal axis.
     fn label(self) -> &'static str {
         match self {
             Self::Temperature => "temperature",
@@ -84,7 +84,7 @@ impl Sweep {
         }
     }
 
-    /// Whether its settings are numbers, and not ways.
+    /// Whether its settings are numbers rather than names.
     fn is_numeric(self) -> bool {
         !matches!(self, Self::Chunking | Self::Quantization)
     }
@@ -190,7 +190,7 @@ impl Args {
     }
 }
 
-/// What rollouts of every scenario got, and what they cost.
+/// Scores and cost of the rollouts of every scenario.
 pub(super) struct Judged {
     pub(super) scores: Vec<Scores>,
     cost: Cost,

@@ -25,12 +25,12 @@ use crate::run::{Run, stop_if_interrupted};
 use crate::sampling::Draw;
 use crate::shipped;
 
-/// How the laptop model is trained.
+/// Training configuration of the laptop model.
 pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
 /// Width of an attention head.
 const HEAD: usize = 32;
 
-/// What is learned, and who judges it.
+/// Arguments shared by ablations that train networks: data, steps and evaluation.
 #[derive(Debug, Serialize, clap::Args)]
 pub(super) struct Lesson {
     /// A folder with a manifest.toml, or any file or folder of scenarios, to train on
@@ -51,7 +51,7 @@ pub(super) struct Lesson {
     draw: Draw,
 }
 
-/// What a network learned.
+/// Result of training one network.
 pub(super) struct Learned {
     pub(super) parameters: f64,
     /// The held-out loss after so many tokens.
@@ -171,7 +171,7 @@ impl Class<'_> {
 }
 
 impl Learned {
-    /// What a network of one loss law would be: for tests of laws.
+    /// A network with given losses, for tests of loss laws.
     #[cfg(test)]
     pub(super) fn of_losses(parameters: f64, losses: Vec<(f64, f64)>) -> Self {
         Self {

@@ -60,11 +60,11 @@ fn known() -> clap::builder::PossibleValuesParser {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let class = self.lesson.begin(run)?;
-        let is_asked = |name: &str| {
+        let is_requested = |name: &str| {
             name == SWITCHES[0].0 || self.only.is_empty() || self.only.iter().any(|o| o == name)
         };
         let mut rows = Vec::new();
-        for (name, turn) in SWITCHES.into_iter().filter(|(name, _)| is_asked(name)) {
+        for (name, turn) in SWITCHES.into_iter().filter(|(name, _)| is_requested(name)) {
             let (mut model, mut train) = of_width(self.width)?;
             turn(&mut model, &mut train);
             let learned = class.teach(run, name, (model, train), &[self.lesson.steps()])?;

@@ -1,4 +1,4 @@
-//! What a decision among learned drivers costs, phase by phase.
+//! Cost of a decision among learned drivers, by phase.
 
 use std::time::{Duration, Instant};
 
@@ -43,9 +43,9 @@ impl Driver for Watched<'_> {
     }
 }
 
-/// The median milliseconds of every phase over `n` decisions with the shipped weights in the shipped
-/// scenario: 20 candidates (more beside other lanes), 4 futures of 4 s for the finalists, the 12 nearest agents. One decision before them warms
-/// up.
+/// Median milliseconds of every phase over `n` decisions with the shipped weights in the shipped
+/// scenario: 20 candidates (more beside other lanes), 4 futures of 4 s for the finalists, the 12
+/// nearest agents. One decision before them is a warm-up.
 ///
 /// Error: no shipped weights, or a drive that fails.
 pub(crate) fn rows(run: &Run, n: usize, precision: Precision) -> anyhow::Result<Vec<Value>> {

@@ -1,5 +1,6 @@
-//! `bench device`: a self-test of a device. The same network over the same scene on the CPU and on
-//! the device of `--device`: how far what they say differs, and how fast each imagines.
+//! `bench device`: a self-test of a device. Runs the same network over the same scene on the CPU
+//! and on the device of `--device`, and measures how far their outputs differ and how fast each
+//! simulates.
 //!
 //! On a CPU, the engine is compared with the tensor library's operations, which are what other
 //! devices run.
@@ -72,11 +73,11 @@ impl Args {
         let sampling = SamplingConfig::default();
         let cpu = TransformerWorld::new(network(&Device::Cpu)?, sampling.clone());
         let other = TransformerWorld::plain(network(run.device())?, sampling);
-        let said = [
+        let outputs = [
             cpu.probe(scenario.present())?,
             other.probe(scenario.present())?,
         ];
-        let difference = relative_difference(&said[0], &said[1]);
+        let difference = relative_difference(&outputs[0], &outputs[1]);
         *worst = worst.max(difference);
         let rate = |world: &TransformerWorld| -> anyhow::Result<f64> {
             let start = Start {

@@ -1,5 +1,5 @@
-//! `bench engine`: what imagining costs, against full autoregression without a cache (the paper's
-//! baseline) and against what the machine's matrix products reach.
+//! `bench engine`: cost of simulation, against full autoregression without a cache (the paper's
+//! baseline) and against the rate of the machine's matrix products.
 //!
 //! Weights are random: speed does not depend on them. Processor time is measured beside wall time,
 //! and rates are per second of processor time, so that a busy machine blurs them less.
@@ -123,7 +123,7 @@ const WAYS: [Way; 6] = [
     },
 ];
 
-/// What some frames of some futures cost.
+/// Cost of some frames of some futures.
 struct Cost {
     frames: usize,
     steps: usize,
@@ -206,7 +206,7 @@ impl Args {
                     "weights_mb": world.weight_bytes() as f64 / 1e6,
                     "kept_mb": world.context_bytes() as f64 / 1e6,
                 });
-                run.say(&format!(
+                run.print(&format!(
                     "{size} x {n_futures}, {} {}: {:.1} ms of processor time a frame",
                     way.name,
                     way.cache,
@@ -371,7 +371,7 @@ fn measure(
     let failed = |error| anyhow::anyhow!("{error}");
     let mut session = world.open(&[start]).map_err(failed)?;
     if steps > 1 {
-        // A session of its own, so that a growing window is measured from its beginning.
+        // A separate session, so that a growing window is measured from its beginning.
         let mut warm = world.open(&[start]).map_err(failed)?;
         warm.step(None).map_err(failed)?;
     }

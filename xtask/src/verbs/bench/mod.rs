@@ -15,7 +15,7 @@ use gump_scene::{Scenario, fixture};
 
 use crate::cli::WrongArguments;
 
-/// What is measured.
+/// The benches.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Simulation: decoding orders, caches, batches and sizes, against the machine's own rate

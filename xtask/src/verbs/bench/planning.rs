@@ -116,7 +116,7 @@ fn row(what: &str, ratio: f64, ours: f64, reference: f64) -> Value {
     json!({ "what": what, "ratio": ratio, "ours": ours, "reference": reference })
 }
 
-/// Fifteen seconds on a bent road of four lanes, as full as asked.
+/// Fifteen seconds on a curved road of four lanes with `n_agents` vehicles.
 fn recording(n_agents: usize) -> anyhow::Result<Recording> {
     const RADIUS: f64 = 400.0;
     const LANES: usize = 4;

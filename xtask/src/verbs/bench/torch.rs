@@ -1,4 +1,4 @@
-//! The same work in PyTorch, in a process of its own, for comparison.
+//! The same work in PyTorch, in a separate process, for comparison.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,12 +20,12 @@ pub(super) struct Torch {
     pub(super) version: String,
 }
 
-/// What a script of `python/bench` prints.
+/// Output of a script of `python/bench`.
 #[derive(Debug, Deserialize)]
 pub(super) struct Timed {
     pub(super) seconds: f64,
     pub(super) cpu_seconds: f64,
-    /// What it computed, for comparison with ours.
+    /// Loss, for comparison with ours.
     #[serde(default)]
     pub(super) loss: f64,
     pub(super) parameters: usize,
@@ -46,8 +46,8 @@ impl Torch {
         let output = Command::new(python).args(["-c", script]).output();
         let output = output.map_err(|error| wrong(format!("cannot be run, {error}")))?;
         if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr);
-            let why = said.lines().last().unwrap_or("it failed").to_owned();
+            let stderr = String::from_utf8_lossy(&output.stderr);
+            let why = stderr.lines().last().unwrap_or("it failed").to_owned();
             return Err(wrong(why).into());
         }
         let version = String::from_utf8_lossy(&output.stdout).trim().to_owned();
@@ -66,7 +66,7 @@ impl Torch {
 
     /// Runs a script of `python/bench` with this many threads.
     ///
-    /// Error: a script that fails, with the last line it said.
+    /// Error: a script that fails, with the last line that it printed.
     pub(super) fn time<T: DeserializeOwned>(
         &self,
         script: &str,
@@ -88,8 +88,12 @@ impl Torch {
             .output()
             .with_context(|| format!("cannot run {}", self.python.display()))?;
         if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr);
-            let why = said.lines().last().unwrap_or("it said nothing").to_owned();
+            let stderr = String::from_utf8_lossy(&output.stderr);
+            let why = stderr
+                .lines()
+                .last()
+                .unwrap_or("it said nothing")
+                .to_owned();
             anyhow::bail!("{} failed: {why}", path.display());
         }
         serde_json::from_slice(&output.stdout)

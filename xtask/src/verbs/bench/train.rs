@@ -88,7 +88,7 @@ impl Args {
         run.result("peak_rss_mb", peak_rss_mb())
     }
 
-    /// One thread, then all that were asked for.
+    /// One thread, then the requested number.
     fn rows(
         &self,
         run: &mut Run,
@@ -216,7 +216,7 @@ impl Args {
     }
 }
 
-/// What the same network must have.
+/// Loss and size that the same network must have in PyTorch.
 struct Expected {
     loss: f64,
     parameters: usize,
@@ -240,11 +240,11 @@ impl Expected {
     }
 }
 
-/// How far apart the losses of both implementations may be, as a fraction.
+/// Largest relative difference between the losses of the two implementations.
 fn tolerance(precision: &str) -> f64 {
     match precision {
         "f32" => 1e-4,
-        // Each rounds other things.
+        // The two round at different places.
         _ => 0.02,
     }
 }

@@ -85,7 +85,7 @@ impl Args {
     }
 }
 
-/// The log with a drift of its own for every agent and rollout, so that no two are alike.
+/// The log with a different drift for every agent and rollout, so that no two are alike.
 fn wandering(log: &Log, n: usize, mode: Mode, seed: Seed) -> Rollouts {
     let oracle = log.oracle(1, mode == Mode::Generation);
     let mut rng = seed.rng();

@@ -80,8 +80,13 @@ impl Args {
                 list.made[i].scenes = scenes;
                 continue;
             }
-            let made = run.phase(&part.file, |_| Ok(make(&list, part, &folder, &progress)?))?;
-            rows.push(row(part, if made { "made as listed" } else { "as listed" }));
+            let is_new = run.phase(&part.file, |_| Ok(make(&list, part, &folder, &progress)?))?;
+            let state = if is_new {
+                "made as listed"
+            } else {
+                "as listed"
+            };
+            rows.push(row(part, state));
         }
         let data = self.data.clone().unwrap_or_else(benchmark::recorded_data);
         for part in &list.recorded {

@@ -16,7 +16,7 @@ use sha2::{Digest, Sha256};
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
 
-/// What a folder of converted scenes knows of its making.
+/// Name of the ledger in a folder of converted scenes.
 const LEDGER: &str = "conversion.json";
 
 /// Arguments of `data convert`.
@@ -43,7 +43,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What to write.
+/// Output format.
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum Format {
@@ -68,16 +68,17 @@ impl From<Format> for OutputFormat {
     }
 }
 
-/// What is in a folder of converted scenes; equal sources in an equal format are taken up again.
+/// Ledger of a folder of converted scenes; a conversion of the same sources to the same format
+/// resumes from it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Ledger {
     /// SHA-256 of the format and of every source's path and size.
     source: String,
-    /// What became of each group of sources, by its number.
+    /// Result for each group of sources, by its number.
     groups: BTreeMap<usize, Group>,
 }
 
-/// What became of some sources.
+/// Result for a group of sources.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Group {
     scenarios: usize,
@@ -100,7 +101,7 @@ impl Args {
         let resumed = ledger.groups.len();
         let before: usize = ledger.groups.values().map(|group| group.scenarios).sum();
         if resumed > 0 {
-            run.say(&format!("{resumed} of {} files are there", groups.len()));
+            run.print(&format!("{resumed} of {} files are there", groups.len()));
         }
         let ledger = Mutex::new(ledger);
         let began = Instant::now();
@@ -157,11 +158,11 @@ impl Args {
         }
         converted?;
         std::fs::remove_file(&mark).with_context(|| format!("cannot remove {}", mark.display()))?;
-        for problem in all.refused.iter().take(TOLD) {
-            run.say(&format!("refused: {problem}"));
+        for problem in all.refused.iter().take(MOST_PRINTED) {
+            run.print(&format!("refused: {problem}"));
         }
         if all.scenarios == 0 {
-            // Whatever is wrong with the path as a whole says more than a count.
+            // An error of the path as a whole says more than a count.
             gump_data::open(&self.from).map(drop)?;
             anyhow::bail!("expected scenarios, none could be converted");
         }
@@ -219,7 +220,7 @@ impl Args {
         Ok(ledger)
     }
 
-    /// What a conversion depends on.
+    /// Fingerprint of a conversion: a hash of all that it depends on.
     fn fingerprint(&self, files: &[PathBuf]) -> anyhow::Result<String> {
         let mut hash = Sha256::new();
         hash.update(serde_json::to_string(&self.format)?);
@@ -252,8 +253,8 @@ impl Args {
     }
 }
 
-/// Refused records told on the terminal; the report has all.
-const TOLD: usize = 10;
+/// Number of refused records printed on the terminal; the report has all.
+const MOST_PRINTED: usize = 10;
 
 fn lock(ledger: &Mutex<Ledger>) -> std::sync::MutexGuard<'_, Ledger> {
     ledger

@@ -43,8 +43,8 @@ impl Args {
         if summary.scenarios == 0
             && let Some(problem) = first_problem
         {
-            // Counts of nothing would only stand before the reason.
-            run.result_untold("unreadable", &summary.unreadable)?;
+            // Zero counts would only hide the reason.
+            run.result_hidden("unreadable", &summary.unreadable)?;
             anyhow::bail!(match n_unreadable {
                 1 => format!("the only record cannot be read: {problem}"),
                 n => format!("none of {n} records can be read, the first because: {problem}"),
@@ -65,7 +65,7 @@ impl Args {
                 picture(&scenario)
                     .save_png(&path)
                     .with_context(|| format!("cannot draw scenario {}", scenario.id))?;
-                run.say(&format!("picture: {}", path.display()));
+                run.print(&format!("picture: {}", path.display()));
                 Ok(())
             })?;
         }

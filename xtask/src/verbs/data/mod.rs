@@ -9,7 +9,7 @@ mod verify;
 
 pub(crate) use inspect::picture;
 
-/// What to do with data.
+/// The verbs of `data`.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Show what is in a file or directory

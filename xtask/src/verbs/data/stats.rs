@@ -38,7 +38,7 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// What a table of targets was measured on: names of files and folders, no more.
+    /// Source of a table of targets: names of files and folders only.
     fn provenance(&self) -> String {
         let name = |path: &PathBuf| {
             let parts = path.components().rev().take(2).collect::<Vec<_>>();
@@ -152,10 +152,10 @@ fn tell_distance(run: &mut Run, compared: &[Comparison]) -> anyhow::Result<()> {
     run.result("distances", compared.iter().map(row).collect::<Vec<_>>())
 }
 
-/// What some scenes consist of.
+/// Statistics of some scenes.
 #[derive(Default)]
 struct Stats {
-    /// Of each scene.
+    /// Duration of each scene, seconds.
     durations_s: Vec<f64>,
     classes: BTreeMap<AgentKind, Class>,
     lanes: usize,
@@ -165,7 +165,7 @@ struct Stats {
     tags: BTreeMap<&'static str, usize>,
     refused: Vec<String>,
     skipped: BTreeMap<&'static str, usize>,
-    /// Distributions, where they are asked for.
+    /// Distributions, where they are requested.
     statistics: Statistics,
 }
 
@@ -173,11 +173,11 @@ struct Stats {
 #[derive(Default)]
 struct Class {
     tracks: usize,
-    /// Present at the present.
+    /// Number of agents in the present frame.
     now: usize,
-    /// States that stand.
+    /// Number of states at standstill.
     standing: u64,
-    /// States that move, by speed.
+    /// Speeds of the moving states.
     speeds: Histogram,
 }
 

@@ -68,7 +68,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// How scenes come about.
+/// Generator of the scenes.
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 enum Kind {
@@ -82,17 +82,17 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.check()?;
         check_seed(run.seed())?;
-        let mut made = Made::default();
+        let mut counts = GeneratedCounts::default();
         match self.kind {
-            Kind::Procedural => self.procedural(run, &mut made)?,
-            Kind::Sumo => self.sumo(run, &mut made)?,
+            Kind::Procedural => self.procedural(run, &mut counts)?,
+            Kind::Sumo => self.sumo(run, &mut counts)?,
         }
-        run.result("scenes", made.scenes)?;
-        run.result("agents", made.by_class.values().sum::<usize>())?;
-        run.result("by_class", made.by_class)?;
-        run.result("by_road", made.by_road)?;
-        run.result("by_tag", made.by_tag)?;
-        run.result("files", made.files)?;
+        run.result("scenes", counts.scenes)?;
+        run.result("agents", counts.by_class.values().sum::<usize>())?;
+        run.result("by_class", counts.by_class)?;
+        run.result("by_road", counts.by_road)?;
+        run.result("by_tag", counts.by_tag)?;
+        run.result("files", counts.files)?;
         Ok(())
     }
 
@@ -121,13 +121,13 @@ impl Args {
     }
 
     fn n_shards(&self, default: usize) -> usize {
-        let asked = self.shards.map_or(default, NonZeroUsize::get);
-        asked.min(self.scenes.get())
+        let shards = self.shards.map_or(default, NonZeroUsize::get);
+        shards.min(self.scenes.get())
     }
 
     /// Makes and writes file by file, some scenes at a time, so that any number of scenes needs
     /// little memory. Scene `k` comes from `seed.fork(k)` and goes to file `k` modulo their number.
-    fn procedural(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
+    fn procedural(&self, run: &mut Run, counts: &mut GeneratedCounts) -> anyhow::Result<()> {
         let config = SynthesisConfig {
             density: self.density,
             family: self.family,
@@ -157,7 +157,7 @@ impl Args {
             let chunks = numbers.chunks(AT_A_TIME).map_while(|chunk| {
                 stopped = run::stop_if_interrupted();
                 let scenes: Vec<Scenario> = chunk.par_iter().map(|&k| one(k)).collect();
-                made.add(&scenes);
+                counts.add(&scenes);
                 stopped.is_ok().then_some(scenes)
             });
             run.phase("synthesize", |run| {
@@ -174,7 +174,7 @@ impl Args {
                 std::fs::remove_file(run.path(&name)).ok();
             }
             stopped?;
-            made.files.push(name);
+            counts.files.push(name);
         }
         Ok(())
     }
@@ -183,7 +183,7 @@ impl Args {
     ///
     /// Run `r` comes from `seed.fork(r)` and scenes are taken in the order of their runs, so the
     /// number of threads changes nothing.
-    fn sumo(&self, run: &mut Run, made: &mut Made) -> anyhow::Result<()> {
+    fn sumo(&self, run: &mut Run, counts: &mut GeneratedCounts) -> anyhow::Result<()> {
         let sumo = Sumo::find()?;
         run.setting("sumo", sumo.version()?)?;
         let work = run.path("work");
@@ -251,8 +251,8 @@ impl Args {
             }
             let rest = left.split_off(wanted);
             run.phase("write", |run| write(run, std::slice::from_ref(name), &left))?;
-            made.add(&left);
-            made.files.push(name.clone());
+            counts.add(&left);
+            counts.files.push(name.clone());
             left = rest;
         }
         drop(progress);
@@ -279,9 +279,9 @@ fn check_seed(seed: Seed) -> anyhow::Result<()> {
     Err(WrongArguments(why).into())
 }
 
-/// What a run made, counted.
+/// Counts of what a run generated.
 #[derive(Default)]
-struct Made {
+struct GeneratedCounts {
     scenes: usize,
     by_class: BTreeMap<&'static str, usize>,
     by_road: BTreeMap<String, usize>,
@@ -289,7 +289,7 @@ struct Made {
     files: Vec<String>,
 }
 
-impl Made {
+impl GeneratedCounts {
     fn add(&mut self, scenes: &[Scenario]) {
         self.scenes += scenes.len();
         for scene in scenes {
@@ -304,8 +304,7 @@ impl Made {
     }
 }
 
-/// The kind of road or the network, told from the front of a scene's id: what comes before the
-/// first part that begins with a digit or is a seed.
+/// The kind of road, or the network, from the beginning of a scene's id.
 fn road(id: &str) -> String {
     let families = RoadFamily::ALL.iter().map(|family| family.name());
     let plain = id.strip_prefix("like-").unwrap_or(id);

@@ -41,11 +41,11 @@ impl Args {
                 } else {
                     verify(file)?
                 };
-                let told = found
+                let listed = found
                     .findings
                     .drain(..)
                     .filter(|finding| self.list || finding.severity == Severity::Broken);
-                findings.extend(told.map(|finding| {
+                findings.extend(listed.map(|finding| {
                     json!({
                         "severity": finding.severity,
                         "problem": finding.problem,
@@ -76,7 +76,7 @@ impl Args {
                 let text = |key: &str| finding[key].as_str().unwrap_or_default();
                 let (severity, problem) = (text("severity"), text("problem"));
                 let (scenario, detail) = (text("scenario"), text("detail"));
-                run.say(&format!(
+                run.print(&format!(
                     "{severity}: {problem}: {scenario}: {detail}: {}",
                     text("path")
                 ));

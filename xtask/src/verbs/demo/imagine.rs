@@ -21,7 +21,7 @@ use crate::{films, futures, shipped};
 
 /// Futures per world.
 const FUTURES: usize = 32;
-/// How far, seconds.
+/// Length of the futures, seconds.
 pub(super) const SECONDS: f64 = 8.0;
 /// Futures per proposal of the planner.
 const PLANNED: usize = 2;
@@ -104,9 +104,9 @@ pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     Ok(json!({ "rows": rows }))
 }
 
-/// What each world and each column of the table is.
+/// Explanations of the worlds and of the columns of the table.
 fn columns() -> Vec<(String, String)> {
-    let said = [
+    let texts = [
         (
             "learned",
             "the shipped network, with rejection of collisions and off-road samples, and kinematic \
@@ -137,13 +137,14 @@ fn columns() -> Vec<(String, String)> {
             "simulated frames of 0.1 s per second of this machine, all futures together",
         ),
     ];
-    said.map(|(name, what)| (name.to_owned(), what.to_owned()))
+    texts
+        .map(|(name, what)| (name.to_owned(), what.to_owned()))
         .into()
 }
 
 /// The meta metric of the Waymo Sim Agents Challenge of 2025; `None` where it is not defined.
 ///
-/// It asks for as many futures everywhere, so fewer stand for more of the same.
+/// The metric requires the same number of futures everywhere, so fewer futures are repeated.
 fn realism(scenario: &Scenario, futures: &[Rollout]) -> Option<f64> {
     let config = Config::of(Year::Y2025);
     let log = Log::of(scenario).ok()?;

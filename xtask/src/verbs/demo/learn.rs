@@ -1,4 +1,4 @@
-//! What the network is, and a few steps of learning.
+//! The parts of the network, and a few steps of training.
 
 use gump_eval::datasets::{self, Split};
 use gump_model::{Device, checkpoint};

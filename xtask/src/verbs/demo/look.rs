@@ -1,4 +1,4 @@
-//! What a scenario is: numbers, a picture, a raster, tokens.
+//! The scenario: numbers, a picture, a raster, tokens.
 
 use gump_data::{ReadReport, Summary};
 use gump_model::ModelConfig;
@@ -35,7 +35,7 @@ pub(super) fn read(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {
     }))
 }
 
-/// What the scenario holds, as (name, value).
+/// Contents of the scenario, as (name, value).
 fn facts(scenario: &Scenario) -> Vec<(String, String)> {
     let mut summary = Summary::default();
     summary.add(scenario, &ReadReport::default());

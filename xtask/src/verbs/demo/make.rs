@@ -14,16 +14,16 @@ use crate::run::Run;
 use crate::verbs::generate;
 use crate::{films, shipped};
 
-/// What the scene is to be.
+/// Prompt of the generated scene.
 const PROMPT: &str = "near_multiple_vehicles";
 const COUNTS: Counts = Counts {
     vehicles: 14,
     pedestrians: 4,
     bicycles: 2,
 };
-/// How far it goes on in the learned world, seconds.
+/// Length of its future in the learned world, seconds.
 const SECONDS: f64 = 6.0;
-/// Scenes made before one is shown that is not what the prompt says.
+/// Attempts before a scene that misses the prompt is shown.
 const ATTEMPTS: usize = 20;
 
 pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {

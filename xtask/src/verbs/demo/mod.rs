@@ -1,8 +1,7 @@
-//! `demo`: the whole road on what the repository ships, and a page that shows it.
+//! `demo`: the whole pipeline on shipped data and weights, and a page that shows it.
 //!
 //! The stages are in [`imagine`] (futures and a plan), [`make`] (a scene from a prompt), [`learn`]
-//! (what the network is and how it learns) and [`look`] (what a scenario is); this file puts them in
-//! a row.
+//! (the network and its training) and [`look`] (the scenario); this file runs them in order.
 
 mod imagine;
 mod learn;
@@ -33,14 +32,14 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What the stages share.
+/// State shared by the stages.
 struct Demo {
     scenario: Scenario,
     sampling: SamplingConfig,
     page: Page,
-    /// Of the learned world.
+    /// Futures of the learned world.
     futures: Vec<Rollout>,
-    /// What the planner considered in it.
+    /// Candidates of the planner in the learned world.
     candidates: Vec<CandidatePath>,
 }
 
@@ -51,7 +50,7 @@ type Stage = (
     fn(&mut Demo, &mut Run) -> anyhow::Result<Value>,
 );
 
-/// In the order in which the page shows what comes of them.
+/// In the order in which the page shows their results.
 const STAGES: [Stage; 10] = [
     ("read", "reading the scenario", look::read),
     (
@@ -94,7 +93,7 @@ impl Args {
              weights trained on synthetic scenes alone."
         ));
         for (number, (name, doing, stage)) in STAGES.into_iter().enumerate() {
-            run.say(&format!("{} of {}: {doing}", number + 1, STAGES.len()));
+            run.print(&format!("{} of {}: {doing}", number + 1, STAGES.len()));
             let block = run.phase(name, |run| stage(&mut demo, run))?;
             run.result(name, block)?;
         }
@@ -112,7 +111,7 @@ fn page(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         machine::Machine::here("cpu").cpu,
     ));
     demo.page.save(&path)?;
-    run.say(&format!("open {}", path.display()));
+    run.print(&format!("open {}", path.display()));
     Ok(serde_json::json!({ "file": path }))
 }
 

@@ -1,16 +1,16 @@
-//! Scenarios that a benchmark is not defined on: named, counted, left out.
+//! Scenarios that are left out because the benchmark is not defined on them.
 
 use crate::run::Run;
 
-/// Why each of them is left out.
+/// The reason for each of them.
 #[derive(Default)]
 pub(crate) struct LeftOut(Vec<String>);
 
 impl LeftOut {
-    /// What came of a scenario; `None` where a recording of another length or rate is the reason
-    /// that nothing did.
+    /// Returns the result of a scenario; notes it as left out and returns `None` if its recording
+    /// has another length or rate than the benchmark.
     ///
-    /// Error: any other.
+    /// Error: any other error of the scenario.
     pub(crate) fn sift<T>(
         &mut self,
         scored: anyhow::Result<T>,
@@ -25,10 +25,10 @@ impl LeftOut {
         }
     }
 
-    /// Puts the reasons, if there are any, into the report and says how many they are.
+    /// Adds the reasons, if there are any, to the report and prints their number.
     ///
     /// Error: all were left out.
-    pub(crate) fn tell(&self, run: &mut Run, n_scored: usize) -> anyhow::Result<()> {
+    pub(crate) fn report(&self, run: &mut Run, n_scored: usize) -> anyhow::Result<()> {
         let n = self.0.len();
         if let Some(first) = self.0.first() {
             run.result("left_out", &self.0)?;
@@ -36,7 +36,7 @@ impl LeftOut {
                 n_scored > 0,
                 "none of {n} scenarios has the length and the rate of the benchmark: {first}"
             );
-            run.say(&format!("{n} scenarios are left out: {first}"));
+            run.print(&format!("{n} scenarios are left out: {first}"));
         }
         Ok(())
     }

@@ -19,7 +19,7 @@ pub(crate) mod wosac;
 
 pub(crate) use closed_loop::Driving;
 
-/// Which benchmark.
+/// The benchmarks.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Motion prediction: distances, misses, overlaps and mAP at 3, 5 and 8 s
@@ -28,7 +28,7 @@ pub(crate) enum Verb {
     Wosac(wosac::Args),
     /// Implausible actions in worlds and in the log: parked cars that move, overlaps, slip
     Behaviour(behaviour::Args),
-    /// How agents react when the ego departs from its log
+    /// Reactions of agents to an ego that departs from its log
     Reactions(reactions::Args),
     /// Generated scenes: similarity to recorded ones, overlaps, prompt satisfaction
     Generation(generation::Args),

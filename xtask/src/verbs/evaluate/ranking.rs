@@ -1,4 +1,5 @@
-//! Who is better in which world, how sure that is, and where worlds disagree.
+//! Pairwise comparisons of planners in every world, their significance, and pairs on which worlds
+//! disagree.
 
 use gump_eval::worlds::WorldName;
 use gump_planner::Comparison;
@@ -26,7 +27,7 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> Strin
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
     worlds: &[(String, Vec<PlannerDrives<'_>>)],
 ) -> anyhow::Result<()> {
@@ -41,7 +42,7 @@ pub(super) fn tell(
                 let Some(compared) = compare(&drives[a], &drives[b], run.seed()) else {
                     continue;
                 };
-                comparisons.push(tell_one(world, &drives[a], &drives[b], &compared));
+                comparisons.push(comparison_row(world, &drives[a], &drives[b], &compared));
                 found.push((world, compared.difference, compared.is_sure()));
             }
             changes.extend(changed(&planners[a].planner, &planners[b].planner, &found));
@@ -50,19 +51,19 @@ pub(super) fn tell(
     run.result("comparisons", comparisons)?;
     let (sure, noise): (Vec<&Change>, Vec<&Change>) = changes.iter().partition(|c| c.is_sure());
     for change in sure {
-        run.say(&format!("warning: {}", change.sentence()));
+        run.print(&format!("warning: {}", change.sentence()));
     }
     if !noise.is_empty() {
         let n = noise.len();
-        run.say(&format!(
+        run.print(&format!(
             "warning: {n} more change of places may be chance, see ranking_changes"
         ));
     }
-    let told = changes.iter().map(Change::tell);
-    run.result("ranking_changes", told.collect::<Vec<_>>())
+    let rows = changes.iter().map(Change::to_json);
+    run.result("ranking_changes", rows.collect::<Vec<_>>())
 }
 
-/// Two planners who are not in the same order in two worlds.
+/// Two planners whose order differs between two worlds.
 #[derive(Clone, Debug, PartialEq)]
 struct Change {
     planners: [String; 2],
@@ -84,7 +85,7 @@ impl Change {
         format!("{a} and {b} change places: {}; {}", worlds[0], worlds[1])
     }
 
-    fn tell(&self) -> Value {
+    fn to_json(&self) -> Value {
         let [(here, x, _), (there, y, _)] = &self.worlds;
         json!({
             "planner": self.planners[0],
@@ -105,7 +106,7 @@ fn compare(a: &PlannerDrives<'_>, b: &PlannerDrives<'_>, seed: Seed) -> Option<C
     Comparison::of_scenes(&a, &b, seed)
 }
 
-fn tell_one(
+fn comparison_row(
     world: &str,
     a: &PlannerDrives<'_>,
     b: &PlannerDrives<'_>,
@@ -154,8 +155,8 @@ mod tests {
                 .map(|(world, (x, sure))| (world, x, sure))
                 .collect();
             let changes = changed("pdm", "idm", &found);
-            let told: Vec<String> = changes.iter().map(Change::sentence).collect();
-            assert_eq!(told, expected);
+            let sentences: Vec<String> = changes.iter().map(Change::sentence).collect();
+            assert_eq!(sentences, expected);
             assert!(changes.iter().all(Change::is_sure));
         };
         check([(0.1, true), (0.2, false), (0.0, false)], &[]);

@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 pub(crate) use self::reasons::weight;
 use crate::run::Run;
 
-/// Agents told about, those nearest to the ego.
+/// Number of agents to describe, those nearest to the ego.
 const OTHERS: usize = 8;
 
 /// A decision made in the present of a scenario, which need not have a future.
@@ -46,7 +46,7 @@ impl Explained<'_> {
             .context("the viewer cannot be written")
     }
 
-    /// What was chosen over what, in words, a picture and a film.
+    /// Writes the choice and its best alternatives in words, as a picture and as a film.
     fn choice(&self, page: &mut Page) -> anyhow::Result<()> {
         let decision = self.decision;
         let chosen = &decision.prospects[decision.chosen];
@@ -155,7 +155,8 @@ pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
     order
 }
 
-/// What every candidate is worth, part by part; parts that are equal for all are one sentence.
+/// Writes the value of every candidate by its parts; parts that are equal for all become one
+/// sentence.
 fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
     let parts = |i: usize| decision.prospects[i].parts();
     let names: Vec<&str> = parts(order[0]).iter().map(|(name, _)| *name).collect();
@@ -215,7 +216,8 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
         .table(&columns, &rows);
 }
 
-/// What those nearest to the ego do, with the chosen candidate and with the best rejected one.
+/// Writes the behaviour of the agents nearest to the ego, with the chosen candidate and with the
+/// best rejected one.
 fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scenario) {
     let last = order[order.len() - 1];
     let other = reasons::best_rejected(decision).unwrap_or(last);
@@ -268,10 +270,10 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
         );
 }
 
-/// What an agent did in a future.
+/// Behaviour of an agent in a future.
 struct Deed {
     metres: f64,
-    /// Least distance of the centres of it and the ego.
+    /// Smallest distance between its centre and the ego's.
     closest: f64,
     hit: bool,
 }
@@ -306,7 +308,7 @@ fn film(scenario: &Scenario, shown: [&Prospect; 2]) -> anyhow::Result<Film> {
         .collect();
     let camera = Camera::on_ego(&scenario.present(), 70.0, 480, 400);
     let spec = FilmSpec {
-        // What is imagined has a frame every half second.
+        // Simulated futures have a frame every half second.
         frame_s: 0.5,
         ..FilmSpec::new(camera)
     };
@@ -348,7 +350,7 @@ pub(crate) fn path(vehicle: &VehicleParameters, decision: &Decision, i: usize) -
     }
 }
 
-/// What `report.json` says of the decision.
+/// The decision as a value for `report.json`.
 pub(crate) fn summary(decision: &Decision) -> Value {
     let ms = |time: std::time::Duration| time.as_secs_f64() * 1e3;
     let phases = &decision.phases;

@@ -1,4 +1,4 @@
-//! What separates two candidates, in words.
+//! Differences between two candidates, in words.
 
 use gump_planner::{Decision, ProposalKind, Prospect};
 use gump_scene::{Agent, Rollout};
@@ -10,10 +10,10 @@ use crate::table::decimal;
 const SAME_PLACE: f64 = 2.0;
 /// Parts of a score that differ by less are equal.
 const SAME_PART: f64 = 0.005;
-/// The closest distances to an agent that differ by less do not tell, metres.
+/// Closest distances to an agent that differ by less count as equal, metres.
 const SAME_GAP: f64 = 1.0;
-/// Differences told of.
-const TOLD: usize = 3;
+/// Maximum number of differences to list.
+const MOST_DIFFERENCES: usize = 3;
 
 /// The best candidate that was not chosen and is not the same drive under another name: one that
 /// ends more than 2 m from the chosen one, or that is worth something else.
@@ -33,8 +33,8 @@ pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
     })
 }
 
-/// The driver who imagines nothing: the Intelligent Driver Model at the limit in the middle of the
-/// way.
+/// The candidate of the ordinary driver: the Intelligent Driver Model at the speed limit in the
+/// middle of the lane.
 pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
     decision.prospects.iter().position(|prospect| {
         matches!(
@@ -45,8 +45,8 @@ pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
     })
 }
 
-/// How much a decision mattered: by how much the chosen candidate is worth more than the ordinary
-/// driver and, far less, than the best that was rejected.
+/// Weight of a decision: the margin of the chosen candidate over the ordinary driver, plus a tenth
+/// of its margin over the best rejected candidate.
 pub(crate) fn weight(decision: &Decision) -> f64 {
     let chosen = decision.prospects[decision.chosen].value;
     let margin = |other: Option<usize>| {
@@ -63,10 +63,10 @@ fn end(prospect: &Prospect) -> Option<gump_geometry::DVec2> {
 /// Sentences on why `chosen` is worth more than `other`, the weightiest first. `near` are agents to
 /// look at.
 pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<String> {
-    let mut told = Vec::new();
+    let mut sentences = Vec::new();
     let (mine, theirs) = (chosen.collisions, other.collisions);
     if mine != theirs {
-        told.push(format!(
+        sentences.push(format!(
             "With \"{}\" the ego is at fault in a collision in {theirs} of {} futures, with \"{}\" \
              in {mine} of {}.",
             other.kind,
@@ -77,29 +77,29 @@ pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> V
     }
     let parts = differing_parts(chosen, other);
     if !parts.is_empty() {
-        told.push(format!("Of the score's parts, {}.", parts.join("; ")));
+        sentences.push(format!("Of the score's parts, {}.", parts.join("; ")));
     }
     if let (Some(mine), Some(theirs)) = (&chosen.hedge, &other.hedge)
         && (mine.total - theirs.total).abs() > SAME_PART
     {
-        told.push(format!(
+        sentences.push(format!(
             "Where the others keep their velocity, it scores {:.2} instead of {:.2}.",
             mine.total, theirs.total
         ));
     }
     let (mine, theirs) = (chosen.progress_m, other.progress_m);
     if (mine - theirs).abs() > SAME_GAP {
-        told.push(format!(
+        sentences.push(format!(
             "It drives {} m along the way, the other {} m.",
             decimal(mine),
             decimal(theirs)
         ));
     }
-    told.extend(approaches(chosen, other, near));
-    if told.is_empty() {
-        told.push("Nothing: both have the same score, and ties go to more progress.".into());
+    sentences.extend(approaches(chosen, other, near));
+    if sentences.is_empty() {
+        sentences.push("Nothing: both have the same score, and ties go to more progress.".into());
     }
-    told
+    sentences
 }
 
 /// The parts that differ, those by most first.
@@ -111,10 +111,10 @@ fn differing_parts(chosen: &Prospect, other: &Prospect) -> Vec<String> {
         .collect();
     let by = |part: &(&str, f64, f64)| (part.1 - part.2).abs();
     parts.sort_by(|a, b| by(b).total_cmp(&by(a)));
-    let tell = |(name, mine, theirs): &(&str, f64, f64)| {
+    let sentence = |(name, mine, theirs): &(&str, f64, f64)| {
         format!("{} is {mine:.2} instead of {theirs:.2}", words(name))
     };
-    parts.iter().take(TOLD).map(tell).collect()
+    parts.iter().take(MOST_DIFFERENCES).map(sentence).collect()
 }
 
 /// Agents to which the ego comes much closer with one than with the other.
@@ -127,12 +127,12 @@ fn approaches(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<Strin
         let gaps = deeds.map(|deed: Deed| deed.closest);
         gaps.fold(f64::INFINITY, f64::min)
     };
-    let mut told: Vec<(f64, String)> = Vec::new();
+    let mut sentences: Vec<(f64, String)> = Vec::new();
     for agent in near {
         let (mine, theirs) = (closest(chosen, agent), closest(other, agent));
         // Centres of cars that touch are at most 5 m apart; what is far from both decides nothing.
         if (mine - theirs).abs() > SAME_GAP && mine.min(theirs) < 12.0 {
-            told.push((
+            sentences.push((
                 mine.min(theirs),
                 format!(
                     "{} {} comes within {mine:.1} m of the ego, with the other within {theirs:.1} m \
@@ -143,8 +143,12 @@ fn approaches(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<Strin
             ));
         }
     }
-    told.sort_by(|a, b| a.0.total_cmp(&b.0));
-    told.into_iter().take(2).map(|(_, text)| text).collect()
+    sentences.sort_by(|a, b| a.0.total_cmp(&b.0));
+    sentences
+        .into_iter()
+        .take(2)
+        .map(|(_, text)| text)
+        .collect()
 }
 
 /// A part's name as a column of a table.

@@ -27,7 +27,7 @@ pub(super) struct Tested {
     pub(super) policies: Vec<Policy>,
 }
 
-/// Who drives.
+/// A policy that drives.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Policy {
     /// The algorithm, or the name of a fixed rule.
@@ -98,18 +98,18 @@ impl DriveRecord {
     }
 }
 
-/// Puts shards together and reports on the whole.
+/// Merges shards and reports on all of them.
 pub(crate) fn report_merged(
     run: &mut Run,
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
     let (header, entries) = results::merge::<Driven>(folders, missing)?;
-    tell(run, &header.settings.try_into()?, &entries)
+    report(run, &header.settings.try_into()?, &entries)
 }
 
 /// Writes every drive to a file, rows and paired differences to the report.
-pub(super) fn tell(
+pub(super) fn report(
     run: &mut Run,
     tested: &Tested,
     entries: &[Entry<Driven>],
@@ -215,7 +215,7 @@ impl Group<'_> {
     }
 }
 
-/// What an interval resamples.
+/// Units that an interval resamples.
 fn over(policies: bool) -> &'static str {
     match policies {
         true => "scenarios and policies",

@@ -13,7 +13,7 @@ use gump_rl::{Actor, Course, Driver, EnvConfig, Episodes, evaluate};
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use super::columns::{DriveRecord, Driven, Policy, Tested, tell};
+use super::columns::{DriveRecord, Driven, Policy, Tested, report};
 use super::{Notes, RlWorld, Settings, courses, read};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, stop_if_interrupted};
@@ -57,7 +57,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// Who is evaluated.
+/// A policy to evaluate.
 pub(super) struct Candidate {
     /// The algorithm, or the name of a fixed rule.
     policy: String,
@@ -75,7 +75,7 @@ enum Kind {
     Constant([f32; 2]),
 }
 
-/// An evaluation: who drives where.
+/// An evaluation: policies, worlds and scenarios.
 pub(super) struct Test<'a> {
     pub(super) candidates: &'a [Candidate],
     pub(super) worlds: Vec<(&'a WorldName, RlWorld)>,
@@ -137,7 +137,7 @@ pub(super) fn load<'a>(
 }
 
 impl Test<'_> {
-    /// Drives what the folder does not have yet and reports on all.
+    /// Drives the scenarios whose results the folder does not have yet, and reports on all.
     pub(super) fn execute(&self, run: &mut Run, courses: &Arc<[Course]>) -> anyhow::Result<()> {
         let tested = self.tested(run, courses)?;
         let header = Header {
@@ -175,7 +175,7 @@ impl Test<'_> {
             self.shard,
             courses.len()
         );
-        tell(run, &tested, &entries)?;
+        report(run, &tested, &entries)?;
         run.result(
             "steps_per_second",
             f64::from(steps) / began.elapsed().as_secs_f64(),

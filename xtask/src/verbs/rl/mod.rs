@@ -42,13 +42,13 @@ pub(crate) enum Verb {
     Table(table::Args),
 }
 
-/// What a config file may say about reinforcement learning.
+/// Settings of reinforcement learning in a config file.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Settings {
-    /// What is driven, seen and earned.
+    /// Environment: episodes, observations and rewards.
     env: EnvConfig,
-    /// How to learn.
+    /// Hyperparameters of soft actor-critic.
     sac: SacConfig,
 }
 
@@ -78,7 +78,8 @@ impl Settings {
     }
 }
 
-/// Keys with a near miss to be told; those of the environment are checked as they are read.
+/// The known keys, from which a near miss is suggested; those of the environment are checked as
+/// they are read.
 fn known_keys() -> anyhow::Result<Table> {
     let sac = SacConfig {
         encoder: Some(Architecture::SmallConv),
@@ -93,7 +94,7 @@ fn known_keys() -> anyhow::Result<Table> {
     Ok(known)
 }
 
-/// A world to drive in; the log is no session of its own but what the environment replays.
+/// A world to drive in; the log needs no world model, since the environment replays it.
 enum RlWorld {
     Log,
     Imagined(World),
@@ -138,7 +139,7 @@ fn courses(
     Ok(Course::prepare(scenarios, STEP)?)
 }
 
-/// What a stored policy remembers of how it came about.
+/// Metadata of a stored policy.
 #[derive(Clone, Debug)]
 struct Notes {
     algorithm: String,
@@ -155,7 +156,7 @@ impl Notes {
         ]))
     }
 
-    /// Error: a note that is missing or that nobody could have written.
+    /// Error: an entry that is missing or invalid.
     fn from_map(notes: &BTreeMap<String, String>) -> anyhow::Result<Self> {
         let get = |key: &str| {
             let note = notes.get(key).cloned();

@@ -55,7 +55,7 @@ impl Args {
             config.sampling = Sampling::prioritized();
         }
         let server = Server::bind(&self.socket)?;
-        run.say(&format!(
+        run.print(&format!(
             "serving {} scenarios at {}; Ctrl-C ends it",
             courses.len(),
             server.path().display()
@@ -70,7 +70,7 @@ impl Args {
     }
 }
 
-/// What was served.
+/// Counts of what was served.
 #[derive(Default)]
 struct Served {
     clients: AtomicU64,
@@ -87,10 +87,10 @@ fn serve(
     config: &EnvConfig,
 ) -> anyhow::Result<Served> {
     let served = Served::default();
-    let tell = |event: Event| match event {
+    let on_event = |event: Event| match event {
         Event::Came { client } => {
             served.clients.fetch_add(1, Ordering::Relaxed);
-            run.say(&format!("client {client} came"));
+            run.print(&format!("client {client} came"));
         }
         Event::Left { client, farewell } => {
             let (n, lost) = (farewell.episodes_finished, farewell.episodes_lost as u64);
@@ -99,7 +99,7 @@ fn serve(
             let why = farewell
                 .error
                 .map_or_else(|| "it said goodbye".to_owned(), |error| error.to_string());
-            run.say(&format!(
+            run.print(&format!(
                 "client {client} left after {n} episodes, {lost} under way: {why}"
             ));
         }
@@ -112,7 +112,7 @@ fn serve(
             }
             server.stop();
         });
-        let done = server.run(courses, traffic, config, &tell);
+        let done = server.run(courses, traffic, config, &on_event);
         is_over.store(true, Ordering::Relaxed);
         done
     })?;

@@ -88,13 +88,13 @@ pub(super) struct Job<'a> {
     pub(super) settings: &'a Settings,
     pub(super) seed: Seed,
     pub(super) folder: PathBuf,
-    /// Whether to go on with what is in the folder.
+    /// Whether to resume the run in the folder.
     pub(super) resume: bool,
     /// Gradient steps after which to stop early.
     pub(super) stop_at: usize,
 }
 
-/// What came of it.
+/// Result of a [`Job`].
 #[derive(Debug, Serialize)]
 pub(super) struct Trained {
     algorithm: &'static str,
@@ -110,7 +110,7 @@ pub(super) struct Trained {
     demonstrated_steps: usize,
     return_first: Option<f64>,
     return_last: Option<f64>,
-    /// How many standard errors the return rose by.
+    /// Rise of the return, in standard errors.
     return_gain: Option<f64>,
     resumed: bool,
     policy: PathBuf,
@@ -147,8 +147,8 @@ impl Args {
         };
         let trained = run.phase("train", |run| job.execute(run))?;
         run.result("scenarios", courses.len())?;
-        let told = serde_json::to_value(&trained)?;
-        for (key, value) in told.as_object().into_iter().flatten() {
+        let results = serde_json::to_value(&trained)?;
+        for (key, value) in results.as_object().into_iter().flatten() {
             run.result(key, value)?;
         }
         Ok(())
@@ -156,14 +156,14 @@ impl Args {
 }
 
 impl Job<'_> {
-    /// Where the policy is written.
+    /// Path of the policy's file.
     pub(super) fn policy(&self) -> PathBuf {
         self.folder.join("policy.safetensors")
     }
 
     /// Trains to the end, to `stop_at` or to Ctrl-C.
     ///
-    /// Error: what the environment reports, and a folder that cannot be gone on with.
+    /// Error: an error of the environment, or a folder whose run cannot be resumed.
     pub(super) fn execute(&self, run: &Run) -> anyhow::Result<Trained> {
         let checkpoint = self.folder.join("checkpoint.safetensors");
         let notes = Notes {
@@ -209,14 +209,14 @@ impl Job<'_> {
         })
     }
 
-    /// The run in the folder, if it is the run that is asked for.
+    /// The run in the folder, if it has the requested settings.
     fn resumed(&self, checkpoint: &Path, notes: &Notes) -> anyhow::Result<Training> {
         let bytes = read(checkpoint)?;
         let in_file = || checkpoint.display().to_string();
         let (training, found) = Training::from_bytes(&bytes).with_context(in_file)?;
         let found = Notes::from_map(&found).with_context(in_file)?;
-        let asked = &self.settings.sac;
-        for (flag, asked, begun) in [
+        let requested = &self.settings.sac;
+        for (flag, requested, begun) in [
             ("--algorithm", notes.algorithm.clone(), found.algorithm),
             (
                 "--train-world",
@@ -225,16 +225,16 @@ impl Job<'_> {
             ),
             (
                 "--steps",
-                asked.steps.to_string(),
+                requested.steps.to_string(),
                 training.config().steps.to_string(),
             ),
         ] {
-            if asked != begun {
-                let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
+            if requested != begun {
+                let wrong = format!("{flag} {requested}: the run to resume began with {begun}");
                 return Err(WrongArguments(wrong).into());
             }
         }
-        if found.env != notes.env || training.config() != asked {
+        if found.env != notes.env || training.config() != requested {
             let wrong = "--config: the run to resume began with another configuration";
             return Err(WrongArguments(wrong.into()).into());
         }

@@ -29,7 +29,7 @@ struct Row {
     digest: String,
 }
 
-/// What all scenes come to.
+/// Totals over all scenes.
 #[derive(Default)]
 struct Total {
     rows: Vec<Row>,
@@ -43,7 +43,7 @@ struct Total {
 
 /// Simulates up to `n` scenes and writes their viewer.
 ///
-/// Error: arguments that are of one scene alone, a scene that cannot be read or simulated.
+/// Error: arguments for a single scene only, or a scene that cannot be read or simulated.
 pub(super) fn execute(args: &Args, n: usize, run: &mut Run) -> anyhow::Result<()> {
     check(args)?;
     let decoding = args.sampling.decoding(&args.world)?;
@@ -63,7 +63,7 @@ pub(super) fn execute(args: &Args, n: usize, run: &mut Run) -> anyhow::Result<()
     );
     run.phase("write", |run| Ok(gallery.save(&run.path("viewer.html"))?))?;
     run.result("decoding", decoding.name)?;
-    total.tell(args, run)
+    total.report(args, run)
 }
 
 fn check(args: &Args) -> Result<(), WrongArguments> {
@@ -103,7 +103,7 @@ fn add(
     Ok((imagined, summary))
 }
 
-/// What the list says of a scene, so that the ones worth a look stand out.
+/// The note beside a scene in the list, which makes the scenes worth a look stand out.
 fn note(args: &Args, total: &Part) -> String {
     let mut note = match args.futures.get() {
         1 => format!("1 simulated future in the world {}", args.world),
@@ -139,7 +139,7 @@ impl Total {
         self.passes += imagined.passes_per_frame * imagined.frames as f64;
     }
 
-    fn tell(&self, args: &Args, run: &mut Run) -> anyhow::Result<()> {
+    fn report(&self, args: &Args, run: &mut Run) -> anyhow::Result<()> {
         let total = self.summary.total();
         run.result("world", &args.world)?;
         run.result("scenes", self.rows.len())?;

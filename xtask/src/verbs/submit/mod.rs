@@ -2,7 +2,7 @@
 
 pub(crate) mod wosac;
 
-/// Which challenge.
+/// The challenges.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
     /// Pack futures of many scenarios for the Waymo Sim Agents Challenge, or check an archive

@@ -41,7 +41,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What is submitted.
+/// Source of the rollouts.
 #[derive(Debug, Serialize, clap::Args)]
 #[group(required = true, multiple = false)]
 struct Source {
@@ -56,7 +56,7 @@ struct Source {
     archive: Option<PathBuf>,
 }
 
-/// Who made it and how; the server asks for it.
+/// Authors and method, which the server requires.
 #[derive(Debug, Serialize, clap::Args)]
 struct Maker {
     /// E-mail address of the account at waymo.com/open
@@ -74,7 +74,7 @@ struct Maker {
     /// Short description of the method
     #[arg(long, value_name = "TEXT")]
     description: Option<String>,
-    /// Where the method is described
+    /// URL of the method's description
     #[arg(long, value_name = "URL")]
     method_link: Option<String>,
     /// The number of parameters of the model with a suffix, like 200K
@@ -171,7 +171,7 @@ impl Args {
         }
         packer.check.finish(&expected);
         if packer.check.n_problems > 0 {
-            return tell(run, &packer.check);
+            return report(run, &packer.check);
         }
         let shards = run.phase("write", |_| Ok(packer.archive.finish()?))?;
         run.result("files", [ARCHIVE])?;
@@ -179,7 +179,7 @@ impl Args {
         run.phase("check", |run| check(run, &path, &expected))
     }
 
-    /// Who must be simulated in which scenario.
+    /// Reads which agents must be simulated in which scenario.
     fn expected(&self, run: &Run) -> anyhow::Result<ExpectedScenarios> {
         let progress = run.progress("reading", 0, "scenarios");
         let mut expected = ExpectedScenarios::default();
@@ -219,12 +219,12 @@ impl Args {
     }
 }
 
-/// An archive in the making; broken futures are told, not packed.
+/// An archive being written; invalid futures are reported, not packed.
 struct Packer<'a> {
     archive: ArchiveWriter,
     check: SubmissionCheck,
     expected: &'a ExpectedScenarios,
-    /// Of the futures that were imagined.
+    /// Digests of the simulated futures.
     digests: Vec<String>,
 }
 
@@ -239,13 +239,13 @@ impl Packer<'_> {
 
 fn check(run: &mut Run, archive: &Path, expected: &ExpectedScenarios) -> anyhow::Result<()> {
     let found = check_archive(archive, expected)?;
-    tell(run, &found)
+    report(run, &found)
 }
 
 /// Reports what was found.
 ///
 /// Error: if anything was.
-fn tell(run: &mut Run, found: &SubmissionCheck) -> anyhow::Result<()> {
+fn report(run: &mut Run, found: &SubmissionCheck) -> anyhow::Result<()> {
     run.result("scenarios", found.scenarios)?;
     run.result("n_problems", found.n_problems)?;
     run.result("problems", &found.problems)?;

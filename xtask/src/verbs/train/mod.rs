@@ -38,7 +38,7 @@ const VALIDATION_SAMPLES: usize = 64;
 /// Steps over which the first and the last loss are averaged.
 const WINDOW: usize = 20;
 
-/// What a stage writes.
+/// Files that a stage writes.
 const CHECKPOINT: &str = "checkpoint.safetensors";
 const WEIGHTS: &str = "weights.safetensors";
 const LOSSES: &str = "losses.csv";
@@ -82,7 +82,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// How a stage begins.
+/// Initial state of a stage.
 enum Begin {
     New,
     From(Box<Network>),
@@ -101,7 +101,7 @@ fn was_trained_in(out: &Path) -> bool {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.check(run)?;
-        if relative::is_asked(self)? {
+        if relative::is_requested(self)? {
             return together(|processes| relative::execute(self, run, processes));
         }
         let stages = self.stages()?;
@@ -113,7 +113,7 @@ impl Args {
         })
     }
 
-    /// Refuses what no training can be made of, before anything is read.
+    /// Refuses arguments that cannot be trained with, before anything is read.
     ///
     /// Error: [`WrongArguments`].
     fn check(&self, run: &Run) -> anyhow::Result<()> {
@@ -207,7 +207,7 @@ impl Args {
                 .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         }
         let seed = Seed(trainer.config().seed).fork(9);
-        // One process tells for all: what is imagined changes nothing that is learned.
+        // One process evaluates for all: the simulations do not affect training.
         let rollouts = if writes { self.realism_rollouts } else { 0 };
         let judge = Judge::new(&validation, rollouts, seed);
         let held_out = HeldOut {
@@ -231,7 +231,7 @@ impl Args {
         }
         trained?;
         run.result("parameters", trainer.network().parameters().count())?;
-        tell(run, &trainer, &losses, resumed_at, began)?;
+        report_run(run, &trainer, &losses, resumed_at, began)?;
         let judged = held_out.judge.as_ref().map_or(0, Judge::scenes);
         run.setting("realism_scenes", judged)?;
         if let Some(last) = losses.last() {
@@ -241,16 +241,16 @@ impl Args {
     }
 
     /// A run keeps the configuration it began with; asking for another one is a mistake.
-    fn check_resumed(&self, trainer: &Trainer, asked: &RunConfig) -> anyhow::Result<()> {
+    fn check_resumed(&self, trainer: &Trainer, requested: &RunConfig) -> anyhow::Result<()> {
         let begun = trainer.config();
         self.check_flags(begun.steps, begun.batch)?;
         let Some(path) = &self.common.config else {
             return Ok(());
         };
-        let wrong = if *trainer.network().config() != asked.model()? {
+        let wrong = if *trainer.network().config() != requested.model()? {
             Some("another model than that of the run to resume".to_owned())
         } else {
-            stages::difference(&asked.train, begun)?
+            stages::difference(&requested.train, begun)?
         };
         match wrong {
             Some(wrong) => Err(WrongArguments(format!("{}: {wrong}", path.display())).into()),
@@ -258,14 +258,14 @@ impl Args {
         }
     }
 
-    /// Error: [`WrongArguments`] if flags ask for other numbers than a run to resume began with.
+    /// Error: [`WrongArguments`] if flags give other numbers than the run to resume began with.
     fn check_flags(&self, steps: usize, batch: usize) -> anyhow::Result<()> {
-        for (flag, asked, begun) in [
+        for (flag, requested, begun) in [
             ("--steps", self.steps, steps),
             ("--batch", self.batch, batch),
         ] {
-            if let Some(asked) = asked.filter(|&asked| asked != begun) {
-                let wrong = format!("{flag} {asked}: the run to resume began with {begun}");
+            if let Some(requested) = requested.filter(|&requested| requested != begun) {
+                let wrong = format!("{flag} {requested}: the run to resume began with {begun}");
                 return Err(WrongArguments(wrong).into());
             }
         }
@@ -276,7 +276,7 @@ impl Args {
         self.read_data(run, &stage.data, stage.config.train.batch)
     }
 
-    /// What is trained on, for steps of `batch` samples, and what is validated on.
+    /// Reads the training data, for steps of `batch` samples, and the validation data.
     fn read_data(
         &self,
         run: &Run,
@@ -325,11 +325,11 @@ trait Learns {
     fn steps(&self) -> usize;
     fn steps_done(&self) -> usize;
     fn step(&mut self) -> anyhow::Result<StepReport>;
-    /// True if any process says so.
-    fn any(&self, said: bool) -> anyhow::Result<bool>;
+    /// Whether any process passes `true`.
+    fn any(&self, value: bool) -> anyhow::Result<bool>;
     /// The loss on held-out scenarios, nats.
     fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64>;
-    /// What it has learned, as a world.
+    /// The current network as a world.
     fn world(&self) -> anyhow::Result<Box<dyn WorldModel>>;
     /// Writes the checkpoint to resume from and the weights to use.
     fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()>;
@@ -348,8 +348,8 @@ impl Learns for Trainer {
         Ok(Trainer::step(self)?)
     }
 
-    fn any(&self, said: bool) -> anyhow::Result<bool> {
-        Ok(Trainer::any(self, said)?)
+    fn any(&self, value: bool) -> anyhow::Result<bool> {
+        Ok(Trainer::any(self, value)?)
     }
 
     fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64> {
@@ -367,7 +367,7 @@ impl Learns for Trainer {
     }
 }
 
-/// Says so if the network is to learn from scenes of a frozen set.
+/// Warns if the training data contain scenes of a frozen set.
 ///
 /// Error: a list of this repository that cannot be read.
 fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
@@ -375,7 +375,7 @@ fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
     let sets = training.ids().filter_map(|id| Some((id, frozen.get(id)?)));
     let found: Vec<_> = sets.collect();
     if let Some((id, set)) = found.first() {
-        run.say(&format!(
+        run.print(&format!(
             "warning: {} training scenes are of frozen sets, {id} of {set} for one: \
              what these weights score there says nothing",
             found.len()
@@ -384,11 +384,11 @@ fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Says so if products in bfloat16 take longer than in f32 on this processor.
+/// Warns if matrix products in bfloat16 take longer than in f32 on this processor.
 fn warn_of_slow_bfloat16(run: &Run, mixed_precision: bool) {
     let kernel = Choice::made().kernel;
     if mixed_precision && run.device().is_cpu() && !kernel.multiplies_bfloat16() {
-        run.say(&format!(
+        run.print(&format!(
             "note: mixed_precision takes longer than f32 with the kernel {}, which has no products \
              of bfloat16",
             kernel.name()
@@ -411,10 +411,11 @@ fn load(weights: &Path, stage: &Stage, device: &Device) -> anyhow::Result<Networ
     })
 }
 
-/// What a stage is validated on.
+/// Validation data of a stage.
 struct HeldOut<'a> {
     scenarios: &'a [Scenario],
-    /// Scores what the network imagines of them, where this process does and it can be scored.
+    /// Scores the network's simulations of them; `None` without rollouts, in processes that do not
+    /// write, and without a scene that can be scored.
     judge: Option<Judge<'a>>,
 }
 
@@ -475,8 +476,8 @@ fn write(run: &Run, files: &Files, trainer: &impl Learns, losses: &Losses) -> an
     Ok(())
 }
 
-/// What came out of a run, or of this part of it.
-fn tell(
+/// Reports the results of a run, or of this part of it.
+fn report_run(
     run: &mut Run,
     trainer: &impl Learns,
     losses: &Losses,

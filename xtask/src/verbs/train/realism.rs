@@ -1,4 +1,4 @@
-//! Realism while training: the network as it is imagines held-out scenes, which are scored as in
+//! Realism during training: the current network simulates held-out scenes, which are scored as in
 //! the Waymo Sim Agents Challenge of 2025.
 
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
@@ -7,9 +7,9 @@ use gump_wosac::realism::{Config, Log, Reference, Rollouts, Scores, Year};
 
 use crate::run::stop_if_interrupted;
 
-/// Scenes that are imagined, at most: what is told between two steps has to be quick.
+/// Maximum number of simulated scenes: the evaluation between two steps has to be quick.
 const SCENES: usize = 8;
-/// Seconds that the challenge asks for.
+/// Seconds that the challenge requires.
 const HORIZON_S: f64 = 8.0;
 
 /// Held-out scenes that can be scored.
@@ -22,7 +22,7 @@ pub(super) struct Judge<'a> {
 
 impl<'a> Judge<'a> {
     /// The first of the scenes on which the challenge is defined, with so many rollouts of each;
-    /// none if there is no such scene or no rollout is asked for.
+    /// `None` without such a scene or without rollouts.
     pub(super) fn new(scenes: &'a [Scenario], rollouts: usize, seed: Seed) -> Option<Self> {
         if rollouts == 0 {
             return None;
@@ -42,7 +42,7 @@ impl<'a> Judge<'a> {
         })
     }
 
-    /// How many scenes there are.
+    /// Number of scenes.
     pub(super) fn scenes(&self) -> usize {
         self.scenes.len()
     }

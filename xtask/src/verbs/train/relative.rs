@@ -18,7 +18,8 @@ use toml::Table;
 use super::realism::Judge;
 use super::stages::{self, Stage};
 use super::{
-    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, tell, warn_of_slow_bfloat16, write,
+    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, report_run, warn_of_slow_bfloat16,
+    write,
 };
 use crate::cli::WrongArguments;
 use crate::losses::Losses;
@@ -31,7 +32,7 @@ pub(super) const NAME: &str = "relative";
 /// Separates the stream of layers that are added.
 const DEEPER: u64 = 11;
 
-/// What a run of one stage is.
+/// Configuration of a run of one stage.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
@@ -43,10 +44,10 @@ struct Config {
     train: RelativeTrainConfig,
 }
 
-/// Whether the arguments mean this network: by name, or by the weights to go on from.
+/// Whether the arguments request this network: by name, or by the initial weights.
 ///
 /// Error: weights that cannot be read.
-pub(super) fn is_asked(args: &Args) -> anyhow::Result<bool> {
+pub(super) fn is_requested(args: &Args) -> anyhow::Result<bool> {
     match (&args.model, &args.from) {
         (Some(name), _) => Ok(name == NAME),
         (None, Some(weights)) => Ok(relative::is_relative(weights)?),
@@ -88,7 +89,7 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
     run.result("weights", weights)
 }
 
-/// The weights to go on from; layers that they lack begin as ones that add nothing.
+/// Loads the initial weights; layers that they lack are initialised to add nothing.
 ///
 /// Error: [`WrongArguments`] if they differ from the configuration in anything but having fewer
 /// layers.
@@ -166,14 +167,14 @@ fn train(
     run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?;
     trained?;
     run.result("parameters", trainer.network().parameters().count())?;
-    tell(run, &trainer, &losses, resumed_at, began)?;
+    report_run(run, &trainer, &losses, resumed_at, began)?;
     if let Some(last) = losses.last() {
         let names = ["stands", "ahead", "left", "turn"];
         let fields = names.iter().zip(&last.loss.fields);
-        let told: Map<_, _> = fields
+        let by_field: Map<_, _> = fields
             .map(|(name, loss)| ((*name).to_owned(), json!(loss)))
             .collect();
-        run.result("loss_per_field", told)?;
+        run.result("loss_per_field", by_field)?;
     }
     Ok(trainer.into_network())
 }
@@ -257,8 +258,8 @@ impl Learns for RelativeTrainer {
         })
     }
 
-    fn any(&self, said: bool) -> anyhow::Result<bool> {
-        Ok(said)
+    fn any(&self, value: bool) -> anyhow::Result<bool> {
+        Ok(value)
     }
 
     fn validate(&self, scenarios: &[Scenario]) -> anyhow::Result<f64> {

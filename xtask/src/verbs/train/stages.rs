@@ -1,8 +1,8 @@
-//! What is to be trained: a run of one stage, or of several that go on from each other.
+//! Training stages: a run has one stage, or several that continue each other.
 //!
-//! In the file, `[train]` holds for all stages, and each `[[stage]]` says what it does otherwise:
-//! `data` (a folder in `--data`, a stream `fresh:PROFILE`, or a list of those, each with `=SHARE` if
-//! samples are not drawn from all alike), `stop_at` and its own `[stage.train]`.
+//! In the file, `[train]` holds for all stages, and each `[[stage]]` overrides it: `data` (a folder
+//! in `--data`, a stream `fresh:PROFILE`, or a list of those, each with `=SHARE` if samples are not
+//! drawn equally from all), `stop_at` and `[stage.train]`.
 
 use std::path::{Path, PathBuf};
 
@@ -17,26 +17,26 @@ use super::Args;
 use crate::cli::WrongArguments;
 use crate::config;
 
-/// A part of a run with a schedule of its own.
+/// A part of a run with a separate schedule.
 #[derive(Debug)]
 pub(super) struct Stage<C = RunConfig> {
     pub(super) config: C,
-    /// What it learns from, each with `=SHARE` if not in equal shares.
+    /// Sources of training data, each with `=SHARE` if the shares are not equal.
     pub(super) data: Vec<PathBuf>,
     pub(super) files: Files,
 }
 
-/// Where a stage ends and what it writes.
+/// Last step and files of a stage.
 #[derive(Debug)]
 pub(super) struct Files {
     /// The step to stop after.
     pub(super) stop_at: usize,
-    /// Where its files go, from the folder of the run.
+    /// Folder of its files, relative to the folder of the run.
     folder: PathBuf,
 }
 
 impl Files {
-    /// A file of the stage, from the folder of the run.
+    /// Path of a file of the stage, relative to the folder of the run.
     pub(super) fn path(&self, name: &str) -> String {
         self.folder.join(name).display().to_string()
     }
@@ -115,17 +115,17 @@ impl Args {
         stages.collect()
     }
 
-    /// What a stage learns from.
-    fn data_of(&self, path: &Path, said: Option<&Value>) -> anyhow::Result<Vec<PathBuf>> {
-        let one = |said: &Value| match said {
+    /// The sources of training data of a stage.
+    fn data_of(&self, path: &Path, data: Option<&Value>) -> anyhow::Result<Vec<PathBuf>> {
+        let one = |data: &Value| match data {
             Value::String(stream) if stream.starts_with(PREFIX) => Ok(stream.into()),
             Value::String(folder) => Ok(self.data.join(folder)),
             other => Err(wrong(path, "data", "a folder or a list of folders", other)),
         };
-        match said {
+        match data {
             None => Ok(vec![self.data.clone()]),
             Some(Value::Array(all)) if !all.is_empty() => all.iter().map(one).collect(),
-            Some(said) => Ok(vec![one(said)?]),
+            Some(data) => Ok(vec![one(data)?]),
         }
     }
 
@@ -175,26 +175,28 @@ fn known_keys() -> anyhow::Result<Table> {
 
 /// The first key in which two configurations differ, with both values.
 pub(super) fn difference<C: Serialize + DeserializeOwned>(
-    asked: &C,
+    requested: &C,
     begun: &C,
 ) -> anyhow::Result<Option<String>> {
     // Through JSON, as a checkpoint holds it, so that no number differs by its last digit.
-    let asked: C = serde_json::from_str(&serde_json::to_string(asked)?)?;
-    let tables = [Table::try_from(&asked)?, Table::try_from(begun)?];
+    let requested: C = serde_json::from_str(&serde_json::to_string(requested)?)?;
+    let tables = [Table::try_from(&requested)?, Table::try_from(begun)?];
     Ok(first_difference(&tables[0], &tables[1]))
 }
 
-fn first_difference(asked: &Table, begun: &Table) -> Option<String> {
-    let keys = asked.keys().chain(begun.keys());
-    let mut differ = keys.filter(|&key| asked.get(key) != begun.get(key));
+fn first_difference(requested: &Table, begun: &Table) -> Option<String> {
+    let keys = requested.keys().chain(begun.keys());
+    let mut differ = keys.filter(|&key| requested.get(key) != begun.get(key));
     let key = differ.next()?;
-    let told = |value: Option<&Value>| value.map_or("nothing".into(), Value::to_string);
-    match (asked.get(key), begun.get(key)) {
-        (Some(Value::Table(asked)), Some(Value::Table(begun))) => first_difference(asked, begun),
-        (asked, begun) => Some(format!(
+    let text = |value: Option<&Value>| value.map_or("nothing".into(), Value::to_string);
+    match (requested.get(key), begun.get(key)) {
+        (Some(Value::Table(requested)), Some(Value::Table(begun))) => {
+            first_difference(requested, begun)
+        }
+        (requested, begun) => Some(format!(
             "{key} is {}, the run to resume began with {}",
-            told(asked),
-            told(begun)
+            text(requested),
+            text(begun)
         )),
     }
 }
@@ -216,14 +218,14 @@ mod tests {
     #[test]
     fn the_first_difference_is_named() {
         let begun = TrainConfig::default();
-        let mut asked = begun.clone();
-        assert_eq!(difference(&asked, &begun).unwrap(), None);
-        asked.sample.sway = 0.5;
-        let told = difference(&asked, &begun).unwrap().unwrap();
-        assert_eq!(told, "sway is 0.5, the run to resume began with 0.0");
-        asked = begun.clone();
-        asked.ema = Some(0.9);
-        let told = difference(&asked, &begun).unwrap().unwrap();
-        assert_eq!(told, "ema is 0.9, the run to resume began with nothing");
+        let mut requested = begun.clone();
+        assert_eq!(difference(&requested, &begun).unwrap(), None);
+        requested.sample.sway = 0.5;
+        let message = difference(&requested, &begun).unwrap().unwrap();
+        assert_eq!(message, "sway is 0.5, the run to resume began with 0.0");
+        requested = begun.clone();
+        requested.ema = Some(0.9);
+        let message = difference(&requested, &begun).unwrap().unwrap();
+        assert_eq!(message, "ema is 0.9, the run to resume began with nothing");
     }
 }

@@ -10,7 +10,8 @@ use gump_scene::{MapParts, RoadEdge, RoadEdgeKind};
 use super::simplify::simplify;
 use crate::ReadReport;
 
-/// How far outside other surfaces are searched, metres: gaps are narrower, medians wider.
+/// Distance outside a surface at which other surfaces are looked up, metres: gaps are narrower,
+/// medians wider.
 const OUTSIDE: f64 = 0.4;
 /// Pieces are at most this long, metres.
 const PIECE: f64 = 2.0;

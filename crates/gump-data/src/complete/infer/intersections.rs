@@ -12,7 +12,7 @@ use gump_scene::{Lane, LaneId};
 use super::simplify::simplify;
 use crate::ReadReport;
 
-/// How far the simplified centre lines may stray, metres; a tenth of the narrowest lane.
+/// Tolerance of simplified centre lines, metres; a tenth of the narrowest lane.
 const TOLERANCE: f64 = 0.15;
 /// Lines that meet at less than this angle (sine of 15 degrees) run together rather than cross.
 const MIN_SINE: f64 = 0.26;

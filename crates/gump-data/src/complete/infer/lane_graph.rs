@@ -129,7 +129,8 @@ fn add_neighbors(lanes: &mut [Lane], report: &mut ReadReport) {
     }
 }
 
-/// How long and how far to the left a lane runs beside another, summed over its places.
+/// Length that a lane runs beside another and its offset to the left times that length, both summed
+/// over sample points.
 #[derive(Default)]
 struct Beside {
     length: f64,

@@ -22,7 +22,7 @@ const TURN_COST: f64 = 8.0;
 const CHANGE_COST: f64 = 6.0;
 /// Cost of going on in a lane the graph does not lead to.
 const JUMP_COST: f64 = 200.0;
-/// How many links may lie between two samples: short lanes can fall between them.
+/// Maximum number of links between two samples: short lanes can fall between them.
 const MAX_LINKS: usize = 3;
 /// Metres over which the path moves from one lane to its neighbour, centred on the change.
 const CHANGE_LENGTH: f64 = 20.0;

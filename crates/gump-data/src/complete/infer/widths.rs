@@ -13,13 +13,13 @@ use gump_scene::{Lane, LaneId, LaneKind, MapParts};
 use super::simplify::simplify;
 use crate::ReadReport;
 
-/// How far from the centre a bound may lie, metres; beyond it the lane has none on that side.
+/// Maximum distance of a bound from the centre, metres; beyond it the lane has none on that side.
 const MAX_REACH: f64 = 4.0;
 /// Metres between two measurements along a lane.
 const SPACING: f64 = 5.0;
 /// At most so many measurements per lane: a damaged file may claim lanes around the world.
 const MAX_MEASUREMENTS: f64 = 200.0;
-/// How far a bound may stray for speed, metres; far less than lines are wide.
+/// Tolerance of simplified bounds, metres, for speed; far less than lines are wide.
 const TOLERANCE: f64 = 0.02;
 /// A bound must lie this much across rather than along the lane (cosine of 45 degrees).
 const MIN_ACROSS: f64 = 0.7;

@@ -21,14 +21,14 @@ pub(crate) const FORMAT: Format = Format {
     open: document::open::<File>,
 };
 
-/// Parquet files start with this; that they are scenarios is told by their columns.
+/// The first bytes of a Parquet file; reading its columns shows whether it contains scenarios.
 fn recognises(head: &[u8]) -> bool {
     head.starts_with(b"PAR1")
 }
 
 /// The ego's track id.
 const EGO: &str = "AV";
-/// How tracks matter, in the column `object_category`: from this number on they are scored.
+/// Smallest value of the column `object_category` for which a track is scored.
 const SCORED: i64 = 2;
 
 /// The rows of a scenario and its map.
@@ -165,7 +165,7 @@ impl File {
     }
 }
 
-/// Ids are numbers but for the ego's; others that are none get one of their own.
+/// Parses a track id, which is a number for all but the ego; other names get a unique negative id.
 fn track_id(name: &str, index: usize) -> i64 {
     let number = name.parse().ok().filter(|id| *id >= 0);
     number.unwrap_or(-1 - index as i64)
@@ -181,10 +181,9 @@ fn track(id: i64, name: &str) -> Track {
     }
 }
 
-/// What an object type is, and its usual length, width and height, metres.
+/// Returns the class of an object type, and its usual length, width and height, metres.
 ///
-/// Source of sizes: the means that the Argoverse 2 sensor logs show for these classes, to a
-/// decimetre.
+/// Source of sizes: the means of these classes in the Argoverse 2 sensor logs, to a decimetre.
 pub(super) fn kind(name: &str) -> (AgentKind, [f64; 3]) {
     let usual = |kind: AgentKind| (kind, kind.usual_size());
     match name {

@@ -70,7 +70,7 @@ fn places(points: &[Point]) -> Vec<DVec3> {
     points.iter().map(|p| dvec3(p.x.0, p.y.0, p.z.0)).collect()
 }
 
-/// Lines and edges have no ids of their own; these are beyond those of lanes and areas.
+/// First id of lines and edges, which have no ids in the format; beyond those of lanes and areas.
 const FIRST_LINE_ID: i64 = 1 << 40;
 
 /// Reads the map file.
@@ -78,7 +78,7 @@ pub(super) fn read(path: &Path) -> Result<Map, DataError> {
     json::read(path, "an Argoverse 2 map as JSON")
 }
 
-/// What the map states. Centre lines run between the bounds; those that forecasting maps state
+/// The features of the map. Centre lines run between the bounds; those that forecasting maps state
 /// are left out because they are the same, without heights.
 pub(super) fn parts(map: &Map, report: &mut ReadReport) -> MapParts {
     let mut parts = MapParts {

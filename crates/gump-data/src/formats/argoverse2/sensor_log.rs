@@ -41,8 +41,8 @@ const EGO: &str = "EGO_VEHICLE";
 ///
 /// Source: the ego's box in the annotated logs of the scenario-mining sample.
 const EGO_SIZE: [f64; 3] = [4.877, 2.0, 1.473];
-/// How far the ego's box centre lies ahead of its origin, the middle of its rear axle, metres: half
-/// the wheelbase of the Ford Fusion (2.85 m), taking its overhangs for equal. The sample's own box
+/// Distance of the ego's box centre ahead of its origin, the middle of its rear axle, metres: half
+/// the wheelbase of the Ford Fusion (2.85 m), assuming equal overhangs. The sample's own box
 /// for the ego is centred on the origin, which contradicts where the format puts that.
 const EGO_AHEAD: f64 = 1.425;
 

@@ -18,9 +18,10 @@ pub(super) struct Damage {
 
 pub(super) type Decoded<T> = Result<T, Damage>;
 
-/// How a column of numbers is stored; the first that loses nothing is taken.
+/// Tag of a column of numbers stored in single precision. Of this, [`DECIMALS`] and [`DOUBLE`], a
+/// column gets the first that loses nothing.
 ///
-/// Many formats state single precision or four decimals, and both take half the room.
+/// Many formats state single precision or four decimals, and both take half the space.
 const SINGLE: u8 = 1;
 /// Whole multiples of 1 / [`DECIMAL`] as i32. Division rounds as reading the decimal did.
 const DECIMALS: u8 = 2;
@@ -77,7 +78,7 @@ impl Encoder {
         self.bytes.extend(value.as_bytes());
     }
 
-    /// What there may be one of.
+    /// An optional value: a flag, then the value if there is one.
     pub(super) fn option<T>(&mut self, value: Option<T>, write: impl FnOnce(&mut Self, T)) {
         self.flag(value.is_some());
         if let Some(value) = value {

@@ -115,7 +115,7 @@ impl Cache {
 
 pub(crate) fn is_shard(file: &Path) -> bool {
     let mut head = [0; MAGIC.len()];
-    // What cannot be read is no shard; whoever opens it will say why.
+    // A file that cannot be read is no shard; opening it reports the reason.
     let read = File::open(file).and_then(|mut file| file.read_exact(&mut head));
     read.is_ok() && head == *MAGIC
 }

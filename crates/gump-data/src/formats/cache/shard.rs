@@ -21,7 +21,7 @@ use super::log;
 use crate::io::stream::io_error;
 use crate::{DataError, Place, write_atomically};
 
-/// What every shard starts with.
+/// The first bytes of every shard.
 pub(super) const MAGIC: &[u8; 8] = b"GUMPDATA";
 /// The version of the layout; other versions are refused, and the source has to be converted again.
 const VERSION: u32 = 1;
@@ -36,7 +36,7 @@ pub(super) struct Shard {
     pub(super) records: Vec<Entry>,
 }
 
-/// Where a record is.
+/// The location of a record in its shard.
 #[derive(Clone)]
 pub(super) struct Entry {
     /// The scenario's id.

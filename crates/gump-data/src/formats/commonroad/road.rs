@@ -162,7 +162,7 @@ fn add_lines(root: &Element, parts: &mut MapParts, report: &mut ReadReport) {
     }
 }
 
-/// Lines have no ids of their own; these are beyond those of lanelets.
+/// First id of lines, which have no ids in the format; beyond those of lanelets.
 const FIRST_LINE_ID: i64 = 1 << 40;
 
 /// Stop signs ("R1-1" in the United States, "206" in Germany) at the stop lines of their lanes.

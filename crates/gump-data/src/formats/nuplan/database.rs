@@ -13,7 +13,7 @@ use super::Token;
 use crate::DataError;
 use crate::io::stream::io_error;
 
-/// What every SQLite file starts with.
+/// The first bytes of every SQLite file.
 pub(super) const MAGIC: &[u8; 16] = b"SQLite format 3\0";
 
 /// An open database and its place, for errors.

@@ -9,7 +9,7 @@ use super::Token;
 use super::log::{Census, Event, Log};
 use crate::DataError;
 
-/// Which events to select. The default selects every tagged event.
+/// A selection of events. The default selects every tagged event.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ScenarioFilter {
     /// Only events of one of these types.

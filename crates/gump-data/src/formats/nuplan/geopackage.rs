@@ -14,7 +14,7 @@ use super::wkb::{self, Shape};
 use crate::error::MAX_COORDINATE;
 use crate::{DataError, ReadReport};
 
-/// Where the layers name the projection of the map.
+/// The layer that names the projection of the map.
 const META: &str = "meta";
 
 /// An open map.

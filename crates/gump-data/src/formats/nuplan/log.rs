@@ -100,7 +100,7 @@ pub struct Event {
 
 impl Event {
     /// The scenario type that nuPlan counts it as when these types are requested: the last of them
-    /// by name, "unknown" if there is none. `None` as filter stands for all types.
+    /// by name, "unknown" if there is none. `None` means all types.
     ///
     /// Source: nuplan-devkit, which takes the largest of the rows that remain after its filter.
     pub fn scenario_type(&self, wanted: Option<&[String]>) -> &str {
@@ -463,7 +463,7 @@ fn kind(category: &str) -> AgentKind {
     }
 }
 
-/// What a log states and a scenario cannot be made of.
+/// Returns the problem for a value of a log that no scenario can be made of.
 pub(super) fn unexpected(expected: &'static str, found: String, place: String) -> Problem {
     Problem::Unexpected {
         expected,

@@ -222,7 +222,7 @@ fn connectors(
     Ok((lanes, stop_lines))
 }
 
-/// What lanes and connectors have in common; `None` without a centre line or an outline.
+/// Builds the part common to lanes and connectors; `None` without a centre line or an outline.
 fn lane<T>(
     outline: &Feature<T>,
     id: i64,
@@ -256,7 +256,7 @@ fn limit(speed_limit: Option<f64>) -> Option<f64> {
     speed_limit.filter(|&limit| limit > 0.0 && limit.is_finite())
 }
 
-/// Connectors know their lanes; lanes learn of their connectors, in the order of these.
+/// Links lanes to the connectors that name them, in the order of the connectors.
 fn link(lanes: &mut [Lane]) {
     let (mut leaving, mut entering) = (BTreeMap::new(), BTreeMap::new());
     for connector in lanes.iter().filter(|lane| lane.in_intersection) {

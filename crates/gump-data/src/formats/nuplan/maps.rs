@@ -31,7 +31,7 @@ const PUBLISHED: [(&str, &str); 4] = [
     ("us-pa-pittsburgh-hazelwood", "9.17.1937"),
 ];
 
-/// How many folders above a log are looked through.
+/// Number of folders searched for maps, from that of the log upwards.
 const MAX_LEVELS: usize = 6;
 
 /// Finds the map of a log.

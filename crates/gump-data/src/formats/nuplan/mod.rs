@@ -83,7 +83,7 @@ fn is_geopackage(head: &[u8]) -> bool {
 }
 
 /// True for a schema without any of a log's tables. A log that lacks one of them is still a log,
-/// and so is a file whose schema cannot be seen: reading it tells what is wrong.
+/// and so is a file whose schema cannot be seen: reading it reports what is wrong.
 fn is_other(head: &[u8]) -> bool {
     let has = |name: &str| {
         head.windows(name.len())
@@ -120,7 +120,7 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
 struct Scenarios {
     log: Log,
     map: Arc<CityMap>,
-    /// What reading the map left out and added, until it is told with the first scenario.
+    /// The report of reading the map, until the first scenario takes it along.
     map_report: Option<ReadReport>,
     events: std::iter::Enumerate<std::vec::IntoIter<Event>>,
     options: ReadOptions,

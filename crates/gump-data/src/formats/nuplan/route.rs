@@ -88,7 +88,8 @@ fn along(map: &MapGraph, stated: &[RoadblockId], ego: Pose) -> Option<Route> {
     })
 }
 
-/// How far the ego is from driving in the middle of a lane, metres; `None` if it is not on it.
+/// Cost of the ego in a lane: its distance from the centre line, metres, plus a penalty for its
+/// heading error; `None` if it is not on the lane.
 fn distance(lane: &Lane, ego: Pose) -> Option<f64> {
     let foot = lane.centerline.project(ego.position);
     let turn = angle_difference(

@@ -116,7 +116,7 @@ impl<'a> Bytes<'a> {
         Ok(point)
     }
 
-    /// As many parts as the count says. Nothing is reserved: a false count ends with the bytes.
+    /// As many parts as the count states. Nothing is reserved: a false count ends with the bytes.
     fn many<T>(
         &mut self,
         little: bool,
@@ -141,7 +141,7 @@ fn kind(code: u32) -> (u32, usize) {
     (kind, 2 + extra)
 }
 
-/// Parts of one kind as one shape; `None` if they differ from what `kind` (4, 5 or 6) says.
+/// Parts of one kind as one shape; `None` if they are not of `kind` (4, 5 or 6).
 fn join(kind: u32, parts: Vec<Shape>) -> Option<Shape> {
     let (mut points, mut lines, mut polygons) = (Vec::new(), Vec::new(), Vec::new());
     for part in parts {

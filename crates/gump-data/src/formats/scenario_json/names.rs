@@ -7,7 +7,7 @@ use gump_geometry::{DVec3, dvec3};
 use crate::complete::track::UNSTATED;
 use crate::io::json::Real;
 
-/// Names as numbers: themselves if they are such, otherwise numbers of their own.
+/// Ids of names: a name that is a number is its own id, others get unique negative ids.
 #[derive(Default)]
 pub(super) struct Names(BTreeMap<String, i64>);
 

@@ -43,10 +43,10 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
-/// What a network is called among the files without scenarios.
+/// The description of a network among the files without scenarios.
 pub(crate) const NETWORK: &str = "SUMO network";
 
-/// How much of a file must be seen to tell what it is; SUMO writes its options in front.
+/// Number of bytes from the start of a file that identify its kind; SUMO writes its options first.
 const HEAD_BYTES: u64 = 16 * 1024;
 
 /// Files of a folder by what they hold.
@@ -194,7 +194,7 @@ impl Folder {
             if !(name.ends_with(".xml") || name.ends_with(".xml.gz")) || !path.is_file() {
                 continue;
             }
-            // A file that cannot be read is none of these; whoever needs it will say so.
+            // A file that cannot be read is none of these; opening it later reports the error.
             let head = stream::head(&path, HEAD_BYTES).unwrap_or_default();
             match root(&head).as_deref() {
                 Some("net") => found.networks.push(path),

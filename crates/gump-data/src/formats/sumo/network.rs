@@ -19,9 +19,9 @@ const DEFAULT_LANE_WIDTH: f64 = 3.2;
 pub struct Network {
     /// Roads in one direction each, junction-internal ones included.
     pub edges: Vec<Edge>,
-    /// Which lane leads to which.
+    /// Connections from lane to lane.
     pub connections: Vec<Connection>,
-    /// Where roads meet.
+    /// Junctions, in which roads meet.
     pub junctions: Vec<Junction>,
 }
 
@@ -194,7 +194,7 @@ fn edge(element: &Element<'_>) -> Result<Option<Edge>, DataError> {
         Some("internal") => EdgeFunction::Internal,
         Some("crossing") => EdgeFunction::Crossing,
         Some("walkingarea") => EdgeFunction::WalkingArea,
-        // Districts and other bookkeeping have no lanes of their own.
+        // Districts and other bookkeeping edges have no lanes.
         Some(_) => return Ok(None),
     };
     let text = |name| Ok::<_, DataError>(element.get(name)?.unwrap_or_default().into_owned());
@@ -218,7 +218,7 @@ fn lane(element: &Element<'_>) -> Result<NetworkLane, DataError> {
     Ok(NetworkLane {
         id: element.need("id")?.into_owned(),
         speed: element.need_number("speed")?,
-        // A width below zero is SUMO's way to say that none is stated.
+        // SUMO writes a negative width if none is stated.
         width: if width > 0.0 {
             width
         } else {
@@ -271,7 +271,7 @@ fn connection(element: &Element<'_>) -> Result<Connection, DataError> {
         let index: usize = element.number(index)?.unwrap_or(0);
         Ok(format!("{}_{index}", element.need(edge)?))
     };
-    // An index of -1 says that the system leaves this connection alone.
+    // An index of -1 means that the system does not control this connection.
     let index = element.number::<i64>("linkIndex")?;
     let index = index.and_then(|index| usize::try_from(index).ok());
     let signal = match (element.get("tl")?, index) {

@@ -76,7 +76,7 @@ impl Roads {
         signal.map_or(&[], Vec::as_slice)
     }
 
-    /// What lies within `radius` metres of any point of `path`: lanes and areas whole, borders
+    /// The features within `radius` metres of any point of `path`: lanes and areas whole, borders
     /// and paint cut to fit.
     pub(super) fn around(&self, path: &[DVec2], radius: f64) -> MapParts {
         let near = Near::new(path, radius);

@@ -310,8 +310,8 @@ impl Scenes {
             snapshot.bodies.get(&id).map(|placed| placed.pose.position)
         };
         let here = placed.pose.position;
-        // Velocity is what the positions say, centred where both neighbours exist; at the present
-        // the next one is not known yet.
+        // Velocities are differences of positions, centred where both neighbours exist; at the
+        // present the next one is not known yet.
         let next = (step != self.now(dt)).then_some(step + 1);
         let velocity = match (at(step.checked_sub(1)), at(next)) {
             (Some(before), Some(after)) => (after - before) / (2.0 * dt),

@@ -9,7 +9,7 @@ use super::roads::Roads;
 use super::xml::Xml;
 use crate::DataError;
 
-/// When each system had which states, a character per signal.
+/// State changes of each system: the time, seconds, and the states, a character per signal.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Signals(BTreeMap<String, Vec<(f64, String)>>);
 

@@ -1,15 +1,15 @@
 //! The drivable surface as overlapping polygons, and its border.
 //!
-//! A network states every lane and junction as a shape of its own. The border of their union is
+//! A network states every lane and junction as a separate shape. The border of their union is
 //! found without clipping polygons: a candidate line is cut into short pieces, and a piece belongs
 //! to the border if the ground just beyond it belongs to no surface.
 
 use gump_geometry::{BoxIndex, DVec2, Polygon, Polyline};
 
-/// Length of the pieces a line is cut into, metres: how finely a border is known.
+/// Length of the pieces a line is cut into, metres: the resolution of a border.
 const PIECE: f64 = 0.5;
-/// How far beyond a line the ground is asked about, metres: gaps narrower than this between
-/// surfaces that were drawn side by side are no border.
+/// Distance beyond a line at which surfaces are looked up, metres: narrower gaps between surfaces
+/// that were drawn side by side are no border.
 const BEYOND: f64 = 0.4;
 /// Stretches shorter than this are left over from joints, metres.
 const SHORTEST: f64 = 1.0;
@@ -21,7 +21,7 @@ pub(super) struct Surfaces {
     boxes: BoxIndex<usize>,
 }
 
-/// What lies beyond a stretch of a line, to the right of its direction.
+/// The ground beyond a stretch of a line, to the right of its direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Beyond {
     /// No surface.

@@ -67,7 +67,7 @@ impl Xml {
         }
     }
 
-    /// Where reading has come to, bytes from the start of the content.
+    /// The position of the reader, bytes from the start of the content.
     pub(super) fn offset(&self) -> u64 {
         self.reader.buffer_position()
     }

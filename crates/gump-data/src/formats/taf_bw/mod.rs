@@ -2,7 +2,7 @@
 //! road as a Lanelet2 map.
 //!
 //! `recorded_trackfiles/PLACE/vehicle_tracks_000.csv` goes with `meta_data.csv` in its folder, which
-//! tells rate and origin, and with `maps/PLACE.osm` two folders up (or beside it). `road` reads the
+//! has rate and origin, and with `maps/PLACE.osm` two folders up (or beside it). `road` reads the
 //! map, `traffic` the tracks. Signals are linked to lanes by a drawing (KML) that is not read.
 //!
 //! Source: the data set's own description, checked on its 27 recordings of three places.
@@ -52,7 +52,7 @@ pub(crate) struct File {
     place: String,
 }
 
-/// What `meta_data.csv` tells.
+/// The content of `meta_data.csv`.
 struct Meta {
     rate_hz: f64,
     /// Latitude and longitude, degrees.

@@ -156,8 +156,8 @@ fn directed(left: &Way, right: &Way, nodes: &BTreeMap<i64, DVec3>) -> [Way; 2] {
 /// other.
 const MAX_LINKS: usize = 16;
 
-/// Lanes go on where bounds end at the nodes at which others begin; they lie side by side where they
-/// share a bound and its direction.
+/// Links lanes: one follows another if its bounds begin at the nodes at which those of the other
+/// end; lanes lie side by side if they share a bound and its direction.
 fn link(lanes: &mut [Lane], bounds: &[(LaneId, [Way; 2])]) {
     type Ends = [Option<i64>; 2];
     let starts =

@@ -64,12 +64,12 @@ impl LiveFuture {
         let decided = future.members.iter().zip(&self.moves);
         let agents = decided.map(|(member, &step)| {
             let next = member.now().then(member.now().pose * step);
-            let told = AgentState {
+            let predicted = AgentState {
                 pose: next.pose,
                 velocity: next.velocity(),
             };
             let driven = ego.filter(|_| member.agent.id == future.scene.ego);
-            member.agent.with_state(driven.unwrap_or(told))
+            member.agent.with_state(driven.unwrap_or(predicted))
         });
         let others = future.others.iter().map(|other| {
             let mut other = *other;
@@ -171,15 +171,15 @@ mod tests {
             let mut ego = scene.ego_now().state;
             for _ in 0..4 {
                 ego.pose.position += DVec2::new(3.0, 0.0);
-                let told = driven.then_some(ego);
-                let ahead = live.decide(&world, told);
+                let assumed = driven.then_some(ego);
+                let ahead = live.decide(&world, assumed);
                 let expected = session
-                    .step(told.as_ref().map(std::slice::from_ref))
+                    .step(assumed.as_ref().map(std::slice::from_ref))
                     .unwrap();
                 assert_eq!(ahead.agents(), expected[0].agents());
                 let moving = ahead.agents().iter().filter(|agent| agent.kind.is_moving());
                 assert_eq!(live.outlooks(&world, 0..2, None).len(), moving.count());
-                assert_eq!(live.go_on(&world, told), expected[0]);
+                assert_eq!(live.go_on(&world, assumed), expected[0]);
             }
         }
     }

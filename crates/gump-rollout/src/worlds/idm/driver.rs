@@ -6,7 +6,7 @@ use rand::Rng as _;
 
 use super::IdmConfig;
 use super::law::{gentle_speed, idm_acceleration};
-use super::obstacles::{Asker, Lead, Obstacle};
+use super::obstacles::{Lead, Observer, Obstacle};
 use super::path::{Path, Stop};
 use super::road::{Road, STANDING};
 
@@ -24,7 +24,7 @@ const ROUTE_REACH: f64 = 5.0;
 /// Path prepared beyond what the driver looks at, so that it is seldom extended, metres.
 const RESERVE: f64 = 100.0;
 
-/// How an agent moves.
+/// Motion of an agent.
 #[derive(Clone, Debug)]
 pub(super) enum Driver {
     /// Along the lane graph.
@@ -50,7 +50,7 @@ pub(super) enum Situation {
     Fixed(Driver),
 }
 
-/// Where a follower gets its path from.
+/// The settings, road and lights from which a follower gets its path.
 #[derive(Clone, Copy)]
 pub(super) struct Ground<'a> {
     pub(super) config: &'a IdmConfig,
@@ -264,7 +264,7 @@ impl Follower {
         own: usize,
         half: f64,
     ) -> f64 {
-        let asker = Asker {
+        let observer = Observer {
             config,
             path: &self.path,
             own,
@@ -272,7 +272,7 @@ impl Follower {
             speed: self.speed,
             lateral: |s| self.place.lateral(s).0,
         };
-        let lead = asker.lead(obstacles);
+        let lead = observer.lead(obstacles);
         let stop = self.stop_line(config, half);
         let most = [lead, stop].into_iter().flatten().max_by(|a, b| {
             let pressure = |lead: &Lead| lead.pressure(config, self.speed);

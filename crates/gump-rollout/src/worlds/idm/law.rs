@@ -52,7 +52,7 @@ pub(super) fn harmless_speed(config: &IdmConfig, speed: f64) -> f64 {
     speed + 2.0 * braking_scale(config) * config.headway
 }
 
-/// The lowest desired speed at which the free road alone asks for no more than comfortable
+/// The lowest desired speed at which the free road alone requires no more than comfortable
 /// braking.
 pub(super) fn gentle_speed(config: &IdmConfig, speed: f64) -> f64 {
     let ratio = 1.0 + config.max_deceleration / config.max_acceleration;
@@ -85,7 +85,7 @@ mod tests {
         check(10.0, f64::INFINITY, 0.0, 0.0);
         // s* = 1 + 7.5 + 5 * (5 - 3) / (2 * 2) = 11.
         check(5.0, 22.0, 3.0, 1.0 - 1.0 / 16.0 - 0.25);
-        // Standing at the standstill gap, and closer, asks for nothing.
+        // Standing at the standstill gap, and closer: no acceleration.
         check(0.0, 1.0, 0.0, 0.0);
         check(0.0, 0.2, 0.0, 0.0);
     }

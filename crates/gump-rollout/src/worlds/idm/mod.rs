@@ -38,11 +38,11 @@ pub struct IdmConfig {
     pub max_acceleration: f64,
     /// Comfortable deceleration `b` of the law, metres per second squared, positive.
     pub max_deceleration: f64,
-    /// How sharply acceleration falls towards the desired speed.
+    /// Exponent of the law: higher values keep acceleration up until nearer the desired speed.
     pub exponent: f64,
     /// Braking limit, metres per second squared, positive; the law itself has none.
     pub emergency_deceleration: f64,
-    /// How far ahead agents and lights are considered, metres.
+    /// Distance ahead within which agents and lights are considered, metres.
     pub look_ahead: f64,
     /// Vehicles slow down for curves to stay below this, metres per second squared.
     pub lateral_acceleration: f64,

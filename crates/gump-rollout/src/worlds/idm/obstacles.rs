@@ -40,7 +40,7 @@ pub(super) struct Lead {
 }
 
 impl Lead {
-    /// How much it restrains: the law brakes with the square of this.
+    /// Strength of the restraint: the law brakes with the square of this.
     pub(super) fn pressure(&self, config: &IdmConfig, speed: f64) -> f64 {
         desired_gap(config, speed, self.speed) / self.gap.max(config.min_gap)
     }
@@ -48,7 +48,7 @@ impl Lead {
 
 /// The vehicle that looks ahead, on its path.
 #[derive(Clone, Copy)]
-pub(super) struct Asker<'a, Lateral> {
+pub(super) struct Observer<'a, Lateral> {
     pub(super) config: &'a IdmConfig,
     pub(super) path: &'a Path,
     /// Index of the vehicle itself among the obstacles.
@@ -59,7 +59,7 @@ pub(super) struct Asker<'a, Lateral> {
     pub(super) lateral: Lateral,
 }
 
-impl<Lateral: Fn(f64) -> f64> Asker<'_, Lateral> {
+impl<Lateral: Fn(f64) -> f64> Observer<'_, Lateral> {
     /// The agent ahead that restrains the vehicle most; `None` on a free road.
     ///
     /// An agent is ahead when its centre is, and in the way when its box, turned into the frame of
@@ -85,8 +85,8 @@ impl<Lateral: Fn(f64) -> f64> Asker<'_, Lateral> {
         worst.map(|(_, lead)| lead)
     }
 
-    /// How far ahead agents are considered: the distance of a comfortable stop, plus the same again
-    /// as a margin.
+    /// Distance ahead within which agents are considered, metres: the distance of a comfortable
+    /// stop, plus the same again as a margin.
     fn reach(&self) -> f64 {
         let config = self.config;
         let stopping = self.speed * self.speed / (2.0 * config.max_deceleration);

@@ -121,7 +121,7 @@ impl Path {
         let mut start = 0.0;
         for lane in lanes.iter().filter_map(|&id| road.lane(id)) {
             let center = lane.centerline.points();
-            // A lane the route leaves sideways ends where its last point comes to lie.
+            // A lane that the route leaves sideways ends at the projection of its last point.
             let end = match center
                 .last()
                 .and_then(|&p| self.project(p, start, f64::INFINITY))
@@ -163,7 +163,7 @@ impl Path {
         }
     }
 
-    /// Notes where the light of `lane`, entered at arc length `start`, asks to stop.
+    /// Records the stop position for the light of `lane`, entered at arc length `start`.
     ///
     /// Without a stop point that is the entry of a lane inside an intersection, else the end.
     fn push_stop(&mut self, lane: &Lane, start: f64, lights: &[Light]) {

@@ -18,7 +18,7 @@ pub(super) const STANDING: f64 = 0.3;
 const ENTERING: f64 = 3.0;
 /// Half the width of the widest lane, metres.
 const WIDEST: f64 = 4.0;
-/// What a radian off the lane's direction costs in metres off its centre when lanes are compared.
+/// Cost of a radian off the lane's direction when lanes are compared, in metres off its centre.
 const METRES_PER_RADIAN: f64 = 3.0;
 /// Lanes that fit this much worse than the best are still within reach, metres.
 const REACH: f64 = 0.5;

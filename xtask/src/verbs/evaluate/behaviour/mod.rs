@@ -24,7 +24,7 @@ use crate::sampling::Sampling;
 use crate::sharding::shard;
 pub(crate) use report::report_merged;
 
-/// How far can be looked, seconds.
+/// The possible horizons, seconds.
 const HORIZONS: [u32; 3] = [8, 30, 60];
 
 /// Arguments of `evaluate behaviour`.

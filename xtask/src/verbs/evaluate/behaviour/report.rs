@@ -127,11 +127,11 @@ pub(super) fn report(
     run.result("set", &settings.scenarios)?;
     run.result("futures", settings.futures)?;
     let rows = worlds.iter().flat_map(|world| rows(world, &log, &keys));
-    run.result_untold("rows", rows.collect::<Vec<_>>())?;
+    run.result_hidden("rows", rows.collect::<Vec<_>>())?;
     // The log replayed is the log, unless the worlds go on for longer.
     let others = worlds.iter().filter(|world| !world.is_same(&log));
     let columns: Vec<&Column> = std::iter::once(&log).chain(others).collect();
-    run.say(&table::text(
+    run.print(&table::text(
         &json!({ "behaviour": lines(&columns, &keys) }),
         run.width(),
     ));

@@ -71,7 +71,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// How a planner is let drive.
+/// Settings of a planner's drives.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Driving {
     /// Seconds to drive; a recording may be shorter
@@ -113,7 +113,7 @@ impl Driving {
         Ok(())
     }
 
-    /// The same for the loop.
+    /// Converts the arguments to a [`DriveConfig`].
     pub(crate) fn config(&self) -> DriveConfig {
         DriveConfig {
             tracking: match self.controller {

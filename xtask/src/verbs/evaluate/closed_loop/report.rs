@@ -65,16 +65,16 @@ pub(super) fn report(
     for name in &settings.worlds {
         let drives = of_world(entries, name);
         let world: WorldName = name.parse().map_err(anyhow::Error::msg)?;
-        let told = drives.iter().map(|drives| row(drives, name, run.seed()));
-        let told: Vec<Value> = told.collect();
+        let world_rows = drives.iter().map(|drives| row(drives, name, run.seed()));
+        let world_rows: Vec<Value> = world_rows.collect();
         if settings.worlds.len() > 1 {
-            run.say(&ranking::table_of(&world, &told, run.width()));
+            run.print(&ranking::table_of(&world, &world_rows, run.width()));
         }
-        rows.extend(told);
+        rows.extend(world_rows);
         let of_row = |row: &PlannerDrives<'_>| -> Vec<Value> {
             let drives = row.drives.iter();
-            let told = drives.map(|(entry, outcome)| tell_one(entry, outcome, &row.planner));
-            told.collect()
+            let values = drives.map(|(entry, outcome)| outcome_row(entry, outcome, &row.planner));
+            values.collect()
         };
         scenarios.extend(drives.iter().flat_map(of_row));
         worlds.push((name.clone(), drives));
@@ -85,7 +85,7 @@ pub(super) fn report(
     run.result("imagination", &settings.imagination)?;
     charts::save(run, "scores", &chart(&rows, &settings.worlds))?;
     run.result("rows", rows)?;
-    ranking::tell(run, &worlds)?;
+    ranking::report(run, &worlds)?;
     run.result("scenarios", &scenarios)?;
     any_succeeded(&scenarios)
 }
@@ -121,8 +121,8 @@ fn of_world<'a>(entries: &'a [Entry<ScenarioDrives>], world: &str) -> Vec<Planne
     others.into_iter().map(|(_, row)| row).collect()
 }
 
-/// Of proposals that were each driven to the end: the one that is best on average, and the best of
-/// every scenario, which no one who does not know the outcome can choose.
+/// Of proposals that were each driven to the end: the one that is best on average, and the best one
+/// of every scenario, which can only be chosen in hindsight.
 fn best_and_oracle(mut alone: Vec<PlannerDrives<'_>>) -> Vec<PlannerDrives<'_>> {
     let average = |drives: &PlannerDrives<'_>| mean(&drives.scores().flatten().collect::<Vec<_>>());
     let value = |drives: &PlannerDrives<'_>| average(drives).unwrap_or(f64::NEG_INFINITY);
@@ -150,22 +150,22 @@ fn best_and_oracle(mut alone: Vec<PlannerDrives<'_>>) -> Vec<PlannerDrives<'_>> 
     vec![best, oracle]
 }
 
-fn tell_one(entry: &Entry<ScenarioDrives>, outcome: &DriveOutcome, planner: &str) -> Value {
-    let mut told = json!({
+fn outcome_row(entry: &Entry<ScenarioDrives>, outcome: &DriveOutcome, planner: &str) -> Value {
+    let mut row = json!({
         "id": entry.id,
         "planner": planner,
         "world": outcome.world,
     });
     if let Some(finished) = &outcome.finished {
-        told["score"] = json!(finished.score);
+        row["score"] = json!(finished.score);
         for (column, metric) in COLUMNS {
-            told[column] = json!(finished.metrics.get(metric));
+            row[column] = json!(finished.metrics.get(metric));
         }
     }
     if let Some(error) = &outcome.error {
-        told["error"] = json!(error);
+        row["error"] = json!(error);
     }
-    told
+    row
 }
 
 /// Every drive that reached its end, as nuPlan's own tables show it.
@@ -198,13 +198,13 @@ fn nuplan_table(worlds: &[(String, Vec<PlannerDrives<'_>>)]) -> gump_data::Table
     nuplan.table()
 }
 
-/// Means over the scenarios that were driven to the end; how many were not stands beside them.
+/// Means over the scenarios that were driven to the end, with the number of those that failed.
 fn row(row: &PlannerDrives<'_>, world: &str, seed: Seed) -> Value {
     let outcomes = row.drives.iter().map(|(_, outcome)| outcome);
     let done: Vec<_> = outcomes.filter_map(|o| o.finished.as_ref()).collect();
     let scores: Vec<f64> = done.iter().map(|finished| finished.score).collect();
     let span = interval(&scores, seed);
-    let mut told = json!({
+    let mut line = json!({
         "planner": row.planner,
         "world": world,
         "scenarios": row.drives.len(),
@@ -215,11 +215,11 @@ fn row(row: &PlannerDrives<'_>, world: &str, seed: Seed) -> Value {
     });
     for (column, metric) in COLUMNS {
         let of_metric = done.iter().filter_map(|f| f.metrics.get(metric).copied());
-        told[column] = json!(mean(&of_metric.collect::<Vec<_>>()));
+        line[column] = json!(mean(&of_metric.collect::<Vec<_>>()));
     }
     let times: Vec<f64> = done.iter().map(|finished| finished.milliseconds).collect();
-    told["milliseconds_per_step"] = json!(mean(&times));
-    told
+    line["milliseconds_per_step"] = json!(mean(&times));
+    line
 }
 
 /// The score of every planner in every world.

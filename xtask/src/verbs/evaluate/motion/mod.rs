@@ -81,7 +81,7 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// What is measured.
+/// Source of the predictions.
 #[derive(Debug, Serialize, clap::Args)]
 #[group(required = true, multiple = false)]
 struct Source {
@@ -93,7 +93,7 @@ struct Source {
     world: Option<WorldName>,
 }
 
-/// Which definition of path shapes.
+/// Definition of path shapes.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum Shapes {
@@ -160,7 +160,7 @@ impl Args {
         drop(progress);
         source.check_all_used(&ids)?;
         let entries = ledger.close()?;
-        left_out.tell(run, entries.len())?;
+        left_out.report(run, entries.len())?;
         report::report(run, &scenarios.name, &entries, &config, source.decoding())
     }
 

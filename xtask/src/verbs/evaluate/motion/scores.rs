@@ -4,7 +4,7 @@ use gump_scene::{AgentId, AgentKind};
 use gump_wosac::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
 use serde::{Deserialize, Serialize};
 
-/// What one scenario got.
+/// Scores of one scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Scores {
     /// Targets that could not be predicted because they were absent.
@@ -34,7 +34,7 @@ struct AtHorizon {
     min_fde: Option<f64>,
     overlaps: bool,
     confidences: Vec<f64>,
-    /// A letter per mode: y if it is what happened, n if not, ? if nobody knows.
+    /// A letter per mode: y if it matches the log, n if not, ? if unknown.
     matches: String,
 }
 

@@ -1,4 +1,4 @@
-//! `evaluate reactions`: the ego leaves its log; who runs into it.
+//! `evaluate reactions`: which agents run into an ego that leaves its log.
 //!
 //! The evaluation is [`gump_eval::reactions`]; `report` sums its results up.
 
@@ -116,11 +116,11 @@ impl Args {
         report::report(run, &settings, &entries)
     }
 
-    /// The manoeuvres asked for, in the order of tables.
+    /// The requested manoeuvres, in the order of tables.
     fn manoeuvres(&self) -> impl Iterator<Item = Manoeuvre> + '_ {
-        let asked =
+        let is_chosen =
             |one: &Manoeuvre| self.manoeuvre.is_empty() || self.manoeuvre.contains(&one.name());
-        Manoeuvre::ALL.into_iter().filter(asked)
+        Manoeuvre::ALL.into_iter().filter(is_chosen)
     }
 
     fn settings(

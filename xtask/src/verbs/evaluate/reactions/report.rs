@@ -44,7 +44,7 @@ struct Sum {
     log: f64,
     struck: f64,
     at_fault: f64,
-    /// Of manoeuvres in which somebody runs into the ego where the log is replayed.
+    /// Number of manoeuvres in which an agent runs into the ego where the log is replayed.
     pressed_scenes: f64,
     pressed: f64,
 }
@@ -216,18 +216,18 @@ pub(super) fn report(
     run.result("set", &settings.scenarios)?;
     run.result("futures", settings.futures)?;
     let rows: Vec<Value> = lines.iter().map(Line::row).collect();
-    run.result_untold("rows", rows)?;
-    run.result_untold("not_scored", not_scored(settings, entries))?;
-    run.result_untold("cases", cases(settings, entries))?;
+    run.result_hidden("rows", rows)?;
+    run.result_hidden("not_scored", not_scored(settings, entries))?;
+    run.result_hidden("cases", cases(settings, entries))?;
     let shown: Vec<Value> = lines.iter().map(Line::shown).collect();
-    run.say(&table::text(&json!({ "reactions": shown }), run.width()));
+    run.print(&table::text(&json!({ "reactions": shown }), run.width()));
     let missing = json!({ "not scored": not_scored(settings, entries) });
-    run.say(&table::text(&missing, run.width()));
+    run.print(&table::text(&missing, run.width()));
     left_out(run, entries)?;
     charts::save(run, "reactions", &chart(settings, &names, &lines))
 }
 
-/// How often a manoeuvre is not scored, and why.
+/// Counts of manoeuvres that are not scored, by reason.
 fn not_scored(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>]) -> Vec<Value> {
     let tried = || entries.iter().flat_map(|entry| &entry.scores.tried);
     let mut rows = Vec::new();
@@ -243,7 +243,7 @@ fn not_scored(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>])
     rows
 }
 
-/// Everybody that ran into the ego, for whoever wants to look.
+/// All agents that ran into the ego, for inspection.
 fn cases(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>]) -> Vec<Value> {
     let mut rows = Vec::new();
     for entry in entries {
@@ -276,7 +276,7 @@ fn left_out(run: &mut Run, entries: &[Entry<ScenarioReactions>]) -> anyhow::Resu
     let whys: Vec<String> = entries.iter().filter_map(why).collect();
     if let Some(first) = whys.first() {
         run.result("left_out", &whys)?;
-        run.say(&format!("{} scenarios are left out: {first}", whys.len()));
+        run.print(&format!("{} scenarios are left out: {first}", whys.len()));
     }
     Ok(())
 }

@@ -108,23 +108,23 @@ impl YearName {
     }
 }
 
-/// What the scores of a scenario depend on, beside the scenario.
+/// Everything but the scenario that the scores of a scenario depend on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Settings {
-    /// What is evaluated: a world or "rollouts".
+    /// The world under evaluation, or "rollouts".
     pub(crate) world: String,
     pub(crate) year: String,
-    /// How many rollouts a world imagines.
+    /// Number of rollouts that a world simulates per scenario.
     pub(crate) rollouts_per_scenario: usize,
     /// The set, without the folders that differ between machines.
     pub(crate) scenarios: String,
     rollouts: String,
-    /// How a learned world decodes, as JSON.
+    /// Sampling of a learned world, as JSON.
     sampling: String,
     seed: String,
 }
 
-/// What one agent cost in one scenario, as it is written.
+/// Loss of score due to one agent in one scenario, as written to the files.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Explained {
     scenario: String,
@@ -200,7 +200,7 @@ impl Args {
             Ok(())
         })?;
         let entries = ledger.close()?;
-        left_out.tell(run, entries.len())?;
+        left_out.report(run, entries.len())?;
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {shard}, found none: {}",
@@ -216,20 +216,20 @@ impl Args {
                 "note: expected {CHALLENGE} rollouts per scenario, as the challenge asks for, \
                  found {fewest}: scores of other numbers of rollouts do not compare"
             );
-            run.say(&note);
-            run.result_untold("note", note)?;
+            run.print(&note);
+            run.result_hidden("note", note)?;
         }
         if self.explain {
             run.result("explain", &explained)?;
             tabulate(run)?;
         }
         if let Some(worst) = worst {
-            worst.tell(run)?;
+            worst.report(run)?;
         }
         Ok(())
     }
 
-    /// Where rollouts come from, once for each decoding; at least one.
+    /// The sources of rollouts, one per decoding; at least one.
     fn sources(&self, run: &mut Run) -> anyhow::Result<Vec<RolloutSource>> {
         match (&self.world, &self.rollouts) {
             (_, Some(path)) => {
@@ -315,7 +315,7 @@ pub(crate) fn rollouts(
     Ok(source.rollouts(run.device(), recorded, mode, &progress)?)
 }
 
-/// Writes what a scenario's score lacks, and keeps the largest attributions of all scenarios.
+/// Writes the attributions of a scenario's lost score, and keeps the largest of all scenarios.
 fn note(
     log: &mut std::fs::File,
     scenario: &str,
@@ -348,7 +348,7 @@ fn note(
     Ok(())
 }
 
-/// Writes all that was noted as a table.
+/// Writes all rows of `explain.jsonl` as a table.
 fn tabulate(run: &Run) -> anyhow::Result<()> {
     let noted = std::fs::read_to_string(run.path("explain.jsonl"))?;
     let rows = noted.lines().map(serde_json::from_str);
@@ -356,7 +356,7 @@ fn tabulate(run: &Run) -> anyhow::Result<()> {
     Ok(tables::of_rows(&rows).write(&run.path("agents.parquet"))?)
 }
 
-/// True if the challenge's second of past and eight of future are not what the log has.
+/// Whether the log does not have the challenge's second of past and eight seconds of future.
 fn is_of_another_length(error: &anyhow::Error) -> bool {
     let found = error.downcast_ref().map(EvalError::cause);
     matches!(found, Some(EvalError::Realism(WosacError::Clock { .. })))

@@ -33,8 +33,8 @@ pub(crate) fn report_merged(
     report(run, &settings, &entries)
 }
 
-/// A world under one decoding: what it got in every scenario.
-struct Told {
+/// A world under one decoding, with its scores in every scenario.
+struct WorldScores {
     world: String,
     decoding: String,
     /// Of all rollouts, where they were imagined.
@@ -42,8 +42,8 @@ struct Told {
     scores: Vec<Scores>,
 }
 
-impl Told {
-    /// What it is called beside the others.
+impl WorldScores {
+    /// Its label in tables and charts.
     fn label(&self) -> String {
         Decoding::label(&self.world, &self.decoding)
     }
@@ -53,31 +53,31 @@ impl Told {
     }
 }
 
-/// What is evaluated in every decoding, then the log and the baseline.
-fn told(settings: &Settings, entries: &[Entry<ScenarioScores>]) -> Vec<Told> {
+/// Scores of the evaluated world in every decoding, then of the log and of the baseline.
+fn world_scores(settings: &Settings, entries: &[Entry<ScenarioScores>]) -> Vec<WorldScores> {
     let decodings = entries.first().map_or(&[][..], |e| &e.scores.evaluated);
     let evaluated = decodings.iter().enumerate().map(|(i, first)| {
         let of = entries.iter().filter_map(|e| e.scores.evaluated.get(i));
         let digests = of.clone().filter_map(|found| found.digest.as_deref());
-        Told {
+        WorldScores {
             world: settings.world.clone(),
             decoding: first.decoding.clone(),
             digest: digest::of_digests(digests),
             scores: of.map(|found| found.scores.clone()).collect(),
         }
     });
-    let other = |world: &str, pick: fn(&ScenarioScores) -> &Scores| Told {
+    let other = |world: &str, pick: fn(&ScenarioScores) -> &Scores| WorldScores {
         world: world.into(),
         decoding: Decoding::NONE.into(),
         digest: None,
         scores: entries.iter().map(|e| pick(&e.scores).clone()).collect(),
     };
-    let mut told: Vec<Told> = evaluated.collect();
-    told.push(other(ORACLE, |scored| &scored.oracle));
+    let mut all: Vec<WorldScores> = evaluated.collect();
+    all.push(other(ORACLE, |scored| &scored.oracle));
     if settings.world != CONSTANT_VELOCITY {
-        told.push(other(CONSTANT_VELOCITY, |scored| &scored.constant_velocity));
+        all.push(other(CONSTANT_VELOCITY, |scored| &scored.constant_velocity));
     }
-    told
+    all
 }
 
 /// Totals, intervals and the time it took.
@@ -86,7 +86,7 @@ pub(crate) fn report(
     settings: &Settings,
     entries: &[Entry<ScenarioScores>],
 ) -> anyhow::Result<()> {
-    let worlds = told(settings, entries);
+    let worlds = world_scores(settings, entries);
     per_scenario(settings, entries, &worlds).write(&run.path("scores.parquet"))?;
     run.result("set", &settings.scenarios)?;
     run.result("scenarios", entries.len())?;
@@ -113,7 +113,7 @@ pub(crate) fn report(
     let undefined = entries.iter().filter(is_undefined);
     let undefined: Vec<&str> = undefined.map(|entry| entry.id.as_str()).collect();
     if let Some(first) = undefined.first() {
-        run.say(&format!(
+        run.print(&format!(
             "warning: {} scenarios have a component without any valid step, {first} for one; \
              as in the reference their scores and the means are no numbers",
             undefined.len()
@@ -147,16 +147,20 @@ fn row((world, decoding): (&str, &str), year: &str, scenarios: usize, scores: &S
 }
 
 /// A row per world and scenario, in the order of the worlds.
-fn per_scenario(settings: &Settings, entries: &[Entry<ScenarioScores>], worlds: &[Told]) -> Table {
+fn per_scenario(
+    settings: &Settings,
+    entries: &[Entry<ScenarioScores>],
+    worlds: &[WorldScores],
+) -> Table {
     let rows = worlds.iter().flat_map(|world| {
         entries
             .iter()
             .zip(&world.scores)
             .map(move |(entry, scores)| {
-                let mut told = world.row(&settings.year, scores, 1);
-                told["scenario_id"] = json!(entry.id);
-                told["index"] = json!(entry.index);
-                told
+                let mut row = world.row(&settings.year, scores, 1);
+                row["scenario_id"] = json!(entry.id);
+                row["index"] = json!(entry.index);
+                row
             })
     });
     tables::of_rows(&rows.collect::<Vec<_>>())

@@ -1,4 +1,5 @@
-//! Who is to be looked at first: what agents cost a score, and what they do in the rollouts.
+//! The agents to look at first: the score lost because of them, and their behaviour in the
+//! rollouts.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +11,7 @@ use serde_json::{Value, json};
 use crate::run::Run;
 use crate::tables;
 
-/// How far the challenge looks, seconds.
+/// Horizon of the challenge, seconds.
 const HORIZON_S: u32 = 8;
 /// Agents shown in the report.
 const N_SHOWN: usize = 20;
@@ -24,12 +25,12 @@ pub(super) struct Worst {
 struct Row {
     scenario: String,
     judged: Judged,
-    /// What realism lacks because of the agent, over all components.
+    /// Realism lost because of the agent, over all components.
     cost: f64,
 }
 
 impl Worst {
-    /// Adds the agents of one scenario: those who are scored, and those who do what no driver would.
+    /// Adds the agents of one scenario that are scored or do something that no driver would.
     pub(super) fn add(
         &mut self,
         scenario: &Scenario,
@@ -57,12 +58,12 @@ impl Worst {
     }
 
     /// Writes all as a table and the worst into the report.
-    pub(super) fn tell(mut self, run: &mut Run) -> anyhow::Result<()> {
+    pub(super) fn report(mut self, run: &mut Run) -> anyhow::Result<()> {
         self.rows.sort_by(|a, b| {
             let order = a.judged.plausibility.total_cmp(&b.judged.plausibility);
             order.then(b.cost.total_cmp(&a.cost))
         });
-        let rows: Vec<Value> = self.rows.iter().map(Row::tell).collect();
+        let rows: Vec<Value> = self.rows.iter().map(Row::to_json).collect();
         if !rows.is_empty() {
             tables::of_rows(&rows).write(&run.path("conduct.parquet"))?;
         }
@@ -71,7 +72,7 @@ impl Worst {
 }
 
 impl Row {
-    fn tell(&self) -> Value {
+    fn to_json(&self) -> Value {
         let Judged {
             conduct,
             realism,
