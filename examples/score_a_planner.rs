@@ -16,12 +16,12 @@ impl Driver for Cruise {
         "cruise"
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let speed = moment.ego.speed();
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+        let speed = input.ego.speed();
         let states = (0..=40).map(|i| EgoState {
-            time_us: moment.ego.time_us + 100_000 * i,
-            rear_axle: moment.ego.rear_axle * Pose::new(0.1 * speed * i as f64, 0.0, 0.0),
-            ..*moment.ego
+            time_us: input.ego.time_us + 100_000 * i,
+            rear_axle: input.ego.rear_axle * Pose::new(0.1 * speed * i as f64, 0.0, 0.0),
+            ..*input.ego
         });
         Ok(Trajectory::new(states.collect())?)
     }

@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use gump::prelude::*;
-use gump::viz::{Camera, FilmSpec, Take, grid_film, log_as_rollout};
+use gump::viz::{Camera, FilmSpec, LabelledRollout, grid_film, log_as_rollout};
 
 const DATASETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../datasets");
 
@@ -33,14 +33,19 @@ fn main() -> anyhow::Result<()> {
 
     // The log, in the form in which futures come, and the futures beside it.
     let log = log_as_rollout(&scenario);
-    let mut takes = vec![Take {
+    let mut takes = vec![LabelledRollout {
         rollout: &log,
         label: "log".into(),
     }];
-    takes.extend(futures.iter().enumerate().map(|(k, rollout)| Take {
-        rollout,
-        label: format!("future {}", k + 1),
-    }));
+    takes.extend(
+        futures
+            .iter()
+            .enumerate()
+            .map(|(k, rollout)| LabelledRollout {
+                rollout,
+                label: format!("future {}", k + 1),
+            }),
+    );
     let spec = FilmSpec {
         columns: 2,
         ..FilmSpec::new(Camera::on_ego(&scene, 90.0, 400, 400))

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use gump_scene::{Rollout, Scenario};
-use gump_viz::{Film, FilmSpec, Take, can_encode_mp4, grid_film, log_as_rollout};
+use gump_viz::{Film, FilmSpec, LabelledRollout, can_encode_mp4, grid_film, log_as_rollout};
 use serde::Serialize;
 
 use crate::cli::WrongArguments;
@@ -124,7 +124,7 @@ fn beside_log(
     let takes: Vec<_> = known
         .into_iter()
         .chain(futures.iter().copied())
-        .map(|(label, rollout)| Take {
+        .map(|(label, rollout)| LabelledRollout {
             rollout,
             label: label.into(),
         })

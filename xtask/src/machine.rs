@@ -32,7 +32,7 @@ impl Machine {
             cores: cores(),
             memory_gb: kib.map(|kib| (kib * 1024.0 / 1e8).round() / 10.0),
             device: device.into(),
-            kernel: Choice::made().clone(),
+            kernel: Choice::current().clone(),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
         }
     }

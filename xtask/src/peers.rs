@@ -13,7 +13,7 @@ pub(crate) fn together<T>(work: impl FnOnce(&Processes) -> anyhow::Result<T>) ->
     let done = work(&processes);
     #[cfg(feature = "mpi")]
     if done.is_err() {
-        processes.desert();
+        processes.abort();
     }
     done
 }

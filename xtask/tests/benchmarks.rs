@@ -177,9 +177,9 @@ fn recordings_of_another_length_are_left_out_by_name_and_egos_chosen_where_none_
     let words = realism("datasets/mini/ngsim-peachtree.tfrecord.gz");
     let found = results(&folder, &words, "out");
     assert_eq!(found["scenarios"], 1);
-    let left_out = found["left_out"].as_array().unwrap();
-    assert_eq!(left_out.len(), 1);
-    let why = left_out[0].as_str().unwrap();
+    let exclusions = found["left_out"].as_array().unwrap();
+    assert_eq!(exclusions.len(), 1);
+    let why = exclusions[0].as_str().unwrap();
     assert!(
         why.contains("USA_Peach-4_8_T-1: expected at least"),
         "{why}"
@@ -675,13 +675,13 @@ fn a_network_reacts_with_its_rules_and_alone() {
     );
     let found = results(&folder, &words, "out");
     let rows = found["rows"].as_array().unwrap().iter();
-    let ways: Vec<_> = rows
+    let categories: Vec<_> = rows
         .map(|row| (&row["decoding"], &row["manoeuvre"]))
         .collect();
     let [stop, all] = ["stop", "all"].map(Value::from);
     let [ruled, raw] = ["ruled", "raw"].map(Value::from);
     assert_eq!(
-        ways,
+        categories,
         [(&ruled, &stop), (&ruled, &all), (&raw, &stop), (&raw, &all)]
     );
 }

@@ -266,9 +266,9 @@ fn realism_is_told_of_the_network_alone_beside_what_rules_make_of_it() {
         (rows, names, results["intervals"][0].clone(), found)
     };
     let yardsticks = ["logged-oracle -", "constant-velocity -"].map(String::from);
-    let named = |ways: &[&str]| {
-        let ways = ways.iter().map(|way| format!("{world} {way}"));
-        ways.chain(yardsticks.clone()).collect::<Vec<_>>()
+    let named = |categories: &[&str]| {
+        let categories = categories.iter().map(|way| format!("{world} {way}"));
+        categories.chain(yardsticks.clone()).collect::<Vec<_>>()
     };
     let (both, names, intervals, drawn) = rows("");
     assert_eq!(names, named(&["ruled", "raw"]));

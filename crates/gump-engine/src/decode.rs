@@ -161,7 +161,7 @@ impl Step<'_> {
             let requests: Vec<&Request> = requests.iter().collect();
             Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
         };
-        let Ok(()) = Clearance::new(self.windows, self.sampling).settle(&mut decoded, again);
+        let Ok(()) = Clearance::new(self.windows, self.sampling).resolve(&mut decoded, again);
         let watched = self.windows.iter().take(self.watch.futures).enumerate();
         let watched =
             watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
@@ -223,10 +223,10 @@ impl Step<'_> {
                 let requests: Vec<&Request> = requests.iter().collect();
                 Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
             };
-            let Ok(()) = clearance.settle(&mut decoded, again);
+            let Ok(()) = clearance.resolve(&mut decoded, again);
             for (&w, request) in members.iter().zip(requests) {
                 let bins = &decoded[w][i];
-                let settled = request.settle(bins, self.sampling);
+                let settled = request.resolve(bins, self.sampling);
                 let slots = &mut self.placed[w];
                 let value = slots.len() - 2 * (self.windows[w].next.tracked.len() - i) + 1;
                 slots[value].slot = Slot::Value(request.settled_state(bins, settled));

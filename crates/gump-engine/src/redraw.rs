@@ -38,7 +38,7 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
     /// Redraws, up to `config.redraws` times, those of the objects added to `decoded` since the
     /// last call that are not clear; earlier ones stay. `draw` decodes the objects that it is
     /// given, each by its window and its index there.
-    pub(crate) fn settle<E>(
+    pub(crate) fn resolve<E>(
         &mut self,
         decoded: &mut [Vec<Bins>],
         mut draw: impl FnMut(&[(usize, usize)], &[Request]) -> Result<Vec<Bins>, E>,
@@ -97,7 +97,7 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
 /// The future positions of an object, scene frame.
 fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
     let poses = request.anchor.poses(bins);
-    let first = request.settle(bins, config).pose;
+    let first = request.resolve(bins, config).pose;
     way(request.from(), [first, poses[1], poses[2]])
 }
 

@@ -156,7 +156,7 @@ impl Group<'_> {
             .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
             .collect();
         let mut clearance = Clearance::new(&self.windows, passes.sampling);
-        clearance.settle(&mut decoded, |who, requests| {
+        clearance.resolve(&mut decoded, |who, requests| {
             let rows = who.iter().map(|(w, i)| (firsts[*w] + i) as u32);
             let rows = Tensor::from_iter(rows, keys.device())?;
             let keys = keys.index_select(&rows, 0)?;
@@ -191,14 +191,14 @@ impl Group<'_> {
             for (decoded, bins) in decoded.iter_mut().zip(bins) {
                 decoded.push(bins);
             }
-            clearance.settle(&mut decoded, |who, requests| {
+            clearance.resolve(&mut decoded, |who, requests| {
                 let rows = who.iter().map(|(row, _)| *row as u32);
                 let rows = Tensor::from_iter(rows, at_key.device())?;
                 let at_key = at_key.index_select(&rows, 0)?;
                 sample_states(passes.network, &at_key, requests, passes.sampling)
             })?;
             for ((row, decoded), request) in rows.iter_mut().zip(&decoded).zip(&requests) {
-                let settled = request.settle(&decoded[i], passes.sampling);
+                let settled = request.resolve(&decoded[i], passes.sampling);
                 row[key + 1].slot = Slot::Value(request.settled_state(&decoded[i], settled));
                 row[key + 1].exact = row[key].exact.map(|like| like.with_state(settled));
             }

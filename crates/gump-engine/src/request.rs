@@ -67,7 +67,7 @@ impl Request {
 
     /// The final state of a decoded object: sampled, averaged over chunks, within its limits, with
     /// a consistent velocity; scene frame, not quantised.
-    pub(crate) fn settle(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
+    pub(crate) fn resolve(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
         let decoded = AgentState {
             pose: self.anchor.poses(bins)[0],
             velocity: self.anchor.velocity(bins),

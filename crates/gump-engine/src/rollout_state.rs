@@ -197,7 +197,7 @@ impl Future {
                 ring.clear();
             }
             ring.push(self.index, request.anchor.poses(bins));
-            let settled = request.settle(bins, sampling);
+            let settled = request.resolve(bins, sampling);
             agent.state = request.settled_state(bins, settled);
             let state = AgentState {
                 pose: scene.world_from_scene * settled.pose,

@@ -193,7 +193,7 @@ impl TransformerSession<'_> {
             &window.requests[seen.place],
         );
         let draws = seen.bins.iter().map(|bins| {
-            let settled = request.settle(bins, self.world.sampling());
+            let settled = request.resolve(bins, self.world.sampling());
             AgentState {
                 pose: scene.world_from_scene * settled.pose,
                 velocity: scene.world_from_scene.rotate(settled.velocity),

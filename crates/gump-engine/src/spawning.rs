@@ -65,13 +65,13 @@ impl TransformerSession<'_> {
         let mut placed = present_all(windows, block_size)?;
         let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
         self.draw_lights(engine, windows, &mut placed, &mut contexts);
-        self.take_out(engine, windows, &placed, &mut contexts);
+        self.despawn(engine, windows, &placed, &mut contexts);
         Ok(())
     }
 
     /// Decides for every tracked agent except the ego whether it is still present; agents in view
     /// always are.
-    fn take_out(
+    fn despawn(
         &self,
         engine: &Engine,
         windows: &mut [Window],
@@ -185,7 +185,7 @@ impl TransformerSession<'_> {
                     None => open.retain(|open| *open != f),
                 }
             }
-            self.let_in(engine, &mut contexts, &mut open, coming, frames)?;
+            self.spawn(engine, &mut contexts, &mut open, coming, frames)?;
             if open.is_empty() {
                 break;
             }
@@ -224,7 +224,7 @@ impl TransformerSession<'_> {
 
     /// Draws the states of new agents; an agent without a valid position is dropped, and no other
     /// enters in that frame.
-    fn let_in(
+    fn spawn(
         &mut self,
         engine: &Engine,
         contexts: &mut [Context],

@@ -500,7 +500,8 @@ fn surrogates_that_are_right_give_full_autoregression() {
     assert_eq!(full[0], guessed[0], "the first object sees no surrogate");
     let agents = window.next.tracked.iter_mut().zip(&window.requests);
     for ((agent, request), bins) in agents.zip(&full) {
-        agent.state = request.settled_state(bins, request.settle(bins, &SamplingConfig::default()));
+        agent.state =
+            request.settled_state(bins, request.resolve(bins, &SamplingConfig::default()));
     }
     assert_eq!(run(Mode::PartialAr, &window), full);
 }

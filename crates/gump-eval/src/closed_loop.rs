@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use gump_nuplan::closed_loop::{DriveConfig, Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{DriveConfig, Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score, evaluate};
 use gump_planner::{Explain, PdmClosed, PdmConfig, ProposalKind};
@@ -386,13 +386,13 @@ impl Driver for StoppableDriver<'_> {
         self.inner.name()
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.inner.start(initialization)
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         self.monitor.check()?;
-        self.inner.drive(moment)
+        self.inner.drive(input)
     }
 }
 

@@ -22,7 +22,8 @@
 //! * [`recordings`]: recordings to drive in, from any readable file, including nuPlan's logs.
 //! * [`results`]: results by scenario, in a file from which interrupted runs resume and shards of
 //!   one evaluation are merged; [`shard`]: the assignment of scenarios to shards.
-//! * [`rollout_files`]: files of futures given by path.
+//! * [`Exclusions`]: scenarios that a benchmark is not defined on; [`rollout_files`]: files of futures
+//!   given by path.
 //!
 //! Metrics, worlds and planners are in their own crates; arguments, progress, tables and charts are
 //! in `xtask`, which follows long work through a [`Monitor`].
@@ -46,6 +47,7 @@ pub mod datasets;
 pub mod decoding;
 pub mod digest;
 mod error;
+mod exclusions;
 pub mod fresh;
 pub mod generation;
 pub mod imagine;
@@ -65,4 +67,5 @@ pub mod training_set;
 pub mod worlds;
 
 pub use error::EvalError;
+pub use exclusions::Exclusions;
 pub use monitor::Monitor;

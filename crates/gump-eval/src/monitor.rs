@@ -30,6 +30,17 @@ pub trait Monitor: Sync {
     }
 }
 
+/// The monitor of a simulation of so many frames; `None` where nothing is simulated.
+pub(crate) fn simulating<'a>(
+    monitor: &'a dyn Monitor,
+    frames: Option<u64>,
+) -> Box<dyn Monitor + 'a> {
+    match frames {
+        Some(frames) => monitor.part("simulating", frames, "frames"),
+        None => Box::new(Uncounted(monitor)),
+    }
+}
+
 /// A part of the work whose units are not counted.
 struct Uncounted<'a, M: ?Sized>(&'a M);
 

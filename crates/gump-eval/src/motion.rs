@@ -4,20 +4,26 @@
 //! The metrics are in `gump-wosac`.
 
 mod files;
+mod scores;
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use gump_data::{DataError, ScenarioRecord};
 use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_model::{Device, checkpoint, relative};
 use gump_scene::{AgentId, PredictedMode, Prediction, Scenario, Seed};
-use gump_wosac::motion::{MotionConfig, forecast};
+use gump_wosac::motion::{MotionConfig, evaluate_predictions, forecast};
 
 use self::files::Predictions;
 use crate::decoding::Decoding;
 use crate::imagine::{frames, imagine};
+use crate::monitor::simulating;
+use crate::results::{Entry, ResultStore};
 use crate::worlds::{WorldName, Worlds};
-use crate::{EvalError, Monitor, digest};
+use crate::{EvalError, Exclusions, Monitor, digest};
+
+pub use self::scores::ScenarioPredictions;
 
 /// A source of predictions.
 pub struct PredictionSource<'a>(Kind<'a>);
@@ -165,6 +171,57 @@ impl<'a> PredictionSource<'a> {
             predictions,
             digest,
         })
+    }
+
+    /// Scores the predictions of those of `records` that the store wants, and adds them to it; the
+    /// monitor counts scenarios. Scenarios of another length or rate are excluded.
+    ///
+    /// # Errors
+    /// The first scenario that cannot be read, predicted or scored, files with predictions of
+    /// scenarios that are not there, or [`EvalError::StoppedAndStored`].
+    pub fn fill(
+        &mut self,
+        store: &mut ResultStore<ScenarioPredictions>,
+        records: impl Iterator<Item = Result<ScenarioRecord, DataError>>,
+        config: &MotionConfig,
+        monitor: &dyn Monitor,
+    ) -> Result<Exclusions, EvalError> {
+        let (mut ids, mut exclusions) = (BTreeSet::new(), Exclusions::default());
+        for (index, record) in records.enumerate() {
+            if monitor.is_stopped() {
+                let from = format!("from scenario {index} on");
+                return Err(EvalError::StoppedAndStored { from });
+            }
+            let mut scenario = record?.scenario;
+            ids.insert(scenario.id.clone());
+            if !store.is_wanted(index) {
+                continue;
+            }
+            let scores = self.score(&mut scenario, index, config, monitor);
+            if let Some(scores) = exclusions.sift(scores)? {
+                let id = scenario.id;
+                store.add(Entry { index, id, scores })?;
+                monitor.advance(1);
+            }
+        }
+        self.check_all_used(&ids)?;
+        Ok(exclusions)
+    }
+
+    /// Predicts a scenario, which is the `index`-th, without its absent targets, and scores it.
+    fn score(
+        &mut self,
+        scenario: &mut Scenario,
+        index: usize,
+        config: &MotionConfig,
+        monitor: &dyn Monitor,
+    ) -> Result<ScenarioPredictions, EvalError> {
+        let absent = self.drop_absent(scenario);
+        let frames = self.frames(scenario, config);
+        let monitor = simulating(monitor, frames);
+        let predicted = self.predict(scenario, index, config, &*monitor)?;
+        let scores = evaluate_predictions(scenario, &predicted.predictions, config)?;
+        Ok(ScenarioPredictions::new(&scores, absent, predicted.digest))
     }
 
     /// Refuses files with predictions of scenarios that are not among `ids`.

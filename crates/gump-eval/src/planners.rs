@@ -10,12 +10,14 @@ use std::time::{Duration, Instant};
 
 use gump_engine::{CacheMode, SamplingConfig};
 use gump_model::Device;
-use gump_nuplan::closed_loop::{Driver, Imagined, Mission, Moment, Replayed, Traffic};
+use gump_nuplan::closed_loop::{
+    Driver, Imagined, PlannerInitialization, PlannerInput, Replayed, Traffic,
+};
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{
     Aggregate, Allocation, Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig,
-    LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, Worth,
+    LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, ValueEstimate,
 };
 use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
@@ -203,9 +205,9 @@ impl PlannerConfig {
             hysteresis: self.hysteresis,
             seed,
             replan_every: self.replan_every,
-            worth: self
-                .discount
-                .map_or(Worth::Rollout, |gamma| Worth::DiscountedStep { gamma }),
+            worth: self.discount.map_or(ValueEstimate::Rollout, |gamma| {
+                ValueEstimate::DiscountedStep { gamma }
+            }),
             budget: PlanBudget {
                 nearest: self.nearest,
                 horizon: self.horizon,
@@ -325,13 +327,13 @@ impl Driver for TimedDriver<'_> {
         self.inner.name()
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.inner.start(initialization)
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let began = Instant::now();
-        let plan = self.inner.drive(moment);
+        let plan = self.inner.drive(input);
         let took = began.elapsed();
         self.spent += took;
         self.steps += 1;

@@ -31,15 +31,19 @@
 mod recordings;
 mod rollouts;
 
+use std::path::PathBuf;
 use std::time::Instant;
 
+use gump_model::Device;
 use gump_rollout::worlds::ConstantVelocity;
-use gump_rollout::{SimulateConfig, Start, simulate};
+use gump_rollout::{BoxError, SimulateConfig, Start, simulate};
 use gump_scene::Seed;
 use gump_wosac::realism::{Config, Evaluation, Mode, Reference, Rollouts, Scores};
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
+use crate::monitor::simulating;
+use crate::results::{Entry, ResultStore};
+use crate::{EvalError, Exclusions, Monitor};
 
 pub use recordings::{Recorded, Recordings, recordings};
 pub use rollouts::{FoundRollouts, RolloutSource};
@@ -67,6 +71,105 @@ pub struct DecodingScores {
     pub digest: Option<String>,
     /// Of the rollouts.
     pub scores: Scores,
+}
+
+/// An evaluation of all scenarios of a set.
+pub struct RealismEvaluation<'a> {
+    /// The metric.
+    pub config: &'a Config,
+    /// Rollouts of each scenario.
+    pub n_rollouts: usize,
+    /// Where learned worlds run.
+    pub device: &'a Device,
+}
+
+/// Rollouts that were just scored, for [`RealismEvaluation::fill`]'s visitor.
+pub struct VisitedRollouts<'a> {
+    /// Position of their source.
+    pub source: usize,
+    /// The scenario.
+    pub recorded: &'a Recorded,
+    /// The rollouts.
+    pub found: &'a FoundRollouts,
+    /// Their evaluation.
+    pub evaluation: &'a Evaluation<'a>,
+}
+
+impl RealismEvaluation<'_> {
+    /// Scores those scenarios of `paths` that the store wants, with rollouts of every source, and
+    /// adds them to it; the monitor counts scenarios. Scenarios of another length or rate than the
+    /// challenge's are excluded.
+    ///
+    /// # Errors
+    /// No source, a first path without scenarios, the first scenario that cannot be read, simulated
+    /// or scored, an error of the visitor, or [`EvalError::StoppedAndStored`].
+    pub fn fill(
+        &self,
+        store: &mut ResultStore<ScenarioScores>,
+        paths: &[PathBuf],
+        sources: &mut [RolloutSource],
+        monitor: &dyn Monitor,
+        visit: &mut dyn FnMut(VisitedRollouts<'_>) -> Result<(), BoxError>,
+    ) -> Result<Exclusions, EvalError> {
+        let none = || EvalError::Argument("expected a source of rollouts, found none".into());
+        let options = sources.first().ok_or_else(none)?.read_options();
+        let (done, shard) = (store.indices(), store.shard());
+        let wanted = move |index| shard.holds(index) && !done.contains(&index);
+        let mut exclusions = Exclusions::default();
+        for recorded in recordings(paths, options, wanted)? {
+            let scored = recorded.and_then(|recorded| {
+                let scores = self.score(&recorded, sources, monitor, visit)?;
+                Ok((recorded, scores))
+            });
+            let Some((recorded, scores)) = exclusions.sift(scored)? else {
+                continue;
+            };
+            let (index, id) = (recorded.index, recorded.log.scenario);
+            store.add(Entry { index, id, scores })?;
+            monitor.advance(1);
+            if monitor.is_stopped() {
+                let from = format!("after scenario {index}");
+                return Err(EvalError::StoppedAndStored { from });
+            }
+        }
+        Ok(exclusions)
+    }
+
+    fn score(
+        &self,
+        recorded: &Recorded,
+        sources: &mut [RolloutSource],
+        monitor: &dyn Monitor,
+        visit: &mut dyn FnMut(VisitedRollouts<'_>) -> Result<(), BoxError>,
+    ) -> Result<ScenarioScores, EvalError> {
+        let place = || format!("cannot evaluate scenario {}", recorded.log.scenario);
+        let found = sources.iter_mut().map(|source| {
+            let monitor = simulating(monitor, source.frames(&recorded.scenario));
+            let found = source.rollouts(self.device, recorded, self.config.mode, &*monitor);
+            found.map_err(|error| error.at(&place()))
+        });
+        let found = found.collect::<Result<Vec<_>, _>>()?;
+        let (mut source, mut visited) = (0, Ok(()));
+        let scores = evaluate(
+            recorded,
+            found,
+            self.n_rollouts,
+            self.config,
+            |found, evaluation| {
+                if visited.is_ok() {
+                    visited = visit(VisitedRollouts {
+                        source,
+                        recorded,
+                        found,
+                        evaluation,
+                    });
+                }
+                source += 1;
+            },
+        )?;
+        visited.map_err(EvalError::of_simulation)?;
+        Ok(scores)
+    }
 }
 
 /// Scores the rollouts of one scenario, beside `n_rollouts` of the log and of constant velocity;

@@ -235,7 +235,7 @@ impl Sumo {
             if is_odd(&scene) {
                 continue;
             }
-            scene.tags = gump_metrics::tags::mine(&scene);
+            scene.tags = gump_metrics::tags::extract_tags(&scene);
             scenes.push(scene);
         }
         std::fs::remove_dir_all(folder).map_err(|cause| EvalError::io("remove", folder, cause))?;

@@ -17,7 +17,7 @@ use gump_scene::AgentKind;
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
-use crate::draft::Draft;
+use crate::partial_scene::PartialScene;
 use crate::{GenerateError, Placement, reason};
 
 /// Number of draws of an object made at once: most objects need no more.
@@ -26,37 +26,37 @@ const VOLLEY: usize = 4;
 /// Gives every unfinished scene its next object; false once all are finished.
 pub(crate) fn advance(
     world: &TransformerWorld,
-    drafts: &mut [Draft<'_>],
+    drafts: &mut [PartialScene<'_>],
 ) -> Result<bool, GenerateError> {
     let engine = world.engine().expect("preparing checked that there is one");
-    let mut open: Vec<&mut Draft<'_>> = drafts
+    let mut open: Vec<&mut PartialScene<'_>> = drafts
         .iter_mut()
-        .filter(|draft| draft.outcome.is_none())
+        .filter(|partial| partial.outcome.is_none())
         .collect();
     if open.is_empty() {
         return Ok(false);
     }
-    let asking: Vec<bool> = open.iter().map(|draft| draft.asks()).collect();
+    let asking: Vec<bool> = open.iter().map(|partial| partial.asks()).collect();
     let hidden = read(world, engine, &mut open, |i| asking[i].then_some(None))?;
     let mut successors = engine.say(&hidden).into_iter();
     let mut keys = Vec::with_capacity(open.len());
-    for (draft, asks) in open.iter_mut().zip(&asking) {
+    for (partial, asks) in open.iter_mut().zip(&asking) {
         let successor = if *asks { successors.next() } else { None };
-        let key = draft.next_key(successor.as_ref());
+        let key = partial.next_key(successor.as_ref());
         if key.is_none() {
-            draft.outcome = Some(Ok(()));
+            partial.outcome = Some(Ok(()));
         }
         keys.push(key);
     }
     let hidden = read(world, engine, &mut open, |i| keys[i].map(Some))?;
     let width = world.network().config().width;
     let mut rows = hidden.chunks_exact(width);
-    let placed = open.into_iter().zip(keys).filter_map(|(draft, key)| {
+    let placed = open.into_iter().zip(keys).filter_map(|(partial, key)| {
         let hidden = rows_next(&mut rows, key)?;
         Some(Query {
-            rules: Arc::new(draft.rules(key?)),
+            rules: Arc::new(partial.rules(key?)),
             key: key?,
-            draft,
+            partial,
             hidden,
             broken: Vec::new(),
         })
@@ -80,24 +80,24 @@ fn rows_next<'h>(
 fn read(
     world: &TransformerWorld,
     engine: &Engine,
-    open: &mut [&mut Draft<'_>],
+    open: &mut [&mut PartialScene<'_>],
     last: impl Fn(usize) -> Option<Option<Key>>,
 ) -> Result<Vec<f32>, EngineError> {
-    let slots = open.iter().enumerate().map(|(i, draft)| {
+    let slots = open.iter().enumerate().map(|(i, partial)| {
         let next = last(i);
-        let slots = next.map(|next| draft.prepared.slots(&draft.agents, next));
+        let slots = next.map(|next| partial.prepared.slots(&partial.agents, next));
         slots.transpose()
     });
     let slots: Vec<Option<Vec<PlacedSlot>>> = slots.collect::<Result<_, _>>()?;
     let members = open.iter_mut().zip(&slots);
     let mut jobs: Vec<Job<'_>> = members
-        .filter_map(|(draft, slots)| {
+        .filter_map(|(partial, slots)| {
             let slots = slots.as_ref()?;
             Some(Job {
                 slots,
                 wanted: vec![slots.len() - 1],
-                memory: draft.prepared.memory(),
-                context: &mut draft.context,
+                memory: partial.prepared.memory(),
+                context: &mut partial.context,
                 keep: true,
             })
         })
@@ -110,7 +110,7 @@ fn read(
 
 /// An object to be drawn.
 struct Query<'d, 'a> {
-    draft: &'d mut Draft<'a>,
+    partial: &'d mut PartialScene<'a>,
     key: Key,
     rules: Arc<Rules>,
     hidden: &'d [f32],
@@ -121,7 +121,7 @@ struct Query<'d, 'a> {
 fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
     let mut drawn = 0;
     while !queries.is_empty() {
-        let tries = queries[0].draft.prepared.request.config.tries;
+        let tries = queries[0].partial.prepared.request.config.tries;
         let n = if drawn == 0 { 1 } else { VOLLEY }.min(tries - drawn);
         let requests: Vec<Request> = queries
             .iter()
@@ -132,7 +132,7 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
             .flat_map(|query| query.hidden.repeat(n))
             .collect();
         let references: Vec<&Request> = requests.iter().collect();
-        let sampling = &queries[0].draft.prepared.sampling;
+        let sampling = &queries[0].partial.prepared.sampling;
         let bins = engine.sample_state(&hidden, &references, sampling);
         drawn += n;
         let is_last = drawn >= tries;
@@ -157,14 +157,14 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
                         break;
                     }
                     Err(clause) => {
-                        query.draft.redraws += 1;
+                        query.partial.redraws += 1;
                         query.broken.push(clause);
                     }
                 }
             }
             match kept {
-                Some((state, outline)) => query.draft.accept(query.key, state, outline),
-                None if is_last => query.draft.fail(query.key, &query.broken),
+                Some((state, outline)) => query.partial.accept(query.key, state, outline),
+                None if is_last => query.partial.fail(query.key, &query.broken),
                 None => {
                     // The numbers of the first draw would give the same again.
                     Arc::make_mut(&mut query.rules).manner.numbers = None;
@@ -177,11 +177,13 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
 }
 
 fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
-    let stream = query.draft.stream(2 * query.draft.agents.len() as u64 + 2);
+    let stream = query
+        .partial
+        .stream(2 * query.partial.agents.len() as u64 + 2);
     let rules = Arc::clone(&query.rules);
     Request {
         anchor: LocalFrame::SCENE,
-        forced: query.draft.given(query.key),
+        forced: query.partial.given(query.key),
         stream: stream.fork(attempt as u64),
         near: None,
         ring: ChunkBuffer::default(),
@@ -197,7 +199,7 @@ type Found = (QuantizedState, OrientedBox);
 /// The drawn state, or the constraint it violates. The ego's box is given and therefore valid.
 fn judge(query: &Query<'_, '_>, bins: &Bins, is_late: bool) -> Result<Found, String> {
     let state = state_of(bins);
-    let prepared = query.draft.prepared;
+    let prepared = query.partial.prepared;
     let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
     let outline = query.rules.outline(&state, map, world_from_scene);
     let broken = query.rules.broken(&state, &outline, map, world_from_scene);
@@ -216,7 +218,7 @@ fn stands_without(
     state: &QuantizedState,
     outline: &OrientedBox,
 ) -> Option<String> {
-    let prepared = query.draft.prepared;
+    let prepared = query.partial.prepared;
     let request = prepared.request;
     let is_asked = request.config.standing_has_reasons
         && request.config.placement == Placement::Guided

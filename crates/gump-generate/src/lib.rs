@@ -15,22 +15,22 @@
 
 mod advance;
 pub mod baseline;
+pub mod check;
 pub mod constraint;
-mod draft;
 mod drive;
-mod even;
-pub mod factory;
+mod futures;
+mod latin_hypercube;
+mod partial_scene;
+pub mod pipeline;
 mod prepared;
 mod prompt;
 mod reason;
 mod request;
 mod roadside;
 mod search;
-mod stage;
-mod takes;
+mod site;
 #[cfg(test)]
 mod tests;
-pub mod verdict;
 
 pub use request::{
     Counts, EgoStart, GenerateConfig, GenerateError, GenerateRequest, GeneratedScene, Placement,

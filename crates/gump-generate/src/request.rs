@@ -11,7 +11,7 @@ use gump_scene::{Agent, AgentId, AgentKind, Frame, Light, MapGraph, Scenario, Sc
 use serde::{Deserialize, Serialize};
 
 use crate::advance;
-use crate::draft::Draft;
+use crate::partial_scene::PartialScene;
 use crate::prepared::Prepared;
 
 /// A request for a scene.
@@ -287,10 +287,10 @@ pub fn generate(
     seeds: &[Seed],
 ) -> Result<Vec<Result<GeneratedScene, GenerateError>>, GenerateError> {
     let prepared = Prepared::new(world, request)?;
-    let mut drafts: Vec<Draft<'_>> = seeds
+    let mut drafts: Vec<PartialScene<'_>> = seeds
         .iter()
-        .map(|seed| Draft::new(&prepared, *seed))
+        .map(|seed| PartialScene::new(&prepared, *seed))
         .collect();
     while advance::advance(world, &mut drafts)? {}
-    Ok(drafts.into_iter().map(Draft::finish).collect())
+    Ok(drafts.into_iter().map(PartialScene::finish).collect())
 }

@@ -10,7 +10,7 @@ use rand::Rng as _;
 use rand::seq::{IndexedRandom as _, SliceRandom as _};
 
 use crate::prompt::PromptSpec;
-use crate::stage::Stage;
+use crate::site::Site;
 use crate::{EgoStart, GenerateRequest};
 
 /// Maximum distance of the ego from the requested pose, metres.
@@ -34,7 +34,7 @@ pub(crate) struct Search<'a> {
 impl Search<'_> {
     /// A stage at the requested pose, on whose lanes the ego keeps its lateral offset; `None` if
     /// the prompts cannot hold there.
-    pub(crate) fn here(&self, seed: Seed) -> Option<Stage> {
+    pub(crate) fn here(&self, seed: Seed) -> Option<Site> {
         let pose = self.request.ego.pose;
         let map: &MapGraph = &self.request.map;
         let rng = &mut seed.rng();
@@ -49,17 +49,17 @@ impl Search<'_> {
         lanes.retain(|(lane, _)| lane.kind != LaneKind::BikeLane);
         for _ in 0..TRIALS {
             let (lane, on) = lanes.choose(rng)?;
-            let stage = self.stage((lane, on.arc_length), on.lateral, rng);
-            if let Some(mut stage) = stage.filter(|stage| self.holds(stage)) {
-                stage.ego.pose = pose;
-                return Some(stage);
+            let site = self.stage((lane, on.arc_length), on.lateral, rng);
+            if let Some(mut site) = site.filter(|site| self.holds(site)) {
+                site.ego.pose = pose;
+                return Some(site);
             }
         }
         None
     }
 
     /// A stage somewhere on the map; `None` if the prompts can hold nowhere.
-    pub(crate) fn anywhere(&self, seed: Seed) -> Option<Stage> {
+    pub(crate) fn anywhere(&self, seed: Seed) -> Option<Site> {
         let (map, lights) = (&self.request.map, &self.request.lights);
         let mut needs = self.cast.needs.iter();
         if !needs.all(|need| need.is_met(map, lights)) {
@@ -79,26 +79,26 @@ impl Search<'_> {
             for &(lane, at) in &places {
                 let at = at + rng.random_range(0.0..SPACING_M);
                 let at = at.min(lane.centerline.length());
-                let stage = self.stage((lane, at), 0.0, rng);
-                if let Some(stage) = stage.filter(|stage| self.holds(stage)) {
-                    return Some(stage);
+                let site = self.stage((lane, at), 0.0, rng);
+                if let Some(site) = site.filter(|site| self.holds(site)) {
+                    return Some(site);
                 }
             }
         }
         None
     }
 
-    fn stage(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Stage> {
-        Stage::set(self.cast, self.request, place, offset, rng)
+    fn stage(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Site> {
+        Site::set(self.cast, self.request, place, offset, rng)
     }
 
     /// Whether all tags hold at the same instant of the trial.
-    fn holds(&self, stage: &Stage) -> bool {
+    fn holds(&self, site: &Site) -> bool {
         if self.prompts.is_empty() {
             return true;
         }
-        let mut trial = stage.trial(self.request);
-        let moments = if stage.takes_time() {
+        let mut trial = site.trial(self.request);
+        let moments = if site.takes_time() {
             &MOMENTS[..]
         } else {
             &MOMENTS[..1]
@@ -184,7 +184,7 @@ mod tests {
         }
     }
 
-    fn found(request: &GenerateRequest, tags: &[&str]) -> Option<Stage> {
+    fn found(request: &GenerateRequest, tags: &[&str]) -> Option<Site> {
         let prompts: Vec<ScenarioTag> = tags.iter().map(|tag| tag.parse().unwrap()).collect();
         let search = Search {
             cast: &PromptSpec::of(&prompts),
@@ -279,8 +279,8 @@ mod tests {
             };
             search.here(Seed(1))
         };
-        let stage = here("following_lane_with_lead").unwrap();
-        let directed = stage.direct(&request);
+        let site = here("following_lane_with_lead").unwrap();
+        let directed = site.direct(&request);
         assert_eq!(directed.ego.pose, request.ego.pose);
         assert!((4.5..9.0).contains(&directed.ego.velocity.unwrap().length()));
         assert_eq!(directed.objects.len(), 1);
@@ -306,15 +306,15 @@ mod tests {
                 ..ObjectSpec::default()
             },
         ];
-        let stage = found(&request, &["starting_left_turn"]).unwrap();
-        let speed = stage.ego.velocity.unwrap().length();
+        let site = found(&request, &["starting_left_turn"]).unwrap();
+        let speed = site.ego.velocity.unwrap().length();
         assert!((5.0..=5.5).contains(&speed), "{speed}");
         // The truck is the requested lead, and no other vehicle is placed there.
-        let stage = found(&request, &["behind_long_vehicle"]).unwrap();
-        assert_eq!(stage.objects.len(), 2);
+        let site = found(&request, &["behind_long_vehicle"]).unwrap();
+        assert_eq!(site.objects.len(), 2);
         assert!(found(&request, &["following_lane_without_lead"]).is_none());
         request.ego.velocity = Some(DVec2::new(8.0, 0.0));
-        let stage = found(&request, &["medium_magnitude_speed"]).unwrap();
-        assert_eq!(stage.ego.velocity, request.ego.velocity);
+        let site = found(&request, &["medium_magnitude_speed"]).unwrap();
+        assert_eq!(site.ego.velocity, request.ego.velocity);
     }
 }

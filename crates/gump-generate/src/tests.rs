@@ -165,14 +165,14 @@ fn what_cannot_be_met_is_said() {
 fn what_a_prompt_says_is_made_and_judged() {
     let mut request = request(Vec::new());
     request.prompts = vec!["behind_bike".parse().unwrap()];
-    let order = factory::GenerationJob {
+    let order = pipeline::GenerationJob {
         request,
         roams: false,
         seconds: 0.0,
         attempts: 20,
     };
-    let made = factory::make_many(
-        factory::GenerationWorlds::of(&world()),
+    let made = pipeline::make_many(
+        pipeline::GenerationWorlds::of(&world()),
         &order,
         0..2,
         Seed(1),
@@ -188,7 +188,7 @@ fn what_a_prompt_says_is_made_and_judged() {
 
 #[test]
 fn prompted_scenes_do_not_depend_on_the_threads() {
-    let order = |tag: &str| factory::GenerationJob {
+    let order = |tag: &str| pipeline::GenerationJob {
         request: GenerateRequest {
             prompts: vec![tag.parse().unwrap()],
             ..request(Vec::new())
@@ -201,8 +201,8 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
     let made_by = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         let made = || {
-            factory::make_many(
-                factory::GenerationWorlds::of(&world()),
+            pipeline::make_many(
+                pipeline::GenerationWorlds::of(&world()),
                 &order,
                 0..3,
                 Seed(1),
@@ -212,7 +212,7 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
         pool.build().unwrap().install(made)
     };
     let made: Vec<_> = made_by(1).into_iter().map(Result::unwrap).collect();
-    assert!(made.iter().all(factory::Made::holds));
+    assert!(made.iter().all(pipeline::CheckedScene::holds));
     assert!(made.iter().all(|made| made.scenario.future().len() >= 50));
     for (one, two) in made.iter().zip(made_by(2)) {
         assert_eq!(one.scenario.log, two.unwrap().scenario.log);
@@ -225,15 +225,15 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
         let mut request = request(Vec::new());
         request.prompts = vec![tag.parse().unwrap()];
         request.config.placement = placement;
-        factory::GenerationJob {
+        pipeline::GenerationJob {
             request,
             roams: false,
             seconds: 0.0,
             attempts: 2,
         }
     };
-    let make = |order: &factory::GenerationJob| {
-        factory::make(factory::GenerationWorlds::of(&world()), order, 0, Seed(1))
+    let make = |order: &pipeline::GenerationJob| {
+        pipeline::make(pipeline::GenerationWorlds::of(&world()), order, 0, Seed(1))
     };
     let error = make(&order("on_carpark", Placement::Guided)).unwrap_err();
     assert!(error.to_string().contains("can hold on_carpark"), "{error}");
@@ -254,13 +254,14 @@ fn a_place_where_nobody_walks_is_left_for_another() {
         pedestrians: 4,
         ..Counts::default()
     });
-    let order = factory::GenerationJob {
+    let order = pipeline::GenerationJob {
         request,
         roams: false,
         seconds: 0.0,
         attempts: 60,
     };
-    let made = factory::make(factory::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
+    let made =
+        pipeline::make(pipeline::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
     assert!(made.attempts > 1 && made.holds(), "{:?}", made.clauses);
     let ego = made.scene.frame.agent(made.scene.ego).unwrap();
     assert!((-40.0..0.0).contains(&ego.state.pose.position.x));
@@ -278,7 +279,7 @@ fn a_steered_ego_is_where_its_drive_says() {
     let rng = &mut Seed(2).rng();
     let lane = (&map.lanes()[0], 100.0);
     let drive = drive::Drive::along(map, lane, 0.0, 3.0, maneuver, rng).unwrap();
-    let takes = takes::steered(&world(), &scenario, &drive, Seed(4)).unwrap();
+    let takes = futures::steered(&world(), &scenario, &drive, Seed(4)).unwrap();
     assert!(!takes.is_empty());
     for take in takes {
         // Steered for four seconds, then imagined for two more.
@@ -295,13 +296,14 @@ fn a_steered_ego_is_where_its_drive_says() {
 fn cones_stand_clear_of_everybody() {
     let mut request = request(Vec::new());
     request.prompts = vec!["near_trafficcone_on_driveable".parse().unwrap()];
-    let order = factory::GenerationJob {
+    let order = pipeline::GenerationJob {
         request,
         roams: false,
         seconds: 0.0,
         attempts: 20,
     };
-    let made = factory::make(factory::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
+    let made =
+        pipeline::make(pipeline::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
     assert!(made.holds(), "{:?}", made.clauses);
     let present = made.scenario.present();
     let agents = present.now().agents().iter();

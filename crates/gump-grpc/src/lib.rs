@@ -1,7 +1,7 @@
 //! Planners in other processes, by nuPlan's planner protocol.
 //!
 //! [`RemoteDriver`] follows the plans of a server at `HOST:PORT`. The protocol is the one that
-//! nuPlan's challenges called planners by (gRPC service `DetectionTracksChallenge`): the mission is
+//! nuPlan's challenges called planners by (gRPC service `DetectionTracksChallenge`): the initialization is
 //! sent once per drive, and at every step a trajectory is requested. A server plans for one drive
 //! at a time, so one drive has to end before the next begins. nuplan-devkit's own servicer and
 //! `python/nuplan_planner.py` are such servers.
@@ -26,7 +26,7 @@ mod tests;
 use std::time::Duration;
 
 use gump_geometry::{Pose, dvec2};
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{Candidate, Explain};
 use gump_proto::nuplan as proto;
@@ -96,8 +96,8 @@ pub enum RemoteError {
         "the light of lane {0}: expected a lane below 2147483648, as the protocol has 32 bits for it"
     )]
     Lane(i64),
-    /// A plan was requested before the mission was set.
-    #[error("the planner was asked to drive before it was given a mission")]
+    /// A plan was requested before the initialization was set.
+    #[error("the planner was asked to drive before it was given an initialization")]
     NoMission,
 }
 
@@ -129,15 +129,15 @@ impl Driver for RemoteDriver {
         &self.name
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
         let mut client = Client::connect(&self.address)?;
-        let message = initialization(mission, &self.map_name);
+        let message = initialization_message(initialization, &self.map_name);
         let proto::Empty {} = client.call("InitializePlanner", message, TO_INITIALIZE)?;
-        self.begun = Some((client, mission.vehicle));
+        self.begun = Some((client, initialization.vehicle));
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, moment: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let (client, vehicle) = self.begun.as_mut().ok_or(RemoteError::NoMission)?;
         let message = input(moment, vehicle)?;
         let plan: proto::Trajectory = client.call("ComputeTrajectory", message, self.to_plan)?;
@@ -151,12 +151,17 @@ impl Explain for RemoteDriver {
     }
 }
 
-fn initialization(mission: &Mission<'_>, map_name: &str) -> proto::PlannerInitializationLight {
-    let blocks = mission.route.map(|route| route.roadblocks.as_slice());
+fn initialization_message(
+    initialization: &PlannerInitialization<'_>,
+    map_name: &str,
+) -> proto::PlannerInitializationLight {
+    let blocks = initialization
+        .route
+        .map(|route| route.roadblocks.as_slice());
     let blocks = blocks.unwrap_or_default().iter();
     proto::PlannerInitializationLight {
         route_roadblock_ids: blocks.map(|block| block.0.to_string()).collect(),
-        mission_goal: mission.goal.map(|goal| proto::StateSe2 {
+        mission_goal: initialization.goal.map(|goal| proto::StateSe2 {
             x: goal.position.x as f32,
             y: goal.position.y as f32,
             heading: goal.heading as f32,
@@ -167,7 +172,7 @@ fn initialization(mission: &Mission<'_>, map_name: &str) -> proto::PlannerInitia
 
 /// The input of a step: the past and present in the first step, then the present alone.
 fn input(
-    moment: &Moment<'_>,
+    moment: &PlannerInput<'_>,
     vehicle: &VehicleParameters,
 ) -> Result<proto::PlannerInput, RemoteError> {
     let first = moment.iteration == 0;
@@ -198,7 +203,7 @@ fn input(
     })
 }
 
-fn lights(moment: &Moment<'_>) -> Result<Vec<proto::TrafficLightStatusData>, RemoteError> {
+fn lights(moment: &PlannerInput<'_>) -> Result<Vec<proto::TrafficLightStatusData>, RemoteError> {
     let lights = moment.scene.now().lights().iter();
     let lights = lights.map(|light| {
         let name = match light.state {
@@ -220,7 +225,7 @@ fn lights(moment: &Moment<'_>) -> Result<Vec<proto::TrafficLightStatusData>, Rem
 }
 
 /// Converts a plan to a trajectory that covers the next step.
-fn trajectory(plan: &proto::Trajectory, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+fn trajectory(plan: &proto::Trajectory, moment: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
     let states = plan.ego_states.iter().enumerate();
     let states = states.map(|(i, state)| ego_state(i, state));
     let trajectory = Trajectory::new(states.collect::<Result<_, _>>()?)?;

@@ -35,7 +35,7 @@ pub struct ComfortBounds {
 
 /// Accelerations, rates and jerks at one instant; `None` where unknown.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Felt {
+pub struct ComfortMeasurements {
     /// Along the heading, metres per second squared.
     pub longitudinal_acceleration: f64,
     /// Across the heading, metres per second squared.
@@ -52,7 +52,7 @@ pub struct Felt {
 
 impl ComfortBounds {
     /// True if every known value lies strictly inside its bounds.
-    pub fn allow(&self, felt: &Felt) -> bool {
+    pub fn allow(&self, felt: &ComfortMeasurements) -> bool {
         let within = |value: Option<f64>, bound: f64| value.is_none_or(|v| v.abs() < bound);
         let along = felt.longitudinal_acceleration;
         self.min_acceleration < along
@@ -84,7 +84,7 @@ impl Metric for Discomfort {
     fn at(&self, scene: &SceneState<'_>, agent: &Agent) -> Option<f64> {
         let forward = agent.state.pose.direction();
         let acceleration = kinematics::acceleration(scene, agent.id)?;
-        let felt = Felt {
+        let felt = ComfortMeasurements {
             longitudinal_acceleration: acceleration.dot(forward),
             lateral_acceleration: acceleration.dot(forward.perp()),
             yaw_rate: kinematics::yaw_rate(scene, agent.id),

@@ -52,7 +52,7 @@ pub mod tags;
 pub use bootstrap::{Interval, interval, intervals, intervals_of_groups};
 pub use border::Border;
 pub use collision::{Collision, overlapping};
-pub use comfort::{ComfortBounds, Discomfort, Felt};
+pub use comfort::{ComfortBounds, ComfortMeasurements, Discomfort};
 pub use displacement::{Displacement, average_displacement};
 pub use kinematics::{Acceleration, Speed, YawRate};
 pub use metric::{ALL, Metric, Reduce, logged, over_rollout, over_rollouts};

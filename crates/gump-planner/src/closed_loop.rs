@@ -4,7 +4,8 @@
 //! parallel; [`plan_once`] only plans. Errors are reported per recording; nothing is averaged here.
 
 use gump_nuplan::closed_loop::{
-    DriveConfig, Driven, Driver, Moment, Recording, Tracking, Traffic, derive_roadblocks, drive,
+    DriveConfig, Driven, Driver, PlannerInput, Recording, Tracking, Traffic, derive_roadblocks,
+    drive,
 };
 use gump_nuplan::metrics::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
 use gump_nuplan::metrics::{open_loop, score};
@@ -76,8 +77,8 @@ pub fn drive_scenario(
 /// # Errors
 /// The error of the driver.
 pub fn plan_once(recording: &Recording, driver: &mut dyn Driver) -> Result<Trajectory, BoxError> {
-    driver.start(&recording.mission())?;
-    driver.drive(&Moment {
+    driver.start(&recording.initialization())?;
+    driver.drive(&PlannerInput {
         iteration: 0,
         scene: recording.scenario().present(),
         ego: recording.ego_at(0),

@@ -7,11 +7,11 @@ use gump_scene::{AgentId, RoadblockId};
 /// Why planning failed.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
-    /// A planner was asked for a plan before it had a mission.
-    #[error("the planner was asked to drive before it was given a mission")]
+    /// A planner was asked for a plan before it had an initialization.
+    #[error("the planner was asked to drive before it was given an initialization")]
     NoMission,
     /// There is no route.
-    #[error("the mission has no route, expected the roadblocks to drive through")]
+    #[error("the initialization has no route, expected the roadblocks to drive through")]
     NoRoute,
     /// A closed loop stopped.
     #[error(transparent)]

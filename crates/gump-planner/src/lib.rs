@@ -56,7 +56,7 @@
 //! struct Cruise;
 //! impl Driver for Cruise {
 //!     fn name(&self) -> &str { "cruise" }
-//!     fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+//!     fn drive(&mut self, moment: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
 //!         let (ego, step) = (*moment.ego, 0.1 * moment.ego.speed());
 //!         let states = (0..=40).map(|i| EgoState {
 //!             time_us: ego.time_us + 100_000 * i,
@@ -95,8 +95,8 @@ pub use compare::{Comparison, PolicyValue, ValueConfig, value_policies};
 pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, SimpleDriver};
 pub use error::PlanError;
 pub use interactive::{
-    Aggregate, Allocation, CandidateScore, Decision, InteractiveDriver, InteractiveDriverConfig,
-    Phases, PlanBudget, Prospect, Worth,
+    Aggregate, Allocation, CandidateEvaluation, CandidateScore, Decision, InteractiveDriver,
+    InteractiveDriverConfig, Phases, PlanBudget, ValueEstimate,
 };
 pub use pdm::{PdmClosed, PdmConfig, PdmScore, Side};
 pub use proposal::{Proposal, ProposalKind};

@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use gump_geometry::Pose;
 use gump_nuplan::closed_loop::{
-    DriveConfig, Driver, Mission, Moment, Recording, Replayed, derive_roadblocks,
+    DriveConfig, Driver, PlannerInitialization, PlannerInput, Recording, Replayed,
+    derive_roadblocks,
 };
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
@@ -158,19 +159,19 @@ impl Driver for Odd {
         "odd"
     }
 
-    fn start(&mut self, _: &Mission<'_>) -> Result<(), BoxError> {
+    fn start(&mut self, _: &PlannerInitialization<'_>) -> Result<(), BoxError> {
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let stay = |i: i64| EgoState {
-            time_us: moment.ego.time_us + i * 500_000,
-            ..*moment.ego
+            time_us: input.ego.time_us + i * 500_000,
+            ..*input.ego
         };
-        if moment.iteration < self.from {
+        if input.iteration < self.from {
             return Ok(Trajectory::new((0..9).map(stay).collect())?);
         }
-        Ok(Trajectory::new((self.answer)(moment.ego)?)?)
+        Ok(Trajectory::new((self.answer)(input.ego)?)?)
     }
 }
 

@@ -4,8 +4,8 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gump_rl::{
-    Autoreset, BicycleLimits, Course, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
-    RasterView, RlError, Sampling, Traffic, VectorEnv, VectorView,
+    Autoreset, BicycleLimits, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
+    PreparedScenario, RasterView, RlError, Sampling, Traffic, VectorEnv, VectorView,
 };
 use gump_scene::Seed;
 use numpy::PyArrayDyn;
@@ -129,11 +129,11 @@ impl Env {
             config.sampling = Sampling::prioritized();
         }
         let scenes: Vec<_> = scenarios.iter().map(|s| Arc::clone(&s.scene)).collect();
-        let courses = threads::work(py, || {
-            Course::prepare(scenes.iter().map(|scene| scene.scenario.clone()), STEP)
+        let prepared = threads::work(py, || {
+            PreparedScenario::prepare(scenes.iter().map(|scene| scene.scenario.clone()), STEP)
         })?;
-        let courses = courses.map_err(errors::value)?;
-        let n_scenarios = courses.len();
+        let prepared = prepared.map_err(errors::value)?;
+        let n_scenarios = prepared.len();
         let model = world.kind.model();
         let (ready_sender, ready) = channel();
         let (asks, requests) = channel();
@@ -142,7 +142,7 @@ impl Env {
                 Some(model) => Traffic::World(&**model),
                 None => Traffic::Log,
             };
-            match DrivingEnv::new(courses, traffic, config) {
+            match DrivingEnv::new(prepared, traffic, config) {
                 Ok(env) => {
                     if ready_sender.send(Ok(env.action_len())).is_ok() {
                         serve(env, &requests);

@@ -1,7 +1,7 @@
 //! Scenes out of nothing, on the map of any scenario.
 
 use gump_generate::constraint::parse_constraints;
-use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
+use gump_generate::pipeline::{CheckedScene, GenerationJob, GenerationWorlds, make_many};
 use gump_generate::{Counts, GenerateConfig, GenerateRequest, Placement};
 use gump_scene::{ScenarioTag, Seed};
 use pyo3::prelude::*;
@@ -109,7 +109,7 @@ pub(crate) fn generate<'py>(
     Ok(list)
 }
 
-fn scene_dict(py: Python<'_>, made: Made) -> PyResult<Bound<'_, PyDict>> {
+fn scene_dict(py: Python<'_>, made: CheckedScene) -> PyResult<Bound<'_, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("holds", made.holds())?;
     dict.set_item("attempts", made.attempts)?;

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use gump_geometry::{Pose, dvec2};
 use gump_nuplan::closed_loop::{
-    DriveConfig, Driver, Imagined, Mission, Moment, Others, Recording, Replayed, Step, Tracking,
-    Traffic, derive_roadblocks,
+    DriveConfig, Driver, Imagined, Others, PlannerInitialization, PlannerInput, Recording,
+    Replayed, Step, Tracking, Traffic, derive_roadblocks,
 };
 use gump_nuplan::metrics::{ClosedLoop, Drive, Sample, Scoring, score};
 use gump_nuplan::reactive_agents::NuplanIdm;
@@ -177,17 +177,17 @@ impl Driver for Timed<'_> {
         self.inner.name()
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.inner.start(initialization)
     }
 
     #[allow(
         clippy::disallowed_methods,
         reason = "how long a planner takes is told, and changes nothing"
     )]
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let began = Instant::now();
-        let plan = self.inner.drive(moment);
+        let plan = self.inner.drive(input);
         self.spent += began.elapsed();
         self.steps += 1;
         plan
@@ -247,39 +247,42 @@ impl Driver for PythonDriver {
         "the planner"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
         let started = Python::attach(|py| {
             let dict = PyDict::new(py);
             dict.set_item("scenario", &self.scenario)?;
-            let lanes = mission.route.iter().flat_map(|route| &route.lanes);
+            let lanes = initialization.route.iter().flat_map(|route| &route.lanes);
             let lanes: Vec<i64> = lanes.map(|lane| lane.0).collect();
             dict.set_item("route_lane_ids", lanes)?;
-            let blocks = mission.route.iter().flat_map(|route| &route.roadblocks);
+            let blocks = initialization
+                .route
+                .iter()
+                .flat_map(|route| &route.roadblocks);
             let blocks: Vec<i64> = blocks.map(|block| block.0).collect();
             dict.set_item("route_roadblock_ids", blocks)?;
-            let goal = mission
+            let goal = initialization
                 .goal
                 .map(|g| (g.position.x, g.position.y, g.heading));
             dict.set_item("mission_goal", goal)?;
-            dict.set_item("vehicle", vehicle(py, &mission.vehicle)?)?;
+            dict.set_item("vehicle", vehicle(py, &initialization.vehicle)?)?;
             self.bridge.call_method1(py, "initialize", (dict,))?;
             Ok(())
         });
         started.map_err(|error| self.keep(error))
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let planned = Python::attach(|py| {
             let dict = PyDict::new(py);
-            dict.set_item("iteration", moment.iteration)?;
-            dict.set_item("time_us", moment.ego.time_us)?;
-            dict.set_item("ego", ego_row(moment.ego).to_vec())?;
+            dict.set_item("iteration", input.iteration)?;
+            dict.set_item("time_us", input.ego.time_us)?;
+            dict.set_item("ego", ego_row(input.ego).to_vec())?;
             // The states before the first iteration are sent once.
-            let before = if moment.iteration == 0 {
-                let history = &moment.scene.history[..moment.scene.history.len() - 1];
-                let frames = history.iter().map(|frame| observed(py, frame, moment));
+            let before = if input.iteration == 0 {
+                let history = &input.scene.history[..input.scene.history.len() - 1];
+                let frames = history.iter().map(|frame| observed(py, frame, input));
                 let frames = frames.collect::<PyResult<Vec<_>>>()?;
-                let past = moment
+                let past = input
                     .past
                     .iter()
                     .map(|ego| (ego.time_us, ego_row(ego).to_vec()));
@@ -288,10 +291,10 @@ impl Driver for PythonDriver {
                 None
             };
             dict.set_item("before", before)?;
-            dict.set_item("observed", observed(py, moment.scene.now(), moment)?)?;
+            dict.set_item("observed", observed(py, input.scene.now(), input)?)?;
             let plan = self.bridge.call_method1(py, "plan", (dict,))?;
             let plan = plan.bind(py).cast::<PyArrayDyn<f64>>()?;
-            trajectory(plan, moment.ego)
+            trajectory(plan, input.ego)
         });
         planned.map_err(|error| self.keep(error))
     }
@@ -311,10 +314,10 @@ fn vehicle<'py>(py: Python<'py>, vehicle: &VehicleParameters) -> PyResult<Bound<
 fn observed<'py>(
     py: Python<'py>,
     frame: &Frame,
-    moment: &Moment<'_>,
+    input: &PlannerInput<'_>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let agents = frame.agents().iter();
-    let others: Vec<_> = agents.filter(|a| a.id != moment.scene.ego).collect();
+    let others: Vec<_> = agents.filter(|a| a.id != input.scene.ego).collect();
     let dict = PyDict::new(py);
     let ids: Vec<i64> = others.iter().map(|agent| agent.id.0).collect();
     let kinds: Vec<&str> = others.iter().map(|agent| agent.kind.name()).collect();
@@ -566,15 +569,15 @@ pub(crate) fn nuplan_plan<'py>(
     let ego = *recording.ego_at(0);
     let plan = py.detach(|| {
         let mut driver = named(planner, &recording, &*thinks_in, Seed(seed))?;
-        let started = driver.start(&recording.mission());
+        let started = driver.start(&recording.initialization());
         started.map_err(errors::value)?;
-        let moment = Moment {
+        let input = PlannerInput {
             iteration: 0,
             scene: recording.scenario().present(),
             ego: &ego,
             past: recording.past(),
         };
-        driver.drive(&moment).map_err(errors::value)
+        driver.drive(&input).map_err(errors::value)
     })?;
     let rows = plan.states().iter().flat_map(|state| {
         let seconds = (state.time_us - ego.time_us) as f64 * 1e-6;

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use gump_rl::{
-    Course, DrivingEnv, EnvConfig, ObservationSpec, RasterView, Rules, Traffic, VectorEnv,
+    DrivingEnv, EnvConfig, ObservationSpec, PreparedScenario, RasterView, Rules, Traffic, VectorEnv,
 };
 use gump_rollout::worlds::Idm;
 use gump_scene::Seed;
@@ -22,9 +22,9 @@ use rand::Rng as _;
 
 const N_ENVS: usize = 128;
 
-fn courses() -> Arc<[Course]> {
+fn prepared() -> Arc<[PreparedScenario]> {
     let scenarios = synthesize_many(&SynthesisConfig::standard(), Seed(1), 64);
-    Course::prepare(scenarios, 0.5).unwrap()
+    PreparedScenario::prepare(scenarios, 0.5).unwrap()
 }
 
 /// Random actions for some steps, used over and over.
@@ -44,7 +44,7 @@ fn measure(c: &mut Criterion, name: &str, traffic: Traffic<'_>, observation: Obs
         observation,
         ..EnvConfig::default()
     };
-    let mut env = DrivingEnv::new(courses(), traffic, config).unwrap();
+    let mut env = DrivingEnv::new(prepared(), traffic, config).unwrap();
     env.reset(Seed(0)).unwrap();
     let actions = actions(env.action_len());
     let mut step = 0;

@@ -6,7 +6,7 @@
 use std::error::Error;
 use std::path::PathBuf;
 
-use gump_rl::{Course, DrivingEnv, EnvConfig, RlError, Traffic, VectorEnv};
+use gump_rl::{DrivingEnv, EnvConfig, PreparedScenario, RlError, Traffic, VectorEnv};
 use gump_rollout::worlds::Idm;
 use gump_scene::Seed;
 
@@ -26,13 +26,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     // ANCHOR: env
     // Steps of half a second; an action is acceleration and steering, each in [-1, 1].
-    let courses = Course::prepare(scenarios, 0.5)?;
+    let prepared = PreparedScenario::prepare(scenarios, 0.5)?;
     let world = Idm::default();
     let config = EnvConfig {
         n_envs: 8,
         ..EnvConfig::default()
     };
-    let mut env = DrivingEnv::new(courses, Traffic::World(&world), config)?;
+    let mut env = DrivingEnv::new(prepared, Traffic::World(&world), config)?;
     // ANCHOR_END: env
 
     let coast: Policy = |_, actions| {

@@ -5,11 +5,11 @@
 //! log, [`Rules::advance`] takes a frame of any world.
 
 use gump_geometry::{OrientedBox, angle_difference};
-use gump_metrics::{ComfortBounds, Felt};
+use gump_metrics::{ComfortBounds, ComfortMeasurements};
 use gump_scene::{Agent, AgentKind, AgentState, Frame};
 use serde::{Deserialize, Serialize};
 
-use crate::{Course, Dynamics, RlError};
+use crate::{Dynamics, PreparedScenario, RlError};
 
 /// Seconds between the moments of a step at which collisions are tested: a vehicle at 15 m/s moves
 /// a third of its length.
@@ -143,14 +143,14 @@ impl EpisodeState {
 }
 
 impl Rules {
-    /// The initial state of every episode on a course: the present of its scenario.
-    pub fn reset(&self, course: &Course) -> EpisodeState {
-        let ego = *course.scenario().present().ego_now();
+    /// The initial state of every episode on a prepared: the present of its scenario.
+    pub fn reset(&self, prepared: &PreparedScenario) -> EpisodeState {
+        let ego = *prepared.scenario().present().ego_now();
         EpisodeState {
             steps: 0,
             ego,
-            before: [course.ego_before(1), course.ego_before(2)],
-            along: course.along_route(ego.state.pose.position),
+            before: [prepared.ego_before(1), prepared.ego_before(2)],
+            along: prepared.along_route(ego.state.pose.position),
             reward: 0.0,
             totals: Totals::default(),
             end: None,
@@ -166,7 +166,7 @@ impl Rules {
     /// and [`RlError::OutOfRange`] for invalid actions.
     pub fn step(
         &self,
-        course: &Course,
+        prepared: &PreparedScenario,
         state: &EpisodeState,
         action: &[f32],
     ) -> Result<EpisodeState, RlError> {
@@ -174,19 +174,19 @@ impl Rules {
             return Err(RlError::Finished { row: 0 });
         }
         self.check_actions(action, 1)?;
-        Ok(self.step_in_log(course, state, action))
+        Ok(self.step_in_log(prepared, state, action))
     }
 
     /// One step with `action_len` checked numbers, the other agents replaying the log.
     pub(crate) fn step_in_log(
         &self,
-        course: &Course,
+        prepared: &PreparedScenario,
         state: &EpisodeState,
         action: &[f32],
     ) -> EpisodeState {
-        let others = [state.steps, state.steps + 1].map(|step| course.logged(step));
-        let mut next = self.advance(course, state, action, others);
-        if next.end.is_none() && next.steps >= course.logged_steps() {
+        let others = [state.steps, state.steps + 1].map(|step| prepared.logged(step));
+        let mut next = self.advance(prepared, state, action, others);
+        if next.end.is_none() && next.steps >= prepared.logged_steps() {
             next.end = Some(End::Truncated);
         }
         next
@@ -204,12 +204,12 @@ impl Rules {
     /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
     pub fn advance(
         &self,
-        course: &Course,
+        prepared: &PreparedScenario,
         state: &EpisodeState,
         action: &[f32],
         [before, after]: [&Frame; 2],
     ) -> EpisodeState {
-        let (dt, now) = (course.dt(), state.ego.state);
+        let (dt, now) = (prepared.dt(), state.ego.state);
         let seen = after.agent(state.ego.id).unwrap_or(&state.ego);
         let n = (dt / MOMENT).round().max(1.0) as usize;
         let at = |k: usize| {
@@ -222,7 +222,7 @@ impl Rules {
             steps: state.steps + 1,
             ego: way[n - 1],
             before: [Some(now), state.before[0]],
-            along: course.along_route(ego.pose.position),
+            along: prepared.along_route(ego.pose.position),
             ..state.clone()
         };
         let moved = ego.pose.position.distance(now.pose.position);
@@ -233,7 +233,7 @@ impl Rules {
             .iter()
             .rev()
             .step_by(stride)
-            .any(|ego| is_off_road(course, ego));
+            .any(|ego| is_off_road(prepared, ego));
         let uncomfortable = next.is_uncomfortable(dt);
 
         let weights = &self.reward;
@@ -247,8 +247,8 @@ impl Rules {
         next.totals.collided |= collided;
         next.totals.off_road |= off_road;
         next.totals.uncomfortable |= uncomfortable;
-        let horizon = (self.horizon / course.dt()).round().max(1.0) as usize;
-        let at_end_of_route = course.route().is_some_and(|r| next.along >= r.length());
+        let horizon = (self.horizon / prepared.dt()).round().max(1.0) as usize;
+        let at_end_of_route = prepared.route().is_some_and(|r| next.along >= r.length());
         next.end = if collided {
             Some(End::Terminated(Failure::Collision))
         } else if off_road {
@@ -265,12 +265,17 @@ impl Rules {
     /// none.
     ///
     /// Shape: `action` is `[action_len]`.
-    pub fn expert_action(&self, course: &Course, state: &EpisodeState, action: &mut [f32]) {
+    pub fn expert_action(
+        &self,
+        prepared: &PreparedScenario,
+        state: &EpisodeState,
+        action: &mut [f32],
+    ) {
         let ahead = self.dynamics.action_len().div_ceil(3);
-        let logged = (1..=ahead).map_while(|k| course.logged_ego(state.steps + k));
+        let logged = (1..=ahead).map_while(|k| prepared.logged_ego(state.steps + k));
         let targets: Vec<AgentState> = logged.collect();
         let now = &state.ego.state;
-        self.dynamics.towards(now, &targets, course.dt(), action);
+        self.dynamics.towards(now, &targets, prepared.dt(), action);
     }
 
     /// Checks that this is a valid batch of `n` actions.
@@ -318,7 +323,7 @@ impl EpisodeState {
             let yaw_acceleration = (yaw_rate - turn_rate(&earlier, &before, dt)) / dt;
             (jerk.dot(forward), change, yaw_acceleration)
         });
-        let felt = Felt {
+        let felt = ComfortMeasurements {
             longitudinal_acceleration: acceleration.dot(forward),
             lateral_acceleration: acceleration.dot(forward.perp()),
             yaw_rate: Some(yaw_rate),
@@ -371,13 +376,13 @@ fn collides(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> bool
 }
 
 /// [`gump_metrics::OffRoad`] of the ego.
-fn is_off_road(course: &Course, ego: &Agent) -> bool {
+fn is_off_road(prepared: &PreparedScenario, ego: &Agent) -> bool {
     if ego.kind != AgentKind::Vehicle {
         return false;
     }
     let z = ego.elevation - ego.height / 2.0;
     let is_off = |corner| {
-        let metres = course.border.metres_off_road(corner, z);
+        let metres = prepared.border.metres_off_road(corner, z);
         metres.is_some_and(|metres| metres > 0.0)
     };
     OrientedBox::corners(&ego.oriented_box())

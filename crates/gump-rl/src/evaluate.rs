@@ -7,8 +7,8 @@ use gump_scene::Seed;
 use rand::Rng as _;
 
 use crate::{
-    Actor, Autoreset, Course, DrivingEnv, EnvConfig, EpisodeStart, Outcome, RlError, Traffic,
-    VectorEnv,
+    Actor, Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, PreparedScenario, RlError,
+    Traffic, VectorEnv,
 };
 
 /// Mean progress of the logged drivers in the paper's test set, metres, by which progress is
@@ -122,17 +122,17 @@ impl Columns {
 /// The episodes of an evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Episodes {
-    /// Indices of the courses to drive.
+    /// Indices of the prepared to drive.
     pub scenarios: Vec<usize>,
     /// Drives of each, in other traffic of the same world.
     pub repeats: usize,
-    /// Source of all randomness: that of an episode depends on this seed, the index of the course
+    /// Source of all randomness: that of an episode depends on this seed, the index of the prepared
     /// and the repeat only, so an evaluation in parts equals one in one go.
     pub seed: Seed,
 }
 
 impl Episodes {
-    /// All of `n` courses.
+    /// All of `n` prepared.
     pub fn all(n: usize, repeats: usize, seed: Seed) -> Self {
         Self {
             scenarios: (0..n).collect(),
@@ -151,7 +151,7 @@ impl Episodes {
 /// # Errors
 /// Errors of the environment; [`RlError::Shape`] for a driver with other observations or actions.
 pub fn evaluate(
-    courses: &Arc<[Course]>,
+    prepared: &Arc<[PreparedScenario]>,
     traffic: Traffic<'_>,
     config: &EnvConfig,
     driver: Driver<'_>,
@@ -170,7 +170,7 @@ pub fn evaluate(
             nearest: None,
             ..*config
         };
-        let mut env = DrivingEnv::new(Arc::clone(courses), traffic, config)?;
+        let mut env = DrivingEnv::new(Arc::clone(prepared), traffic, config)?;
         let start = |&(scenario, repeat): &(usize, usize)| EpisodeStart {
             scenario,
             seed: episodes.seed.fork(scenario as u64).fork(repeat as u64),
@@ -404,14 +404,14 @@ mod tests {
     }
 
     /// Empty roads of different lengths behind the ego, a recorded ego of constant speed.
-    fn courses() -> Arc<[Course]> {
+    fn prepared() -> Arc<[PreparedScenario]> {
         let scene = |speed: f64| -> Scenario {
             let text = format!(
                 "lane 1: 0,0 400,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity {speed},0"
             );
             fixture::scenario(&text).unwrap()
         };
-        Course::prepare([4.0, 8.0, 12.0].map(scene), 0.5).unwrap()
+        PreparedScenario::prepare([4.0, 8.0, 12.0].map(scene), 0.5).unwrap()
     }
 
     fn run(driver: Driver<'_>, n_envs: usize) -> Vec<Drive> {
@@ -422,7 +422,7 @@ mod tests {
         let world = Idm::default();
         let traffic = Traffic::World(&world);
         let episodes = Episodes::all(3, 2, Seed(3));
-        evaluate(&courses(), traffic, &config, driver, &episodes).unwrap()
+        evaluate(&prepared(), traffic, &config, driver, &episodes).unwrap()
     }
 
     #[test]
@@ -463,7 +463,7 @@ mod tests {
         let config = EnvConfig::default();
         let driver = Driver::Learned(&actor);
         let episodes = Episodes::all(3, 1, Seed(0));
-        let result = evaluate(&courses(), Traffic::Log, &config, driver, &episodes);
+        let result = evaluate(&prepared(), Traffic::Log, &config, driver, &episodes);
         assert!(matches!(result, Err(RlError::Shape { expected: 3, .. })));
     }
 }

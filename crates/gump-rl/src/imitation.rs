@@ -5,9 +5,11 @@ use std::sync::Arc;
 use gump_scene::Seed;
 
 use crate::sac::{ReplayBuffer, Transition};
-use crate::{Autoreset, Course, DrivingEnv, EnvConfig, EpisodeStart, RlError, Traffic, VectorEnv};
+use crate::{
+    Autoreset, DrivingEnv, EnvConfig, EpisodeStart, PreparedScenario, RlError, Traffic, VectorEnv,
+};
 
-/// Drives every course once within its log, by the actions that come nearest to the log's, from the
+/// Drives every prepared once within its log, by the actions that come nearest to the log's, from the
 /// present to the end of the episode.
 ///
 /// The transitions are those of the environment, including rewards and ends. If the dynamics cannot
@@ -16,23 +18,27 @@ use crate::{Autoreset, Course, DrivingEnv, EnvConfig, EpisodeStart, RlError, Tra
 /// # Errors
 /// [`RlError::NoScenario`] and [`RlError::Parameter`].
 pub fn demonstrations(
-    courses: &Arc<[Course]>,
+    prepared: &Arc<[PreparedScenario]>,
     config: &EnvConfig,
 ) -> Result<ReplayBuffer, RlError> {
-    let n = courses.len();
+    let n = prepared.len();
     let config = EnvConfig {
         n_envs: n,
         autoreset: Autoreset::SameStep,
         ..*config
     };
-    let mut env = DrivingEnv::new(Arc::clone(courses), Traffic::Log, config)?;
+    let mut env = DrivingEnv::new(Arc::clone(prepared), Traffic::Log, config)?;
     let start = |scenario| EpisodeStart {
         scenario,
         seed: Seed(0),
     };
     env.reset_to(&(0..n).map(start).collect::<Vec<_>>())?;
     let (o, a) = (env.observation_len(), env.action_len());
-    let longest = courses.iter().map(Course::logged_steps).max().unwrap_or(0);
+    let longest = prepared
+        .iter()
+        .map(PreparedScenario::logged_steps)
+        .max()
+        .unwrap_or(0);
     let mut buffer = ReplayBuffer::new((n * longest).max(1), config.observation.form(), a)?;
     let mut actions = vec![0.0; n * a];
     let mut is_driving = vec![true; n];
@@ -73,8 +79,8 @@ mod tests {
         };
         // The second log drives into a parked car after 21 m.
         let scenes = [scene(""), scene("agent vehicle 1: 35.8,0")];
-        let courses = Course::prepare(scenes, 0.5).unwrap();
-        let buffer = demonstrations(&courses, &EnvConfig::default()).unwrap();
+        let prepared = PreparedScenario::prepare(scenes, 0.5).unwrap();
+        let buffer = demonstrations(&prepared, &EnvConfig::default()).unwrap();
         let ends: Vec<_> = buffer.iter().filter(|t| t.terminated).collect();
         assert_eq!(buffer.len(), 16 + 6);
         assert_eq!(ends.len(), 1);

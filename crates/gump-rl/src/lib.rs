@@ -1,7 +1,7 @@
 //! A vectorised driving environment over any world, and reinforcement learning in it.
 //!
 //! Start with [`DrivingEnv`]: many episodes in parallel, with one batched call of the world per
-//! step. It implements [`VectorEnv`], the only interface that learning algorithms need. [`Course`]
+//! step. It implements [`VectorEnv`], the only interface that learning algorithms need. [`PreparedScenario`]
 //! is a prepared scenario, [`Dynamics`] defines actions, [`ObservationSpec`] observations and
 //! [`RewardWeights`] the reward. [`Rules`] is one episode as pure functions. [`sac`] trains an
 //! [`Actor`] from rewards or from experts. [`server`] provides environments to other processes.
@@ -13,15 +13,15 @@
 //! * **step**: the duration of an action, half a second; one or more frames of a world.
 //!
 //! ```
-//! use gump_rl::{Course, DrivingEnv, EnvConfig, Traffic, VectorEnv};
+//! use gump_rl::{PreparedScenario, DrivingEnv, EnvConfig, Traffic, VectorEnv};
 //! use gump_scene::Seed;
 //!
 //! let scenario = gump_scene::fixture::scenario(
 //!     "lane 1: 0,0 300,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 8,0",
 //! ).unwrap();
-//! let courses = Course::prepare([scenario], 0.5).unwrap();
+//! let prepared = PreparedScenario::prepare([scenario], 0.5).unwrap();
 //! let config = EnvConfig { n_envs: 4, ..EnvConfig::default() };
-//! let mut env = DrivingEnv::new(courses, Traffic::Log, config).unwrap();
+//! let mut env = DrivingEnv::new(prepared, Traffic::Log, config).unwrap();
 //! env.reset(Seed(0)).unwrap();
 //! // Half of the hardest acceleration, straight ahead.
 //! env.step(&[0.5, 0.0].repeat(4)).unwrap();
@@ -30,7 +30,6 @@
 //! ```
 
 mod actor;
-mod course;
 mod dynamics;
 mod env;
 mod episode;
@@ -39,12 +38,12 @@ mod evaluate;
 mod imitation;
 pub mod networks;
 mod observation;
+mod prepared_scenario;
 pub mod sac;
 pub mod server;
 mod vector_env;
 
 pub use actor::Actor;
-pub use course::Course;
 pub use dynamics::{BicycleLimits, Dynamics, PoseLimits};
 pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling, Traffic};
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
@@ -57,4 +56,5 @@ pub use imitation::demonstrations;
 pub use observation::{
     ObservationForm, ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View, expand, observe,
 };
+pub use prepared_scenario::PreparedScenario;
 pub use vector_env::VectorEnv;

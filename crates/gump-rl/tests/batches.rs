@@ -9,19 +9,23 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use common::{Transition, busy, config, env, part, roam, street, wander};
 use gump_rl::{
-    Autoreset, Course, DrivingEnv, EnvConfig, ObservationSpec, RasterView, RlError, Sampling,
-    Traffic, VectorEnv, expand,
+    Autoreset, DrivingEnv, EnvConfig, ObservationSpec, PreparedScenario, RasterView, RlError,
+    Sampling, Traffic, VectorEnv, expand,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentState, Frame, Seed};
 
-fn with_mode<'w>(courses: &Arc<[Course]>, traffic: Traffic<'w>, mode: Autoreset) -> DrivingEnv<'w> {
+fn with_mode<'w>(
+    prepared: &Arc<[PreparedScenario]>,
+    traffic: Traffic<'w>,
+    mode: Autoreset,
+) -> DrivingEnv<'w> {
     let config = EnvConfig {
         autoreset: mode,
         ..config(4)
     };
-    DrivingEnv::new(Arc::clone(courses), traffic, config).unwrap()
+    DrivingEnv::new(Arc::clone(prepared), traffic, config).unwrap()
 }
 
 /// Each row acts by its own count of transitions, so that waiting rows act no differently.
@@ -69,10 +73,10 @@ fn transitions(env: &mut DrivingEnv<'_>, n: usize) -> Vec<Vec<Transition>> {
 
 #[test]
 fn transitions_are_the_same_in_all_autoreset_modes() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
     for traffic in [Traffic::Log, Traffic::World(&idm)] {
-        let of = |mode| transitions(&mut with_mode(&courses, traffic, mode), 40);
+        let of = |mode| transitions(&mut with_mode(&prepared, traffic, mode), 40);
         let same_step = of(Autoreset::SameStep);
         assert_eq!(same_step, of(Autoreset::NextStep));
         assert_eq!(same_step, of(Autoreset::Disabled));
@@ -84,10 +88,10 @@ fn transitions_are_the_same_in_all_autoreset_modes() {
 
 #[test]
 fn the_same_seed_gives_the_same_episodes() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
     for traffic in [Traffic::Log, Traffic::World(&idm)] {
-        let of = |seed| roam(&mut env(&courses, traffic, 3), Seed(seed), 30);
+        let of = |seed| roam(&mut env(&prepared, traffic, 3), Seed(seed), 30);
         assert_eq!(of(1), of(1));
         assert_ne!(of(1), of(2));
     }
@@ -95,18 +99,18 @@ fn the_same_seed_gives_the_same_episodes() {
 
 #[test]
 fn a_row_does_not_notice_its_neighbours() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
     for traffic in [Traffic::Log, Traffic::World(&idm)] {
-        let few = roam(&mut env(&courses, traffic, 2), Seed(1), 40);
-        let many = roam(&mut env(&courses, traffic, 5), Seed(1), 40);
+        let few = roam(&mut env(&prepared, traffic, 2), Seed(1), 40);
+        let many = roam(&mut env(&prepared, traffic, 5), Seed(1), 40);
         assert_eq!(few[..], many[..2]);
     }
 }
 
 #[test]
 fn the_number_of_threads_changes_nothing() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
     let raster = ObservationSpec::Raster(RasterView::default());
     for traffic in [Traffic::Log, Traffic::World(&idm)] {
@@ -119,7 +123,7 @@ fn the_number_of_threads_changes_nothing() {
                         sampling: Sampling::prioritized(),
                         ..config(20)
                     };
-                    let mut env = DrivingEnv::new(courses.clone(), traffic, config).unwrap();
+                    let mut env = DrivingEnv::new(prepared.clone(), traffic, config).unwrap();
                     roam(&mut env, Seed(2), 12)
                 };
                 pool.build().unwrap().install(run)
@@ -131,14 +135,14 @@ fn the_number_of_threads_changes_nothing() {
 
 #[test]
 fn agents_far_away_follow_the_log() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
     let of = |nearest| {
         let config = EnvConfig {
             nearest,
             ..config(3)
         };
-        let mut env = DrivingEnv::new(courses.clone(), Traffic::World(&idm), config).unwrap();
+        let mut env = DrivingEnv::new(prepared.clone(), Traffic::World(&idm), config).unwrap();
         roam(&mut env, Seed(1), 40)
     };
     let all = of(None);
@@ -150,20 +154,20 @@ fn agents_far_away_follow_the_log() {
 /// Replaying the log needs no session; a session that replays it gives the same motion.
 #[test]
 fn the_log_is_the_world_that_replays_it() {
-    for course in busy(4).iter() {
-        let courses = Course::prepare([course.scenario().clone()], course.dt()).unwrap();
-        let replay = LogReplay::new(course.scenario());
-        let fast = roam(&mut env(&courses, Traffic::Log, 2), Seed(1), 30);
-        let slow = roam(&mut env(&courses, Traffic::World(&replay), 2), Seed(1), 30);
+    for one in busy(4).iter() {
+        let prepared = PreparedScenario::prepare([one.scenario().clone()], one.dt()).unwrap();
+        let replay = LogReplay::new(one.scenario());
+        let fast = roam(&mut env(&prepared, Traffic::Log, 2), Seed(1), 30);
+        let slow = roam(&mut env(&prepared, Traffic::World(&replay), 2), Seed(1), 30);
         assert_eq!(fast, slow);
     }
 }
 
 #[test]
 fn an_episode_can_be_driven_again() {
-    let courses = busy(6);
+    let prepared = busy(6);
     let idm = Idm::default();
-    let mut original = env(&courses, Traffic::World(&idm), 3);
+    let mut original = env(&prepared, Traffic::World(&idm), 3);
     original.reset(Seed(8)).unwrap();
     // The second episode of row 1, with the actions it took.
     let mut actions = Vec::new();
@@ -181,7 +185,7 @@ fn an_episode_can_be_driven_again() {
             (n_ended == 2).then_some(ended)
         })
         .unwrap();
-    let mut again = env(&courses, Traffic::World(&idm), 1);
+    let mut again = env(&prepared, Traffic::World(&idm), 1);
     again.reset_to(&[outcome.start]).unwrap();
     for action in &actions {
         assert!(again.finished().is_empty());
@@ -211,10 +215,10 @@ fn rasters_are_what_their_bits_say() {
 
 #[test]
 fn refused_actions_change_nothing() {
-    let courses = street("");
+    let prepared = street("");
     let (mut env, mut untouched) = (
-        with_mode(&courses, Traffic::Log, Autoreset::Disabled),
-        with_mode(&courses, Traffic::Log, Autoreset::Disabled),
+        with_mode(&prepared, Traffic::Log, Autoreset::Disabled),
+        with_mode(&prepared, Traffic::Log, Autoreset::Disabled),
     );
     assert!(matches!(env.step(&[0.0; 8]), Err(RlError::NotReset)));
     assert!(matches!(
@@ -312,9 +316,9 @@ impl Session for FragileSession<'_> {
 
 #[test]
 fn failures_of_the_world_are_reported() {
-    let courses = street("");
+    let prepared = street("");
     let world = Fragile::default();
-    let mut fragile = env(&courses, Traffic::World(&world), 2);
+    let mut fragile = env(&prepared, Traffic::World(&world), 2);
     fragile.reset(Seed(0)).unwrap();
     world.broken.store(true, Ordering::Relaxed);
     let error = fragile.step(&[0.0; 4]).unwrap_err();
@@ -331,6 +335,6 @@ fn failures_of_the_world_are_reported() {
         dt: Some(0.3),
         ..Fragile::default()
     };
-    let error = env(&courses, Traffic::World(&odd), 2).reset(Seed(0));
+    let error = env(&prepared, Traffic::World(&odd), 2).reset(Seed(0));
     assert!(matches!(error, Err(RlError::TimeStep { frames: 0.3, .. })));
 }

@@ -7,8 +7,8 @@ mod common;
 use common::{DT, STREET, busy, config, env, street, until_end, wander};
 use gump_metrics::{Collision, Metric, OffRoad, Reward};
 use gump_rl::{
-    BicycleLimits, Course, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Failure, PoseLimits,
-    RlError, Rules, Traffic, VectorEnv,
+    BicycleLimits, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Failure, PoseLimits,
+    PreparedScenario, RlError, Rules, Traffic, VectorEnv,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
@@ -17,10 +17,10 @@ const COAST: [f32; 2] = [0.0, 0.0];
 
 #[test]
 fn a_free_road_is_driven_to_the_horizon() {
-    let courses = street("agent vehicle 1: 60,9");
+    let prepared = street("agent vehicle 1: 60,9");
     let idm = Idm::default();
     for traffic in [Traffic::Log, Traffic::World(&idm)] {
-        let mut env = env(&courses, traffic, 3);
+        let mut env = env(&prepared, traffic, 3);
         env.reset(Seed(0)).unwrap();
         let first = env.observations().to_vec();
         let (n, outcome) = until_end(&mut env, &COAST);
@@ -43,9 +43,9 @@ fn a_free_road_is_driven_to_the_horizon() {
 
 #[test]
 fn a_collision_terminates() {
-    let courses = street("agent vehicle 1: 34.85,0");
+    let prepared = street("agent vehicle 1: 34.85,0");
     for traffic in [Traffic::Log, Traffic::World(&ConstantVelocity)] {
-        let (n, outcome) = until_end(&mut env(&courses, traffic, 1), &COAST);
+        let (n, outcome) = until_end(&mut env(&prepared, traffic, 1), &COAST);
         // 20.05 m of free road at 5 m per step.
         assert_eq!((n, outcome.end), (5, End::Terminated(Failure::Collision)));
         assert!((outcome.totals.reward - (2.5 - 5.0)).abs() < 1e-9);
@@ -56,17 +56,17 @@ fn a_collision_terminates() {
 /// Both boxes are clear of each other after 2.5 and after 3 s; the car passes in between.
 #[test]
 fn a_collision_within_a_step_terminates() {
-    let courses = street("agent vehicle 1: 37.5,-55.5 heading 1.5708 velocity 0,20");
+    let prepared = street("agent vehicle 1: 37.5,-55.5 heading 1.5708 velocity 0,20");
     for traffic in [Traffic::Log, Traffic::World(&ConstantVelocity)] {
-        let (n, outcome) = until_end(&mut env(&courses, traffic, 1), &COAST);
+        let (n, outcome) = until_end(&mut env(&prepared, traffic, 1), &COAST);
         assert_eq!((n, outcome.end), (6, End::Terminated(Failure::Collision)));
     }
 }
 
 #[test]
 fn leaving_the_road_terminates() {
-    let courses = street("edge: -10,-3 400,-3\nedge: 400,3 -10,3");
-    let (n, outcome) = until_end(&mut env(&courses, Traffic::Log, 1), &[0.0, 1.0]);
+    let prepared = street("edge: -10,-3 400,-3\nedge: 400,3 -10,3");
+    let (n, outcome) = until_end(&mut env(&prepared, Traffic::Log, 1), &[0.0, 1.0]);
     assert_eq!(outcome.end, End::Terminated(Failure::OffRoad));
     assert!(n < 5 && outcome.totals.off_road, "{n}");
 }
@@ -75,11 +75,11 @@ fn leaving_the_road_terminates() {
 fn the_end_of_the_route_and_of_the_log_truncate() {
     let text = "lane 1: 0,0 30,0\nroute 1\nego vehicle 0: 10,0 velocity 10,0";
     let short = fixture::scenario(text).unwrap();
-    let courses = Course::prepare([short], DT).unwrap();
-    let (n, outcome) = until_end(&mut env(&courses, Traffic::Log, 1), &COAST);
+    let prepared = PreparedScenario::prepare([short], DT).unwrap();
+    let (n, outcome) = until_end(&mut env(&prepared, Traffic::Log, 1), &COAST);
     assert_eq!((n, outcome.end), (4, End::Truncated));
-    let courses = street("history 1.0 future 3.0 dt 0.1");
-    let steps = |traffic| until_end(&mut env(&courses, traffic, 1), &COAST).0;
+    let prepared = street("history 1.0 future 3.0 dt 0.1");
+    let steps = |traffic| until_end(&mut env(&prepared, traffic, 1), &COAST).0;
     assert_eq!(steps(Traffic::Log), 6);
     assert_eq!(steps(Traffic::World(&ConstantVelocity)), 16);
 }
@@ -91,8 +91,8 @@ fn rewards_are_those_of_the_metrics() {
     let rules = Rules::default();
     let reward = Reward::driving_step();
     let (mut failures, mut n) = (0, 0);
-    for (i, course) in busy(24).iter().enumerate() {
-        let scene = course.scenario().present();
+    for (i, prepared) in busy(24).iter().enumerate() {
+        let scene = prepared.scenario().present();
         let history: Vec<Frame> = scene.strided_history(5, 9).into_iter().cloned().collect();
         let start = SceneState {
             history: &history,
@@ -100,11 +100,11 @@ fn rewards_are_those_of_the_metrics() {
             ..scene
         };
         let mut rollout = Rollout::begin(start);
-        let mut state = rules.reset(course);
+        let mut state = rules.reset(prepared);
         while state.end.is_none() {
             let action = wander(i, state.steps as u64, 2);
-            let next = rules.step(course, &state, &action).unwrap();
-            let [before, frame] = [state.steps, next.steps].map(|step| course.logged(step));
+            let next = rules.step(prepared, &state, &action).unwrap();
+            let [before, frame] = [state.steps, next.steps].map(|step| prepared.logged(step));
             let others = frame.agents().iter().filter(|agent| agent.id != scene.ego);
             // Both failures by the metrics at a moment of the step.
             let failed = |k: usize| {
@@ -159,9 +159,9 @@ fn rewards_are_those_of_the_metrics() {
 /// Metres between the driven ego and its log, at most, and the share of safe episodes, when all
 /// rows do what the log did.
 fn follow_the_log(dynamics: Dynamics) -> (f64, f64) {
-    let courses = busy(24);
+    let prepared = busy(24);
     let config = EnvConfig {
-        n_envs: courses.len(),
+        n_envs: prepared.len(),
         rules: Rules {
             dynamics,
             ..Rules::default()
@@ -170,7 +170,7 @@ fn follow_the_log(dynamics: Dynamics) -> (f64, f64) {
         autoreset: gump_rl::Autoreset::Disabled,
         ..EnvConfig::default()
     };
-    let mut env = DrivingEnv::new(courses, Traffic::Log, config).unwrap();
+    let mut env = DrivingEnv::new(prepared, Traffic::Log, config).unwrap();
     env.reset(Seed(0)).unwrap();
     let mut actions = vec![0.0; env.n_envs() * env.action_len()];
     let (mut worst, mut safe) = (0.0f64, 0);
@@ -179,7 +179,7 @@ fn follow_the_log(dynamics: Dynamics) -> (f64, f64) {
         env.step(&actions).unwrap();
         for row in 0..env.n_envs() {
             let (start, state) = env.episode(row).unwrap();
-            let logged = env.courses()[start.scenario].logged_ego(state.steps);
+            let logged = env.prepared()[start.scenario].logged_ego(state.steps);
             let logged = logged.unwrap().pose.position;
             worst = worst.max(logged.distance(state.ego.state.pose.position));
         }
@@ -210,24 +210,24 @@ fn the_experts_actions_reproduce_the_log() {
 
 #[test]
 fn a_copied_state_has_the_same_successor() {
-    let courses = busy(1);
+    let prepared = busy(1);
     let rules = Rules::default();
-    let start = rules.reset(&courses[0]);
-    let one = rules.step(&courses[0], &start, &[0.5, 0.1]).unwrap();
+    let start = rules.reset(&prepared[0]);
+    let one = rules.step(&prepared[0], &start, &[0.5, 0.1]).unwrap();
     let again = rules
-        .step(&courses[0], &start.clone(), &[0.5, 0.1])
+        .step(&prepared[0], &start.clone(), &[0.5, 0.1])
         .unwrap();
     assert_eq!(one, again);
-    let other = rules.step(&courses[0], &start, &[0.5, -0.1]).unwrap();
+    let other = rules.step(&prepared[0], &start, &[0.5, -0.1]).unwrap();
     assert_ne!(one, other);
 }
 
 #[test]
 fn what_is_no_action_is_refused() {
-    let courses = street("");
+    let prepared = street("");
     let rules = Rules::default();
-    let start = rules.reset(&courses[0]);
-    let refuse = |action: &[f32]| rules.step(&courses[0], &start, action).unwrap_err();
+    let start = rules.reset(&prepared[0]);
+    let refuse = |action: &[f32]| rules.step(&prepared[0], &start, action).unwrap_err();
     assert!(matches!(refuse(&[0.0]), RlError::Count { found: 1, .. }));
     assert!(matches!(
         refuse(&[0.0, f32::NAN]),
@@ -241,17 +241,17 @@ fn what_is_no_action_is_refused() {
     );
     let mut ended = start;
     ended.end = Some(End::Truncated);
-    let error = rules.step(&courses[0], &ended, &COAST).unwrap_err();
+    let error = rules.step(&prepared[0], &ended, &COAST).unwrap_err();
     assert!(matches!(error, RlError::Finished { row: 0 }));
 }
 
 #[test]
 fn parameters_out_of_range_are_refused() {
-    let courses = street("");
+    let prepared = street("");
     let check = |change: &dyn Fn(&mut EnvConfig)| {
         let mut config = config(2);
         change(&mut config);
-        let found = DrivingEnv::new(courses.clone(), Traffic::Log, config);
+        let found = DrivingEnv::new(prepared.clone(), Traffic::Log, config);
         assert!(matches!(found.err(), Some(RlError::Parameter { .. })));
     };
     check(&|c| c.n_envs = 0);
@@ -277,5 +277,5 @@ fn parameters_out_of_range_are_refused() {
     let nothing = DrivingEnv::new([].into(), Traffic::Log, config(2));
     assert!(matches!(nothing.err(), Some(RlError::NoScenario)));
     let none = fixture::scenario(STREET).unwrap();
-    assert!(Course::new(none, 0.03).is_err());
+    assert!(PreparedScenario::new(none, 0.03).is_err());
 }

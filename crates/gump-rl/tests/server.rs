@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 
 use common::{busy, config, env};
 use gump_rl::server::{Event, Server, ServerError};
-use gump_rl::{Course, Traffic, VectorEnv};
+use gump_rl::{PreparedScenario, Traffic, VectorEnv};
 use gump_scene::Seed;
 
 const N: usize = 3;
@@ -23,13 +23,17 @@ fn socket(name: &str) -> PathBuf {
 }
 
 /// Runs a server on the log while `talk` talks to it; returns its events.
-fn with_server(name: &str, courses: &Arc<[Course]>, talk: impl FnOnce(&Path)) -> Vec<Event> {
+fn with_server(
+    name: &str,
+    prepared: &Arc<[PreparedScenario]>,
+    talk: impl FnOnce(&Path),
+) -> Vec<Event> {
     let path = socket(name);
     let server = Server::bind(&path).unwrap();
     let events = Mutex::new(Vec::new());
     let record = |event| events.lock().unwrap().push(event);
     std::thread::scope(|scope| {
-        let run = || server.run(courses, Traffic::Log, &config(1), &record);
+        let run = || server.run(prepared, Traffic::Log, &config(1), &record);
         let running = scope.spawn(run);
         let stop = StopOnDrop(&server);
         talk(&path);
@@ -143,10 +147,10 @@ fn farewell(events: &[Event]) -> &gump_rl::server::Farewell {
 
 #[test]
 fn a_client_sees_what_the_environment_shows() {
-    let courses = busy(4);
-    let mut own = env(&courses, Traffic::Log, N);
+    let prepared = busy(4);
+    let mut own = env(&prepared, Traffic::Log, N);
     own.reset_with(&[Seed(7), Seed(8), Seed(9)]).unwrap();
-    let events = with_server("sees", &courses, |path| {
+    let events = with_server("sees", &prepared, |path| {
         let mut client = Client::greeted(path, 1);
         assert_eq!(client.reset([7, 8, 9]), own.observations());
         for _ in 0..20 {
@@ -182,8 +186,8 @@ fn a_client_sees_what_the_environment_shows() {
 
 #[test]
 fn refusals_change_nothing_and_the_talk_goes_on() {
-    let courses = busy(2);
-    with_server("refusals", &courses, |path| {
+    let prepared = busy(2);
+    with_server("refusals", &prepared, |path| {
         let mut client = Client::greeted(path, 2);
         let mut untouched = Client::greeted(path, 2);
         let (code, what) = client.refused(&frame(3, &[0; 24]));
@@ -211,9 +215,9 @@ fn refusals_change_nothing_and_the_talk_goes_on() {
 
 /// Sends garbage; returns the message of the server and the error it hung up with.
 fn garbage(name: &str, greeted: bool, bytes: &[u8]) -> (String, ServerError) {
-    let courses = busy(1);
+    let prepared = busy(1);
     let mut message = String::new();
-    let mut events = with_server(name, &courses, |path| {
+    let mut events = with_server(name, &prepared, |path| {
         let mut client = if greeted {
             Client::greeted(path, 1)
         } else {
@@ -274,8 +278,8 @@ fn garbage_is_answered_and_the_server_lives_on() {
 
 #[test]
 fn a_client_may_vanish_within_a_step() {
-    let courses = busy(2);
-    let events = with_server("vanish", &courses, |path| {
+    let prepared = busy(2);
+    let events = with_server("vanish", &prepared, |path| {
         let mut client = Client::greeted(path, 1);
         client.reset([1, 2, 3]);
         client.step(&[0.0; 6]);

@@ -89,7 +89,7 @@ fn draw_scenario(
         objects_of_interest: Vec::new(),
         tags: Vec::new(),
     };
-    scenario.tags = gump_metrics::tags::mine(&scenario);
+    scenario.tags = gump_metrics::tags::extract_tags(&scenario);
     Some(scenario)
 }
 

@@ -34,7 +34,7 @@ impl Mpi {
 
     /// Skips MPI's finalization, so that `mpirun` stops the other processes when this one ends: for
     /// a process that failed while others may not have.
-    pub fn desert(&self) {
+    pub fn abort(&self) {
         std::mem::forget(self.clone());
     }
 }

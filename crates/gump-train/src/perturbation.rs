@@ -24,7 +24,7 @@ const TURN: f64 = 0.12;
 
 /// The `frames` token frames of a log from index `start` on, perturbed after the first; a push is
 /// up to `reach_m` metres to either side.
-pub(crate) fn sway(
+pub(crate) fn lateral_perturbation(
     scenario: &Scenario,
     start: usize,
     stride: usize,
@@ -88,14 +88,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_drives_sways_around_its_way_and_who_stands_or_walks_does_not() {
+    fn drivers_are_displaced_from_their_path_and_who_stands_or_walks_is_not() {
         let scenario = fixture::scenario(
             "ego vehicle 0: 0,0 velocity 8,0
              agent vehicle 1: 20,0 velocity 0,0
              agent pedestrian 7: 30,3 velocity 0,-3",
         )
         .unwrap();
-        let shown = |seed| sway(&scenario, 10, 5, 5, 1.0, &mut Seed(seed).rng());
+        let shown = |seed| lateral_perturbation(&scenario, 10, 5, 5, 1.0, &mut Seed(seed).rng());
         let mut farthest = 0.0_f64;
         for seed in 0..20 {
             let drive = shown(seed);

@@ -6,7 +6,7 @@
 use std::error::Error;
 use std::path::Path;
 
-use gump_viz::{Camera, FilmSpec, PictureSpec, Take, Theme};
+use gump_viz::{Camera, FilmSpec, LabelledRollout, PictureSpec, Theme};
 use gump_viz::{draw_futures, grid_film, log_as_rollout};
 
 const SHIPPED: &str = concat!(
@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     picture.save_png(Path::new("out/scene.png"))?;
 
     let log = log_as_rollout(&scenario);
-    let take = Take {
+    let take = LabelledRollout {
         rollout: &log,
         label: scenario.id.clone(),
     };

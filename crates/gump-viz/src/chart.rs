@@ -26,7 +26,7 @@ pub struct Chart {
     /// Whether to mark each point with a disc: for few points that were measured.
     pub markers: bool,
     /// Labels at 1, 2, ... of a horizontal axis of categories; empty for an axis of numbers.
-    pub ways: Vec<String>,
+    pub categories: Vec<String>,
     /// The curves, in the order of the legend.
     pub series: Vec<Series>,
 }
@@ -84,11 +84,11 @@ impl Chart {
 
     /// Returns the label at a place of the horizontal axis.
     fn x_tick(&self, x: f64) -> String {
-        if self.ways.is_empty() {
+        if self.categories.is_empty() {
             return tick(x);
         }
         let is_whole = (x - x.round()).abs() < 1e-6 && x >= 1.0;
-        let way = is_whole.then(|| self.ways.get(x.round() as usize - 1));
+        let way = is_whole.then(|| self.categories.get(x.round() as usize - 1));
         way.flatten().cloned().unwrap_or_default()
     }
 
@@ -120,10 +120,10 @@ impl Chart {
             .configure_mesh()
             .x_desc(self.x_label.as_str())
             .y_desc(self.y_label.as_str())
-            .x_labels(if self.ways.is_empty() {
+            .x_labels(if self.categories.is_empty() {
                 8
             } else {
-                2 * self.ways.len() + 1
+                2 * self.categories.len() + 1
             })
             .y_labels(6)
             .x_label_formatter(&|v| self.x_tick(*v))
@@ -180,7 +180,7 @@ impl Plot for Chart {
         let ends = spans.flat_map(|&(_, low, high)| [low, high]);
         let ends = ends.filter(|&y| self.fits(y, self.log_y));
         let empty = || VizError::EmptyChart(self.title.clone());
-        let x = match self.ways.len() {
+        let x = match self.categories.len() {
             0 => range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?,
             n => (0.5, n as f64 + 0.5),
         };
@@ -344,7 +344,7 @@ mod tests {
     #[test]
     fn ways_stand_under_their_points() {
         let mut chart = losses();
-        chart.ways = ["full", "partial"].map(String::from).into();
+        chart.categories = ["full", "partial"].map(String::from).into();
         chart.series.truncate(1);
         chart.series[0].points = vec![(1.0, 0.5), (2.0, 0.75)];
         chart.series[0].spans = vec![(1.0, 0.4, 0.6)];

@@ -11,8 +11,8 @@ use tiny_skia::{
     FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Rect, Stroke, Transform,
 };
 
-use crate::lettering;
 use crate::pen::paint;
+use crate::text_layout;
 use crate::theme::Rgb;
 
 /// Pixels per unit of the drawing, so that it is sharp on dense screens and on paper.
@@ -182,7 +182,7 @@ impl DrawingBackend for ChartCanvas<'_> {
 
     fn draw_text<S: BackendTextStyle>(&mut self, text: &str, style: &S, at: BackendCoord) -> Drawn {
         let height = capital(style);
-        let width = lettering::width(text, height);
+        let width = text_layout::width(text, height);
         let anchor = style.anchor();
         let left = match anchor.h_pos {
             HPos::Left => 0.0,
@@ -205,7 +205,7 @@ impl DrawingBackend for ChartCanvas<'_> {
             .pre_translate(x, y)
             .pre_rotate(turn);
         let ink = self.ink(style.color());
-        lettering::stroke(self.pixmap, text, (left, baseline), height, &ink, placed);
+        text_layout::stroke(self.pixmap, text, (left, baseline), height, &ink, placed);
         Ok(())
     }
 
@@ -215,7 +215,7 @@ impl DrawingBackend for ChartCanvas<'_> {
         style: &S,
     ) -> Result<(u32, u32), DrawingErrorKind<Infallible>> {
         let height = capital(style);
-        let width = lettering::width(text, height);
+        let width = text_layout::width(text, height);
         Ok((width.ceil() as u32, (1.4 * height).ceil() as u32))
     }
 }

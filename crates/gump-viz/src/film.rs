@@ -19,7 +19,7 @@ use crate::indexed::{Palette, UNCHANGED};
 use crate::pen::Pen;
 use crate::picture::{draw_label, draw_rectangle, recent};
 use crate::theme::{Colours, mix};
-use crate::{Camera, Theme, VizError, lettering, video};
+use crate::{Camera, Theme, VizError, text_layout, video};
 
 /// Content and style of a film.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,7 +98,7 @@ const FOLLOWED: f64 = 90.0;
 
 /// A rollout and the label in the corner of its panel.
 #[derive(Clone, Debug)]
-pub struct Take<'a> {
+pub struct LabelledRollout<'a> {
     /// The rollout.
     pub rollout: &'a Rollout,
     /// Label; empty for none.
@@ -139,7 +139,7 @@ struct Patch {
 /// # Errors
 /// [`VizError::NothingToFilm`], or [`VizError::Size`] if the panels together are too large for a
 /// GIF (65 535 pixels a side) or empty.
-pub fn grid_film(takes: &[Take<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
+pub fn grid_film(takes: &[LabelledRollout<'_>], spec: &FilmSpec) -> Result<Film, VizError> {
     let panels = takes.iter().map(|take| Panel {
         rollouts: vec![take.rollout],
         label: &take.label,
@@ -458,8 +458,8 @@ fn draw_footer(width: usize, time: f64, duration: f64, colours: &Colours) -> Opt
     let [r, g, b] = colours.ground;
     pixmap.fill(tiny_skia::Color::from_rgba8(r, g, b, 0xFF));
     let label = format!("{time:.1} s");
-    lettering::write(&mut pixmap, &label, (8.0, 16.0), 8.0, colours.text);
-    let left = 16.0 + lettering::width("88.8 s", 8.0);
+    text_layout::write(&mut pixmap, &label, (8.0, 16.0), 8.0, colours.text);
+    let left = 16.0 + text_layout::width("88.8 s", 8.0);
     let track = width as f64 - left - 10.0;
     let share = if duration > 0.0 {
         (time / duration).min(1.0)

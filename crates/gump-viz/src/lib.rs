@@ -41,11 +41,11 @@ mod error;
 mod files;
 mod film;
 mod indexed;
-mod lettering;
 mod page;
 mod pen;
 mod picture;
 mod plot;
+mod text_layout;
 mod theme;
 mod video;
 mod viewer;
@@ -57,7 +57,7 @@ pub use bars::{Bar, BarGroup, Bars};
 pub use camera::Camera;
 pub use chart::{Chart, Series};
 pub use error::VizError;
-pub use film::{Film, FilmSpec, Take, grid_film, log_as_rollout, overlay_film};
+pub use film::{Film, FilmSpec, LabelledRollout, grid_film, log_as_rollout, overlay_film};
 pub use page::{Page, Section};
 pub use picture::{
     Picture, PictureSpec, draw_candidates, draw_futures, draw_raster_layer, draw_scene,

@@ -13,7 +13,7 @@ use crate::draw_map::draw_backdrop;
 use crate::files::write_whole;
 use crate::pen::{Pen, Shape, paint};
 use crate::theme::{Colours, Rgb, mix};
-use crate::{Camera, CandidatePath, Theme, VizError, lettering};
+use crate::{Camera, CandidatePath, Theme, VizError, text_layout};
 
 /// Content and style of a picture.
 #[derive(Clone, Debug, PartialEq)]
@@ -245,7 +245,7 @@ fn draw_scale_bar(pixmap: &mut Pixmap, scale: f64, colours: &Colours) {
     let (left, bottom) = (size * 1.2, f64::from(pixmap.height()) - size * 1.2);
     let (length, thick) = (metres * scale, (size / 5.0).max(1.5));
     let words = left + length + size * 0.7;
-    let right = words + lettering::width(&label, size) + size;
+    let right = words + text_layout::width(&label, size) + size;
     draw_patch(
         pixmap,
         (0.0, bottom - size * 1.9),
@@ -265,7 +265,7 @@ fn draw_scale_bar(pixmap: &mut Pixmap, scale: f64, colours: &Colours) {
     ] {
         draw_rectangle(pixmap, (x, y), (w, h), colours.text, 1.0);
     }
-    lettering::write(pixmap, &label, (words, bottom), size, colours.text);
+    text_layout::write(pixmap, &label, (words, bottom), size, colours.text);
 }
 
 /// The largest of 1, 2, 5, 10, 20, ... that does not exceed `metres`.
@@ -284,7 +284,7 @@ fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
         ("bicycle", colours.bicycle),
     ];
     let size = (f64::from(pixmap.width()) / 60.0).clamp(6.0, 11.0);
-    let advance = |text: &str| lettering::width(text, size) + size * 3.0;
+    let advance = |text: &str| text_layout::width(text, size) + size * 3.0;
     let total: f64 = entries.iter().map(|(text, _)| advance(text)).sum();
     let (right, bottom) = (f64::from(pixmap.width()), f64::from(pixmap.height()));
     let (mut x, baseline) = (right - total, bottom - size * 1.2);
@@ -292,7 +292,7 @@ fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
     draw_patch(pixmap, (x - size, baseline - size * 1.9), patch, colours);
     for (text, colour) in entries {
         draw_rectangle(pixmap, (x, baseline - size), (size, size), colour, 1.0);
-        lettering::write(pixmap, text, (x + size * 1.5, baseline), size, colours.text);
+        text_layout::write(pixmap, text, (x + size * 1.5, baseline), size, colours.text);
         x += advance(text);
     }
 }
@@ -304,10 +304,10 @@ pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
     }
     let width = f64::from(pixmap.width());
     let size = (width / 50.0).clamp(9.0, 12.0);
-    let label = lettering::fitted(label, size, width - size * 1.4);
-    let patch = (lettering::width(&label, size) + size * 1.4, size * 2.4);
+    let label = text_layout::fitted(label, size, width - size * 1.4);
+    let patch = (text_layout::width(&label, size) + size * 1.4, size * 2.4);
     draw_patch(pixmap, (0.0, 0.0), patch, colours);
-    lettering::write(pixmap, &label, (size * 0.7, size * 1.7), size, colours.text);
+    text_layout::write(pixmap, &label, (size * 0.7, size * 1.7), size, colours.text);
 }
 
 /// A piece of ground under words, so that they can be read over anything.

@@ -6,8 +6,8 @@ use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario, fixture};
 
 use crate::theme::{Rgb, mix};
 use crate::{
-    Camera, CandidatePath, Chart, FilmSpec, Page, Picture, PictureSpec, Series, Take, Theme,
-    VizError, draw_candidates, draw_futures, draw_raster_layer, draw_scene, grid_film,
+    Camera, CandidatePath, Chart, FilmSpec, LabelledRollout, Page, Picture, PictureSpec, Series,
+    Theme, VizError, draw_candidates, draw_futures, draw_raster_layer, draw_scene, grid_film,
     log_as_rollout, overlay_film,
 };
 
@@ -213,7 +213,7 @@ fn a_film_of_two_futures_plays_side_by_side() {
     let mut spec = FilmSpec::new(camera(&scenario));
     (spec.frame_s, spec.speed) = (0.2, 2.0);
     spec.past_s = 0.0;
-    let take = |rollout, label: &str| Take {
+    let take = |rollout, label: &str| LabelledRollout {
         rollout,
         label: label.into(),
     };

@@ -1,17 +1,17 @@
 //! The viewer: one HTML file in which to play scenes, their logs and any number of futures.
 //!
-//! [`Viewer`] collects the content of a scene, `viewer/told.rs` the metrics, predictions and
+//! [`Viewer`] collects the content of a scene, `viewer/annotations.rs` the metrics, predictions and
 //! candidate paths shown beside it; `viewer/pack.rs` packs it; `viewer/gallery.rs` puts scenes and
 //! page together. The page itself is `viewer/*.js` and `traffic.js`, plain script without
 //! libraries. Its colours are in `theme.rs` and `palette.css`, shared with pictures and pages.
 
+mod annotations;
 mod gallery;
 mod pack;
 #[cfg(feature = "rerun")]
 mod recording;
 #[cfg(test)]
 mod tests;
-mod told;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -22,10 +22,10 @@ use serde_json::{Value, json};
 
 use crate::VizError;
 use crate::draw_map::{is_for_cars, style};
+use annotations::{CELL, SPEED, TURN_DEG};
+pub use annotations::{CandidatePath, HeatMap, MetricTrack};
 pub use gallery::Gallery;
 use pack::{CENTI, Class, HEADINGS, Packer, units};
-use told::{CELL, SPEED, TURN_DEG};
-pub use told::{CandidatePath, HeatMap, MetricTrack};
 
 /// The map is kept within this distance of any agent, metres.
 const MARGIN: f64 = 120.0;

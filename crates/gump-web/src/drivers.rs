@@ -1,7 +1,7 @@
 //! Rule-based drivers of the ego, which plan at each half second.
 
 use gump_geometry::dvec2;
-use gump_nuplan::closed_loop::{Driver as Planner, Moment, Recording};
+use gump_nuplan::closed_loop::{Driver as Planner, PlannerInput, Recording};
 use gump_planner::{NuplanIdmDriver, PdmClosed};
 use gump_rollout::BoxError;
 use gump_scene::{AgentState, EgoState, SceneState};
@@ -12,7 +12,7 @@ use crate::tape::Driver;
 /// Microseconds between frames.
 const FRAME_US: i64 = 100_000;
 
-/// Moment of the drive at which a driver plans.
+/// PlannerInput of the drive at which a driver plans.
 pub(crate) struct Place<'a> {
     pub(crate) recording: &'a Recording,
     pub(crate) scene: SceneState<'a>,
@@ -45,11 +45,11 @@ fn follow(
     place: &Place<'_>,
     n: usize,
 ) -> Result<Vec<AgentState>, BoxError> {
-    planner.start(&place.recording.mission())?;
+    planner.start(&place.recording.initialization())?;
     let Some((ego, past)) = place.ego.split_last() else {
         return Ok(Vec::new());
     };
-    let plan = planner.drive(&Moment {
+    let plan = planner.drive(&PlannerInput {
         iteration: past.len(),
         scene: place.scene,
         ego,

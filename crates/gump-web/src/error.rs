@@ -67,7 +67,7 @@ pub enum GameError {
     Over(usize),
     /// A moment that has not been driven.
     #[error("The moment {asked:.1} s has not been driven: the drive is {driven:.1} s long.")]
-    Moment {
+    PlannerInput {
         /// The requested moment, seconds.
         asked: f64,
         /// Length of the drive, seconds.

@@ -330,7 +330,7 @@ impl Game {
     /// Rewinds the drive to so many frames after its start.
     ///
     /// # Errors
-    /// [`GameError::Moment`] for a moment that has not been driven.
+    /// [`GameError::PlannerInput`] for a moment that has not been driven.
     pub fn rewind(&mut self, frame: usize) -> Result<(), GameError> {
         self.check_moment(frame)?;
         let knot = frame / STRIDE;
@@ -404,7 +404,7 @@ impl Game {
     /// Begins eight futures from so many frames after the start, at the half second before it.
     ///
     /// # Errors
-    /// [`GameError::Moment`] for a moment that has not been driven.
+    /// [`GameError::PlannerInput`] for a moment that has not been driven.
     pub fn branch(&mut self, frame: usize) -> Result<(), GameError> {
         self.check_moment(frame)?;
         let knot = frame / STRIDE;
@@ -452,7 +452,7 @@ impl Game {
     /// The scene as it was so many frames after the start.
     ///
     /// # Errors
-    /// [`GameError::Moment`] for a moment that has not been driven.
+    /// [`GameError::PlannerInput`] for a moment that has not been driven.
     pub fn at(&self, frame: usize) -> Result<SceneState<'_>, GameError> {
         self.check_moment(frame)?;
         let scene = self.scene();
@@ -540,7 +540,7 @@ impl Game {
         if frame <= self.driven() {
             return Ok(());
         }
-        Err(GameError::Moment {
+        Err(GameError::PlannerInput {
             asked: frame as f64 * DT,
             driven: self.driven() as f64 * DT,
         })

@@ -98,7 +98,7 @@ pub mod prelude {
     pub use crate::model::{Device, checkpoint};
     #[cfg(feature = "nuplan")]
     pub use crate::nuplan::closed_loop::{
-        DriveConfig, Driver, Imagined, Moment, Replayed, Traffic,
+        DriveConfig, Driver, Imagined, PlannerInput, Replayed, Traffic,
     };
     #[cfg(feature = "nuplan")]
     pub use crate::nuplan::{reactive_agents::NuplanIdm, tracking::Trajectory};

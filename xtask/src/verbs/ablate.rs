@@ -1,9 +1,9 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
 mod decoding;
-mod lesson;
 mod scaling;
 mod switches;
+mod train_variant;
 
 use std::num::NonZeroUsize;
 

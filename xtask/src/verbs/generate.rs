@@ -9,9 +9,9 @@ use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_eval::worlds::{self, World, WorldName};
+use gump_generate::check::{off_road, overlaps};
 use gump_generate::constraint::parse_constraints;
-use gump_generate::factory::{GenerationJob, GenerationWorlds, Made, make_many};
-use gump_generate::verdict::{off_road, overlaps};
+use gump_generate::pipeline::{CheckedScene, GenerationJob, GenerationWorlds, make_many};
 use gump_generate::{Counts, GenerateConfig, GenerateError, GenerateRequest, Placement};
 use gump_model::{Device, checkpoint, relative};
 use gump_scene::{AgentKind, Scenario, ScenarioTag};
@@ -221,7 +221,7 @@ impl Args {
         run: &Run,
         worlds: GenerationWorlds<'_>,
         order: &GenerationJob,
-    ) -> anyhow::Result<(Vec<Made>, Duration)> {
+    ) -> anyhow::Result<(Vec<CheckedScene>, Duration)> {
         let n = self.count.get() as u64;
         let progress = run.progress("generating", n, "scenes");
         let began = Instant::now();
@@ -316,7 +316,7 @@ pub(crate) fn world(
 }
 
 /// All scenes as Waymo records, the first as JSON, as a picture, and as a film if it moves.
-fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
+fn write(run: &Run, made: &[CheckedScene], film: &FilmArgs) -> anyhow::Result<()> {
     let scenarios: Vec<&Scenario> = made.iter().map(|made| &made.scenario).collect();
     gump_data::womd::write_scenarios(&run.path("scenes.tfrecord"), scenarios.iter().copied())?;
     let Some(&first) = scenarios.first() else {
@@ -345,7 +345,7 @@ fn write(run: &Run, made: &[Made], film: &FilmArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn report(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()> {
+fn report(run: &mut Run, made: &[CheckedScene], elapsed: Duration) -> anyhow::Result<()> {
     let n = made.len() as f64;
     let agents: usize = made.iter().map(agents).sum();
     let vehicles: usize = made
@@ -378,7 +378,7 @@ fn report(run: &mut Run, made: &[Made], elapsed: Duration) -> anyhow::Result<()>
 }
 
 /// Share of vehicles at standstill in the last frames of the simulated futures; `None` without any.
-fn standing_at_end(made: &[Made]) -> Option<f64> {
+fn standing_at_end(made: &[CheckedScene]) -> Option<f64> {
     let imagined = made
         .iter()
         .filter(|made| !made.scenario.future().is_empty());
@@ -392,20 +392,20 @@ fn standing_at_end(made: &[Made]) -> Option<f64> {
     (!speeds.is_empty()).then(|| standing as f64 / speeds.len() as f64)
 }
 
-fn agents(made: &Made) -> usize {
+fn agents(made: &CheckedScene) -> usize {
     count(made, AgentKind::is_moving)
 }
 
-fn count(made: &Made, wanted: impl Fn(AgentKind) -> bool) -> usize {
+fn count(made: &CheckedScene, wanted: impl Fn(AgentKind) -> bool) -> usize {
     let present = made.scenario.present();
     let agents = present.now().agents().iter();
     agents.filter(|agent| wanted(agent.kind)).count()
 }
 
 /// Per clause whether it holds; of several scenes, in all of them, with the share in which it does.
-fn clauses(made: &[Made]) -> Vec<Value> {
+fn clauses(made: &[CheckedScene]) -> Vec<Value> {
     let first = made.first().map_or(&[][..], |made| &made.clauses);
-    let row = |(i, clause): (usize, &gump_generate::verdict::Clause)| {
+    let row = |(i, clause): (usize, &gump_generate::check::Clause)| {
         let verdicts: Vec<Option<bool>> = made.iter().map(|made| made.clauses[i].holds).collect();
         let holding = verdicts
             .iter()

@@ -7,7 +7,7 @@ use gump_eval::planners::{PlannerName, PlanningWorld, TimedDriver};
 use gump_eval::recordings;
 use gump_eval::recordings::Case;
 use gump_eval::worlds::WorldName;
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{Scored, drive_and_score};
 use gump_planner::{Candidate, Decision, Explain};
@@ -116,12 +116,12 @@ struct Noteworthy {
 
 impl Noted<'_> {
     /// Keeps the decision of this moment if it is the one to explain so far.
-    fn note(&mut self, moment: &Moment<'_>) {
+    fn note(&mut self, input: &PlannerInput<'_>) {
         let (Some(explain), Some(decision)) = (self.explain, self.inner.decision()) else {
             return;
         };
         // Between two decisions the ego follows the older one, which began with others elsewhere.
-        let now = moment.scene.now();
+        let now = input.scene.now();
         let is_here = |then: &Agent| {
             let position = |agent: &Agent| agent.state.pose.position;
             now.agent(then.id)
@@ -134,13 +134,13 @@ impl Noted<'_> {
             .is_some_and(begins_now);
         let weight = explain::weight(decision);
         let is_requested = match explain {
-            Step::Number(step) => moment.iteration <= step,
+            Step::Number(step) => input.iteration <= step,
             Step::Decisive => self.explained.as_ref().is_none_or(|e| weight > e.weight),
         };
         if is_requested && (is_new || self.explained.is_none()) {
             self.explained = Some(Noteworthy {
-                step: moment.iteration,
-                past: moment.scene.history.to_vec(),
+                step: input.iteration,
+                past: input.scene.history.to_vec(),
                 decision: decision.clone(),
                 weight,
             });
@@ -153,16 +153,16 @@ impl Driver for Noted<'_> {
         self.inner.name()
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.inner.start(initialization)
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         // A drive takes a minute; after Ctrl-C its remainder is of no use.
         stop_if_interrupted()?;
-        let plan = self.inner.drive(moment)?;
+        let plan = self.inner.drive(input)?;
         self.steps.push(self.inner.candidates());
-        self.note(moment);
+        self.note(input);
         Ok(plan)
     }
 }

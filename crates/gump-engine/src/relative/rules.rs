@@ -35,7 +35,7 @@ const HARDEST: f64 = 6.0;
 pub(super) type Again<'a> = dyn FnMut(&[usize], usize) -> Vec<Pose> + 'a;
 
 /// The limits of a move, in the frame of the agent that makes it.
-pub(super) fn held_back(now: &Shown, step: Pose) -> Pose {
+pub(super) fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
     let Some(limits) = Limits::of(now.body.kind) else {
         return step;
     };
@@ -142,7 +142,7 @@ pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)
 
 /// Redraws moves of vehicles over a red light, up to `redraws` times each; a vehicle without
 /// another move brakes, if that stops it.
-pub(super) fn heed(
+pub(super) fn obey_lights(
     agents: &[Shown],
     driven: Option<usize>,
     lines: &[(&StopLine, LightState)],
@@ -213,7 +213,7 @@ pub struct Driven {
 
 /// Redraws moves that are not clear, up to `redraws` times each; an agent without a clear path
 /// brakes.
-pub fn settle(
+pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
     survey: &Survey,
@@ -330,7 +330,7 @@ mod tests {
         let mut moves = [straight(4.0), Pose::IDENTITY];
         let mut calls = Vec::new();
         let survey = Survey::default();
-        settle(
+        resolve(
             &agents,
             None,
             &survey,
@@ -353,7 +353,7 @@ mod tests {
         let survey = Survey::default();
         let settled = |driven: Option<Driven>| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
-            settle(&agents, driven, &survey, 2, &mut moves, &mut |who, _| {
+            resolve(&agents, driven, &survey, 2, &mut moves, &mut |who, _| {
                 who.iter().map(|_| straight(4.0)).collect()
             });
             moves
@@ -370,7 +370,7 @@ mod tests {
         let survey = Survey::default();
         let follower = |yields: bool| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
-            settle(
+            resolve(
                 &agents,
                 driven(1, yields),
                 &survey,
@@ -408,7 +408,7 @@ mod tests {
         let settled = |car: Shown, step: f64, lights: &[(&StopLine, LightState)], drawn: f64| {
             let mut moves = [straight(step)];
             let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
-            heed(&[car], None, lights, 3, &mut moves, &mut again);
+            obey_lights(&[car], None, lights, 3, &mut moves, &mut again);
             moves[0].position.x
         };
         let red = [(&line, LightState::Red)];
@@ -460,7 +460,7 @@ mod tests {
                 for _ in 0..40 {
                     let mut moves = [straight(speed * TOKEN_DT)];
                     let mut again = |_: &[usize], _: usize| vec![straight(speed * TOKEN_DT)];
-                    heed(&[now], None, &lights, 2, &mut moves, &mut again);
+                    obey_lights(&[now], None, &lights, 2, &mut moves, &mut again);
                     now = now.then(now.pose * moves[0]);
                 }
                 let front = now.pose.position.x + 2.0;
@@ -472,9 +472,9 @@ mod tests {
 
     #[test]
     fn nobody_slips_sideways_or_turns_on_the_spot() {
-        let kept = held_back(&car(0.0, 1.0), Pose::new(1.0, 2.0, 1.0));
+        let kept = kinematically_limited(&car(0.0, 1.0), Pose::new(1.0, 2.0, 1.0));
         assert!(kept.position.y < 0.5 && kept.heading < 0.3, "{kept:?}");
         let fine = Pose::new(4.0, 0.1, 0.05);
-        assert_eq!(held_back(&car(0.0, 4.0), fine), fine);
+        assert_eq!(kinematically_limited(&car(0.0, 4.0), fine), fine);
     }
 }

@@ -41,7 +41,7 @@ const CROSSES: f64 = 0.52;
 /// of those that meet there they have waited longest.
 ///
 /// `agents` are all of the frame, each with its waiting time in seconds.
-pub(super) fn held_by_nothing(
+pub(super) fn free_to_go(
     map: &MapGraph,
     lights: &[Light],
     agents: &[(Agent, f64)],
@@ -158,7 +158,7 @@ mod tests {
         let agents: Vec<_> = agents
             .map(|agent| (*agent, since(agent.id).map_or(0.0, |(_, s)| *s)))
             .collect();
-        let found = held_by_nothing(scene.map, scene.now().lights(), &agents, 4.0);
+        let found = free_to_go(scene.map, scene.now().lights(), &agents, 4.0);
         found.into_iter().map(|i| agents[i].0.id.0).collect()
     }
 

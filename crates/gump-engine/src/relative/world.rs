@@ -31,9 +31,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::EngineError;
 use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
-use crate::relative::rules::{Driven, StopLine, heed, held_back, runs_red, settle, start};
+use crate::relative::rules::{
+    Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
+};
 use crate::relative::seen::{Seen, add_presents};
-use crate::relative::waiting::held_by_nothing;
+use crate::relative::waiting::free_to_go;
 use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
@@ -560,7 +562,7 @@ impl Future {
             let members = self.members.iter().map(|m| (m.agent, m.waited));
             let others = self.others.iter().map(|&other| (other, 0.0));
             let all: Vec<_> = members.chain(others).collect();
-            for i in held_by_nothing(map, &self.lights, &all, PATIENCE_S) {
+            for i in free_to_go(map, &self.lights, &all, PATIENCE_S) {
                 limits[i] = Some(RELEASED_S);
                 self.members[i].could_go = true;
             }
@@ -585,7 +587,7 @@ impl Future {
         let draw = sampling.draw();
         let agents: Vec<Shown> = self.members.iter().map(Member::now).collect();
         let kept = |i: usize, bins| match sampling.limits {
-            true => held_back(&agents[i], dequantize(bins)),
+            true => kinematically_limited(&agents[i], dequantize(bins)),
             false => dequantize(bins),
         };
         let mut moves: Vec<Pose> = (0..agents.len()).map(|i| kept(i, drawn[i])).collect();
@@ -620,7 +622,7 @@ impl Future {
             Some((line, lights[i.ok()?].state))
         });
         let lines: Vec<_> = lines.collect();
-        heed(&agents, driven, &lines, redraws, &mut moves, &mut again);
+        obey_lights(&agents, driven, &lines, redraws, &mut moves, &mut again);
         // Redraws that keep agents clear of others must not make them run a red light.
         let kept = moves.clone();
         let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
@@ -635,7 +637,7 @@ impl Future {
             index,
             is_heeded: sampling.yields_to_driven,
         });
-        settle(&agents, driven, survey, redraws, &mut moves, &mut lawful);
+        resolve(&agents, driven, survey, redraws, &mut moves, &mut lawful);
         moves
     }
 

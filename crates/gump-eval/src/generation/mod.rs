@@ -13,7 +13,7 @@ mod sources;
 
 use gump_data::ReadOptions;
 use gump_generate::baseline::{overlapping_vehicles, wrong_way};
-use gump_generate::verdict::off_road;
+use gump_generate::check::off_road;
 
 use gump_metrics::mmd::{MmdMean, MmdProtocol, SceneMmd, scene_mmd};
 use gump_metrics::{Interval, intervals};

@@ -3,8 +3,8 @@
 //! A tag is requested on maps that admit it, which is determined without the network; a tag that
 //! none of the maps admits (a car park, an all-way stop) is listed and does not count.
 
-use gump_generate::factory::{GenerationJob, GenerationWorlds, admits, make};
-use gump_generate::verdict::{Clause, NOBODY_OVERLAPS};
+use gump_generate::check::{Clause, NOBODY_OVERLAPS};
+use gump_generate::pipeline::{GenerationJob, GenerationWorlds, admits, make};
 use gump_generate::{Counts, GenerateConfig, GenerateRequest};
 use gump_metrics::tags::{self, rules};
 use gump_scene::{Scenario, ScenarioTag, Seed};
@@ -140,10 +140,10 @@ pub fn prompt_satisfaction(
         .filter_map(|i| {
             let order = order(shuffled[i % shuffled.len()], None, once(config));
             let made = make(worlds, &order, i as u64, seed.fork(8)).ok()?;
-            Some(tags::mine(&made.scenario))
+            Some(tags::extract_tags(&made.scenario))
         })
         .collect();
-    let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::mine).collect();
+    let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::extract_tags).collect();
     Ok(summed(&tags, &places, &prompted, &unprompted, &logged))
 }
 

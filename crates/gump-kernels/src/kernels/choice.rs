@@ -152,7 +152,7 @@ static CHOSEN: OnceLock<Choice> = OnceLock::new();
 
 impl Choice {
     /// Returns the choice of this process; the first call makes it.
-    pub fn made() -> &'static Self {
+    pub fn current() -> &'static Self {
         CHOSEN.get_or_init(Self::best)
     }
 

@@ -76,7 +76,7 @@ enum AnyUnit {
 /// The chosen kernel's unit for bfloat16, if it has one.
 fn unit() -> Option<AnyUnit> {
     #[cfg(target_arch = "x86_64")]
-    match Choice::made().kernel {
+    match Choice::current().kernel {
         Kernel::Amx => Amx::detect().map(AnyUnit::Amx),
         Kernel::Avx512Bf16 => Avx512Bf16::detect().map(AnyUnit::Avx512Bf16),
         _ => None,
@@ -156,7 +156,7 @@ enum Vectors {
 impl Vectors {
     #[inline(always)]
     fn chosen() -> Self {
-        let kernel = Choice::made().kernel;
+        let kernel = Choice::current().kernel;
         if kernel >= Kernel::Avx512
             && let Some(vectors) = Avx512::detect()
         {
@@ -229,7 +229,7 @@ pub(crate) const BYTE_ROWS: usize = 16;
 /// [`byte_tile`] of 16 rows one after another, where the chosen kernel has tiles of bytes.
 pub(crate) fn byte_tiles(rows: &[u8], panel: &[i8]) -> Option<[[i32; PANEL]; BYTE_ROWS]> {
     #[cfg(target_arch = "x86_64")]
-    if Choice::made().kernel == Kernel::Amx {
+    if Choice::current().kernel == Kernel::Amx {
         return Amx::detect().map(|unit| amx_bytes(unit, rows, panel));
     }
     let _ = (rows, panel);

@@ -281,7 +281,7 @@ fn infinities_stay_and_the_smallest_vanish() {
 
 #[test]
 fn the_best_kernel_is_one_the_processor_has() {
-    let choice = Choice::made();
+    let choice = Choice::current();
     assert!(choice.kernel.is_present());
     assert!(choice.wrong.is_empty(), "{choice:?}");
     for kernel in Kernel::ALL {

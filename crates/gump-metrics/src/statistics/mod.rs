@@ -138,17 +138,18 @@ impl Statistics {
         let keys = self.counted.keys().chain(reference.counted.keys());
         let keys: std::collections::BTreeSet<_> = keys.copied().collect();
         let compared = keys.into_iter().map(|(measure, class)| {
-            let (mine, theirs) = (self.get(measure, class), reference.get(measure, class));
-            let both = mine.zip(theirs);
+            let (extract_tags, theirs) = (self.get(measure, class), reference.get(measure, class));
+            let both = extract_tags.zip(theirs);
             Comparison {
                 measure,
                 class,
-                n: mine.map_or(0, Distribution::n),
-                mean: mine.map(Distribution::mean),
+                n: extract_tags.map_or(0, Distribution::n),
+                mean: extract_tags.map(Distribution::mean),
                 reference_n: theirs.map_or(0, Distribution::n),
                 reference_mean: theirs.map(Distribution::mean),
-                wasserstein: both.map(|(mine, theirs)| mine.wasserstein(theirs)),
-                jensen_shannon: both.map(|(mine, theirs)| mine.jensen_shannon(theirs)),
+                wasserstein: both.map(|(extract_tags, theirs)| extract_tags.wasserstein(theirs)),
+                jensen_shannon: both
+                    .map(|(extract_tags, theirs)| extract_tags.jensen_shannon(theirs)),
             }
         });
         compared.collect()

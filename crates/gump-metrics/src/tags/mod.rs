@@ -48,7 +48,7 @@ pub fn rules() -> &'static [Rule] {
 }
 
 /// The tags that hold at the present of a scenario, sorted.
-pub fn mine(scenario: &Scenario) -> Vec<ScenarioTag> {
+pub fn extract_tags(scenario: &Scenario) -> Vec<ScenarioTag> {
     of_view(View::of(scenario))
 }
 

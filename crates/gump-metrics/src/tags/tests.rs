@@ -15,7 +15,10 @@ fn scene(text: &str) -> Scenario {
 }
 
 fn names(scenario: &Scenario) -> Vec<&'static str> {
-    mine(scenario).into_iter().map(ScenarioTag::name).collect()
+    extract_tags(scenario)
+        .into_iter()
+        .map(ScenarioTag::name)
+        .collect()
 }
 
 /// The tags of agents on the road; those in `expected` hold, those in `not` do not.
@@ -633,6 +636,9 @@ fn another_agent_at_another_time_has_the_tags_of_a_scenario_retold() {
             route: None,
             ..scenario.clone()
         };
-        assert_eq!(around(&scenario, AgentId(agent), now), mine(&retold));
+        assert_eq!(
+            around(&scenario, AgentId(agent), now),
+            extract_tags(&retold)
+        );
     }
 }

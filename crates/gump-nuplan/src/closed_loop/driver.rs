@@ -8,7 +8,7 @@ use gump_scene::{EgoState, MapGraph, Route, SceneState, VehicleParameters};
 use crate::tracking::Trajectory;
 use gump_rollout::BoxError;
 
-/// Receives a mission once, then plans a trajectory at every step.
+/// Receives an initialization once, then plans a trajectory at every step.
 ///
 /// Unlike a [`gump_rollout::Policy`] it drives a vehicle with a rear axle in one future, may keep
 /// state, and returns seconds of trajectory of which a tenth of a second is driven.
@@ -16,12 +16,12 @@ pub trait Driver {
     /// A short name for tables and reports.
     fn name(&self) -> &str;
 
-    /// Resets the driver and sets a new mission; a driver without state need not implement this.
+    /// Resets the driver and sets a new initialization; a driver without state need not implement this.
     ///
     /// # Errors
-    /// Any reason for which the mission is impossible, for instance a route that is not in the map.
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        let _ = mission;
+    /// Any reason for which the initialization is impossible, for instance a route that is not in the map.
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        let _ = initialization;
         Ok(())
     }
 
@@ -29,12 +29,12 @@ pub trait Driver {
     ///
     /// # Errors
     /// Any reason for which the driver cannot plan.
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError>;
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError>;
 }
 
 /// The route, the goal and the vehicle of a drive.
 #[derive(Clone, Copy, Debug)]
-pub struct Mission<'a> {
+pub struct PlannerInitialization<'a> {
     /// The map.
     pub map: &'a Arc<MapGraph>,
     /// The route, if one is known.
@@ -47,7 +47,7 @@ pub struct Mission<'a> {
 
 /// The input of a driver at one iteration.
 #[derive(Clone, Copy, Debug)]
-pub struct Moment<'a> {
+pub struct PlannerInput<'a> {
     /// Iterations completed so far.
     pub iteration: usize,
     /// The scene up to now.

@@ -16,7 +16,7 @@ mod roadblocks;
 mod traffic;
 
 pub use controller::{Controller, Tracking};
-pub use driver::{Driver, Mission, Moment};
+pub use driver::{Driver, PlannerInitialization, PlannerInput};
 pub use recording::Recording;
 pub use roadblocks::derive_roadblocks;
 pub use traffic::{Imagined, Others, Replayed, Step, Traffic};
@@ -93,21 +93,21 @@ pub fn drive(
     let mut ego = *recording.ego_at(0);
     let mut rollout = begin(recording, &ego, first);
     driver
-        .start(&recording.mission())
+        .start(&recording.initialization())
         .map_err(failed(0, driver.name()))?;
     let mut states: Vec<EgoState> = recording.past().to_vec();
     let n_past = states.len();
     let mut plans = Vec::new();
     let mut controller = Controller::new(config.tracking);
     for iteration in 0..n {
-        let moment = Moment {
+        let input = PlannerInput {
             iteration,
             scene: rollout.last(),
             ego: &ego,
             past: &states,
         };
         let plan = driver
-            .drive(&moment)
+            .drive(&input)
             .map_err(failed(iteration, driver.name()))?;
         states.push(ego);
         if iteration + 1 < n {

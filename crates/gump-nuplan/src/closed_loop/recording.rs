@@ -3,7 +3,7 @@
 use gump_geometry::{Pose, angle_difference};
 use gump_scene::{Agent, EgoState, Scenario, VehicleParameters};
 
-use super::Mission;
+use super::PlannerInitialization;
 use gump_rollout::RolloutError;
 
 /// A recorded drive: traffic, and the ego at its rear axle in every frame.
@@ -113,8 +113,8 @@ impl Recording {
     }
 
     /// The driver's initialization.
-    pub fn mission(&self) -> Mission<'_> {
-        Mission {
+    pub fn initialization(&self) -> PlannerInitialization<'_> {
+        PlannerInitialization {
             map: &self.scenario.map,
             route: self.scenario.route.as_ref(),
             goal: self.goal,

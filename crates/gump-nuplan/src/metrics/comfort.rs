@@ -8,7 +8,7 @@ use gump_scene::{EgoState, VehicleParameters};
 
 use super::savgol::SavitzkyGolay;
 use super::statistics::{mean_step, round8};
-use gump_metrics::{ComfortBounds, Felt};
+use gump_metrics::{ComfortBounds, ComfortMeasurements};
 
 /// The motion of a vehicle: one entry per sample in every list.
 #[derive(Clone, Debug, PartialEq, Default)]
@@ -101,7 +101,7 @@ impl ComfortSeries {
     /// True if every value lies strictly inside its bounds.
     pub fn is_comfortable(&self, bounds: &ComfortBounds) -> bool {
         (0..self.acceleration.len()).all(|i| {
-            bounds.allow(&Felt {
+            bounds.allow(&ComfortMeasurements {
                 longitudinal_acceleration: self.longitudinal_acceleration[i],
                 lateral_acceleration: self.lateral_acceleration[i],
                 yaw_rate: Some(self.yaw_rate[i]),

@@ -1,7 +1,7 @@
 //! The world's own ego as a driver.
 
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError, Start, WorldModel};
 use gump_scene::{EgoState, Seed, VehicleParameters};
@@ -59,12 +59,12 @@ impl<'w> ImitationDriver<'w> {
     }
 
     /// The ego's mean poses over all futures, now first; and the seconds in between.
-    fn imagine(&self, moment: &Moment<'_>) -> Result<(Vec<Pose>, f64), BoxError> {
-        let scene = moment.scene;
+    fn imagine(&self, input: &PlannerInput<'_>) -> Result<(Vec<Pose>, f64), BoxError> {
+        let scene = input.scene;
         let mut session = self.world.open(&[Start {
             scene,
             n_futures: self.n_futures,
-            seed: self.seed.fork(moment.iteration as u64),
+            seed: self.seed.fork(input.iteration as u64),
         }])?;
         let dt = session.dt();
         let mut places = vec![scene.ego_now().state.pose];
@@ -94,22 +94,22 @@ impl Driver for ImitationDriver<'_> {
         "imitation"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.vehicle = Some(mission.vehicle);
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.vehicle = Some(initialization.vehicle);
         self.plan = None;
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
         if let Some(plan) = &self.plan
-            && !moment.iteration.is_multiple_of(self.every)
+            && !input.iteration.is_multiple_of(self.every)
         {
             return Ok(plan.clone());
         }
-        let (places, dt) = self.imagine(moment)?;
+        let (places, dt) = self.imagine(input)?;
         let proposal = Proposal::through(ProposalKind::Imitation, &places, dt);
-        let plan = follow(&proposal, moment, &vehicle)?;
+        let plan = follow(&proposal, input, &vehicle)?;
         self.plan = Some(plan.clone());
         Ok(plan)
     }
@@ -128,14 +128,14 @@ impl Explain for ImitationDriver<'_> {
 /// A proposal as the trajectory that a vehicle follows from its present state on.
 fn follow(
     proposal: &Proposal,
-    moment: &Moment<'_>,
+    input: &PlannerInput<'_>,
     vehicle: &VehicleParameters,
 ) -> Result<Trajectory, BoxError> {
-    let now = moment.scene.ego_now().state;
-    let mut states = vec![*moment.ego];
+    let now = input.scene.ego_now().state;
+    let mut states = vec![*input.ego];
     for (i, state) in proposal.resampled(&now, DT).iter().enumerate() {
         states.push(EgoState {
-            time_us: moment.ego.time_us + (i as i64 + 1) * (DT * 1e6) as i64,
+            time_us: input.ego.time_us + (i as i64 + 1) * (DT * 1e6) as i64,
             rear_axle: vehicle.rear_axle_of(state.pose),
             velocity: dvec2(state.velocity.dot(state.pose.direction()), 0.0),
             ..EgoState::default()

@@ -1,6 +1,6 @@
 //! The recorded driver, an oracle.
 
-use gump_nuplan::closed_loop::{Driver, Moment, Recording};
+use gump_nuplan::closed_loop::{Driver, PlannerInput, Recording};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, RolloutError};
 use gump_scene::EgoState;
@@ -36,8 +36,8 @@ impl Driver for LogDriver {
         "log"
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let rest = self.states.get(moment.iteration..).unwrap_or_default();
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+        let rest = self.states.get(input.iteration..).unwrap_or_default();
         let mut plan: Vec<EgoState> = rest
             .iter()
             .step_by(STRIDE)

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::{OrientedBox, Polygon, Pose, Quad, widen};
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::path::{Path, baseline};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::BoxError;
@@ -16,7 +16,7 @@ use gump_scene::{
 
 use crate::PlanError;
 use crate::candidates::{Candidate, Explain};
-use crate::pdm::mission::stated_route;
+use crate::pdm::initialization::stated_route;
 use crate::route_search::{first_lanes, lanes_of_route};
 
 /// States of a plan besides the present ...
@@ -32,7 +32,7 @@ const RADIUS: f64 = 40.0;
 #[derive(Debug)]
 pub struct NuplanIdmDriver {
     law: IdmConfig,
-    mission: Option<Known>,
+    initialization: Option<Known>,
     plan: Vec<Pose>,
 }
 
@@ -45,7 +45,7 @@ struct Known {
     way: Option<Way>,
 }
 
-/// The path and the desired speed, found once per mission.
+/// The path and the desired speed, found once per initialization.
 #[derive(Debug)]
 struct Way {
     path: Path,
@@ -64,7 +64,7 @@ impl Default for NuplanIdmDriver {
                 exponent: 4.0,
                 ..IdmConfig::default()
             },
-            mission: None,
+            initialization: None,
             plan: Vec::new(),
         }
     }
@@ -75,13 +75,13 @@ impl Driver for NuplanIdmDriver {
         "idm"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        let route = stated_route(mission)?;
-        let lanes = lanes_of_route(mission.map, &route);
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        let route = stated_route(initialization)?;
+        let lanes = lanes_of_route(initialization.map, &route);
         self.plan.clear();
-        self.mission = Some(Known {
-            map: Arc::clone(mission.map),
-            vehicle: mission.vehicle,
+        self.initialization = Some(Known {
+            map: Arc::clone(initialization.map),
+            vehicle: initialization.vehicle,
             lanes: lanes.iter().map(|lane| lane.id).collect(),
             route,
             way: None,
@@ -89,12 +89,12 @@ impl Driver for NuplanIdmDriver {
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let known = self.mission.as_mut().ok_or(PlanError::NoMission)?;
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+        let known = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
         if known.way.is_none() {
-            known.way = Some(known.find_way(moment.ego, self.law.target_velocity)?);
+            known.way = Some(known.find_way(input.ego, self.law.target_velocity)?);
         }
-        let states = known.follow(moment, &self.law)?;
+        let states = known.follow(input, &self.law)?;
         self.plan = states.iter().map(|state| state.rear_axle).collect();
         Ok(Trajectory::new(states)?)
     }
@@ -171,11 +171,15 @@ impl Known {
         nearest.copied().ok_or(PlanError::NoRoute)
     }
 
-    fn follow(&self, moment: &Moment<'_>, law: &IdmConfig) -> Result<Vec<EgoState>, PlanError> {
+    fn follow(
+        &self,
+        input: &PlannerInput<'_>,
+        law: &IdmConfig,
+    ) -> Result<Vec<EgoState>, PlanError> {
         let way = self.way.as_ref().ok_or(PlanError::NoRoute)?;
-        let ego = moment.ego;
+        let ego = input.ego;
         let mut footprint = self.vehicle.footprint(ego.rear_axle);
-        let obstacles = self.obstacles(moment, &footprint);
+        let obstacles = self.obstacles(input, &footprint);
         let mut now = (way.path.project(footprint.pose.position), ego.velocity.x);
         let mut states = vec![self.state(way, now, ego.time_us)];
         for step in 1..=STATES {
@@ -227,8 +231,8 @@ impl Known {
         }
     }
 
-    fn obstacles<'a>(&self, moment: &Moment<'a>, ego: &OrientedBox) -> Vec<Obstacle<'a>> {
-        let scene = moment.scene;
+    fn obstacles<'a>(&self, input: &PlannerInput<'a>, ego: &OrientedBox) -> Vec<Obstacle<'a>> {
+        let scene = input.scene;
         let near = scene.now().agents().iter().filter(|agent| {
             let away = agent.state.pose.position.distance(ego.pose.position);
             agent.id != scene.ego && away < RADIUS

@@ -1,7 +1,7 @@
 //! A car that continues straight on.
 
 use gump_geometry::DVec2;
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::{Controls, Trajectory, propagate_by};
 use gump_rollout::BoxError;
 use gump_scene::{EgoState, VehicleParameters};
@@ -37,17 +37,17 @@ impl Driver for SimpleDriver {
         "simple"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.vehicle = Some(mission.vehicle);
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.vehicle = Some(initialization.vehicle);
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
         let mut state = EgoState {
-            time_us: moment.ego.time_us,
-            rear_axle: moment.ego.rear_axle,
-            velocity: moment.ego.velocity,
+            time_us: input.ego.time_us,
+            rear_axle: input.ego.rear_axle,
+            velocity: input.ego.velocity,
             ..EgoState::default()
         };
         let mut plan = vec![state];

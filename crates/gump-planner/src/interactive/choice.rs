@@ -8,7 +8,7 @@ use gump_scene::{EgoState, Frame, Rollout};
 use rayon::prelude::*;
 
 use super::imagine::{DECISION, Row};
-use super::{Aggregate, InteractiveDriverConfig, Prospect, Worth};
+use super::{Aggregate, CandidateEvaluation, InteractiveDriverConfig, ValueEstimate};
 use crate::ProposalKind;
 use crate::pdm::propose::DT;
 use crate::pdm::score::{Judge, NO_PROGRESS, PdmScore, normalize};
@@ -75,7 +75,7 @@ impl CandidateScore {
 #[derive(Clone, Copy)]
 pub(super) struct Reward<'a> {
     pub(super) judge: Judge<'a>,
-    pub(super) worth: Worth,
+    pub(super) worth: ValueEstimate,
     /// The drive so far, oldest first, which nuPlan's metric includes: a drive that begins with a
     /// jolt is not comfortable.
     pub(super) past: &'a [EgoState],
@@ -138,7 +138,7 @@ impl Reward<'_> {
             judged
         });
         let mut all: Vec<Judged> = all.collect();
-        if let Worth::DiscountedStep { gamma } = self.worth {
+        if let ValueEstimate::DiscountedStep { gamma } = self.worth {
             for future in 0..n_futures {
                 let mut of_future: Vec<(&mut Judged, &[EgoState])> = all
                     .iter_mut()
@@ -316,7 +316,7 @@ impl Tally {
         finalist: bool,
         config: &InteractiveDriverConfig,
         film: impl Fn(Vec<Frame>) -> Rollout,
-    ) -> Prospect {
+    ) -> CandidateEvaluation {
         let standing = self.standing(config);
         let score = self.score();
         let hedge = self.hedge.as_ref().map(score_of);
@@ -325,7 +325,7 @@ impl Tally {
             futures.push(film(row.frames));
             drives.push(row.drive);
         }
-        Prospect {
+        CandidateEvaluation {
             kind,
             value: standing.value,
             score,
@@ -384,7 +384,11 @@ fn score_of(judged: &Judged) -> Score {
 
 /// The best prospect of those that were simulated to the end; ties are broken as
 /// [`super::InteractiveDriver`] states.
-pub(super) fn choose(prospects: &[Prospect], previous: Option<usize>, hysteresis: f64) -> usize {
+pub(super) fn choose(
+    prospects: &[CandidateEvaluation],
+    previous: Option<usize>,
+    hysteresis: f64,
+) -> usize {
     let standing = prospects.iter().map(|prospect| Standing {
         value: prospect.value,
         collisions: prospect.collisions,
@@ -441,7 +445,7 @@ fn clearly(a: f64, b: f64) -> Ordering {
 
 /// True if even the chosen candidate collides soon in most futures and the ego is slow enough for
 /// the brake.
-pub(super) fn is_emergency(chosen: &Prospect, ego: &EgoState) -> bool {
+pub(super) fn is_emergency(chosen: &CandidateEvaluation, ego: &EgoState) -> bool {
     let soon = chosen.collision_s <= BRAKE_STEPS as f64 * DT;
     soon && ego.speed() <= BRAKE_SPEED
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use gump_geometry::Pose;
-use gump_nuplan::closed_loop::Moment;
+use gump_nuplan::closed_loop::PlannerInput;
 use gump_rollout::worlds::IdmConfig;
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState, Seed};
@@ -13,7 +13,7 @@ use super::choice::{Reward, Tally, best_of};
 use super::policies::{self, Policy};
 use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
-use crate::pdm::mission::State;
+use crate::pdm::initialization::State;
 use crate::pdm::propose::{Corridor, DT, Proposal, Proposer};
 use crate::pdm::score::Judge;
 use crate::pdm::track::Tracker;
@@ -36,7 +36,7 @@ pub(super) struct Imagination<'a> {
     /// Prepared for the decision.
     pub(super) state: &'a State,
     pub(super) speeds: &'a [f64],
-    pub(super) moment: &'a Moment<'a>,
+    pub(super) input: &'a PlannerInput<'a>,
     pub(super) clock: &'a dyn Fn() -> Duration,
 }
 
@@ -106,14 +106,14 @@ impl<'a> Imagination<'a> {
         let history = self.surroundings();
         let scene = SceneState {
             history: &history,
-            ..self.moment.scene
+            ..self.input.scene
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
         let policies = policies::all(self.config, self.speeds, self.state.lane_changes());
         let begun = self.begin(&proposer, &policies);
         let corridors: Vec<Corridor> = (0..proposer.lines.len())
             .map(|line| {
-                let place = self.moment.ego.rear_axle.position;
+                let place = self.input.ego.rear_axle.position;
                 proposer.corridor(line, proposer.lines[line].project(place))
             })
             .collect();
@@ -204,7 +204,7 @@ impl<'a> Imagination<'a> {
 
     /// Seed of a round: the same for all candidates.
     fn seed(&self, round: usize) -> Seed {
-        let seed = self.config.seed.fork(self.moment.iteration as u64);
+        let seed = self.config.seed.fork(self.input.iteration as u64);
         match round {
             0 => seed,
             _ => seed.fork(ROUND + round as u64),
@@ -277,7 +277,7 @@ impl<'a> Imagination<'a> {
 
     /// The last second of the ego and of the agents nearest to it.
     fn surroundings(&self) -> Vec<Frame> {
-        let scene = self.moment.scene;
+        let scene = self.input.scene;
         let place = scene.ego_now().state.pose.position;
         let moving = scene.now().agents().iter();
         let mut near: Vec<(f64, AgentId)> = moving
@@ -298,7 +298,7 @@ impl<'a> Imagination<'a> {
 
     /// Policies before they have driven, with the laws they drive by.
     fn begin(&self, proposer: &Proposer<'_>, policies: &[Policy]) -> Vec<(Proposal, IdmConfig)> {
-        let ego = self.moment.ego;
+        let ego = self.input.ego;
         let begin = |policy: &Policy| {
             let mut begun = proposer.begin(policy.line, ego.rear_axle, ego.velocity.x);
             begun.desired_speed = policy.desired_speed;
@@ -315,7 +315,7 @@ impl<'a> Imagination<'a> {
                 forecast: self.state.forecast.clone(),
                 policy,
                 law,
-                drive: vec![*self.moment.ego],
+                drive: vec![*self.input.ego],
                 frames: Vec::new(),
                 lost: false,
             }
@@ -395,7 +395,7 @@ impl<'a> Imagination<'a> {
         }
         for (future, (&i, frame)) in live.iter().zip(frames).enumerate() {
             let row = &mut rows[i];
-            let ego = self.moment.scene.ego;
+            let ego = self.input.scene.ego;
             if !driven && frame.agent(ego).is_none() {
                 let step = row.frames.len();
                 let gone = RolloutError::EgoVanished { ego, future, step };
@@ -408,7 +408,7 @@ impl<'a> Imagination<'a> {
 
     /// Lets the vehicle follow the world's motion of the ego.
     fn imitate(&self, rows: &mut [Row], n_decisions: usize) {
-        let (scene, vehicle) = (self.moment.scene, &self.state.vehicle);
+        let (scene, vehicle) = (self.input.scene, &self.state.vehicle);
         let now = scene.ego_now().state;
         let mut tracker = Tracker::new(n_decisions * DECISION);
         for row in rows {
@@ -425,15 +425,15 @@ impl<'a> Imagination<'a> {
                 .chain(states.iter().map(|state| state.pose))
                 .map(|center| vehicle.rear_axle_of(center))
                 .collect();
-            let ego = self.moment.ego;
+            let ego = self.input.ego;
             tracker.drive(ego, &poses, vehicle.wheel_base, &mut row.drive);
         }
     }
 
     fn reward(&self) -> Reward<'_> {
         // The drive before the first iteration is not judged.
-        let past = self.moment.past;
-        let driven = self.moment.iteration.min(COMFORT_PAST).min(past.len());
+        let past = self.input.past;
+        let driven = self.input.iteration.min(COMFORT_PAST).min(past.len());
         Reward {
             judge: self.judge_of(),
             worth: self.config.worth,
@@ -478,8 +478,8 @@ impl Row {
             };
             let elapsed = (n - before) as f64 * DECISION_S;
             let drift = (to.position - earlier.position) / elapsed;
-            let moments = (first..=last).map(|moment| {
-                let t = moment as f64 * MOMENT_DT / DECISION_S - (n - 1) as f64;
+            let moments = (first..=last).map(|input| {
+                let t = input as f64 * MOMENT_DT / DECISION_S - (n - 1) as f64;
                 from.interpolate(to, t)
             });
             object.imagine(moments, drift);

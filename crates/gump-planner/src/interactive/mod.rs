@@ -17,13 +17,13 @@ mod tests;
 use std::time::Duration;
 
 use gump_metrics::Score;
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Rollout, Seed};
 
 use crate::candidates::{Candidate, Explain};
-use crate::pdm::mission::{State, brake, trajectory};
+use crate::pdm::initialization::{State, brake, trajectory};
 use crate::pdm::propose::DT;
 use crate::pdm::{self, STEPS, TRAJECTORY_STEPS};
 use crate::{PdmConfig, PlanError, ProposalKind};
@@ -52,7 +52,7 @@ pub struct InteractiveDriverConfig {
     /// Iterations of the loop between two decisions, > 0; in between the chosen policy is followed.
     pub replan_every: usize,
     /// The value of a future.
-    pub worth: Worth,
+    pub worth: ValueEstimate,
     /// Combination of the values of a candidate's futures into one.
     pub aggregate: Aggregate,
     /// Number of standard deviations over the futures that are subtracted from the mean, at least
@@ -82,7 +82,7 @@ impl Default for InteractiveDriverConfig {
             allocation: Allocation::default(),
             seed: Seed(0),
             replan_every: 5,
-            worth: Worth::Rollout,
+            worth: ValueEstimate::Rollout,
             aggregate: Aggregate::default(),
             caution: 0.0,
             hedge: 0.5,
@@ -116,7 +116,7 @@ pub enum Aggregate {
 
 /// The value of a future.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Worth {
+pub enum ValueEstimate {
     /// The score of the whole drive, 0 to 1: the product of PDM's gates times the mean of progress,
     /// time to collision, the speed limit and comfort with the weights of nuPlan's closed-loop
     /// score. Comfort is that of nuPlan's metric, including the last 2 s of the drive so far; any
@@ -176,7 +176,7 @@ impl Phases {
 
 /// One candidate with its rollouts and scores.
 #[derive(Clone, Debug)]
-pub struct Prospect {
+pub struct CandidateEvaluation {
     /// The policy, or the world's ego.
     pub kind: ProposalKind,
     /// The result of each future.
@@ -203,7 +203,7 @@ pub struct Prospect {
     pub drives: Vec<Vec<EgoState>>,
 }
 
-impl Prospect {
+impl CandidateEvaluation {
     /// Means over the futures of every gate's factor and every term's value, by name, and the total
     /// of the hedge as `hedge`.
     pub fn parts(&self) -> Vec<(&'static str, f64)> {
@@ -221,7 +221,7 @@ pub struct Decision {
     /// True if the ego brakes instead, because even the best candidate collides soon.
     pub brakes: bool,
     /// All candidates: lateral offsets one after another, within each the speeds, imitation last.
-    pub prospects: Vec<Prospect>,
+    pub prospects: Vec<CandidateEvaluation>,
     /// Horizon that was simulated, seconds.
     pub horizon: f64,
     /// Time spent.
@@ -244,7 +244,7 @@ pub struct InteractiveDriver<'w> {
     world: &'w dyn WorldModel,
     config: InteractiveDriverConfig,
     clock: Box<dyn Fn() -> Duration + 'w>,
-    mission: Option<State>,
+    initialization: Option<State>,
     decision: Option<Decision>,
     decided_at: usize,
     /// The path of the chosen imitation.
@@ -265,7 +265,7 @@ impl<'w> InteractiveDriver<'w> {
             world,
             config,
             clock: Box::new(|| Duration::ZERO),
-            mission: None,
+            initialization: None,
             decision: None,
             decided_at: 0,
             following: None,
@@ -281,45 +281,45 @@ impl<'w> InteractiveDriver<'w> {
         }
     }
 
-    fn is_due(&self, moment: &Moment<'_>) -> bool {
-        let old = moment.iteration >= self.decided_at + self.config.replan_every;
-        let ends = |way: &Trajectory| way.end_us() < moment.ego.time_us + 2_000_000;
+    fn is_due(&self, input: &PlannerInput<'_>) -> bool {
+        let old = input.iteration >= self.decided_at + self.config.replan_every;
+        let ends = |way: &Trajectory| way.end_us() < input.ego.time_us + 2_000_000;
         old || self.decision.is_none() || self.following.as_ref().is_some_and(ends)
     }
 
-    fn decide(&mut self, moment: &Moment<'_>, speeds: &[f64]) -> Result<(), PlanError> {
-        let state = self.mission.as_ref().ok_or(PlanError::NoMission)?;
+    fn decide(&mut self, input: &PlannerInput<'_>, speeds: &[f64]) -> Result<(), PlanError> {
+        let state = self.initialization.as_ref().ok_or(PlanError::NoMission)?;
         let imagination = Imagination {
             world: self.world,
             config: &self.config,
             state,
             speeds,
-            moment,
+            input,
             clock: &*self.clock,
         };
         let mut decision = imagination.imagine()?;
         // Changes of lane come and go: the previous choice is found by its kind.
         let kind = |decision: &Decision| decision.prospects[decision.chosen].kind;
         let kind = self.decision.as_ref().map(kind);
-        let same = |prospect: &Prospect| Some(prospect.kind) == kind;
+        let same = |prospect: &CandidateEvaluation| Some(prospect.kind) == kind;
         let previous = decision.prospects.iter().position(same);
         decision.chosen = choose(&decision.prospects, previous, self.config.hysteresis);
         let chosen = &decision.prospects[decision.chosen];
-        decision.brakes = is_emergency(chosen, moment.ego);
+        decision.brakes = is_emergency(chosen, input.ego);
         self.following = match chosen.kind {
-            ProposalKind::Imitation if !decision.brakes => Some(imitated(chosen, moment.ego)?),
+            ProposalKind::Imitation if !decision.brakes => Some(imitated(chosen, input.ego)?),
             _ => None,
         };
         self.decision = Some(decision);
-        self.decided_at = moment.iteration;
+        self.decided_at = input.iteration;
         Ok(())
     }
 
     /// Lets the chosen policy drive on from the actual positions of all agents.
-    fn follow(&self, moment: &Moment<'_>, speeds: &[f64]) -> Result<Trajectory, PlanError> {
-        let state = self.mission.as_ref().ok_or(PlanError::NoMission)?;
+    fn follow(&self, input: &PlannerInput<'_>, speeds: &[f64]) -> Result<Trajectory, PlanError> {
+        let state = self.initialization.as_ref().ok_or(PlanError::NoMission)?;
         let decision = self.decision.as_ref().ok_or(PlanError::NoMission)?;
-        let ego = moment.ego;
+        let ego = input.ego;
         if decision.brakes {
             return Ok(trajectory(ego.time_us, &brake(ego, &state.vehicle))?);
         }
@@ -341,28 +341,28 @@ impl Driver for InteractiveDriver<'_> {
         "interactive"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.mission = Some(State::new(mission)?);
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.initialization = Some(State::new(initialization)?);
         (self.decision, self.following) = (None, None);
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
-        let speeds = state.prepare(moment, &self.config.proposals)?;
-        if self.is_due(moment) {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+        let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+        let speeds = state.prepare(input, &self.config.proposals)?;
+        if self.is_due(input) {
             let chosen = |decision: &Decision| decision.prospects[decision.chosen].kind;
             let under_way = match self.decision.as_ref().map(chosen) {
                 Some(ProposalKind::LaneChange { side, .. }) => Some(side),
                 _ => None,
             };
-            let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
+            let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
             if self.config.lane_changes {
-                state.lay_changes(moment.ego, &self.config.proposals, under_way)?;
+                state.lay_changes(input.ego, &self.config.proposals, under_way)?;
             }
-            self.decide(moment, &speeds)?;
+            self.decide(input, &speeds)?;
         }
-        Ok(self.follow(moment, &speeds)?)
+        Ok(self.follow(input, &speeds)?)
     }
 }
 
@@ -395,7 +395,7 @@ impl Explain for InteractiveDriver<'_> {
 
 /// The ego's motion in the future that ends nearest to the mean end of all, and straight on after
 /// it.
-fn imitated(prospect: &Prospect, ego: &EgoState) -> Result<Trajectory, PlanError> {
+fn imitated(prospect: &CandidateEvaluation, ego: &EgoState) -> Result<Trajectory, PlanError> {
     let end = |drive: &Vec<EgoState>| drive[drive.len() - 1].rear_axle.position;
     let n = prospect.drives.len() as f64;
     let middle = prospect
@@ -455,7 +455,7 @@ fn check(config: &InteractiveDriverConfig) -> Result<(), PlanError> {
     if !(0.0..=1.0).contains(&config.hedge) {
         return wrong("hedge", config.hedge, "0 to 1");
     }
-    if let Worth::DiscountedStep { gamma } = config.worth
+    if let ValueEstimate::DiscountedStep { gamma } = config.worth
         && !(gamma > 0.0 && gamma <= 1.0)
     {
         return wrong("gamma", gamma, "more than 0 and at most 1");

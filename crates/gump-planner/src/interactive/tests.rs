@@ -48,7 +48,7 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
     }
 }
 
-fn fraction(prospect: &Prospect) -> f64 {
+fn fraction(prospect: &CandidateEvaluation) -> f64 {
     match prospect.kind {
         ProposalKind::Idm { speed_fraction, .. } | ProposalKind::Brisk { speed_fraction } => {
             speed_fraction
@@ -348,7 +348,7 @@ fn plans_repeat_and_do_not_depend_on_earlier_plans() {
     let result = |driver: &mut InteractiveDriver<'_>, recording: &Recording| {
         let plan = plan_once(recording, driver).unwrap();
         let decision = driver.decision().unwrap();
-        let of = |p: &Prospect| (p.kind, p.score.clone(), p.drives.clone());
+        let of = |p: &CandidateEvaluation| (p.kind, p.score.clone(), p.drives.clone());
         let prospects: Vec<_> = decision.prospects.iter().map(of).collect();
         (plan, decision.chosen, prospects)
     };
@@ -542,7 +542,7 @@ fn threads_change_nothing() {
         let run = || {
             let decision = decide(&world, InteractiveDriverConfig::default(), text);
             let frames = |future: &Rollout| future.imagined().to_vec();
-            let summary = |p: &Prospect| {
+            let summary = |p: &CandidateEvaluation| {
                 let frames: Vec<_> = p.futures.iter().map(frames).collect();
                 (p.score.clone(), p.drives.clone(), frames)
             };
@@ -564,7 +564,7 @@ const BEHIND: &str = "ego vehicle 0: 2,0 velocity 6,0
 fn halving_imagines_the_better_candidates_more_often() {
     let world = ByLaw(at_random_speed);
     let decision = decide(&world, InteractiveDriverConfig::default(), BEHIND);
-    let of = |p: &Prospect| (p.futures.len(), p.drives.len(), p.finalist);
+    let of = |p: &CandidateEvaluation| (p.futures.len(), p.drives.len(), p.finalist);
     let counts: Vec<_> = decision.prospects.iter().map(of).collect();
     let count =
         |n: usize, finalist: bool| counts.iter().filter(|t| **t == (n, n, finalist)).count();
@@ -575,8 +575,8 @@ fn halving_imagines_the_better_candidates_more_often() {
     );
     assert!(decision.prospects[decision.chosen].finalist);
     // What drops out was no better, in the futures it saw, than what stayed.
-    let first = |p: &Prospect| p.score.futures[0].total;
-    let (seen, unseen): (Vec<&Prospect>, _) =
+    let first = |p: &CandidateEvaluation| p.score.futures[0].total;
+    let (seen, unseen): (Vec<&CandidateEvaluation>, _) =
         decision.prospects.iter().partition(|p| p.futures.len() > 1);
     let worst = seen.iter().map(|p| first(p)).fold(f64::INFINITY, f64::min);
     assert!(unseen.iter().all(|p| first(p) <= worst + 1e-6));
@@ -759,12 +759,12 @@ fn only_the_nearest_are_imagined() {
 #[test]
 fn the_other_reading_of_the_return_agrees_where_nothing_happens() {
     let text = "ego vehicle 0: 2,0 velocity 6,0";
-    let worth = Worth::DiscountedStep { gamma: 0.95 };
+    let worth = ValueEstimate::DiscountedStep { gamma: 0.95 };
     let config = |worth| InteractiveDriverConfig {
         worth,
         ..only(&[0.5], &[0.0])
     };
-    let whole = decide(&ConstantVelocity, config(Worth::Rollout), text);
+    let whole = decide(&ConstantVelocity, config(ValueEstimate::Rollout), text);
     let steps = decide(&ConstantVelocity, config(worth), text);
     let [a, b] = [&whole, &steps].map(|d| d.prospects[0].score.mean);
     // A single candidate is the farthest in the whole and in every step.
@@ -779,7 +779,7 @@ fn the_other_reading_of_the_return_agrees_where_nothing_happens() {
         };
         decide(&ConstantVelocity, config, crash).prospects[0].clone()
     };
-    let (whole, steps) = (both(Worth::Rollout), both(worth));
+    let (whole, steps) = (both(ValueEstimate::Rollout), both(worth));
     assert_eq!((whole.collisions, whole.score.mean), (4, 0.0));
     let earned = steps.score.mean;
     assert!(
@@ -996,7 +996,10 @@ fn numbers_out_of_range_are_refused() {
     check(|c| c.caution = f64::NAN, "caution");
     check(|c| c.hysteresis = -1.0, "hysteresis");
     check(|c| c.hedge = 1.5, "hedge");
-    check(|c| c.worth = Worth::DiscountedStep { gamma: 0.0 }, "gamma");
+    check(
+        |c| c.worth = ValueEstimate::DiscountedStep { gamma: 0.0 },
+        "gamma",
+    );
     check(|c| c.budget.horizon = 0.3, "horizon");
     check(|c| c.budget.horizon = 9.0, "horizon");
     check(

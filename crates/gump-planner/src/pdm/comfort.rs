@@ -4,7 +4,7 @@
 //! a window.
 
 use gump_geometry::angle_difference;
-use gump_metrics::{ComfortBounds, Felt};
+use gump_metrics::{ComfortBounds, ComfortMeasurements};
 use gump_nuplan::metrics::SavitzkyGolay;
 use gump_scene::EgoState;
 
@@ -97,7 +97,7 @@ impl ComfortFilters {
         read(raw, |s| s.acceleration.length());
         self.smoothing.apply(raw, smooth);
         self.jerk.apply(smooth, d);
-        let felt = |i: usize| Felt {
+        let felt = |i: usize| ComfortMeasurements {
             longitudinal_acceleration: a[i],
             lateral_acceleration: c[i],
             longitudinal_jerk: Some(b[i]),
@@ -116,7 +116,7 @@ impl ComfortFilters {
         }
         self.yaw_rate.apply(raw, a);
         self.yaw_acceleration.apply(raw, b);
-        let turned = |i: usize| Felt {
+        let turned = |i: usize| ComfortMeasurements {
             longitudinal_acceleration: 0.0,
             lateral_acceleration: 0.0,
             longitudinal_jerk: None,

@@ -11,8 +11,8 @@
 pub(crate) mod comfort;
 pub(crate) mod forecast;
 pub(crate) mod ground;
+pub(crate) mod initialization;
 pub(crate) mod lane_change;
-pub(crate) mod mission;
 pub(crate) mod propose;
 #[cfg(test)]
 mod scene_tests;
@@ -24,7 +24,7 @@ pub(crate) mod track;
 pub use lane_change::Side;
 pub use score::PdmScore;
 
-use gump_nuplan::closed_loop::{Driver, Mission, Moment};
+use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::BoxError;
 use gump_rollout::worlds::IdmConfig;
@@ -33,7 +33,7 @@ use gump_scene::EgoState;
 use crate::candidates::{Candidate, Explain};
 use crate::{PlanError, ProposalKind};
 use comfort::ComfortFilters;
-use mission::{State, brake, trajectory};
+use initialization::{State, brake, trajectory};
 use propose::{DT, Proposal};
 use score::Judge;
 use track::Tracker;
@@ -83,7 +83,7 @@ impl Default for PdmConfig {
 #[derive(Debug)]
 pub struct PdmClosed {
     config: PdmConfig,
-    mission: Option<State>,
+    initialization: Option<State>,
     tracker: Tracker,
     comfort: ComfortFilters,
     thought: Thought,
@@ -114,7 +114,7 @@ impl PdmClosed {
         check(&config)?;
         Ok(Self {
             config,
-            mission: None,
+            initialization: None,
             tracker: Tracker::new(STEPS),
             comfort: ComfortFilters::new(STEPS + 1, DT),
             thought: Thought::default(),
@@ -183,18 +183,18 @@ impl Driver for PdmClosed {
         "pdm-closed"
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        let state = State::new(mission)?;
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        let state = State::new(initialization)?;
         self.thought = Thought::default();
-        self.mission = Some(state);
+        self.initialization = Some(state);
         Ok(())
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
-        let state = self.mission.as_mut().ok_or(PlanError::NoMission)?;
-        let speeds = state.prepare(moment, &self.config)?;
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+        let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+        let speeds = state.prepare(input, &self.config)?;
         let proposer = state.proposer(&self.config.law, &speeds);
-        let ego = moment.ego;
+        let ego = input.ego;
         let thought = &mut self.thought;
         thought.proposals = proposer.propose(ego.rear_axle, ego.velocity.x, STEPS);
         thought.drives.resize(thought.proposals.len(), Vec::new());

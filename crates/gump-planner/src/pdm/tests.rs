@@ -176,7 +176,7 @@ fn check(map: &Arc<MapGraph>, name: &str, golden: &Value) {
         path: Polyline::new(vec![dvec2(0.0, 0.0)]).unwrap(),
     });
     let history = [frame(input, &state)];
-    let moment = Moment {
+    let moment = PlannerInput {
         iteration: 0,
         scene: SceneState {
             map,
@@ -189,13 +189,13 @@ fn check(map: &Arc<MapGraph>, name: &str, golden: &Value) {
         past: &[],
     };
     let mut planner = PdmClosed::default();
-    let mission = Mission {
+    let initialization = PlannerInitialization {
         map,
         route: Some(&route),
         goal: None,
         vehicle: VehicleParameters::PACIFICA,
     };
-    planner.start(&mission).unwrap();
+    planner.start(&initialization).unwrap();
     let plan = planner.drive(&moment).unwrap();
     check_ground(name, &planner, golden);
     check_proposals(name, planner.thought(), golden);
@@ -231,7 +231,7 @@ fn check_pose(name: &str, found: Pose, row: &[f64]) {
 }
 
 fn check_ground(name: &str, planner: &PdmClosed, golden: &Value) {
-    let state = planner.mission.as_ref().unwrap();
+    let state = planner.initialization.as_ref().unwrap();
     let path = &state.centerline().path;
     assert_abs_diff_eq!(
         path.length(),

@@ -14,7 +14,7 @@ use gump_scene::Seed;
 use rayon::prelude::*;
 
 use crate::observation::Observed;
-use crate::{Course, End, EpisodeState, RlError, VectorEnv};
+use crate::{End, EpisodeState, PreparedScenario, RlError, VectorEnv};
 use row::Row;
 use sampler::Sampler;
 use traffic::Others;
@@ -36,7 +36,7 @@ const ROWS_PER_TASK: usize = 8;
 /// With [`Autoreset::SameStep`], the default, it follows the contract of [`VectorEnv`]; the other
 /// modes are Gymnasium's. The front page of the crate has an example.
 pub struct DrivingEnv<'w> {
-    courses: Arc<[Course]>,
+    prepared: Arc<[PreparedScenario]>,
     others: Others<'w>,
     config: EnvConfig,
     sampler: Sampler,
@@ -52,16 +52,16 @@ pub struct DrivingEnv<'w> {
 }
 
 impl<'w> DrivingEnv<'w> {
-    /// An environment on these courses among `traffic`. It has no episodes before the first reset.
+    /// An environment on these prepared among `traffic`. It has no episodes before the first reset.
     ///
     /// # Errors
     /// [`RlError::NoScenario`], and [`RlError::Parameter`] for parameters out of range.
     pub fn new(
-        courses: Arc<[Course]>,
+        prepared: Arc<[PreparedScenario]>,
         traffic: Traffic<'w>,
         config: EnvConfig,
     ) -> Result<Self, RlError> {
-        if courses.is_empty() {
+        if prepared.is_empty() {
             return Err(RlError::NoScenario);
         }
         config.check()?;
@@ -69,7 +69,7 @@ impl<'w> DrivingEnv<'w> {
         let observed = || Observed::new(&config.observation, n);
         Ok(Self {
             others: Others::new(traffic, config.nearest),
-            sampler: Sampler::new(config.sampling, n, courses.len()),
+            sampler: Sampler::new(config.sampling, n, prepared.len()),
             rows: Vec::new(),
             observations: observed(),
             finals: observed(),
@@ -78,7 +78,7 @@ impl<'w> DrivingEnv<'w> {
             truncated: vec![false; n],
             restarted: vec![false; n],
             finished: Vec::new(),
-            courses,
+            prepared,
             config,
         })
     }
@@ -88,7 +88,7 @@ impl<'w> DrivingEnv<'w> {
     /// # Errors
     /// [`RlError::Count`], [`RlError::NoSuchScenario`], and errors of the world.
     pub fn reset_to(&mut self, starts: &[EpisodeStart]) -> Result<(), RlError> {
-        let (expected, found, n) = (self.config.n_envs, starts.len(), self.courses.len());
+        let (expected, found, n) = (self.config.n_envs, starts.len(), self.prepared.len());
         if expected != found {
             return Err(RlError::Count {
                 who: "the list of starts",
@@ -165,8 +165,10 @@ impl<'w> DrivingEnv<'w> {
             });
         }
         for (row, action) in self.rows.iter().zip(actions.chunks_exact_mut(len)) {
-            let course = &self.courses[row.start.scenario];
-            self.config.rules.expert_action(course, &row.state, action);
+            let prepared = &self.prepared[row.start.scenario];
+            self.config
+                .rules
+                .expert_action(prepared, &row.state, action);
         }
         Ok(())
     }
@@ -203,9 +205,9 @@ impl<'w> DrivingEnv<'w> {
         &self.config
     }
 
-    /// The courses.
-    pub fn courses(&self) -> &Arc<[Course]> {
-        &self.courses
+    /// The prepared.
+    pub fn prepared(&self) -> &Arc<[PreparedScenario]> {
+        &self.prepared
     }
 
     /// Starts new episodes in all rows, row `i` with seed `seeds[i]`, and resets the statistics of
@@ -222,7 +224,7 @@ impl<'w> DrivingEnv<'w> {
                 found,
             });
         }
-        self.sampler = Sampler::new(self.config.sampling, expected, self.courses.len());
+        self.sampler = Sampler::new(self.config.sampling, expected, self.prepared.len());
         let blank = self.blank();
         self.rows = seeds.iter().map(|seed| Row::new(*seed, &blank)).collect();
         for (i, row) in self.rows.iter_mut().enumerate() {
@@ -233,7 +235,7 @@ impl<'w> DrivingEnv<'w> {
 
     /// Placeholder state of a row until its first episode begins.
     fn blank(&self) -> EpisodeState {
-        self.config.rules.reset(&self.courses[0])
+        self.config.rules.reset(&self.prepared[0])
     }
 
     fn live(&self) -> Result<&[Row], RlError> {
@@ -246,7 +248,7 @@ impl<'w> DrivingEnv<'w> {
     /// Opens the world on the starts of all rows.
     fn open(&mut self) -> Result<(), RlError> {
         self.clear_step();
-        let opened = self.others.open(&self.courses, &mut self.rows);
+        let opened = self.others.open(&self.prepared, &mut self.rows);
         if opened.is_err() {
             self.rows.clear();
         }
@@ -267,7 +269,7 @@ impl<'w> DrivingEnv<'w> {
             self.rows[i].draw(i, &self.sampler);
             self.restarted[i] = true;
         }
-        let restarted = self.others.restart(&self.courses, &mut self.rows, chosen);
+        let restarted = self.others.restart(&self.prepared, &mut self.rows, chosen);
         if restarted.is_err() {
             // The state of a world that failed halfway is unknown.
             self.rows.clear();
@@ -279,7 +281,7 @@ impl<'w> DrivingEnv<'w> {
 
     /// Puts these rows at the start of their episodes.
     fn observe_starts(&mut self, chosen: &[usize]) {
-        let (courses, config) = (&self.courses, &self.config);
+        let (prepared, config) = (&self.prepared, &self.config);
         let mut is_chosen = vec![false; self.rows.len()];
         for &i in chosen {
             is_chosen[i] = true;
@@ -289,9 +291,9 @@ impl<'w> DrivingEnv<'w> {
             .with_min_len(ROWS_PER_TASK)
             .filter(|(_, chosen)| *chosen)
             .for_each(|((row, mut out), _)| {
-                let course = &courses[row.start.scenario];
-                row.state = config.rules.reset(course);
-                row.observe(course, &config.observation, &mut out);
+                let prepared = &prepared[row.start.scenario];
+                row.state = config.rules.reset(prepared);
+                row.observe(prepared, &config.observation, &mut out);
             });
     }
 
@@ -305,7 +307,7 @@ impl<'w> DrivingEnv<'w> {
 
     /// Moves the active rows to the states that their actions and the world give.
     fn arrive(&mut self, actions: &[f32], acts: &[bool]) {
-        let (courses, config) = (&self.courses, &self.config);
+        let (prepared, config) = (&self.prepared, &self.config);
         let len = config.rules.dynamics.action_len();
         self.rows
             .par_iter_mut()
@@ -317,9 +319,9 @@ impl<'w> DrivingEnv<'w> {
             .with_min_len(ROWS_PER_TASK)
             .filter(|((((_, acts), _), _), _)| **acts)
             .for_each(|(((((row, action), _), mut last), next), reward)| {
-                let course = &courses[row.start.scenario];
-                row.arrive(course, &config.rules, action);
-                row.observe(course, &config.observation, &mut last);
+                let prepared = &prepared[row.start.scenario];
+                row.arrive(prepared, &config.rules, action);
+                row.observe(prepared, &config.observation, &mut last);
                 next.copy_from(&last);
                 *reward = row.state.reward as f32;
             });
@@ -381,8 +383,8 @@ impl VectorEnv for DrivingEnv<'_> {
         }
         let acts: Vec<bool> = self.rows.iter().map(|r| r.state.end.is_none()).collect();
         self.clear_step();
-        let (rules, courses) = (&self.config.rules, &self.courses);
-        let moved = self.others.step(courses, rules, &mut self.rows, actions);
+        let (rules, prepared) = (&self.config.rules, &self.prepared);
+        let moved = self.others.step(prepared, rules, &mut self.rows, actions);
         if moved.is_err() {
             self.rows.clear();
         }

@@ -4,7 +4,9 @@ use gump_scene::{Agent, Frame, SceneState, Seed};
 
 use super::sampler::Sampler;
 use crate::observation::{ObservedRow, View};
-use crate::{Course, End, EpisodeState, Failure, ObservationSpec, Rules, Totals, observe};
+use crate::{
+    End, EpisodeState, Failure, ObservationSpec, PreparedScenario, Rules, Totals, observe,
+};
 
 /// The start of an episode, which together with its actions determines it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,14 +62,14 @@ impl Row {
     }
 
     /// Limits the world to the `n` agents that come nearest to the ego in the log.
-    pub(super) fn limit(&mut self, course: &Course, n: Option<usize>) {
+    pub(super) fn limit(&mut self, prepared: &PreparedScenario, n: Option<usize>) {
         self.history.clear();
-        let Some(nearest) = n.and_then(|n| course.by_distance().get(..n)) else {
+        let Some(nearest) = n.and_then(|n| prepared.by_distance().get(..n)) else {
             return;
         };
-        let ego = course.scenario().ego;
+        let ego = prepared.scenario().ego;
         let kept = |agent: &&Agent| agent.id == ego || nearest.contains(&agent.id);
-        let past = course.scenario().present().history.iter();
+        let past = prepared.scenario().present().history.iter();
         self.history.extend(past.map(|frame| {
             let agents = frame.agents().iter().filter(kept).copied().collect();
             Frame::new(agents, frame.lights().to_vec())
@@ -75,8 +77,8 @@ impl Row {
     }
 
     /// The scene as the world is to see it.
-    pub(super) fn scene<'a>(&'a self, course: &'a Course) -> SceneState<'a> {
-        let scene = course.scenario().present();
+    pub(super) fn scene<'a>(&'a self, prepared: &'a PreparedScenario) -> SceneState<'a> {
+        let scene = prepared.scenario().present();
         match self.history.is_empty() {
             true => scene,
             false => SceneState {
@@ -87,14 +89,14 @@ impl Row {
     }
 
     /// The world's frame together with the agents that follow the log.
-    pub(super) fn complete(&self, course: &Course, frame: Frame) -> Frame {
+    pub(super) fn complete(&self, prepared: &PreparedScenario, frame: Frame) -> Frame {
         let Some(present) = self.history.last() else {
             return frame;
         };
-        let logged = course.logged(self.state.steps + 1).agents().iter();
+        let logged = prepared.logged(self.state.steps + 1).agents().iter();
         let follows_log = |agent: &&Agent| {
             let id = agent.id;
-            present.agent(id).is_none() && course.logged(0).agent(id).is_some()
+            present.agent(id).is_none() && prepared.logged(0).agent(id).is_some()
         };
         let agents = logged.filter(follows_log).chain(frame.agents()).copied();
         Frame::new(agents.collect(), frame.lights().to_vec())
@@ -111,32 +113,32 @@ impl Row {
     }
 
     /// Moves the episode to the result of an action and the world.
-    pub(super) fn arrive(&mut self, course: &Course, rules: &Rules, action: &[f32]) {
+    pub(super) fn arrive(&mut self, prepared: &PreparedScenario, rules: &Rules, action: &[f32]) {
         self.state = match &self.imagined {
             [Some(after), before] if !self.in_log => {
-                let before = before.as_ref().unwrap_or(course.logged(self.state.steps));
-                rules.advance(course, &self.state, action, [before, after])
+                let before = before.as_ref().unwrap_or(prepared.logged(self.state.steps));
+                rules.advance(prepared, &self.state, action, [before, after])
             }
-            _ => rules.step_in_log(course, &self.state, action),
+            _ => rules.step_in_log(prepared, &self.state, action),
         };
     }
 
     pub(super) fn observe(
         &self,
-        course: &Course,
+        prepared: &PreparedScenario,
         spec: &ObservationSpec,
         out: &mut ObservedRow<'_>,
     ) {
         let steps = self.state.steps;
         let (now, before) = match &self.imagined {
             [Some(now), before] => (now, before.as_ref()),
-            [None, _] => (course.logged(steps), None),
+            [None, _] => (prepared.logged(steps), None),
         };
         let view = View {
-            course,
+            prepared,
             state: &self.state,
             now,
-            before: before.or_else(|| course.logged_before(steps)),
+            before: before.or_else(|| prepared.logged_before(steps)),
         };
         observe(spec, &view, out.numbers, out.packed);
     }
@@ -174,27 +176,27 @@ mod tests {
         let text = "lane 1: 0,0 400,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 10,0\n
             agent vehicle 1: 60,9\nagent vehicle 2: 0,5 velocity -10,0\n
             agent vehicle 3: 120,5 velocity -10,0\n";
-        let course = Course::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
+        let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
         let rules = Rules::default();
-        let mut row = Row::new(Seed(0), &rules.reset(&course));
+        let mut row = Row::new(Seed(0), &rules.reset(&prepared));
         let ids = |frame: &Frame| -> Vec<i64> { frame.agents().iter().map(|a| a.id.0).collect() };
 
-        row.limit(&course, Some(2));
-        let seen = row.scene(&course);
+        row.limit(&prepared, Some(2));
+        let seen = row.scene(&prepared);
         assert_eq!(
             seen.history.len(),
-            course.scenario().present().history.len()
+            prepared.scenario().present().history.len()
         );
         assert_eq!(ids(seen.now()), [0, 1, 3]);
         // The world leaves all agents in place.
-        let frame = row.complete(&course, seen.now().clone());
+        let frame = row.complete(&prepared, seen.now().clone());
         assert_eq!(ids(&frame), [0, 1, 2, 3]);
         let x = |id| frame.agent(AgentId(id)).unwrap().state.pose.position.x;
         assert_eq!((x(2), x(3)), (-5.0, 120.0));
 
         for n in [Some(3), Some(7), None] {
-            row.limit(&course, n);
-            assert_eq!(ids(row.scene(&course).now()), [0, 1, 2, 3]);
+            row.limit(&prepared, n);
+            assert_eq!(ids(row.scene(&prepared).now()), [0, 1, 2, 3]);
         }
     }
 }

@@ -5,7 +5,7 @@ use gump_scene::{AgentState, Frame};
 
 use super::Traffic;
 use super::row::Row;
-use crate::{Course, RlError, Rules};
+use crate::{PreparedScenario, RlError, Rules};
 
 /// The other agents of all rows.
 pub(super) struct Others<'w> {
@@ -28,7 +28,11 @@ impl<'w> Others<'w> {
     }
 
     /// Begins the episodes of all rows.
-    pub(super) fn open(&mut self, courses: &[Course], rows: &mut [Row]) -> Result<(), RlError> {
+    pub(super) fn open(
+        &mut self,
+        prepared: &[PreparedScenario],
+        rows: &mut [Row],
+    ) -> Result<(), RlError> {
         self.session = None;
         for row in rows.iter_mut() {
             row.imagined = [None, None];
@@ -38,11 +42,11 @@ impl<'w> Others<'w> {
             return Ok(());
         };
         for row in rows.iter_mut() {
-            row.limit(&courses[row.start.scenario], self.nearest);
+            row.limit(&prepared[row.start.scenario], self.nearest);
         }
-        let starts: Vec<Start<'_>> = rows.iter().map(|row| start(courses, row)).collect();
+        let starts: Vec<Start<'_>> = rows.iter().map(|row| start(prepared, row)).collect();
         let session = world.open(&starts).map_err(|e| failed(world, e))?;
-        frames_per_step(courses[rows[0].start.scenario].dt(), session.dt())?;
+        frames_per_step(prepared[rows[0].start.scenario].dt(), session.dt())?;
         self.session = Some(session);
         Ok(())
     }
@@ -50,21 +54,21 @@ impl<'w> Others<'w> {
     /// Begins new episodes in some rows.
     pub(super) fn restart(
         &mut self,
-        courses: &[Course],
+        prepared: &[PreparedScenario],
         rows: &mut [Row],
         chosen: &[usize],
     ) -> Result<(), RlError> {
         if chosen.len() == rows.len() {
             // All at once is cheaper, and nothing is lost.
-            return self.open(courses, rows);
+            return self.open(prepared, rows);
         }
         for &i in chosen {
             rows[i].imagined = [None, None];
         }
         if let (Some(world), Some(session)) = (self.world, &mut self.session) {
             for &i in chosen {
-                rows[i].limit(&courses[rows[i].start.scenario], self.nearest);
-                let start = start(courses, &rows[i]);
+                rows[i].limit(&prepared[rows[i].start.scenario], self.nearest);
+                let start = start(prepared, &rows[i]);
                 session.replace(i, start).map_err(|e| failed(world, e))?;
             }
         }
@@ -77,7 +81,7 @@ impl<'w> Others<'w> {
     /// The session is put back only on success: one that failed halfway cannot be used.
     pub(super) fn step(
         &mut self,
-        courses: &[Course],
+        prepared: &[PreparedScenario],
         rules: &Rules,
         rows: &mut [Row],
         actions: &[f32],
@@ -89,7 +93,7 @@ impl<'w> Others<'w> {
             return Ok(());
         }
         let mut session = self.session.take().ok_or(RlError::NotReset)?;
-        let dt = courses[rows[0].start.scenario].dt();
+        let dt = prepared[rows[0].start.scenario].dt();
         let n = frames_per_step(dt, session.dt())?;
         let len = rules.dynamics.action_len();
         let mut frames = Vec::new();
@@ -112,7 +116,7 @@ impl<'w> Others<'w> {
         check(rows, &frames)?;
         for (row, frame) in rows.iter_mut().zip(frames) {
             let before = row.imagined[0].take();
-            let frame = row.complete(&courses[row.start.scenario], frame);
+            let frame = row.complete(&prepared[row.start.scenario], frame);
             row.imagined = [Some(frame), before];
         }
         self.session = Some(session);
@@ -138,9 +142,9 @@ fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
     }
 }
 
-fn start<'a>(courses: &'a [Course], row: &'a Row) -> Start<'a> {
+fn start<'a>(prepared: &'a [PreparedScenario], row: &'a Row) -> Start<'a> {
     Start {
-        scene: row.scene(&courses[row.start.scenario]),
+        scene: row.scene(&prepared[row.start.scenario]),
         n_futures: 1,
         seed: row.start.seed,
     }

@@ -8,7 +8,7 @@ use gump_scene::Frame;
 use serde::{Deserialize, Serialize};
 
 use crate::networks::Picture;
-use crate::{Course, EpisodeState, RlError};
+use crate::{EpisodeState, PreparedScenario, RlError};
 
 pub(crate) use buffer::{Observed, ObservedRow};
 pub use raster::{RASTER_LAYERS, RasterView, expand};
@@ -138,8 +138,8 @@ impl From<Picture> for ObservationForm {
 /// An episode at one instant, as input of an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// Its course.
-    pub course: &'a Course,
+    /// Its prepared.
+    pub prepared: &'a PreparedScenario,
     /// Its state.
     pub state: &'a EpisodeState,
     /// All agents now. The ego in it is ignored.

@@ -1,6 +1,6 @@
 //! Bird's-eye images of an episode, one bit per pixel and layer.
 //!
-//! The map is rendered once per course, north up (`Texture`); an observation samples it and draws
+//! The map is rendered once per prepared, north up (`Texture`); an observation samples it and draws
 //! the moving agents on top.
 
 use gump_geometry::{Canvas, DVec2, Pose, dvec2, fill_polygon, stroke_polyline};
@@ -9,7 +9,7 @@ use gump_scene::{AgentId, Frame, Light, LightState};
 use serde::{Deserialize, Serialize};
 
 use super::View;
-use crate::Course;
+use crate::PreparedScenario;
 
 /// Size and scale of a raster observation; the ego is at its centre and faces up.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -69,8 +69,8 @@ impl RasterView {
 
     /// Shape: `packed` is `[packed_len]`.
     pub(super) fn observe(&self, view: &View<'_>, packed: &mut [u8]) {
-        let course = view.course;
-        let texture = course.texture.get_or_init(|| Texture::paint(course));
+        let prepared = view.prepared;
+        let texture = prepared.texture.get_or_init(|| Texture::paint(prepared));
         let (map, moving) = packed.split_at_mut(MAP_LAYERS.len() * self.plane_len());
         let pose = view.state.ego.state.pose;
         self.look_up(texture, pose, map);
@@ -89,7 +89,7 @@ impl RasterView {
         };
         let is_red = |light: &Light| light.state == LightState::Red;
         let has_red = view.now.lights().iter().any(is_red);
-        draw(has_red, &|plane| plane.red_lights(course, view.now));
+        draw(has_red, &|plane| plane.red_lights(prepared, view.now));
         draw(true, &|plane| plane.agents(view.now, ego));
         draw(view.before.is_some(), &|plane| {
             if let Some(before) = view.before {
@@ -180,7 +180,7 @@ const TEXEL: f64 = 0.75;
 /// can go and see in eight seconds at 30 m/s.
 const TEXTURE_SIDE: usize = 768;
 
-/// The map of a course as a bird's-eye image, north up: per texel one bit per layer of the map.
+/// The map of a prepared as a bird's-eye image, north up: per texel one bit per layer of the map.
 #[derive(Debug)]
 pub(crate) struct Texture {
     /// World position of the texel (0, 0)'s lower left corner.
@@ -190,8 +190,8 @@ pub(crate) struct Texture {
 }
 
 impl Texture {
-    fn paint(course: &Course) -> Self {
-        let scene = course.scenario().present();
+    fn paint(prepared: &PreparedScenario) -> Self {
+        let scene = prepared.scenario().present();
         let center = scene.ego_now().state.pose.position;
         // A raster looks up, to +x of its frame: turned by a quarter, its columns lie along x.
         let pose = Pose {
@@ -282,12 +282,12 @@ impl<'a> Plane<'a> {
         }
     }
 
-    fn red_lights(&mut self, course: &Course, frame: &Frame) {
+    fn red_lights(&mut self, prepared: &PreparedScenario, frame: &Frame) {
         for light in frame.lights() {
             if light.state != LightState::Red {
                 continue;
             }
-            if let Some(lane) = course.scenario().map.lane(light.lane) {
+            if let Some(lane) = prepared.scenario().map.lane(light.lane) {
                 let points = lane.centerline.points().iter().map(|p| self.pixel(*p));
                 let points: Vec<DVec2> = points.collect();
                 stroke_polyline(&mut self.canvas, &points, 1.0);
@@ -309,13 +309,13 @@ mod tests {
 
     /// The layers as text, '#' for 1, one per row of the picture.
     fn draw(text: &str, layer: &str) -> Vec<String> {
-        let course = Course::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
-        let state = Rules::default().reset(&course);
+        let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
+        let state = Rules::default().reset(&prepared);
         let view = View {
-            course: &course,
+            prepared: &prepared,
             state: &state,
-            now: course.logged(0),
-            before: Some(&course.scenario().log[course.scenario().now - 5]),
+            now: prepared.logged(0),
+            before: Some(&prepared.scenario().log[prepared.scenario().now - 5]),
         };
         let mut packed = vec![0xAA; VIEW.packed_len()];
         VIEW.observe(&view, &mut packed);

@@ -104,7 +104,7 @@ impl VectorView {
     }
 
     fn route(&self, view: &View<'_>, out: &mut [f32]) {
-        let Some(path) = view.course.route() else {
+        let Some(path) = view.prepared.route() else {
             return;
         };
         let (pose, along) = (view.state.ego.state.pose, view.state.along);
@@ -188,7 +188,7 @@ impl VectorView {
         let mut walked = 0.0;
         let mut before: Option<(f64, f64)> = None;
         while walked < self.ray_range {
-            let Some(clearance) = view.course.border.clearance(from + direction * walked) else {
+            let Some(clearance) = view.prepared.border.clearance(from + direction * walked) else {
                 return self.ray_range;
             };
             if clearance <= 0.0 {
@@ -207,7 +207,7 @@ impl VectorView {
 fn ego(view: &View<'_>, out: &mut [f32]) {
     let ego = &view.state.ego;
     let speed = ego.state.velocity.dot(ego.state.pose.direction());
-    let (acceleration, yaw_rate) = view.state.motion(view.course.dt());
+    let (acceleration, yaw_rate) = view.state.motion(view.prepared.dt());
     let numbers = [
         speed * SPEED,
         acceleration / 4.0,
@@ -219,7 +219,7 @@ fn ego(view: &View<'_>, out: &mut [f32]) {
 }
 
 fn light(view: &View<'_>, out: &mut [f32]) {
-    let Some((distance, colour)) = view.course.light_ahead(view.state.along, view.now) else {
+    let Some((distance, colour)) = view.prepared.light_ahead(view.state.along, view.now) else {
         return;
     };
     if distance > AHEAD {
@@ -282,7 +282,7 @@ impl<'a> Walk<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Course, Rules};
+    use crate::{PreparedScenario, Rules};
     use gump_scene::fixture;
 
     const VIEW: VectorView = VectorView {
@@ -295,13 +295,13 @@ mod tests {
     };
 
     fn check(text: &str, expected: &[f32]) {
-        let course = Course::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
-        let state = Rules::default().reset(&course);
+        let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
+        let state = Rules::default().reset(&prepared);
         let mut found = vec![f32::NAN; VIEW.len()];
         let view = View {
-            course: &course,
+            prepared: &prepared,
             state: &state,
-            now: course.logged(0),
+            now: prepared.logged(0),
             before: None,
         };
         VIEW.observe(&view, &mut found);
@@ -378,17 +378,17 @@ mod tests {
 
     #[test]
     fn agents_out_of_range_are_not_seen() {
-        let course = |x: f64| {
+        let prepared = |x: f64| {
             let text = format!("ego vehicle 0: 0,0\nagent vehicle 1: {x},0");
-            Course::new(fixture::scenario(&text).unwrap(), 0.5).unwrap()
+            PreparedScenario::new(fixture::scenario(&text).unwrap(), 0.5).unwrap()
         };
         for (x, expected) in [(79.0, 1), (81.0, 0)] {
-            let course = course(x);
-            let state = Rules::default().reset(&course);
+            let prepared = prepared(x);
+            let state = Rules::default().reset(&prepared);
             let view = View {
-                course: &course,
+                prepared: &prepared,
                 state: &state,
-                now: course.logged(0),
+                now: prepared.logged(0),
                 before: None,
             };
             assert_eq!(VIEW.nearest(&view).len(), expected);

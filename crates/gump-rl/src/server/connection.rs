@@ -6,8 +6,8 @@ use std::sync::Arc;
 use super::ServerError;
 use super::frame::{self, kind};
 use crate::{
-    Autoreset, BicycleLimits, Course, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
-    RasterView, Rules, Traffic, VectorEnv, VectorView,
+    Autoreset, BicycleLimits, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
+    PreparedScenario, RasterView, Rules, Traffic, VectorEnv, VectorView,
 };
 
 /// The protocol version.
@@ -21,7 +21,7 @@ const MAX_ROWS: u32 = 4096;
 #[derive(Debug)]
 pub struct Connection<'a, S> {
     stream: BufReader<S>,
-    courses: &'a Arc<[Course]>,
+    prepared: &'a Arc<[PreparedScenario]>,
     traffic: Traffic<'a>,
     config: EnvConfig,
 }
@@ -41,13 +41,13 @@ impl<'a, S: Read + Write> Connection<'a, S> {
     /// Creates a connection whose handshake has not begun.
     pub fn new(
         stream: S,
-        courses: &'a Arc<[Course]>,
+        prepared: &'a Arc<[PreparedScenario]>,
         traffic: Traffic<'a>,
         config: &EnvConfig,
     ) -> Self {
         Self {
             stream: BufReader::new(stream),
-            courses,
+            prepared,
             traffic,
             config: *config,
         }
@@ -132,13 +132,13 @@ impl<'a, S: Read + Write> Connection<'a, S> {
             },
             ..self.config
         };
-        let env = DrivingEnv::new(Arc::clone(self.courses), self.traffic, config)?;
+        let env = DrivingEnv::new(Arc::clone(self.prepared), self.traffic, config)?;
         let mut body = Vec::new();
         let shape = config.observation.shape();
         body.extend(rows.to_le_bytes());
         body.extend((env.action_len() as u32).to_le_bytes());
-        body.extend(self.courses[0].dt().to_le_bytes());
-        body.extend((self.courses.len() as u32).to_le_bytes());
+        body.extend(self.prepared[0].dt().to_le_bytes());
+        body.extend((self.prepared.len() as u32).to_le_bytes());
         frame::put_flags(&mut body, [config.observation.packed_len() > 0]);
         body.push(shape.len() as u8);
         for axis in shape {

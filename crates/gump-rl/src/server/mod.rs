@@ -1,6 +1,6 @@
 //! Environments for other processes, over a Unix socket.
 //!
-//! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; courses and world
+//! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; prepared and world
 //! are shared. Invalid requests are answered with an error and at worst close that connection; the
 //! server and other clients are not affected. `python/gump_env.py` is a client, and
 //! `python/gump_sb3.py` adapts it to Stable-Baselines3.
@@ -45,7 +45,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::{Course, EnvConfig, Traffic};
+use crate::{EnvConfig, PreparedScenario, Traffic};
 
 pub use connection::{Connection, Farewell};
 pub use error::ServerError;
@@ -119,7 +119,7 @@ impl Server {
     /// [`ServerError::Listen`] if no client can be accepted any more.
     pub fn run(
         &self,
-        courses: &Arc<[Course]>,
+        prepared: &Arc<[PreparedScenario]>,
         traffic: Traffic<'_>,
         config: &EnvConfig,
         report: &(dyn Fn(Event) + Sync),
@@ -147,7 +147,7 @@ impl Server {
                 }
                 scope.spawn(move || {
                     report(Event::Came { client });
-                    let connection = Connection::new(stream, courses, traffic, config);
+                    let connection = Connection::new(stream, prepared, traffic, config);
                     let farewell = connection.serve();
                     self.lock().retain(|(other, _)| *other != client);
                     report(Event::Left { client, farewell });

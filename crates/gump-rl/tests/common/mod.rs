@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use gump_rl::{Course, DrivingEnv, EnvConfig, Outcome, Traffic, VectorEnv};
+use gump_rl::{DrivingEnv, EnvConfig, Outcome, PreparedScenario, Traffic, VectorEnv};
 use gump_scene::{Seed, fixture};
 use gump_synthesis::{SynthesisConfig, synthesize_many};
 use rand::Rng as _;
@@ -16,15 +16,15 @@ pub(crate) const DT: f64 = 0.5;
 pub(crate) const STREET: &str =
     "lane 1: 0,0 400,0 speed 15\nroute 1\nego vehicle 0: 10,0 velocity 10,0\n";
 
-pub(crate) fn street(others: &str) -> Arc<[Course]> {
+pub(crate) fn street(others: &str) -> Arc<[PreparedScenario]> {
     let scenario = fixture::scenario(&format!("{STREET}{others}")).unwrap();
-    Course::prepare([scenario], DT).unwrap()
+    PreparedScenario::prepare([scenario], DT).unwrap()
 }
 
 /// Synthetic traffic on synthetic roads.
-pub(crate) fn busy(n: usize) -> Arc<[Course]> {
+pub(crate) fn busy(n: usize) -> Arc<[PreparedScenario]> {
     let scenarios = synthesize_many(&SynthesisConfig::standard(), Seed(3), n);
-    Course::prepare(scenarios, DT).unwrap()
+    PreparedScenario::prepare(scenarios, DT).unwrap()
 }
 
 pub(crate) fn config(n_envs: usize) -> EnvConfig {
@@ -35,11 +35,11 @@ pub(crate) fn config(n_envs: usize) -> EnvConfig {
 }
 
 pub(crate) fn env<'w>(
-    courses: &Arc<[Course]>,
+    prepared: &Arc<[PreparedScenario]>,
     traffic: Traffic<'w>,
     n_envs: usize,
 ) -> DrivingEnv<'w> {
-    DrivingEnv::new(Arc::clone(courses), traffic, config(n_envs)).unwrap()
+    DrivingEnv::new(Arc::clone(prepared), traffic, config(n_envs)).unwrap()
 }
 
 /// One step of one row, from one observation to the next.

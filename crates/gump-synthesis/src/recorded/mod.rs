@@ -134,7 +134,7 @@ pub(crate) fn draw_scenario(
         objects_of_interest: Vec::new(),
         tags: Vec::new(),
     };
-    scenario.tags = gump_metrics::tags::mine(&scenario);
+    scenario.tags = gump_metrics::tags::extract_tags(&scenario);
     Some(scenario)
 }
 

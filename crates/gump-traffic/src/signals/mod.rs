@@ -163,7 +163,7 @@ impl Signals {
                 .flat_map(|g| &junction.groups[g].members);
             let mut movements = lights.filter_map(|&l| self.plan.movements[l].as_ref());
             movements.any(|movement| match vehicles {
-                Some(all) => all.iter().any(|at| movement.is_asked_for_by(*at)),
+                Some(all) => all.iter().any(|at| movement.has_demand_from(*at)),
                 None => true,
             })
         };

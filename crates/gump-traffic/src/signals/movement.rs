@@ -133,7 +133,7 @@ impl Movement {
     }
 
     /// Whether a vehicle at this position waits for the light or approaches it.
-    pub(super) fn is_asked_for_by(&self, at: Pose) -> bool {
+    pub(super) fn has_demand_from(&self, at: Pose) -> bool {
         let is_far = at.position.distance(self.line.position) > WAITING_M + BESIDE_M;
         if is_far && !self.approaches.is_empty() {
             return false;

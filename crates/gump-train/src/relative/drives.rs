@@ -11,7 +11,7 @@
 //! The resulting motion is the target, so that the network learns to follow the rules itself.
 
 use gump_engine::relative::engine::{Draw, Engine, Workspace};
-use gump_engine::relative::rules::settle;
+use gump_engine::relative::rules::resolve;
 use gump_engine::relative::seen::{Seen, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
@@ -223,7 +223,7 @@ impl Driver {
         let mut moves = drawn(&all, 0);
         let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
         let redraws = self.config.redraws;
-        settle(agents, None, survey, redraws, &mut moves, &mut again);
+        resolve(agents, None, survey, redraws, &mut moves, &mut again);
         moves
     }
 

@@ -33,7 +33,7 @@ pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
 use self::targets::{class_targets, control_targets, light_targets, targets};
 pub(crate) use self::window::Driven;
 use self::window::{Window, choose_window};
-use crate::perturbation as drift;
+use crate::perturbation;
 
 /// Separates the random stream of hiding from those of other choices.
 const HIDDEN: u64 = 1 << 32;
@@ -63,9 +63,11 @@ pub struct SampleConfig {
     pub frame_dropout: f64,
     /// Probability that moving objects are displaced from their path, with the return to it as
     /// target.
-    pub sway: f64,
+    #[serde(alias = "sway")]
+    pub lateral_perturbation: f64,
     /// Maximum sideways displacement per push, metres.
-    pub sway_m: f64,
+    #[serde(alias = "sway_m")]
+    pub lateral_perturbation_m: f64,
     /// Probability that the last frame's values are perturbed, like surrogates in partial-AR
     /// decoding; the targets are not changed.
     pub surrogate_noise: f64,
@@ -98,8 +100,8 @@ impl Default for SampleConfig {
             translation_m: 5.0,
             agent_dropout: 0.1,
             frame_dropout: 0.1,
-            sway: 0.0,
-            sway_m: 0.8,
+            lateral_perturbation: 0.0,
+            lateral_perturbation_m: 0.8,
             surrogate_noise: 0.5,
             shuffle_ids: true,
             prompt_dropout: 0.5,
@@ -123,7 +125,7 @@ impl SampleConfig {
             augment: 0.0,
             agent_dropout: 0.0,
             frame_dropout: 0.0,
-            sway: 0.0,
+            lateral_perturbation: 0.0,
             surrogate_noise: 0.0,
             shuffle_ids: false,
             prompt_dropout: 1.0,
@@ -190,22 +192,22 @@ pub(crate) fn draw(
 ) -> Option<Sample> {
     let mut rng = seed.rng();
     let mut window = choose_window(scenario, driven, config, &mut rng)?;
-    let swaying = if driven.is_none() && rng.random_bool(config.sway) {
+    let perturbed = if driven.is_none() && rng.random_bool(config.lateral_perturbation) {
         let (start, stride) = (window.start, window.stride);
-        let drive = drift::sway(
+        let drive = perturbation::lateral_perturbation(
             scenario,
             start,
             stride,
             config.frames,
-            config.sway_m,
+            config.lateral_perturbation_m,
             &mut rng,
         );
         Some(drive)
     } else {
         None
     };
-    if let Some(drive) = &swaying {
-        let slack = drift::SLACK;
+    if let Some(drive) = &perturbed {
+        let slack = perturbation::SLACK;
         window.driven = Some(Driven { drive, slack });
     }
     let frames: Vec<Frame> = (0..config.frames)

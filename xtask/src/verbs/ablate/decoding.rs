@@ -26,7 +26,6 @@ use crate::machine::cpu_seconds;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Draw;
 use crate::shipped;
-use crate::verbs::evaluate;
 
 /// Arguments of the ablations of decoding.
 #[derive(Debug, Serialize, clap::Args)]
@@ -106,7 +105,7 @@ impl Sweep {
             Self::Chunking => {
                 let decay = base.sampling.decay;
                 let average = if decay > 0.0 { decay } else { 1.2 };
-                let ways = [
+                let categories = [
                     ("one pose", Surrogate::ConstantVelocity, 0.0),
                     ("surrogates from chunks", Surrogate::Chunk, 0.0),
                     ("chunks averaged", Surrogate::Chunk, average),
@@ -118,7 +117,7 @@ impl Sweep {
                     });
                     (name.to_owned(), (i + 1) as f64, turned)
                 };
-                ways.into_iter().enumerate().map(setting).collect()
+                categories.into_iter().enumerate().map(setting).collect()
             }
             Self::Quantization => {
                 let forms = [
@@ -146,12 +145,12 @@ impl Args {
         let procedural = || shipped::data().join("procedural.tfrecord.gz");
         let path = self.scenarios.clone().unwrap_or_else(procedural);
         run.setting("scenarios", path.display().to_string())?;
-        let (mut rows, mut curves, mut ways) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut rows, mut curves, mut categories) = (Vec::new(), Vec::new(), Vec::new());
         let mut digests = Vec::new();
         for base in self.draw.decodings(Mode::PartialAr)? {
             let (mut first, mut curve) = (None, Series::default());
             curve.name = base.name.into();
-            ways.clear();
+            categories.clear();
             for (name, at, decoding) in sweep.settings(&base) {
                 let phase = format!("{name}, {}", base.name);
                 let judged = run.phase(&phase, |run| {
@@ -171,7 +170,7 @@ impl Args {
                 curve
                     .spans
                     .extend(low_high.map(|(low, high)| (at, low, high)));
-                ways.push(name);
+                categories.push(name);
                 rows.push(row);
             }
             curves.push(curve);
@@ -182,7 +181,11 @@ impl Args {
             x_label: sweep.label().into(),
             y_label: "realism (2025), mean and 95 % interval".into(),
             markers: true,
-            ways: if sweep.is_numeric() { Vec::new() } else { ways },
+            categories: if sweep.is_numeric() {
+                Vec::new()
+            } else {
+                categories
+            },
             series: curves,
             ..Chart::default()
         };
@@ -248,7 +251,8 @@ pub(super) fn score(
         stop_if_interrupted()?;
         let recorded = recorded?;
         let (cpu, began) = (cpu_seconds(), Instant::now());
-        let found = evaluate::wosac::rollouts(run, &mut source, &recorded, config.mode)?;
+        let simulating = run.simulating(source.frames(&recorded.scenario));
+        let found = source.rollouts(run.device(), &recorded, config.mode, &simulating)?;
         let wall = began.elapsed().as_secs_f64();
         let spent = |before| cpu_seconds().map_or(wall, |after| after - before);
         cost.cpu += cpu.map_or(wall, spent);

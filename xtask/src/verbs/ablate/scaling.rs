@@ -9,7 +9,7 @@ use gump_viz::{Chart, Series};
 use serde::Serialize;
 use serde_json::json;
 
-use super::lesson::{Learned, Lesson, of_width};
+use super::train_variant::{Learned, TrainVariant, of_width};
 use crate::run::{Common, Run};
 
 /// Widths of the network; the last is that of `tiny`.
@@ -24,7 +24,7 @@ const GROWTH: f64 = 5.0;
 pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
-    lesson: Lesson,
+    train_variant: TrainVariant,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -32,11 +32,11 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let class = self.lesson.begin(run)?;
+        let class = self.train_variant.begin(run)?;
         let (mut rows, mut sizes) = (Vec::new(), Vec::new());
         for width in WIDTHS {
             let name = format!("width-{width}");
-            let measured = measured(self.lesson.steps());
+            let measured = measured(self.train_variant.steps());
             let learned = class.teach(run, &name, of_width(width)?, &measured)?;
             let mut row = learned.row()?;
             row["width"] = json!(width);

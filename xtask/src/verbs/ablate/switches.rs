@@ -7,7 +7,7 @@ use gump_viz::Bars;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::lesson::{Lesson, of_width};
+use super::train_variant::{TrainVariant, of_width};
 use crate::charts;
 use crate::run::{Common, Run};
 
@@ -16,7 +16,7 @@ use crate::run::{Common, Run};
 pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
-    lesson: Lesson,
+    train_variant: TrainVariant,
     /// Width of the networks, a multiple of 32 [tiny: 128]
     #[arg(long, value_name = "C", default_value_t = 64, value_parser = width)]
     width: usize,
@@ -49,7 +49,9 @@ const SWITCHES: [(&str, Turn); 9] = [
     }),
     ("free-bins", |model, _| model.smooth_bins = false),
     ("sharp-targets", |_, train| train.loss.smoothing_bins = 0.0),
-    ("no-sway", |_, train| train.sample.sway = 0.0),
+    ("no-perturbation", |_, train| {
+        train.sample.lateral_perturbation = 0.0
+    }),
     ("no-turns", |_, train| train.sample.augment = 0.0),
 ];
 
@@ -59,7 +61,7 @@ fn known() -> clap::builder::PossibleValuesParser {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let class = self.lesson.begin(run)?;
+        let class = self.train_variant.begin(run)?;
         let is_requested = |name: &str| {
             name == SWITCHES[0].0 || self.only.is_empty() || self.only.iter().any(|o| o == name)
         };
@@ -67,7 +69,7 @@ impl Args {
         for (name, turn) in SWITCHES.into_iter().filter(|(name, _)| is_requested(name)) {
             let (mut model, mut train) = of_width(self.width)?;
             turn(&mut model, &mut train);
-            let learned = class.teach(run, name, (model, train), &[self.lesson.steps()])?;
+            let learned = class.teach(run, name, (model, train), &[self.train_variant.steps()])?;
             let mut row = learned.row()?;
             row["switch"] = json!(name);
             rows.push(row);

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use gump_engine::{Precision, SamplingConfig};
 use gump_eval::planners::PlanningWorld;
 use gump_eval::recordings;
-use gump_nuplan::closed_loop::{DriveConfig, Driver, Mission, Moment, Replayed, drive};
+use gump_nuplan::closed_loop::{
+    DriveConfig, Driver, PlannerInitialization, PlannerInput, Replayed, drive,
+};
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{Explain, InteractiveDriver, InteractiveDriverConfig, Phases};
 use gump_rollout::BoxError;
@@ -29,13 +31,13 @@ impl Driver for Watched<'_> {
         self.inner.name()
     }
 
-    fn start(&mut self, mission: &Mission<'_>) -> Result<(), BoxError> {
-        self.inner.start(mission)
+    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+        self.inner.start(initialization)
     }
 
-    fn drive(&mut self, moment: &Moment<'_>) -> Result<Trajectory, BoxError> {
+    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
         let began = Instant::now();
-        let plan = self.inner.drive(moment)?;
+        let plan = self.inner.drive(input)?;
         let phases = self.inner.decision().map(|decision| decision.phases);
         self.decisions
             .push((began.elapsed(), phases.unwrap_or_default()));

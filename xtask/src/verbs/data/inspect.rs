@@ -87,7 +87,7 @@ pub(crate) fn picture(scenario: &Scenario) -> Picture {
 /// Mines the tags of a scenario whose format states none.
 fn add_tags(scenario: &mut Scenario) {
     if scenario.tags.is_empty() {
-        scenario.tags = gump_metrics::tags::mine(scenario);
+        scenario.tags = gump_metrics::tags::extract_tags(scenario);
     }
 }
 

@@ -246,7 +246,7 @@ impl Stats {
         self.with_route += usize::from(scenario.route.is_some());
         let mined;
         let tags = if scenario.tags.is_empty() {
-            mined = gump_metrics::tags::mine(scenario);
+            mined = gump_metrics::tags::extract_tags(scenario);
             &mined
         } else {
             &scenario.tags

@@ -1,8 +1,8 @@
 //! A scene from a prompt, on the scenario's map.
 
 use gump_eval::worlds::World;
-use gump_generate::factory::{GenerationJob, GenerationWorlds, make_many};
-use gump_generate::verdict::{off_road, overlaps};
+use gump_generate::check::{off_road, overlaps};
+use gump_generate::pipeline::{GenerationJob, GenerationWorlds, make_many};
 use gump_generate::{Counts, GenerateConfig, GenerateRequest};
 use gump_model::Device;
 use gump_scene::ScenarioTag;

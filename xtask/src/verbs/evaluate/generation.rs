@@ -16,7 +16,7 @@ use gump_eval::generation::{
 };
 use gump_eval::worlds::{self, World};
 use gump_generate::Placement;
-use gump_generate::factory::GenerationWorlds;
+use gump_generate::pipeline::GenerationWorlds;
 use gump_metrics::Interval;
 use gump_metrics::mmd::MmdProtocol;
 use gump_scene::Scenario;

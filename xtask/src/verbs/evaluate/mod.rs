@@ -8,8 +8,8 @@
 pub(crate) mod behaviour;
 mod closed_loop;
 mod columns;
+mod exclusions;
 pub(crate) mod generation;
-mod left_out;
 mod merge;
 pub(crate) mod motion;
 mod open_loop;

@@ -6,10 +6,10 @@ mod reasons;
 use anyhow::Context as _;
 use gump_geometry::DVec2;
 use gump_metrics::overlapping;
-use gump_planner::{Decision, Prospect};
+use gump_planner::{CandidateEvaluation, Decision};
 use gump_scene::{Agent, Rollout, Scenario, VehicleParameters};
 use gump_viz::{
-    Camera, CandidatePath, Film, FilmSpec, Page, Picture, PictureSpec, Take, Viewer,
+    Camera, CandidatePath, Film, FilmSpec, LabelledRollout, Page, Picture, PictureSpec, Viewer,
     draw_candidates, grid_film,
 };
 use serde_json::{Value, json};
@@ -298,10 +298,10 @@ fn deed(future: &Rollout, agent: &Agent) -> Option<Deed> {
 }
 
 /// The first future of each, side by side.
-fn film(scenario: &Scenario, shown: [&Prospect; 2]) -> anyhow::Result<Film> {
-    let takes: Vec<Take<'_>> = shown
+fn film(scenario: &Scenario, shown: [&CandidateEvaluation; 2]) -> anyhow::Result<Film> {
+    let takes: Vec<LabelledRollout<'_>> = shown
         .iter()
-        .map(|prospect| Take {
+        .map(|prospect| LabelledRollout {
             rollout: &prospect.futures[0],
             label: prospect.kind.to_string(),
         })

@@ -1,6 +1,6 @@
 //! Differences between two candidates, in words.
 
-use gump_planner::{Decision, ProposalKind, Prospect};
+use gump_planner::{CandidateEvaluation, Decision, ProposalKind};
 use gump_scene::{Agent, Rollout};
 
 use super::{Deed, deed};
@@ -19,7 +19,7 @@ const MOST_DIFFERENCES: usize = 3;
 /// ends more than 2 m from the chosen one, or that is worth something else.
 pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
     let chosen = &decision.prospects[decision.chosen];
-    let differs = |prospect: &Prospect| match (end(prospect), end(chosen)) {
+    let differs = |prospect: &CandidateEvaluation| match (end(prospect), end(chosen)) {
         (Some(a), Some(b)) => a.distance(b) > SAME_PLACE,
         _ => (prospect.value - chosen.value).abs() > SAME_PART,
     };
@@ -55,14 +55,18 @@ pub(crate) fn weight(decision: &Decision) -> f64 {
     margin(ordinary(decision)) + 0.1 * margin(best_rejected(decision))
 }
 
-fn end(prospect: &Prospect) -> Option<gump_geometry::DVec2> {
+fn end(prospect: &CandidateEvaluation) -> Option<gump_geometry::DVec2> {
     let last = prospect.drives.first()?.last()?;
     Some(last.rear_axle.position)
 }
 
 /// Sentences on why `chosen` is worth more than `other`, the weightiest first. `near` are agents to
 /// look at.
-pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<String> {
+pub(super) fn between(
+    chosen: &CandidateEvaluation,
+    other: &CandidateEvaluation,
+    near: &[&Agent],
+) -> Vec<String> {
     let mut sentences = Vec::new();
     let (mine, theirs) = (chosen.collisions, other.collisions);
     if mine != theirs {
@@ -103,7 +107,7 @@ pub(super) fn between(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> V
 }
 
 /// The parts that differ, those by most first.
-fn differing_parts(chosen: &Prospect, other: &Prospect) -> Vec<String> {
+fn differing_parts(chosen: &CandidateEvaluation, other: &CandidateEvaluation) -> Vec<String> {
     let pairs = chosen.score.parts().into_iter().zip(other.score.parts());
     let mut parts: Vec<(&str, f64, f64)> = pairs
         .map(|((name, mine), (_, theirs))| (name, mine, theirs))
@@ -118,8 +122,12 @@ fn differing_parts(chosen: &Prospect, other: &Prospect) -> Vec<String> {
 }
 
 /// Agents to which the ego comes much closer with one than with the other.
-fn approaches(chosen: &Prospect, other: &Prospect, near: &[&Agent]) -> Vec<String> {
-    let closest = |prospect: &Prospect, agent: &Agent| {
+fn approaches(
+    chosen: &CandidateEvaluation,
+    other: &CandidateEvaluation,
+    near: &[&Agent],
+) -> Vec<String> {
+    let closest = |prospect: &CandidateEvaluation, agent: &Agent| {
         let deeds = prospect
             .futures
             .iter()

@@ -9,12 +9,12 @@ use gump_eval::datasets::Split;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_rl::{Actor, Course, Driver, EnvConfig, Episodes, evaluate};
+use gump_rl::{Actor, Driver, EnvConfig, Episodes, PreparedScenario, evaluate};
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
 use super::columns::{DriveRecord, Driven, Policy, Tested, report};
-use super::{Notes, RlWorld, Settings, courses, read};
+use super::{Notes, RlWorld, Settings, prepared, read};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
@@ -92,8 +92,8 @@ impl Args {
         }
         let (candidates, env) = self.candidates()?;
         let limit = self.limit;
-        let courses = run.phase("read", |run| {
-            courses(run, &self.scenarios, Split::Test, limit)
+        let prepared = run.phase("read", |run| {
+            prepared(run, &self.scenarios, Split::Test, limit)
         })?;
         let worlds = load(run, &self.test_world, &self.sampling)?;
         let test = Test {
@@ -104,7 +104,7 @@ impl Args {
             sampling: &self.sampling,
             shard: self.shard,
         };
-        test.execute(run, &courses)
+        test.execute(run, &prepared)
     }
 
     /// Reads the policies; the environment is that of the config file, else that of the first.
@@ -138,8 +138,12 @@ pub(super) fn load<'a>(
 
 impl Test<'_> {
     /// Drives the scenarios whose results the folder does not have yet, and reports on all.
-    pub(super) fn execute(&self, run: &mut Run, courses: &Arc<[Course]>) -> anyhow::Result<()> {
-        let tested = self.tested(run, courses)?;
+    pub(super) fn execute(
+        &self,
+        run: &mut Run,
+        prepared: &Arc<[PreparedScenario]>,
+    ) -> anyhow::Result<()> {
+        let tested = self.tested(run, prepared)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard: self.shard,
@@ -147,7 +151,7 @@ impl Test<'_> {
         };
         let mut store = ResultStore::open(run.out(), &header)?;
         let missing = |index: &usize| self.shard.holds(*index) && !store.has(*index);
-        let todo: Vec<usize> = (0..courses.len()).filter(missing).collect();
+        let todo: Vec<usize> = (0..prepared.len()).filter(missing).collect();
         let (mut steps, began) = (0, Instant::now());
         run.phase("drive", |run| {
             let n = todo.len() * self.worlds.len() * self.candidates.len();
@@ -157,12 +161,12 @@ impl Test<'_> {
                 for w in 0..self.worlds.len() {
                     for p in 0..self.candidates.len() {
                         stop_if_interrupted()?;
-                        steps += self.drive(run, courses, (w, p), round, &mut driven)?;
+                        steps += self.drive(run, prepared, (w, p), round, &mut driven)?;
                         progress.advance(round.len() as u64);
                     }
                 }
                 for (&index, scores) in round.iter().zip(driven) {
-                    let id = courses[index].scenario().id.clone();
+                    let id = prepared[index].scenario().id.clone();
                     store.add(Entry { index, id, scores })?;
                 }
             }
@@ -173,7 +177,7 @@ impl Test<'_> {
             !entries.is_empty(),
             "expected scenarios in shard {}, found none among {}",
             self.shard,
-            courses.len()
+            prepared.len()
         );
         report(run, &tested, &entries)?;
         run.result(
@@ -186,7 +190,7 @@ impl Test<'_> {
     fn drive(
         &self,
         run: &Run,
-        courses: &Arc<[Course]>,
+        prepared: &Arc<[PreparedScenario]>,
         (w, p): (usize, usize),
         scenarios: &[usize],
         driven: &mut [Driven],
@@ -198,7 +202,7 @@ impl Test<'_> {
             seed: run.seed(),
         };
         let drives = evaluate(
-            courses,
+            prepared,
             world.traffic(),
             self.env,
             candidate.driver(),
@@ -214,10 +218,10 @@ impl Test<'_> {
         Ok(drives.iter().map(|drive| drive.steps as u32).sum())
     }
 
-    fn tested(&self, run: &Run, courses: &[Course]) -> anyhow::Result<Tested> {
-        let ids: Vec<&str> = courses.iter().map(|c| c.scenario().id.as_str()).collect();
+    fn tested(&self, run: &Run, prepared: &[PreparedScenario]) -> anyhow::Result<Tested> {
+        let ids: Vec<&str> = prepared.iter().map(|c| c.scenario().id.as_str()).collect();
         Ok(Tested {
-            scenarios: courses.len(),
+            scenarios: prepared.len(),
             sha256_of_ids: sha256(ids.join("\n").as_bytes()),
             repeats: self.repeats,
             seed: run.seed().0.to_string(),

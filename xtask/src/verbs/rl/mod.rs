@@ -19,7 +19,7 @@ use gump_eval::worlds::{World, WorldName};
 use gump_model::Device;
 use gump_rl::networks::Architecture;
 use gump_rl::sac::SacConfig;
-use gump_rl::{Autoreset, Course, EnvConfig, Traffic};
+use gump_rl::{Autoreset, EnvConfig, PreparedScenario, Traffic};
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
@@ -119,15 +119,15 @@ impl RlWorld {
     }
 }
 
-/// The scenarios of a path as courses: of a data set with a manifest those of `split`, else all.
+/// The scenarios of a path as prepared: of a data set with a manifest those of `split`, else all.
 ///
 /// Error: nothing there to read, or a scenario that cannot be driven.
-fn courses(
+fn prepared(
     run: &Run,
     path: &Path,
     split: Split,
     limit: Option<usize>,
-) -> anyhow::Result<Arc<[Course]>> {
+) -> anyhow::Result<Arc<[PreparedScenario]>> {
     let progress = run.progress("reading", 0, "scenarios");
     let parts = match datasets::Manifest::of(path)? {
         Some(_) => datasets::parts(path, split)?,
@@ -136,7 +136,7 @@ fn courses(
     let mut scenarios = datasets::read(&parts, &progress)?;
     scenarios.truncate(limit.unwrap_or(usize::MAX));
     anyhow::ensure!(!scenarios.is_empty(), "no scenario in {}", path.display());
-    Ok(Course::prepare(scenarios, STEP)?)
+    Ok(PreparedScenario::prepare(scenarios, STEP)?)
 }
 
 /// Metadata of a stored policy.

@@ -9,10 +9,10 @@ use gump_engine::SamplingConfig;
 use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
 use gump_rl::server::{Event, Server};
-use gump_rl::{Course, EnvConfig, Sampling, Traffic};
+use gump_rl::{EnvConfig, PreparedScenario, Sampling, Traffic};
 use serde::Serialize;
 
-use super::{RlWorld, courses};
+use super::{RlWorld, prepared};
 use crate::run::{Common, Run, interrupted};
 
 /// Arguments of `rl serve`.
@@ -43,8 +43,8 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let courses = run.phase("read", |run| {
-            courses(run, &self.scenarios, Split::Train, self.limit)
+        let prepared = run.phase("read", |run| {
+            prepared(run, &self.scenarios, Split::Train, self.limit)
         })?;
         let world = run.phase("load", |run| {
             RlWorld::load(run.device(), &self.world, &SamplingConfig::default())
@@ -57,13 +57,13 @@ impl Args {
         let server = Server::bind(&self.socket)?;
         run.print(&format!(
             "serving {} scenarios at {}; Ctrl-C ends it",
-            courses.len(),
+            prepared.len(),
             server.path().display()
         ));
         let served = run.phase("serve", |run| {
-            serve(run, &server, &courses, world.traffic(), &config)
+            serve(run, &server, &prepared, world.traffic(), &config)
         })?;
-        run.result("scenarios", courses.len())?;
+        run.result("scenarios", prepared.len())?;
         run.result("clients", served.clients.into_inner())?;
         run.result("episodes", served.episodes.into_inner())?;
         run.result("episodes_lost", served.lost.into_inner())
@@ -82,7 +82,7 @@ struct Served {
 fn serve(
     run: &Run,
     server: &Server,
-    courses: &Arc<[Course]>,
+    prepared: &Arc<[PreparedScenario]>,
     traffic: Traffic<'_>,
     config: &EnvConfig,
 ) -> anyhow::Result<Served> {
@@ -112,7 +112,7 @@ fn serve(
             }
             server.stop();
         });
-        let done = server.run(courses, traffic, config, &on_event);
+        let done = server.run(prepared, traffic, config, &on_event);
         is_over.store(true, Ordering::Relaxed);
         done
     })?;

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::evaluate::{Candidate, Test, load};
 use super::train::{AlgorithmName, Job};
-use super::{RlWorld, Settings, courses};
+use super::{RlWorld, Settings, prepared};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -67,8 +67,8 @@ impl Args {
 
     /// Trains whatever is not there yet; the files of the policies, kind by kind.
     fn train(&self, run: &mut Run, settings: &Settings) -> anyhow::Result<Vec<PathBuf>> {
-        let courses = run.phase("read", |run| {
-            courses(run, &self.scenarios, Split::Train, None)
+        let prepared = run.phase("read", |run| {
+            prepared(run, &self.scenarios, Split::Train, None)
         })?;
         let sampling = self.sampling.resolve()?;
         let device = run.device().clone();
@@ -88,7 +88,7 @@ impl Args {
                     algorithm,
                     world_name,
                     world,
-                    courses: &courses,
+                    prepared: &prepared,
                     settings,
                     seed: Seed(run.seed().0 + k),
                     resume: folder.join("checkpoint.safetensors").exists(),
@@ -106,7 +106,7 @@ impl Args {
     /// Lets all policies, and rules to compare them with, drive everywhere.
     fn test(&self, run: &mut Run, settings: &Settings, files: &[PathBuf]) -> anyhow::Result<()> {
         let path = self.test_scenarios.as_ref().unwrap_or(&self.scenarios);
-        let courses = run.phase("read", |run| courses(run, path, Split::Test, None))?;
+        let prepared = run.phase("read", |run| prepared(run, path, Split::Test, None))?;
         let rules = ["random", "brake", "constant-speed"].map(PathBuf::from);
         let all = rules.iter().chain(files);
         let candidates: Vec<Candidate> = all
@@ -122,6 +122,6 @@ impl Args {
             sampling: &self.sampling,
             shard: Shard::WHOLE,
         };
-        test.execute(run, &courses)
+        test.execute(run, &prepared)
     }
 }

@@ -9,12 +9,12 @@ use anyhow::Context as _;
 use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
 use gump_rl::sac::{Algorithm, Training};
-use gump_rl::{Course, DrivingEnv, demonstrations};
+use gump_rl::{DrivingEnv, PreparedScenario, demonstrations};
 use gump_scene::Seed;
 use serde::Serialize;
 
 use super::curves::Curves;
-use super::{Notes, RlWorld, Settings, courses, read, write};
+use super::{Notes, RlWorld, Settings, prepared, read, write};
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
@@ -84,7 +84,7 @@ pub(super) struct Job<'a> {
     pub(super) algorithm: AlgorithmName,
     pub(super) world_name: &'a WorldName,
     pub(super) world: &'a RlWorld,
-    pub(super) courses: &'a Arc<[Course]>,
+    pub(super) prepared: &'a Arc<[PreparedScenario]>,
     pub(super) settings: &'a Settings,
     pub(super) seed: Seed,
     pub(super) folder: PathBuf,
@@ -125,8 +125,8 @@ impl Args {
             return Err(WrongArguments(wrong.into()).into());
         }
         let sampling = self.sampling.resolve()?;
-        let courses = run.phase("read", |run| {
-            courses(run, &self.scenarios, Split::Train, None)
+        let prepared = run.phase("read", |run| {
+            prepared(run, &self.scenarios, Split::Train, None)
         })?;
         let device = run.device().clone();
         let world = run.phase("load", |_| {
@@ -138,7 +138,7 @@ impl Args {
             algorithm: self.algorithm,
             world_name: &self.train_world,
             world: &world,
-            courses: &courses,
+            prepared: &prepared,
             settings: &settings,
             seed: run.seed(),
             folder: run.out().to_owned(),
@@ -146,7 +146,7 @@ impl Args {
             stop_at: self.stop_at.unwrap_or(usize::MAX),
         };
         let trained = run.phase("train", |run| job.execute(run))?;
-        run.result("scenarios", courses.len())?;
+        run.result("scenarios", prepared.len())?;
         let results = serde_json::to_value(&trained)?;
         for (key, value) in results.as_object().into_iter().flatten() {
             run.result(key, value)?;
@@ -174,7 +174,7 @@ impl Job<'_> {
         let mut training = if self.resume {
             self.resumed(&checkpoint, &notes)?
         } else {
-            let experts = demonstrations(self.courses, &self.settings.env)?;
+            let experts = demonstrations(self.prepared, &self.settings.env)?;
             let config = self.settings.sac.clone();
             Training::new(self.algorithm.resolve(), config, experts, self.seed)?
         };
@@ -253,7 +253,7 @@ impl Job<'_> {
         let progress = run.progress(&label, total as u64, "steps");
         progress.advance(training.steps() as u64);
         let traffic = self.world.traffic();
-        let mut env = DrivingEnv::new(Arc::clone(self.courses), traffic, self.settings.env)?;
+        let mut env = DrivingEnv::new(Arc::clone(self.prepared), traffic, self.settings.env)?;
         let mut saved = Instant::now();
         while training.steps() < total.min(self.stop_at) {
             let observe = |report| {

@@ -386,7 +386,7 @@ fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
 
 /// Warns if matrix products in bfloat16 take longer than in f32 on this processor.
 fn warn_of_slow_bfloat16(run: &Run, mixed_precision: bool) {
-    let kernel = Choice::made().kernel;
+    let kernel = Choice::current().kernel;
     if mixed_precision && run.device().is_cpu() && !kernel.multiplies_bfloat16() {
         run.print(&format!(
             "note: mixed_precision takes longer than f32 with the kernel {}, which has no products \

@@ -207,11 +207,17 @@ mod tests {
 
     #[test]
     fn changes_go_as_deep_as_they_are() {
-        let mut table: Table = "[train]\nbatch = 4\n[train.sample]\nsway = 0.6\nframes = 5"
-            .parse()
-            .unwrap();
-        merge(&mut table, "[train.sample]\nsway = 0.0".parse().unwrap());
-        let expected = "[train]\nbatch = 4\n[train.sample]\nsway = 0.0\nframes = 5";
+        let mut table: Table =
+            "[train]\nbatch = 4\n[train.sample]\nlateral_perturbation = 0.6\nframes = 5"
+                .parse()
+                .unwrap();
+        merge(
+            &mut table,
+            "[train.sample]\nlateral_perturbation = 0.0"
+                .parse()
+                .unwrap(),
+        );
+        let expected = "[train]\nbatch = 4\n[train.sample]\nlateral_perturbation = 0.0\nframes = 5";
         assert_eq!(table, expected.parse().unwrap());
     }
 
@@ -220,9 +226,12 @@ mod tests {
         let begun = TrainConfig::default();
         let mut requested = begun.clone();
         assert_eq!(difference(&requested, &begun).unwrap(), None);
-        requested.sample.sway = 0.5;
+        requested.sample.lateral_perturbation = 0.5;
         let message = difference(&requested, &begun).unwrap().unwrap();
-        assert_eq!(message, "sway is 0.5, the run to resume began with 0.0");
+        assert_eq!(
+            message,
+            "lateral_perturbation is 0.5, the run to resume began with 0.0"
+        );
         requested = begun.clone();
         requested.ema = Some(0.9);
         let message = difference(&requested, &begun).unwrap().unwrap();

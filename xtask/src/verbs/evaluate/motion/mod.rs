@@ -2,9 +2,7 @@
 //! file or of a world's futures.
 
 mod report;
-mod scores;
 
-use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -12,19 +10,16 @@ use gump_data::ReadOptions;
 use gump_eval::EvalError;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::motion::PredictionSource;
-use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::results::{Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_wosac::motion::{
-    MotionConfig, MotionProblem, PredictionScore, ShapeRules, evaluate_predictions,
-};
+use gump_wosac::motion::{MotionConfig, ShapeRules};
 use serde::{Deserialize, Serialize};
 
-use self::scores::Scores;
-use super::left_out::LeftOut;
+use super::exclusions;
 use crate::benchmark;
 use crate::cli::WrongArguments;
-use crate::run::{self, Common, Run};
+use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 
@@ -123,44 +118,14 @@ impl Args {
         let mut source = run.phase("load", |run| self.predictions(run))?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
         let header = self.header(run, &scenarios, source.decoding())?;
-        let mut ledger = ResultStore::open(run.out(), &header)?;
-        let (mut ids, mut left_out) = (BTreeSet::new(), LeftOut::default());
-        let progress = run.progress("measuring", 0, "scenarios");
-        let mut records = self.open(&scenarios)?.enumerate();
-        while let Some((index, record)) = run.phase("read", |_| Ok(records.next()))? {
-            run::stop_if_interrupted()?;
-            let mut scenario = record?.scenario;
-            ids.insert(scenario.id.clone());
-            if !self.shard.holds(index) || ledger.has(index) {
-                continue;
-            }
-            let absent = source.drop_absent(&mut scenario);
-            let predictions = run.phase("predict", |run| {
-                let frames = source.frames(&scenario, &config);
-                let progress = run.simulating(frames);
-                Ok(source.predict(&scenario, index, &config, &progress)?)
-            });
-            let scores = predictions.and_then(|predicted| {
-                run.phase("score", |_| {
-                    let predictions = &predicted.predictions;
-                    let scores = evaluate_predictions(&scenario, predictions, &config);
-                    Ok((scores.map_err(EvalError::from)?, predicted.digest))
-                })
-            });
-            let scores: Option<(Vec<PredictionScore>, Option<String>)> =
-                left_out.sift(scores, is_of_another_length)?;
-            let Some((scores, digest)) = scores else {
-                continue;
-            };
-            let scores = Scores::new(&scores, absent, digest);
-            let id = scenario.id;
-            ledger.add(Entry { index, id, scores })?;
-            progress.advance(1);
-        }
-        drop(progress);
-        source.check_all_used(&ids)?;
-        let entries = ledger.close()?;
-        left_out.report(run, entries.len())?;
+        let mut store = ResultStore::open(run.out(), &header)?;
+        let exclusions = run.phase("evaluate", |run| {
+            let progress = run.progress("measuring", 0, "scenarios");
+            let records = self.open(&scenarios)?;
+            Ok(source.fill(&mut store, records, &config, &progress)?)
+        })?;
+        let entries = store.close()?;
+        exclusions::report(run, &exclusions, entries.len())?;
         report::report(run, &scenarios.name, &entries, &config, source.decoding())
     }
 
@@ -219,15 +184,4 @@ impl Args {
             settings,
         })
     }
-}
-
-/// True if the recording does not reach as far as the benchmark looks, or not in its steps.
-fn is_of_another_length(error: &anyhow::Error) -> bool {
-    let Some(EvalError::Motion(error)) = error.downcast_ref().map(EvalError::cause) else {
-        return false;
-    };
-    matches!(
-        error.problem,
-        MotionProblem::ShortLog { .. } | MotionProblem::TimeStep { .. }
-    )
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use gump_eval::decoding::Decoding;
 use gump_eval::digest;
+use gump_eval::motion::ScenarioPredictions;
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
@@ -13,7 +14,6 @@ use gump_wosac::motion::{MotionConfig, MotionRow, MotionTally};
 use serde::Deserialize as _;
 use serde_json::{Map, Value, json};
 
-use super::scores::Scores;
 use super::{NAME, Shapes};
 use crate::charts;
 use crate::run::Run;
@@ -35,7 +35,7 @@ const CHARTS: [(&str, &str, &[&str]); 2] = [
 pub(super) fn report(
     run: &mut Run,
     set: &str,
-    entries: &[Entry<Scores>],
+    entries: &[Entry<ScenarioPredictions>],
     config: &MotionConfig,
     decoding: &str,
 ) -> anyhow::Result<()> {
@@ -75,7 +75,7 @@ pub(crate) fn report_merged(
     folders: &[PathBuf],
     missing: MissingShards,
 ) -> anyhow::Result<()> {
-    let (header, entries) = results::merge::<Scores>(folders, missing)?;
+    let (header, entries) = results::merge::<ScenarioPredictions>(folders, missing)?;
     let shapes = header.settings.get("shapes").cloned();
     let shapes = shapes.context("expected the setting shapes in the ledger")?;
     let seed = header

@@ -223,7 +223,7 @@ pub(super) fn report(
     run.print(&table::text(&json!({ "reactions": shown }), run.width()));
     let missing = json!({ "not scored": not_scored(settings, entries) });
     run.print(&table::text(&missing, run.width()));
-    left_out(run, entries)?;
+    exclusions(run, entries)?;
     charts::save(run, "reactions", &chart(settings, &names, &lines))
 }
 
@@ -268,7 +268,7 @@ fn cases(settings: &ReactionSettings, entries: &[Entry<ScenarioReactions>]) -> V
 }
 
 /// Names scenarios that say nothing.
-fn left_out(run: &mut Run, entries: &[Entry<ScenarioReactions>]) -> anyhow::Result<()> {
+fn exclusions(run: &mut Run, entries: &[Entry<ScenarioReactions>]) -> anyhow::Result<()> {
     let why = |entry: &Entry<ScenarioReactions>| {
         let why = entry.scores.unfit.as_ref()?;
         Some(format!("scenario {}: {why}", entry.id))

@@ -7,26 +7,24 @@
 mod report;
 mod worst;
 
+use std::fs::File;
 use std::io::Write as _;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
-use anyhow::Context as _;
-use gump_eval::EvalError;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
-use gump_eval::realism::{
-    FoundRollouts, Recorded, RolloutSource, ScenarioScores, evaluate, recordings,
-};
-use gump_eval::results::{Entry, Header, ResultStore};
+use gump_eval::realism::{RealismEvaluation, RolloutSource, VisitedRollouts};
+use gump_eval::results::{Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_wosac::realism::{Attribution, Config, Mode, WosacError, Year};
+use gump_rollout::BoxError;
+use gump_wosac::realism::{Attribution, Config, Mode, Year};
 use serde::{Deserialize, Serialize};
 
-use super::left_out::LeftOut;
+use super::exclusions;
 use crate::benchmark;
 use crate::cli::WrongArguments;
-use crate::run::{Common, Run, interrupted};
+use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
 use crate::tables;
@@ -157,50 +155,49 @@ impl Args {
         };
         let config = Config::of(self.year.year());
         let mut sources = self.sources(run)?;
-        let options = sources[0].read_options();
-        let mut ledger = ResultStore::open(run.out(), &header)?;
-        let (mut explained, mut left_out) = (Vec::new(), LeftOut::default());
+        let mut store = ResultStore::open(run.out(), &header)?;
+        let mut explained = Vec::new();
         let mut worst = self.explain.then(Worst::default);
         let mut fewest = usize::MAX;
-        run.phase("evaluate", |run| {
+        let exclusions = run.phase("evaluate", |run| {
             let mut log = match self.explain {
-                true => Some(std::fs::File::create(run.path("explain.jsonl"))?),
+                true => Some(File::create(run.path("explain.jsonl"))?),
                 false => None,
             };
-            let progress = run.progress("evaluating", 0, "scenarios");
-            let kept = ledger.indices();
-            let wanted = move |index| shard.holds(index) && !kept.contains(&index);
-            for recorded in recordings(&scenarios.paths, options, wanted)? {
-                let scored = recorded.map_err(Into::into).and_then(|recorded: Recorded| {
-                    let seen = (worst.as_mut(), &mut fewest);
-                    let scored = self.evaluate(run, &config, &recorded, &mut sources, seen)?;
-                    Ok((recorded, scored))
-                });
-                let scored = left_out.sift(scored, is_of_another_length)?;
-                let Some((recorded, (entry, attributions))) = scored else {
-                    continue;
+            let mut visit = |visited: VisitedRollouts<'_>| {
+                fewest = visited.found.rollouts.count().min(fewest);
+                // Explanations are of the first decoding.
+                let (Some(log), 0) = (&mut log, visited.source) else {
+                    return Ok(());
                 };
-                ledger.add(entry)?;
-                if let Some(log) = &mut log {
-                    note(
-                        log,
-                        &recorded.log.scenario,
-                        &config,
+                let attributions = visited.evaluation.explain();
+                if let Some(worst) = worst.as_mut().filter(|_| config.mode == Mode::SimAgents) {
+                    worst.add(
+                        &visited.recorded.scenario,
+                        &visited.found.rollouts,
+                        visited.evaluation,
                         &attributions,
-                        &mut explained,
-                    )?;
+                    );
                 }
-                progress.advance(1);
-                anyhow::ensure!(
-                    !interrupted(),
-                    "stopped by Ctrl-C; the same command resumes after scenario {}",
-                    recorded.index
-                );
-            }
-            Ok(())
+                let scenario = &visited.recorded.log.scenario;
+                note(log, scenario, &config, &attributions, &mut explained)
+            };
+            let progress = run.progress("evaluating", 0, "scenarios");
+            let evaluation = RealismEvaluation {
+                config: &config,
+                n_rollouts: self.rollouts_per_scenario.get(),
+                device: run.device(),
+            };
+            Ok(evaluation.fill(
+                &mut store,
+                &scenarios.paths,
+                &mut sources,
+                &progress,
+                &mut visit,
+            )?)
         })?;
-        let entries = ledger.close()?;
-        left_out.report(run, entries.len())?;
+        let entries = store.close()?;
+        exclusions::report(run, &exclusions, entries.len())?;
         anyhow::ensure!(
             !entries.is_empty(),
             "expected scenarios in shard {shard}, found none: {}",
@@ -266,63 +263,16 @@ impl Args {
             seed: run.seed().0.to_string(),
         })
     }
-
-    fn evaluate(
-        &self,
-        run: &Run,
-        config: &Config,
-        recorded: &Recorded,
-        sources: &mut [RolloutSource],
-        (mut worst, fewest): (Option<&mut Worst>, &mut usize),
-    ) -> anyhow::Result<(Entry<ScenarioScores>, Vec<Attribution>)> {
-        let n = self.rollouts_per_scenario.get();
-        let id = &recorded.log.scenario;
-        let found = sources.iter_mut().map(|source| {
-            let found = rollouts(run, source, recorded, config.mode);
-            found.with_context(|| format!("cannot evaluate scenario {id}"))
-        });
-        let found = found.collect::<anyhow::Result<Vec<_>>>()?;
-        let mut attributions = None;
-        let scores = evaluate(recorded, found, n, config, |found, evaluation| {
-            *fewest = found.rollouts.count().min(*fewest);
-            if attributions.is_none() {
-                let of_first = evaluation.explain();
-                if let Some(worst) = worst.take().filter(|_| config.mode == Mode::SimAgents) {
-                    worst.add(&recorded.scenario, &found.rollouts, evaluation, &of_first);
-                }
-                attributions = Some(of_first);
-            }
-        })?;
-        let entry = Entry {
-            index: recorded.index,
-            id: id.clone(),
-            scores,
-        };
-        Ok((entry, attributions.unwrap_or_default()))
-    }
-}
-
-/// Rollouts of one scenario, with a progress bar where they are simulated.
-///
-/// Error: as [`RolloutSource::rollouts`].
-pub(crate) fn rollouts(
-    run: &Run,
-    source: &mut RolloutSource,
-    recorded: &Recorded,
-    mode: Mode,
-) -> anyhow::Result<FoundRollouts> {
-    let progress = run.simulating(source.frames(&recorded.scenario));
-    Ok(source.rollouts(run.device(), recorded, mode, &progress)?)
 }
 
 /// Writes the attributions of a scenario's lost score, and keeps the largest of all scenarios.
 fn note(
-    log: &mut std::fs::File,
+    log: &mut File,
     scenario: &str,
     config: &Config,
     attributions: &[Attribution],
     largest: &mut Vec<Explained>,
-) -> anyhow::Result<()> {
+) -> Result<(), BoxError> {
     // Steps count from the first scored one: that after the present, or that 1 s before it.
     let first = match config.mode {
         Mode::SimAgents => 1.0,
@@ -354,10 +304,4 @@ fn tabulate(run: &Run) -> anyhow::Result<()> {
     let rows = noted.lines().map(serde_json::from_str);
     let rows = rows.collect::<Result<Vec<_>, _>>()?;
     Ok(tables::of_rows(&rows).write(&run.path("agents.parquet"))?)
-}
-
-/// Whether the log does not have the challenge's second of past and eight seconds of future.
-fn is_of_another_length(error: &anyhow::Error) -> bool {
-    let found = error.downcast_ref().map(EvalError::cause);
-    matches!(found, Some(EvalError::Realism(WosacError::Clock { .. })))
 }

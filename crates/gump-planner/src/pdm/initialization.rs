@@ -1,10 +1,10 @@
-//! State of a mission: the way, the road around the ego and the objects on it.
+//! State of an initialization: the way, the road around the ego and the objects on it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, Polygon, Pose, Quad, angle_difference};
-use gump_nuplan::closed_loop::{Mission, Moment};
+use gump_nuplan::closed_loop::{PlannerInitialization, PlannerInput};
 use gump_nuplan::path::{Path, baseline};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::RolloutError;
@@ -24,7 +24,7 @@ use crate::route_search::{correct_route, lanes_of_route, nearest_vertex, shortes
 /// Roadblocks of the route that the centre line is laid through.
 const WINDOW: usize = 30;
 
-/// State since the mission began.
+/// State since the initialization began.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(crate) map: Arc<MapGraph>,
@@ -55,15 +55,15 @@ struct Way {
 }
 
 impl State {
-    /// Takes a mission; the way is found in the first step.
+    /// Takes an initialization; the way is found in the first step.
     ///
     /// # Errors
     /// As [`stated_route`].
-    pub(crate) fn new(mission: &Mission<'_>) -> Result<Self, PlanError> {
+    pub(crate) fn new(initialization: &PlannerInitialization<'_>) -> Result<Self, PlanError> {
         Ok(Self {
-            stated: stated_route(mission)?,
-            map: Arc::clone(mission.map),
-            vehicle: mission.vehicle,
+            stated: stated_route(initialization)?,
+            map: Arc::clone(initialization.map),
+            vehicle: initialization.vehicle,
             way: None,
             ground: Ground::default(),
             forecast: Forecast::default(),
@@ -79,15 +79,15 @@ impl State {
     /// for an agent whose state is not finite, because a forecast could not place it.
     pub(crate) fn prepare(
         &mut self,
-        moment: &Moment<'_>,
+        input: &PlannerInput<'_>,
         config: &PdmConfig,
     ) -> Result<Vec<f64>, PlanError> {
-        let mut agents = moment.scene.now().agents().iter();
+        let mut agents = input.scene.now().agents().iter();
         if let Some(agent) = agents.find(|agent| !agent.state.is_finite()) {
             return Err(PlanError::NotFinite { agent: agent.id });
         }
-        self.look(moment, config)?;
-        let lane = self.starting_lane(moment.ego)?;
+        self.look(input, config)?;
+        let lane = self.starting_lane(input.ego)?;
         self.lay_lines(lane, config)?;
         let lane = self.map.lane(lane);
         let limit = lane.and_then(|lane| lane.speed_limit.or(lane.kind.usual_speed_limit()));
@@ -118,8 +118,8 @@ impl State {
     }
 
     /// Updates the road and the objects around the ego.
-    fn look(&mut self, moment: &Moment<'_>, config: &PdmConfig) -> Result<(), PlanError> {
-        let ego = moment.ego;
+    fn look(&mut self, input: &PlannerInput<'_>, config: &PdmConfig) -> Result<(), PlanError> {
+        let ego = input.ego;
         if self.way.is_none() {
             let route = correct_route(&self.map, &self.stated, ego.rear_axle);
             let in_order: Vec<LaneId> = lanes_of_route(&self.map, &route)
@@ -145,7 +145,7 @@ impl State {
         let footprint = self.vehicle.footprint(ego.rear_axle);
         self.ground
             .look(&self.map, &way.lanes, footprint.pose.position);
-        let scene = moment.scene;
+        let scene = input.scene;
         let others = scene
             .now()
             .agents()
@@ -190,7 +190,7 @@ impl State {
         nearest.copied().ok_or(PlanError::NoRoute)
     }
 
-    /// Lays the lines through the route, once per mission.
+    /// Lays the lines through the route, once per initialization.
     fn lay_lines(&mut self, start: LaneId, config: &PdmConfig) -> Result<(), PlanError> {
         let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
         if !way.lines.is_empty() {
@@ -315,13 +315,15 @@ fn red_lights(
         .collect()
 }
 
-/// The roadblocks of a mission that are in the map.
+/// The roadblocks of an initialization that are in the map.
 ///
 /// # Errors
-/// [`PlanError::NoRoute`] if the mission states none, [`PlanError::ForeignRoute`] if none of them
+/// [`PlanError::NoRoute`] if the initialization states none, [`PlanError::ForeignRoute`] if none of them
 /// is in the map.
-pub(crate) fn stated_route(mission: &Mission<'_>) -> Result<Vec<RoadblockId>, PlanError> {
-    let stated = mission
+pub(crate) fn stated_route(
+    initialization: &PlannerInitialization<'_>,
+) -> Result<Vec<RoadblockId>, PlanError> {
+    let stated = initialization
         .route
         .map(|route| &route.roadblocks[..])
         .unwrap_or_default();
@@ -331,7 +333,7 @@ pub(crate) fn stated_route(mission: &Mission<'_>) -> Result<Vec<RoadblockId>, Pl
     let known: Vec<_> = stated
         .iter()
         .copied()
-        .filter(|&id| mission.map.roadblock(id).is_some())
+        .filter(|&id| initialization.map.roadblock(id).is_some())
         .collect();
     if known.is_empty() {
         return Err(PlanError::ForeignRoute { first: stated[0] });

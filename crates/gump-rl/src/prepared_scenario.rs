@@ -15,7 +15,7 @@ const HALF: f64 = 256.0;
 
 /// A scenario to drive in, with steps of a fixed length.
 #[derive(Debug)]
-pub struct Course {
+pub struct PreparedScenario {
     scenario: Scenario,
     dt: f64,
     /// Frames of the log per step.
@@ -37,7 +37,7 @@ struct RouteLight {
     stop_at: f64,
 }
 
-impl Course {
+impl PreparedScenario {
     /// Prepares a scenario for steps of `dt` seconds.
     ///
     /// # Errors
@@ -82,20 +82,20 @@ impl Course {
     /// Prepares many scenarios, to be shared by any number of environments.
     ///
     /// # Errors
-    /// As [`Course::new`], for the first that cannot be prepared, and [`RlError::NoScenario`].
+    /// As [`PreparedScenario::new`], for the first that cannot be prepared, and [`RlError::NoScenario`].
     pub fn prepare(
         scenarios: impl IntoIterator<Item = Scenario>,
         dt: f64,
     ) -> Result<Arc<[Self]>, RlError> {
-        let courses: Result<Vec<Self>, _> = scenarios
+        let prepared: Result<Vec<Self>, _> = scenarios
             .into_iter()
             .map(|scenario| Self::new(scenario, dt))
             .collect();
-        let courses = courses?;
-        if courses.is_empty() {
+        let prepared = prepared?;
+        if prepared.is_empty() {
             return Err(RlError::NoScenario);
         }
-        Ok(courses.into())
+        Ok(prepared.into())
     }
 
     /// The scenario as given.
@@ -119,7 +119,7 @@ impl Course {
         &self.scenario.log[(self.scenario.now + step * self.stride).min(last)]
     }
 
-    /// The log one step before [`Course::logged`], if it goes back that far.
+    /// The log one step before [`PreparedScenario::logged`], if it goes back that far.
     pub(crate) fn logged_before(&self, step: usize) -> Option<&Frame> {
         let index = (self.scenario.now + step * self.stride).checked_sub(self.stride)?;
         self.scenario.log.get(index)
@@ -232,19 +232,19 @@ mod tests {
     const STREET: &str = "lane 1: 0,0 50,0 next 2\nlane 2: 50,0 100,0\nroute 1,2\n
         light 1 red: 38,0\nlight 2 green:\nego vehicle 0: 10,0 velocity 10,0\n";
 
-    fn course(text: &str, dt: f64) -> Result<Course, RlError> {
-        Course::new(fixture::scenario(text).unwrap(), dt)
+    fn prepared(text: &str, dt: f64) -> Result<PreparedScenario, RlError> {
+        PreparedScenario::new(fixture::scenario(text).unwrap(), dt)
     }
 
     #[test]
     fn the_log_is_read_in_steps() {
-        let course = course(STREET, 0.5).unwrap();
-        assert_eq!(course.logged_steps(), 16);
-        let x = |step| course.logged_ego(step).unwrap().pose.position.x;
+        let prepared = prepared(STREET, 0.5).unwrap();
+        assert_eq!(prepared.logged_steps(), 16);
+        let x = |step| prepared.logged_ego(step).unwrap().pose.position.x;
         assert!((x(0) - 10.0).abs() < 1e-9 && (x(3) - 25.0).abs() < 1e-9);
-        assert_eq!(course.logged_ego(17), None);
-        assert_eq!(course.logged(99), course.logged(16));
-        let before = |n| course.ego_before(n).map(|s| s.pose.position.x.round());
+        assert_eq!(prepared.logged_ego(17), None);
+        assert_eq!(prepared.logged(99), prepared.logged(16));
+        let before = |n| prepared.ego_before(n).map(|s| s.pose.position.x.round());
         assert_eq!(
             (before(1), before(2), before(3)),
             (Some(5.0), Some(0.0), None)
@@ -253,8 +253,8 @@ mod tests {
 
     #[test]
     fn the_next_light_of_the_route_is_the_one_that_counts() {
-        let course = course(STREET, 0.5).unwrap();
-        let ahead = |along| course.light_ahead(along, course.logged(0));
+        let prepared = prepared(STREET, 0.5).unwrap();
+        let ahead = |along| prepared.light_ahead(along, prepared.logged(0));
         assert_eq!(ahead(10.0), Some((28.0, LightState::Red)));
         assert_eq!(ahead(40.0), Some((60.0, LightState::Green)));
         assert_eq!(ahead(101.0), None);
@@ -262,13 +262,13 @@ mod tests {
 
     #[test]
     fn scenarios_that_cannot_be_driven_are_refused() {
-        let error = course(STREET, 0.25).unwrap_err();
+        let error = prepared(STREET, 0.25).unwrap_err();
         assert!(matches!(error, RlError::TimeStep { step: 0.25, .. }));
         let mut broken = fixture::scenario(STREET).unwrap();
         broken.now = 1000;
-        let error = Course::new(broken, 0.5).unwrap_err();
+        let error = PreparedScenario::new(broken, 0.5).unwrap_err();
         assert!(matches!(error, RlError::Scenario { .. }));
-        let error = Course::prepare([], 0.5).unwrap_err();
+        let error = PreparedScenario::prepare([], 0.5).unwrap_err();
         assert!(matches!(error, RlError::NoScenario));
     }
 }

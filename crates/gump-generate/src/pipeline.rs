@@ -12,11 +12,11 @@ use gump_rollout::WorldModel;
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rayon::prelude::*;
 
+use crate::check::{Clause, check_clauses, through_time};
 use crate::prompt::PromptSpec;
 use crate::search::{Search, any_start};
-use crate::stage::Stage;
-use crate::verdict::{Clause, through_time, verdict};
-use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, generate, takes};
+use crate::site::Site;
+use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, futures, generate};
 
 /// Number of further attempts for a scene without a later overlap, once one satisfies the
 /// request.
@@ -38,7 +38,7 @@ pub struct GenerationJob {
 
 /// A generated scene with its check.
 #[derive(Clone, Debug)]
-pub struct Made {
+pub struct CheckedScene {
     /// The scene as generated.
     pub scene: GeneratedScene,
     /// Its simulated future, at 10 Hz. The present is the instant at which the prompts hold, at
@@ -57,7 +57,7 @@ pub struct Made {
     pub moment_s: f64,
 }
 
-impl Made {
+impl CheckedScene {
     /// True if no clause fails; undecidable clauses do not count.
     pub fn holds(&self) -> bool {
         self.clauses
@@ -94,7 +94,7 @@ pub fn make_many(
     order: &GenerationJob,
     numbers: Range<u64>,
     seed: Seed,
-) -> Result<Vec<Result<Made, GenerateError>>, GenerateError> {
+) -> Result<Vec<Result<CheckedScene, GenerateError>>, GenerateError> {
     let request = &order.request;
     if order.roams || !request.prompts.is_empty() {
         let numbers = numbers.into_par_iter();
@@ -111,10 +111,10 @@ pub fn make_many(
         let scene = scene?;
         let mut scenario = scene.scenario(name(number), &request.map, &[]);
         let stream = stream(number).fork(2);
-        takes::extend(worlds.traffic, &mut scenario, order.seconds, stream)?;
-        let mut clauses = verdict(&scenario, &[], request.counts.as_ref());
+        futures::extend(worlds.traffic, &mut scenario, order.seconds, stream)?;
+        let mut clauses = check_clauses(&scenario, &[], request.counts.as_ref());
         through_time(&mut clauses, &scenario, request.counts.as_ref());
-        Ok(Made {
+        Ok(CheckedScene {
             clauses,
             scene,
             scenario,
@@ -150,15 +150,15 @@ pub fn make(
     order: &GenerationJob,
     number: u64,
     seed: Seed,
-) -> Result<Made, GenerateError> {
+) -> Result<CheckedScene, GenerateError> {
     let seed = seed.fork(number);
     let mut place = Place::new(order);
     let mut failure = None;
-    let (mut held, mut last): (Option<Made>, Option<Made>) = (None, None);
+    let (mut held, mut last): (Option<CheckedScene>, Option<CheckedScene>) = (None, None);
     let mut further = 0;
     for attempt in 0..order.attempts.max(1) {
         let stream = seed.fork(attempt as u64);
-        let (request, stage) = match place.next(attempt, stream.fork(0)) {
+        let (request, site) = match place.next(attempt, stream.fork(0)) {
             // What was possible at first is not called impossible afterwards.
             Err(_) if attempt > 0 => break,
             next => next?,
@@ -171,7 +171,7 @@ pub fn make(
                 let is_of_place = match error {
                     GenerateError::NoLane | GenerateError::NoPlace { .. } => true,
                     // At this place no object may be where the prompt requires one.
-                    GenerateError::Constraints(_) => stage.is_some(),
+                    GenerateError::Constraints(_) => site.is_some(),
                     _ => false,
                 };
                 if !is_of_place {
@@ -181,7 +181,7 @@ pub fn make(
                 continue;
             }
         };
-        let made = Made {
+        let made = CheckedScene {
             scenario: scene.scenario(name(number), &request.map, &request.prompts),
             scene,
             clauses: Vec::new(),
@@ -190,14 +190,14 @@ pub fn make(
             is_steered: false,
             moment_s: 0.0,
         };
-        let mut made = judged(worlds.traffic, order, made, stage.as_ref(), stream)?;
+        let mut made = judged(worlds.traffic, order, made, site.as_ref(), stream)?;
         if !made.holds() {
             last = Some(made);
             continue;
         }
         let before = held.as_ref().and_then(|held| held.first_satisfied);
         made.first_satisfied = before.or(Some((attempt + 1, made.is_steered)));
-        if takes::stays_clear(&made.scenario) {
+        if futures::stays_clear(&made.scenario) {
             return Ok(made);
         }
         held.get_or_insert(made);
@@ -235,7 +235,7 @@ impl<'a> Place<'a> {
         &mut self,
         attempt: usize,
         seed: Seed,
-    ) -> Result<(GenerateRequest, Option<Stage>), GenerateError> {
+    ) -> Result<(GenerateRequest, Option<Site>), GenerateError> {
         let (request, roams) = (&self.order.request, self.order.roams);
         if request.prompts.is_empty() || request.config.placement != Placement::Guided {
             let mut request = request.clone();
@@ -252,18 +252,18 @@ impl<'a> Place<'a> {
         // The place asked for goes first if it will do, and alone if no other does.
         let here = || search.here(seed.fork(0)).filter(|_| !roams);
         let anywhere = || search.anywhere(seed.fork(1));
-        let mut stage = if attempt == 0 { here() } else { None };
-        if stage.is_none() && self.searches {
-            stage = anywhere();
-            self.searches = stage.is_some();
+        let mut site = if attempt == 0 { here() } else { None };
+        if site.is_none() && self.searches {
+            site = anywhere();
+            self.searches = site.is_some();
         }
-        let stage = stage.or_else(here).ok_or_else(|| {
+        let site = site.or_else(here).ok_or_else(|| {
             let names: Vec<&str> = request.prompts.iter().map(|tag| tag.name()).collect();
             GenerateError::NoStage {
                 prompts: names.join(" and "),
             }
         })?;
-        Ok((stage.direct(request), Some(stage)))
+        Ok((site.direct(request), Some(site)))
     }
 }
 
@@ -271,36 +271,37 @@ impl<'a> Place<'a> {
 fn judged(
     world: &dyn WorldModel,
     order: &GenerationJob,
-    mut made: Made,
-    stage: Option<&Stage>,
+    mut made: CheckedScene,
+    site: Option<&Site>,
     stream: Seed,
-) -> Result<Made, GenerateError> {
+) -> Result<CheckedScene, GenerateError> {
     let (prompts, counts) = (&order.request.prompts, order.request.counts.as_ref());
     let is_tag = |scenario: &Scenario| {
         let fails = |tag: &ScenarioTag| tags::holds(*tag, scenario) == Some(false);
         !prompts.iter().any(fails)
     };
     let holds = |scenario: &Scenario| {
-        let clauses = || verdict(scenario, &[], counts);
+        let clauses = || check_clauses(scenario, &[], counts);
         is_tag(scenario) && clauses().iter().all(|clause| clause.holds != Some(false))
     };
     if !prompts.is_empty() {
         // One future shows the agents present; an event, or a future without overlaps, may take
         // several.
         let (mut found, mut first) = (None, None);
-        for (n, i) in [(1, 0), (takes::FUTURES, 1)] {
+        for (n, i) in [(1, 0), (futures::FUTURES, 1)] {
             if found.is_none() {
-                let futures = takes::free(world, &made.scenario, n, stream.fork(2).fork(i))?;
-                let is_good = |scenario: &Scenario| holds(scenario) && takes::stays_clear(scenario);
-                found = takes::moment(futures.clone(), is_good);
-                first = first.or_else(|| takes::moment(futures, holds));
+                let futures = futures::free(world, &made.scenario, n, stream.fork(2).fork(i))?;
+                let is_good =
+                    |scenario: &Scenario| holds(scenario) && futures::stays_clear(scenario);
+                found = futures::moment(futures.clone(), is_good);
+                first = first.or_else(|| futures::moment(futures, holds));
             }
         }
         let mut found = found.or(first);
-        if let (None, Some(stage), true) = (&found, stage, order.request.config.steers) {
-            let drive = stage.drive_from(made.scenario.present().ego_now());
-            let steered = takes::steered(world, &made.scenario, &drive, stream.fork(3))?;
-            found = takes::moment(steered, holds);
+        if let (None, Some(site), true) = (&found, site, order.request.config.steers) {
+            let drive = site.drive_from(made.scenario.present().ego_now());
+            let steered = futures::steered(world, &made.scenario, &drive, stream.fork(3))?;
+            found = futures::moment(steered, holds);
             made.is_steered = found.is_some();
         }
         if let Some((scenario, seconds)) = found {
@@ -310,10 +311,10 @@ fn judged(
     let seconds = if prompts.is_empty() {
         order.seconds
     } else {
-        order.seconds.max(takes::JUDGED_S)
+        order.seconds.max(futures::JUDGED_S)
     };
-    takes::extend(world, &mut made.scenario, seconds, stream.fork(4))?;
-    made.clauses = verdict(&made.scenario, prompts, counts);
+    futures::extend(world, &mut made.scenario, seconds, stream.fork(4))?;
+    made.clauses = check_clauses(&made.scenario, prompts, counts);
     through_time(&mut made.clauses, &made.scenario, counts);
     Ok(made)
 }

@@ -32,7 +32,7 @@ const HEAD: usize = 32;
 
 /// Arguments shared by ablations that train networks: data, steps and evaluation.
 #[derive(Debug, Serialize, clap::Args)]
-pub(super) struct Lesson {
+pub(super) struct TrainVariant {
     /// A folder with a manifest.toml, or any file or folder of scenarios, to train on
     #[arg(long, value_name = "PATH")]
     data: PathBuf,
@@ -63,13 +63,13 @@ pub(super) struct Learned {
 
 /// A lesson whose held-out scenes are read.
 pub(super) struct Class<'a> {
-    lesson: &'a Lesson,
+    train_variant: &'a TrainVariant,
     held_out: PathBuf,
     scenes: Vec<Scenario>,
     decodings: Vec<Decoding>,
 }
 
-impl Lesson {
+impl TrainVariant {
     /// Optimiser steps of each network.
     pub(super) fn steps(&self) -> usize {
         self.steps.get()
@@ -84,7 +84,7 @@ impl Lesson {
         run.setting("scenarios", held_out.display().to_string())?;
         let progress = run.progress("reading", 0, "scenarios");
         Ok(Class {
-            lesson: self,
+            train_variant: self,
             scenes: datasets::read(&[Part::whole(&held_out)], &progress)?,
             decodings: self.draw.decodings(Mode::PartialAr)?,
             held_out,
@@ -118,7 +118,7 @@ impl Class<'_> {
             self.train(run, model, config, measured, &weights)
         })?;
         learned.seconds = began.elapsed().as_secs_f64();
-        let n = self.lesson.rollouts_per_scenario.get();
+        let n = self.train_variant.rollouts_per_scenario.get();
         for way in &self.decodings {
             let judged = run.phase(&format!("score {name}, {}", way.name), |run| {
                 let world = WorldName::Model(weights.clone());
@@ -139,11 +139,11 @@ impl Class<'_> {
     ) -> anyhow::Result<Learned> {
         let progress = run.progress("reading", 0, "scenarios");
         let data = TrainingSet::open(
-            &datasets::parts(&self.lesson.data, Split::Train)?,
+            &datasets::parts(&self.train_variant.data, Split::Train)?,
             &progress,
         )?;
         drop(progress);
-        let steps = self.lesson.steps();
+        let steps = self.train_variant.steps();
         config.steps = steps;
         config.seed = run.seed().0;
         config.optimizer.warmup = config.optimizer.warmup.min(steps / 10);

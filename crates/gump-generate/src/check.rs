@@ -50,7 +50,7 @@ impl fmt::Display for Clause {
 /// road.
 ///
 /// Prompts about what is beginning are decided by the frames after the present.
-pub fn verdict(
+pub fn check_clauses(
     scenario: &Scenario,
     prompts: &[ScenarioTag],
     counts: Option<&Counts>,
@@ -143,7 +143,7 @@ mod tests {
             pedestrians: 1,
             bicycles: 1,
         };
-        let clauses = verdict(&scenario, &prompts, Some(&counts));
+        let clauses = check_clauses(&scenario, &prompts, Some(&counts));
         let holds: Vec<_> = clauses.iter().map(|clause| clause.holds).collect();
         let (yes, no) = (Some(true), Some(false));
         assert_eq!(holds, [yes, no, None, yes, no, yes, no, no]);
@@ -162,7 +162,7 @@ mod tests {
             ..Counts::default()
         };
         let prompts = ["high_magnitude_speed".parse::<ScenarioTag>().unwrap()];
-        let mut clauses = verdict(&scenario, &prompts, Some(&counts));
+        let mut clauses = check_clauses(&scenario, &prompts, Some(&counts));
         assert!(
             clauses
                 .iter()
@@ -175,7 +175,7 @@ mod tests {
         assert_eq!(clauses[4].holds, yes);
         let mut alone = scenario.clone();
         alone.log.truncate(alone.now + 1);
-        let mut clauses = verdict(&alone, &[], None);
+        let mut clauses = check_clauses(&alone, &[], None);
         through_time(&mut clauses, &alone, None);
         assert!(
             clauses

@@ -15,10 +15,10 @@ use rand::seq::SliceRandom;
 
 use crate::constraint::EGO;
 use crate::prepared::Prepared;
-use crate::{GenerateError, GeneratedScene, even};
+use crate::{GenerateError, GeneratedScene, latin_hypercube};
 
 /// One scene during generation.
-pub(crate) struct Draft<'a> {
+pub(crate) struct PartialScene<'a> {
     pub(super) prepared: &'a Prepared<'a>,
     seed: Seed,
     restart: usize,
@@ -34,9 +34,9 @@ pub(crate) struct Draft<'a> {
     pub(super) outcome: Option<Result<(), GenerateError>>,
 }
 
-impl<'a> Draft<'a> {
+impl<'a> PartialScene<'a> {
     pub(crate) fn new(prepared: &'a Prepared<'a>, seed: Seed) -> Self {
-        let mut draft = Self {
+        let mut partial = Self {
             prepared,
             seed,
             restart: 0,
@@ -49,8 +49,8 @@ impl<'a> Draft<'a> {
             context: Context::default(),
             outcome: None,
         };
-        draft.begin();
-        draft
+        partial.begin();
+        partial
     }
 
     /// Clears the scene for another start.
@@ -154,7 +154,7 @@ impl<'a> Draft<'a> {
         // The scene's own stream 0 has drawn the ids.
         let seed = self.stream(0).fork(1 + class_index(key.kind) as u64);
         let evenly = request.config.even && !key.is_ego() && i < n;
-        evenly.then(|| even::numbers(seed, i, n))
+        evenly.then(|| latin_hypercube::numbers(seed, i, n))
     }
 
     /// The given values of the ego, per step of the decoder.

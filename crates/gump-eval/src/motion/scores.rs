@@ -1,17 +1,19 @@
-//! Scores of the predictions of one scenario as they are kept in a ledger.
+//! Scores of the predictions of one scenario, as they are stored.
 
 use gump_scene::{AgentId, AgentKind};
 use gump_wosac::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
 use serde::{Deserialize, Serialize};
 
+use crate::EvalError;
+
 /// Scores of one scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Scores {
+pub struct ScenarioPredictions {
     /// Targets that could not be predicted because they were absent.
-    pub(super) absent: usize,
+    pub absent: usize,
     /// Of the futures that predictions were condensed from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) digest: Option<String>,
+    pub digest: Option<String>,
     /// Every prediction.
     #[serde(default)]
     predictions: Vec<Line>,
@@ -38,7 +40,7 @@ struct AtHorizon {
     matches: String,
 }
 
-impl Scores {
+impl ScenarioPredictions {
     pub(super) fn new(scores: &[PredictionScore], absent: usize, digest: Option<String>) -> Self {
         let line = |score: &PredictionScore| Line {
             agents: score.agents.iter().map(|agent| agent.0).collect(),
@@ -55,8 +57,9 @@ impl Scores {
 
     /// The scores they were made of.
     ///
-    /// Error: words that are no class, shape or match.
-    pub(super) fn scores(&self) -> anyhow::Result<Vec<PredictionScore>> {
+    /// # Errors
+    /// Words that are no class, shape or match.
+    pub fn scores(&self) -> Result<Vec<PredictionScore>, EvalError> {
         self.predictions.iter().map(Line::score).collect()
     }
 }
@@ -77,8 +80,8 @@ fn at_horizon(score: &HorizonScore) -> AtHorizon {
 }
 
 impl Line {
-    fn score(&self) -> anyhow::Result<PredictionScore> {
-        let unknown = |what: &str, word: &str| anyhow::anyhow!("{word} is no {what}");
+    fn score(&self) -> Result<PredictionScore, EvalError> {
+        let unknown = |what: &str, word: &str| EvalError::Results(format!("{word} is no {what}"));
         let mut kinds = AgentKind::MOVING.into_iter().chain(AgentKind::STATIC);
         let kind = kinds.find(|kind| kind.name() == self.class);
         let shape = self.shape.as_deref().map(|name| {
@@ -94,21 +97,24 @@ impl Line {
                 .horizons
                 .iter()
                 .map(AtHorizon::score)
-                .collect::<anyhow::Result<_>>()?,
+                .collect::<Result<_, EvalError>>()?,
         })
     }
 }
 
 impl AtHorizon {
-    fn score(&self) -> anyhow::Result<HorizonScore> {
+    fn score(&self) -> Result<HorizonScore, EvalError> {
         let (n, found) = (self.confidences.len(), self.matches.len());
-        anyhow::ensure!(n == found, "expected {n} matches, found {found}");
+        if n != found {
+            let wrong = format!("expected {n} matches, found {found}");
+            return Err(EvalError::Results(wrong));
+        }
         let mode = |(&confidence, letter)| {
             let matches = match letter {
                 'y' => Some(true),
                 'n' => Some(false),
                 '?' => None,
-                other => anyhow::bail!("{other} is no match"),
+                other => return Err(EvalError::Results(format!("{other} is no match"))),
             };
             Ok(ModeScore {
                 confidence,
@@ -120,7 +126,7 @@ impl AtHorizon {
             min_ade: self.min_ade,
             min_fde: self.min_fde,
             overlaps: self.overlaps,
-            modes: modes.collect::<anyhow::Result<_>>()?,
+            modes: modes.collect::<Result<_, EvalError>>()?,
         })
     }
 }
@@ -130,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scores_survive_the_ledger_to_the_bit() {
+    fn scores_survive_the_store_to_the_bit() {
         let mode = |confidence: f64, matches| ModeScore {
             confidence,
             matches,
@@ -154,17 +160,20 @@ mod tests {
                 },
             ],
         }];
-        let kept = Scores::new(&scores, 2, Some("c0de".into()));
+        let kept = ScenarioPredictions::new(&scores, 2, Some("c0de".into()));
         let text = toml::to_string(&kept).unwrap();
-        let read: Scores = toml::from_str(&text).unwrap();
+        let read: ScenarioPredictions = toml::from_str(&text).unwrap();
         assert_eq!(read, kept);
         assert_eq!(read.scores().unwrap(), scores);
         for (from, to) in [("y?", "yz"), ("bicycle", "tram"), ("left-u-turn", "loop")] {
-            let broken: Scores = toml::from_str(&text.replace(from, to)).unwrap();
+            let broken: ScenarioPredictions = toml::from_str(&text.replace(from, to)).unwrap();
             assert!(broken.scores().is_err(), "{to}");
         }
-        let nothing = Scores::new(&[], 0, None);
+        let nothing = ScenarioPredictions::new(&[], 0, None);
         let text = toml::to_string(&nothing).unwrap();
-        assert_eq!(toml::from_str::<Scores>(&text).unwrap(), nothing);
+        assert_eq!(
+            toml::from_str::<ScenarioPredictions>(&text).unwrap(),
+            nothing
+        );
     }
 }

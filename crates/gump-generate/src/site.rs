@@ -21,7 +21,7 @@ const CROSSES_S: f64 = 1.8;
 
 /// The place of a scene, with the agents that its prompts need.
 #[derive(Clone, Debug)]
-pub(crate) struct Stage {
+pub(crate) struct Site {
     pub(super) ego: EgoStart,
     /// The ego's drive if it is steered.
     drive: Drive,
@@ -51,7 +51,7 @@ enum Way {
     Along(Drive),
 }
 
-impl Stage {
+impl Site {
     /// Places all agents around the ego at a position, this many metres left of the middle of a
     /// lane; `None` where that is impossible.
     pub(crate) fn set(
@@ -78,27 +78,27 @@ impl Stage {
         if ego.velocity.is_none() && wished.is_some() {
             ego.velocity = Some(ego.pose.direction() * speed);
         }
-        let mut stage = Self {
+        let mut site = Self {
             ego,
             drive,
             objects: request.objects.clone(),
             fixtures: Vec::new(),
             extras: Vec::new(),
         };
-        stage.put_cast(cast, map, rng)?;
+        site.put_cast(cast, map, rng)?;
         if let Some(whereabouts) = cast.crosswalk {
-            stage.put_on_crosswalk(whereabouts, map, rng)?;
+            site.put_on_crosswalk(whereabouts, map, rng)?;
         }
         if let Some(class) = cast.crossing {
-            stage.put_crossing(class, map, rng)?;
+            site.put_crossing(class, map, rng)?;
         }
         if cast.is_trailed {
-            stage.put_trail(speed, map, rng)?;
+            site.put_trail(speed, map, rng)?;
         }
         if let Some(works) = cast.works {
-            stage.fixtures = roadside::put(map, place.0, &stage.drive, ego.length, works)?;
+            site.fixtures = roadside::put(map, place.0, &site.drive, ego.length, works)?;
         }
-        Some(stage)
+        Some(site)
     }
 
     /// The drive of the ego in a scene generated here: at its own speed, if that was open.

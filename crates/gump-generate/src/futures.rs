@@ -5,11 +5,11 @@ use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{Frame, Rollout, Scenario, Seed};
 
 use crate::GenerateError;
+use crate::check::{LOOK_S, overlaps_in};
 use crate::drive::{Drive, Steered};
-use crate::verdict::{LOOK_S, overlaps_in};
 
 #[cfg(doc)]
-use crate::verdict::through_time;
+use crate::check::through_time;
 
 /// Number of futures simulated of a scene, after a first one that is often sufficient.
 pub(super) const FUTURES: usize = 4;
