@@ -1,5 +1,7 @@
 //! The state of all agents and lights at one instant.
 
+use std::sync::Arc;
+
 use gump_geometry::DVec2;
 
 use crate::{Agent, AgentId, LaneId};
@@ -29,10 +31,13 @@ pub struct Light {
 }
 
 /// Agents sorted by id (each at most once) and lights sorted by lane.
+///
+/// A frame never changes once made; clones share its contents, so that the futures of a scene share
+/// its history.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Frame {
-    agents: Vec<Agent>,
-    lights: Vec<Light>,
+    agents: Arc<[Agent]>,
+    lights: Arc<[Light]>,
 }
 
 impl Frame {
@@ -45,7 +50,10 @@ impl Frame {
         lights.reverse();
         lights.sort_by_key(|light| light.lane);
         lights.dedup_by_key(|light| light.lane);
-        Self { agents, lights }
+        Self {
+            agents: agents.into(),
+            lights: lights.into(),
+        }
     }
 
     /// All agents, sorted by id.
