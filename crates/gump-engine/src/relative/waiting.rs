@@ -17,6 +17,9 @@ const IN_LANE_M: f64 = 1.0;
 const BESIDE_M: f64 = 2.0;
 /// Maximum deviation from its direction, radians.
 const ALONG: f64 = 0.35;
+/// The same of agents that were seen to drive, which may stand across their lane or between two.
+const ASTRAY_M: f64 = 2.5;
+const TURNED: f64 = 0.9;
 /// Distance ahead within which lights and crossing traffic are considered, metres.
 const LOOK_M: f64 = 25.0;
 /// The free path that a start needs beyond the front bumper, metres.
@@ -36,52 +39,75 @@ const MOVES: f64 = 0.5;
 const MEETING_M: f64 = 25.0;
 const CROSSES: f64 = 0.52;
 
-/// Returns the indices of the agents that stand in a lane, have waited for more than `patience_s`
-/// and could drive on: no agent is on the path ahead or about to cross it, no light forbids it, and
-/// of those that meet there they have waited longest.
+/// An agent of a frame, and what is known of its past.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Standing {
+    pub(super) agent: Agent,
+    /// Time that it has stood, seconds; 0 if it moves.
+    pub(super) waited_s: f64,
+    /// Whether it was seen to drive: it is not parked, wherever it stands.
+    pub(super) has_driven: bool,
+}
+
+/// Returns the indices of the agents that have stood for more than `patience_s` and could go on.
 ///
-/// `agents` are all of the frame, each with its waiting time in seconds.
+/// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
+/// light forbids it, and of those that meet there it has waited longest. A pedestrian could if it
+/// stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
+/// frame.
 pub(super) fn free_to_go(
     map: &MapGraph,
     lights: &[Light],
-    agents: &[(Agent, f64)],
+    agents: &[Standing],
     patience_s: f64,
 ) -> Vec<usize> {
-    let waits = |i: &usize| agents[*i].1 > patience_s;
-    let mut free: Vec<usize> = (0..agents.len()).filter(waits).collect();
-    free.retain(|&i| {
-        let agent = &agents[i].0;
-        let reached = ahead(map, agent);
-        !reached.is_empty()
-            && !is_shut(&reached, lights)
-            && !agents
-                .iter()
-                .any(|(other, _)| other.id != agent.id && holds(&reached, agent, other))
-    });
+    let waits = |i: &usize| agents[*i].waited_s > patience_s;
+    let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
+    let walks = |i: usize| agents[i].agent.kind == AgentKind::Pedestrian;
+    let (mut free, mut people) = (Vec::new(), Vec::new());
+    for &i in &waiting {
+        let agent = &agents[i].agent;
+        let reached = ahead(map, &agents[i]);
+        if reached.is_empty() {
+            continue;
+        }
+        let holding = |&j: &usize| j != i && holds(&reached, agent, &agents[j].agent);
+        let in_the_way = waiting.iter().copied().filter(|&j| walks(j));
+        people.extend(in_the_way.filter(holding));
+        if !is_shut(&reached, lights) && !(0..agents.len()).any(|j| holding(&j)) {
+            free.push(i);
+        }
+    }
     let goes_first = |i: usize, j: usize| {
-        let ((one, waited), (other, longer)) = (&agents[i], &agents[j]);
-        let turn = angle_difference(one.state.pose.heading, other.state.pose.heading);
-        let gap = one.state.pose.position.distance(other.state.pose.position);
-        let is_later = (-*waited, one.id) > (-*longer, other.id);
-        turn.abs() > CROSSES && gap < MEETING_M && is_later
+        let (one, other) = (&agents[i], &agents[j]);
+        let (own, its) = (one.agent.state.pose, other.agent.state.pose);
+        let turn = angle_difference(own.heading, its.heading);
+        let is_later = (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id);
+        turn.abs() > CROSSES && own.position.distance(its.position) < MEETING_M && is_later
     };
     let is_next = |i: &usize| !free.iter().any(|&j| goes_first(*i, j));
-    free.iter().copied().filter(is_next).collect()
+    let mut next: Vec<usize> = free.iter().copied().filter(is_next).collect();
+    next.extend(people);
+    next.sort_unstable();
+    next.dedup();
+    next
 }
 
 /// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
 /// agents beside the lanes. Distances are from its front bumper.
-fn ahead<'m>(map: &'m MapGraph, agent: &Agent) -> Vec<LaneAhead<'m>> {
-    let beside = match agent.kind {
-        AgentKind::Vehicle => IN_LANE_M,
-        AgentKind::Bicycle => BESIDE_M,
+fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
+    let agent = &standing.agent;
+    let (beside, turned) = match (agent.kind, standing.has_driven) {
+        (AgentKind::Vehicle | AgentKind::Bicycle, true) => (ASTRAY_M, TURNED),
+        (AgentKind::Vehicle, false) => (IN_LANE_M, ALONG),
+        (AgentKind::Bicycle, false) => (BESIDE_M, ALONG),
         _ => return Vec::new(),
     };
     let pose = agent.state.pose;
     let along = |lane: &Lane| {
         let at = lane.centerline.project(pose.position).arc_length;
         let heading = lane.centerline.pose_at(at).heading;
-        (angle_difference(heading, pose.heading).abs() < ALONG).then_some(at)
+        (angle_difference(heading, pose.heading).abs() < turned).then_some(at)
     };
     let mut near = map.lanes_near(pose.position, beside);
     let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
@@ -129,8 +155,12 @@ fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent) -> bool {
             foot.distance <= beside && (0.0..metres).contains(&ahead)
         })
     };
-    // Bicycles keep to the side of their lane.
+    // Bicycles keep to the side of their lane; vehicles far from its centre return to it.
     let aside = reached[0].lane.centerline.project(own.position).distance;
+    let aside = match agent.kind {
+        AgentKind::Bicycle => aside.min(BESIDE_M),
+        _ => aside.min(IN_LANE_M),
+    };
     let mut body = corners.into_iter().chain([at]);
     if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, ROOM_M)) {
         return true;
@@ -152,14 +182,22 @@ mod tests {
 
     /// Ids of the agents that could go, given their waiting times, seconds.
     fn free(scenario: &Scenario, waited: &[(i64, f64)]) -> Vec<i64> {
+        free_after(false, scenario, waited)
+    }
+
+    fn free_after(has_driven: bool, scenario: &Scenario, waited: &[(i64, f64)]) -> Vec<i64> {
         let scene = scenario.present();
         let since = |id: AgentId| waited.iter().find(|(of, _)| *of == id.0);
         let agents = scene.now().agents().iter();
         let agents: Vec<_> = agents
-            .map(|agent| (*agent, since(agent.id).map_or(0.0, |(_, s)| *s)))
+            .map(|agent| Standing {
+                agent: *agent,
+                waited_s: since(agent.id).map_or(0.0, |(_, s)| *s),
+                has_driven,
+            })
             .collect();
         let found = free_to_go(scene.map, scene.now().lights(), &agents, 4.0);
-        found.into_iter().map(|i| agents[i].0.id.0).collect()
+        found.into_iter().map(|i| agents[i].agent.id.0).collect()
     }
 
     fn scenario(text: &str) -> Scenario {
@@ -197,6 +235,29 @@ mod tests {
         // It has passed, or does not move.
         assert_eq!(free(&crossing(20.0, 8.0), &waited), [0]);
         assert_eq!(free(&crossing(-20.0, 0.0), &waited), [0]);
+    }
+
+    #[test]
+    fn who_was_seen_to_drive_is_not_parked() {
+        let astray = |pose: &str| scenario(&format!("lane 1: 0,0 200,0\nego vehicle 0: {pose}"));
+        let waited = [(0, 9.0)];
+        for pose in ["20,2", "20,0 heading 0.7"] {
+            assert!(free(&astray(pose), &waited).is_empty(), "{pose}");
+            assert_eq!(free_after(true, &astray(pose), &waited), [0], "{pose}");
+        }
+        assert!(free_after(true, &astray("20,4"), &waited).is_empty());
+    }
+
+    #[test]
+    fn pedestrians_leave_the_path_of_those_who_wait_for_them() {
+        let with = |y: f64| {
+            let road = "lane 1: 0,0 200,0\nego vehicle 0: 20,0\n";
+            scenario(&format!("{road}agent pedestrian 1: 26,{y}"))
+        };
+        assert_eq!(free(&with(0.5), &[(0, 9.0), (1, 9.0)]), [1]);
+        assert!(free(&with(0.5), &[(0, 9.0), (1, 2.0)]).is_empty());
+        assert!(free(&with(0.5), &[(0, 2.0), (1, 9.0)]).is_empty());
+        assert_eq!(free(&with(4.0), &[(0, 9.0), (1, 9.0)]), [0]);
     }
 
     #[test]

@@ -35,7 +35,7 @@ use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
 };
 use crate::relative::seen::{Seen, add_presents};
-use crate::relative::waiting::free_to_go;
+use crate::relative::waiting::{Standing, free_to_go};
 use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
@@ -55,6 +55,8 @@ const WAITED_S: f64 = 4.0;
 /// than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute (result 23).
 const PATIENCE_S: f64 = 9.0;
 const RELEASED_S: f64 = 1.0;
+/// An agent that was faster than this is not parked, metres per second.
+const DRIVES: f64 = 2.0;
 /// An agent this near to a lane's centre, and this well aligned with it, stands in the lane:
 /// metres, radians.
 const IN_LANE: (f64, f64) = (1.0, 0.35);
@@ -342,6 +344,8 @@ struct Member {
     seen: Seen,
     /// Time that it has stood, seconds, as far as it was observed.
     waited: f64,
+    /// Whether it was faster than [`DRIVES`] in a frame since.
+    has_driven: bool,
     /// Whether it stands in a lane although nothing holds it.
     could_go: bool,
 }
@@ -559,8 +563,16 @@ impl Future {
             limits.push(is_long.then_some(WAITED_S));
         }
         if is_one_waiting {
-            let members = self.members.iter().map(|m| (m.agent, m.waited));
-            let others = self.others.iter().map(|&other| (other, 0.0));
+            let members = self.members.iter().map(|member| Standing {
+                agent: member.agent,
+                waited_s: member.waited,
+                has_driven: member.has_driven,
+            });
+            let others = self.others.iter().map(|&agent| Standing {
+                agent,
+                waited_s: 0.0,
+                has_driven: false,
+            });
             let all: Vec<_> = members.chain(others).collect();
             for i in free_to_go(map, &self.lights, &all, PATIENCE_S) {
                 limits[i] = Some(RELEASED_S);
@@ -741,6 +753,7 @@ impl Member {
             agent: *agent,
             seen: Seen::first(engine, body(agent), state.pose, state.velocity),
             waited: 0.0,
+            has_driven: state.speed() > DRIVES,
             could_go: false,
         }
     }
@@ -756,6 +769,7 @@ impl Member {
             true => self.waited + TOKEN_DT,
             false => 0.0,
         };
+        self.has_driven |= self.now().velocity().length() > DRIVES;
         self.agent.state = AgentState {
             pose: state.pose,
             velocity: self.now().velocity(),
