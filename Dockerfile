@@ -30,7 +30,6 @@ RUN --mount=type=cache,target=/usr/local/cargo/registry \
 FROM debian:${DEBIAN}-slim
 LABEL org.opencontainers.image.title="gump" \
       org.opencontainers.image.description="A generative world model for driving" \
-      org.opencontainers.image.source="https://github.com/gump-rs/gump" \
       org.opencontainers.image.licenses="Apache-2.0"
 COPY --from=build /opt/gump /opt/gump
 # What .cargo/config.toml sets. The driver would set them itself by starting over; here it need not.

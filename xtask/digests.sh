@@ -2,7 +2,9 @@
 # Prints a digest of the results of a fixed set of runs, one a line: what a change of structure alone
 # must leave as it is. Give it a driver: `xtask/digests.sh target/debug/xtask`.
 #
-# Times, rates, memory and paths are left out of what is digested.
+# Times, rates, memory and paths are left out of what is digested. `xtask/digests-amx.txt` has the digests
+# of processors with AMX: `xtask/digests.sh target/debug/xtask | diff xtask/digests-amx.txt -` shows only its
+# heading there.
 set -euo pipefail
 driver=$(realpath "${1:?the driver to run, for instance target/debug/xtask}")
 cd "$(dirname "$0")/.."
@@ -19,7 +21,8 @@ digest() {
 import hashlib, json, re, sys
 
 SKIP = re.compile(
-    r"second|_ms|millis|rate_per|per_second|memory|rss|bytes|path|file|folder|out|time|speed_up|tokens_per|stage|index"
+    r"(^|_)(seconds|ms|milliseconds|wall|rss|memory|bytes|path|file|folder|out)(_|$)"
+    r"|(^|_)time$|per_second|^speed_up"
 )
 
 def kept(value):
@@ -50,7 +53,7 @@ run simulate-relative-raw simulate --scenario $mini/procedural.tfrecord.gz#1 --w
 run simulate-tiny simulate --scenario $scene --world $tiny --futures 3 --seconds 4
 run simulate-tiny-full-ar simulate --scenario $scene --world $tiny --futures 1 --seconds 2 --mode full-ar
 run simulate-tiny-growing simulate --scenario $scene --world $tiny --futures 2 --seconds 4 --cache growing
-run simulate-tiny-life simulate --scenario $scene --world $tiny --futures 2 --seconds 4 --life
+run simulate-tiny-spawn simulate --scenario $scene --world $tiny --futures 2 --seconds 4 --spawn
 run simulate-tiny-int8 simulate --scenario $scene --world $tiny --futures 2 --seconds 3 --precision int8
 run simulate-idm simulate --scenario $scene --world idm --futures 2 --seconds 8
 run generate generate --map $mini/procedural.tfrecord.gz#0 --vehicles 8 --pedestrians 2 --count 2 --simulate 2

@@ -46,13 +46,13 @@ class Simulation:
             "rows": torch.randint(table.shape[0], (n, 12)),
             "sine_positions": keys + 1,
             "sines": torch.randn(len(keys), net.model["width"]),
-            "lookers": keys,
+            "local_map_rows": keys,
             "places": torch.randint(net.positions.shape[0], (3, len(keys))),
-            "seers": keys,
+            "context_rows": keys,
         }
         if net.model["surroundings"]:
             n_numbers = net.weights["mct.surroundings.in.weight"].shape[1]
-            batch["surroundings"] = torch.randn(len(keys), n_numbers)
+            batch["local_context"] = torch.randn(len(keys), n_numbers)
         return batch, t
 
     def frame(self, batch, t, pasts):

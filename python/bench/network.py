@@ -146,15 +146,15 @@ class Network:
         if batch["sine_positions"].numel():
             sines = self.sine(batch["sines"])
             x = x.index_add(0, batch["sine_positions"], sines.to(x.dtype))
-        if self.model["local_map"] and batch["lookers"].numel():
+        if self.model["local_map"] and batch["local_map_rows"].numel():
             flat = visual.flatten(0, 1)
             places = enumerate(batch["places"])
             seen = sum(self.linear(flat[rows], f"mct.local.{i}") for i, rows in places)
-            x = x.index_add(0, batch["lookers"], seen.to(x.dtype))
-        if self.model["surroundings"] and batch["seers"].numel():
-            seen = F.gelu(self.linear(batch["surroundings"], "mct.surroundings.in"))
+            x = x.index_add(0, batch["local_map_rows"], seen.to(x.dtype))
+        if self.model["surroundings"] and batch["context_rows"].numel():
+            seen = F.gelu(self.linear(batch["local_context"], "mct.surroundings.in"))
             seen = self.linear(seen, "mct.surroundings.out")
-            x = x.index_add(0, batch["seers"], seen.to(x.dtype))
+            x = x.index_add(0, batch["context_rows"], seen.to(x.dtype))
         return self.drop(x.view(self.shape["sequences"], self.shape["tokens"], -1))
 
     def mlp(self, x, p):
@@ -332,7 +332,7 @@ class Network:
 
 
 WHOLE = (
-    "rows sine_positions lookers places seers state.rows state.tokens state.bins control.rows "
+    "rows sine_positions local_map_rows places context_rows state.rows state.tokens state.bins control.rows "
     "control.targets lights.rows lights.targets classes.rows classes.targets trajectory.rows"
 ).split()
 

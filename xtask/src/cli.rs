@@ -139,7 +139,7 @@ impl Invocation {
                 Motion Wosac Behaviour Reactions Generation ClosedLoop OpenLoop Merge;
             Rl rl: Train Evaluate Serve Table;
             Submit submit: Wosac;
-            Ablate ablate: Nar Scaling Switches;
+            Ablate ablate: Nar Scaling Features;
             Bench bench: Engine Train Device Wosac Planning;
             [Quantization Temperature Decay History Chunking]
         }

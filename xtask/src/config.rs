@@ -156,19 +156,8 @@ fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a s
 
 /// Levenshtein distance over bytes, with `_` and `-` taken as equal.
 fn edit_distance(a: &str, b: &str) -> usize {
-    let plain = |byte: u8| if byte == b'_' { b'-' } else { byte };
-    let b: Vec<u8> = b.bytes().map(plain).collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.bytes().map(plain).enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, &y) in b.iter().enumerate() {
-            let substituted = diagonal + usize::from(x != y);
-            diagonal = row[j + 1];
-            row[j + 1] = substituted.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
+    let plain = |word: &str| word.replace('_', "-").into_bytes();
+    strsim::generic_levenshtein(&plain(a), &plain(b))
 }
 
 #[cfg(test)]

@@ -3,8 +3,8 @@
 //! One file per verb under `verbs/`, each a thin layer over the crates: it reads its arguments,
 //! shows progress, calls crates and fills a report. What every verb shares is in [`run`] (output
 //! folder, seed, threads, phases), [`report`] (`report.json` and the table on the terminal),
-//! [`config`] (TOML files as flags), [`words`] (other names of flags) and [`progress`]; [`installed`] is what differs
-//! outside of a checkout. Start with [`cli`].
+//! [`config`] (TOML files as flags), [`words`] (other names of flags), [`choices`] (values of
+//! flags) and [`progress`]; [`installed`] is what differs outside of a checkout. Start with [`cli`].
 #![allow(
     clippy::disallowed_methods,
     reason = "the driver measures phases and stamps reports; layers 0-3 may not"
@@ -14,6 +14,7 @@ mod annotations;
 mod benchmark;
 mod charts;
 mod checks;
+mod choices;
 mod cli;
 mod config;
 mod films;

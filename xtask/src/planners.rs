@@ -5,13 +5,14 @@ use std::ffi::OsStr;
 use std::fmt;
 use std::time::Duration;
 
-use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use clap::builder::{PossibleValue, TypedValueParser};
 use clap::{Arg, Command};
 use gump_engine::SamplingConfig;
 use gump_eval::planners::{PlannerConfig, PlannerName};
 use gump_planner::{Aggregate, Allocation};
 use serde::{Serialize, Serializer};
 
+use crate::choices::{AGGREGATES, ALLOCATIONS, named, one_of};
 use crate::cli::WrongArguments;
 
 /// Our planners as the help lists them.
@@ -26,27 +27,9 @@ fn ours() -> Vec<PossibleValue> {
     PlannerName::ALL.map(value).into()
 }
 
-/// Reads the name of one of our planners.
-#[derive(Clone)]
-pub(crate) struct PlannerParser;
-
-impl TypedValueParser for PlannerParser {
-    type Value = PlannerName;
-
-    fn parse_ref(
-        &self,
-        command: &Command,
-        arg: Option<&Arg>,
-        value: &OsStr,
-    ) -> Result<PlannerName, clap::Error> {
-        let known = PossibleValuesParser::new(ours());
-        let name = known.parse_ref(command, arg, value)?;
-        Ok(name.parse().expect("clap lets known names pass"))
-    }
-
-    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
-        Some(Box::new(ours().into_iter()))
-    }
+/// The parser of the name of one of our planners.
+pub(crate) fn planner() -> impl TypedValueParser<Value = PlannerName> {
+    named(ours())
 }
 
 /// A planner: one of ours, or a process that serves nuPlan's planner protocol.
@@ -127,7 +110,7 @@ impl TypedValueParser for ChosenParser {
                 wrong,
             ));
         }
-        let ours = PlannerParser.parse_ref(command, arg, value);
+        let ours = planner().parse_ref(command, arg, value);
         ours.map(Chosen::Ours)
     }
 
@@ -150,26 +133,6 @@ fn remote(text: &str) -> Result<Chosen, String> {
     }
 }
 
-/// [`Allocation`] as an argument.
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum AllocationName {
-    /// All futures of all candidates
-    Uniform,
-    /// One future of all candidates, further ones of the better half, and so on
-    Halving,
-}
-
-/// [`Aggregate`] as an argument.
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum AggregateName {
-    /// The mean of its futures
-    Mean,
-    /// The worst of its futures
-    Worst,
-}
-
 #[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum YieldingName {
@@ -186,11 +149,11 @@ pub(crate) struct ImaginationArgs {
     #[arg(long, value_name = "N", default_value_t = 4)]
     futures: usize,
     /// Allocation of futures to the interactive planner's candidates
-    #[arg(long, value_enum, default_value_t = AllocationName::Halving)]
-    allocation: AllocationName,
+    #[arg(long, value_parser = one_of(ALLOCATIONS), default_value_t = Allocation::Halving)]
+    allocation: Allocation,
     /// Aggregation of a candidate's scores over its futures
-    #[arg(long, value_enum, default_value_t = AggregateName::Mean)]
-    aggregate: AggregateName,
+    #[arg(long, value_parser = one_of(AGGREGATES), default_value_t = Aggregate::Mean)]
+    aggregate: Aggregate,
     /// Weight of a future in which the others keep their velocity, 0 to 1
     #[arg(long, value_name = "X", default_value_t = PlannerConfig::default().hedge)]
     hedge: f64,
@@ -255,14 +218,8 @@ impl ImaginationArgs {
         }
         Ok(PlannerConfig {
             futures: self.futures,
-            allocation: match self.allocation {
-                AllocationName::Uniform => Allocation::Uniform,
-                AllocationName::Halving => Allocation::Halving,
-            },
-            aggregate: match self.aggregate {
-                AggregateName::Mean => Aggregate::Mean,
-                AggregateName::Worst => Aggregate::Worst,
-            },
+            allocation: self.allocation,
+            aggregate: self.aggregate,
             hedge: self.hedge,
             hysteresis: self.hysteresis,
             nearest: self.nearest,

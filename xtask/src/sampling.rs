@@ -5,14 +5,15 @@ use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
+use crate::choices::{CACHES, LIGHTS, MODES, PRECISIONS, one_of};
 use crate::cli::WrongArguments;
 
 /// Flags of a learned world's decoding.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Sampling {
     /// Decode all agents of a frame at once or one after another
-    #[arg(long, value_enum, default_value_t = ModeName::PartialAr)]
-    mode: ModeName,
+    #[arg(long, value_parser = one_of(MODES), default_value_t = Mode::PartialAr)]
+    mode: Mode,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) draw: Draw,
@@ -22,11 +23,11 @@ pub(crate) struct Sampling {
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct Draw {
     /// Key/value cache of the network
-    #[arg(long, value_enum, default_value_t = CacheName::Window)]
-    cache: CacheName,
+    #[arg(long, value_parser = one_of(CACHES), default_value_t = CacheMode::Window)]
+    cache: CacheMode,
     /// Number format of the weights
-    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
-    precision: PrecisionName,
+    #[arg(long, value_parser = one_of(PRECISIONS), default_value_t = Precision::F32)]
+    precision: Precision,
     /// Divides the logits; above 1 is more diverse [default: 0.5, and 1 of a relative network]
     #[arg(long, value_name = "X")]
     temperature: Option<f64>,
@@ -60,67 +61,8 @@ pub(crate) struct Draw {
     #[arg(long = "spawn", alias = "life")]
     life: bool,
     /// Traffic lights after the present
-    #[arg(long, value_enum, default_value_t = LightsName::Model)]
-    lights: LightsName,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum ModeName {
-    PartialAr,
-    FullAr,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum CacheName {
-    /// No key/value cache: every pass recomputes the whole window
-    None,
-    /// Sliding window; nothing is recomputed within a frame
-    Window,
-    /// Growing window, as far as it fits; nothing is recomputed between frames either
-    Growing,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum LightsName {
-    /// Simulated signal phases
-    Model,
-    /// As at the present
-    Hold,
-    /// As recorded (uses the future)
-    Log,
-}
-
-impl LightsName {
-    /// The model's form of the name.
-    pub(crate) fn resolve(self) -> LightSource {
-        match self {
-            Self::Model => LightSource::Model,
-            Self::Hold => LightSource::Hold,
-            Self::Log => LightSource::Log,
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum PrecisionName {
-    F32,
-    Bf16,
-    Int8,
-}
-
-impl PrecisionName {
-    /// The model's form of the name.
-    pub(crate) fn resolve(self) -> Precision {
-        match self {
-            Self::F32 => Precision::F32,
-            Self::Bf16 => Precision::Bf16,
-            Self::Int8 => Precision::Int8,
-        }
-    }
+    #[arg(long, value_parser = one_of(LIGHTS), default_value_t = LightSource::Model)]
+    lights: LightSource,
 }
 
 impl Sampling {
@@ -128,14 +70,14 @@ impl Sampling {
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn resolve(&self) -> anyhow::Result<SamplingConfig> {
-        self.draw.resolve(self.mode())
+        self.draw.resolve(self.mode)
     }
 
     /// The decoding of a world.
     ///
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decoding(&self, world: &WorldName) -> anyhow::Result<Decoding> {
-        Ok(self.draw.decoding(self.mode())?.for_world(world))
+        Ok(self.draw.decoding(self.mode)?.for_world(world))
     }
 
     /// Every decoding of a world that a table shows: for a network under rules also the network
@@ -144,15 +86,8 @@ impl Sampling {
     /// Error: as [`Draw::resolve`].
     pub(crate) fn decodings(&self, world: &WorldName) -> anyhow::Result<Vec<Decoding>> {
         match world {
-            WorldName::Model(_) => self.draw.decodings(self.mode()),
+            WorldName::Model(_) => self.draw.decodings(self.mode),
             _ => Ok(vec![self.decoding(world)?]),
-        }
-    }
-
-    fn mode(&self) -> Mode {
-        match self.mode {
-            ModeName::PartialAr => Mode::PartialAr,
-            ModeName::FullAr => Mode::FullAr,
         }
     }
 }
@@ -177,14 +112,10 @@ impl Draw {
         };
         let config = SamplingConfig {
             mode,
-            cache: match self.cache {
-                CacheName::None => CacheMode::None,
-                CacheName::Window => CacheMode::Window,
-                CacheName::Growing => CacheMode::Growing,
-            },
-            precision: self.precision.resolve(),
-            life: self.life,
-            lights: self.lights.resolve(),
+            cache: self.cache,
+            precision: self.precision,
+            spawn: self.life,
+            lights: self.lights,
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             top_p: self.top_p.or(base.top_p),
@@ -278,8 +209,8 @@ mod tests {
 
     fn draw() -> Draw {
         Draw {
-            cache: CacheName::Window,
-            precision: PrecisionName::F32,
+            cache: CacheMode::Window,
+            precision: Precision::F32,
             temperature: None,
             top_k: None,
             top_p: None,
@@ -290,7 +221,26 @@ mod tests {
             paper: false,
             ruled: false,
             life: false,
-            lights: LightsName::Model,
+            lights: LightSource::Model,
+        }
+    }
+
+    #[test]
+    fn stored_settings_are_read_under_former_and_present_names() {
+        let config = SamplingConfig {
+            spawn: true,
+            ..SamplingConfig::default()
+        };
+        let stored = serde_json::to_string(&config).unwrap();
+        assert!(stored.contains("\"life\":true") && stored.contains("\"pace\":"));
+        let present = stored
+            .replace("\"life\"", "\"spawn\"")
+            .replace("\"pace\"", "\"spawn_rates\"");
+        for text in [stored, present] {
+            assert_eq!(
+                serde_json::from_str::<SamplingConfig>(&text).unwrap(),
+                config
+            );
         }
     }
 

@@ -12,6 +12,7 @@ use std::sync::OnceLock;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, ArgMatches, Command};
+use toml::{Table, Value};
 
 use crate::cli::WrongArguments;
 use crate::{installed, machine};
@@ -32,6 +33,15 @@ const ALIASES: [(&str, &[&str]); 9] = [
 
 /// Flags under their former names, which work for a release more, and under their present ones.
 const FORMER: [(&str, &str); 1] = [("life", "spawn")];
+
+/// Verbs of verbs under their former names, likewise.
+const FORMER_VERBS: [([&str; 2], &str); 1] = [(["ablate", "switches"], "ablate features")];
+
+/// Keys of the tables of a `--config` file under their former names, likewise.
+const FORMER_KEYS: [(&str, &str); 2] = [
+    ("sway", "lateral_perturbation"),
+    ("sway_m", "lateral_perturbation_m"),
+];
 
 /// Short names; a verb's first flag with a letter has it.
 const SHORT: [(char, &[&str]); 7] = [
@@ -204,18 +214,49 @@ pub(crate) fn present_name(name: &str) -> &str {
     former.map_or(name, |(_, present)| present)
 }
 
-/// A sentence for each flag that is given under its former name.
+/// A sentence for each verb and each flag that is given under its former name.
 pub(crate) fn notes_on_former_names(arguments: &[OsString]) -> Vec<String> {
     let given = |name: &str| {
         let mut words = arguments.iter().take_while(|word| *word != "--");
         words.any(|word| word.to_str() == Some(&format!("--{name}")))
     };
-    let notes = FORMER.iter().filter(|(former, _)| given(former));
+    let flags = FORMER.iter().filter(|(former, _)| given(former));
+    let flags =
+        flags.map(|(former, present)| note(&format!("--{former}"), &format!("--{present}")));
+    let verb: Vec<&OsString> = arguments.iter().skip(1).take(2).collect();
+    let verbs = FORMER_VERBS.iter().filter(|(former, _)| verb == *former);
+    let verbs = verbs.map(|(former, present)| note(&former.join(" "), present));
+    verbs.chain(flags).collect()
+}
+
+/// Puts the keys of a table, at any depth, under their present names; a sentence for each that had
+/// its former one.
+pub(crate) fn rename_former_keys(table: &mut Table) -> Vec<String> {
+    let mut notes = Vec::new();
+    for (former, present) in FORMER_KEYS {
+        // Where both are given, the former one is refused as any unknown key.
+        if !table.contains_key(present)
+            && let Some(value) = table.remove(former)
+        {
+            table.insert(present.into(), value);
+            notes.push(note(former, present));
+        }
+    }
+    for (_, value) in table.iter_mut() {
+        match value {
+            Value::Table(inner) => notes.extend(rename_former_keys(inner)),
+            Value::Array(items) => {
+                let tables = items.iter_mut().filter_map(Value::as_table_mut);
+                notes.extend(tables.flat_map(rename_former_keys));
+            }
+            _ => {}
+        }
+    }
     notes
-        .map(|(former, present)| {
-            format!("note: --{former} is now --{present}; the former name works until 0.3")
-        })
-        .collect()
+}
+
+fn note(former: &str, present: &str) -> String {
+    format!("note: {former} is now {present}; the former name works until 0.3")
 }
 
 /// Parses `-3` as a number rather than a flag, so that the error is about the number.
@@ -346,6 +387,30 @@ mod tests {
             (present_name("life"), present_name("seed")),
             ("spawn", "seed")
         );
+        let notes = notes_on_former_names(&words("xtask ablate switches --steps 3"));
+        assert_eq!(notes.len(), 1);
+        assert!(notes[0].contains("ablate switches is now ablate features"));
+        assert!(notes_on_former_names(&words("xtask ablate features")).is_empty());
+    }
+
+    #[test]
+    fn former_keys_of_tables_are_renamed_and_noted() {
+        let text = "[train.sample]\nsway = 0.5\n[[stage]]\n[stage.train.sample]\nsway_m = 2.0\n";
+        let mut table: Table = text.parse().unwrap();
+        let notes = rename_former_keys(&mut table);
+        assert_eq!(notes.len(), 2);
+        assert!(
+            notes
+                .iter()
+                .any(|note| note.contains("sway is now lateral_perturbation;"))
+        );
+        let renamed = text
+            .replace("sway_m", "lateral_perturbation_m")
+            .replace("sway =", "lateral_perturbation =");
+        assert_eq!(table, renamed.parse().unwrap());
+        let both = "lateral_perturbation = 1.0\nsway = 0.5";
+        let mut both: Table = both.parse().unwrap();
+        assert!(rename_former_keys(&mut both).is_empty() && both.contains_key("sway"));
     }
 
     #[test]

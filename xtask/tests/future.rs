@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 
 use gump_data::{cache, find, womd};
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_scene::{
     Agent, AgentId, AgentState, Frame, LaneId, Light, LightState, Scenario, Seed, fixture,
@@ -69,7 +69,7 @@ impl Workplace {
             ..ModelConfig::tiny()
         };
         let network = Network::random(config, Seed(0), &Device::Cpu).unwrap();
-        checkpoint::save(&network, &self.path("w.safetensors"), Precision::Half).unwrap();
+        checkpoint::save(&network, &self.path("w.safetensors"), StorageType::Half).unwrap();
         "w.safetensors"
     }
 }

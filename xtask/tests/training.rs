@@ -6,7 +6,7 @@ use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{Device, ModelConfig, Network, checkpoint, relative};
 use gump_scene::Seed;
 use gump_train::{ModelChoice, RunConfig, TrainConfig};
@@ -280,7 +280,7 @@ fn the_recorded_stages_of_the_shipped_weights_can_be_run() {
     assert_eq!(results["parameters"], shipped.parameters().count());
     // What is shipped is half of that precision.
     let small = place.path("small.safetensors");
-    checkpoint::save(&network, &small, Precision::Half).unwrap();
+    checkpoint::save(&network, &small, StorageType::Half).unwrap();
     assert!(fs::metadata(small).unwrap().len() < 12_000_000);
 }
 

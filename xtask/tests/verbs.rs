@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gump_kernels::Kernel;
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_scene::Seed;
 use gump_train::{ModelChoice, RunConfig, TrainConfig};
@@ -77,7 +77,7 @@ impl Workplace {
     /// Weights of a very small network that has learned nothing.
     fn weights(&self) -> &'static str {
         let network = Network::random(very_small(), Seed(0), &Device::Cpu).unwrap();
-        checkpoint::save(&network, &self.path("w.safetensors"), Precision::Half).unwrap();
+        checkpoint::save(&network, &self.path("w.safetensors"), StorageType::Half).unwrap();
         "w.safetensors"
     }
 
@@ -1047,8 +1047,8 @@ fn bench_train_times_both_number_formats() {
     let rows = place.report(words)["results"]["rows"].clone();
     let precisions: Vec<_> = rows.as_array().unwrap().iter().collect();
     assert_eq!(precisions.len(), 2);
-    for (row, precision) in precisions.into_iter().zip(["f32", "bf16"]) {
-        assert_eq!(row["precision"], precision);
+    for (row, storage) in precisions.into_iter().zip(["f32", "bf16"]) {
+        assert_eq!(row["precision"], storage);
         assert!(row["cpu_milliseconds_per_step"].as_f64().unwrap() > 0.0);
         assert!(row["ratio"].is_null());
     }

@@ -5,14 +5,18 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
+use std::fmt;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use gump_scene::Scenario;
 use prost::Message as _;
-use serde::Serialize;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
+use serde::{Deserialize, Serialize};
 
 use crate::formats::cache::ShardWriter;
 use crate::formats::{scenario_json, womd};
@@ -23,8 +27,9 @@ use crate::tracks::TrackTable;
 use crate::{DataError, ReadOptions, ReadReport, Reader, open_files, write_atomically};
 
 /// The output format.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum OutputFormat {
     /// The cache that training reads: everything, bit for bit.
     Cache,
@@ -35,6 +40,35 @@ pub enum OutputFormat {
     /// Tables of tracks, without maps.
     #[cfg(feature = "parquet")]
     Parquet,
+}
+
+impl OutputFormat {
+    /// All of them, in the order of declaration.
+    pub const ALL: &'static [Self] = &[
+        Self::Cache,
+        Self::Waymo,
+        Self::ScenarioJson,
+        #[cfg(feature = "parquet")]
+        Self::Parquet,
+    ];
+}
+
+impl fmt::Display for OutputFormat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for OutputFormat {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 /// The result of a conversion.

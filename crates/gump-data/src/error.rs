@@ -35,6 +35,7 @@ pub const INCOMPLETE: &str = "CACHE-INCOMPLETE";
 
 /// Why data could not be read or written.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum DataError {
     /// An error of the operating system.
     #[error("could not {doing}: {source}: {}", path.display())]
@@ -326,6 +327,7 @@ pub(crate) const MAX_COORDINATE: f64 = 1e8;
 
 /// Why a decoded record is not a usable scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum Problem {
     /// Bytes are not a valid message.
     #[error("expected a {message} message, found bytes that are none: {source}")]

@@ -116,7 +116,7 @@ fn allowed(request: &Request, step: usize, field: Field) -> Range<usize> {
     let Some((centre, reach)) = request.near else {
         return all;
     };
-    let [x, y] = request.anchor.near(centre, reach);
+    let [x, y] = request.local_frame.near(centre, reach);
     let bins = match step {
         4 => x,
         5 => y,
@@ -221,7 +221,7 @@ mod tests {
 
     fn request() -> Request {
         Request {
-            anchor: LocalFrame::SCENE,
+            local_frame: LocalFrame::SCENE,
             forced: [None; STEPS.len()],
             stream: Seed(3),
             near: None,

@@ -1,7 +1,8 @@
 //! Closed-loop rollouts of the learned world models.
 //!
 //! * Worlds driven by a network: [`TransformerWorld`], [`relative::RelativeWorld`].
-//! * Partial autoregression and its caches: `decode`, `session`.
+//! * Partial autoregression: `partial_ar`, one step of all futures in `session`. The KV cache:
+//!   `cpu::KvCache`.
 //! * CPU implementations of the networks without a tensor library: `cpu`, `relative`.
 //! * Sampling (`draw`, `nucleus`), and corrections of draws: `rejection`, `kinematic_limits`.
 //! * Agents that enter and leave: `spawning`.
@@ -40,11 +41,9 @@
 //! ```
 
 #[cfg(feature = "tensors")]
-pub mod agreement;
+mod agreement;
 #[cfg(feature = "tensors")]
 pub mod cpu;
-#[cfg(feature = "tensors")]
-pub mod decode;
 #[cfg(feature = "tensors")]
 mod deconvolution;
 #[cfg(feature = "tensors")]
@@ -53,13 +52,15 @@ mod error;
 pub mod kinematic_limits;
 pub mod nucleus;
 #[cfg(feature = "tensors")]
+mod partial_ar;
+#[cfg(feature = "tensors")]
 pub mod placement;
 #[cfg(feature = "tensors")]
 mod predictive_samples;
 #[cfg(feature = "tensors")]
 mod redraw;
 #[cfg(feature = "tensors")]
-pub mod reference;
+mod reference;
 mod rejection;
 pub mod relative;
 #[cfg(feature = "tensors")]
@@ -72,7 +73,7 @@ pub mod scene;
 #[cfg(feature = "tensors")]
 mod session;
 #[cfg(feature = "tensors")]
-pub mod spawning;
+mod spawning;
 #[cfg(feature = "tensors")]
 pub mod temporal_ensemble;
 #[cfg(test)]

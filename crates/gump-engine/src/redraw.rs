@@ -10,7 +10,7 @@ use gump_scene::{AgentKind, AgentState};
 use gump_tokenizer::{Field, QuantizedState};
 use rayon::prelude::*;
 
-use crate::decode::Window;
+use crate::partial_ar::Window;
 use crate::rejection::{BRAKING, Footprints, Member, Way, way};
 use crate::request::Request;
 use crate::sampling::SamplingConfig;
@@ -19,13 +19,13 @@ use crate::sampling::SamplingConfig;
 const REDRAW: u64 = 1 << 20;
 
 /// The objects of some windows that have been drawn so far.
-pub(crate) struct Clearance<'a, W> {
+pub(crate) struct RejectionSampler<'a, W> {
     windows: &'a [W],
     config: &'a SamplingConfig,
     crowds: Vec<Footprints>,
 }
 
-impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
+impl<'a, W: Borrow<Window> + Sync> RejectionSampler<'a, W> {
     /// Nothing has been drawn yet.
     pub(crate) fn new(windows: &'a [W], config: &'a SamplingConfig) -> Self {
         Self {
@@ -96,7 +96,7 @@ impl<'a, W: Borrow<Window> + Sync> Clearance<'a, W> {
 
 /// The future positions of an object, scene frame.
 fn foreseen(request: &Request, bins: &Bins, config: &SamplingConfig) -> Way {
-    let poses = request.anchor.poses(bins);
+    let poses = request.local_frame.poses(bins);
     let first = request.resolve(bins, config).pose;
     way(request.from(), [first, poses[1], poses[2]])
 }
@@ -105,7 +105,7 @@ impl Member {
     /// The chunk of braking along the path of `bins`; `None` for an object that hardly moves.
     pub(crate) fn brake(&self, request: &Request, bins: &Bins) -> Option<Bins> {
         let before = self.before.filter(|_| self.speed > 0.5)?;
-        let poses = request.anchor.poses(bins);
+        let poses = request.local_frame.poses(bins);
         let at = |s: f64| {
             let mut from = (before, 0.0);
             for pose in poses {
@@ -124,7 +124,7 @@ impl Member {
             let velocity = pose.direction() * (self.speed - BRAKING * t).max(0.0);
             Some(AgentState { pose, velocity })
         });
-        let braking = request.anchor.bins(QuantizedState::default(), states);
+        let braking = request.local_frame.bins(QuantizedState::default(), states);
         let sizes = 2;
         let bin = |i: usize| braking[i].filter(|_| i >= sizes).unwrap_or(bins[i]);
         Some(std::array::from_fn(bin))
@@ -160,7 +160,7 @@ impl Footprints {
                 );
                 member.is_ignored = member.is_driven && !config.yields_to_driven;
                 if agent.key.kind == AgentKind::Vehicle && !member.is_driven {
-                    member.look_for_edges(&window.survey);
+                    member.look_for_edges(&window.lane_map);
                 }
                 member
             };

@@ -16,9 +16,9 @@ use gump_tokenizer::Slot;
 use rayon::prelude::*;
 
 use crate::EngineError;
-use crate::decode::Window;
 use crate::draw::draw_field;
-use crate::redraw::Clearance;
+use crate::partial_ar::Window;
+use crate::redraw::RejectionSampler;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
 
@@ -155,8 +155,8 @@ impl Group<'_> {
             .iter()
             .scan(0, |next, n| Some(std::mem::replace(next, *next + n)))
             .collect();
-        let mut clearance = Clearance::new(&self.windows, passes.sampling);
-        clearance.resolve(&mut decoded, |who, requests| {
+        let mut rejection_sampler = RejectionSampler::new(&self.windows, passes.sampling);
+        rejection_sampler.resolve(&mut decoded, |who, requests| {
             let rows = who.iter().map(|(w, i)| (firsts[*w] + i) as u32);
             let rows = Tensor::from_iter(rows, keys.device())?;
             let keys = keys.index_select(&rows, 0)?;
@@ -178,7 +178,7 @@ impl Group<'_> {
         let mut rows: Vec<Vec<PlacedSlot>> =
             self.slots.iter().map(|slots| slots.to_vec()).collect();
         let mut decoded = vec![Vec::with_capacity(n); rows.len()];
-        let mut clearance = Clearance::new(&self.windows, passes.sampling);
+        let mut rejection_sampler = RejectionSampler::new(&self.windows, passes.sampling);
         for i in 0..n {
             let key = first + 2 * i;
             let from = cache.as_ref().map_or(0, Cache::len);
@@ -191,7 +191,7 @@ impl Group<'_> {
             for (decoded, bins) in decoded.iter_mut().zip(bins) {
                 decoded.push(bins);
             }
-            clearance.resolve(&mut decoded, |who, requests| {
+            rejection_sampler.resolve(&mut decoded, |who, requests| {
                 let rows = who.iter().map(|(row, _)| *row as u32);
                 let rows = Tensor::from_iter(rows, at_key.device())?;
                 let at_key = at_key.index_select(&rows, 0)?;

@@ -14,7 +14,7 @@
 mod tests;
 
 use gump_geometry::{OrientedBox, Pose, angle_difference};
-use gump_model::local_context::{Edge, Survey, metres_across, metres_off};
+use gump_model::local_context::{Edge, LaneMap, metres_across, metres_off};
 
 /// Poses of a chunk that must be clear: 1.5 s.
 pub(crate) const POSES: usize = 3;
@@ -130,12 +130,12 @@ impl Member {
     }
 
     /// Sets the road edges that it might cross on its path, and its distance off the road.
-    pub(crate) fn look_for_edges(&mut self, survey: &Survey) {
+    pub(crate) fn look_for_edges(&mut self, lane_map: &LaneMap) {
         let Some(before) = self.before else {
             return;
         };
         let radius = self.reach + (self.moves() + 1.0).max(self.speed * 1.5);
-        let near = survey.edges_near(before.position, radius);
+        let near = lane_map.edges_near(before.position, radius);
         self.edges = near
             .filter(|edge| edge.from.distance(before.position) <= radius)
             .collect();

@@ -18,7 +18,7 @@ use crate::temporal_ensemble::ChunkBuffer;
 #[derive(Clone, Debug)]
 pub struct Request {
     /// The frame in which the bins are expressed.
-    pub anchor: LocalFrame,
+    pub local_frame: LocalFrame,
     /// Bins that are given, per step.
     pub forced: [Option<u16>; STEPS.len()],
     /// The object's own stream of randomness in this frame.
@@ -62,15 +62,15 @@ impl Request {
     /// The previous pose of the object, scene frame; `None` if it is not known.
     pub(crate) fn from(&self) -> Option<Pose> {
         let limited = self.limits.map(|(from, _)| from);
-        limited.or(self.anchor.origin())
+        limited.or(self.local_frame.origin())
     }
 
     /// The final state of a decoded object: sampled, averaged over chunks, within its limits, with
     /// a consistent velocity; scene frame, not quantised.
     pub(crate) fn resolve(&self, bins: &Bins, config: &SamplingConfig) -> AgentState {
         let decoded = AgentState {
-            pose: self.anchor.poses(bins)[0],
-            velocity: self.anchor.velocity(bins),
+            pose: self.local_frame.poses(bins)[0],
+            velocity: self.local_frame.velocity(bins),
         };
         let average = self.ring.aggregate(self.frame, decoded.pose, config.decay);
         let Some(from) = self.from().filter(|_| !self.is_driven()) else {

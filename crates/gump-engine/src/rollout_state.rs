@@ -13,12 +13,12 @@ use gump_model::steps::TOKEN_DT;
 use gump_scene::{Agent, AgentState, Frame, Seed};
 use gump_tokenizer::{Identities, QuantizedState, TokenAgent, TokenFrame};
 
-use crate::cpu::Context;
-use crate::decode::Window;
+use crate::cpu::KvCache;
 use crate::kinematic_limits::Limits;
+use crate::partial_ar::Window;
 use crate::request::{Request, set_pose};
 use crate::sampling::{CacheMode, SamplingConfig, Surrogate};
-use crate::scene::Scene;
+use crate::scene::SceneContext;
 use crate::spawning::Phases;
 use crate::temporal_ensemble::ChunkBuffer;
 use crate::world::TransformerWorld;
@@ -28,7 +28,7 @@ const GUARD_M: f64 = 5.0;
 
 /// One future in progress.
 #[derive(Clone, Debug)]
-pub(crate) struct Future {
+pub(crate) struct RolloutState {
     pub(crate) scene: usize,
     pub(crate) seed: Seed,
     /// The last token frames: at most `history` of them, or as many as a growing window holds.
@@ -46,14 +46,14 @@ pub(crate) struct Future {
     /// The time for which lights have shown their colour, with spawning.
     pub(crate) phases: Phases,
     /// The engine's cache of its window.
-    pub(crate) context: Context,
+    pub(crate) kv_cache: KvCache,
 }
 
-impl Future {
+impl RolloutState {
     /// The window of one future: its history and the next frame with provisional states.
     pub(crate) fn window(
         &self,
-        scene: &Scene,
+        scene: &SceneContext,
         world: &TransformerWorld,
         ego: Option<AgentState>,
     ) -> Window {
@@ -84,14 +84,14 @@ impl Future {
                 key: agent.key,
                 state: surrogate,
             });
-            let anchor = self.anchor(agent, scene, world);
+            let local_frame = self.local_frame(agent, scene, world);
             let is = match (id, ego) {
                 (0, Some(state)) => scene.local(state),
                 _ => surrogate.to_agent_state(),
             };
             requests.push(Request {
-                anchor,
-                forced: given(anchor, &surrogate, is, driven),
+                local_frame,
+                forced: given(local_frame, &surrogate, is, driven),
                 stream: stream(self.seed, index, id),
                 near: Some((position, GUARD_M)),
                 // A driven object was put where it is; what it once foresaw does not count.
@@ -111,20 +111,25 @@ impl Future {
             exact: self.exact(scene),
             next,
             requests,
-            survey: Arc::clone(&scene.survey),
+            lane_map: Arc::clone(&scene.lane_map),
         }
     }
 
     /// The objects of the window's frames, not quantised.
-    pub(crate) fn exact(&self, scene: &Scene) -> ExactFrames {
+    pub(crate) fn exact(&self, scene: &SceneContext) -> ExactFrames {
         let n = self.frames.len();
         ExactFrames::last(n, &self.recent, &self.identities, scene.world_from_scene)
     }
 
     /// The frame in which the next chunk of `agent`, a token of the last frame, is expressed: its
     /// pose, not quantised.
-    fn anchor(&self, agent: &TokenAgent, scene: &Scene, world: &TransformerWorld) -> LocalFrame {
-        if world.network().config().anchored {
+    fn local_frame(
+        &self,
+        agent: &TokenAgent,
+        scene: &SceneContext,
+        world: &TransformerWorld,
+    ) -> LocalFrame {
+        if world.network().config().local_frame {
             LocalFrame::at(self.pose(agent, scene))
         } else {
             LocalFrame::SCENE
@@ -135,7 +140,7 @@ impl Future {
     fn limits(
         &self,
         agent: &TokenAgent,
-        scene: &Scene,
+        scene: &SceneContext,
         sampling: &SamplingConfig,
     ) -> Option<(Pose, Limits)> {
         let limits = Limits::of(agent.key.kind).filter(|_| sampling.limits)?;
@@ -143,7 +148,7 @@ impl Future {
     }
 
     /// The pose of `agent`, a token of the last frame, not quantised; scene frame.
-    fn pose(&self, agent: &TokenAgent, scene: &Scene) -> Pose {
+    fn pose(&self, agent: &TokenAgent, scene: &SceneContext) -> Pose {
         let id = self.identities.agent(agent.key.id);
         let present = self.recent.last().expect("a future has a present");
         let known = id.and_then(|id| present.agent(id));
@@ -181,7 +186,7 @@ impl Future {
         &mut self,
         window: Window,
         decoded: &[Bins],
-        scene: &Scene,
+        scene: &SceneContext,
         world: &TransformerWorld,
         ego: Option<AgentState>,
     ) -> Frame {
@@ -196,7 +201,7 @@ impl Future {
             if driven {
                 ring.clear();
             }
-            ring.push(self.index, request.anchor.poses(bins));
+            ring.push(self.index, request.local_frame.poses(bins));
             let settled = request.resolve(bins, sampling);
             agent.state = request.settled_state(bins, settled);
             let state = AgentState {
@@ -246,11 +251,11 @@ impl Future {
     }
 
     /// Changes to another scene of the same traffic: tokens and chunks are expressed in its frame.
-    pub(crate) fn enter(&mut self, index: usize, from: &Scene, to: &Scene) {
+    pub(crate) fn enter(&mut self, index: usize, from: &SceneContext, to: &SceneContext) {
         let to_from_from = to.world_from_scene.inverse() * from.world_from_scene;
         self.scene = index;
         self.frames = to.history.clone();
-        self.context.clear();
+        self.kv_cache.clear();
         self.rings
             .values_mut()
             .for_each(|ring| ring.transform(to_from_from));
@@ -264,13 +269,13 @@ pub(crate) fn stream(seed: Seed, frame: usize, id: u16) -> Seed {
 
 /// Sizes never change; the state `is` of a driven object is given completely.
 fn given(
-    anchor: LocalFrame,
+    local_frame: LocalFrame,
     like: &QuantizedState,
     is: AgentState,
     driven: bool,
 ) -> [Option<u16>; STEPS.len()] {
     let state = driven.then_some(is);
-    anchor.bins(*like, [state, None, None, None])
+    local_frame.bins(*like, [state, None, None, None])
 }
 
 /// Half a second of constant velocity.

@@ -2,7 +2,12 @@
 //!
 //! Requests to the decoder are in `request`, drawing of bins is in `draw`.
 
+use std::fmt;
+use std::str::FromStr;
+
 use gump_kernels::panels::Precision;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 /// Configuration of decoding.
@@ -32,11 +37,13 @@ pub struct SamplingConfig {
     pub surrogate: Surrogate,
     /// Whether agents enter and leave; otherwise the set of agents is fixed. A sequence network
     /// decides this itself (on a CPU), as well as the states of lights.
-    pub life: bool,
+    #[serde(rename = "life", alias = "spawn")]
+    pub spawn: bool,
     /// Source of the lights, where the network does not decide them.
     pub lights: LightSource,
     /// Factors on the rates of arrivals and of changes of lights.
-    pub pace: RateScale,
+    #[serde(rename = "pace", alias = "spawn_rates")]
+    pub spawn_rates: RateScale,
     /// Maximum number of redraws of an object that would overlap another or leave the road within
     /// 1.5 s (paper: 0); in partial-AR decoding only.
     pub redraws: usize,
@@ -60,9 +67,9 @@ impl Default for SamplingConfig {
             decay: 0.3,
             history: 3,
             surrogate: Surrogate::Chunk,
-            life: false,
+            spawn: false,
             lights: LightSource::Model,
-            pace: RateScale::default(),
+            spawn_rates: RateScale::default(),
             redraws: 12,
             yields_to_driven: true,
             limits: true,
@@ -135,6 +142,7 @@ impl Default for RateScale {
 /// Source of traffic lights after the present.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum LightSource {
     /// Signal phases, estimated from the observed states.
     #[default]
@@ -145,14 +153,61 @@ pub enum LightSource {
     Log,
 }
 
+impl LightSource {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 3] = [Self::Model, Self::Hold, Self::Log];
+}
+
+impl fmt::Display for LightSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for LightSource {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 /// The order in which the objects of a frame are decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Mode {
     /// All at once against surrogates: one transformer pass per frame.
     PartialAr,
     /// One after another: one pass per object.
     FullAr,
+}
+
+impl Mode {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::PartialAr, Self::FullAr];
+}
+
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Mode {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 /// Caching between passes, and the length of the window.
@@ -161,6 +216,7 @@ pub enum Mode {
 /// unchanged, so every cache is exact: the result is that of computing the same window anew.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum CacheMode {
     /// Nothing: every pass sees the whole window.
     None,
@@ -173,9 +229,33 @@ pub enum CacheMode {
     Growing,
 }
 
+impl CacheMode {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 3] = [Self::None, Self::Window, Self::Growing];
+}
+
+impl fmt::Display for CacheMode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for CacheMode {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 /// The source of provisional states.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Surrogate {
     /// Chunks decoded for earlier frames.
     Chunk,
@@ -189,6 +269,17 @@ pub enum Surrogate {
 mod tests {
     use super::*;
 
+    #[test]
+    fn names_read_as_they_are_written() {
+        assert_eq!(
+            Mode::ALL.map(|mode| mode.to_string()),
+            ["partial-ar", "full-ar"]
+        );
+        assert_eq!("partial-ar".parse(), Ok(Mode::PartialAr));
+        let error = "best".parse::<LightSource>().unwrap_err().to_string();
+        assert!(error.contains("`model`, `hold`, `log`"), "{error}");
+    }
+
     /// Every field is spelled out, so that a new one has to be decided for these decodings.
     #[test]
     fn what_raw_and_paper_set_is_pinned() {
@@ -201,9 +292,9 @@ mod tests {
             decay: 0.3,
             history: 3,
             surrogate: Surrogate::Chunk,
-            life: false,
+            spawn: false,
             lights: LightSource::Model,
-            pace: RateScale {
+            spawn_rates: RateScale {
                 arrivals: 1.0,
                 light_changes: 1.0,
             },

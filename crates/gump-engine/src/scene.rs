@@ -8,7 +8,7 @@ use gump_geometry::Pose;
 use gump_model::ModelConfig;
 use gump_model::config::KEEP_RANGE_M;
 use gump_model::exact::ExactFrames;
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::local_frame::LocalFrame;
 use gump_model::mct::VisualMemory;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
@@ -20,7 +20,7 @@ use gump_tokenizer::{
 };
 
 use crate::EngineError;
-use crate::cpu::{Context, SceneMemory};
+use crate::cpu::{KvCache, SceneMemory};
 use crate::placement::ground::Ground;
 use crate::world::TransformerWorld;
 
@@ -30,7 +30,7 @@ pub enum Memory {
     /// For the engine.
     Packed(SceneMemory),
     /// For the tensor library.
-    Plain(VisualMemory),
+    Reference(VisualMemory),
 }
 
 impl Memory {
@@ -38,14 +38,14 @@ impl Memory {
     pub fn packed(&self) -> Option<&SceneMemory> {
         match self {
             Self::Packed(memory) => Some(memory),
-            Self::Plain(_) => None,
+            Self::Reference(_) => None,
         }
     }
 
     /// The tensor library's form, if it is that.
-    pub(crate) fn plain(&self) -> Option<&VisualMemory> {
+    pub(crate) fn reference(&self) -> Option<&VisualMemory> {
         match self {
-            Self::Plain(memory) => Some(memory),
+            Self::Reference(memory) => Some(memory),
             Self::Packed(_) => None,
         }
     }
@@ -53,7 +53,7 @@ impl Memory {
 
 /// Data shared by all futures of a start.
 #[derive(Debug)]
-pub struct Scene {
+pub struct SceneContext {
     /// The scene frame in the world.
     pub world_from_scene: Pose,
     pub(crate) ego: AgentId,
@@ -61,7 +61,7 @@ pub struct Scene {
     /// The encoding of the map.
     pub memory: Memory,
     /// The history as computed by the engine, from which futures continue.
-    pub(crate) prefix: Context,
+    pub(crate) prefix: KvCache,
     /// Frames before the start, scene frame.
     pub history: Vec<TokenFrame>,
     /// The lane that each light token controls, light 1 first.
@@ -70,7 +70,7 @@ pub struct Scene {
     pub(crate) recent: Vec<Frame>,
     pub(crate) map: Arc<MapGraph>,
     /// The map prepared around the scene.
-    pub survey: Arc<Survey>,
+    pub lane_map: Arc<LaneMap>,
     pub(crate) route: Option<Arc<Route>>,
     /// Valid positions by class; computed on first use.
     grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
@@ -78,7 +78,7 @@ pub struct Scene {
     entries: [OnceLock<Arc<Ground>>; N_CLASSES],
 }
 
-impl Scene {
+impl SceneContext {
     /// The content of the present of a scene.
     pub fn new(world: &TransformerWorld, scene: SceneState<'_>) -> Result<Self, EngineError> {
         let world_from_scene = scene.ego_now().state.pose;
@@ -126,24 +126,24 @@ impl Scene {
             .encode(&map, &frames, ego, world_from_scene, &identities);
         let (sequence, _) = encoded.sequence.fit(world.longest_frame());
         let raster = rasterize(world.network().raster_spec(), &view, world_from_scene);
-        let survey = Arc::new(Survey::new(&map, world_from_scene));
+        let lane_map = Arc::new(LaneMap::new(&map, world_from_scene));
         let memory = world
             .network()
-            .look(std::slice::from_ref(&raster), vec![Arc::clone(&survey)])?;
+            .look(std::slice::from_ref(&raster), vec![Arc::clone(&lane_map)])?;
         Ok(Self {
             world_from_scene,
             ego,
             identities,
             memory: match world.engine() {
                 Some(engine) => Memory::Packed(engine.remember(&memory)?),
-                None => Memory::Plain(memory),
+                None => Memory::Reference(memory),
             },
-            prefix: Context::default(),
+            prefix: KvCache::default(),
             history: sequence.frames().to_vec(),
             lights: encoded.lights,
             recent,
             map,
-            survey,
+            lane_map,
             route,
             grounds: Default::default(),
             entries: Default::default(),
@@ -157,8 +157,8 @@ impl Scene {
     }
 
     /// The frame in which the chunk at a key of the present is expressed.
-    pub fn anchor(&self, key: &PlacedSlot, config: &ModelConfig) -> LocalFrame {
-        let last = key.last_pose().filter(|_| config.anchored);
+    pub fn local_frame(&self, key: &PlacedSlot, config: &ModelConfig) -> LocalFrame {
+        let last = key.last_pose().filter(|_| config.local_frame);
         last.map_or(LocalFrame::SCENE, LocalFrame::at)
     }
 

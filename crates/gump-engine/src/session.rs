@@ -11,11 +11,11 @@ use rayon::prelude::*;
 
 use crate::EngineError;
 use crate::cpu::SceneMemory;
-use crate::decode::{Step, Window, present_all};
+use crate::partial_ar::{Step, Window, present_all};
 use crate::predictive_samples::Seen;
 use crate::reference::{Passes, decode};
-use crate::rollout_state::Future;
-use crate::scene::Scene;
+use crate::rollout_state::RolloutState;
+use crate::scene::SceneContext;
 use crate::world::TransformerWorld;
 
 /// An ego farther than this from the origin of its scene gets a new scene around it, metres.
@@ -27,8 +27,8 @@ const RECENTRE_ALIVE_M: f64 = 20.0;
 
 pub(crate) struct TransformerSession<'a> {
     pub(crate) world: &'a TransformerWorld,
-    pub(crate) scenes: Vec<Scene>,
-    pub(crate) futures: Vec<Future>,
+    pub(crate) scenes: Vec<SceneContext>,
+    pub(crate) futures: Vec<RolloutState>,
     /// Settings of predictive samples, and those recorded.
     pub(crate) probe: ProbeConfig,
     pub(crate) samples: Vec<PredictiveSamples>,
@@ -60,7 +60,7 @@ impl Session for TransformerSession<'_> {
                 future.window(scene, self.world, ego.map(|states| states[i]))
             })
             .collect();
-        if sampling.life {
+        if sampling.spawn {
             self.before_decoding(&mut windows)?;
         }
         let decoded = self.decode(&windows)?;
@@ -70,7 +70,7 @@ impl Session for TransformerSession<'_> {
             let ego = ego.map(|states| states[i]);
             frames.push(self.futures[i].commit(window, &bins, scene, self.world, ego));
         }
-        if sampling.life {
+        if sampling.spawn {
             self.after_decoding(&mut frames)?;
         }
         Ok(frames)
@@ -96,7 +96,7 @@ impl Session for TransformerSession<'_> {
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
         let index = self.scenes.len();
-        let mut scene = Scene::new(self.world, start.scene)?;
+        let mut scene = SceneContext::new(self.world, start.scene)?;
         let mut fresh = self.world.futures(index, &mut scene, 1, start.seed)?;
         self.scenes.push(scene);
         self.futures[future] = fresh.pop().expect("one future was asked for");
@@ -110,14 +110,14 @@ impl TransformerSession<'_> {
     #[cfg(test)]
     pub(crate) fn forget(&mut self) {
         for future in &mut self.futures {
-            future.context = crate::cpu::Context::default();
+            future.kv_cache = crate::cpu::KvCache::default();
         }
     }
 
     /// Gives every future whose ego nears the edge of its window a new scene around the ego's
     /// present, with map and tokens; such a future no longer shares its visual memory with others.
     fn recentre(&mut self) -> Result<(), EngineError> {
-        let reach = match self.world.sampling().life {
+        let reach = match self.world.sampling().spawn {
             true => RECENTRE_ALIVE_M,
             false => RECENTRE_M,
         };
@@ -128,7 +128,7 @@ impl TransformerSession<'_> {
         let around = |i: &usize| {
             let future = &self.futures[*i];
             let from = &self.scenes[future.scene];
-            Scene::of_window(
+            SceneContext::of_window(
                 self.world,
                 Arc::clone(&from.map),
                 from.route.clone(),
@@ -137,7 +137,7 @@ impl TransformerSession<'_> {
                 future.identities.clone(),
             )
         };
-        let scenes: Vec<Scene> = far.par_iter().map(around).collect::<Result<_, _>>()?;
+        let scenes: Vec<SceneContext> = far.par_iter().map(around).collect::<Result<_, _>>()?;
         for (i, to) in far.into_iter().zip(scenes) {
             let index = self.scenes.len();
             let future = &mut self.futures[i];
@@ -153,7 +153,10 @@ impl TransformerSession<'_> {
         let (network, sampling) = (self.world.network(), self.world.sampling());
         let placed = present_all(windows, network.config().block_size)?;
         let Some(engine) = self.world.engine() else {
-            let memories = self.scenes.iter().filter_map(|scene| scene.memory.plain());
+            let memories = self
+                .scenes
+                .iter()
+                .filter_map(|scene| scene.memory.reference());
             let memories: Vec<&VisualMemory> = memories.collect();
             let passes = Passes::new(network, sampling, &memories);
             let decoded = decode(&passes, windows, &placed);
@@ -162,7 +165,7 @@ impl TransformerSession<'_> {
         };
         let memories = self.scenes.iter().filter_map(|scene| scene.memory.packed());
         let memories: Vec<&SceneMemory> = memories.collect();
-        let mut contexts: Vec<_> = self.futures.iter_mut().map(|f| &mut f.context).collect();
+        let mut kv_caches: Vec<_> = self.futures.iter_mut().map(|f| &mut f.kv_cache).collect();
         let step = Step {
             engine,
             sampling,
@@ -171,9 +174,9 @@ impl TransformerSession<'_> {
             placed,
             watch: self.probe,
         };
-        let decoded = step.decode(&mut contexts);
+        let decoded = step.decode(&mut kv_caches);
         self.world.count_passes(decoded.passes);
-        let kept = contexts.iter().map(|context| context.bytes()).sum();
+        let kept = kv_caches.iter().map(|kv_cache| kv_cache.bytes()).sum();
         self.world.note_context_bytes(kept);
         let seen = decoded.seen.iter();
         let samples: Vec<_> = seen

@@ -9,7 +9,7 @@
 //! ego, or where a lane begins at the end of the map, and leave likewise, away from the ego. An
 //! uncertain network assigns arrivals and departures to all agents, and training samples contain
 //! false ones where they leave agents out. [`RateScale`](crate::RateScale) scales the rates of
-//! arrivals and of changes of lights. `SamplingConfig::life` switches spawning on; benchmarks with
+//! arrivals and of changes of lights. `SamplingConfig::spawn` switches spawning on; benchmarks with
 //! given agents leave it off.
 
 mod lights;
@@ -27,15 +27,15 @@ use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 
 use crate::EngineError;
-use crate::cpu::{Context, Engine, Job};
-use crate::decode::{Window, present_all};
+use crate::cpu::{Engine, Job, KvCache};
 use crate::nucleus::uniform;
+use crate::partial_ar::{Window, present_all};
 use crate::placement::births::{BEGIN_AT, next_key, stays};
 use crate::placement::object_spec::{ObjectSpec, agent_of};
 use crate::placement::rules::{Manner, Rules, box_of, state_of};
 use crate::request::Request;
-use crate::rollout_state::{Future, stream};
-use crate::scene::Scene;
+use crate::rollout_state::{RolloutState, stream};
+use crate::scene::SceneContext;
 use crate::session::TransformerSession;
 use crate::temporal_ensemble::ChunkBuffer;
 
@@ -63,9 +63,9 @@ impl TransformerSession<'_> {
         };
         let block_size = self.world.network().config().block_size;
         let mut placed = present_all(windows, block_size)?;
-        let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
-        self.draw_lights(engine, windows, &mut placed, &mut contexts);
-        self.despawn(engine, windows, &placed, &mut contexts);
+        let mut kv_caches: Vec<KvCache> = self.futures.iter().map(|f| f.kv_cache.clone()).collect();
+        self.draw_lights(engine, windows, &mut placed, &mut kv_caches);
+        self.despawn(engine, windows, &placed, &mut kv_caches);
         Ok(())
     }
 
@@ -76,7 +76,7 @@ impl TransformerSession<'_> {
         engine: &Engine,
         windows: &mut [Window],
         placed: &[Vec<PlacedSlot>],
-        contexts: &mut [Context],
+        kv_caches: &mut [KvCache],
     ) {
         let members: Vec<usize> = (0..windows.len())
             .filter(|w| windows[*w].next.tracked.len() > 1)
@@ -89,8 +89,8 @@ impl TransformerSession<'_> {
                 (1..n).map(|i| first + 2 * i - 1).collect()
             })
             .collect();
-        let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
-        let mut successors = engine.say(&hidden).into_iter();
+        let hidden = self.run(engine, windows, placed, kv_caches, &members, &wanted);
+        let mut successors = engine.successors(&hidden).into_iter();
         for &w in &members {
             let window = &mut windows[w];
             let scene = &self.scenes[window.scene];
@@ -123,14 +123,14 @@ impl TransformerSession<'_> {
         engine: &Engine,
         windows: &[Window],
         placed: &[Vec<PlacedSlot>],
-        contexts: &mut [Context],
+        kv_caches: &mut [KvCache],
         members: &[usize],
         wanted: &[Vec<usize>],
     ) -> Vec<f32> {
-        let of_members = contexts.iter_mut().enumerate();
+        let of_members = kv_caches.iter_mut().enumerate();
         let mut wanted = members.iter().zip(wanted).peekable();
         let mut jobs = Vec::with_capacity(members.len());
-        for (w, context) in of_members {
+        for (w, kv_cache) in of_members {
             let Some((_, wanted)) = wanted.next_if(|(member, _)| **member == w) else {
                 continue;
             };
@@ -142,7 +142,7 @@ impl TransformerSession<'_> {
                     .memory
                     .packed()
                     .expect("with an engine the memory is the engine's"),
-                context,
+                kv_cache,
                 keep: true,
             });
         }
@@ -160,18 +160,18 @@ impl TransformerSession<'_> {
             *frame = future.without_the_gone(frame, scene);
         }
         let engine = self.world.engine().expect("checked before decoding");
-        let arrivals = self.world.sampling().pace.arrivals;
+        let arrivals = self.world.sampling().spawn_rates.arrivals;
         let mut open: Vec<usize> = (0..self.futures.len()).collect();
-        let mut contexts: Vec<Context> = self.futures.iter().map(|f| f.context.clone()).collect();
+        let mut kv_caches: Vec<KvCache> = self.futures.iter().map(|f| f.kv_cache.clone()).collect();
         for birth in 0..MOST_BIRTHS {
             let before = open.clone();
             let slots: Vec<Vec<PlacedSlot>> = before
                 .iter()
                 .map(|&f| self.futures[f].slots_to_end(&self.scenes[self.futures[f].scene]))
                 .collect::<Result<_, _>>()?;
-            let hidden = self.read(engine, &mut contexts, &before, &slots);
+            let hidden = self.read(engine, &mut kv_caches, &before, &slots);
             let mut coming = Vec::new();
-            for (&f, successor) in before.iter().zip(engine.say(&hidden)) {
+            for (&f, successor) in before.iter().zip(engine.successors(&hidden)) {
                 let future = &mut self.futures[f];
                 let longest = self.world.longest_frame();
                 let seed = future.decision(About::Coming).fork(birth as u64);
@@ -185,7 +185,7 @@ impl TransformerSession<'_> {
                     None => open.retain(|open| *open != f),
                 }
             }
-            self.spawn(engine, &mut contexts, &mut open, coming, frames)?;
+            self.spawn(engine, &mut kv_caches, &mut open, coming, frames)?;
             if open.is_empty() {
                 break;
             }
@@ -197,13 +197,13 @@ impl TransformerSession<'_> {
     fn read(
         &self,
         engine: &Engine,
-        contexts: &mut [Context],
+        kv_caches: &mut [KvCache],
         members: &[usize],
         slots: &[Vec<PlacedSlot>],
     ) -> Vec<f32> {
         let mut of_members = members.iter().zip(slots).peekable();
         let mut jobs = Vec::with_capacity(members.len());
-        for (f, context) in contexts.iter_mut().enumerate() {
+        for (f, kv_cache) in kv_caches.iter_mut().enumerate() {
             let Some((_, slots)) = of_members.next_if(|(member, _)| **member == f) else {
                 continue;
             };
@@ -212,7 +212,7 @@ impl TransformerSession<'_> {
                 slots,
                 wanted: vec![slots.len() - 1],
                 memory: memory.expect("with an engine the memory is the engine's"),
-                context,
+                kv_cache,
                 keep: true,
             });
         }
@@ -227,7 +227,7 @@ impl TransformerSession<'_> {
     fn spawn(
         &mut self,
         engine: &Engine,
-        contexts: &mut [Context],
+        kv_caches: &mut [KvCache],
         open: &mut Vec<usize>,
         coming: Vec<(usize, AgentKind, Seed)>,
         frames: &mut [Frame],
@@ -255,7 +255,7 @@ impl TransformerSession<'_> {
                 future.slots_to_key(*key, &self.scenes[future.scene])
             })
             .collect::<Result<_, _>>()?;
-        let hidden = self.read(engine, contexts, &members, &slots);
+        let hidden = self.read(engine, kv_caches, &members, &slots);
         let width = self.world.network().config().width;
         for ((f, key, agent, seed), hidden) in arriving.into_iter().zip(hidden.chunks(width)) {
             let future = &mut self.futures[f];
@@ -263,7 +263,7 @@ impl TransformerSession<'_> {
             let rules = Arc::new(future.rules(key.kind, scene));
             let requests: Vec<Request> = (0..TRIES)
                 .map(|i| Request {
-                    anchor: LocalFrame::SCENE,
+                    local_frame: LocalFrame::SCENE,
                     forced: [None; STEPS.len()],
                     stream: seed.fork(3).fork(i),
                     near: None,
@@ -328,7 +328,7 @@ fn first_slot(window: &Window, slots: &[PlacedSlot]) -> usize {
     slots.len() - 2 * window.next.tracked.len() - window.next.lights.len() - 2
 }
 
-impl Future {
+impl RolloutState {
     /// Seed of the decisions of one kind in the frame in progress.
     fn decision(&self, about: About) -> Seed {
         stream(self.seed, self.index, 0).fork(about as u64)
@@ -336,7 +336,7 @@ impl Future {
 
     /// The frame without the agents whose tokens were removed, with its lights as drawn; their ids
     /// are free once no frame of the window has them.
-    fn without_the_gone(&mut self, frame: &Frame, scene: &Scene) -> Frame {
+    fn without_the_gone(&mut self, frame: &Frame, scene: &SceneContext) -> Frame {
         let n = self.frames.len();
         let ids = |frame: Option<&TokenFrame>| -> BTreeSet<u16> {
             let agents = frame.into_iter().flat_map(TokenFrame::agents);
@@ -375,7 +375,7 @@ impl Future {
     }
 
     /// All slots of the window, the present frame included, up to where a new agent may come.
-    fn slots_to_end(&self, scene: &Scene) -> Result<Vec<PlacedSlot>, EngineError> {
+    fn slots_to_end(&self, scene: &SceneContext) -> Result<Vec<PlacedSlot>, EngineError> {
         let sequence = TokenSequence::new(Vec::new(), self.frames.clone());
         let sequence = sequence.map_err(EngineError::Grammar)?;
         let exact = self.exact(scene);
@@ -383,7 +383,7 @@ impl Future {
     }
 
     /// The same with the key of a new agent after them.
-    fn slots_to_key(&self, key: Key, scene: &Scene) -> Result<Vec<PlacedSlot>, EngineError> {
+    fn slots_to_key(&self, key: Key, scene: &SceneContext) -> Result<Vec<PlacedSlot>, EngineError> {
         let mut frames = self.frames.clone();
         let now = frames.last_mut().expect("a future has a present");
         now.newborn.push(TokenAgent {
@@ -400,7 +400,7 @@ impl Future {
 
     /// The constraints of a new agent: positions where lanes or walkways enter the window, clear of
     /// all agents.
-    fn rules(&self, kind: AgentKind, scene: &Scene) -> Rules {
+    fn rules(&self, kind: AgentKind, scene: &SceneContext) -> Rules {
         let now = self.frames.last().into_iter().flat_map(TokenFrame::agents);
         let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();
         let ego = self.frames.last().and_then(|frame| frame.tracked.first());

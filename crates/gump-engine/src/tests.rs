@@ -14,7 +14,7 @@ use gump_rollout::{Start, WorldModel};
 use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
 use gump_tokenizer::Slot;
 
-use crate::decode::{Window, present_all};
+use crate::partial_ar::{Window, present_all};
 use crate::reference::{Passes, decode};
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
@@ -456,7 +456,7 @@ fn window(scenario: &Scenario) -> Window {
     };
     let next = history[history.len() - 1].clone();
     let request = |(i, _)| Request {
-        anchor: LocalFrame::SCENE,
+        local_frame: LocalFrame::SCENE,
         forced: [None; STEPS.len()],
         stream: Seed(i as u64),
         near: None,
@@ -472,7 +472,7 @@ fn window(scenario: &Scenario) -> Window {
         exact: Default::default(),
         next,
         requests,
-        survey: Arc::default(),
+        lane_map: Arc::default(),
     }
 }
 
@@ -624,7 +624,7 @@ fn trajectory_heads_predict_every_agent_of_the_window() {
         Network::random(config, Seed(3), &Device::Cpu).unwrap()
     };
     let last = network().config().layers - 1;
-    let plain = TransformerWorld::plain(with(vec![0, last]), SamplingConfig::default());
+    let plain = TransformerWorld::reference(with(vec![0, last]), SamplingConfig::default());
     let predicted = plain.predict_trajectories(scenario.present()).unwrap();
     let present = scenario.present();
     let agents = present.now().agents().iter();
@@ -642,7 +642,7 @@ fn trajectory_heads_predict_every_agent_of_the_window() {
     let engine = TransformerWorld::new(with(vec![0, last]), SamplingConfig::default());
     let same = engine.predict_trajectories(scenario.present()).unwrap();
     assert_eq!(same, predicted);
-    let none = TransformerWorld::plain(with(vec![]), SamplingConfig::default());
+    let none = TransformerWorld::reference(with(vec![]), SamplingConfig::default());
     let error = none.predict_trajectories(scenario.present()).unwrap_err();
     assert!(error.to_string().contains("no trajectory heads"), "{error}");
 }

@@ -12,7 +12,7 @@ use gump_scene::{AgentId, SceneState};
 use gump_tokenizer::Slot;
 
 use crate::EngineError;
-use crate::scene::Scene;
+use crate::scene::SceneContext;
 use crate::world::TransformerWorld;
 
 /// The predicted futures of an agent.
@@ -51,7 +51,7 @@ impl TransformerWorld {
         let Some(head) = network.trajectory_heads.last() else {
             return Err(EngineError::NoTrajectoryHeads);
         };
-        let scene = Scene::new(self, scene)?;
+        let scene = SceneContext::new(self, scene)?;
         let slots = scene.slots()?;
         let last = scene.history.len() - 1;
         let agents: Vec<Present> = slots
@@ -67,7 +67,7 @@ impl TransformerWorld {
             .collect();
         // The engine keeps the map in another form, without the features that heads read.
         let encoded;
-        let memory = match scene.memory.plain() {
+        let memory = match scene.memory.reference() {
             Some(memory) => memory,
             None => {
                 let view = SceneState {
@@ -78,7 +78,7 @@ impl TransformerWorld {
                     dt: TOKEN_DT,
                 };
                 let raster = rasterize(network.raster_spec(), &view, scene.world_from_scene);
-                encoded = network.look(&[raster], vec![Arc::clone(&scene.survey)])?;
+                encoded = network.look(&[raster], vec![Arc::clone(&scene.lane_map)])?;
                 &encoded
             }
         };

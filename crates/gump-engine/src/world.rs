@@ -2,15 +2,14 @@
 //!
 //! A session stores, per scene, the frame of reference, the identities and the visual memory, which
 //! all its futures share (`scene`); and per future, the token frames of its window, the chunks of
-//! every agent and the present in world coordinates (`rollout_state`). `decode` turns windows into
-//! new states; `session` advances step by step.
+//! every agent and the present in world coordinates (`rollout_state`). `partial_ar` turns windows
+//! into new states; `session` advances step by step.
 //!
 //! Agents outside the token window, of kinds that are not predicted, or beyond the vocabulary
 //! continue with constant velocity, so that every agent of the present stays for the whole future;
 //! one that moves into the window is controlled by the network from then on.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use candle_core::Tensor;
@@ -27,9 +26,9 @@ use crate::EngineError;
 use crate::cpu::{Engine, Job};
 use crate::reference::sample_states;
 use crate::request::Request;
-use crate::rollout_state::{Future, stream};
+use crate::rollout_state::{RolloutState, stream};
 use crate::sampling::SamplingConfig;
-use crate::scene::{Memory, Scene};
+use crate::scene::{Memory, SceneContext};
 use crate::session::TransformerSession;
 use crate::spawning::Phases;
 use crate::temporal_ensemble::{Chunk, ChunkBuffer};
@@ -56,13 +55,13 @@ impl TransformerWorld {
         });
         Self {
             engine,
-            ..Self::plain(network, sampling)
+            ..Self::reference(network, sampling)
         }
     }
 
     /// A world that always uses the tensor library's operations: slower on a CPU, and the reference
     /// for tests of the engine.
-    pub fn plain(network: Network, sampling: SamplingConfig) -> Self {
+    pub fn reference(network: Network, sampling: SamplingConfig) -> Self {
         Self {
             network,
             sampling,
@@ -141,15 +140,19 @@ impl TransformerWorld {
         let mut distinct: Vec<SceneState<'_>> = Vec::new();
         let mut scene_of = Vec::with_capacity(starts.len());
         for start in starts {
-            let known = distinct.iter().position(|seen| is_same(seen, &start.scene));
+            let known = distinct
+                .iter()
+                .position(|seen: &SceneState<'_>| seen.is_same_scene(&start.scene));
             scene_of.push(known.unwrap_or(distinct.len()));
             if known.is_none() {
                 distinct.push(start.scene);
             }
         }
-        let scenes = distinct.par_iter().map(|scene| Scene::new(self, *scene));
-        let mut scenes: Vec<Scene> = scenes.collect::<Result<_, _>>()?;
-        let mut futures: Vec<Vec<Future>> = Vec::with_capacity(starts.len());
+        let scenes = distinct
+            .par_iter()
+            .map(|scene| SceneContext::new(self, *scene));
+        let mut scenes: Vec<SceneContext> = scenes.collect::<Result<_, _>>()?;
+        let mut futures: Vec<Vec<RolloutState>> = Vec::with_capacity(starts.len());
         for (i, start) in starts.iter().enumerate() {
             let (scene, n) = (scene_of[i], start.n_futures);
             let like = |j: &usize| {
@@ -174,17 +177,17 @@ impl TransformerWorld {
     pub(crate) fn futures(
         &self,
         scene: usize,
-        shared: &mut Scene,
+        shared: &mut SceneContext,
         n: usize,
         seed: Seed,
-    ) -> Result<Vec<Future>, EngineError> {
+    ) -> Result<Vec<RolloutState>, EngineError> {
         let chunks = self.first_chunks(shared, n, seed)?;
         let last = shared
             .history
             .last()
             .map_or(0, |_| shared.history.len() - 1);
         let future = |(k, rings): (usize, Vec<(u16, Chunk)>)| {
-            let mut future = Future {
+            let mut future = RolloutState {
                 scene,
                 seed: seed.fork(k as u64),
                 frames: shared.history.clone(),
@@ -194,7 +197,7 @@ impl TransformerWorld {
                 recent: shared.recent.clone(),
                 identities: shared.identities.clone(),
                 phases: Phases::default(),
-                context: shared.prefix.clone(),
+                kv_cache: shared.prefix.clone(),
             };
             for (id, chunk) in rings {
                 future.rings.entry(id).or_default().push(last, chunk);
@@ -208,7 +211,7 @@ impl TransformerWorld {
     /// frame's keys foresee: the chunks that the first surrogates come from.
     fn first_chunks(
         &self,
-        scene: &mut Scene,
+        scene: &mut SceneContext,
         n: usize,
         seed: Seed,
     ) -> Result<Vec<Vec<(u16, Chunk)>>, EngineError> {
@@ -219,19 +222,22 @@ impl TransformerWorld {
             .windows(2)
             .enumerate()
             .filter_map(|(i, pair)| match (pair[0].slot, pair[1].slot) {
-                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => {
-                    Some((i, key.id, state, scene.anchor(&pair[0], network.config())))
-                }
+                (Slot::Key(key), Slot::Value(state)) if pair[0].frame == last => Some((
+                    i,
+                    key.id,
+                    state,
+                    scene.local_frame(&pair[0], network.config()),
+                )),
                 _ => None,
             })
             .collect();
         let requests: Vec<Request> = (0..n)
             .flat_map(|k| keys.iter().map(move |key| (k, key)))
-            .map(|(k, (_, id, state, anchor))| {
+            .map(|(k, (_, id, state, local_frame))| {
                 let is = scene.present(*id).unwrap_or(state.to_agent_state());
                 Request {
-                    anchor: *anchor,
-                    forced: anchor.bins(*state, [Some(is), None, None, None]),
+                    local_frame: *local_frame,
+                    forced: local_frame.bins(*state, [Some(is), None, None, None]),
                     stream: stream(seed.fork(k as u64), last, *id),
                     near: None,
                     ring: ChunkBuffer::default(),
@@ -257,7 +263,7 @@ impl TransformerWorld {
         let per_future = |bins: &[Bins]| {
             keys.iter()
                 .zip(bins)
-                .map(|((_, id, _, anchor), b)| (*id, anchor.poses(b)))
+                .map(|((_, id, _, local_frame), b)| (*id, local_frame.poses(b)))
                 .collect()
         };
         Ok(bins.chunks(keys.len().max(1)).map(per_future).collect())
@@ -267,7 +273,7 @@ impl TransformerWorld {
     /// cache that futures continue from.
     fn read_history(
         &self,
-        scene: &mut Scene,
+        scene: &mut SceneContext,
         slots: &[PlacedSlot],
         places: Vec<usize>,
     ) -> Result<Vec<f32>, EngineError> {
@@ -277,11 +283,11 @@ impl TransformerWorld {
                 slots,
                 wanted: places,
                 memory,
-                context: &mut scene.prefix,
+                kv_cache: &mut scene.prefix,
                 keep: true,
             }]));
         }
-        let memory = scene.memory.plain();
+        let memory = scene.memory.reference();
         let memory = memory.expect("without an engine the memory is the tensor library's");
         let batch = self.network.pack(&[slots], 0, memory)?;
         let features = self.network.mct.forward(&batch, memory, None, None)?;
@@ -297,7 +303,7 @@ impl TransformerWorld {
     /// # Errors
     /// A scene that cannot be tokenised, or errors of the tensor library.
     pub fn probe(&self, scene: SceneState<'_>) -> Result<Vec<f32>, EngineError> {
-        let mut scene = Scene::new(self, scene)?;
+        let mut scene = SceneContext::new(self, scene)?;
         let slots = scene.slots()?;
         let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
         let key = key.expect("the ego is in every frame of the window");
@@ -311,15 +317,6 @@ impl TransformerWorld {
         values.extend(logits.flatten_all()?.to_vec1::<f32>()?);
         Ok(values)
     }
-}
-
-/// True if two views have the same frames and the same map.
-fn is_same(a: &SceneState<'_>, b: &SceneState<'_>) -> bool {
-    let route = |scene: &SceneState<'_>| scene.route.map(Arc::as_ptr);
-    Arc::ptr_eq(a.map, b.map)
-        && std::ptr::eq(a.history, b.history)
-        && route(a) == route(b)
-        && (a.ego, a.dt) == (b.ego, b.dt)
 }
 
 impl WorldModel for TransformerWorld {

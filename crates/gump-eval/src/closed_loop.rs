@@ -45,7 +45,8 @@ pub struct ClosedLoopSettings {
     /// Length of the drives and controller, as JSON.
     pub driving: String,
     /// Settings of planners with rollouts, as JSON.
-    pub thinking: String,
+    #[serde(rename = "thinking", alias = "imagining")]
+    pub imagining: String,
     /// Sampling of learned worlds, as JSON.
     pub sampling: String,
     /// The seed, in decimal digits.
@@ -111,6 +112,7 @@ pub trait PlannerFactory: Sync {
 
 /// A planner to evaluate.
 #[derive(Clone, Copy)]
+#[non_exhaustive]
 pub enum EvaluatedPlanner<'a> {
     /// One of ours; [`PlannerName::Proposals`] stands for every proposal alone.
     Named(PlannerName),

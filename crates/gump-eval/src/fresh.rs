@@ -72,7 +72,7 @@ impl SceneStream {
             return Ok(None);
         };
         let (profile, seed) = rest.split_once(':').unwrap_or((rest, "0"));
-        let profile = profile_of_name(profile).map_err(EvalError::Argument)?;
+        let profile = profile_of_name(profile)?;
         let seed = seed.parse().map_err(|_| {
             EvalError::Argument(format!("expected a whole number as seed in {PREFIX}{rest}"))
         })?;
@@ -100,11 +100,13 @@ impl SceneStream {
 /// The profile of this name.
 ///
 /// # Errors
-/// A sentence that names the profiles that exist.
-pub fn profile_of_name(name: &str) -> Result<Profile, String> {
+/// [`EvalError::Argument`] that names the profiles that exist.
+pub fn profile_of_name(name: &str) -> Result<Profile, EvalError> {
     Profile::of_name(name).ok_or_else(|| {
         let known = Profile::ALL.map(Profile::name).join(", ");
-        format!("expected one of the profiles {known}, found {name:?}")
+        EvalError::Argument(format!(
+            "expected one of the profiles {known}, found {name:?}"
+        ))
     })
 }
 

@@ -74,7 +74,7 @@ impl<'a> PredictionSource<'a> {
         if network.trajectory_heads.is_empty() {
             return Err(without("one without"));
         }
-        let world = TransformerWorld::plain(network, SamplingConfig::default());
+        let world = TransformerWorld::reference(network, SamplingConfig::default());
         Ok(Self(Kind::Heads(Box::new(world))))
     }
 

@@ -30,6 +30,7 @@ use crate::worlds::{World, WorldName};
 
 /// A planner by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum PlannerName {
     /// The recorded driver: an oracle.
     Log,
@@ -205,7 +206,7 @@ impl PlannerConfig {
             hysteresis: self.hysteresis,
             seed,
             replan_every: self.replan_every,
-            worth: self.discount.map_or(ValueEstimate::Rollout, |gamma| {
+            value: self.discount.map_or(ValueEstimate::Rollout, |gamma| {
                 ValueEstimate::DiscountedStep { gamma }
             }),
             budget: PlanBudget {

@@ -5,6 +5,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::EvalError;
+
 /// Part `k` of `n`. Scenarios are assigned in turn, so shards are similar in size and content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
@@ -28,13 +30,15 @@ impl Shard {
     /// shards: `GUMP_SHARDS` does, and it also overrides the count of Slurm.
     ///
     /// # Errors
-    /// A sentence that says which variable is missing or wrong.
-    pub fn of_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Self, String> {
+    /// [`EvalError::Argument`] that says which variable is missing or wrong.
+    pub fn of_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Self, EvalError> {
         let number = |name: &str| {
             let text = variable(name).filter(|text| !text.is_empty());
             let parsed = text.map(|text| {
                 let wrong = format!("expected a number in {name}, found \"{text}\"");
-                text.trim().parse::<usize>().map_err(|_| wrong)
+                text.trim()
+                    .parse::<usize>()
+                    .map_err(|_| EvalError::Argument(wrong))
             });
             parsed.transpose()
         };
@@ -58,19 +62,22 @@ impl Shard {
             (Some(found), ..) | (None, Some(found), _) => found,
             (None, None, Some(index)) => (index, None),
             (None, None, None) => {
-                return Err("expected SLURM_ARRAY_TASK_ID, SLURM_PROCID or \
-                            JOB_COMPLETION_INDEX for auto, found none of them"
-                    .into());
+                let wrong = "expected SLURM_ARRAY_TASK_ID, SLURM_PROCID or \
+                             JOB_COMPLETION_INDEX for auto, found none of them";
+                return Err(EvalError::Argument(wrong.into()));
             }
         };
         let n = match number("GUMP_SHARDS")?.or(known) {
             Some(n) => n,
-            None => return Err("expected the number of shards in GUMP_SHARDS, found none".into()),
+            None => {
+                let wrong = "expected the number of shards in GUMP_SHARDS, found none";
+                return Err(EvalError::Argument(wrong.into()));
+            }
         };
         if index >= n {
-            return Err(format!(
+            return Err(EvalError::Argument(format!(
                 "expected fewer than {n} shards counted from 0, found number {index}"
-            ));
+            )));
         }
         Ok(Self { k: index + 1, n })
     }
@@ -82,21 +89,27 @@ impl Shard {
 }
 
 impl FromStr for Shard {
-    type Err = String;
+    type Err = EvalError;
 
-    fn from_str(text: &str) -> Result<Self, String> {
+    /// Reads `K/N`.
+    ///
+    /// # Errors
+    /// [`EvalError::Argument`] unless K is from 1 to N.
+    fn from_str(text: &str) -> Result<Self, EvalError> {
         let parts = text.split_once('/');
         match parts.map(|(k, n)| (k.parse(), n.parse())) {
             Some((Ok(k), Ok(n))) if 1 <= k && k <= n => Ok(Self { k, n }),
-            _ => Err("expected K/N with K from 1 to N, like 2/8".into()),
+            _ => Err(EvalError::Argument(
+                "expected K/N with K from 1 to N, like 2/8".into(),
+            )),
         }
     }
 }
 
 impl TryFrom<String> for Shard {
-    type Error = String;
+    type Error = EvalError;
 
-    fn try_from(text: String) -> Result<Self, String> {
+    fn try_from(text: String) -> Result<Self, EvalError> {
         text.parse()
     }
 }
@@ -133,7 +146,8 @@ mod tests {
                 let value = set.iter().find(|(known, _)| *known == name);
                 value.map(|(_, value)| (*value).to_owned())
             });
-            found.map(|shard| shard.to_string())
+            let written = found.map(|shard| shard.to_string());
+            written.map_err(|error| error.to_string())
         };
         let array = [
             ("SLURM_ARRAY_TASK_ID", "7"),

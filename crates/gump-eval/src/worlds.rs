@@ -19,6 +19,7 @@ use crate::EvalError;
 
 /// A world by name.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum WorldName {
     /// The recording: an oracle.
     Log,
@@ -31,9 +32,14 @@ pub enum WorldName {
 }
 
 impl FromStr for WorldName {
-    type Err = String;
+    type Err = EvalError;
 
-    fn from_str(name: &str) -> Result<Self, String> {
+    /// Reads `log`, `idm`, `constant-velocity` or `model:WEIGHTS`; a path of weights alone is that
+    /// model.
+    ///
+    /// # Errors
+    /// [`EvalError::Argument`], with a suggestion where the name looks like a path.
+    fn from_str(name: &str) -> Result<Self, EvalError> {
         match name {
             "log" => Ok(Self::Log),
             "idm" => Ok(Self::Idm),
@@ -42,7 +48,7 @@ impl FromStr for WorldName {
                 Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
                 // No other world has such a name, so the meaning is clear.
                 None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
-                _ => Err(no_world(name)),
+                _ => Err(EvalError::Argument(no_world(name))),
             },
         }
     }
@@ -72,13 +78,13 @@ const WEIGHTS: &str = ".safetensors";
 /// A file of weights, given by its path or by the name of a world.
 ///
 /// # Errors
-/// A world without weights.
-pub fn weights(name: &str) -> Result<PathBuf, String> {
+/// [`EvalError::Argument`] if it is a world without weights.
+pub fn weights(name: &str) -> Result<PathBuf, EvalError> {
     match name.parse() {
         Ok(WorldName::Model(path)) => Ok(path),
-        Ok(world) => Err(format!(
+        Ok(world) => Err(EvalError::Argument(format!(
             "expected a file of weights, found the world {world}"
-        )),
+        ))),
         Err(_) => Ok(name.into()),
     }
 }
@@ -111,6 +117,7 @@ impl Serialize for WorldName {
 }
 
 /// A world that is ready to simulate.
+#[non_exhaustive]
 pub enum World {
     /// A rule-based world.
     Rule(Box<dyn WorldModel>),
@@ -168,8 +175,12 @@ impl World {
                 LightSource::Model => LightControl::Signals,
                 LightSource::Hold => LightControl::Hold,
                 LightSource::Log => recorded(),
+                other => {
+                    let wrong = format!("expected lights of model, hold or log, found {other}");
+                    return Err(EvalError::Argument(wrong));
+                }
             },
-            arrivals: sampling.life.then(Arrivals::default),
+            arrivals: sampling.spawn.then(Arrivals::default),
         };
         Ok(match name {
             WorldName::Log => {
@@ -203,6 +214,16 @@ impl World {
             Self::Rule(world) => &**world,
             Self::Learned(world) => &**world,
             Self::Relative(world) => &**world,
+        }
+    }
+
+    /// The world model, to be shared.
+    #[must_use]
+    pub fn into_model(self) -> Arc<dyn WorldModel> {
+        match self {
+            Self::Rule(world) => world.into(),
+            Self::Learned(world) => Arc::<TransformerWorld>::from(world),
+            Self::Relative(world) => Arc::<Living<RelativeWorld>>::from(world),
         }
     }
 
@@ -271,7 +292,7 @@ mod tests {
         }
         let bare: WorldName = "a/b.safetensors".parse().unwrap();
         assert_eq!(bare.to_string(), "model:a/b.safetensors");
-        let other = "a/b.bin".parse::<WorldName>().unwrap_err();
+        let other = "a/b.bin".parse::<WorldName>().unwrap_err().to_string();
         assert!(
             other.ends_with("for weights in a file: model:a/b.bin"),
             "{other}"

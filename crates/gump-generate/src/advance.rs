@@ -38,7 +38,7 @@ pub(crate) fn advance(
     }
     let asking: Vec<bool> = open.iter().map(|partial| partial.asks()).collect();
     let hidden = read(world, engine, &mut open, |i| asking[i].then_some(None))?;
-    let mut successors = engine.say(&hidden).into_iter();
+    let mut successors = engine.successors(&hidden).into_iter();
     let mut keys = Vec::with_capacity(open.len());
     for (partial, asks) in open.iter_mut().zip(&asking) {
         let successor = if *asks { successors.next() } else { None };
@@ -97,7 +97,7 @@ fn read(
                 slots,
                 wanted: vec![slots.len() - 1],
                 memory: partial.prepared.memory(),
-                context: &mut partial.context,
+                kv_cache: &mut partial.kv_cache,
                 keep: true,
             })
         })
@@ -182,7 +182,7 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
         .stream(2 * query.partial.agents.len() as u64 + 2);
     let rules = Arc::clone(&query.rules);
     Request {
-        anchor: LocalFrame::SCENE,
+        local_frame: LocalFrame::SCENE,
         forced: query.partial.given(query.key),
         stream: stream.fork(attempt as u64),
         near: None,

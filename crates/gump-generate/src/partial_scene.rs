@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use gump_engine::cpu::{Context, Successor};
+use gump_engine::cpu::{KvCache, Successor};
 use gump_engine::placement::births;
 use gump_engine::placement::births::NEWBORN_AT;
 use gump_engine::placement::object_spec::{Bounds, ObjectSpec, agent_of};
@@ -30,7 +30,7 @@ pub(crate) struct PartialScene<'a> {
     keys: VecDeque<Key>,
     /// Objects with constraints still to come, in canonical order.
     wished: VecDeque<&'a ObjectSpec>,
-    pub(super) context: Context,
+    pub(super) kv_cache: KvCache,
     pub(super) outcome: Option<Result<(), GenerateError>>,
 }
 
@@ -46,7 +46,7 @@ impl<'a> PartialScene<'a> {
             named: BTreeMap::new(),
             keys: VecDeque::new(),
             wished: VecDeque::new(),
-            context: Context::default(),
+            kv_cache: KvCache::default(),
             outcome: None,
         };
         partial.begin();

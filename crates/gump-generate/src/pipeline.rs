@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use crate::check::{Clause, check_clauses, through_time};
 use crate::prompt::PromptSpec;
-use crate::search::{Search, any_start};
+use crate::prompt_search::{Search, any_start};
 use crate::site::Site;
 use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, futures, generate};
 
@@ -22,7 +22,7 @@ use crate::{GenerateError, GenerateRequest, GeneratedScene, Placement, futures, 
 /// request.
 const FURTHER: usize = 3;
 
-/// A job of the factory.
+/// A job of the pipeline.
 #[derive(Clone, Debug)]
 pub struct GenerationJob {
     /// The request of every scene.

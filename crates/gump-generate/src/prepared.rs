@@ -8,7 +8,7 @@ use gump_engine::cpu::SceneMemory;
 use gump_engine::placement::ground::Ground;
 use gump_engine::placement::object_spec::{ObjectSpec, agent_of};
 use gump_engine::placement::rules::{Manner, Rules};
-use gump_engine::scene::Scene;
+use gump_engine::scene::SceneContext;
 use gump_engine::{EngineError, SamplingConfig, TransformerWorld};
 use gump_geometry::OrientedBox;
 use gump_model::placed_slot::{PlacedSlot, place};
@@ -23,7 +23,7 @@ use crate::{GenerateError, GenerateRequest, Placement, constraint};
 /// Data shared by all scenes of a request.
 pub(crate) struct Prepared<'a> {
     pub(super) request: &'a GenerateRequest,
-    pub(super) scene: Scene,
+    pub(super) scene: SceneContext,
     prompts: Vec<Option<ScenarioTag>>,
     /// With relations stored on both sides.
     pub(super) objects: Vec<ObjectSpec>,
@@ -101,7 +101,7 @@ impl<'a> Prepared<'a> {
             objects.filter(move |o| o.id != EGO && o.class.kind() == kind)
         };
         let config = &self.request.config;
-        let asked = match &self.request.counts {
+        let requested = match &self.request.counts {
             None => {
                 let n: usize = AgentKind::MOVING
                     .map(|kind| wished(kind).count())
@@ -124,9 +124,9 @@ impl<'a> Prepared<'a> {
         };
         let fixed = 3 + 2 + self.prompts.len() + self.scene.history[0].lights.len();
         let room = world.longest_frame().saturating_sub(fixed) / 2;
-        let most = room.min(*AGENT_KEYS.end() as usize);
-        if asked > most {
-            return Err(GenerateError::TooMany { asked, most });
+        let max = room.min(*AGENT_KEYS.end() as usize);
+        if requested > max {
+            return Err(GenerateError::TooMany { requested, max });
         }
         Ok(())
     }
@@ -219,7 +219,10 @@ impl<'a> Prepared<'a> {
 }
 
 /// The map with only the ego, as the network sees it.
-fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<Scene, EngineError> {
+fn scene_of_ego(
+    world: &TransformerWorld,
+    request: &GenerateRequest,
+) -> Result<SceneContext, EngineError> {
     if world.engine().is_none() {
         let what = "scenes are generated";
         return Err(EngineError::NotOnCpu { what });
@@ -236,7 +239,7 @@ fn scene_of_ego(world: &TransformerWorld, request: &GenerateRequest) -> Result<S
     let frame = Frame::new(agents, request.lights.clone());
     let identities = Identities::ranked(&[&frame], id, start.pose);
     let map = Arc::clone(&request.map);
-    Scene::of_window(world, map, None, vec![frame], id, identities)
+    SceneContext::of_window(world, map, None, vec![frame], id, identities)
 }
 
 /// Valid positions on every lane that constraints name.

@@ -1,7 +1,7 @@
 //! Requirements of a prompt in guided placement, beyond the effect of its tokens on the network:
 //! the ego's speed and manoeuvre, agents around it, objects at the roadside.
 //!
-//! This module makes a tag possible; `stage` finds places where it can hold, and `verdict` checks
+//! This module makes a tag possible; `site` finds places where it can hold, and `check` checks
 //! whether it does.
 
 use gump_engine::placement::object_spec::{Bounds, Class, ObjectSpec, Relation};

@@ -1,6 +1,8 @@
 //! Requests for scenes, their results, and generation.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
 use std::sync::Arc;
 
 use gump_engine::placement::object_spec::ObjectSpec;
@@ -8,6 +10,8 @@ use gump_engine::{EngineError, TransformerWorld};
 use gump_geometry::{DVec2, Pose};
 use gump_rollout::BoxError;
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Light, MapGraph, Scenario, ScenarioTag, Seed};
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 use crate::advance;
@@ -193,6 +197,29 @@ pub enum Placement {
     Guided,
 }
 
+impl Placement {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::Free, Self::Guided];
+}
+
+impl fmt::Display for Placement {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Placement {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 /// A generated scene.
 #[derive(Clone, Debug)]
 pub struct GeneratedScene {
@@ -230,6 +257,7 @@ impl GeneratedScene {
 
 /// Why there is no scene.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum GenerateError {
     /// Constraints that contradict themselves, each other or the map.
     #[error("constraints: {0}")]
@@ -247,12 +275,12 @@ pub enum GenerateError {
         prompts: String,
     },
     /// More objects than there are keys or space for.
-    #[error("{asked} objects are more than the {most} that a scene of this model holds")]
+    #[error("{requested} objects are more than the {max} that a scene of this model holds")]
     TooMany {
         /// Number requested.
-        asked: usize,
+        requested: usize,
         /// The maximum.
-        most: usize,
+        max: usize,
     },
     /// No valid state was found for an object.
     #[error(

@@ -321,9 +321,9 @@ fn traffic_lives_where_it_is_let() {
     let scene = &make(&request(Vec::new()), 1)[0];
     let map = fixture::scenario(ROAD).unwrap().map;
     let scenario = scene.scenario("made".into(), &map, &[]);
-    let frames = |life: bool| {
+    let frames = |spawn: bool| {
         let sampling = SamplingConfig {
-            life,
+            spawn,
             ..SamplingConfig::default()
         };
         let world = TransformerWorld::new(network(), sampling);

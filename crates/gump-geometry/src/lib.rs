@@ -34,6 +34,7 @@ mod polygon;
 mod polyline;
 mod pose;
 mod quad;
+mod simplify;
 
 pub use distance::{cross, distance_to_segment, project_on_segment, segments_intersect};
 pub use fast::{LineIndex, PolygonIndex};
@@ -44,5 +45,6 @@ pub use polygon::Polygon;
 pub use polyline::{Polyline, Projection};
 pub use pose::{Pose, angle_difference, interpolate_angle, wrap_angle};
 pub use quad::{Quad, joint, widen};
+pub use simplify::simplify;
 
 pub use glam::{DVec2, DVec3, dvec2, dvec3};

@@ -9,7 +9,7 @@
 //! The history is sent as pickled objects of nuplan-devkit, which open wherever the devkit is
 //! installed.
 //!
-//! ```no_run
+//! ```
 //! use gump_grpc::RemoteDriver;
 //! use gump_nuplan::closed_loop::Driver;
 //!
@@ -44,6 +44,7 @@ const BUFFER: usize = 22;
 
 /// Why a remote planner returned no plan.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum RemoteError {
     /// No planner could be reached.
     #[error("expected a planner at {address}, found none: {what}")]

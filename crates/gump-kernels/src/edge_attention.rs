@@ -40,24 +40,51 @@ impl Edges {
     /// `n_sources`.
     ///
     /// # Errors
-    /// A sentence that describes the mismatch.
-    pub fn check(&self, n_nodes: usize, n_sources: usize) -> Result<(), String> {
+    /// The first mismatch.
+    pub fn check(&self, n_nodes: usize, n_sources: usize) -> Result<(), EdgesError> {
         let ascend = self.offsets.first() == Some(&0) && self.offsets.is_sorted();
         let ends = self.offsets.last().map_or(0, |&end| end as usize);
         if self.n_nodes() != n_nodes || !ascend || ends != self.sources.len() {
-            return Err(format!(
-                "edge attention: {} offsets to {ends} for {n_nodes} nodes and {} edges",
-                self.offsets.len(),
-                self.sources.len()
-            ));
+            return Err(EdgesError::Offsets {
+                n_offsets: self.offsets.len(),
+                ends,
+                n_nodes,
+                n_edges: self.sources.len(),
+            });
         }
-        if let Some(source) = self.sources.iter().find(|&&s| s as usize >= n_sources) {
-            return Err(format!(
-                "edge attention: source {source} is not below {n_sources}"
-            ));
+        if let Some(&found) = self.sources.iter().find(|&&s| s as usize >= n_sources) {
+            return Err(EdgesError::Source { found, n_sources });
         }
         Ok(())
     }
+}
+
+/// Edges that do not fit the nodes and sources they are used with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum EdgesError {
+    /// The offsets are not one more than the nodes, or do not ascend from 0 to the number of edges.
+    #[error(
+        "edge attention: {n_offsets} offsets to {ends} for {n_nodes} nodes and {n_edges} edges"
+    )]
+    Offsets {
+        /// Number of offsets.
+        n_offsets: usize,
+        /// The last offset; 0 without any.
+        ends: usize,
+        /// Number of nodes expected.
+        n_nodes: usize,
+        /// Number of edges.
+        n_edges: usize,
+    },
+    /// An edge from a source that does not exist.
+    #[error("edge attention: source {found} is not below {n_sources}")]
+    Source {
+        /// The source of the edge.
+        found: u32,
+        /// Number of sources.
+        n_sources: usize,
+    },
 }
 
 /// Sizes that all rows share.

@@ -7,7 +7,12 @@
 //! Every element of a product is one chain of fused multiply-adds in the order of the inner index,
 //! whatever the neighbouring rows: a row's bits depend neither on the batch nor on the threads.
 
+use std::fmt;
+use std::str::FromStr;
+
 use rayon::prelude::*;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 use crate::gemm::{Mat, MatMut, Store, Threads};
@@ -37,7 +42,28 @@ pub enum Precision {
     Int8,
 }
 
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Precision {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 impl Precision {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 3] = [Self::F32, Self::Bf16, Self::Int8];
+
     /// Bits a weight takes.
     pub fn bits(self) -> u32 {
         match self {

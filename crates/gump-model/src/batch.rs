@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::embedding::{ROWS_PER_TOKEN, SineKey, SineTables, Tables};
-use crate::local_context::{LocalContext, Survey, encode_local_context, n_numbers};
+use crate::local_context::{LaneMap, LocalContext, encode_local_context, n_numbers};
 use crate::mct::{PLACES, TokenBatch};
 use crate::placed_slot::PlacedSlot;
 
@@ -20,7 +20,7 @@ pub struct Packer {
     sines: SineTables,
     width: usize,
     local_map: bool,
-    surroundings: bool,
+    local_context: bool,
     n_numbers: usize,
     visual_side: usize,
     cell_m: f64,
@@ -34,7 +34,7 @@ impl Packer {
             sines: SineTables::new(config),
             width: config.width,
             local_map: config.local_map,
-            surroundings: config.surroundings,
+            local_context: config.local_context,
             n_numbers: n_numbers(config),
             visual_side: config.visual_side(),
             cell_m: config.visual.metres_per_px * config.visual.encoder.stride() as f64,
@@ -43,23 +43,23 @@ impl Packer {
 
     /// Packs sequences side by side, without their first `from` slots; shorter ones are padded at
     /// the end, where causality hides the padding. The same number of consecutive sequences shares
-    /// each of the `surveys`.
+    /// each of the `lane_maps`.
     pub(crate) fn pack(
         &self,
         sequences: &[&[PlacedSlot]],
         from: usize,
-        surveys: &[Arc<Survey>],
+        lane_maps: &[Arc<LaneMap>],
         device: &Device,
     ) -> candle_core::Result<TokenBatch> {
         let longest = sequences.iter().map(|sequence| sequence.len()).max();
         let t = longest.unwrap_or(0).saturating_sub(from);
         let b = sequences.len();
-        let sharing = b / surveys.len().max(1);
+        let sharing = b / lane_maps.len().max(1);
         let look = |(row, slots): (usize, &&[PlacedSlot])| {
-            if !self.surroundings {
+            if !self.local_context {
                 return Vec::new();
             }
-            let mut seen = encode_local_context(&surveys[row / sharing], slots, from);
+            let mut seen = encode_local_context(&lane_maps[row / sharing], slots, from);
             seen.iter_mut()
                 .for_each(|(at, _)| *at = *at + row * t - from);
             seen
@@ -72,8 +72,8 @@ impl Packer {
         let mut rows: Vec<u32> = Vec::with_capacity(b * t * ROWS_PER_TOKEN);
         let mut sine_positions: Vec<u32> = Vec::new();
         let mut features: Vec<f32> = Vec::new();
-        let mut lookers: Vec<u32> = Vec::new();
-        let mut looker_rows: Vec<u32> = Vec::new();
+        let mut local_map_rows: Vec<u32> = Vec::new();
+        let mut local_map_sequences: Vec<u32> = Vec::new();
         let mut places: [Vec<u32>; PLACES.len()] = Default::default();
         for (row, sequence) in sequences.iter().enumerate() {
             let sequence = &sequence[from.min(sequence.len())..];
@@ -84,8 +84,8 @@ impl Packer {
                     sine_positions.push(flat);
                 }
                 if let Some(seen) = self.cells(placed) {
-                    lookers.push(flat);
-                    looker_rows.push(row as u32);
+                    local_map_rows.push(flat);
+                    local_map_sequences.push(row as u32);
                     for (cells, cell) in places.iter_mut().zip(seen) {
                         cells.push(cell);
                     }
@@ -95,16 +95,16 @@ impl Packer {
                 rows.extend(self.tables.rows(&padding(from + position)));
             }
         }
-        let (n, k) = (sine_positions.len(), lookers.len());
+        let (n, k) = (sine_positions.len(), local_map_rows.len());
         Ok(TokenBatch {
             rows: Tensor::from_vec(rows, (b * t, ROWS_PER_TOKEN), device)?,
             sine_positions: Tensor::from_vec(sine_positions, n, device)?,
             sines: Tensor::from_vec(features, (n, self.width), device)?,
-            lookers: Tensor::from_vec(lookers, k, device)?,
+            local_map_rows: Tensor::from_vec(local_map_rows, k, device)?,
             places,
-            looker_rows,
-            seers: Tensor::from_iter(seen.iter().map(|(at, _)| *at as u32), device)?,
-            surroundings: Tensor::from_vec(
+            local_map_sequences,
+            context_rows: Tensor::from_iter(seen.iter().map(|(at, _)| *at as u32), device)?,
+            local_context: Tensor::from_vec(
                 seen.iter()
                     .flat_map(|(_, numbers)| &numbers[..self.n_numbers])
                     .copied()

@@ -29,11 +29,12 @@ pub use crate::prefixes::{DRIVER, OPTIMIZER, TRAINED};
 const FORMAT: &str = "gump-1";
 
 /// The matrix that reads local contexts, marks last.
-const SURROUNDINGS_IN: &str = "mct.surroundings.in.weight";
+const LOCAL_CONTEXT_IN: &str = "mct.surroundings.in.weight";
 
-/// The precision of stored numbers.
+/// The type of stored numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Precision {
+#[non_exhaustive]
+pub enum StorageType {
     /// Half precision, for shipping.
     Half,
     /// Full precision, for resuming.
@@ -53,17 +54,12 @@ pub struct Archive {
 ///
 /// # Errors
 /// [`ModelError::Io`] with the path; the previous file, if any, is intact.
-pub fn save(network: &Network, path: &Path, precision: Precision) -> Result<(), ModelError> {
+pub fn save(network: &Network, path: &Path, storage: StorageType) -> Result<(), ModelError> {
     let tensors = network
         .parameters()
         .all()
         .map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
-    write(
-        path,
-        tensors.collect(),
-        header(network.config())?,
-        precision,
-    )
+    write(path, tensors.collect(), header(network.config())?, storage)
 }
 
 /// Reads a network.
@@ -114,7 +110,7 @@ pub fn load_to_grow(
     }
     let tensors = network.parameters().all().map(|(name, var)| {
         let tensor = match name {
-            SURROUNDINGS_IN => widened(var.as_tensor(), n_numbers(wanted))?,
+            LOCAL_CONTEXT_IN => widened(var.as_tensor(), n_numbers(wanted))?,
             _ => var.as_tensor().clone(),
         };
         Ok((name.to_owned(), tensor))
@@ -183,11 +179,11 @@ pub fn write(
     path: &Path,
     tensors: BTreeMap<String, Tensor>,
     metadata: BTreeMap<String, String>,
-    precision: Precision,
+    storage: StorageType,
 ) -> Result<(), ModelError> {
-    let (dtype, kind) = match precision {
-        Precision::Half => (DType::F16, Dtype::F16),
-        Precision::Full => (DType::F32, Dtype::F32),
+    let (dtype, kind) = match storage {
+        StorageType::Half => (DType::F16, Dtype::F16),
+        StorageType::Full => (DType::F32, Dtype::F32),
     };
     let mut bytes: BTreeMap<String, (Vec<usize>, Vec<u8>)> = BTreeMap::new();
     for (name, tensor) in tensors {
@@ -195,13 +191,13 @@ pub fn write(
             .to_dtype(dtype)?
             .to_device(&Device::Cpu)?
             .flatten_all()?;
-        let data = match precision {
-            Precision::Half => flat
+        let data = match storage {
+            StorageType::Half => flat
                 .to_vec1::<half::f16>()?
                 .iter()
                 .flat_map(|v| v.to_le_bytes())
                 .collect(),
-            Precision::Full => flat
+            StorageType::Full => flat
                 .to_vec1::<f32>()?
                 .iter()
                 .flat_map(|v| v.to_le_bytes())

@@ -42,12 +42,12 @@ pub struct ModelConfig {
     pub local_map: bool,
     /// Whether an object's chunk is expressed in the frame of its last state, in finer bins (the
     /// paper: in the frame of the scene), so that motion is independent of position and direction.
-    #[serde(default)]
-    pub anchored: bool,
+    #[serde(default, rename = "anchored", alias = "local_frame")]
+    pub local_frame: bool,
     /// Whether every object gets the paths ahead, road edges and neighbours in its own frame, as
     /// numbers at its key (the paper: the raster and the tokens only).
-    #[serde(default)]
-    pub surroundings: bool,
+    #[serde(default, rename = "surroundings", alias = "local_context")]
+    pub local_context: bool,
     /// Whether the local context contains marks of unknown inputs: speed limits, stop signs, lights
     /// and sizes that the source of a scene does not state. Without marks there are only default
     /// values.
@@ -90,6 +90,7 @@ pub struct VisualConfig {
 /// The convolutional network that reads the raster.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Encoder {
     /// Three strided stages with a residual block each, stride 8, for CPUs.
     Compact,
@@ -142,8 +143,8 @@ impl ModelConfig {
             pairs_share: true,
             smooth_bins: true,
             local_map: true,
-            anchored: true,
-            surroundings: true,
+            local_frame: true,
+            local_context: true,
             unknown_marks: true,
             dropout: 0.0,
             reconstruction: true,
@@ -175,8 +176,8 @@ impl ModelConfig {
             pairs_share: false,
             smooth_bins: false,
             local_map: false,
-            anchored: false,
-            surroundings: false,
+            local_frame: false,
+            local_context: false,
             unknown_marks: false,
             dropout: 0.1,
             reconstruction: true,
@@ -264,4 +265,22 @@ fn layer_names(spec: &RasterSpec) -> Vec<String> {
         .iter()
         .map(|layer| layer.name().to_owned())
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_are_read_under_former_and_present_names() {
+        let shape = ModelConfig::tiny();
+        let stored = serde_json::to_string(&shape).unwrap();
+        assert!(stored.contains("\"surroundings\":true") && stored.contains("\"anchored\":true"));
+        let present = stored
+            .replace("surroundings", "local_context")
+            .replace("anchored", "local_frame");
+        for text in [stored, present] {
+            assert_eq!(serde_json::from_str::<ModelConfig>(&text).unwrap(), shape);
+        }
+    }
 }

@@ -198,7 +198,7 @@ impl StateDecoder {
         };
         let rows = (gump_tokenizer::TABLE_ROWS as usize, c);
         let table = config
-            .anchored
+            .local_frame
             .then(|| scope.get("table", rows, Init::Normal(TABLE_DEVIATION)))
             .transpose()?;
         Ok(Self {

@@ -4,11 +4,16 @@ use std::path::PathBuf;
 
 /// An error of the model: a configuration, a checkpoint, an input or the arithmetic below.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ModelError {
     /// The tensor library failed.
     #[cfg(feature = "tensors")]
     #[error("tensor operation failed: {0}")]
     Tensor(#[from] candle_core::Error),
+    /// Another error of parameters or layers.
+    #[cfg(feature = "tensors")]
+    #[error(transparent)]
+    Network(gump_nn::NnError),
     /// A configuration contradicts itself.
     #[error("configuration: {0}")]
     Config(String),
@@ -81,6 +86,7 @@ impl From<gump_nn::NnError> for ModelError {
                 expected,
                 found,
             },
+            other => Self::Network(other),
         }
     }
 }

@@ -22,7 +22,7 @@ const POSES: usize = 4;
 /// The frame in which a chunk is expressed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LocalFrame {
-    scene_from_anchor: Pose,
+    scene_from_local: Pose,
     places: [f64; CHUNK],
     headings: [f64; CHUNK],
 }
@@ -30,7 +30,7 @@ pub struct LocalFrame {
 impl LocalFrame {
     /// The scene's own frame, in the bins of the tokens.
     pub const SCENE: Self = Self {
-        scene_from_anchor: Pose {
+        scene_from_local: Pose {
             position: DVec2::ZERO,
             heading: 0.0,
         },
@@ -41,7 +41,7 @@ impl LocalFrame {
     /// The frame of an object that was last at `pose`, scene frame.
     pub fn at(pose: Pose) -> Self {
         Self {
-            scene_from_anchor: pose,
+            scene_from_local: pose,
             places: FINER_PLACES,
             headings: FINER_HEADINGS,
         }
@@ -49,7 +49,7 @@ impl LocalFrame {
 
     /// The object's last pose; `None` if chunks are expressed in the scene's frame.
     pub fn origin(&self) -> Option<Pose> {
-        (*self != Self::SCENE).then_some(self.scene_from_anchor)
+        (*self != Self::SCENE).then_some(self.scene_from_local)
     }
 
     /// The bins of a chunk: the size of `like`, the velocity of the first state, and the poses of
@@ -63,15 +63,15 @@ impl LocalFrame {
         let mut bins = [None; STEPS.len()];
         bins[0] = Some(like.get(STEPS[0]));
         bins[1] = Some(like.get(STEPS[1]));
-        let anchor_from_scene = self.scene_from_anchor.inverse();
+        let local_from_scene = self.scene_from_local.inverse();
         if let Some(state) = states[0] {
-            let velocity = anchor_from_scene.rotate(state.velocity);
+            let velocity = local_from_scene.rotate(state.velocity);
             bins[2] = Some(Field::VelocityX.quantize(velocity.x).bin);
             bins[3] = Some(Field::VelocityY.quantize(velocity.y).bin);
         }
         for (i, state) in states.into_iter().enumerate() {
             let Some(state) = state else { continue };
-            let pose = anchor_from_scene * state.pose;
+            let pose = local_from_scene * state.pose;
             let place = pose.position * self.places[i];
             if i > 0 && place.abs().max_element() > Field::X.high() {
                 continue;
@@ -91,14 +91,14 @@ impl LocalFrame {
             Field::VelocityX.dequantize(bins[2]),
             Field::VelocityY.dequantize(bins[3]),
         );
-        self.scene_from_anchor.rotate(DVec2::new(x, y))
+        self.scene_from_local.rotate(DVec2::new(x, y))
     }
 
     /// The poses of the bins of a chunk, scene frame.
     pub fn poses(&self, bins: &Bins) -> [Pose; CHUNK] {
         std::array::from_fn(|i| {
             let at = POSES + CHUNK_STEP * i;
-            self.scene_from_anchor
+            self.scene_from_local
                 * Pose::new(
                     Field::X.dequantize(bins[at]) / self.places[i],
                     Field::Y.dequantize(bins[at + 1]) / self.places[i],
@@ -108,9 +108,9 @@ impl LocalFrame {
     }
 
     /// The bins of the first x and y whose places may lie within `reach` metres of `centre`, scene
-    /// frame, along both axes of the anchor.
+    /// frame, along both axes of the frame.
     pub fn near(&self, centre: DVec2, reach: f64) -> [std::ops::RangeInclusive<u16>; 2] {
-        let centre = self.scene_from_anchor.inverse() * centre;
+        let centre = self.scene_from_local.inverse() * centre;
         [(Field::X, centre.x), (Field::Y, centre.y)].map(|(field, at)| {
             let bin = |place: f64| field.quantize(place * self.places[0]).bin;
             bin(at - reach)..=bin(at + reach)
@@ -147,16 +147,16 @@ mod tests {
             state(46.0, -21.5, 2.3),
         ];
         let own = LocalFrame::at(Pose::new(54.0, -35.4, 1.9));
-        for (anchor, place, turn) in [(LocalFrame::SCENE, 0.1, 0.016), (own, 0.025, 0.008)] {
-            let bins = all(anchor.bins(QuantizedState::default(), chunk));
-            let poses = anchor.poses(&bins);
+        for (local_frame, place, turn) in [(LocalFrame::SCENE, 0.1, 0.016), (own, 0.025, 0.008)] {
+            let bins = all(local_frame.bins(QuantizedState::default(), chunk));
+            let poses = local_frame.poses(&bins);
             let found = poses[0].position - dvec2(52.3, -31.7);
-            // Both coordinates may be half a bin off, along the axes of the anchor.
+            // Both coordinates may be half a bin off, along the axes of the frame.
             assert!(found.length() <= 1.415 * place, "{found}");
             assert!(angle_difference(poses[0].heading, 2.0).abs() <= turn);
             assert!(poses[3].position.distance(dvec2(46.0, -21.5)) < 0.15);
             let expected = Pose::new(0.0, 0.0, 2.0).rotate(dvec2(8.0, 0.0));
-            assert!(anchor.velocity(&bins).distance(expected) < 0.18);
+            assert!(local_frame.velocity(&bins).distance(expected) < 0.18);
         }
     }
 

@@ -21,7 +21,7 @@ use gump_tokenizer::N_CLASSES;
 use crate::ModelError;
 use crate::config::{Gate, ModelConfig};
 use crate::embedding::Tables;
-use crate::local_context::{Survey, n_numbers};
+use crate::local_context::{LaneMap, n_numbers};
 
 /// Self-attention and MLP, pre-norm.
 #[derive(Debug)]
@@ -167,7 +167,7 @@ impl CrossBlock {
 #[derive(Clone, Debug)]
 pub struct VisualMemory {
     /// Per scene, its prepared map for local contexts.
-    pub surveys: Vec<Arc<Survey>>,
+    pub lane_maps: Vec<Arc<LaneMap>>,
     /// The visual tokens themselves, for reading the map under an object.
     pub visual: Tensor,
     /// By layer of cross-attention.
@@ -190,9 +190,9 @@ impl VisualMemory {
                 join(&|part| part.key_values[i].1.clone())?,
             ))
         });
-        let surveys = parts.iter().flat_map(|part| &part.surveys);
+        let lane_maps = parts.iter().flat_map(|part| &part.lane_maps);
         Ok(Self {
-            surveys: surveys.cloned().collect(),
+            lane_maps: lane_maps.cloned().collect(),
             visual: join(&|part| part.visual.clone())?,
             key_values: key_values.collect::<Result<_>>()?,
         })
@@ -247,7 +247,7 @@ pub struct Mct {
     /// One map per position that an object looks at, if the network has this option.
     local: Vec<Linear>,
     /// Two layers over local contexts, if the network has this option.
-    surroundings: Option<(Linear, Linear)>,
+    local_context: Option<(Linear, Linear)>,
 }
 
 /// Tokens ready to embed: `B` sequences of `T` tokens each.
@@ -260,23 +260,24 @@ pub struct TokenBatch {
     /// Their sine features, [N, C].
     pub(crate) sines: Tensor,
     /// Flat indices of the keys that read the map under their object, [K].
-    pub(crate) lookers: Tensor,
+    pub(crate) local_map_rows: Tensor,
     /// Per position they look at, the visual token there, counted within a scene, [K] each.
     pub(crate) places: [Vec<u32>; PLACES.len()],
     /// Row of the batch each of them stands in, [K].
-    pub(crate) looker_rows: Vec<u32>,
+    pub(crate) local_map_sequences: Vec<u32>,
     /// Flat indices of the keys with a local context, [K'].
-    pub(crate) seers: Tensor,
+    pub(crate) context_rows: Tensor,
     /// Their local contexts, [K', n] with n the numbers that this network uses.
-    pub(crate) surroundings: Tensor,
+    pub(crate) local_context: Tensor,
     /// (B, T)
     pub shape: (usize, usize),
 }
 
 impl TokenBatch {
     /// Returns the inputs of the transformer by name, for code in other languages: `rows`,
-    /// `sine_positions`, `sines`, `lookers`, `seers` and `surroundings` as stored, and `places`
-    /// \[places, K\], rows of the visual tokens of all sequences, of which each has `visual_tokens`.
+    /// `sine_positions`, `sines`, `local_map_rows`, `context_rows` and `local_context` as stored, and
+    /// `places` \[places, K\], rows of the visual tokens of all sequences, of which each has
+    /// `visual_tokens`.
     ///
     /// Every sequence must have a separate scene.
     ///
@@ -287,20 +288,20 @@ impl TokenBatch {
         let places: Vec<u32> = self
             .places
             .iter()
-            .flat_map(|cells| self.looker_rows.iter().zip(cells).map(of_row))
+            .flat_map(|cells| self.local_map_sequences.iter().zip(cells).map(of_row))
             .collect();
-        let shape = (PLACES.len(), self.looker_rows.len());
+        let shape = (PLACES.len(), self.local_map_sequences.len());
         Ok(vec![
             ("rows", self.rows.clone()),
             ("sine_positions", self.sine_positions.clone()),
             ("sines", self.sines.clone()),
-            ("lookers", self.lookers.clone()),
+            ("local_map_rows", self.local_map_rows.clone()),
             (
                 "places",
                 Tensor::from_vec(places, shape, self.rows.device())?,
             ),
-            ("seers", self.seers.clone()),
-            ("surroundings", self.surroundings.clone()),
+            ("context_rows", self.context_rows.clone()),
+            ("local_context", self.local_context.clone()),
         ])
     }
 }
@@ -328,8 +329,8 @@ impl Mct {
                 )
             })
             .collect::<std::result::Result<_, _>>()?;
-        let surroundings = config
-            .surroundings
+        let local_context = config
+            .local_context
             .then(|| {
                 let mut scope = scope.part("surroundings");
                 let zero = Some(Init::Constant(0.0));
@@ -341,7 +342,7 @@ impl Mct {
             })
             .transpose()?;
         Ok(Self {
-            surroundings,
+            local_context,
             table: scope.get(
                 "tables",
                 (tables.n_rows(), c),
@@ -385,10 +386,10 @@ impl Mct {
     }
 
     /// Encodes the visual tokens of scenes once, [S, M, C].
-    pub fn remember(&self, visual: &Tensor, surveys: Vec<Arc<Survey>>) -> Result<VisualMemory> {
+    pub fn remember(&self, visual: &Tensor, lane_maps: Vec<Arc<LaneMap>>) -> Result<VisualMemory> {
         let key_values = self.cross.iter().map(|cross| cross.remember(visual));
         Ok(VisualMemory {
-            surveys,
+            lane_maps,
             visual: visual.clone(),
             key_values: key_values.collect::<Result<_>>()?,
         })
@@ -401,7 +402,7 @@ impl Mct {
         let sharing = (batch.shape.0 / scenes) as u32;
         let mut seen: Option<Tensor> = None;
         for (map, cells) in self.local.iter().zip(&batch.places) {
-            let rows = batch.looker_rows.iter().zip(cells);
+            let rows = batch.local_map_sequences.iter().zip(cells);
             let rows: Vec<u32> = rows
                 .map(|(row, cell)| row / sharing * m as u32 + cell)
                 .collect();
@@ -428,18 +429,18 @@ impl Mct {
         if batch.sines.dim(0)? > 0 {
             x = x.index_add(&batch.sine_positions, &self.embed_sine(&batch.sines)?, 0)?;
         }
-        if !batch.looker_rows.is_empty() {
+        if !batch.local_map_sequences.is_empty() {
             x = x.index_add(
-                &batch.lookers,
+                &batch.local_map_rows,
                 &self.encode_local_context(batch, visual)?,
                 0,
             )?;
         }
-        if let Some((first, second)) = &self.surroundings
-            && batch.surroundings.dim(0)? > 0
+        if let Some((first, second)) = &self.local_context
+            && batch.local_context.dim(0)? > 0
         {
-            let seen = second.forward(&ops::gelu(&first.forward(&batch.surroundings)?)?)?;
-            x = x.index_add(&batch.seers, &seen, 0)?;
+            let seen = second.forward(&ops::gelu(&first.forward(&batch.local_context)?)?)?;
+            x = x.index_add(&batch.context_rows, &seen, 0)?;
         }
         let mut x = drop_out(x.reshape((b, t, ()))?, dropout)?; // [B, T, C]
         let mut levels = Vec::with_capacity(self.levels.len());

@@ -15,7 +15,7 @@ use crate::ModelError;
 use crate::batch::Packer;
 use crate::config::ModelConfig;
 use crate::decoder::{CONTROL_KEYS, N_LIGHT_STATES, STEPS, StateDecoder};
-use crate::local_context::Survey;
+use crate::local_context::LaneMap;
 use crate::mct::{Mct, TokenBatch, VisualMemory};
 use crate::placed_slot::PlacedSlot;
 use crate::trajectory_head::TrajectoryHead;
@@ -127,8 +127,10 @@ impl Network {
         from: usize,
         memory: &VisualMemory,
     ) -> Result<TokenBatch, ModelError> {
-        let surveys = &memory.surveys;
-        Ok(self.packer.pack(sequences, from, surveys, self.device())?)
+        let lane_maps = &memory.lane_maps;
+        Ok(self
+            .packer
+            .pack(sequences, from, lane_maps, self.device())?)
     }
 
     /// Rasters of several scenes as one tensor, [S, P, side, side].
@@ -196,9 +198,9 @@ impl Network {
     pub fn look<R: Borrow<Raster>>(
         &self,
         rasters: &[R],
-        surveys: Vec<Arc<Survey>>,
+        lane_maps: Vec<Arc<LaneMap>>,
     ) -> Result<VisualMemory, ModelError> {
         let features = self.visual.features(&self.raster_tensor(rasters)?, false)?;
-        Ok(self.mct.remember(&self.place(&features)?, surveys)?)
+        Ok(self.mct.remember(&self.place(&features)?, lane_maps)?)
     }
 }

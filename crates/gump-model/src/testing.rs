@@ -9,7 +9,7 @@ use gump_tokenizer::{Identities, Tokenizer, TokenizerConfig};
 use crate::Network;
 use crate::config::{Gate, ModelConfig, VisualConfig};
 use crate::exact::ExactFrames;
-use crate::local_context::Survey;
+use crate::local_context::LaneMap;
 use crate::mct::VisualMemory;
 use crate::placed_slot::{PlacedSlot, place_exactly};
 
@@ -67,9 +67,9 @@ pub fn slots(scenario: &Scenario) -> Vec<PlacedSlot> {
 pub fn memory(network: &Network, scenario: &Scenario) -> VisualMemory {
     let scene = scenario.present();
     let raster = gump_raster::rasterize(network.raster_spec(), &scene, scene.ego_now().state.pose);
-    let survey = Survey::new(scene.map, scene.ego_now().state.pose);
+    let lane_map = LaneMap::new(scene.map, scene.ego_now().state.pose);
     network
-        .look(&[raster], vec![Arc::new(survey)])
+        .look(&[raster], vec![Arc::new(lane_map)])
         .expect("the test's network and scene fit together")
 }
 

@@ -2,6 +2,7 @@
 
 /// An error of parameters, of the optimizer's configuration, or of the tensor library below.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum NnError {
     /// The tensor library failed.
     #[error("tensor operation failed: {0}")]

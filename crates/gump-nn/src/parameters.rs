@@ -6,13 +6,14 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Shape, Tensor, Var};
-use gump_seed::Seed;
+use gump_seed::{Seed, standard_normal};
 use rand::Rng as _;
 
 use crate::NnError;
 
 /// Initialisation of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum Init {
     /// Every entry the same.
     Constant(f64),
@@ -220,7 +221,7 @@ fn initial(shape: &Shape, init: Init, seed: Seed, device: &Device) -> Result<Ten
     let values: Vec<f32> = match init {
         Init::Constant(value) => vec![value as f32; n],
         Init::Normal(deviation) => (0..n)
-            .map(|_| (normal(&mut rng) * deviation) as f32)
+            .map(|_| (standard_normal(&mut rng) * deviation) as f32)
             .collect(),
         Init::Xavier => {
             let dims = shape.dims();
@@ -237,10 +238,4 @@ fn initial(shape: &Shape, init: Init, seed: Seed, device: &Device) -> Result<Ten
         }
     };
     Ok(Tensor::from_vec(values, shape, device)?)
-}
-
-/// A standard normal number by Box and Muller (1958).
-fn normal(rng: &mut gump_seed::Rng) -> f64 {
-    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
-    radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }

@@ -8,7 +8,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use gump_geometry::{Polygon, Polyline, Pose, dvec2};
-use gump_nuplan::metrics::{Drive, Sample, SavitzkyGolay, score};
+use gump_nuplan::metrics::{Sample, SavitzkyGolay, SimulationHistory, score};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Area, AreaKind, EgoState, Frame, Lane, LaneId, MapGraph,
     MapParts, Roadblock, RoadblockId, VehicleParameters,
@@ -108,7 +108,7 @@ fn bench(c: &mut Criterion) {
         })
         .collect();
     let expert: Vec<EgoState> = (0..=N_SAMPLES).map(|k| ego(k, 11.0)).collect();
-    let drive = Drive {
+    let drive = SimulationHistory {
         samples: &samples,
         expert: &expert,
         map: &map,

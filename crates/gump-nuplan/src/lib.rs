@@ -6,7 +6,7 @@
 //! are in `gump-planner`, file formats in `gump-data`.
 //!
 //! ```
-//! use gump_nuplan::metrics::{RolloutDrive, Scoring, score};
+//! use gump_nuplan::metrics::{RolloutHistory, Scoring, score};
 //! use gump_rollout::{SimulateConfig, Start, simulate, worlds::ConstantVelocity};
 //! use gump_scene::Seed;
 //!
@@ -18,7 +18,7 @@
 //! let start = Start { scene: scenario.present(), n_futures: 1, seed: Seed(0) };
 //! let driven = simulate(&ConstantVelocity, &[start], None, &SimulateConfig::default())?;
 //! // Nobody was hit, and the ego went as far as the log.
-//! let metrics = score(&RolloutDrive::new(&driven[0], &scenario).on(&scenario.map))?;
+//! let metrics = score(&RolloutHistory::new(&driven[0], &scenario).on(&scenario.map))?;
 //! assert_eq!(metrics.collisions.score, 1.0);
 //! assert!(metrics.score(&Scoring::closed_loop()) > 0.99);
 //! # Ok::<(), gump_rollout::BoxError>(())

@@ -36,7 +36,7 @@ fn main() -> Result<(), BoxError> {
     let speed = recording.ego_at(0).speed();
     println!("{}: the ego drives {speed:.1} m/s", recording.scenario().id);
     println!("   score  progress, m  comfort  candidate");
-    for (i, candidate) in decision.prospects.iter().enumerate() {
+    for (i, candidate) in decision.candidates.iter().enumerate() {
         let parts = candidate.score.parts();
         let comfort = parts.iter().find(|(name, _)| *name == "comfort");
         // A gate is a factor: 0 where something happened in all imagined futures.
@@ -54,6 +54,6 @@ fn main() -> Result<(), BoxError> {
         );
     }
     // It may still brake.
-    println!("chosen: {}", decision.prospects[decision.chosen].kind);
+    println!("chosen: {}", decision.candidates[decision.chosen].kind);
     Ok(())
 }

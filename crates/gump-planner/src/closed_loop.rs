@@ -7,7 +7,9 @@ use gump_nuplan::closed_loop::{
     DriveConfig, Driven, Driver, PlannerInput, Recording, Tracking, Traffic, derive_roadblocks,
     drive,
 };
-use gump_nuplan::metrics::{ClosedLoop, Drive, OpenLoop, OpenLoopConfig, Sample, Scoring};
+use gump_nuplan::metrics::{
+    ClosedLoop, OpenLoop, OpenLoopConfig, Sample, Scoring, SimulationHistory,
+};
 use gump_nuplan::metrics::{open_loop, score};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::BoxError;
@@ -140,9 +142,9 @@ fn judged<'a>(
     map: &'a MapGraph,
     samples: &'a [Sample],
     driven: &Driven,
-) -> Drive<'a> {
+) -> SimulationHistory<'a> {
     let n = (driven.ego.len() + 1).min(recording.expert().len());
-    Drive {
+    SimulationHistory {
         samples,
         expert: &recording.expert()[..n],
         map,

@@ -6,6 +6,7 @@ use gump_scene::{AgentId, RoadblockId};
 
 /// Why planning failed.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum PlanError {
     /// A planner was asked for a plan before it had an initialization.
     #[error("the planner was asked to drive before it was given an initialization")]

@@ -13,7 +13,7 @@
 //! # Terms
 //! * **proposal**: a trajectory of the ego. **Candidate**: a proposal with its simulated outcome.
 //! * **way**: the line that a proposal follows, taken from the route.
-//! * **prospect**: a policy with its rollouts and scores. **Decision**: all prospects, and the one
+//! * **candidate**: a policy with its rollouts and scores. **Decision**: all candidates, and the one
 //!   that was chosen.
 //!
 //! ```
@@ -37,10 +37,10 @@
 //! plan_once(&recording, &mut planner).unwrap();
 //! let decision = planner.decision().unwrap();
 //! // Five speeds on three lines, four other driving styles, and what the world has the ego do.
-//! assert_eq!(decision.prospects.len(), 20);
-//! let best = decision.prospects[decision.chosen].value;
-//! let mut finalists = decision.prospects.iter().filter(|prospect| prospect.finalist);
-//! assert!(finalists.all(|prospect| prospect.value <= best + 1e-6));
+//! assert_eq!(decision.candidates.len(), 20);
+//! let best = decision.candidates[decision.chosen].value;
+//! let mut finalists = decision.candidates.iter().filter(|candidate| candidate.finalist);
+//! assert!(finalists.all(|candidate| candidate.value <= best + 1e-6));
 //! ```
 //!
 //! # Scoring a planner

@@ -23,6 +23,7 @@ pub struct Proposal {
 
 /// The origin of a proposal.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum ProposalKind {
     /// The Intelligent Driver Model along a line beside the centre of the way.
     Idm {

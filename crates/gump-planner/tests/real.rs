@@ -31,18 +31,18 @@ fn check(scenario: &Scenario, expected: Range<f64>) {
         plan_once(&recording, &mut planner).unwrap();
         let decision = planner.decision().unwrap();
         // Beside 19 policies and imitation two for each lane to change to.
-        let n = decision.prospects.len();
+        let n = decision.candidates.len();
         assert!(n >= 20 && n.is_multiple_of(2), "{n}");
         assert!(!decision.brakes, "the emergency brake was needed");
-        for prospect in &decision.prospects {
-            for pair in prospect.drives[0].windows(2) {
+        for evaluation in &decision.candidates {
+            for pair in evaluation.drives[0].windows(2) {
                 let moved = (pair[1].rear_axle.position - pair[0].rear_axle.position) / 0.1;
                 let velocity = |state: &EgoState| state.rear_axle.direction() * state.velocity.x;
                 let middle = (velocity(&pair[0]) + velocity(&pair[1])) / 2.0;
                 assert!((moved - middle).length() < 0.3, "{moved} but {middle}");
             }
         }
-        let metres = decision.prospects[decision.chosen].progress_m;
+        let metres = decision.candidates[decision.chosen].progress_m;
         assert!(expected.contains(&metres), "{metres} m in {}", world.name());
     }
 }

@@ -4,6 +4,18 @@
 //!
 //! Fields are named as in the schema. Optional fields keep proto2's meaning: absent is `None`.
 //! Repeated numbers are read packed and unpacked; each is written as in the schema.
+//!
+//! ```
+//! use gump_proto::{ObjectType, Scenario, Track};
+//! use prost::Message as _;
+//!
+//! let car = Track { id: Some(7), object_type: Some(ObjectType::Vehicle as i32), ..Track::default() };
+//! let sent = Scenario { tracks: vec![car], ..Scenario::default() };
+//! let read = Scenario::decode(sent.encode_to_vec().as_slice())?;
+//! assert_eq!(read, sent);
+//! assert_eq!(read.tracks[0].object_type(), ObjectType::Vehicle);
+//! # Ok::<(), prost::DecodeError>(())
+//! ```
 
 pub mod motion;
 pub mod nuplan;

@@ -1,21 +1,19 @@
 //! nuPlan's closed loop and its scores, with our planners or planners in Python.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
+use gump_eval::planners::{PlannerConfig, PlannerName, TimedDriver};
+use gump_eval::recordings::{self, Case};
 use gump_geometry::{Pose, dvec2};
 use gump_nuplan::closed_loop::{
     DriveConfig, Driver, Imagined, Others, PlannerInitialization, PlannerInput, Recording,
-    Replayed, Step, Tracking, Traffic, derive_roadblocks,
+    Replayed, Step, Tracking, Traffic,
 };
-use gump_nuplan::metrics::{ClosedLoop, Drive, Sample, Scoring, score};
+use gump_nuplan::metrics::{ClosedLoop, Sample, Scoring, SimulationHistory, score};
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
+use gump_planner::Explain;
 use gump_planner::closed_loop::{Scored, drive_and_score};
-use gump_planner::{
-    ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver, NuplanIdmDriver,
-    PdmClosed, SimpleDriver,
-};
 use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Frame, Scenario as Recorded, Seed, VehicleParameters};
@@ -34,21 +32,11 @@ use crate::world::World;
 /// the vehicle's frame; steering angle and rate; yaw rate and acceleration.
 const EGO: usize = 11;
 
-/// The recording of a scenario to drive through; roadblocks and the rear axle are derived where a
-/// scenario has none.
+/// The scenario as a recording to drive through.
 ///
 /// Error: a map without lanes, or no ego.
-fn recording(scene: &Scene) -> PyResult<Recording> {
-    let scenario = &scene.scenario;
-    if scenario.map.lanes().is_empty() {
-        return Err(errors::value(format!(
-            "scenario {}: expected a map with lanes to plan on, found none",
-            scenario.id
-        )));
-    }
-    let mut driven = scenario.clone();
-    derive_roadblocks(&mut driven);
-    Recording::of_boxes(driven).map_err(errors::value)
+fn case(scene: &Scene) -> PyResult<Case> {
+    recordings::of_boxes(scene.scenario.clone()).map_err(errors::value)
 }
 
 /// Drives through a scenario and scores the drive.
@@ -71,7 +59,7 @@ pub(crate) fn nuplan_simulate<'py>(
     seed: u64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let scene = Arc::clone(&scenario.get().scene);
-    let recording = recording(&scene)?;
+    let case = case(&scene)?;
     let model = world.kind.model();
     let rules = world.name_is("idm");
     let inner: Box<dyn Traffic + Send + '_> = match &model {
@@ -91,15 +79,20 @@ pub(crate) fn nuplan_simulate<'py>(
     };
     let thinks_in = imagination.and_then(|world| world.kind.model());
     let thinks_in = thinks_in.unwrap_or_else(|| Arc::new(Idm::default()));
-    let map = &scene.scenario.map;
     let mut drive = |driver: &mut dyn Driver| {
-        let mut driver = Timed::new(driver);
-        let scored = drive_and_score(&recording, map, &mut traffic, &mut driver, &config);
-        scored.map(|scored| (scored, driver.milliseconds()))
+        let mut driver = TimedDriver::new(driver, None);
+        let scored = drive_and_score(
+            &case.recording,
+            &case.map,
+            &mut traffic,
+            &mut driver,
+            &config,
+        );
+        scored.map(|scored| (scored, driver.milliseconds_per_step()))
     };
     let driven = match planner.extract::<String>() {
         Ok(name) => py.detach(|| {
-            let mut driver = named(&name, &recording, &*thinks_in, Seed(seed))?;
+            let mut driver = named(&name, &case, &*thinks_in, Seed(seed))?;
             drive(&mut *driver).map_err(errors::value)
         }),
         Err(_) => {
@@ -125,73 +118,23 @@ pub(crate) fn nuplan_simulate<'py>(
 /// A planner of ours.
 fn named<'w>(
     name: &str,
-    recording: &Recording,
+    case: &Case,
     world: &'w dyn WorldModel,
     seed: Seed,
-) -> PyResult<Box<dyn Driver + 'w>> {
-    Ok(match name {
-        "log" => Box::new(LogDriver::new(recording, &[])),
-        "idm" => Box::new(NuplanIdmDriver::default()),
-        "simple" => Box::new(SimpleDriver::default()),
-        "pdm-closed" => Box::new(PdmClosed::default()),
-        "imitation" => Box::new(ImitationDriver::new(world, 4, 5, seed).map_err(errors::value)?),
-        "interactive" => {
-            let config = InteractiveDriverConfig {
-                seed,
-                ..InteractiveDriverConfig::default()
-            };
-            Box::new(InteractiveDriver::new(world, config).map_err(errors::value)?)
-        }
-        found => {
-            return Err(errors::value(format!(
-                "planner: expected log, idm, simple, pdm-closed, imitation, interactive or an \
-                 object with initialize and compute_planner_trajectory, found {found}"
-            )));
-        }
-    })
-}
-
-/// A driver whose steps are timed.
-struct Timed<'a> {
-    inner: &'a mut dyn Driver,
-    spent: Duration,
-    steps: u32,
-}
-
-impl<'a> Timed<'a> {
-    fn new(inner: &'a mut dyn Driver) -> Self {
-        Self {
-            inner,
-            spent: Duration::ZERO,
-            steps: 0,
-        }
-    }
-
-    fn milliseconds(&self) -> f64 {
-        self.spent.as_secs_f64() * 1e3 / f64::from(self.steps.max(1))
-    }
-}
-
-impl Driver for Timed<'_> {
-    fn name(&self) -> &str {
-        self.inner.name()
-    }
-
-    fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
-        self.inner.start(initialization)
-    }
-
-    #[allow(
-        clippy::disallowed_methods,
-        reason = "how long a planner takes is told, and changes nothing"
-    )]
-    fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let began = Instant::now();
-        let plan = self.inner.drive(input);
-        self.spent += began.elapsed();
-        self.steps += 1;
-        plan
-    }
+) -> PyResult<Box<dyn Explain + 'w>> {
+    // The proposals are many planners, of which none drives alone.
+    let known = PlannerName::ALL.into_iter();
+    let known = known.filter(|planner| *planner != PlannerName::Proposals);
+    let Some(planner) = known.clone().find(|planner| planner.name() == name) else {
+        let names: Vec<&str> = known.map(PlannerName::name).collect();
+        return Err(errors::value(format!(
+            "planner: expected {} or an object with initialize and compute_planner_trajectory, \
+             found {name}",
+            names.join(", ")
+        )));
+    };
+    let built = planner.build(case, world, seed, &PlannerConfig::default());
+    built.map_err(errors::value)
 }
 
 /// Traffic whose parallel work is done on our threads.
@@ -410,7 +353,7 @@ pub(crate) fn nuplan_score<'py>(
     agent_id: Option<&Bound<'py, PyArrayDyn<i64>>>,
     others: Option<&Bound<'py, PyArrayDyn<f64>>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let recording = recording(&scenario.scene)?;
+    let recording = case(&scenario.scene)?.recording;
     let times = Numbers::new("time_us", time_us, &["N"])?;
     let n = times.shape()[0];
     let ego = Numbers::new("ego", ego, &["N", "11"])?;
@@ -446,7 +389,7 @@ pub(crate) fn nuplan_score<'py>(
         });
         let samples: Vec<Sample> = samples.collect();
         let expert = recording.expert();
-        score(&Drive {
+        score(&SimulationHistory {
             samples: &samples,
             expert: &expert[..(n + 1).min(expert.len())],
             map: &scenario.scene.scenario.map,
@@ -563,12 +506,13 @@ pub(crate) fn nuplan_plan<'py>(
     imagination: Option<&World>,
     seed: u64,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let recording = recording(&scenario.scene)?;
+    let case = case(&scenario.scene)?;
+    let recording = &case.recording;
     let thinks_in = imagination.and_then(|world| world.kind.model());
     let thinks_in = thinks_in.unwrap_or_else(|| Arc::new(Idm::default()));
     let ego = *recording.ego_at(0);
     let plan = py.detach(|| {
-        let mut driver = named(planner, &recording, &*thinks_in, Seed(seed))?;
+        let mut driver = named(planner, &case, &*thinks_in, Seed(seed))?;
         let started = driver.start(&recording.initialization());
         started.map_err(errors::value)?;
         let input = PlannerInput {

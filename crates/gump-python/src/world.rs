@@ -1,17 +1,18 @@
 //! Worlds by name, their simulations, and sessions that advance step by step.
 
-use std::path::{Path, PathBuf};
+use std::fmt::Display;
+use std::path::PathBuf;
+use std::str::FromStr;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_engine::{LightSource, Mode, Precision, SamplingConfig, TransformerWorld};
+use gump_eval::worlds::{self, WorldName};
 use gump_geometry::{Pose, dvec2};
-use gump_model::{Device, checkpoint, relative};
-use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
+use gump_model::Device;
+use gump_rollout::worlds::LogReplay;
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentId, AgentState, Frame, Rollout, Seed};
-use gump_traffic::{Arrivals, LightControl, Living, LivingConfig};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 
@@ -25,12 +26,10 @@ use crate::{errors, threads};
 pub(crate) enum Kind {
     /// The log, which is another world in every scenario.
     Log,
-    /// Rules that do not use the log.
-    Rules(Arc<dyn WorldModel>),
-    /// A network of the paper's kind, which also generates scenes.
+    /// A network of sequences, which also generates scenes.
     Transformer(Arc<TransformerWorld>),
-    /// A network of another kind.
-    Network(Arc<dyn WorldModel>),
+    /// Rules, or a network of another kind.
+    Other(Arc<dyn WorldModel>),
 }
 
 /// A world: simulates the future of traffic.
@@ -38,6 +37,8 @@ pub(crate) enum Kind {
 pub(crate) struct World {
     name: String,
     pub(crate) kind: Kind,
+    /// Whether it cannot simulate on a map without lanes.
+    follows_lanes: bool,
     /// Conversion of its frames to those of the scene.
     frames: SimulateConfig,
 }
@@ -55,7 +56,7 @@ struct Sampling {
     limits: bool,
     raw: bool,
     paper: bool,
-    life: bool,
+    spawn: bool,
     lights: String,
     precision: String,
 }
@@ -72,23 +73,15 @@ impl Sampling {
             _ => SamplingConfig::default(),
         };
         let config = SamplingConfig {
-            mode: match self.mode.as_str() {
-                "partial-ar" => Mode::PartialAr,
-                "full-ar" => Mode::FullAr,
-                found => return Err(unknown("mode", "partial-ar or full-ar", found)),
-            },
-            precision: match self.precision.as_str() {
-                "f32" => Precision::F32,
-                "bf16" => Precision::Bf16,
-                "int8" => Precision::Int8,
-                found => return Err(unknown("precision", "f32, bf16 or int8", found)),
-            },
-            life: self.life,
-            lights: match self.lights.as_str() {
-                "model" => LightSource::Model,
-                "hold" => LightSource::Hold,
-                found => return Err(unknown("lights", "model or hold", found)),
-            },
+            mode: one_of(&Mode::ALL, "mode", &self.mode)?,
+            precision: one_of(&Precision::ALL, "precision", &self.precision)?,
+            spawn: self.spawn,
+            // Recorded lights would need a world per scenario.
+            lights: one_of(
+                &[LightSource::Model, LightSource::Hold],
+                "lights",
+                &self.lights,
+            )?,
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             top_p: self.top_p.or(base.top_p),
@@ -116,6 +109,20 @@ impl Sampling {
     }
 }
 
+/// The value of an argument that takes one of some names.
+fn one_of<T>(known: &[T], argument: &str, found: &str) -> PyResult<T>
+where
+    T: Display + FromStr + PartialEq,
+{
+    let value = found.parse().ok().filter(|value| known.contains(value));
+    value.ok_or_else(|| {
+        let mut names = known.iter().map(ToString::to_string);
+        let last = names.next_back().unwrap_or_default();
+        let others: Vec<String> = names.collect();
+        unknown(argument, &format!("{} or {last}", others.join(", ")), found)
+    })
+}
+
 fn unknown(name: &str, expected: &str, found: &str) -> PyErr {
     errors::value(format!("{name}: expected {expected}, found {found}"))
 }
@@ -131,22 +138,16 @@ impl World {
     ) -> PyResult<Self> {
         let sampling: Sampling = sampling.extract()?;
         let config = sampling.resolve()?;
-        let kind = match (name, &weights) {
-            ("log", _) => Kind::Log,
-            ("idm", _) => Kind::Rules(Arc::new(Living::new(Idm::default(), living(&config)))),
-            ("constant-velocity", _) => {
-                Kind::Rules(Arc::new(Living::new(ConstantVelocity, living(&config))))
-            }
-            (_, Some(path)) => threads::work(py, || load(path, config))??,
-            (found, None) => {
-                let expected = "log, idm, constant-velocity, model or model:WEIGHTS";
-                return Err(unknown("world", expected, found));
-            }
+        let world = world_name(name, weights)?;
+        let is_learned = matches!(world, WorldName::Model(_));
+        let (kind, follows_lanes) = match &world {
+            WorldName::Log => (Kind::Log, false),
+            world => build(py, world, &config)?,
         };
-        let is_learned = matches!(kind, Kind::Transformer(_) | Kind::Network(_));
         Ok(Self {
             name: name.into(),
             kind,
+            follows_lanes,
             frames: if sampling.paper && is_learned {
                 SimulateConfig::compat()
             } else {
@@ -214,9 +215,7 @@ impl World {
     /// Error: a map without lanes for a world that follows them.
     pub(crate) fn model(&self, scene: &Scene) -> PyResult<Arc<dyn WorldModel>> {
         let scenario = &scene.scenario;
-        let follows_lanes =
-            self.name == "idm" || matches!(self.kind, Kind::Transformer(_) | Kind::Network(_));
-        if follows_lanes && scenario.map.lanes().is_empty() {
+        if self.follows_lanes && scenario.map.lanes().is_empty() {
             return Err(errors::value(format!(
                 "scenario {}: expected a map with lanes to drive on, found none",
                 scenario.id
@@ -236,41 +235,51 @@ impl Kind {
     pub(crate) fn model(&self) -> Option<Arc<dyn WorldModel>> {
         match self {
             Self::Log => None,
-            Self::Rules(world) | Self::Network(world) => Some(Arc::clone(world)),
             Self::Transformer(world) => Some(Arc::<TransformerWorld>::clone(world)),
+            Self::Other(world) => Some(Arc::clone(world)),
         }
     }
 }
 
-/// Traffic lights and arrivals, which change beside the motion of agents.
-fn living(config: &SamplingConfig) -> LivingConfig {
-    LivingConfig {
-        lights: match config.lights {
-            LightSource::Hold => LightControl::Hold,
-            _ => LightControl::Signals,
-        },
-        arrivals: config.life.then(Arrivals::default),
+/// The world that a name and its weights stand for.
+///
+/// Error: no such world.
+fn world_name(name: &str, weights: Option<PathBuf>) -> PyResult<WorldName> {
+    if let Some(path) = weights {
+        return Ok(WorldName::Model(path));
+    }
+    match name.parse() {
+        // Weights are found by the caller, which also knows the shipped ones.
+        Err(_) | Ok(WorldName::Model(_)) => {
+            let expected = "log, idm, constant-velocity, model or model:WEIGHTS";
+            Err(unknown("world", expected, name))
+        }
+        Ok(world) => Ok(world),
     }
 }
 
-/// Reads weights, whatever network they are of.
-fn load(path: &Path, config: SamplingConfig) -> PyResult<Kind> {
-    if !path.exists() {
+/// A world for all scenarios, and whether it cannot simulate on a map without lanes.
+///
+/// Error: weights that are missing or damaged.
+fn build(py: Python<'_>, name: &WorldName, config: &SamplingConfig) -> PyResult<(Kind, bool)> {
+    if let WorldName::Model(path) = name
+        && !path.exists()
+    {
         return Err(pyo3::exceptions::PyFileNotFoundError::new_err(format!(
             "expected weights, found no file: {}",
             path.display()
         )));
     }
-    let damaged = |error: gump_model::ModelError| errors::DataError::new_err(error.to_string());
-    if relative::is_relative(path).map_err(damaged)? {
-        let network = relative::load(path, &Device::Cpu).map_err(damaged)?;
-        let world =
-            RelativeWorld::new(&network, RelativeSampling::from(&config)).map_err(damaged)?;
-        return Ok(Kind::Network(Arc::new(Living::new(world, living(&config)))));
-    }
-    let network = checkpoint::load(path, &Device::Cpu).map_err(damaged)?;
-    let world = TransformerWorld::new(network, config);
-    Ok(Kind::Transformer(Arc::new(world)))
+    let built = threads::work(py, || {
+        worlds::World::without_log(&Device::Cpu, name, config)
+    })?;
+    let world = built.map_err(|error| errors::DataError::new_err(error.to_string()))?;
+    let follows_lanes = world.follows_lanes();
+    let kind = match world {
+        worlds::World::Learned(world) => Kind::Transformer(Arc::from(world)),
+        world => Kind::Other(world.into_model()),
+    };
+    Ok((kind, follows_lanes))
 }
 
 fn check_futures(futures: usize) -> PyResult<()> {

@@ -23,7 +23,7 @@ fn config(year: &str) -> PyResult<Arc<Config>> {
     static CONFIGS: [OnceLock<Arc<Config>>; Year::ALL.len()] = [const { OnceLock::new() }; 5];
     if year.contains('\n') {
         let config = Config::parse(year).map_err(|why| {
-            let why = why.trim().replace('\n', " ");
+            let why = why.to_string().trim().replace('\n', " ");
             errors::value(format!("settings: {why}"))
         })?;
         return Ok(Arc::new(config));

@@ -53,6 +53,11 @@ def test_a_network_imagines(crossing, network):
     assert moved.max() < 5.0
 
 
+def test_former_names_of_arguments_work():
+    with pytest.warns(DeprecationWarning, match="life is now spawn"):
+        gump.World("idm", life=True)
+
+
 def test_more_real_than_going_straight_on(crossing, network):
     def score(world):
         states = world.simulate(crossing, futures=16)

@@ -8,6 +8,7 @@ use std::str::FromStr;
 /// Lines are one pixel wide. "Surface" of a lane means its centre line widened to the lane's
 /// width. Layers that the map has no data for are zero.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum Layer {
     /// Painted lines: 1.
     RoadLines,

@@ -2,10 +2,10 @@
 
 use std::borrow::Cow;
 
-use gump_scene::{Rng, Seed};
+use gump_scene::{Rng, Seed, standard_normal};
 
 use crate::ObservationForm;
-use crate::networks::{ConvNet, ConvPass, Mlp, Normalizer, Pass, standard_normal};
+use crate::networks::{ConvNet, ConvPass, Mlp, Normalizer, Pass};
 use crate::sac::{SacConfig, Squashed};
 
 /// Preprocessing of observations, and a network that outputs mean and log standard deviation of

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 /// The meaning of an action.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
+#[non_exhaustive]
 pub enum Dynamics {
     /// Two numbers, held for the step: acceleration (-1 the hardest braking, 0 none, 1 the hardest
     /// acceleration) and steering (the share of the sharpest turn possible at this speed, positive

@@ -5,6 +5,7 @@ use gump_scene::{AgentId, ScenarioError};
 
 /// Why an environment or a buffer could not do what was requested.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum RlError {
     /// There are no scenarios to start an episode from.
     #[error("an environment needs at least one scenario")]

@@ -22,7 +22,8 @@ const N_RESAMPLES: usize = 2000;
 
 /// The driver.
 #[derive(Clone, Copy, Debug)]
-pub enum Driver<'a> {
+#[non_exhaustive]
+pub enum EvaluatedPolicy<'a> {
     /// A policy, by the modes of its distributions.
     Learned(&'a Actor),
     /// The log, as far as the dynamics can follow it: an oracle.
@@ -35,7 +36,7 @@ pub enum Driver<'a> {
 
 /// The outcome of one episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Drive {
+pub struct EpisodeResult {
     /// Index of the scenario.
     pub scenario: usize,
     /// Index of the seed.
@@ -67,7 +68,7 @@ pub struct Columns {
     pub comfort: Option<f64>,
 }
 
-impl Drive {
+impl EpisodeResult {
     fn new(scenario: usize, repeat: usize, outcome: &Outcome) -> Self {
         let totals = &outcome.totals;
         Self {
@@ -99,18 +100,18 @@ impl Drive {
 
 impl Columns {
     /// Over episodes; `None` if there are none.
-    pub fn of(drives: &[Drive]) -> Option<Self> {
+    pub fn of(drives: &[EpisodeResult]) -> Option<Self> {
         let n = drives.len() as f64;
-        let share = |happened: fn(&Drive) -> bool| {
+        let share = |happened: fn(&EpisodeResult) -> bool| {
             drives.iter().filter(|drive| happened(drive)).count() as f64 / n
         };
-        let safe: Vec<&Drive> = drives.iter().filter(|drive| drive.is_safe()).collect();
-        let of_safe = |value: fn(&Drive) -> f64| {
+        let safe: Vec<&EpisodeResult> = drives.iter().filter(|drive| drive.is_safe()).collect();
+        let of_safe = |value: fn(&EpisodeResult) -> f64| {
             let sum: f64 = safe.iter().map(|drive| value(drive)).sum();
             (!safe.is_empty()).then(|| sum / safe.len() as f64)
         };
         (!drives.is_empty()).then(|| Self {
-            score: drives.iter().map(Drive::score).sum::<f64>() / n,
+            score: drives.iter().map(EpisodeResult::score).sum::<f64>() / n,
             collision_rate: share(|drive| drive.collided),
             offroad_rate: share(|drive| drive.off_road),
             progress: of_safe(|drive| drive.progress),
@@ -154,9 +155,9 @@ pub fn evaluate(
     prepared: &Arc<[PreparedScenario]>,
     traffic: Traffic<'_>,
     config: &EnvConfig,
-    driver: Driver<'_>,
+    driver: EvaluatedPolicy<'_>,
     episodes: &Episodes,
-) -> Result<Vec<Drive>, RlError> {
+) -> Result<Vec<EpisodeResult>, RlError> {
     let of_scenario = |&scenario: &usize| {
         let repeats = 0..episodes.repeats;
         repeats.map(move |repeat| (scenario, repeat))
@@ -178,7 +179,8 @@ pub fn evaluate(
         let starts: Vec<EpisodeStart> = episodes_now.iter().map(start).collect();
         let outcomes = drive(&mut env, driver, &starts)?;
         let ended = episodes_now.iter().zip(&outcomes);
-        drives.extend(ended.map(|(&(scenario, repeat), o)| Drive::new(scenario, repeat, o)));
+        drives
+            .extend(ended.map(|(&(scenario, repeat), o)| EpisodeResult::new(scenario, repeat, o)));
     }
     Ok(drives)
 }
@@ -186,7 +188,7 @@ pub fn evaluate(
 /// Drives every row to the end of its first episode.
 fn drive(
     env: &mut DrivingEnv<'_>,
-    driver: Driver<'_>,
+    driver: EvaluatedPolicy<'_>,
     starts: &[EpisodeStart],
 ) -> Result<Vec<Outcome>, RlError> {
     env.reset_to(starts)?;
@@ -198,18 +200,18 @@ fn drive(
     let mut outcomes: Vec<Option<Outcome>> = vec![None; n];
     while outcomes.contains(&None) {
         match driver {
-            Driver::Learned(actor) => {
+            EvaluatedPolicy::Learned(actor) => {
                 check("observations", actor.observation_len(), o)?;
                 check("actions", actor.action_len(), a)?;
                 actions = actor.modes(env.observations());
             }
-            Driver::Expert => env.expert_actions(&mut actions)?,
-            Driver::Random => {
+            EvaluatedPolicy::Expert => env.expert_actions(&mut actions)?,
+            EvaluatedPolicy::Random => {
                 for (action, rng) in actions.chunks_exact_mut(a).zip(&mut rngs) {
                     action.fill_with(|| rng.random_range(-1.0..=1.0));
                 }
             }
-            Driver::Constant(action) => {
+            EvaluatedPolicy::Constant(action) => {
                 check("actions", action.len(), a)?;
                 actions = action.repeat(n);
             }
@@ -235,7 +237,7 @@ fn check(what: &'static str, expected: usize, found: usize) -> Result<(), RlErro
 }
 
 /// Mean score of every scenario over its drives, in the order of the scenarios.
-pub fn score_by_scenario(drives: &[Drive]) -> Vec<f64> {
+pub fn score_by_scenario(drives: &[EpisodeResult]) -> Vec<f64> {
     let n = drives.iter().map(|drive| drive.scenario + 1).max();
     let mut sums = vec![(0.0, 0.0); n.unwrap_or(0)];
     for drive in drives {
@@ -328,8 +330,8 @@ mod tests {
         off_road: bool,
         progress: f64,
         comfortable: bool,
-    ) -> Drive {
-        Drive {
+    ) -> EpisodeResult {
+        EpisodeResult {
             scenario,
             repeat: 0,
             collided,
@@ -414,7 +416,7 @@ mod tests {
         PreparedScenario::prepare([4.0, 8.0, 12.0].map(scene), 0.5).unwrap()
     }
 
-    fn run(driver: Driver<'_>, n_envs: usize) -> Vec<Drive> {
+    fn run(driver: EvaluatedPolicy<'_>, n_envs: usize) -> Vec<EpisodeResult> {
         let config = EnvConfig {
             n_envs,
             ..EnvConfig::default()
@@ -427,7 +429,7 @@ mod tests {
 
     #[test]
     fn every_scenario_is_driven_once_per_repeat() {
-        let drives = run(Driver::Expert, 4);
+        let drives = run(EvaluatedPolicy::Expert, 4);
         let order: Vec<_> = drives.iter().map(|d| (d.scenario, d.repeat)).collect();
         assert_eq!(order, [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)]);
         for drive in &drives {
@@ -449,19 +451,22 @@ mod tests {
         let observation = EnvConfig::default().observation.len();
         let actor = Actor::new(&config, observation, 2, Seed(1));
         assert_eq!(
-            run(Driver::Learned(&actor), 6),
-            run(Driver::Learned(&actor), 1)
+            run(EvaluatedPolicy::Learned(&actor), 6),
+            run(EvaluatedPolicy::Learned(&actor), 1)
         );
-        let still = run(Driver::Constant(&[-1.0, 0.0]), 6);
+        let still = run(EvaluatedPolicy::Constant(&[-1.0, 0.0]), 6);
         assert!(still.iter().all(|drive| drive.progress < 20.0));
-        assert_eq!(run(Driver::Random, 6), run(Driver::Random, 1));
+        assert_eq!(
+            run(EvaluatedPolicy::Random, 6),
+            run(EvaluatedPolicy::Random, 1)
+        );
     }
 
     #[test]
     fn policies_of_another_shape_are_refused() {
         let actor = Actor::new(&SacConfig::default(), 3, 2, Seed(1));
         let config = EnvConfig::default();
-        let driver = Driver::Learned(&actor);
+        let driver = EvaluatedPolicy::Learned(&actor);
         let episodes = Episodes::all(3, 1, Seed(0));
         let result = evaluate(&prepared(), Traffic::Log, &config, driver, &episodes);
         assert!(matches!(result, Err(RlError::Shape { expected: 3, .. })));

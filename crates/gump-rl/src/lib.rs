@@ -4,7 +4,8 @@
 //! step. It implements [`VectorEnv`], the only interface that learning algorithms need. [`PreparedScenario`]
 //! is a prepared scenario, [`Dynamics`] defines actions, [`ObservationSpec`] observations and
 //! [`RewardWeights`] the reward. [`Rules`] is one episode as pure functions. [`sac`] trains an
-//! [`Actor`] from rewards or from experts. [`server`] provides environments to other processes.
+//! [`Actor`] from rewards or from experts. On Unix, [`server`] provides environments to other
+//! processes.
 //!
 //! # Terms
 //! * **row**: an index of the batch. **Episode**: the steps of a row from a start to an end.
@@ -40,6 +41,7 @@ pub mod networks;
 mod observation;
 mod prepared_scenario;
 pub mod sac;
+#[cfg(unix)]
 pub mod server;
 mod vector_env;
 
@@ -49,8 +51,8 @@ pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling,
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
 pub use error::RlError;
 pub use evaluate::{
-    Columns, Drive, Driver, Episodes, Estimate, LOGGED_PROGRESS, estimate, estimate_difference,
-    evaluate, score_by_scenario,
+    Columns, EpisodeResult, Episodes, Estimate, EvaluatedPolicy, LOGGED_PROGRESS, estimate,
+    estimate_difference, evaluate, score_by_scenario,
 };
 pub use imitation::demonstrations;
 pub use observation::{

@@ -4,6 +4,7 @@ use gump_scene::AgentId;
 
 /// Why traffic could not be simulated; errors inside a world or a policy are passed on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum RolloutError {
     /// The duration is not a positive number.
     #[error("asked to simulate {0} s, expected a positive number of seconds")]

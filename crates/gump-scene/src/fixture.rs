@@ -30,6 +30,9 @@ use crate::{
 
 /// Reads a scenario from the text form described in the module.
 ///
+/// The error is a plain `String`, not a type: fixtures are written by hand in tests and examples,
+/// where nothing but its text is of use.
+///
 /// # Errors
 /// A sentence with the line at fault.
 pub fn scenario(text: &str) -> Result<Scenario, String> {

@@ -56,6 +56,13 @@ impl Frame {
         }
     }
 
+    /// Whether both are clones of one frame, which share their contents.
+    ///
+    /// Equal frames that were made separately are not.
+    pub fn is_clone_of(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.agents, &other.agents) && Arc::ptr_eq(&self.lights, &other.lights)
+    }
+
     /// All agents, sorted by id.
     pub fn agents(&self) -> &[Agent] {
         &self.agents

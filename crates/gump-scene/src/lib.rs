@@ -48,7 +48,7 @@ mod tag;
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
-pub use gump_seed::{Rng, Seed};
+pub use gump_seed::{Rng, Seed, standard_normal};
 pub use lanes_ahead::{LaneAhead, lanes_ahead};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
@@ -62,4 +62,4 @@ pub use route::Route;
 pub use scenario::{Scenario, ScenarioError};
 pub use scene_state::SceneState;
 pub use stop_line::{stop_line, ways_beyond, ways_cross, ways_join};
-pub use tag::ScenarioTag;
+pub use tag::{ParseTagError, ScenarioTag};

@@ -283,6 +283,7 @@ pub struct MapParts {
 
 /// Why parts do not form a valid map.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MapError {
     /// Two lanes have the same id.
     #[error("lane id {0} occurs twice")]

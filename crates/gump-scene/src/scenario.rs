@@ -31,6 +31,7 @@ pub struct Scenario {
 
 /// Why a recording is not a valid scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum ScenarioError {
     /// The log has no present.
     #[error("the present is frame {now} but the log has {frames} frames")]

@@ -27,6 +27,20 @@ impl<'a> SceneState<'a> {
             .expect("the history of a scene is never empty")
     }
 
+    /// Whether both are views of one scene: of the same map and route, and of frames that are clones
+    /// of each other. Worlds read the scene of several starts once by it.
+    ///
+    /// Equal frames that were made separately are different scenes.
+    pub fn is_same_scene(&self, other: &SceneState<'_>) -> bool {
+        let route = |scene: &SceneState<'_>| scene.route.map(Arc::as_ptr);
+        let frames = self.history.iter().zip(other.history);
+        Arc::ptr_eq(self.map, other.map)
+            && route(self) == route(other)
+            && (self.ego, self.dt) == (other.ego, other.dt)
+            && self.history.len() == other.history.len()
+            && frames.into_iter().all(|(a, b)| a.is_clone_of(b))
+    }
+
     /// The same scene without the ego's route: the input of a world whose realism is scored.
     ///
     /// Few recordings state a route. Readers derive it from where the ego drives *after* the
@@ -58,5 +72,23 @@ impl<'a> SceneState<'a> {
             .collect();
         frames.reverse();
         frames
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::fixture;
+
+    #[test]
+    fn clones_of_a_scenario_are_one_scene_and_equal_ones_are_not() {
+        let text = "lane 1: 0,0 100,0\nego vehicle 0: 10,0 velocity 5,0";
+        let scenario = fixture::scenario(text).unwrap();
+        let clone = scenario.clone();
+        assert!(scenario.present().is_same_scene(&clone.present()));
+        let again = fixture::scenario(text).unwrap();
+        assert!(!scenario.present().is_same_scene(&again.present()));
+        let mut shorter = scenario.present();
+        shorter.history = &shorter.history[1..];
+        assert!(!scenario.present().is_same_scene(&shorter));
     }
 }

@@ -33,20 +33,22 @@ impl fmt::Display for ScenarioTag {
     }
 }
 
+/// The error of reading a [`ScenarioTag`]: no tag has this name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("\"{0}\" is not one of the {n} scenario tags", n = ScenarioTag::COUNT)]
+pub struct ParseTagError(String);
+
 impl FromStr for ScenarioTag {
-    type Err = String;
+    type Err = ParseTagError;
 
     /// Finds a tag by name.
     ///
     /// # Errors
-    /// A sentence with the unknown name.
-    fn from_str(name: &str) -> Result<Self, String> {
+    /// An unknown name.
+    fn from_str(name: &str) -> Result<Self, ParseTagError> {
         match NAMES.binary_search(&name) {
             Ok(i) => Ok(Self(i as u8)),
-            Err(_) => Err(format!(
-                "\"{name}\" is not one of the {} scenario tags",
-                Self::COUNT
-            )),
+            Err(_) => Err(ParseTagError(name.to_owned())),
         }
     }
 }

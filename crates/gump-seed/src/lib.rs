@@ -13,7 +13,7 @@
 //! assert_eq!(first.rng().next_u64(), Seed(7).fork(0).rng().next_u64());
 //! ```
 
-use rand::SeedableRng;
+use rand::{Rng as _, SeedableRng};
 
 /// The random generator of the workspace: portable and documented, unlike `StdRng`.
 pub type Rng = rand_chacha::ChaCha8Rng;
@@ -41,10 +41,31 @@ impl Seed {
     }
 }
 
+/// A number from the standard normal distribution. Takes two numbers from the generator.
+///
+/// Source: Box and Muller 1958. The second normal number of the pair is dropped, so that a draw
+/// depends on nothing but the generator.
+pub fn standard_normal(rng: &mut Rng) -> f64 {
+    // 1 - u is never 0.
+    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
+    radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use rand::RngCore;
+
+    #[test]
+    fn normal_numbers_have_their_moments() {
+        let mut rng = Seed(1).rng();
+        let drawn: Vec<f64> = (0..20_000).map(|_| standard_normal(&mut rng)).collect();
+        let moment = |k: i32| drawn.iter().map(|x| x.powi(k)).sum::<f64>() / drawn.len() as f64;
+        // Four standard errors each: 1, sqrt(2), sqrt(96) over sqrt(20000).
+        assert!(moment(1).abs() < 0.028, "{}", moment(1));
+        assert!((moment(2) - 1.0).abs() < 0.04, "{}", moment(2));
+        assert!((moment(4) - 3.0).abs() < 0.28, "{}", moment(4));
+    }
 
     #[test]
     fn streams_are_fixed_for_all_time() {

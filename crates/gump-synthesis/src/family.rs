@@ -4,6 +4,7 @@ use std::fmt;
 
 /// A kind of road network; its dimensions are drawn per scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum RoadFamily {
     /// Four legs, traffic lights.
     SignalizedCrossing,

@@ -12,6 +12,7 @@ const ATTEMPTS: u64 = 64;
 
 /// The style of synthetic scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+#[non_exhaustive]
 pub enum Profile {
     /// Idealised traffic on regular roads, with every agent observed all the time: [`synthesize`].
     #[default]

@@ -33,6 +33,7 @@ pub const MAX_PROMPTS: usize = 4;
 
 /// Why tokens are not a valid scene.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum GrammarError {
     /// A slot is not allowed at its position.
     #[error("slot {position}: expected {expected}, found {found}")]

@@ -18,6 +18,7 @@ const ARRIVALS: u64 = 1 << 57;
 
 /// Source of the lights after the present.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub enum LightControl {
     /// The same as at the present.
     Hold,
@@ -81,11 +82,6 @@ impl<W> Living<W> {
     /// The wrapped world, which moves the agents.
     pub fn world(&self) -> &W {
         &self.world
-    }
-
-    /// The wrapped world, mutably.
-    pub fn world_mut(&mut self) -> &mut W {
-        &mut self.world
     }
 
     /// The same surroundings around the world that `change` returns.

@@ -99,6 +99,7 @@ pub struct RunConfig {
 /// A preset by name, or all values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
+#[non_exhaustive]
 pub enum ModelChoice {
     /// One of [`ModelConfig::PRESETS`].
     Preset(String),

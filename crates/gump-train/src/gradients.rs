@@ -8,7 +8,7 @@ use gump_nn::ops::Deferred;
 use gump_nn::parameters::Parameters;
 use rayon::prelude::*;
 
-use super::peers::ProcessGroup;
+use super::process_group::ProcessGroup;
 use crate::TrainError;
 use crate::loss::LossParts;
 
@@ -63,9 +63,9 @@ impl BatchGradients {
     pub(super) fn share(
         &mut self,
         parameters: &Parameters,
-        peers: &dyn ProcessGroup,
+        group: &dyn ProcessGroup,
     ) -> std::result::Result<(), TrainError> {
-        if peers.size() == 1 {
+        if group.size() == 1 {
             return Ok(());
         }
         let mut numbers = self.loss.numbers();
@@ -84,7 +84,7 @@ impl BatchGradients {
         for (_, var) in parameters.statistics() {
             numbers.extend(var.flatten_all()?.to_vec1::<f32>()?);
         }
-        peers.sum(&mut numbers)?;
+        group.sum(&mut numbers)?;
         let (scalars, mut rest) = numbers.split_at(n_scalars);
         self.tokens = scalars[n_scalars - 1].round() as usize;
         self.loss = LossParts::of_numbers(&scalars[..n_scalars - 1]);
@@ -103,7 +103,7 @@ impl BatchGradients {
         }
         for (_, var) in parameters.statistics() {
             let sum = Tensor::from_slice(take(var.elem_count()), var.shape(), var.device())?;
-            var.set(&(sum / peers.size() as f64)?)?;
+            var.set(&(sum / group.size() as f64)?)?;
         }
         Ok(())
     }

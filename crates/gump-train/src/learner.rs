@@ -5,7 +5,7 @@ use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
 use gump_kernels::Operands;
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{Network, checkpoint};
 use gump_nn::NnError;
 use gump_nn::optimizer::{AdamW, move_average};
@@ -112,7 +112,7 @@ impl TrainState {
             serde_json::to_string(config).map_err(|e| TrainError::Config(e.to_string()))?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
-        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
+        Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 
     /// The network to validate and to ship: the moving average if there is one.

@@ -5,6 +5,24 @@
 //! training data, rewards, and the trainer ([`relative`]). Runs resume exactly, and the same seed
 //! gives the same result for any number of threads. The networks are in `gump-model`; command line,
 //! progress and output files are in `xtask`.
+//!
+//! ```
+//! use gump_model::{Device, ModelConfig};
+//! use gump_train::{SampleConfig, TrainConfig, Trainer};
+//!
+//! let scenario = gump_scene::fixture::scenario(
+//!     "lane 1: -100,0 200,0 speed 15
+//!      ego vehicle 0: 0,0 velocity 8,0
+//!      agent vehicle 1: 20,0 velocity 5,0",
+//! )?;
+//! let mut config = TrainConfig { steps: 1, batch: 1, ..TrainConfig::default() };
+//! config.sample = SampleConfig::plain(4);
+//! let mut trainer = Trainer::new(ModelConfig::tiny(), config, vec![scenario], &Device::Cpu)?;
+//! let report = trainer.step()?;
+//! assert!(report.loss.total.is_finite());
+//! assert_eq!(trainer.steps_done(), 1);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 pub mod closed_loop;
 mod config;
@@ -14,8 +32,8 @@ mod learner;
 pub mod loss;
 #[cfg(feature = "mpi")]
 mod mpi;
-mod peers;
 mod perturbation;
+mod process_group;
 pub mod relative;
 pub mod sample;
 pub mod scenes;
@@ -31,7 +49,7 @@ pub use gump_nn::OptimizerConfig;
 pub use loss::{LossConfig, LossParts};
 #[cfg(feature = "mpi")]
 pub use mpi::Mpi;
-pub use peers::{ProcessGroup, SingleProcess};
+pub use process_group::{ProcessGroup, SingleProcess};
 pub use sample::SampleConfig;
 pub use scenes::ScenarioSource;
 pub use trainer::{Batch, StepReport, Trainer};

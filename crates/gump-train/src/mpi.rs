@@ -7,7 +7,7 @@ use mpi::collective::{CommunicatorCollectives as _, SystemOperation};
 use mpi::environment::Universe;
 use mpi::traits::Communicator as _;
 
-use super::peers::ProcessGroup;
+use super::process_group::ProcessGroup;
 use crate::TrainError;
 
 /// The processes started by `mpirun`.

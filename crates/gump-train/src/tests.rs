@@ -20,7 +20,7 @@ use crate::closed_loop::ClosedLoopConfig;
 use crate::config::TrainConfig;
 use crate::gradients::BatchGradients;
 use crate::loss::LossParts;
-use crate::peers::ProcessGroup;
+use crate::process_group::ProcessGroup;
 use crate::sample::SampleConfig;
 use crate::trainer::Trainer;
 
@@ -304,7 +304,7 @@ fn assert_same(one: &BatchGradients, other: &BatchGradients, what: &str) {
 }
 
 fn first_step(trainer: &Trainer) -> BatchGradients {
-    let numbers = crate::trainer::share(&trainer.config, &*trainer.peers);
+    let numbers = crate::trainer::share(&trainer.config, &*trainer.group);
     let samples = trainer.source.samples(0, &numbers).unwrap();
     trainer.differentiate(&samples).unwrap()
 }
@@ -349,8 +349,8 @@ impl ProcessGroup for Thread {
     }
 }
 
-/// Does the work in as many threads at once that are peers of each other.
-fn among<T: Send>(n: usize, work: impl Fn(Thread) -> T + Sync) -> Vec<T> {
+/// Does the work in as many threads at once that are members of one group.
+fn in_threads<T: Send>(n: usize, work: impl Fn(Thread) -> T + Sync) -> Vec<T> {
     let desks: Arc<Vec<_>> = Arc::new((0..n).map(|_| Mutex::default()).collect());
     let barrier = Arc::new(Barrier::new(n));
     std::thread::scope(|scope| {
@@ -374,8 +374,8 @@ fn among<T: Send>(n: usize, work: impl Fn(Thread) -> T + Sync) -> Vec<T> {
 fn a_batch_shared_among_processes_is_the_batch() {
     let whole = first_step(&varied_trainer(6, 1));
     for (n, accumulate) in [(2, 1), (3, 2)] {
-        for found in among(n, |peers| {
-            first_step(&varied_trainer(6, accumulate).among(peers).unwrap())
+        for found in in_threads(n, |group| {
+            first_step(&varied_trainer(6, accumulate).with_group(group).unwrap())
         }) {
             assert_same(&found, &whole, &format!("{n} processes"));
         }
@@ -392,9 +392,9 @@ fn processes_learn_what_one_learns_and_stay_alike() {
     };
     let alone = learn(&mut varied_trainer(4, 1));
     let folder = tempfile::tempdir().unwrap();
-    let together = among(2, |peers| {
-        let path = folder.path().join(peers.rank.to_string());
-        let mut trainer = varied_trainer(4, 1).among(peers).unwrap();
+    let together = in_threads(2, |group| {
+        let path = folder.path().join(group.rank.to_string());
+        let mut trainer = varied_trainer(4, 1).with_group(group).unwrap();
         let losses = learn(&mut trainer);
         assert!(!trainer.any(false).unwrap());
         trainer.save(&path).unwrap();
@@ -416,11 +416,11 @@ fn processes_share_the_statistics_of_a_resnet() {
     resnet.visual.encoder = Encoder::Resnet18;
     (resnet.visual.side_px, resnet.visual.metres_per_px) = (64, 3.25);
     let folder = tempfile::tempdir().unwrap();
-    let together = among(2, |peers| {
-        let path = folder.path().join(peers.rank.to_string());
+    let together = in_threads(2, |group| {
+        let path = folder.path().join(group.rank.to_string());
         let scenes = vec![scenario(4.0)];
         let run = Trainer::new(resnet.clone(), varied(4, 1), scenes, &Device::Cpu).unwrap();
-        let mut run = run.among(peers).unwrap();
+        let mut run = run.with_group(group).unwrap();
         let losses = [0, 1].map(|_| run.step().unwrap().loss.total);
         assert!(losses.iter().all(|loss| loss.is_finite()));
         run.save(&path).unwrap();
@@ -444,12 +444,12 @@ fn a_failure_of_one_process_stops_all() {
             Err(TrainError::Source("rotten".into()))
         }
     }
-    let failed = among(2, |peers| {
-        let run = match peers.rank {
+    let failed = in_threads(2, |group| {
+        let run = match group.rank {
             0 => varied_trainer(4, 1),
             _ => Trainer::new(model(), varied(4, 1), Rotten, &Device::Cpu).unwrap(),
         };
-        let error = run.among(peers).unwrap().step().unwrap_err();
+        let error = run.with_group(group).unwrap().step().unwrap_err();
         error.to_string()
     });
     assert!(failed[0].contains("another one could not"), "{failed:?}");

@@ -3,7 +3,7 @@
 //!
 //! Sample `i` of step `s` depends only on the seed, `s` and `i`, so results do not depend on
 //! threads, processes or restarts. Settings are in `config`, samples come from `source`, parts of a
-//! batch are summed in `gradients` and `peers`, and `learner` defines what is saved.
+//! batch are summed in `gradients` and `process_group`, and `learner` defines what is saved.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use gump_model::Network;
-use gump_model::checkpoint::{self, Precision};
+use gump_model::checkpoint::{self, StorageType};
 use gump_model::config::ModelConfig;
 use gump_nn::layers::Dropout;
 use gump_nn::ops::Deferred;
@@ -25,7 +25,7 @@ use crate::config::TrainConfig;
 use crate::gradients::{BatchGradients, Part};
 use crate::learner::TrainState;
 use crate::loss::{Counts, LossConfig, LossParts, export, loss};
-use crate::peers::{ProcessGroup, SingleProcess};
+use crate::process_group::{ProcessGroup, SingleProcess};
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 use crate::source::{SampleReceiver, Source, check_rate, prefetch};
@@ -63,7 +63,7 @@ impl Batch {
 pub struct Trainer {
     pub(crate) learner: TrainState,
     pub(crate) config: TrainConfig,
-    pub(crate) peers: Box<dyn ProcessGroup>,
+    pub(crate) group: Box<dyn ProcessGroup>,
     pub(crate) source: Arc<Source>,
     /// Samples of the next step, being drawn while the present one is computed.
     pub(crate) next: SampleReceiver,
@@ -141,7 +141,7 @@ impl Trainer {
         Ok(Self {
             learner,
             config,
-            peers: Box::new(SingleProcess),
+            group: Box::new(SingleProcess),
             source,
             next,
         })
@@ -151,12 +151,12 @@ impl Trainer {
     ///
     /// # Errors
     /// A batch that is too small to be shared.
-    pub fn among(self, peers: impl ProcessGroup + 'static) -> Result<Self, TrainError> {
-        self.config.validate(peers.size())?;
-        let share = share(&self.config, &peers);
+    pub fn with_group(self, group: impl ProcessGroup + 'static) -> Result<Self, TrainError> {
+        self.config.validate(group.size())?;
+        let share = share(&self.config, &group);
         Ok(Self {
             next: prefetch(&self.source, self.learner.step, share),
-            peers: Box::new(peers),
+            group: Box::new(group),
             ..self
         })
     }
@@ -178,7 +178,7 @@ impl Trainer {
             return Err(TrainError::Peers(why));
         }
         let samples = drawn?;
-        let share = share(&self.config, &*self.peers);
+        let share = share(&self.config, &*self.group);
         self.next = prefetch(&self.source, self.learner.step + 1, share);
         self.learn_from(&samples)
     }
@@ -188,7 +188,7 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::Source`] for a scenario that cannot be read.
     pub fn batch(&self, step: usize) -> Result<Batch, TrainError> {
-        let share = share(&self.config, &*self.peers);
+        let share = share(&self.config, &*self.group);
         let samples = self.source.samples(step, &share)?;
         Ok(Batch { samples })
     }
@@ -222,7 +222,7 @@ impl Trainer {
         let (tensors, shape) = export(network, &batch.samples, &self.config.loss)?;
         let mut header = checkpoint::header(network.config())?;
         header.insert("shape".to_owned(), shape.to_string());
-        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
+        Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 
     fn learn_from(&mut self, samples: &[Sample]) -> Result<StepReport, TrainError> {
@@ -252,7 +252,7 @@ impl Trainer {
         let mut found = BatchGradients::default();
         let part = samples.len().div_ceil(self.config.accumulate).max(1);
         for (i, samples) in samples.chunks(part).enumerate() {
-            let seed = seed.fork((i * self.peers.size() + self.peers.rank()) as u64);
+            let seed = seed.fork((i * self.group.size() + self.group.rank()) as u64);
             let alone = network.samples_together(samples.len());
             let parts = samples.par_chunks(alone).enumerate().map(|(j, samples)| {
                 let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
@@ -270,7 +270,7 @@ impl Trainer {
             let parts: Vec<_> = parts.collect::<Result<_, TrainError>>()?;
             found.add(network.parameters(), &parts)?;
         }
-        found.share(network.parameters(), &*self.peers)?;
+        found.share(network.parameters(), &*self.group)?;
         Ok(found)
     }
 
@@ -286,7 +286,7 @@ impl Trainer {
         };
         scenarios.iter().take(limit).try_for_each(check_rate)?;
         let (reader, network) = (&self.source.reader, self.learner.shipped());
-        let (rank, size) = (self.peers.rank(), self.peers.size());
+        let (rank, size) = (self.group.rank(), self.group.size());
         let samples: Vec<Sample> = scenarios
             .par_iter()
             .take(limit)
@@ -309,7 +309,7 @@ impl Trainer {
         }
         if size > 1 {
             let mut numbers = sum.numbers();
-            self.peers.sum(&mut numbers)?;
+            self.group.sum(&mut numbers)?;
             sum = LossParts::of_numbers(&numbers);
         }
         Ok(sum)
@@ -320,9 +320,9 @@ impl Trainer {
     /// Error: there are no targets.
     fn total(&self, own: Counts) -> Result<Counts, TrainError> {
         let mut whole = own;
-        if self.peers.size() > 1 {
+        if self.group.size() > 1 {
             let mut numbers = whole.numbers();
-            self.peers.sum(&mut numbers)?;
+            self.group.sum(&mut numbers)?;
             whole = Counts::of_numbers(&numbers);
         }
         if whole.scenes == 0.0 {
@@ -338,7 +338,7 @@ impl Trainer {
     /// [`TrainError::Peers`] if the connection to another process is lost.
     pub fn any(&self, flag: bool) -> Result<bool, TrainError> {
         let mut number = [f32::from(u8::from(flag))];
-        self.peers.sum(&mut number)?;
+        self.group.sum(&mut number)?;
         Ok(number[0] > 0.0)
     }
 
@@ -380,6 +380,6 @@ impl Trainer {
 }
 
 /// Numbers of the samples of a step that a process draws.
-pub(crate) fn share(config: &TrainConfig, peers: &dyn ProcessGroup) -> Vec<usize> {
-    (peers.rank()..config.batch).step_by(peers.size()).collect()
+pub(crate) fn share(config: &TrainConfig, group: &dyn ProcessGroup) -> Vec<usize> {
+    (group.rank()..config.batch).step_by(group.size()).collect()
 }

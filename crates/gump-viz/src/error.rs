@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 /// Why something could not be drawn to a file.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum VizError {
     /// The file system refused.
     #[error("could not write {path}", path = path.display())]

@@ -4,7 +4,7 @@ pub(crate) use gump_engine::relative::{LiveFuture, RelativeWorld};
 
 use gump_engine::SamplingConfig;
 use gump_engine::relative::RelativeSampling;
-use gump_kernels::{Choice, Kernel};
+use gump_kernels::{Choice, Kernel, KernelError};
 use gump_model::relative::RelativeWeights;
 
 /// The world of some weights, with the rules that the driver's worlds have.
@@ -20,8 +20,7 @@ pub(crate) fn world(weights: &[u8]) -> Result<RelativeWorld, String> {
 /// called before any game is opened.
 ///
 /// # Errors
-/// A sentence if another kernel has been at work.
-pub fn compute_as_browsers_do() -> Result<(), String> {
-    let forced = Choice::force(Kernel::Portable);
-    forced.map(drop).map_err(|error| error.to_string())
+/// If another kernel has been at work.
+pub fn compute_as_browsers_do() -> Result<(), KernelError> {
+    Choice::force(Kernel::Portable).map(drop)
 }

@@ -2,6 +2,7 @@
 
 /// Errors of the game, each one sentence for the player.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum GameError {
     /// The file holds no scenario that can be read.
     #[error("This file cannot be read as a scene: {0}.")]

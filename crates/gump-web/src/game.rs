@@ -514,11 +514,11 @@ impl Game {
     pub fn fans(&self, draws: std::ops::Range<u64>) -> Vec<Fan> {
         let knot = self.driven() / STRIDE * STRIDE;
         let start = &self.frames[self.scenario.now + knot];
-        let outlooks = self
+        let predicted = self
             .live
-            .outlooks(&self.world, draws, Some(self.scenario.ego));
-        let fans = outlooks.into_iter().filter_map(|outlook| {
-            let from = start.agent(outlook.agent)?.state.pose;
+            .predictive_samples(&self.world, draws, Some(self.scenario.ego));
+        let fans = predicted.into_iter().filter_map(|samples| {
+            let from = start.agent(samples.agent)?.state.pose;
             let way = |state: &AgentState| {
                 let step = from.inverse() * state.pose;
                 let mut at = from;
@@ -528,9 +528,9 @@ impl Game {
                 })
             };
             Some(Fan {
-                agent: outlook.agent,
+                agent: samples.agent,
                 from: [from.position.x, from.position.y],
-                ways: outlook.draws.iter().map(way).collect(),
+                ways: samples.draws.iter().map(way).collect(),
             })
         });
         fans.collect()

@@ -1,6 +1,6 @@
 //! Scores of a drive: nuPlan's closed-loop score, and the realism of the traffic.
 
-use gump_nuplan::metrics::{MetricScores, RolloutDrive, Scoring, score};
+use gump_nuplan::metrics::{MetricScores, RolloutHistory, Scoring, score};
 use gump_wosac::realism::{self, Config, Log, N_FUTURE, Rollouts, Year};
 
 use crate::{Game, GameError};
@@ -40,11 +40,11 @@ impl Game {
         }
         let refused =
             |error: gump_nuplan::metrics::NuPlanError| GameError::Score(error.to_string());
-        let whole = RolloutDrive::new(&self.rollout(driven), self.scenario());
+        let whole = RolloutHistory::new(&self.rollout(driven), self.scenario());
         let mut parts = score(&whole.on(self.map())).map_err(refused)?.scores();
         let recorded = self.scenario().future().len().min(driven);
         if recorded < driven && recorded >= SHORTEST {
-            let begun = RolloutDrive::new(&self.rollout(recorded), self.scenario());
+            let begun = RolloutHistory::new(&self.rollout(recorded), self.scenario());
             let begun = score(&begun.on(self.map())).map_err(refused)?.scores();
             for name in COMPARED {
                 if let Some(&compared) = begun.get(name) {

@@ -1,8 +1,8 @@
 //! `ablate`: the paper's ablations, one table and one picture each.
 
 mod decoding;
+mod features;
 mod scaling;
-mod switches;
 mod train_variant;
 
 use std::num::NonZeroUsize;
@@ -44,7 +44,8 @@ pub(crate) enum Verb {
     /// Three sizes trained on the same samples: loss against tokens with a fitted law, and realism
     Scaling(scaling::Args),
     /// Each option of the network and of its training left out or put in: loss and realism
-    Switches(switches::Args),
+    #[command(alias = "switches")]
+    Features(features::Args),
 }
 
 /// Arguments of `ablate nar`.

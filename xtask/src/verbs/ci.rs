@@ -20,6 +20,10 @@ pub(crate) struct Args {
 /// The list that `.ci/run` reads too: a name and the words after `cargo` a line.
 const CHECKS: &str = include_str!("../../../.ci/checks");
 
+/// What is checked by other tools than cargo's own, or takes long: outside crates, spelling, unused
+/// dependencies, rare features, the oldest Rust. It says what it skips.
+const POLICIES: &str = ".ci/policies";
+
 /// A target that checks named `wasm...` build for.
 const WASM: &str = "wasm32-unknown-unknown";
 
@@ -49,6 +53,9 @@ impl Args {
             run.phase(name, |_| cargo(words))?;
             done.push(name);
         }
+        run.print(POLICIES);
+        run.phase("policies", |_| policies())?;
+        done.push("policies");
         run.result("steps", done)?;
         Ok(())
     }
@@ -67,6 +74,13 @@ fn cargo(words: &str) -> anyhow::Result<()> {
     }
     let status = command.status().context("cannot run cargo")?;
     anyhow::ensure!(status.success(), "cargo {words} failed: {status}");
+    Ok(())
+}
+
+fn policies() -> anyhow::Result<()> {
+    let mut command = Command::new(repository().join(POLICIES));
+    let status = command.status().context("cannot run .ci/policies")?;
+    anyhow::ensure!(status.success(), "{POLICIES} failed: {status}");
     Ok(())
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
-use gump_engine::{SamplingConfig, TransformerWorld};
+use gump_engine::{LightSource, SamplingConfig, TransformerWorld};
 use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::check::{off_road, overlaps};
 use gump_generate::constraint::parse_constraints;
@@ -19,10 +19,10 @@ use gump_viz::{Camera, PictureSpec, Viewer, draw_scene, log_as_rollout};
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use crate::choices::{LIGHTS, PLACEMENTS, one_of};
 use crate::cli::WrongArguments;
 use crate::films::FilmArgs;
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::sampling::LightsName;
 use crate::shipped;
 
 /// Scenes made together.
@@ -69,14 +69,14 @@ pub(crate) struct Args {
     #[arg(long, value_name = "WORLD", default_value_t = shipped::world())]
     world: WorldName,
     /// Traffic lights after the present
-    #[arg(long, value_enum, default_value_t = LightsName::Model)]
-    lights: LightsName,
+    #[arg(long, value_parser = one_of(LIGHTS), default_value_t = LightSource::Model)]
+    lights: LightSource,
     /// Start of the ego
     #[arg(long, value_enum, default_value_t = StartName::Recorded)]
     start: StartName,
     /// Placement of objects
-    #[arg(long, value_enum, default_value_t = PlacementName::Guided)]
-    placement: PlacementName,
+    #[arg(long, value_parser = one_of(PLACEMENTS), default_value_t = Placement::Guided)]
+    placement: Placement,
     /// Weights of the model [default: the shipped ones]
     #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
     weights: Option<PathBuf>,
@@ -110,24 +110,6 @@ enum StartName {
     Anywhere,
 }
 
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum PlacementName {
-    /// Wherever the model puts them
-    Free,
-    /// Only the model's proposals on lanes and walkways
-    Guided,
-}
-
-impl PlacementName {
-    pub(crate) fn resolve(self) -> Placement {
-        match self {
-            Self::Free => Placement::Free,
-            Self::Guided => Placement::Guided,
-        }
-    }
-}
-
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let prompts = tags(&self.prompt)?;
@@ -140,8 +122,8 @@ impl Args {
         })?;
         let traffic = run.phase("load", |run| {
             let sampling = SamplingConfig {
-                life: self.life,
-                lights: self.lights.resolve(),
+                spawn: self.life,
+                lights: self.lights,
                 ..SamplingConfig::default()
             };
             Ok(World::without_log(run.device(), &self.world, &sampling)?)
@@ -208,7 +190,7 @@ impl Args {
         GenerateConfig {
             temperature: self.temperature.unwrap_or(manner.temperature),
             top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
-            placement: self.placement.resolve(),
+            placement: self.placement,
             // Agents that stand without a reason would still be there half a minute later.
             standing_has_reasons: self.simulate > 0.0 && !self.paper,
             ..manner
@@ -246,9 +228,9 @@ impl Args {
 /// Turns a request for more objects than a scene can hold into [`WrongArguments`].
 fn too_many(error: GenerateError) -> anyhow::Error {
     match error {
-        GenerateError::TooMany { asked, most } => WrongArguments(format!(
-            "--vehicles, --bicycles, --pedestrians: expected at most {most} objects with the ego and \
-             what stands on the map, found {asked}"
+        GenerateError::TooMany { requested, max } => WrongArguments(format!(
+            "--vehicles, --bicycles, --pedestrians: expected at most {max} objects with the ego and \
+             what stands on the map, found {requested}"
         ))
         .into(),
         other => other.into(),
@@ -289,7 +271,7 @@ pub(crate) fn tags(names: &[String]) -> anyhow::Result<Vec<ScenarioTag>> {
 pub(crate) fn world(
     device: &Device,
     weights: Option<&PathBuf>,
-    life: bool,
+    spawn: bool,
 ) -> anyhow::Result<TransformerWorld> {
     let path = match weights {
         Some(path) => path.clone(),
@@ -309,7 +291,7 @@ pub(crate) fn world(
     }
     let network = checkpoint::load(&path, device)?;
     let sampling = SamplingConfig {
-        life,
+        spawn,
         ..SamplingConfig::default()
     };
     Ok(TransformerWorld::new(network, sampling))

@@ -20,7 +20,7 @@ use super::evaluate::Driving;
 use super::explain;
 use crate::cli::WrongArguments;
 use crate::films::FilmArgs;
-use crate::planners::{ImaginationArgs, PlannerParser};
+use crate::planners::{ImaginationArgs, planner};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
 
@@ -31,7 +31,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S")]
     scenario: String,
     /// Planner that drives
-    #[arg(long, value_parser = PlannerParser, value_name = "P", default_value_t = PlannerName::Interactive)]
+    #[arg(long, value_parser = planner(), value_name = "P", default_value_t = PlannerName::Interactive)]
     planner: PlannerName,
     /// Traffic model of the drive and of the planner's rollouts: log, idm, constant-velocity or
     /// model:WEIGHTS
@@ -128,7 +128,7 @@ impl Noted<'_> {
                 .is_some_and(|agent| position(agent).distance(position(then)) < 1e-6)
         };
         let begins_now = |future: &Rollout| future.start().agents().iter().all(is_here);
-        let is_new = decision.prospects[decision.chosen]
+        let is_new = decision.candidates[decision.chosen]
             .futures
             .first()
             .is_some_and(begins_now);

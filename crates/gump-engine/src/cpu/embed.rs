@@ -12,7 +12,7 @@ use gump_kernels::wide;
 use gump_model::ModelError;
 use gump_model::batch::Packer;
 use gump_model::embedding::SineKey;
-use gump_model::local_context::{LocalContext, Survey, encode_local_context, n_numbers};
+use gump_model::local_context::{LaneMap, LocalContext, encode_local_context, n_numbers};
 use gump_model::mct::PLACES;
 use gump_model::placed_slot::PlacedSlot;
 use rayon::prelude::*;
@@ -32,7 +32,7 @@ pub(super) struct Embedder {
     /// One map per position that an object looks at, if the network has this option.
     local: Vec<Panels>,
     /// Two layers over the local context of an object, if the network has this option.
-    surroundings: Option<[Panels; 2]>,
+    local_context: Option<[Panels; 2]>,
     /// Number of its inputs.
     n_numbers: usize,
 }
@@ -57,7 +57,7 @@ impl Embedder {
             local: (0..n_places)
                 .map(|i| source.linear(&format!("mct.local.{i}"), c))
                 .collect::<Result<_, _>>()?,
-            surroundings: match config.surroundings {
+            local_context: match config.local_context {
                 true => Some([
                     source.linear("mct.surroundings.in", n_numbers(config))?,
                     source.linear("mct.surroundings.out", 2 * c)?,
@@ -122,26 +122,26 @@ impl Embedder {
     }
 
     /// The local contexts of the objects at the keys from slot `from` on, if the network uses them.
-    pub(super) fn surroundings(
+    pub(super) fn local_context(
         &self,
-        survey: &Survey,
+        lane_map: &LaneMap,
         slots: &[PlacedSlot],
         from: usize,
     ) -> Vec<(usize, LocalContext)> {
-        match self.surroundings {
-            Some(_) => encode_local_context(survey, slots, from),
+        match self.local_context {
+            Some(_) => encode_local_context(lane_map, slots, from),
             None => Vec::new(),
         }
     }
 
     /// Adds the encoded local contexts to rows of `x`. Returns the number of multiplications.
-    pub(super) fn add_surroundings(
+    pub(super) fn add_local_context(
         &self,
         seen: &[(usize, LocalContext)],
         rooms: &Pool,
         x: &mut [f32],
     ) -> u64 {
-        let Some([first, second]) = &self.surroundings else {
+        let Some([first, second]) = &self.local_context else {
             return 0;
         };
         let c = self.width;

@@ -2,18 +2,18 @@
 //!
 //! It covers everything between slots and sampled bins, over weights that are packed once.
 //! Sequences of any lengths are computed together, row by row, without padding; keys and values of
-//! the map exist once per scene; each sequence may have a [`Context`], whose tokens are not
+//! the map exist once per scene; each sequence may have a [`KvCache`], whose tokens are not
 //! computed again. The reference implementation is `mct`, which other devices run and tests compare
 //! with. Start with [`Engine::run`].
 //!
 //! The arithmetic of a row does not depend on other rows, so a future does not depend on other
-//! futures, the number of threads, or the content of a context.
+//! futures, the number of threads, or the content of a cache.
 //!
 //! Shapes: `R` new tokens of all sequences one after another, `C` width.
 
-mod cache;
 mod decoder;
 mod embed;
+mod kv_cache;
 mod successor;
 #[cfg(test)]
 mod tests;
@@ -24,10 +24,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-pub use self::cache::Context;
-use self::cache::{Heads, Pages, attend};
 use self::decoder::Decoder;
 use self::embed::{Embedder, Ground};
+pub use self::kv_cache::KvCache;
+use self::kv_cache::{Heads, Pages, attend};
 pub use self::successor::Successor;
 use gump_kernels::gelu::gelu_row;
 use gump_kernels::panels::{Panels, Precision, Scratch};
@@ -35,7 +35,7 @@ use gump_kernels::wide;
 use gump_model::ModelError;
 use gump_model::Network;
 use gump_model::decoder::{Bins, STATE_STEPS, STEPS};
-use gump_model::local_context::{LocalContext, Survey};
+use gump_model::local_context::{LaneMap, LocalContext};
 use gump_model::mct::VisualMemory;
 use gump_model::placed_slot::PlacedSlot;
 
@@ -70,7 +70,7 @@ pub struct SceneMemory {
     n: usize,
     cross: Vec<Pages>,
     ground: Ground,
-    survey: Arc<Survey>,
+    lane_map: Arc<LaneMap>,
 }
 
 /// One sequence in a pass.
@@ -85,7 +85,7 @@ pub struct Job<'a> {
     pub memory: &'a SceneMemory,
     /// The cache. Tokens of the sequence in it are not computed again. New ones are added if `keep`
     /// is set; otherwise it is cleared.
-    pub context: &'a mut Context,
+    pub kv_cache: &'a mut KvCache,
     /// Whether the tokens read are cached.
     pub keep: bool,
 }
@@ -160,7 +160,7 @@ impl Engine {
                 .map(pages)
                 .collect::<Result<_, _>>()?,
             ground: self.embedder.ground(&memory.visual)?,
-            survey: memory.surveys.first().cloned().unwrap_or_default(),
+            lane_map: memory.lane_maps.first().cloned().unwrap_or_default(),
         })
     }
 
@@ -209,12 +209,12 @@ impl Engine {
     }
 
     /// Logits of the successors of the tokens whose hidden vectors `[N, C]` are given.
-    pub fn say(&self, hidden: &[f32]) -> Vec<Successor> {
+    pub fn successors(&self, hidden: &[f32]) -> Vec<Successor> {
         let rows = hidden.len() / self.width;
         self.count(self.successors.products(rows));
         hidden
             .chunks_exact(self.width)
-            .map(|hidden| self.successors.say(hidden))
+            .map(|hidden| self.successors.logits(hidden))
             .collect()
     }
 
@@ -230,14 +230,14 @@ impl Engine {
             let end = job.wanted.last().map_or(0, |last| last + 1);
             job.slots = &job.slots[..end];
             let first = job.wanted.first().copied().unwrap_or(0);
-            let start = job.context.reuse(job.slots, first);
+            let start = job.kv_cache.reuse(job.slots, first);
             let n_layers = if job.keep || start > 0 {
                 self.layers.len()
             } else {
                 1
             };
             // What is not kept needs room for one layer at a time.
-            job.context.layers.resize(n_layers, Pages::default());
+            job.kv_cache.layers.resize(n_layers, Pages::default());
             rows.extend((start..end).map(|place| (i, place)));
             starts.push(start);
         }
@@ -257,9 +257,9 @@ impl Engine {
         }
         for (job, start) in jobs.iter_mut().zip(starts) {
             if job.keep {
-                job.context.slots.extend_from_slice(&job.slots[start..]);
+                job.kv_cache.slots.extend_from_slice(&job.slots[start..]);
             } else {
-                job.context.clear();
+                job.kv_cache.clear();
             }
         }
         let mut hidden = vec![0.0; rows.len() * c];
@@ -283,12 +283,12 @@ impl Engine {
                 let rows = |(place, numbers)| (first + place - start, numbers);
                 let seen = self
                     .embedder
-                    .surroundings(&job.memory.survey, job.slots, start);
+                    .local_context(&job.memory.lane_map, job.slots, start);
                 seen.into_iter().map(rows).collect::<Vec<_>>()
             });
         let seen: Vec<Vec<(usize, LocalContext)>> = seen.collect();
         self.embedder
-            .add_surroundings(&seen.concat(), &self.rooms, x)
+            .add_local_context(&seen.concat(), &self.rooms, x)
     }
 
     /// Leaves of `x` only the rows that are asked for.
@@ -329,9 +329,9 @@ impl Engine {
         let c = self.width;
         self.count_layer(layer, jobs, rows);
         let own = |row: &Row| {
-            let context = &*jobs[row.0].context;
-            let l = if context.layers.len() == 1 { 0 } else { l };
-            (&context.layers[l], row.1 + 1)
+            let kv_cache = &*jobs[row.0].kv_cache;
+            let l = if kv_cache.layers.len() == 1 { 0 } else { l };
+            (&kv_cache.layers[l], row.1 + 1)
         };
         let map = |row: &Row| {
             let memory = jobs[row.0].memory;
@@ -430,11 +430,11 @@ fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], k
     for (job, start) in jobs.iter_mut().zip(starts) {
         let (own, after) = rest.split_at((job.slots.len() - start) * 2 * c);
         rest = after;
-        parts.push((&mut *job.context, *start, own));
+        parts.push((&mut *job.kv_cache, *start, own));
     }
-    parts.into_par_iter().for_each(|(context, start, kv)| {
-        let l = if context.layers.len() == 1 { 0 } else { l };
-        context.layers[l].write(heads, start, kv);
+    parts.into_par_iter().for_each(|(kv_cache, start, kv)| {
+        let l = if kv_cache.layers.len() == 1 { 0 } else { l };
+        kv_cache.layers[l].write(heads, start, kv);
     });
 }
 

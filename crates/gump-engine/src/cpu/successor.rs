@@ -48,7 +48,7 @@ impl Successors {
         self.0.products(rows)
     }
 
-    pub(super) fn say(&self, hidden: &[f32]) -> Successor {
+    pub(super) fn logits(&self, hidden: &[f32]) -> Successor {
         let mut all = vec![0.0; self.0.n_out()];
         self.0
             .apply_to_few(hidden, &mut all, &mut Scratch::default());

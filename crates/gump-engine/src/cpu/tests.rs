@@ -16,19 +16,19 @@ fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
     differences.fold(0.0, f32::max)
 }
 
-/// Hidden vectors of all tokens of a sequence, in one pass over what `context` does not hold.
+/// Hidden vectors of all tokens of a sequence, in one pass over what `kv_cache` does not hold.
 fn all(
     engine: &Engine,
     memory: &SceneMemory,
     slots: &[PlacedSlot],
-    context: &mut Context,
+    kv_cache: &mut KvCache,
 ) -> Vec<f32> {
-    let held = context.common(slots);
+    let held = kv_cache.common(slots);
     engine.run(&mut [Job {
         slots,
         wanted: (held..slots.len()).collect(),
         memory,
-        context,
+        kv_cache,
         keep: true,
     }])
 }
@@ -40,7 +40,7 @@ fn the_engine_says_what_the_network_says() {
     let engine = Engine::new(&network, Precision::F32).unwrap();
     let packed = engine.remember(&memory).unwrap();
     let expected = hidden(&network, &[&slots], &memory).concat().concat();
-    let found = all(&engine, &packed, &slots, &mut Context::default());
+    let found = all(&engine, &packed, &slots, &mut KvCache::default());
     assert!(largest_difference(&found, &expected) < 1e-4);
     assert!(engine.products() > 0);
 }
@@ -52,7 +52,7 @@ fn lower_precision_says_nearly_the_same() {
     let read_with = |precision| {
         let engine = Engine::new(&network, precision).unwrap();
         let packed = engine.remember(&memory).unwrap();
-        let vectors = all(&engine, &packed, &slots, &mut Context::default());
+        let vectors = all(&engine, &packed, &slots, &mut KvCache::default());
         (vectors, engine.weight_bytes())
     };
     let (exact, bytes) = read_with(Precision::F32);
@@ -101,23 +101,23 @@ fn a_context_changes_no_bit() {
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));
     let engine = Engine::new(&network, Precision::F32).unwrap();
     let memory = engine.remember(&memory).unwrap();
-    let whole = all(&engine, &memory, &slots, &mut Context::default());
-    let mut context = Context::default();
+    let whole = all(&engine, &memory, &slots, &mut KvCache::default());
+    let mut kv_cache = KvCache::default();
     let mut pieces = Vec::new();
     for end in [11, 12, slots.len()] {
-        pieces.extend(all(&engine, &memory, &slots[..end], &mut context));
-        assert_eq!(context.slots.len(), end);
+        pieces.extend(all(&engine, &memory, &slots[..end], &mut kv_cache));
+        assert_eq!(kv_cache.slots.len(), end);
     }
     assert_eq!(pieces, whole);
     // Another value in the middle: only the tokens before it are kept, by this future alone.
-    let shared = context.clone();
+    let shared = kv_cache.clone();
     let value = slots.iter().rposition(|p| matches!(p.slot, Slot::Value(_)));
     let mut changed = slots.clone();
     if let Slot::Value(state) = &mut changed[value.unwrap()].slot {
         state.x += 7;
     }
-    let after = all(&engine, &memory, &changed, &mut context);
-    let afresh = all(&engine, &memory, &changed, &mut Context::default());
+    let after = all(&engine, &memory, &changed, &mut kv_cache);
+    let afresh = all(&engine, &memory, &changed, &mut KvCache::default());
     assert_eq!(after, afresh[afresh.len() - after.len()..]);
     let mut other = shared.clone();
     assert_eq!(other.common(&slots), slots.len());
@@ -132,19 +132,19 @@ fn sequences_do_not_know_their_neighbours_or_the_threads() {
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));
     let engine = Engine::new(&network, Precision::F32).unwrap();
     let memory = engine.remember(&memory).unwrap();
-    let alone = all(&engine, &memory, &slots, &mut Context::default());
+    let alone = all(&engine, &memory, &slots, &mut KvCache::default());
     for threads in [1, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         pool.build().unwrap().install(|| {
-            let mut contexts: Vec<Context> = (0..9).map(|_| Context::default()).collect();
-            let mut jobs: Vec<Job<'_>> = contexts
+            let mut kv_caches: Vec<KvCache> = (0..9).map(|_| KvCache::default()).collect();
+            let mut jobs: Vec<Job<'_>> = kv_caches
                 .iter_mut()
                 .enumerate()
-                .map(|(i, context)| Job {
+                .map(|(i, kv_cache)| Job {
                     slots: &slots[..slots.len() - i],
                     wanted: vec![3, slots.len() - i - 1],
                     memory: &memory,
-                    context,
+                    kv_cache,
                     keep: i % 2 == 0,
                 })
                 .collect();
@@ -164,7 +164,7 @@ fn a_probe_is_the_same_by_engine_and_by_tensors() {
     let scenario = scenario();
     let sampling = SamplingConfig::default();
     let fused = TransformerWorld::new(network(), sampling.clone());
-    let plain = TransformerWorld::plain(network(), sampling);
+    let plain = TransformerWorld::reference(network(), sampling);
     let outputs = [fused, plain].map(|world| world.probe(scenario.present()).unwrap());
     assert!(outputs[0].len() > 32);
     assert!(largest_difference(&outputs[0], &outputs[1]) < 1e-4);
@@ -189,7 +189,7 @@ fn imagine(
     let world = if engine {
         TransformerWorld::new(network(), sampling.clone())
     } else {
-        TransformerWorld::plain(network(), sampling.clone())
+        TransformerWorld::reference(network(), sampling.clone())
     };
     let start = Start {
         scene: course.scenario.present(),

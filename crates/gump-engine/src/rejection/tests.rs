@@ -209,7 +209,7 @@ fn braking_stays_on_the_way_and_stops() {
     use crate::request::Request;
 
     let request = Request {
-        anchor: gump_model::local_frame::LocalFrame::at(Pose::new(0.0, 0.0, 0.0)),
+        local_frame: gump_model::local_frame::LocalFrame::at(Pose::new(0.0, 0.0, 0.0)),
         forced: [None; gump_model::decoder::STEPS.len()],
         stream: gump_scene::Seed(0),
         near: None,
@@ -227,7 +227,7 @@ fn braking_stays_on_the_way_and_stops() {
         })
     };
     let bins = request
-        .anchor
+        .local_frame
         .bins(QuantizedState::default(), std::array::from_fn(arc));
     let bins: Bins = bins.map(|bin| bin.expect("all are within the grid"));
     let moving = Member {
@@ -235,7 +235,7 @@ fn braking_stays_on_the_way_and_stops() {
         ..member(0.0, 4.0)
     };
     let braking = moving.brake(&request, &bins).expect("it moves");
-    let poses = request.anchor.poses(&braking);
+    let poses = request.local_frame.poses(&braking);
     // 8 m/s and 5 m/s^2: 3.4 m after half a second, 6.4 m after 1.6 s for good.
     for (pose, s) in poses.iter().zip([3.375_f64, 5.5, 6.375, 6.4]) {
         let on_arc = DVec2::new(40.0 * (s / 40.0).sin(), 40.0 * (1.0 - (s / 40.0).cos()));

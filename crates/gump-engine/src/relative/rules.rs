@@ -6,7 +6,7 @@
 //! drawn move.
 
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::Shown;
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{
@@ -216,7 +216,7 @@ pub struct Driven {
 pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
-    survey: &Survey,
+    lane_map: &LaneMap,
     redraws: usize,
     moves: &mut [Pose],
     again: &mut Again<'_>,
@@ -237,7 +237,7 @@ pub fn resolve(
             member.walks = now.body.kind == AgentKind::Pedestrian;
             member.is_ignored = is_driven(i).is_some_and(|driven| !driven.is_heeded);
             if now.body.kind == AgentKind::Vehicle && !member.is_driven {
-                member.look_for_edges(survey);
+                member.look_for_edges(lane_map);
             }
             member
         });
@@ -329,11 +329,11 @@ mod tests {
         let agents = [car(0.0, 4.0), car(9.0, 0.0)];
         let mut moves = [straight(4.0), Pose::IDENTITY];
         let mut calls = Vec::new();
-        let survey = Survey::default();
+        let lane_map = LaneMap::default();
         resolve(
             &agents,
             None,
-            &survey,
+            &lane_map,
             4,
             &mut moves,
             &mut |who, attempt| {
@@ -350,10 +350,10 @@ mod tests {
     #[test]
     fn who_finds_no_way_brakes_and_the_driven_are_left_alone() {
         let agents = [car(0.0, 4.0), car(9.0, 0.0)];
-        let survey = Survey::default();
+        let lane_map = LaneMap::default();
         let settled = |driven: Option<Driven>| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
-            resolve(&agents, driven, &survey, 2, &mut moves, &mut |who, _| {
+            resolve(&agents, driven, &lane_map, 2, &mut moves, &mut |who, _| {
                 who.iter().map(|_| straight(4.0)).collect()
             });
             moves
@@ -367,13 +367,13 @@ mod tests {
     #[test]
     fn a_driven_agent_may_be_left_to_the_network() {
         let agents = [car(0.0, 4.0), car(9.0, 0.0)];
-        let survey = Survey::default();
+        let lane_map = LaneMap::default();
         let follower = |yields: bool| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
             resolve(
                 &agents,
                 driven(1, yields),
-                &survey,
+                &lane_map,
                 2,
                 &mut moves,
                 &mut |_, _| vec![straight(1.0)],

@@ -25,7 +25,7 @@ const LOOK_M: f64 = 25.0;
 /// The free path that a start needs beyond the front bumper, metres.
 const ROOM_M: f64 = 5.0;
 /// Space beside the path, from the side of the agent, that others are not in, metres; people need
-/// more.
+/// more, unless they have stood there for as long.
 const SIDE_M: f64 = 0.3;
 const SIDE_OF_PEOPLE_M: f64 = 1.0;
 /// Crossing traffic within this time is let pass, seconds, ...
@@ -71,7 +71,10 @@ pub(super) fn free_to_go(
         if reached.is_empty() {
             continue;
         }
-        let holding = |&j: &usize| j != i && holds(&reached, agent, &agents[j].agent);
+        let holding = |&j: &usize| {
+            let stays = agents[j].waited_s > patience_s;
+            j != i && holds(&reached, agent, &agents[j].agent, stays)
+        };
         let in_the_way = waiting.iter().copied().filter(|&j| walks(j));
         people.extend(in_the_way.filter(holding));
         if !is_shut(&reached, lights) && !(0..agents.len()).any(|j| holding(&j)) {
@@ -135,8 +138,9 @@ fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light]) -> bool {
     is_one_shut
 }
 
-/// Whether another agent is in the way, or will be when it crosses.
-fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent) -> bool {
+/// Whether another agent is in the way, or will be when it crosses; one that `stays` is not about to
+/// step onto the path.
+fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent, stays: bool) -> bool {
     let (pose, at) = (other.state.pose, other.state.pose.position);
     let own = agent.state.pose;
     let reach = LOOK_M + agent.length + other.length + GAP_S * other.state.speed();
@@ -144,7 +148,7 @@ fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent) -> bool {
         return false;
     }
     let side = match other.kind {
-        AgentKind::Pedestrian | AgentKind::Bicycle => SIDE_OF_PEOPLE_M,
+        AgentKind::Pedestrian | AgentKind::Bicycle if !stays => SIDE_OF_PEOPLE_M,
         _ => SIDE_M,
     };
     let corners = other.oriented_box().corners();
@@ -257,6 +261,9 @@ mod tests {
         assert_eq!(free(&with(0.5), &[(0, 9.0), (1, 9.0)]), [1]);
         assert!(free(&with(0.5), &[(0, 9.0), (1, 2.0)]).is_empty());
         assert!(free(&with(0.5), &[(0, 2.0), (1, 9.0)]).is_empty());
+        // Beside the path it holds as long as it may step onto it.
+        assert_eq!(free(&with(1.8), &[(0, 9.0), (1, 9.0)]), [0]);
+        assert!(free(&with(1.8), &[(0, 9.0), (1, 2.0)]).is_empty());
         assert_eq!(free(&with(4.0), &[(0, 9.0), (1, 9.0)]), [0]);
     }
 

@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::ModelError;
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::relative::RelativeWeights;
 use gump_model::relative::graph::{Body, Lights, Shown};
 use gump_model::relative::grid::{FIELDS, dequantize};
@@ -266,7 +266,8 @@ impl WorldModel for RelativeWorld {
 
     fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
         // Planners open the same scene for each of their candidates: it is read once.
-        let groups: Vec<&[Start<'_>]> = starts.chunk_by(is_same_scene).collect();
+        let groups = starts.chunk_by(|a, b| a.scene.is_same_scene(&b.scene));
+        let groups: Vec<&[Start<'_>]> = groups.collect();
         let begun = groups.par_iter().map(|group| self.begin(group));
         let begun: Vec<_> = begun.collect::<Result<_, _>>()?;
         Ok(Box::new(RelativeSession {
@@ -279,14 +280,6 @@ impl WorldModel for RelativeWorld {
     }
 }
 
-/// Whether two starts have the same frames and the same map: the same slices, not equal ones.
-fn is_same_scene(a: &Start<'_>, b: &Start<'_>) -> bool {
-    let (a, b) = (a.scene, b.scene);
-    std::ptr::eq(a.history, b.history)
-        && Arc::ptr_eq(a.map, b.map)
-        && (a.ego, a.dt) == (b.ego, b.dt)
-}
-
 /// Data shared by all futures of a start.
 #[derive(Debug)]
 pub(super) struct Scene {
@@ -296,7 +289,7 @@ pub(super) struct Scene {
     map: VectorMap,
     pub memory: MapMemory,
     /// The edges of the road and the lines before lights, where rules look at them.
-    pub survey: Survey,
+    pub lane_map: LaneMap,
     lines: Vec<StopLine>,
     ego: AgentId,
 }
@@ -322,9 +315,9 @@ impl Scene {
         Self {
             memory: engine.remember(&map),
             map,
-            survey: match sampling.redraws {
-                0 => Survey::default(),
-                _ => Survey::of_curbs(&source, centre, MAP_M),
+            lane_map: match sampling.redraws {
+                0 => LaneMap::default(),
+                _ => LaneMap::of_curbs(&source, centre, MAP_M),
             },
             lines: match sampling.redraws {
                 0 => Vec::new(),
@@ -623,7 +616,7 @@ impl Future {
                 .map(|(&i, bins)| kept(i, bins))
                 .collect()
         };
-        let (survey, redraws) = (&self.scene.survey, sampling.redraws);
+        let (lane_map, redraws) = (&self.scene.lane_map, sampling.redraws);
         let driven = driven.map(|(i, _)| i);
         let could_go = |i: &usize| self.members[*i].could_go && driven != Some(*i);
         let standing = (0..agents.len()).filter(could_go).collect();
@@ -649,12 +642,12 @@ impl Future {
             index,
             is_heeded: sampling.yields_to_driven,
         });
-        resolve(&agents, driven, survey, redraws, &mut moves, &mut lawful);
+        resolve(&agents, driven, lane_map, redraws, &mut moves, &mut lawful);
         moves
     }
 
     /// Returns draws of the next states of all agents but the driven one, from separate streams.
-    fn outlooks(
+    fn predictive_samples(
         &self,
         engine: &Engine,
         sampling: &RelativeSampling,
@@ -673,7 +666,7 @@ impl Future {
             .collect();
         let members = self.members.iter().enumerate();
         let predicted = members.filter(|(_, member)| driven != Some(member.agent.id));
-        let outlook = |(i, member): (usize, &Member)| PredictiveSamples {
+        let samples_of = |(i, member): (usize, &Member)| PredictiveSamples {
             future,
             step,
             step_s: TOKEN_DT,
@@ -689,7 +682,7 @@ impl Future {
                 })
                 .collect(),
         };
-        predicted.map(outlook).collect()
+        predicted.map(samples_of).collect()
     }
 
     /// Shows these lights in the next frame.
@@ -843,7 +836,7 @@ impl Session for RelativeSession<'_> {
             let seen = probed.flat_map(|(i, future)| {
                 let driven = ego.is_some().then_some(future.scene.ego);
                 let draws = 0..probe.draws as u64;
-                future.outlooks(engine, sampling, (draws, i, self.step), driven)
+                future.predictive_samples(engine, sampling, (draws, i, self.step), driven)
             });
             self.samples.extend(seen);
         }

@@ -14,11 +14,11 @@ use gump_model::placed_slot::PlacedSlot;
 use gump_scene::{Frame, LaneId, LightState};
 use gump_tokenizer::{Slot, TokenLight};
 
-use crate::cpu::{Context, Engine};
-use crate::decode::Window;
+use crate::cpu::{Engine, KvCache};
 use crate::nucleus::uniform;
+use crate::partial_ar::Window;
 use crate::placement::births::pick;
-use crate::scene::Scene;
+use crate::scene::SceneContext;
 use crate::session::TransformerSession;
 use crate::spawning::{About, first_slot};
 
@@ -59,7 +59,7 @@ impl TransformerSession<'_> {
         engine: &Engine,
         windows: &mut [Window],
         placed: &mut [Vec<PlacedSlot>],
-        contexts: &mut [Context],
+        kv_caches: &mut [KvCache],
     ) {
         let companions: Vec<Vec<Option<usize>>> = windows
             .iter()
@@ -75,8 +75,8 @@ impl TransformerSession<'_> {
             let members: Vec<usize> = (0..windows.len()).filter(is_independent).collect();
             let at = |w: usize| first_slot(&windows[w], &placed[w]) + light;
             let wanted: Vec<Vec<usize>> = members.iter().map(|w| vec![at(*w)]).collect();
-            let hidden = self.run(engine, windows, placed, contexts, &members, &wanted);
-            let mut successors = engine.say(&hidden).into_iter();
+            let hidden = self.run(engine, windows, placed, kv_caches, &members, &wanted);
+            let mut successors = engine.successors(&hidden).into_iter();
             for (w, window) in windows.iter_mut().enumerate() {
                 let Some(companion) = companions[w].get(light) else {
                     continue;
@@ -91,7 +91,7 @@ impl TransformerSession<'_> {
                             .next()
                             .expect("one word per light that is asked about");
                         let seed = future.decision(About::Lights).fork(light as u64);
-                        let changes = self.world.sampling().pace.light_changes;
+                        let changes = self.world.sampling().spawn_rates.light_changes;
                         let age = future.phases.age(lane);
                         next_light(
                             &successor.lights,
@@ -111,7 +111,7 @@ impl TransformerSession<'_> {
 }
 
 /// Per light the first one that it goes with: of the same stop line and showing the same.
-fn companions(lights: &[TokenLight], scene: &Scene, now: &Frame) -> Vec<Option<usize>> {
+fn companions(lights: &[TokenLight], scene: &SceneContext, now: &Frame) -> Vec<Option<usize>> {
     let stop = |light: &TokenLight| -> Option<DVec2> {
         let lane = *scene.lights.get(usize::from(light.index).checked_sub(1)?)?;
         let stated = now.light(lane).and_then(|light| light.stop_point);

@@ -15,6 +15,7 @@ const TRIES: usize = 20;
 
 /// A source of scenes.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum SceneSource {
     /// The model, with its own manner of drawing.
     Model(Placement),

@@ -27,6 +27,7 @@ use crate::panels::PANEL;
 /// A set of instructions that matrices are multiplied with. A later one includes the earlier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Kernel {
     /// No more than every processor has.
     Portable,

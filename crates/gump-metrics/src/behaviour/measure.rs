@@ -7,6 +7,7 @@ use gump_scene::{AgentId, AgentKind};
 
 /// An event that a driver would notice. The definitions are in the table of the [module](super).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
 pub enum Measure {
     /// A vehicle that stands for the whole log moves away from its place.
     ParkedMove,

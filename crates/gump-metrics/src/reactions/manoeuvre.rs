@@ -39,6 +39,7 @@ const STILL_M: f64 = 0.02;
 
 /// A manoeuvre of the ego.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
 pub enum Manoeuvre {
     /// Follows its log.
     Log,

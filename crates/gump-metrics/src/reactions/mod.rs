@@ -73,6 +73,7 @@ const LEAVES_M: f64 = 3.0;
 
 /// Why a scenario cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum Unfit {
     /// The log ends before the horizon.
     #[error("expected a log that goes on for {needed} s, found {found:.1} s")]
@@ -92,6 +93,7 @@ pub enum Unfit {
 
 /// Why a manoeuvre is not scored in a scenario.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
 pub enum Reason {
     /// The ego is too slow for the manoeuvre.
     TooSlow,

@@ -2,6 +2,7 @@
 
 /// A statistic of scenes. Rates and shares are fractions, other units are SI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub enum Measure {
     /// Share of steps slower than 0.3 m/s.
     Standing,

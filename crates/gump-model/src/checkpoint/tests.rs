@@ -39,7 +39,7 @@ fn write_tensors(
         .collect();
     let mut metadata = header(network.config()).unwrap();
     change(&mut tensors, &mut metadata);
-    write(path, tensors, metadata, Precision::Full).unwrap();
+    write(path, tensors, metadata, StorageType::Full).unwrap();
 }
 
 /// Loading must fail with one line that names the file and contains `expected`.
@@ -71,7 +71,7 @@ fn equal_weights_are_equal_bytes() {
 fn weights_come_back() {
     with_file(|path| {
         let network = Network::random(small(), Seed(1), &Device::Cpu).unwrap();
-        save(&network, path, Precision::Full).unwrap();
+        save(&network, path, StorageType::Full).unwrap();
         let loaded = load(path, &Device::Cpu).unwrap();
         assert_eq!(loaded.config(), network.config());
         for ((name, a), (_, b)) in network.parameters().all().zip(loaded.parameters().all()) {
@@ -92,7 +92,7 @@ fn weights_without_marks_grow_them_and_say_the_same() {
             ..small()
         };
         let network = Network::random(config(false), Seed(1), &Device::Cpu).unwrap();
-        save(&network, path, Precision::Full).unwrap();
+        save(&network, path, StorageType::Full).unwrap();
         let grown = load_to_grow(path, &config(true), &Device::Cpu).unwrap();
         let grown = grown.expect("the same model but for the marks");
         assert_eq!(*grown.config(), config(true));
@@ -114,7 +114,7 @@ fn weights_without_marks_grow_them_and_say_the_same() {
         let off = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-5, "{off}");
         // The other way round, and into another model, nothing grows.
-        save(&grown, path, Precision::Full).unwrap();
+        save(&grown, path, StorageType::Full).unwrap();
         let load = |config| load_to_grow(path, &config, &Device::Cpu).unwrap();
         assert!(load(config(false)).is_none());
         let wider = ModelConfig {
@@ -188,7 +188,7 @@ fn a_folder_that_is_not_there_is_an_error_and_leaves_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("nowhere").join("weights.safetensors");
     assert!(
-        save(&network, &path, Precision::Half)
+        save(&network, &path, StorageType::Half)
             .unwrap_err()
             .to_string()
             .contains("nowhere")

@@ -12,7 +12,7 @@
 //! `unknown_marks` a mark beside it.
 
 mod edges;
-mod survey;
+mod lane_map;
 #[cfg(test)]
 #[cfg(feature = "tensors")]
 mod tests;
@@ -21,13 +21,13 @@ use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_scene::{AgentKind, LightState, TYPICAL_SPEED_LIMIT};
 use gump_tokenizer::{Field, Key, QuantizedState, Slot, TokenLight, class_index};
 
-use self::survey::{LANE_STEP_M, N_PATHS, PATH_POINTS};
+use self::lane_map::{LANE_STEP_M, N_PATHS, PATH_POINTS};
 use crate::ModelConfig;
 use crate::exact::Exact;
 use crate::placed_slot::PlacedSlot;
 
 pub use self::edges::{Edge, metres_across, metres_off};
-pub use self::survey::Survey;
+pub use self::lane_map::LaneMap;
 
 /// Points of a path, as indices: 0, 4, 8, 14, 22, 32 and 44 m ahead.
 const SHOWN: [usize; 7] = [0, 2, 4, 7, 11, 16, 22];
@@ -110,7 +110,7 @@ impl Seen {
 /// The local contexts of the objects at the keys from slot `from` on, each with its slot; a key
 /// whose object the window has not shown before has none.
 pub fn encode_local_context(
-    survey: &Survey,
+    lane_map: &LaneMap,
     slots: &[PlacedSlot],
     from: usize,
 ) -> Vec<(usize, LocalContext)> {
@@ -141,7 +141,7 @@ pub fn encode_local_context(
             (Slot::Key(key), _) if i >= from => {
                 if let Some(last) = placed.last {
                     let scene = Around {
-                        survey,
+                        lane_map,
                         others: &others,
                         lights: &lights,
                     };
@@ -157,7 +157,7 @@ pub fn encode_local_context(
 
 /// Surroundings of the objects of a frame.
 struct Around<'a> {
-    survey: &'a Survey,
+    lane_map: &'a LaneMap,
     others: &'a [Seen],
     lights: &'a [TokenLight],
 }
@@ -173,7 +173,7 @@ impl Around<'_> {
         let paths = if own.key.kind == AgentKind::Pedestrian {
             Vec::new()
         } else {
-            self.survey.paths(own.pose)
+            self.lane_map.paths(own.pose)
         };
         for i in 0..N_PATHS {
             let out = writer.next(PATH_NUMBERS);
@@ -195,14 +195,14 @@ impl Around<'_> {
     }
 
     /// Sets the marks of unknown inputs.
-    fn mark(&self, own: &Seen, paths: &[survey::Path], near: &[&Seen], marks: &mut [f32]) {
+    fn mark(&self, own: &Seen, paths: &[lane_map::Path], near: &[&Seen], marks: &mut [f32]) {
         let mark = |is_unknown: bool| f64::from(u8::from(is_unknown));
         let mut writer = Writer(marks);
         for i in 0..N_PATHS {
-            let limit = paths.get(i).map(|path| self.survey.limit_at(path[0]));
+            let limit = paths.get(i).map(|path| self.lane_map.limit_at(path[0]));
             writer.put([mark(limit == Some(None))]);
         }
-        let unstated = self.survey.unstated;
+        let unstated = self.lane_map.unstated;
         writer.put([
             mark(unstated.stop_signs),
             mark(unstated.lights),
@@ -219,7 +219,7 @@ impl Around<'_> {
         for shown in SHOWN {
             let out = writer.next(4);
             if let Some(&index) = path.get(shown) {
-                let pose = own_from_scene * self.survey.point(index).pose;
+                let pose = own_from_scene * self.lane_map.point(index).pose;
                 let direction = pose.direction();
                 Writer(out).put([
                     pose.position.x / 20.0,
@@ -229,14 +229,14 @@ impl Around<'_> {
                 ]);
             }
         }
-        let limit = self.survey.limit_at(path[0]);
+        let limit = self.lane_map.limit_at(path[0]);
         writer.put([limit.unwrap_or(TYPICAL_SPEED_LIMIT) / 15.0]);
         let away = |step: usize| step as f64 * LANE_STEP_M;
         let nearness = |metres: f64| 1.0 - metres / away(PATH_POINTS);
         let light = path.iter().enumerate().find_map(|(step, &index)| {
             let light = self
                 .light_at(index)
-                .filter(|_| step > 0 && self.survey.is_start(index))?;
+                .filter(|_| step > 0 && self.lane_map.is_start(index))?;
             Some((away(step), light))
         });
         let out = writer.next(4);
@@ -249,14 +249,14 @@ impl Around<'_> {
                 is(LightState::Green),
             ]);
         }
-        let sign = path.iter().position(|&index| self.survey.is_stop(index));
+        let sign = path.iter().position(|&index| self.lane_map.is_stop(index));
         let out = writer.next(2);
         if let Some(step) = sign {
             Writer(out).put([1.0, nearness(away(step))]);
         }
         let out = writer.next(3);
         if let Some((step, ahead)) = self.ahead_on(path, own) {
-            let along = self.survey.point(path[step]).pose.direction();
+            let along = self.lane_map.point(path[step]).pose.direction();
             let gap = away(step) - (own.length + ahead.length) / 2.0;
             Writer(out).put([
                 nearness(gap.max(0.0)),
@@ -268,7 +268,7 @@ impl Around<'_> {
 
     /// The colour of the light at the start of a lane.
     fn light_at(&self, index: u32) -> Option<LightState> {
-        let start = self.survey.point(index).pose;
+        let start = self.lane_map.point(index).pose;
         let at_start = |light: &&TokenLight| {
             let place =
                 gump_geometry::dvec2(Field::X.dequantize(light.x), Field::Y.dequantize(light.y));
@@ -287,7 +287,7 @@ impl Around<'_> {
         let on_path = near.filter_map(|other| {
             let clear = (own.width + other.width) / 2.0 + 0.3;
             let distance = |index: u32| {
-                self.survey
+                self.lane_map
                     .point(index)
                     .pose
                     .position
@@ -297,7 +297,7 @@ impl Around<'_> {
                 .iter()
                 .enumerate()
                 .min_by(|a, b| distance(*a.1).total_cmp(&distance(*b.1)))?;
-            let local = self.survey.point(nearest).pose.inverse() * other.pose.position;
+            let local = self.lane_map.point(nearest).pose.inverse() * other.pose.position;
             let is_ahead = step > 0 && local.x.abs() < 0.5 * LANE_STEP_M + 0.5 * other.length;
             (is_ahead && local.y.abs() < clear).then_some((step, other))
         });
@@ -305,15 +305,15 @@ impl Around<'_> {
     }
 
     /// The nearest lanes to the left and to the right that no path follows.
-    fn beside(&self, paths: &[survey::Path], own_from_scene: Pose, own: Pose, out: &mut [f32]) {
+    fn beside(&self, paths: &[lane_map::Path], own_from_scene: Pose, own: Pose, out: &mut [f32]) {
         let mut nearest: [Option<(f64, f64)>; 2] = [None, None];
         let followed = |lane: u32| {
             paths
                 .iter()
-                .any(|path| self.survey.point(path[0]).lane == lane)
+                .any(|path| self.lane_map.point(path[0]).lane == lane)
         };
-        for index in self.survey.lanes_near(own.position, 6.0) {
-            let point = self.survey.point(index);
+        for index in self.lane_map.lanes_near(own.position, 6.0) {
+            let point = self.lane_map.point(index);
             let local = own_from_scene * point.pose.position;
             if local.x.abs() > LANE_STEP_M || local.y.abs() > 6.0 || followed(point.lane) {
                 continue;
@@ -336,7 +336,7 @@ impl Around<'_> {
     /// Writes the proximity of road edges in each direction, 1 at the object and 0 out of reach.
     fn edges(&self, own_from_scene: Pose, position: DVec2, out: &mut [f32]) {
         let mut nearest = [EDGE_REACH_M * EDGE_REACH_M; SECTORS];
-        for edge in self.survey.edges_near(position, EDGE_REACH_M) {
+        for edge in self.lane_map.edges_near(position, EDGE_REACH_M) {
             let local = own_from_scene * edge.from;
             let away = local.length_squared();
             if away < EDGE_REACH_M * EDGE_REACH_M {

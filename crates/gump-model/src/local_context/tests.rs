@@ -7,8 +7,8 @@ use super::*;
 use crate::testing::{scenario, slots};
 
 fn seen(scenario: &Scenario) -> Vec<(usize, LocalContext)> {
-    let survey = Survey::new(&scenario.map, scenario.present().ego_now().state.pose);
-    encode_local_context(&survey, &slots(scenario), 0)
+    let lane_map = LaneMap::new(&scenario.map, scenario.present().ego_now().state.pose);
+    encode_local_context(&lane_map, &slots(scenario), 0)
 }
 
 /// The part of the first path in what the ego sees last.
@@ -29,10 +29,10 @@ fn the_first_frame_sees_nothing_and_later_ones_the_frame_before() {
     assert_eq!(seen.len(), keys.count());
     assert!(seen.iter().all(|(i, _)| slots[*i].frame > 0));
     // Looking from later on gives the same numbers.
-    let survey = Survey::new(&scenario.map, scenario.present().ego_now().state.pose);
+    let lane_map = LaneMap::new(&scenario.map, scenario.present().ego_now().state.pose);
     let from = seen[seen.len() / 2].0;
     assert_eq!(
-        encode_local_context(&survey, &slots, from),
+        encode_local_context(&lane_map, &slots, from),
         seen[seen.len() / 2..]
     );
 }
@@ -84,11 +84,17 @@ fn a_fork_shows_both_branches_from_left_to_right() {
          ego vehicle 0: 0,0 velocity 8,0",
     )
     .unwrap();
-    let survey = Survey::new(&fork.map, Pose::default());
-    let ends: Vec<f64> = survey
+    let lane_map = LaneMap::new(&fork.map, Pose::default());
+    let ends: Vec<f64> = lane_map
         .paths(Pose::default())
         .iter()
-        .map(|path| survey.point(*path.last().expect("points")).pose.position.y)
+        .map(|path| {
+            lane_map
+                .point(*path.last().expect("points"))
+                .pose
+                .position
+                .y
+        })
         .collect();
     assert_eq!(ends.len(), 2);
     assert!(ends[0] > 5.0 && ends[1] < -5.0, "{ends:?}");
@@ -97,14 +103,14 @@ fn a_fork_shows_both_branches_from_left_to_right() {
 #[test]
 fn points_are_found_where_they_are() {
     let scenario = scenario();
-    let survey = Survey::new(&scenario.map, Pose::default());
-    let near = survey
+    let lane_map = LaneMap::new(&scenario.map, Pose::default());
+    let near = lane_map
         .edges_near(dvec2(0.0, 0.0), 10.0)
         .filter(|edge| edge.from.length() < 10.0)
         .count();
     // The edge passes two metres to the right.
     assert!((12..=15).contains(&near), "{near}");
-    assert_eq!(survey.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
+    assert_eq!(lane_map.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
 }
 
 #[test]
@@ -118,13 +124,13 @@ fn the_mouth_of_a_driveway_is_no_curb() {
     let area = gump_scene::Area::new(99, gump_scene::AreaKind::Driveway, polygon);
     parts.areas.push(area);
     let map = gump_scene::MapGraph::new(parts).unwrap();
-    let ahead = |survey: &Survey| {
-        let near = survey.edges_near(dvec2(0.0, 0.0), 10.0);
+    let ahead = |lane_map: &LaneMap| {
+        let near = lane_map.edges_near(dvec2(0.0, 0.0), 10.0);
         let middles = near.map(|edge| edge.from.midpoint(edge.to).x);
         middles.filter(|x| x.abs() < 8.0).collect::<Vec<_>>()
     };
-    let all = ahead(&Survey::of_edges(&map, dvec2(0.0, 0.0), 50.0));
-    let curbs = ahead(&Survey::of_curbs(&map, dvec2(0.0, 0.0), 50.0));
+    let all = ahead(&LaneMap::of_edges(&map, dvec2(0.0, 0.0), 50.0));
+    let curbs = ahead(&LaneMap::of_curbs(&map, dvec2(0.0, 0.0), 50.0));
     assert!(all.iter().any(|x| x.abs() < 2.0), "{all:?}");
     assert!(curbs.iter().all(|x| x.abs() > 3.0), "{curbs:?}");
     assert!(curbs.len() >= 3, "{curbs:?}");

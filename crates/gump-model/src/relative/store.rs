@@ -7,7 +7,7 @@ use gump_nn::Parameters;
 
 use super::{RelativeConfig, RelativeNetwork};
 use crate::ModelError;
-use crate::checkpoint::{self, Precision};
+use crate::checkpoint::{self, StorageType};
 use crate::prefixes::PREFIXES;
 
 /// Header entry that distinguishes the two architectures.
@@ -20,16 +20,11 @@ const ARCHITECTURE: (&str, &str) = ("architecture", "relative");
 pub fn save(
     network: &RelativeNetwork,
     path: &Path,
-    precision: Precision,
+    storage: StorageType,
 ) -> Result<(), ModelError> {
     let all = network.parameters().all();
     let tensors = all.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
-    checkpoint::write(
-        path,
-        tensors.collect(),
-        header(network.config())?,
-        precision,
-    )
+    checkpoint::write(path, tensors.collect(), header(network.config())?, storage)
 }
 
 /// Reads a network.

@@ -1,6 +1,12 @@
 //! Controllers: from a plan to the ego's next state.
 
+use std::fmt;
+use std::str::FromStr;
+
 use gump_scene::EgoState;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
+use serde::{Deserialize, Serialize};
 
 use super::Recording;
 use crate::tracking::{LqrTracker, Trajectory, propagate};
@@ -10,7 +16,9 @@ use gump_rollout::RolloutError;
 const IMPOSSIBLE_SPEED: f64 = 50.0;
 
 /// The way in which the ego follows its plan.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Tracking {
     /// As a car: the LQR tracker steers the kinematic bicycle.
     TwoStage,
@@ -18,6 +26,29 @@ pub enum Tracking {
     Perfect,
     /// The logged state, whatever the plan: open loop.
     Log,
+}
+
+impl Tracking {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 3] = [Self::TwoStage, Self::Perfect, Self::Log];
+}
+
+impl fmt::Display for Tracking {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Tracking {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 /// A controller with its state between steps.

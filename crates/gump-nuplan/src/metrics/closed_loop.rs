@@ -15,7 +15,7 @@ use super::progress::{ExpertProgress, expert_progress};
 use super::scoring::{MetricScores, Scoring};
 use super::speed_limit::{SpeedLimit, speed_limit};
 use super::time_to_collision::{Place, TimeToCollision, TimeToCollisionConfig, time_to_collision};
-use super::{Drive, NuPlanError};
+use super::{NuPlanError, SimulationHistory};
 use gump_metrics::ComfortBounds;
 
 /// nuPlan's closed-loop metrics of one drive. All series have one entry per sample.
@@ -55,7 +55,7 @@ pub struct ClosedLoop {
 /// [`NuPlanError`] if samples or expert are missing, not finite or not in order of time.
 ///
 /// Source: nuplan-devkit, the metrics of its closed-loop challenges with their parameters.
-pub fn score(drive: &Drive<'_>) -> Result<ClosedLoop, NuPlanError> {
+pub fn score(drive: &SimulationHistory<'_>) -> Result<ClosedLoop, NuPlanError> {
     check(drive)?;
     let boxes: Vec<[DVec2; 4]> = drive
         .samples
@@ -155,7 +155,7 @@ fn judged(corners: &[CornerLanes<'_>]) -> Vec<Keeping> {
     judged
 }
 
-fn check(drive: &Drive<'_>) -> Result<(), NuPlanError> {
+fn check(drive: &SimulationHistory<'_>) -> Result<(), NuPlanError> {
     if drive.samples.is_empty() {
         return Err(NuPlanError::NoSamples);
     }

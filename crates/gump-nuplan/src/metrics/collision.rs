@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use gump_metrics::encounter::{CollisionKind, classify, speed};
 use gump_scene::{AgentId, AgentKind};
 
-use super::history::Drive;
+use super::history::SimulationHistory;
 
 /// The first contact with one agent; later contacts with the same do not count.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,7 +54,7 @@ impl Collisions {
 ///
 /// Source: nuPlan's `no_ego_at_fault_collisions`; per group the score is `1 - n / (allowed + 1)`,
 /// at least 0, with one collision allowed with objects and none with road users.
-pub fn collisions(drive: &Drive<'_>, in_one_lane: &[bool]) -> Collisions {
+pub fn collisions(drive: &SimulationHistory<'_>, in_one_lane: &[bool]) -> Collisions {
     let mut hit = BTreeSet::new();
     let mut events = Vec::new();
     for (i, sample) in drive.samples.iter().enumerate() {

@@ -3,7 +3,7 @@
 use gump_geometry::DVec2;
 use gump_scene::MapGraph;
 
-use super::history::Drive;
+use super::history::SimulationHistory;
 use super::lanes::{CornerLanes, Lanes, distance};
 use gump_metrics::metres_off_road;
 
@@ -28,7 +28,7 @@ pub struct DrivableArea {
 ///
 /// Source: nuPlan's `drivable_area_compliance`.
 pub fn drivable_area(
-    drive: &Drive<'_>,
+    drive: &SimulationHistory<'_>,
     followed: &[Lanes<'_>],
     corners: &[CornerLanes<'_>],
 ) -> DrivableArea {

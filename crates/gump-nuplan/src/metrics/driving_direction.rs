@@ -1,6 +1,6 @@
 //! Driving against the direction of traffic.
 
-use super::history::Drive;
+use super::history::SimulationHistory;
 use super::lanes::Lanes;
 use super::statistics::mean_step;
 
@@ -45,7 +45,7 @@ pub struct DrivingDirection {
 ///
 /// Source: nuPlan's `driving_direction_compliance`.
 pub fn driving_direction(
-    drive: &Drive<'_>,
+    drive: &SimulationHistory<'_>,
     followed: &[Lanes<'_>],
     config: &DrivingDirectionConfig,
 ) -> DrivingDirection {
@@ -78,7 +78,7 @@ pub fn driving_direction(
 }
 
 /// Distance along the followed lane since the previous sample, metres.
-fn lane_progress(drive: &Drive<'_>, followed: &[Lanes<'_>]) -> Vec<f64> {
+fn lane_progress(drive: &SimulationHistory<'_>, followed: &[Lanes<'_>]) -> Vec<f64> {
     let mut lane_before = None;
     let mut distance_before = None;
     let centres = drive.centres();

@@ -2,6 +2,7 @@
 
 /// Why a drive or plan cannot be scored.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum NuPlanError {
     /// There are no samples.
     #[error("the drive has no samples")]

@@ -11,7 +11,7 @@ pub struct Sample {
     /// The ego at the start of the step, and the time.
     pub ego: EgoState,
     /// The other agents and the lights at that time. The ego may be among the agents, see
-    /// [`Drive::ego`].
+    /// [`SimulationHistory::ego`].
     pub frame: Frame,
     /// The plan of this step, with increasing times; only open-loop scores use it, so it may be
     /// empty otherwise.
@@ -23,7 +23,7 @@ pub struct Sample {
 /// A simulation of N iterations has N - 1 samples (no action follows the last state) and N states
 /// of the expert; the metrics do not depend on that.
 #[derive(Clone, Copy, Debug)]
-pub struct Drive<'a> {
+pub struct SimulationHistory<'a> {
     /// Executed steps in order of time.
     pub samples: &'a [Sample],
     /// The recorded driver's states over the same time, from the same start.
@@ -36,7 +36,7 @@ pub struct Drive<'a> {
     pub vehicle: VehicleParameters,
 }
 
-impl<'a> Drive<'a> {
+impl<'a> SimulationHistory<'a> {
     /// Times, microseconds.
     pub(crate) fn times_us(&self) -> Vec<i64> {
         self.samples.iter().map(|s| s.ego.time_us).collect()
@@ -82,16 +82,16 @@ pub(crate) fn motion_of<'a>(
     Motion::of(&vehicle, &ego_states(&vehicle, agent, dt, None, frames))
 }
 
-/// A simulated drive and the logged one as inputs of scoring; see [`RolloutDrive::new`].
+/// A simulated drive and the logged one as inputs of scoring; see [`RolloutHistory::new`].
 #[derive(Clone, Debug)]
-pub struct RolloutDrive {
+pub struct RolloutHistory {
     samples: Vec<Sample>,
     expert: Vec<EgoState>,
     ego: AgentId,
     vehicle: VehicleParameters,
 }
 
-impl RolloutDrive {
+impl RolloutHistory {
     /// Prepares a rollout and the log it started from for scoring, including the start, as far as
     /// the ego is present.
     ///
@@ -125,8 +125,8 @@ impl RolloutDrive {
     }
 
     /// The drive, on a map.
-    pub fn on<'a>(&'a self, map: &'a MapGraph) -> Drive<'a> {
-        Drive {
+    pub fn on<'a>(&'a self, map: &'a MapGraph) -> SimulationHistory<'a> {
+        SimulationHistory {
             samples: &self.samples,
             expert: &self.expert,
             map,

@@ -1,8 +1,8 @@
 //! nuPlan's planning metrics and scores, and the paper's variants for reinforcement learning.
 //!
-//! Start with [`score`]: it measures a [`Drive`] in closed loop; [`ClosedLoop`] contains every
-//! part. [`open_loop`] compares plans with the expert, [`Scoring`] combines metrics into one number
-//! and a table, [`RlScore`] is the paper's score. Simulation is in `gump-rollout` and
+//! Start with [`score`]: it measures a [`SimulationHistory`] in closed loop; [`ClosedLoop`] contains
+//! every part. [`open_loop`] compares plans with the expert, [`Scoring`] combines metrics into one
+//! number and a table, [`RlScore`] is the paper's score. Simulation is in `gump-rollout` and
 //! `gump-planner`, files are in `gump-data`.
 //!
 //! The numbers agree with nuplan-devkit on its own test scenes and on recorded ones, see
@@ -10,14 +10,14 @@
 //! differ, the code is followed, because published scores come from it.
 //!
 //! # Terms
-//! * **sample**: one executed step. **Drive**: all samples, with the expert's.
+//! * **sample**: one executed step. **History**: all samples, with the expert's.
 //! * **followed lanes**: the lanes under the ego's centre. **Corner lanes**: those under its
 //!   corners.
 //! * **at fault**: a collision that counts against the ego.
 //!
 //! # Scoring one's own planner
 //! ```
-//! use gump_nuplan::metrics::{Drive, Sample, Scoring, score};
+//! use gump_nuplan::metrics::{Sample, Scoring, SimulationHistory, score};
 //! use gump_scene::{EgoState, VehicleParameters, fixture};
 //!
 //! let scenario = fixture::scenario(
@@ -37,7 +37,7 @@
 //!     .collect();
 //! // ... and what the recorded driver did.
 //! let expert: Vec<EgoState> = (0..=80).map(|step| at(step, 10.0)).collect();
-//! let drive = Drive {
+//! let drive = SimulationHistory {
 //!     samples: &samples,
 //!     expert: &expert,
 //!     map: &scenario.map,
@@ -74,7 +74,7 @@ pub use driving_direction::{DrivingDirection, DrivingDirectionConfig, driving_di
 pub use error::NuPlanError;
 pub use gump_metrics::bearing::{bearing, is_ahead, is_behind, signed_lateral_gap};
 pub use gump_metrics::encounter::{CollisionKind, classify};
-pub use history::{Drive, RolloutDrive, Sample, vehicle_of};
+pub use history::{RolloutHistory, Sample, SimulationHistory, vehicle_of};
 pub use lanes::{
     CornerLanes, Keeping, LaneChange, Lanes, corner_lanes, followed_lanes, is_in_intersection,
     keeping, lane_changes,

@@ -4,7 +4,7 @@ use gump_geometry::{Pose, angle_difference};
 use gump_scene::{EgoState, VehicleParameters};
 
 use super::error::NuPlanError;
-use super::history::{Drive, Sample};
+use super::history::{Sample, SimulationHistory};
 use super::scoring::MetricScores;
 
 /// Settings of the comparison: rate and horizons.
@@ -76,7 +76,7 @@ pub struct OpenLoop {
 ///
 /// Source: nuPlan's planner-expert metrics.
 pub fn open_loop(
-    drive: &Drive<'_>,
+    drive: &SimulationHistory<'_>,
     expert_future: &[EgoState],
     config: &OpenLoopConfig,
 ) -> Result<OpenLoop, NuPlanError> {
@@ -213,7 +213,7 @@ fn scores(horizons: &[HorizonError; 3], config: &OpenLoopConfig) -> MetricScores
 ///
 /// Source: nuPlan's `ego_expert_L2_error` (weight 0) and `ego_expert_L2_error_with_yaw` (2.5),
 /// statistics without score.
-pub fn expert_errors(drive: &Drive<'_>, heading_weight: f64) -> Vec<f64> {
+pub fn expert_errors(drive: &SimulationHistory<'_>, heading_weight: f64) -> Vec<f64> {
     let pairs = drive.samples.iter().map(|s| &s.ego).zip(drive.expert);
     let centre = |state: &EgoState| drive.vehicle.center_of(state.rear_axle);
     let error = |(ego, expert): (&EgoState, &EgoState)| {
@@ -243,7 +243,7 @@ mod tests {
             plan,
             ..Sample::default()
         };
-        let drive = Drive {
+        let drive = SimulationHistory {
             samples: &[sample],
             expert: &straight(0, 0, 5.0),
             map: &MapGraph::default(),

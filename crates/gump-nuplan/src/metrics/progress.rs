@@ -3,7 +3,7 @@
 use gump_geometry::{DVec2, Polygon, Polyline};
 use gump_scene::{MapGraph, RoadblockId};
 
-use super::history::Drive;
+use super::history::SimulationHistory;
 use super::lanes::{Lanes, followed_lanes};
 use gump_metrics::gained;
 
@@ -42,7 +42,7 @@ impl ExpertProgress {
 /// expert followed in it. On other maps it is the expert's own path.
 ///
 /// Source: nuPlan's `ego_progress_along_expert_route`; for other maps ours.
-pub fn expert_progress(drive: &Drive<'_>) -> ExpertProgress {
+pub fn expert_progress(drive: &SimulationHistory<'_>) -> ExpertProgress {
     let (ego, expert) = (drive.centres(), drive.expert_centres());
     let (series, expert_series) = if drive.map.roadblocks().is_empty() {
         let path = Polyline::new(expert.clone());

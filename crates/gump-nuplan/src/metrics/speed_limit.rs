@@ -2,7 +2,7 @@
 
 use gump_scene::{Lane, MapGraph};
 
-use super::history::Drive;
+use super::history::SimulationHistory;
 use super::lanes::Lanes;
 use super::statistics::mean_step;
 
@@ -26,7 +26,7 @@ pub struct SpeedLimit {
 /// stated there is no excess.
 ///
 /// Source: nuPlan's `speed_limit_compliance`.
-pub fn speed_limit(drive: &Drive<'_>, followed: &[Lanes<'_>]) -> SpeedLimit {
+pub fn speed_limit(drive: &SimulationHistory<'_>, followed: &[Lanes<'_>]) -> SpeedLimit {
     let excess = |(sample, lanes): (&super::Sample, &Lanes<'_>)| {
         let limit = limit(drive.map, lanes);
         limit.map_or(0.0, |limit| (sample.ego.speed() - limit).max(0.0))

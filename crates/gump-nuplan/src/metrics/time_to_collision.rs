@@ -8,7 +8,7 @@ use gump_metrics::encounter::speed;
 use gump_scene::{Agent, AgentId};
 
 use super::collision::Collisions;
-use super::history::Drive;
+use super::history::SimulationHistory;
 
 /// A slower ego is never about to collide, metres per second.
 ///
@@ -70,7 +70,7 @@ pub struct Place {
 ///
 /// Source: nuPlan's `time_to_collision_within_bound`: headings determine the directions of motion.
 pub fn time_to_collision(
-    drive: &Drive<'_>,
+    drive: &SimulationHistory<'_>,
     places: &[Place],
     collisions: &Collisions,
     config: &TimeToCollisionConfig,

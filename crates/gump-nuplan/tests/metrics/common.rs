@@ -1,7 +1,7 @@
 //! Reading the recorded values.
 
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_nuplan::metrics::{Drive, Sample};
+use gump_nuplan::metrics::{Sample, SimulationHistory};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, EgoState, Frame, MapGraph, VehicleParameters,
 };
@@ -120,8 +120,8 @@ pub(crate) fn drive<'a>(
     samples: &'a [Sample],
     expert: &'a [EgoState],
     map: &'a MapGraph,
-) -> Drive<'a> {
-    Drive {
+) -> SimulationHistory<'a> {
+    SimulationHistory {
         samples,
         expert,
         map,

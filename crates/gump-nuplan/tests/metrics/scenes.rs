@@ -3,8 +3,8 @@
 use gump_geometry::{Pose, dvec2};
 use gump_metrics::ComfortBounds;
 use gump_nuplan::metrics::{
-    CollisionKind, Collisions, ComfortSeries, Drive, Motion, OpenLoopConfig, Place, Statistics,
-    TimeToCollisionConfig, collisions, expert_errors, open_loop, time_to_collision,
+    CollisionKind, Collisions, ComfortSeries, Motion, OpenLoopConfig, Place, SimulationHistory,
+    Statistics, TimeToCollisionConfig, collisions, expert_errors, open_loop, time_to_collision,
 };
 use gump_scene::{Agent, AgentKind, MapGraph, VehicleParameters};
 use serde_json::Value;
@@ -132,7 +132,7 @@ fn check_errors(found: &[f64], expected: &Expected<'_>, name: &str) {
 }
 
 fn check_comfort(
-    drive: &Drive<'_>,
+    drive: &SimulationHistory<'_>,
     metric: &str,
     case: &Value,
     expected: &Expected<'_>,
@@ -174,7 +174,12 @@ fn bounds(constructor: &str) -> (f64, f64) {
     }
 }
 
-fn check_collisions(drive: &Drive<'_>, case: &Value, expected: &Expected<'_>, name: &str) {
+fn check_collisions(
+    drive: &SimulationHistory<'_>,
+    case: &Value,
+    expected: &Expected<'_>,
+    name: &str,
+) {
     // Where there is no map the ego is in no lane.
     let found = collisions(drive, &vec![false; drive.samples.len()]);
     expected.check(&statistics(&found), Some(found.score), None, name);
@@ -215,7 +220,12 @@ pub(crate) fn statistics(found: &Collisions) -> Vec<f64> {
     values
 }
 
-fn check_time_to_collision(drive: &Drive<'_>, case: &Value, expected: &Expected<'_>, name: &str) {
+fn check_time_to_collision(
+    drive: &SimulationHistory<'_>,
+    case: &Value,
+    expected: &Expected<'_>,
+    name: &str,
+) {
     let parameters = &case["metric_parameters"];
     let config = TimeToCollisionConfig {
         step: number(&parameters["time_step_size"]),

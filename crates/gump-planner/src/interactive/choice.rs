@@ -75,7 +75,7 @@ impl CandidateScore {
 #[derive(Clone, Copy)]
 pub(super) struct Reward<'a> {
     pub(super) judge: Judge<'a>,
-    pub(super) worth: ValueEstimate,
+    pub(super) value: ValueEstimate,
     /// The drive so far, oldest first, which nuPlan's metric includes: a drive that begins with a
     /// jolt is not comfortable.
     pub(super) past: &'a [EgoState],
@@ -138,7 +138,7 @@ impl Reward<'_> {
             judged
         });
         let mut all: Vec<Judged> = all.collect();
-        if let ValueEstimate::DiscountedStep { gamma } = self.worth {
+        if let ValueEstimate::DiscountedStep { gamma } = self.value {
             for future in 0..n_futures {
                 let mut of_future: Vec<(&mut Judged, &[EgoState])> = all
                     .iter_mut()
@@ -382,21 +382,21 @@ fn score_of(judged: &Judged) -> Score {
     }
 }
 
-/// The best prospect of those that were simulated to the end; ties are broken as
+/// The best candidate of those that were simulated to the end; ties are broken as
 /// [`super::InteractiveDriver`] states.
 pub(super) fn choose(
-    prospects: &[CandidateEvaluation],
+    evaluations: &[CandidateEvaluation],
     previous: Option<usize>,
     hysteresis: f64,
 ) -> usize {
-    let standing = prospects.iter().map(|prospect| Standing {
-        value: prospect.value,
-        collisions: prospect.collisions,
-        progress_m: prospect.progress_m,
-        collision_s: prospect.collision_s,
+    let standing = evaluations.iter().map(|evaluation| Standing {
+        value: evaluation.value,
+        collisions: evaluation.collisions,
+        progress_m: evaluation.progress_m,
+        collision_s: evaluation.collision_s,
     });
-    let finalists: Vec<usize> = (0..prospects.len())
-        .filter(|&i| prospects[i].finalist)
+    let finalists: Vec<usize> = (0..evaluations.len())
+        .filter(|&i| evaluations[i].finalist)
         .collect();
     let standing: Vec<Standing> = standing.collect();
     first_of(&standing, &finalists, previous, hysteresis)

@@ -158,18 +158,18 @@ impl<'a> Imagination<'a> {
             phases.score += (self.clock)() - time;
         }
         let time = (self.clock)();
-        let prospects = tallies.into_iter().enumerate().map(|(i, tally)| {
+        let evaluations = tallies.into_iter().enumerate().map(|(i, tally)| {
             let film = |frames| film(scene, frames);
             let policy = policies.get(i);
             let kind = policy.map_or(ProposalKind::Imitation, |policy| policy.kind);
             tally.sum_up(kind, left.contains(&i), self.config, film)
         });
-        let prospects = prospects.collect();
+        let evaluations = evaluations.collect();
         phases.score += (self.clock)() - time;
         Ok(Decision {
             chosen: 0,
             brakes: false,
-            prospects,
+            candidates: evaluations,
             horizon: horizon as f64 * DECISION_S,
             phases,
         })
@@ -436,7 +436,7 @@ impl<'a> Imagination<'a> {
         let driven = self.input.iteration.min(COMFORT_PAST).min(past.len());
         Reward {
             judge: self.judge_of(),
-            worth: self.config.worth,
+            value: self.config.value,
             past: &past[past.len() - driven..],
             limit: self.state.stated_limit,
         }

@@ -14,6 +14,8 @@ mod policies;
 #[cfg(test)]
 mod tests;
 
+use std::fmt;
+use std::str::FromStr;
 use std::time::Duration;
 
 use gump_metrics::Score;
@@ -21,6 +23,9 @@ use gump_nuplan::closed_loop::{Driver, PlannerInitialization, PlannerInput};
 use gump_nuplan::tracking::Trajectory;
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::{EgoState, Rollout, Seed};
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
+use serde::{Deserialize, Serialize};
 
 use crate::candidates::{Candidate, Explain};
 use crate::pdm::initialization::{State, brake, trajectory};
@@ -52,7 +57,7 @@ pub struct InteractiveDriverConfig {
     /// Iterations of the loop between two decisions, > 0; in between the chosen policy is followed.
     pub replan_every: usize,
     /// The value of a future.
-    pub worth: ValueEstimate,
+    pub value: ValueEstimate,
     /// Combination of the values of a candidate's futures into one.
     pub aggregate: Aggregate,
     /// Number of standard deviations over the futures that are subtracted from the mean, at least
@@ -82,7 +87,7 @@ impl Default for InteractiveDriverConfig {
             allocation: Allocation::default(),
             seed: Seed(0),
             replan_every: 5,
-            worth: ValueEstimate::Rollout,
+            value: ValueEstimate::Rollout,
             aggregate: Aggregate::default(),
             caution: 0.0,
             hedge: 0.5,
@@ -93,7 +98,9 @@ impl Default for InteractiveDriverConfig {
 }
 
 /// Distribution of the rollouts over candidates.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Allocation {
     /// All futures of all candidates, as in the paper.
     Uniform,
@@ -104,8 +111,33 @@ pub enum Allocation {
     Halving,
 }
 
+impl Allocation {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::Uniform, Self::Halving];
+}
+
+impl fmt::Display for Allocation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Allocation {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 /// Combination of the values of a candidate's futures into one.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Aggregate {
     /// Their mean minus [`InteractiveDriverConfig::caution`] standard deviations.
     #[default]
@@ -114,8 +146,32 @@ pub enum Aggregate {
     Worst,
 }
 
+impl Aggregate {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::Mean, Self::Worst];
+}
+
+impl fmt::Display for Aggregate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Aggregate {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
 /// The value of a future.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum ValueEstimate {
     /// The score of the whole drive, 0 to 1: the product of PDM's gates times the mean of progress,
     /// time to collision, the speed limit and comfort with the weights of nuPlan's closed-loop
@@ -213,15 +269,15 @@ impl CandidateEvaluation {
     }
 }
 
-/// A decision with all prospects.
+/// A decision with all candidates.
 #[derive(Clone, Debug)]
 pub struct Decision {
-    /// Index of the chosen prospect.
+    /// Index of the chosen candidate.
     pub chosen: usize,
     /// True if the ego brakes instead, because even the best candidate collides soon.
     pub brakes: bool,
     /// All candidates: lateral offsets one after another, within each the speeds, imitation last.
-    pub prospects: Vec<CandidateEvaluation>,
+    pub candidates: Vec<CandidateEvaluation>,
     /// Horizon that was simulated, seconds.
     pub horizon: f64,
     /// Time spent.
@@ -299,12 +355,12 @@ impl<'w> InteractiveDriver<'w> {
         };
         let mut decision = imagination.imagine()?;
         // Changes of lane come and go: the previous choice is found by its kind.
-        let kind = |decision: &Decision| decision.prospects[decision.chosen].kind;
+        let kind = |decision: &Decision| decision.candidates[decision.chosen].kind;
         let kind = self.decision.as_ref().map(kind);
-        let same = |prospect: &CandidateEvaluation| Some(prospect.kind) == kind;
-        let previous = decision.prospects.iter().position(same);
-        decision.chosen = choose(&decision.prospects, previous, self.config.hysteresis);
-        let chosen = &decision.prospects[decision.chosen];
+        let same = |evaluation: &CandidateEvaluation| Some(evaluation.kind) == kind;
+        let previous = decision.candidates.iter().position(same);
+        decision.chosen = choose(&decision.candidates, previous, self.config.hysteresis);
+        let chosen = &decision.candidates[decision.chosen];
         decision.brakes = is_emergency(chosen, input.ego);
         self.following = match chosen.kind {
             ProposalKind::Imitation if !decision.brakes => Some(imitated(chosen, input.ego)?),
@@ -351,7 +407,7 @@ impl Driver for InteractiveDriver<'_> {
         let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
         let speeds = state.prepare(input, &self.config.proposals)?;
         if self.is_due(input) {
-            let chosen = |decision: &Decision| decision.prospects[decision.chosen].kind;
+            let chosen = |decision: &Decision| decision.candidates[decision.chosen].kind;
             let under_way = match self.decision.as_ref().map(chosen) {
                 Some(ProposalKind::LaneChange { side, .. }) => Some(side),
                 _ => None,
@@ -371,14 +427,14 @@ impl Explain for InteractiveDriver<'_> {
         let Some(decision) = &self.decision else {
             return Vec::new();
         };
-        let prospects = decision.prospects.iter().enumerate();
-        let mut all: Vec<Candidate> = prospects
-            .map(|(i, prospect)| Candidate {
-                name: prospect.kind.to_string(),
+        let evaluations = decision.candidates.iter().enumerate();
+        let mut all: Vec<Candidate> = evaluations
+            .map(|(i, evaluation)| Candidate {
+                name: evaluation.kind.to_string(),
                 chosen: i == decision.chosen && !decision.brakes,
-                score: Some(prospect.value),
-                parts: prospect.parts(),
-                poses: prospect.drives[0].iter().map(|s| s.rear_axle).collect(),
+                score: Some(evaluation.value),
+                parts: evaluation.parts(),
+                poses: evaluation.drives[0].iter().map(|s| s.rear_axle).collect(),
             })
             .collect();
         if decision.brakes {
@@ -395,17 +451,17 @@ impl Explain for InteractiveDriver<'_> {
 
 /// The ego's motion in the future that ends nearest to the mean end of all, and straight on after
 /// it.
-fn imitated(prospect: &CandidateEvaluation, ego: &EgoState) -> Result<Trajectory, PlanError> {
+fn imitated(evaluation: &CandidateEvaluation, ego: &EgoState) -> Result<Trajectory, PlanError> {
     let end = |drive: &Vec<EgoState>| drive[drive.len() - 1].rear_axle.position;
-    let n = prospect.drives.len() as f64;
-    let middle = prospect
+    let n = evaluation.drives.len() as f64;
+    let middle = evaluation
         .drives
         .iter()
         .map(end)
         .sum::<gump_geometry::DVec2>()
         / n;
     let off = |drive: &Vec<EgoState>| end(drive).distance_squared(middle);
-    let nearest = prospect
+    let nearest = evaluation
         .drives
         .iter()
         .min_by(|a, b| off(a).total_cmp(&off(b)));
@@ -455,7 +511,7 @@ fn check(config: &InteractiveDriverConfig) -> Result<(), PlanError> {
     if !(0.0..=1.0).contains(&config.hedge) {
         return wrong("hedge", config.hedge, "0 to 1");
     }
-    if let ValueEstimate::DiscountedStep { gamma } = config.worth
+    if let ValueEstimate::DiscountedStep { gamma } = config.value
         && !(gamma > 0.0 && gamma <= 1.0)
     {
         return wrong("gamma", gamma, "more than 0 and at most 1");

@@ -48,8 +48,8 @@ fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
     }
 }
 
-fn fraction(prospect: &CandidateEvaluation) -> f64 {
-    match prospect.kind {
+fn fraction(evaluation: &CandidateEvaluation) -> f64 {
+    match evaluation.kind {
         ProposalKind::Idm { speed_fraction, .. } | ProposalKind::Brisk { speed_fraction } => {
             speed_fraction
         }
@@ -162,13 +162,13 @@ fn who_moves_first_is_let_in_and_a_forecast_does_not_know_it() {
     };
     let world = ByLaw(yields_to_the_bold);
     let decision = decide(&world, trusting(), CROSSING);
-    let chosen = &decision.prospects[decision.chosen];
+    let chosen = &decision.candidates[decision.chosen];
     assert!(chosen.progress_m > waits + 5.0, "{}", chosen.progress_m);
     assert!(fraction(chosen) > 0.5 && chosen.collisions == 0);
     // With others that do not react it waits as well.
     let deaf = ByLaw(|agent, _, _| coasted(agent));
     let decision = decide(&deaf, trusting(), CROSSING);
-    assert!(decision.prospects[decision.chosen].progress_m < waits + 2.0);
+    assert!(decision.candidates[decision.chosen].progress_m < waits + 2.0);
 }
 
 #[test]
@@ -180,7 +180,7 @@ fn a_hedge_keeps_from_relying_on_others() {
             ..InteractiveDriverConfig::default()
         };
         let decision = decide(&world, config, CROSSING);
-        decision.prospects[decision.chosen].clone()
+        decision.candidates[decision.chosen].clone()
     };
     let (bold, careful) = (with(0.0), with(0.9));
     assert_eq!(bold.hedge, None);
@@ -217,7 +217,7 @@ fn a_lane_that_ends_is_left() {
         ..InteractiveDriverConfig::default()
     };
     let decision = merging("", config.clone());
-    let chosen = &decision.prospects[decision.chosen];
+    let chosen = &decision.candidates[decision.chosen];
     let left = ProposalKind::LaneChange {
         speed_fraction: 1.0,
         side: Side::Left,
@@ -227,7 +227,7 @@ fn a_lane_that_ends_is_left() {
     assert!((3.0..4.0).contains(&end.position.y), "{end:?}");
     // Not into a vehicle that drives beside it.
     let beside = merging("agent vehicle 1: 21,3.5 velocity 10,0", config.clone());
-    let chosen = &beside.prospects[beside.chosen];
+    let chosen = &beside.candidates[beside.chosen];
     assert_eq!(chosen.collisions, 0);
     assert!(chosen.score.mean > 0.0);
     // Without them there are as many candidates as on a road of one lane.
@@ -236,14 +236,14 @@ fn a_lane_that_ends_is_left() {
         ..config
     };
     assert_eq!(
-        merging("", none).prospects.len() + 2,
-        decision.prospects.len()
+        merging("", none).candidates.len() + 2,
+        decision.candidates.len()
     );
 }
 
 /// Speed and line of the chosen one.
 fn fraction_and_offset(decision: &Decision) -> (f64, f64) {
-    match decision.prospects[decision.chosen].kind {
+    match decision.candidates[decision.chosen].kind {
         ProposalKind::Idm {
             speed_fraction,
             lateral_offset,
@@ -277,7 +277,7 @@ fn a_stopped_vehicle_is_stopped_for() {
     let vehicle = *recording(&text).vehicle();
     for world in [&ConstantVelocity as &dyn WorldModel, &Idm::default()] {
         let decision = decide(world, ruled(), &text);
-        let chosen = &decision.prospects[decision.chosen];
+        let chosen = &decision.candidates[decision.chosen];
         // It brakes late, so after the four seconds that are imagined it may still roll; that it
         // comes to a stop is seen in the closed loop.
         for drive in &chosen.drives {
@@ -296,11 +296,11 @@ fn a_stopped_vehicle_is_stopped_for() {
 fn every_candidate_keeps_its_score() {
     let text = format!("{FREE}\n agent vehicle 1: 60,0 velocity 5,0");
     let decision = decide(&ConstantVelocity, ruled(), &text);
-    assert_eq!(decision.prospects.len(), 15);
-    let chosen = decision.prospects[decision.chosen].score.mean;
-    for prospect in &decision.prospects {
-        let score = &prospect.score;
-        assert_eq!((score.futures.len(), prospect.value), (2, score.mean));
+    assert_eq!(decision.candidates.len(), 15);
+    let chosen = decision.candidates[decision.chosen].score.mean;
+    for evaluation in &decision.candidates {
+        let score = &evaluation.score;
+        assert_eq!((score.futures.len(), evaluation.value), (2, score.mean));
         assert!(score.mean <= chosen + 1e-6);
         // The futures of this world are equal.
         assert_eq!(score.standard_error, Some(0.0));
@@ -329,12 +329,12 @@ fn every_candidate_keeps_its_score() {
 fn progress_is_what_is_driven() {
     let decision = decide(&ConstantVelocity, ruled(), FREE);
     // The centred policy for 20 % of 12 m/s brakes from 10 m/s; the one for all of it goes farthest.
-    let farthest = decision.prospects[4].progress_m;
-    for prospect in &decision.prospects[..5] {
-        let drive = &prospect.drives[0];
+    let farthest = decision.candidates[4].progress_m;
+    for evaluation in &decision.candidates[..5] {
+        let drive = &evaluation.drives[0];
         let driven = drive[40].rear_axle.position.x - drive[0].rear_axle.position.x;
-        assert_abs_diff_eq!(prospect.progress_m, driven, epsilon = 1e-9);
-        let parts = prospect.score.parts();
+        assert_abs_diff_eq!(evaluation.progress_m, driven, epsilon = 1e-9);
+        let parts = evaluation.score.parts();
         let (_, share) = parts.iter().find(|(name, _)| *name == "progress").unwrap();
         assert_abs_diff_eq!(*share, driven / farthest, epsilon = 1e-9);
     }
@@ -349,8 +349,8 @@ fn plans_repeat_and_do_not_depend_on_earlier_plans() {
         let plan = plan_once(recording, driver).unwrap();
         let decision = driver.decision().unwrap();
         let of = |p: &CandidateEvaluation| (p.kind, p.score.clone(), p.drives.clone());
-        let prospects: Vec<_> = decision.prospects.iter().map(of).collect();
-        (plan, decision.chosen, prospects)
+        let evaluations: Vec<_> = decision.candidates.iter().map(of).collect();
+        (plan, decision.chosen, evaluations)
     };
     let new = || InteractiveDriver::new(&world, ruled()).unwrap();
     let mut driver = new();
@@ -368,7 +368,7 @@ fn the_emergency_brake_is_the_last_resort() {
     let way = plan_once(&recording(text), &mut driver).unwrap();
     let decision = driver.decision().unwrap();
     assert!(decision.brakes);
-    assert!(decision.prospects.iter().all(|p| p.score.is_hopeless()));
+    assert!(decision.candidates.iter().all(|p| p.score.is_hopeless()));
     let candidates = driver.candidates();
     let (brake, judged) = candidates.split_last().unwrap();
     assert_eq!((judged.len(), brake.name.as_str()), (15, "emergency brake"));
@@ -428,7 +428,7 @@ fn what_the_world_imagines_decides() {
         starts: Mutex::default(),
     };
     let decision = decide(&world, ruled(), &text);
-    let progress = |decision: &Decision| decision.prospects[decision.chosen].progress_m;
+    let progress = |decision: &Decision| decision.candidates[decision.chosen].progress_m;
     let free = progress(&decide(&ConstantVelocity, ruled(), &text));
     assert!(progress(&decision) < free, "{fast} is driven as far");
     // Common random numbers: one session, every candidate from the same seed.
@@ -455,7 +455,7 @@ fn turning_the_world_turns_the_decision() {
          ego vehicle 0: -0.5,10 velocity 0,6\n agent vehicle 1: 0,40 velocity 0,3",
     );
     assert_eq!(straight.chosen, turned.chosen);
-    for (a, b) in straight.prospects.iter().zip(&turned.prospects) {
+    for (a, b) in straight.candidates.iter().zip(&turned.candidates) {
         assert_abs_diff_eq!(a.value, b.value, epsilon = 1e-9);
         for (a, b) in a.drives[0].iter().zip(&b.drives[0]) {
             let there = a.rear_axle.position.perp();
@@ -468,7 +468,7 @@ fn turning_the_world_turns_the_decision() {
 fn a_single_candidate_is_taken() {
     let config = only(&[0.6], &[0.0]);
     let decision = decide(&ConstantVelocity, config, "ego vehicle 0: 2,0 velocity 5,0");
-    assert_eq!((decision.prospects.len(), decision.chosen), (1, 0));
+    assert_eq!((decision.candidates.len(), decision.chosen), (1, 0));
     assert!(!decision.brakes && decision.horizon == 4.0);
 }
 
@@ -487,7 +487,7 @@ fn the_one_that_hits_something_is_left_whatever_the_seed() {
             ..only(&[0.8], &[1.0, 0.0])
         };
         let decision = decide(&world, config, text);
-        assert_eq!(decision.chosen, 1, "{:?}", decision.prospects[0].score);
+        assert_eq!(decision.chosen, 1, "{:?}", decision.candidates[0].score);
     }
 }
 
@@ -500,9 +500,9 @@ fn values_follow_their_candidates() {
     let forward = decide(&world, only(&speeds, &[0.0]), text);
     let reversed = decide(&world, only(&[1.0, 0.5, 0.2], &[0.0]), text);
     for (a, b) in forward
-        .prospects
+        .candidates
         .iter()
-        .zip(reversed.prospects.iter().rev())
+        .zip(reversed.candidates.iter().rev())
     {
         assert_eq!(a.score, b.score);
         assert_eq!(a.drives, b.drives);
@@ -517,9 +517,9 @@ fn the_world_is_told_exactly_where_the_ego_is() {
     for world in [&ByLaw(at_random_speed) as &dyn WorldModel, &Idm::default()] {
         let decision = decide(world, only(&[0.4, 1.0], &[0.0, -1.0]), text);
         let mut n_complete = 0;
-        for prospect in &decision.prospects {
-            n_complete += usize::from(prospect.futures[0].steps() == 8);
-            for (future, drive) in prospect.futures.iter().zip(&prospect.drives) {
+        for evaluation in &decision.candidates {
+            n_complete += usize::from(evaluation.futures[0].steps() == 8);
+            for (future, drive) in evaluation.futures.iter().zip(&evaluation.drives) {
                 // A lost future is dropped before its end.
                 assert_eq!(drive.len(), 41);
                 for (i, frame) in future.imagined().iter().enumerate() {
@@ -546,7 +546,7 @@ fn threads_change_nothing() {
                 let frames: Vec<_> = p.futures.iter().map(frames).collect();
                 (p.score.clone(), p.drives.clone(), frames)
             };
-            let all: Vec<_> = decision.prospects.iter().map(summary).collect();
+            let all: Vec<_> = decision.candidates.iter().map(summary).collect();
             (decision.chosen, all)
         };
         pool.build().unwrap().install(run)
@@ -565,7 +565,7 @@ fn halving_imagines_the_better_candidates_more_often() {
     let world = ByLaw(at_random_speed);
     let decision = decide(&world, InteractiveDriverConfig::default(), BEHIND);
     let of = |p: &CandidateEvaluation| (p.futures.len(), p.drives.len(), p.finalist);
-    let counts: Vec<_> = decision.prospects.iter().map(of).collect();
+    let counts: Vec<_> = decision.candidates.iter().map(of).collect();
     let count =
         |n: usize, finalist: bool| counts.iter().filter(|t| **t == (n, n, finalist)).count();
     // Of nineteen policies and imitation ten see a second future, five the third and fourth.
@@ -573,11 +573,13 @@ fn halving_imagines_the_better_candidates_more_often() {
         (count(1, false), count(2, false), count(4, true)),
         (10, 5, 5)
     );
-    assert!(decision.prospects[decision.chosen].finalist);
+    assert!(decision.candidates[decision.chosen].finalist);
     // What drops out was no better, in the futures it saw, than what stayed.
     let first = |p: &CandidateEvaluation| p.score.futures[0].total;
-    let (seen, unseen): (Vec<&CandidateEvaluation>, _) =
-        decision.prospects.iter().partition(|p| p.futures.len() > 1);
+    let (seen, unseen): (Vec<&CandidateEvaluation>, _) = decision
+        .candidates
+        .iter()
+        .partition(|p| p.futures.len() > 1);
     let worst = seen.iter().map(|p| first(p)).fold(f64::INFINITY, f64::min);
     assert!(unseen.iter().all(|p| first(p) <= worst + 1e-6));
 }
@@ -593,9 +595,9 @@ fn brisk_drivers_come_closer_and_those_who_yield_stay_back() {
         config,
         "ego vehicle 0: 2,0 velocity 4,0\n agent vehicle 1: 25,0 velocity 5,0",
     );
-    assert_eq!(decision.prospects.len(), 19);
+    assert_eq!(decision.candidates.len(), 19);
     let of = |kind: ProposalKind| {
-        let found = decision.prospects.iter().find(|p| p.kind == kind);
+        let found = decision.candidates.iter().find(|p| p.kind == kind);
         found.unwrap_or_else(|| panic!("{kind} is no candidate"))
     };
     let usual = of(ProposalKind::Idm {
@@ -623,9 +625,9 @@ fn driving_too_fast_and_jolts_cost_what_nuplan_takes_off() {
     let text = "ego vehicle 0: 2,0 velocity 16,0 size 5,2";
     let decision = decide(&ConstantVelocity, only(&[1.0], &[0.0]), text);
     // From 16 m/s where 12 are allowed: PDM has no term for it, nuPlan has.
-    let parts = decision.prospects[0].score.parts();
+    let parts = decision.candidates[0].score.parts();
     let part = |name: &str| parts.iter().find(|(part, _)| *part == name).unwrap().1;
-    let drive = &decision.prospects[0].drives[0];
+    let drive = &decision.candidates[0].drives[0];
     let excess = drive
         .iter()
         .map(|s| (s.speed() - 12.0).max(0.0))
@@ -645,7 +647,7 @@ fn where_futures_are_equal_halving_takes_what_uniform_takes() {
         let all = decide(&ConstantVelocity, with(Allocation::Uniform), text);
         let half = decide(&ConstantVelocity, with(Allocation::Halving), text);
         assert_eq!(all.chosen, half.chosen, "{text}");
-        let value = |decision: &Decision| decision.prospects[decision.chosen].value;
+        let value = |decision: &Decision| decision.candidates[decision.chosen].value;
         assert_abs_diff_eq!(value(&all), value(&half), epsilon = 1e-12);
     }
 }
@@ -658,14 +660,14 @@ fn the_worst_future_counts_if_it_is_asked_for() {
         ..only(&[0.4, 1.0], &[0.0])
     };
     let decision = decide(&world, config, BEHIND);
-    for prospect in &decision.prospects {
-        let totals = prospect.score.futures.iter().map(|score| score.total);
-        assert_eq!(prospect.value, totals.fold(f64::INFINITY, f64::min));
+    for evaluation in &decision.candidates {
+        let totals = evaluation.score.futures.iter().map(|score| score.total);
+        assert_eq!(evaluation.value, totals.fold(f64::INFINITY, f64::min));
     }
-    let means = decision.prospects.iter().map(|p| p.score.mean);
+    let means = decision.candidates.iter().map(|p| p.score.mean);
     assert!(
         decision
-            .prospects
+            .candidates
             .iter()
             .zip(means)
             .any(|(p, mean)| p.value < mean - 1e-3)
@@ -688,10 +690,10 @@ fn a_round_that_time_does_not_allow_does_not_count() {
     plan_once(&recording(BEHIND), &mut driver).unwrap();
     let decision = driver.decision().unwrap();
     assert_eq!(decision.horizon, 4.0);
-    assert!(decision.prospects.iter().all(|p| p.futures.len() == 1));
-    assert!(decision.prospects[decision.chosen].finalist);
-    for prospect in &decision.prospects {
-        assert!(prospect.drives.iter().all(|drive| drive.len() == 41));
+    assert!(decision.candidates.iter().all(|p| p.futures.len() == 1));
+    assert!(decision.candidates[decision.chosen].finalist);
+    for evaluation in &decision.candidates {
+        assert!(evaluation.drives.iter().all(|drive| drive.len() == 41));
     }
 }
 
@@ -707,7 +709,7 @@ fn values_of_few_futures_are_those_of_many_on_average() {
             seed: Seed(seed),
             ..only(&[0.4, 1.0], &[0.0])
         };
-        decide(&world, config, text).prospects[0].score.clone()
+        decide(&world, config, text).candidates[0].score.clone()
     };
     let few: Vec<f64> = (0..64).map(|seed| value(seed, 4).mean).collect();
     let mean = few.iter().sum::<f64>() / 64.0;
@@ -737,8 +739,8 @@ fn out_of_time_all_are_judged_by_the_same_shorter_horizon() {
     assert!(0.5 <= decision.horizon && decision.horizon < 4.0);
     assert!(decision.phases.total() > Duration::ZERO);
     let n = (decision.horizon * 10.0).round() as usize + 1;
-    for prospect in &decision.prospects {
-        assert!(prospect.drives.iter().all(|drive| drive.len() == n));
+    for evaluation in &decision.candidates {
+        assert!(evaluation.drives.iter().all(|drive| drive.len() == n));
     }
 }
 
@@ -751,7 +753,7 @@ fn only_the_nearest_are_imagined() {
     let mut config = only(&[0.4], &[0.0]);
     config.budget.nearest = 2;
     let decision = decide(&ConstantVelocity, config, text);
-    let frame = decision.prospects[0].futures[0].last();
+    let frame = decision.candidates[0].futures[0].last();
     let ids = frame.now().agents().iter().map(|agent| agent.id.0);
     assert_eq!(ids.collect::<Vec<_>>(), [0, 1, 2]);
 }
@@ -759,27 +761,27 @@ fn only_the_nearest_are_imagined() {
 #[test]
 fn the_other_reading_of_the_return_agrees_where_nothing_happens() {
     let text = "ego vehicle 0: 2,0 velocity 6,0";
-    let worth = ValueEstimate::DiscountedStep { gamma: 0.95 };
-    let config = |worth| InteractiveDriverConfig {
-        worth,
+    let value = ValueEstimate::DiscountedStep { gamma: 0.95 };
+    let config = |value| InteractiveDriverConfig {
+        value,
         ..only(&[0.5], &[0.0])
     };
     let whole = decide(&ConstantVelocity, config(ValueEstimate::Rollout), text);
-    let steps = decide(&ConstantVelocity, config(worth), text);
-    let [a, b] = [&whole, &steps].map(|d| d.prospects[0].score.mean);
+    let steps = decide(&ConstantVelocity, config(value), text);
+    let [a, b] = [&whole, &steps].map(|d| d.candidates[0].score.mean);
     // A single candidate is the farthest in the whole and in every step.
     assert_abs_diff_eq!(a, b, epsilon = 1e-12);
     // One that collides at the end keeps what it earned before.
     let crash = "ego vehicle 0: 2,0 velocity 11,0 size 5,2
         agent vehicle 1: 36,-16 velocity 0,6";
-    let both = |worth| {
+    let both = |value| {
         let config = InteractiveDriverConfig {
-            worth,
+            value,
             ..only(&[1.0], &[0.0])
         };
-        decide(&ConstantVelocity, config, crash).prospects[0].clone()
+        decide(&ConstantVelocity, config, crash).candidates[0].clone()
     };
-    let (whole, steps) = (both(ValueEstimate::Rollout), both(worth));
+    let (whole, steps) = (both(ValueEstimate::Rollout), both(value));
     assert_eq!((whole.collisions, whole.score.mean), (4, 0.0));
     let earned = steps.score.mean;
     assert!(
@@ -798,10 +800,10 @@ fn where_all_collide_the_last_to_do_so_drives_or_brakes() {
             2.0 + 5.0 + gap
         );
         let decision = decide(&ConstantVelocity, only(&[0.2, 1.0], &[0.0]), &text);
-        assert!(decision.prospects.iter().all(|p| p.value == 0.0));
-        let soonest = decision.prospects.iter().map(|p| p.collision_s);
+        assert!(decision.candidates.iter().all(|p| p.value == 0.0));
+        let soonest = decision.candidates.iter().map(|p| p.collision_s);
         let latest = soonest.fold(0.0, f64::max);
-        let chosen = &decision.prospects[decision.chosen];
+        let chosen = &decision.candidates[decision.chosen];
         assert_eq!(chosen.collision_s, latest);
         assert_eq!(decision.brakes, brakes, "{chosen:?}");
     };
@@ -814,12 +816,12 @@ fn ties_are_broken_in_order() {
     let text = "ego vehicle 0: 2,0 velocity 6,0";
     let decision = decide(&ConstantVelocity, only(&[0.4, 0.5, 0.6], &[0.0]), text);
     let with = |values: [(f64, usize, f64); 3], previous, hysteresis| {
-        let mut prospects = decision.prospects.clone();
-        for (prospect, (value, collisions, progress_m)) in prospects.iter_mut().zip(values) {
-            (prospect.value, prospect.collisions) = (value, collisions);
-            prospect.progress_m = progress_m;
+        let mut evaluations = decision.candidates.clone();
+        for (evaluation, (value, collisions, progress_m)) in evaluations.iter_mut().zip(values) {
+            (evaluation.value, evaluation.collisions) = (value, collisions);
+            evaluation.progress_m = progress_m;
         }
-        choose(&prospects, previous, hysteresis)
+        choose(&evaluations, previous, hysteresis)
     };
     assert_eq!(
         with([(0.5, 0, 1.0), (0.6, 1, 0.0), (0.5, 0, 9.0)], None, 0.0),
@@ -872,9 +874,9 @@ fn imitation_is_a_candidate_like_any_other() {
     let mut driver = InteractiveDriver::new(&world, config).unwrap();
     let way = plan_once(&recording(text), &mut driver).unwrap();
     let decision = driver.decision().unwrap();
-    assert_eq!(decision.prospects[1].kind, ProposalKind::Imitation);
+    assert_eq!(decision.candidates[1].kind, ProposalKind::Imitation);
     assert_eq!(decision.chosen, 1);
-    assert!((decision.prospects[1].progress_m - 36.0).abs() < 0.5);
+    assert!((decision.candidates[1].progress_m - 36.0).abs() < 0.5);
     // The drive equals the imagined future, and continues past its end.
     let end = way.states()[80].rear_axle.position.x - way.states()[0].rear_axle.position.x;
     assert!((end - 72.0).abs() < 1.0, "{end}");
@@ -997,7 +999,7 @@ fn numbers_out_of_range_are_refused() {
     check(|c| c.hysteresis = -1.0, "hysteresis");
     check(|c| c.hedge = 1.5, "hedge");
     check(
-        |c| c.worth = ValueEstimate::DiscountedStep { gamma: 0.0 },
+        |c| c.value = ValueEstimate::DiscountedStep { gamma: 0.0 },
         "gamma",
     );
     check(|c| c.budget.horizon = 0.3, "horizon");

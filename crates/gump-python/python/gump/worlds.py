@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any, List, NamedTuple, Optional, Sequence, Tuple, Union
 
@@ -28,7 +29,7 @@ class World:
     among them the likeliest that together have the probability `top_p`; `decay` weighs earlier
     predictions of a moment, `redraws` is how often what would run into something or off the road is
     drawn again, `limits` hold back what cannot move so. `raw` is the network alone, `paper` the
-    paper's decoding, `life` lets agents come and leave, as many as at the start. `lights` is what
+    paper's decoding, `spawn` lets agents come and leave, as many as at the start. `lights` is what
     traffic lights show: "model", what signals of such junctions do, or "hold". `mode` is "partial-ar" or
     "full-ar", `precision` "f32", "bf16" or "int8".
 
@@ -48,13 +49,19 @@ class World:
         limits: bool = True,
         raw: bool = False,
         paper: bool = False,
-        life: bool = False,
+        spawn: bool = False,
         lights: str = "model",
         mode: str = "partial-ar",
         precision: str = "f32",
+        life: Optional[bool] = None,
     ) -> None:
         if not isinstance(name, str):
             raise TypeError(f"world: expected a name, found {type(name).__name__}")
+        if life is not None:
+            warnings.warn(
+                "life is now spawn; the former name works until 0.3", DeprecationWarning, stacklevel=2
+            )
+            spawn = spawn or life
         weights = None
         if name == "model":
             weights = os.fspath(SHIPPED_WEIGHTS)
@@ -70,7 +77,7 @@ class World:
             "limits": limits,
             "raw": raw,
             "paper": paper,
-            "life": life,
+            "spawn": spawn,
             "lights": lights,
             "precision": precision,
         }

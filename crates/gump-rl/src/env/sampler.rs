@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 /// Rule by which episodes choose their scenarios.
 #[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
+#[non_exhaustive]
 pub enum Sampling {
     /// Uniformly at random.
     #[default]

@@ -20,6 +20,7 @@ const PARTIAL_SUMS: usize = 4;
 /// and for the target copy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum Architecture {
     /// Four convolutions of 3 x 3, each halving the side: 16, 32, 64, 64 channels, with all pixels
     /// of the last as features. For CPUs.

@@ -3,7 +3,7 @@
 //! Maps are stored as `[channel, row of the batch, y, x]`. The maps of many rows are therefore one
 //! matrix, and deep layers, whose maps are a few pixels wide, multiply as fast as shallow ones.
 
-use super::product::{Matrix, add_product};
+use super::product::{Mat, add_product};
 
 /// Squares of weights that slide over maps; what lies beyond the border is 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,8 +59,8 @@ impl Convolution {
         output.resize(self.outputs * pixels, 0.0);
         add_product(
             output,
-            Matrix::new(weights, self.outputs, self.taps()),
-            Matrix::new(columns, self.taps(), pixels),
+            Mat::new(weights, self.outputs, self.taps()),
+            Mat::new(columns, self.taps(), pixels),
         );
     }
 
@@ -75,13 +75,13 @@ impl Convolution {
         columns: &mut Vec<f32>,
     ) {
         let pixels = rows * self.side_out().pow(2);
-        let above = Matrix::new(output_gradient, self.outputs, pixels);
+        let above = Mat::new(output_gradient, self.outputs, pixels);
         self.gather(input, rows, columns);
-        let seen = Matrix::new(columns, self.taps(), pixels);
+        let seen = Mat::new(columns, self.taps(), pixels);
         add_product(weight_gradient, above, seen.t());
         if let Some(input_gradient) = input_gradient {
             columns.fill(0.0);
-            let weights = Matrix::new(weights, self.outputs, self.taps());
+            let weights = Mat::new(weights, self.outputs, self.taps());
             add_product(columns, weights.t(), above);
             self.scatter(columns, rows, input_gradient);
         }

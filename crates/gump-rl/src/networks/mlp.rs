@@ -3,7 +3,7 @@
 use gump_scene::Rng;
 use rand::Rng as _;
 
-use super::product::{Matrix, add_product};
+use super::product::{Mat, add_product};
 
 /// Dense layers with ReLU between them.
 ///
@@ -132,8 +132,8 @@ impl Mlp {
                 output.extend_from_slice(biases);
             }
             // [rows, in] [in, out] -> [rows, out]
-            let input = Matrix::new(&before[layer], rows, inputs);
-            add_product(output, input, Matrix::new(weights, outputs, inputs).t());
+            let input = Mat::new(&before[layer], rows, inputs);
+            add_product(output, input, Mat::new(weights, outputs, inputs).t());
             if layer + 1 < n_layers {
                 for x in output.iter_mut() {
                     *x = x.max(0.0);
@@ -187,13 +187,13 @@ impl Mlp {
             let (inputs, outputs) = (self.sizes[layer], self.sizes[layer + 1]);
             let begin = end - (inputs + 1) * outputs;
             // [rows, out]
-            let above = Matrix::new(delta, rows, outputs);
+            let above = Mat::new(delta, rows, outputs);
             if let Some(gradient) = &mut gradient {
                 let (weights, biases) = gradient[begin..end].split_at_mut(inputs * outputs);
                 add_product(
                     weights,
                     above.t(),
-                    Matrix::new(&layers[layer], rows, inputs),
+                    Mat::new(&layers[layer], rows, inputs),
                 );
                 for row in delta.chunks_exact(outputs) {
                     for (sum, x) in biases.iter_mut().zip(row) {
@@ -206,7 +206,7 @@ impl Mlp {
             }
             delta_before.clear();
             delta_before.resize(rows * inputs, 0.0);
-            let weights = Matrix::new(self.layer(layer).0, outputs, inputs);
+            let weights = Mat::new(self.layer(layer).0, outputs, inputs);
             add_product(delta_before, above, weights);
             if layer > 0 {
                 for (x, &activation) in delta_before.iter_mut().zip(&layers[layer]) {

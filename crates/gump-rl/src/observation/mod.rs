@@ -18,6 +18,7 @@ pub use vector::VectorView;
 /// The form of an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
+#[non_exhaustive]
 pub enum ObservationSpec {
     /// A short vector of numbers in the ego's frame.
     Vector(VectorView),
@@ -105,6 +106,7 @@ impl ObservationSpec {
 /// The form of observations, as far as learners need it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum ObservationForm {
     /// This many numbers of any size.
     Numbers(usize),

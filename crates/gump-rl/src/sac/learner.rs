@@ -4,14 +4,14 @@
 //! conventions: critic losses are added and not halved, and all gradients are computed before any
 //! parameter changes. Gradients are hand-written; tests compare them with finite differences.
 
-use gump_scene::Seed;
+use gump_scene::{Seed, standard_normal};
 
 use super::critics::{Critic, critic_loss, soft_target};
 use super::vision::{Seen, Vision};
 use super::{Batch, SacConfig};
 use crate::ObservationForm;
 use crate::actor::Actor;
-use crate::networks::{Adam, Pass, clip, standard_normal};
+use crate::networks::{Adam, Pass, clip};
 
 /// Actor, critics and temperature with their optimizers.
 #[derive(Clone, Debug)]
@@ -106,11 +106,6 @@ impl Learner {
     /// The policy.
     pub fn actor(&self) -> &Actor {
         &self.actor
-    }
-
-    /// The policy, mutably.
-    pub fn actor_mut(&mut self) -> &mut Actor {
-        &mut self.actor
     }
 
     /// The critics.

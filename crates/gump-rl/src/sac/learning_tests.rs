@@ -7,7 +7,9 @@ use std::ops::ControlFlow;
 use gump_scene::Seed;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
-use super::toys::{Bandit, Clock, Identity, Pendulum, Problem, Reach, Regulator, SeenReach, Toy};
+use super::test_envs::{
+    Bandit, Clock, Identity, Pendulum, Problem, Reach, Regulator, SeenReach, Toy,
+};
 use super::{Algorithm, SacConfig, StepReport, Training};
 use crate::networks::Architecture;
 
@@ -230,7 +232,7 @@ fn experts_are_imitated() {
     let mut rng = Seed(3).rng();
     for i in 0..500 {
         let seen = i as f32 / 250.0 - 1.0;
-        let noise = 0.05 * crate::networks::standard_normal(&mut rng) as f32;
+        let noise = 0.05 * gump_scene::standard_normal(&mut rng) as f32;
         expert.push(Transition {
             observation: (&[seen]).into(),
             action: &[(0.5 * seen + noise).clamp(-1.0, 1.0)],

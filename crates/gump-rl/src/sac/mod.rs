@@ -17,9 +17,9 @@ mod vision;
 #[cfg(test)]
 mod learning_tests;
 #[cfg(test)]
-mod tests;
+mod test_envs;
 #[cfg(test)]
-mod toys;
+mod tests;
 #[cfg(test)]
 mod vision_tests;
 

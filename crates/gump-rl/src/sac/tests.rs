@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 use gump_scene::Seed;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
-use super::toys::{Reach, Toy};
+use super::test_envs::{Reach, Toy};
 use super::{Algorithm, Batch, Learner, SacConfig, StepReport, Training};
 use crate::networks::Normalizer;
 use crate::{Actor, RlError, VectorEnv as _};
@@ -70,7 +70,7 @@ fn a_critic_loss_by_hand() {
     let noise = |row: usize| {
         let mut rng = Seed(1).fork(1).rng();
         let drawn: Vec<f64> = (0..3)
-            .map(|_| crate::networks::standard_normal(&mut rng))
+            .map(|_| gump_scene::standard_normal(&mut rng))
             .collect();
         drawn[row]
     };

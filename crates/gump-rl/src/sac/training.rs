@@ -1,10 +1,14 @@
 //! Training runs: collecting and learning alternate, in segments between which a run can be
 //! resumed.
 
+use std::fmt;
 use std::ops::ControlFlow;
+use std::str::FromStr;
 
 use gump_scene::Seed;
 use rand::Rng as _;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 use super::replay_buffer::{ReplayBuffer, Transition};
@@ -16,11 +20,35 @@ use crate::{Actor, ObservationForm, RlError, VectorEnv};
 /// The training signal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[non_exhaustive]
 pub enum Algorithm {
     /// Rewards, with a share of expert transitions.
     Sac,
     /// Expert transitions only; no environment is needed.
     Imitation,
+}
+
+impl Algorithm {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::Sac, Self::Imitation];
+}
+
+impl fmt::Display for Algorithm {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Algorithm {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 /// A run: the learner, its replay buffer and its progress.

@@ -9,8 +9,8 @@ use gump_scene::Seed;
 use rand::Rng as _;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
+use super::test_envs::{Problem as _, Reach, SeenReach, Toy};
 use super::tests::check_gradient;
-use super::toys::{Problem as _, Reach, SeenReach, Toy};
 use super::{Algorithm, Batch, Learner, SacConfig, Training, UpdateReport};
 use crate::networks::{Architecture, Picture};
 use crate::{Actor, RlError};

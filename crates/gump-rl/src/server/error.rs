@@ -7,6 +7,7 @@ use crate::RlError;
 
 /// Why a server or a connection ended, or a request was refused.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum ServerError {
     /// Another server listens there.
     #[error("a server listens already at {}", .0.display())]

@@ -1,4 +1,4 @@
-//! Environments for other processes, over a Unix socket.
+//! Environments for other processes, over a Unix socket; only on Unix.
 //!
 //! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; prepared and world
 //! are shared. Invalid requests are answered with an error and at worst close that connection; the
@@ -52,6 +52,7 @@ pub use error::ServerError;
 
 /// An event between the server and a client.
 #[derive(Debug)]
+#[non_exhaustive]
 pub enum Event {
     /// A client has connected.
     Came {

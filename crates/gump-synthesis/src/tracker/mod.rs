@@ -10,8 +10,7 @@ mod sight;
 
 use std::collections::BTreeMap;
 
-use gump_scene::{Agent, AgentId, Frame, Light, Rng, Scenario, Seed};
-use rand::Rng as _;
+use gump_scene::{Agent, AgentId, Frame, Light, Scenario, Seed};
 
 use self::noise::Noise;
 use self::sight::Sight;
@@ -109,13 +108,6 @@ fn is_light_seen(light: &Light, ego: Option<gump_geometry::DVec2>, tracker: &Tra
         (Some(at), Some(ego), Some(range)) => at.distance(ego) < 1.1 * range,
         _ => true,
     }
-}
-
-/// A number from the standard normal distribution.
-fn normal(rng: &mut Rng) -> f64 {
-    // Box and Muller 1958; 1 - u is never 0.
-    let (u, v): (f64, f64) = (rng.random(), rng.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 /// True if the agent has hardly moved so far.

@@ -1,10 +1,10 @@
 //! Errors of pose, velocity and size.
 
 use gump_geometry::{DVec2, wrap_angle};
-use gump_scene::{Agent, AgentKind, AgentState, Rng, Seed};
+use gump_scene::{Agent, AgentKind, AgentState, Rng, Seed, standard_normal};
 use rand::Rng as _;
 
-use super::{normal, stands};
+use super::stands;
 
 /// Correlation time of errors of position and heading, seconds.
 const MEMORY_S: f64 = 0.6;
@@ -73,7 +73,7 @@ impl Noise {
         let level = level(agent.kind);
         // The ego knows its own motion.
         let own = if is_ego { 0.15 } else { 1.0 };
-        let scale = noise * own * (level.spread * normal(&mut rng)).exp().min(6.0);
+        let scale = noise * own * (level.spread * standard_normal(&mut rng)).exp().min(6.0);
         Self {
             is_restless: rng.random_bool(RESTLESS) || agent.kind != AgentKind::Vehicle,
             rng,
@@ -90,10 +90,10 @@ impl Noise {
         let slow = (-dt / MEMORY_S).exp();
         let fast = (-dt / VELOCITY_MEMORY_S).exp();
         let rng = &mut self.rng;
-        let mut vector = || DVec2::new(normal(rng), normal(rng));
+        let mut vector = || DVec2::new(standard_normal(rng), standard_normal(rng));
         self.position = self.position * slow + vector() * (1.0 - slow * slow).sqrt();
         self.velocity = self.velocity * fast + vector() * (1.0 - fast * fast).sqrt();
-        self.heading = self.heading * slow + normal(rng) * (1.0 - slow * slow).sqrt();
+        self.heading = self.heading * slow + standard_normal(rng) * (1.0 - slow * slow).sqrt();
         if self.scale == 0.0 {
             return *agent;
         }

@@ -28,8 +28,8 @@ pub(crate) fn export(
     let device = network.device();
     let rasters: Vec<&Raster> = samples.iter().map(|sample| &sample.raster).collect();
     let raster = network.raster_tensor(&rasters)?;
-    let surveys = samples.iter().map(|sample| sample.survey.clone());
-    let memory = network.look(&rasters, surveys.collect())?;
+    let lane_maps = samples.iter().map(|sample| sample.lane_map.clone());
+    let memory = network.look(&rasters, lane_maps.collect())?;
     let sequences: Vec<_> = samples
         .iter()
         .map(|sample| sample.slots.as_slice())

@@ -202,10 +202,10 @@ pub(crate) fn loss(
     let rasters: Vec<&Raster> = samples.iter().map(|sample| &sample.raster).collect();
     let raster = network.raster_tensor(&rasters)?;
     let features = network.visual.features(&raster, training)?;
-    let surveys = samples.iter().map(|sample| Arc::clone(&sample.survey));
+    let lane_maps = samples.iter().map(|sample| Arc::clone(&sample.lane_map));
     let memory = network
         .mct
-        .remember(&network.place(&features)?, surveys.collect())?;
+        .remember(&network.place(&features)?, lane_maps.collect())?;
     let sequences: Vec<_> = samples
         .iter()
         .map(|sample| sample.slots.as_slice())

@@ -15,7 +15,7 @@ use gump_engine::relative::rules::resolve;
 use gump_engine::relative::seen::{Seen, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
@@ -137,7 +137,7 @@ impl TrackDriver for Driver {
         seed: Seed,
     ) {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
-        let survey = ruled.then(|| Survey::of_curbs(streets, centre, EDGES_M));
+        let lane_map = ruled.then(|| LaneMap::of_curbs(streets, centre, EDGES_M));
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
@@ -164,8 +164,8 @@ impl TrackDriver for Driver {
                 .filter(|&a| members[a].is_some())
                 .collect();
             let seed = seed.fork(t as u64);
-            if let Some(survey) = &survey {
-                let moves = self.moves_by_the_rules(&agents, survey, &hidden, seed, &mut room);
+            if let Some(lane_map) = &lane_map {
+                let moves = self.moves_by_the_rules(&agents, lane_map, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
                     if let Some(next) = &mut tracks[a].states[t + 1] {
                         *next = next.led_to(now.pose * step);
@@ -198,7 +198,7 @@ impl Driver {
     fn moves_by_the_rules(
         &self,
         agents: &[Shown],
-        survey: &Survey,
+        lane_map: &LaneMap,
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,
@@ -223,7 +223,7 @@ impl Driver {
         let mut moves = drawn(&all, 0);
         let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
         let redraws = self.config.redraws;
-        resolve(agents, None, survey, redraws, &mut moves, &mut again);
+        resolve(agents, None, lane_map, redraws, &mut moves, &mut again);
         moves
     }
 

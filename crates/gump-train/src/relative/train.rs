@@ -9,7 +9,7 @@ use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
 use gump_kernels::Operands;
 use gump_model::checkpoint;
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::relative::grid::FIELDS;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
@@ -457,7 +457,7 @@ impl RelativeTrainer {
             serde_json::to_string(&self.config).map_err(|e| TrainError::Config(e.to_string()))?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
-        Ok(checkpoint::write(path, tensors, header, Precision::Full)?)
+        Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 
     /// Ends the run and returns the network to use.

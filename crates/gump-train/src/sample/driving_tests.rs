@@ -1,6 +1,6 @@
 //! Tests that training and driving encode the same state of an object.
 
-use gump_engine::scene::Scene;
+use gump_engine::scene::SceneContext;
 use gump_engine::{SamplingConfig, TransformerWorld};
 use gump_model::ModelConfig;
 use gump_model::local_context::encode_local_context;
@@ -28,17 +28,17 @@ fn training_and_driving_see_the_same() {
     let shown = draw(&scenario, None, &reader, &SampleConfig::plain(3), Seed(3))
         .expect("the log is a window");
     let world = TransformerWorld::new(network, SamplingConfig::default());
-    let driven = Scene::new(&world, scenario.present()).unwrap();
+    let driven = SceneContext::new(&world, scenario.present()).unwrap();
     let slots = driven.slots().unwrap();
     assert_eq!(shown.slots, slots);
-    let seen = encode_local_context(&driven.survey, &slots, 0);
-    assert_eq!(encode_local_context(&shown.survey, &shown.slots, 0), seen);
+    let seen = encode_local_context(&driven.lane_map, &slots, 0);
+    assert_eq!(encode_local_context(&shown.lane_map, &shown.slots, 0), seen);
     // Each has its context in the frame of its chunk, whose pose is between the bins.
     for (i, _) in seen {
         let key = &slots[i];
         let (exact, rounded) = (key.last_pose().unwrap(), key.last.unwrap().pose());
         assert_eq!(
-            driven.anchor(key, &ModelConfig::tiny()),
+            driven.local_frame(key, &ModelConfig::tiny()),
             LocalFrame::at(exact)
         );
         assert!(exact.position.distance(rounded.position) > 1e-3);

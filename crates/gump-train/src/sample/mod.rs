@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use gump_model::Network;
 use gump_model::exact::ExactFrames;
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 use gump_raster::{Raster, RasterSpec, rasterize};
 use gump_scene::{Agent, AgentId, Frame, MapGraph, Rng, Scenario, ScenarioTag, SceneState, Seed};
@@ -144,7 +144,7 @@ impl SampleConfig {
 pub(crate) struct Sample {
     pub(crate) slots: Vec<PlacedSlot>,
     pub(crate) raster: Raster,
-    pub(crate) survey: Arc<Survey>,
+    pub(crate) lane_map: Arc<LaneMap>,
     pub(crate) states: Vec<StateTarget>,
     pub(crate) control: Vec<ControlTarget>,
     pub(crate) lights: Vec<ControlTarget>,
@@ -157,7 +157,7 @@ pub(crate) struct Reader {
     pub(crate) spec: RasterSpec,
     pub(crate) tokenizer: Tokenizer,
     /// Whether chunks are expressed in the local frames of objects.
-    pub(crate) anchored: bool,
+    pub(crate) local_frame: bool,
     /// Maximum number of tokens.
     pub(crate) block_size: usize,
 }
@@ -168,7 +168,7 @@ impl Reader {
         Self {
             spec: network.raster_spec().clone(),
             tokenizer: Tokenizer::new(TokenizerConfig::default()),
-            anchored: network.config().anchored,
+            local_frame: network.config().local_frame,
             block_size: network.config().block_size,
         }
     }
@@ -241,14 +241,14 @@ pub(crate) fn draw(
     let n = sequence.frames().len();
     let exact = ExactFrames::last(n, &frames, &identities, pose);
     let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
-    let (mut states, trajectories) = targets(&slots, &window, &identities, reader.anchored);
+    let (mut states, trajectories) = targets(&slots, &window, &identities, reader.local_frame);
     if hidden.sizes {
         // The network must not learn these sizes.
         states.iter_mut().for_each(StateTarget::forget_size);
     }
     let mut sample = Sample {
         raster: draw_raster(&window, &map, hidden, &reader.spec),
-        survey: Arc::new(Survey::new(&map, window.world_from_scene)),
+        lane_map: Arc::new(LaneMap::new(&map, window.world_from_scene)),
         slots: Vec::new(),
         states,
         control: control_targets(&slots),

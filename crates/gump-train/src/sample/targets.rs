@@ -64,7 +64,7 @@ pub(super) fn targets(
     slots: &[PlacedSlot],
     window: &Window<'_>,
     identities: &Identities,
-    anchored: bool,
+    local_frame: bool,
 ) -> (Vec<StateTarget>, Vec<TrajectoryTarget>) {
     let mut states = Vec::new();
     let mut trajectories = Vec::new();
@@ -79,7 +79,7 @@ pub(super) fn targets(
             continue;
         };
         let frame = placed.frame;
-        let anchor = match anchored {
+        let own_frame = match local_frame {
             true => placed.last_pose().map_or(LocalFrame::SCENE, LocalFrame::at),
             false => LocalFrame::SCENE,
         };
@@ -87,7 +87,7 @@ pub(super) fn targets(
         chunk[0] = chunk[0].or(Some(value.to_agent_state()));
         states.push(StateTarget {
             key: i,
-            bins: anchor.bins(value, chunk),
+            bins: own_frame.bins(value, chunk),
             is_known: placed.last.is_some(),
             stands: chunk[0].is_some_and(|state| state.speed() < STANDING_M_PER_S),
         });

@@ -14,7 +14,7 @@ fn reader() -> Reader {
         spec: RasterSpec::full(16, 12.0),
         tokenizer: Tokenizer::new(TokenizerConfig::default()),
         block_size: 2048,
-        anchored: false,
+        local_frame: false,
     }
 }
 

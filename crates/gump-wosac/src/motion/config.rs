@@ -1,5 +1,12 @@
 //! Settings of the challenge: times, thresholds, number of modes, shapes.
 
+use std::fmt;
+use std::str::FromStr;
+
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
+use serde::{Deserialize, Serialize};
+
 /// The settings of a motion-prediction benchmark.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionConfig {
@@ -43,12 +50,37 @@ pub struct SpeedScale {
 }
 
 /// The definition of the shapes of recorded paths.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum ShapeRules {
     /// Since March 2024.
     Current,
     /// Leaderboards of 2021 to 2023: coarser limits, and turns from headings that are not wrapped.
+    #[serde(rename = "until-2023")]
     Until2023,
+}
+
+impl ShapeRules {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 2] = [Self::Current, Self::Until2023];
+}
+
+impl fmt::Display for ShapeRules {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for ShapeRules {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 impl MotionConfig {

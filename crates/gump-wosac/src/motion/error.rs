@@ -14,6 +14,7 @@ pub struct MotionError {
 
 /// A mismatch between predictions and scenario.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum MotionProblem {
     /// Positions of a path do not fall on recorded frames.
     #[error("expected frames that divide the {expected} s between positions, found {found} s")]

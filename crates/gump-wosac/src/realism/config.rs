@@ -1,20 +1,49 @@
 //! Settings of each year of the challenge: components, estimators, weights; one TOML file per year.
 
+use std::fmt;
+use std::str::FromStr;
+
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 /// A year of the challenge.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[non_exhaustive]
 pub enum Year {
     /// 2023 as first published: leaderboard V0.
+    #[serde(rename = "2023-v0")]
     Y2023V0,
     /// 2023 after the correction of collisions and off-road: leaderboard V1, the GUMP paper's.
+    #[serde(rename = "2023")]
     Y2023,
     /// 2024.
+    #[serde(rename = "2024")]
     Y2024,
     /// 2025, simulated agents.
+    #[serde(rename = "2025")]
     Y2025,
     /// 2025, scenario generation.
+    #[serde(rename = "2025-generation")]
     Y2025Generation,
+}
+
+impl fmt::Display for Year {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Year {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 impl Year {
@@ -27,7 +56,7 @@ impl Year {
         Self::Y2025Generation,
     ];
 
-    /// Its name on the command line.
+    /// The name that it is stored and displayed under.
     pub fn name(self) -> &'static str {
         match self {
             Self::Y2023V0 => "2023-v0",
@@ -42,6 +71,7 @@ impl Year {
 /// The version of the feature code; the reference's code changed with the years, not only its
 /// settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[non_exhaustive]
 pub enum Algorithm {
     /// Backward differences; the log counts as valid throughout when distances are computed.
     #[serde(rename = "2023-v0")]
@@ -77,6 +107,7 @@ pub enum Mode {
 /// The components of a score, in the order of the reference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Component {
     /// Speed in space, m/s.
     LinearSpeed,
@@ -241,6 +272,11 @@ pub struct Config {
     pub traffic_light_violation: Option<FeatureConfig>,
 }
 
+/// The error of reading a [`Config`]: the invalid line and what is wrong with it.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ConfigError(String);
+
 impl Config {
     /// The challenge of a year.
     pub fn of(year: Year) -> Self {
@@ -260,9 +296,9 @@ impl Config {
     /// Custom settings, in the format of the shipped files.
     ///
     /// # Errors
-    /// A sentence with the invalid line.
-    pub fn parse(text: &str) -> Result<Self, String> {
-        toml::from_str(text).map_err(|error| error.to_string())
+    /// Text that is not TOML, and unknown, missing or wrong settings.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        toml::from_str(text).map_err(|error| ConfigError(error.to_string()))
     }
 
     /// The settings of a component; `None` if it is not scored.
@@ -302,6 +338,15 @@ mod tests {
     }
 
     #[test]
+    fn years_are_read_by_their_names() {
+        for year in Year::ALL {
+            assert_eq!(year.to_string(), year.name());
+            assert_eq!(year.name().parse(), Ok(year));
+        }
+        assert!("2022".parse::<Year>().is_err());
+    }
+
+    #[test]
     fn components_are_their_own_index() {
         for (i, component) in Component::ALL.into_iter().enumerate() {
             assert_eq!(component as usize, i);
@@ -311,7 +356,8 @@ mod tests {
     #[test]
     fn unknown_settings_are_refused() {
         let text = include_str!("configs/2024.toml").replace("weight", "wait");
-        assert!(Config::parse(&text).unwrap_err().contains("wait"));
+        let error = Config::parse(&text).unwrap_err().to_string();
+        assert!(error.contains("wait"), "{error}");
         let text = include_str!("configs/2024.toml").replace("bins", "bars");
         assert!(Config::parse(&text).is_err());
     }

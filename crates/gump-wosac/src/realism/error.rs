@@ -5,6 +5,7 @@ use gump_scene::AgentId;
 /// Why rollouts cannot be scored.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[allow(missing_docs, reason = "the sentences name the fields")]
+#[non_exhaustive]
 pub enum WosacError {
     /// A track of the log has another number of steps.
     #[error(

@@ -41,7 +41,9 @@ mod reference;
 mod road_edge;
 mod scores;
 
-pub use config::{Algorithm, Component, Config, Estimator, FeatureConfig, Group, Mode, Year};
+pub use config::{
+    Algorithm, Component, Config, ConfigError, Estimator, FeatureConfig, Group, Mode, Year,
+};
 pub use error::WosacError;
 pub use estimate::{Shape, log_likelihoods};
 pub use explain::{AgentRealism, Attribution};

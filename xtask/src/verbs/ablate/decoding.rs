@@ -120,16 +120,11 @@ impl Sweep {
                 categories.into_iter().enumerate().map(setting).collect()
             }
             Self::Quantization => {
-                let forms = [
-                    ("f32", Precision::F32),
-                    ("bf16", Precision::Bf16),
-                    ("int8", Precision::Int8),
-                ];
-                let setting = |(i, (name, precision)): (usize, (&str, _))| {
+                let setting = |(i, precision): (usize, Precision)| {
                     let turned = base.with(|config| config.precision = precision);
-                    (name.to_owned(), (i + 1) as f64, turned)
+                    (precision.to_string(), (i + 1) as f64, turned)
                 };
-                forms.into_iter().enumerate().map(setting).collect()
+                Precision::ALL.into_iter().enumerate().map(setting).collect()
             }
         }
     }

@@ -12,7 +12,7 @@ use gump_eval::decoding::Decoding;
 use gump_eval::training_set::TrainingSet;
 use gump_eval::worlds::WorldName;
 use gump_metrics::interval;
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{ModelConfig, checkpoint};
 use gump_scene::{Scenario, Seed};
 use gump_train::{RunConfig, TrainConfig, Trainer};
@@ -160,7 +160,7 @@ impl Class<'_> {
                 losses.push((tokens as f64, loss));
             }
         }
-        checkpoint::save(trainer.network(), weights, Precision::Half)?;
+        checkpoint::save(trainer.network(), weights, StorageType::Half)?;
         Ok(Learned {
             parameters: trainer.network().parameters().count() as f64,
             losses,

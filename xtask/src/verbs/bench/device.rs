@@ -72,7 +72,7 @@ impl Args {
         let network = |device: &Device| Network::random(config.clone(), run.seed(), device);
         let sampling = SamplingConfig::default();
         let cpu = TransformerWorld::new(network(&Device::Cpu)?, sampling.clone());
-        let other = TransformerWorld::plain(network(run.device())?, sampling);
+        let other = TransformerWorld::reference(network(run.device())?, sampling);
         let outputs = [
             cpu.probe(scenario.present())?,
             other.probe(scenario.present())?,

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
-use gump_engine::{CacheMode, Mode, SamplingConfig, TransformerWorld};
+use gump_engine::{CacheMode, Mode, Precision, SamplingConfig, TransformerWorld};
 use gump_model::{Network, checkpoint};
 use gump_rollout::{Start, WorldModel as _};
 use gump_scene::Scenario;
@@ -16,9 +16,9 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::torch::{Timed, Torch};
+use crate::choices::{PRECISIONS, one_of};
 use crate::machine::{cpu_seconds, peak_rss_mb};
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::sampling::PrecisionName;
 
 /// Arguments of `bench engine`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -52,8 +52,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "WAY,...", value_delimiter = ',')]
     only: Vec<String>,
     /// Number format of the weights
-    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
-    precision: PrecisionName,
+    #[arg(long, value_parser = one_of(PRECISIONS), default_value_t = Precision::F32)]
+    precision: Precision,
     /// Frames per measurement of partial autoregression, half a second each
     #[arg(long, value_name = "N", default_value_t = 16)]
     frames: usize,
@@ -230,13 +230,12 @@ impl Args {
         let file = run.path(&format!("{size}.safetensors"));
         let (tensors, shape) = network(run, size)?.export()?;
         let header = [("shape".to_owned(), shape.to_string())];
-        checkpoint::write(&file, tensors, header.into(), checkpoint::Precision::Full)?;
+        checkpoint::write(&file, tensors, header.into(), checkpoint::StorageType::Full)?;
         let steps = self.steps(growing);
         let mut rows = Vec::new();
         for &n_futures in &self.futures {
-            let formats = [PrecisionName::F32, PrecisionName::Bf16, PrecisionName::Int8];
             let mut worlds = Vec::new();
-            for precision in formats {
+            for precision in Precision::ALL {
                 worlds.push(self.world_in(run, size, growing, precision)?);
             }
             let mut ours = [const { Vec::new() }; 3];
@@ -321,27 +320,28 @@ impl Args {
         run: &Run,
         size: &str,
         way: &Way,
-        precision: PrecisionName,
+        precision: Precision,
     ) -> anyhow::Result<TransformerWorld> {
         let sampling = SamplingConfig {
             mode: way.mode,
             cache: way.kept,
-            precision: precision.resolve(),
+            precision,
             ..SamplingConfig::default()
         };
         let network = network(run, size)?;
         Ok(if way.engine {
             TransformerWorld::new(network, sampling)
         } else {
-            TransformerWorld::plain(network, sampling)
+            TransformerWorld::reference(network, sampling)
         })
     }
 
     fn steps(&self, way: &Way) -> usize {
         match way.mode {
-            Mode::FullAr => 1,
             Mode::PartialAr if self.quick || !way.engine => self.frames.min(2),
             Mode::PartialAr => self.frames,
+            // One pass per object takes seconds.
+            _ => 1,
         }
     }
 }

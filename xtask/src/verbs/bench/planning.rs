@@ -5,6 +5,7 @@ use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_engine::Precision;
 use gump_eval::planners::TimedDriver;
 use gump_nuplan::closed_loop::{DriveConfig, Recording, Replayed, derive_roadblocks, drive};
 use gump_nuplan::reactive_agents::NuplanIdm;
@@ -14,8 +15,8 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::decision;
+use crate::choices::{PRECISIONS, one_of};
 use crate::run::{Common, Run};
-use crate::sampling::PrecisionName;
 
 /// Milliseconds of a PDM-Closed step in its authors' Python.
 ///
@@ -42,8 +43,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value = "5")]
     decisions: NonZeroUsize,
     /// Number format of the learned drivers' weights
-    #[arg(long, value_enum, default_value_t = PrecisionName::F32)]
-    precision: PrecisionName,
+    #[arg(long, value_parser = one_of(PRECISIONS), default_value_t = Precision::F32)]
+    precision: Precision,
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
@@ -107,7 +108,7 @@ impl Args {
         )?;
         run.result(
             "decision",
-            decision::rows(run, self.decisions.get(), self.precision.resolve())?,
+            decision::rows(run, self.decisions.get(), self.precision)?,
         )
     }
 }

@@ -13,6 +13,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::choices::{FORMATS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
 
@@ -29,8 +30,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
     /// Output format
-    #[arg(long, value_enum, default_value_t = Format::Cache)]
-    format: Format,
+    #[arg(long, value_parser = one_of(FORMATS), default_value_t = OutputFormat::Cache)]
+    format: OutputFormat,
     /// Smooth the tracks of noisy recordings, such as NGSIM's, with velocities that fit; those of
     /// Waymo, nuPlan, SUMO and the cache stay as they are
     #[arg(long)]
@@ -43,35 +44,10 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// Output format.
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum Format {
-    /// The cache, which training reads from
-    Cache,
-    /// Waymo's scenarios as TFRecord
-    Waymo,
-    /// JSON, a file per scenario
-    ScenarioJson,
-    /// Tables of tracks
-    Parquet,
-}
-
-impl From<Format> for OutputFormat {
-    fn from(format: Format) -> Self {
-        match format {
-            Format::Cache => Self::Cache,
-            Format::Waymo => Self::Waymo,
-            Format::ScenarioJson => Self::ScenarioJson,
-            Format::Parquet => Self::Parquet,
-        }
-    }
-}
-
-/// Ledger of a folder of converted scenes; a conversion of the same sources to the same format
-/// resumes from it.
+/// The finished part of a conversion, stored in its folder; a conversion of the same sources to the
+/// same format resumes from it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Ledger {
+struct Conversion {
     /// SHA-256 of the format and of every source's path and size.
     source: String,
     /// Result for each group of sources, by its number.
@@ -116,16 +92,11 @@ impl Args {
                     return Ok(());
                 }
                 let stem = self.to.join(format!("scenes-{i:05}"));
-                let converted = convert(
-                    &files[range.clone()],
-                    options,
-                    self.format.into(),
-                    &stem,
-                    |_| {
+                let converted =
+                    convert(&files[range.clone()], options, self.format, &stem, |_| {
                         progress.advance(1);
                         run::stop_if_interrupted()
-                    },
-                )?;
+                    })?;
                 let mut ledger = lock(&ledger);
                 ledger.groups.insert(i, Group::of(&converted));
                 self.save(&ledger)
@@ -178,7 +149,7 @@ impl Args {
     /// empty one for a new folder.
     ///
     /// Error: [`WrongArguments`] for a folder that holds something else.
-    fn ledger(&self, files: &[PathBuf]) -> anyhow::Result<Ledger> {
+    fn ledger(&self, files: &[PathBuf]) -> anyhow::Result<Conversion> {
         let [from, to] = [&self.from, &self.to].map(std::path::absolute);
         let wrong = |why: String| anyhow::Error::from(WrongArguments(why));
         if to?.starts_with(from?) {
@@ -203,9 +174,9 @@ impl Args {
                 )));
             }
             let groups = BTreeMap::new();
-            return Ok(Ledger { source, groups });
+            return Ok(Conversion { source, groups });
         };
-        let mut ledger: Ledger = serde_json::from_str(&text)
+        let mut ledger: Conversion = serde_json::from_str(&text)
             .with_context(|| format!("expected a ledger: {}", self.to.join(LEDGER).display()))?;
         if ledger.source != source {
             return Err(wrong(format!(
@@ -244,7 +215,7 @@ impl Args {
         Ok(mark)
     }
 
-    fn save(&self, ledger: &Ledger) -> anyhow::Result<()> {
+    fn save(&self, ledger: &Conversion) -> anyhow::Result<()> {
         let path = self.to.join(LEDGER);
         gump_data::write_atomically(&path, |file| {
             serde_json::to_writer_pretty(file, ledger)
@@ -256,7 +227,7 @@ impl Args {
 /// Number of refused records printed on the terminal; the report has all.
 const MOST_PRINTED: usize = 10;
 
-fn lock(ledger: &Mutex<Ledger>) -> std::sync::MutexGuard<'_, Ledger> {
+fn lock(ledger: &Mutex<Conversion>) -> std::sync::MutexGuard<'_, Conversion> {
     ledger
         .lock()
         .unwrap_or_else(std::sync::PoisonError::into_inner)

@@ -224,7 +224,7 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
             "What should the ego do? {} candidates were driven in up to {PLANNED} futures of the \
              learned world, in which the others react, and scored as nuPlan scores a drive. The best \
              {} of them, the chosen one first:",
-            decision.prospects.len(),
+            decision.candidates.len(),
             table.len(),
         ))
         .table(&["candidate", "mean score"], &table)
@@ -233,14 +233,14 @@ pub(super) fn plan(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
             "All candidates, the chosen one in the ego's colour; a dot where each ends after four \
              seconds.",
         )?;
-    let choice = &decision.prospects[decision.chosen];
+    let choice = &decision.candidates[decision.chosen];
     let (kind, score) = if decision.brakes {
         (ProposalKind::EmergencyBrake, None)
     } else {
         (choice.kind, Some(choice.value))
     };
     Ok(json!({
-        "candidates": decision.prospects.len(),
+        "candidates": decision.candidates.len(),
         "chosen": kind.to_string(),
         "score": score,
     }))

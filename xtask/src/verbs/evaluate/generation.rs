@@ -193,7 +193,7 @@ impl Args {
         for (name, life) in [("those who are there", false), ("life", true)] {
             stop_if_interrupted()?;
             let sampling = SamplingConfig {
-                life,
+                spawn: life,
                 ..SamplingConfig::default()
             };
             let traffic = World::without_log(run.device(), &shipped::world(), &sampling)?;

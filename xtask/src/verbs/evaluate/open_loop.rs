@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::closed_loop::mean;
 use crate::cli::WrongArguments;
-use crate::planners::{ImaginationArgs, PlannerParser};
+use crate::planners::{ImaginationArgs, planner};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::{benchmark, charts};
@@ -25,7 +25,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     scenarios: ScenarioSetName,
     /// Planners to evaluate, comma-separated, one row each
-    #[arg(long, value_parser = PlannerParser, value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
+    #[arg(long, value_parser = planner(), value_name = "P", required = true, num_args = 1.., value_delimiter = ',')]
     planner: Vec<PlannerName>,
     /// Traffic model of planners' rollouts: idm or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]

@@ -49,15 +49,15 @@ impl Explained<'_> {
     /// Writes the choice and its best alternatives in words, as a picture and as a film.
     fn choice(&self, page: &mut Page) -> anyhow::Result<()> {
         let decision = self.decision;
-        let chosen = &decision.prospects[decision.chosen];
+        let chosen = &decision.candidates[decision.chosen];
         let rejected = reasons::best_rejected(decision);
         page.lede(format!(
             "{:.1} s after the start, {} candidates drove {:.1} s among others who react: the best {} \
              of them in {} futures, the others in fewer. {}",
             self.time,
-            decision.prospects.len(),
+            decision.candidates.len(),
             decision.horizon,
-            decision.prospects.iter().filter(|p| p.finalist).count(),
+            decision.candidates.iter().filter(|p| p.finalist).count(),
             chosen.futures.len(),
             match decision.brakes {
                 true => "Even the best of them hits something soon: the ego brakes.".to_owned(),
@@ -77,7 +77,7 @@ impl Explained<'_> {
                 continue;
             };
             compared.push(i);
-            let other = &decision.prospects[i];
+            let other = &decision.candidates[i];
             section.prose(&format!(
                 "\"{}\" scores {}; \"{}\", {what}, {}. {}",
                 chosen.kind,
@@ -95,7 +95,7 @@ impl Explained<'_> {
         if let Some(i) = rejected {
             let caption = "The first future of the chosen candidate and of the best rejected one. All \
                            can be played and clicked into in viewer.html.";
-            let film = film(self.scenario, [chosen, &decision.prospects[i]])?;
+            let film = film(self.scenario, [chosen, &decision.candidates[i]])?;
             section.film(&film, caption);
         }
         section.link("viewer.html", "Play every candidate in the viewer");
@@ -129,7 +129,7 @@ fn rounded(score: f64) -> String {
 fn near(decision: &Decision, scenario: &Scenario) -> Vec<Agent> {
     let scene = scenario.present();
     let ego = scene.ego_now().state.pose.position;
-    let Some(future) = decision.prospects[decision.chosen].futures.first() else {
+    let Some(future) = decision.candidates[decision.chosen].futures.first() else {
         return Vec::new();
     };
     let start = future.at(0);
@@ -145,11 +145,11 @@ fn near(decision: &Decision, scenario: &Scenario) -> Vec<Agent> {
 
 /// The chosen one, then the others, best first.
 pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..decision.prospects.len()).collect();
+    let mut order: Vec<usize> = (0..decision.candidates.len()).collect();
     order.sort_by(|&a, &b| {
-        let value = |i: usize| decision.prospects[i].value;
+        let value = |i: usize| decision.candidates[i].value;
         // Values of fewer futures do not compare.
-        let rank = |i: usize| (i == decision.chosen, decision.prospects[i].futures.len());
+        let rank = |i: usize| (i == decision.chosen, decision.candidates[i].futures.len());
         rank(b).cmp(&rank(a)).then(value(b).total_cmp(&value(a)))
     });
     order
@@ -158,7 +158,7 @@ pub(crate) fn ranked(decision: &Decision) -> Vec<usize> {
 /// Writes the value of every candidate by its parts; parts that are equal for all become one
 /// sentence.
 fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
-    let parts = |i: usize| decision.prospects[i].parts();
+    let parts = |i: usize| decision.candidates[i].parts();
     let names: Vec<&str> = parts(order[0]).iter().map(|(name, _)| *name).collect();
     let value = |i: usize, part: usize| parts(i).get(part).map_or(0.0, |(_, value)| *value);
     let (equal, telling): (Vec<usize>, Vec<usize>) = (0..names.len()).partition(|&part| {
@@ -175,14 +175,14 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
     let rows: Vec<Vec<String>> = order
         .iter()
         .map(|&i| {
-            let prospect = &decision.prospects[i];
+            let evaluation = &decision.candidates[i];
             let mut row = vec![
-                prospect.kind.to_string(),
-                format!("{:.3}", prospect.value),
-                prospect.futures.len().to_string(),
+                evaluation.kind.to_string(),
+                format!("{:.3}", evaluation.value),
+                evaluation.futures.len().to_string(),
             ];
             row.extend(telling.iter().map(|&part| format!("{:.2}", value(i, part))));
-            row.push(format!("{:.1}", prospect.progress_m));
+            row.push(format!("{:.1}", evaluation.progress_m));
             row
         })
         .collect();
@@ -200,7 +200,7 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
         true => String::new(),
         false => format!(" Equal for all: {}.", all_alike.join(", ")),
     };
-    let hedged = match decision.prospects[order[0]].hedge {
+    let hedged = match decision.candidates[order[0]].hedge {
         Some(_) => {
             " The hedge is the same score where the others keep their velocity; it is a part of the \
              total."
@@ -221,7 +221,7 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
 fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scenario) {
     let last = order[order.len() - 1];
     let other = reasons::best_rejected(decision).unwrap_or(last);
-    let shown = [decision.chosen, other].map(|i| &decision.prospects[i]);
+    let shown = [decision.chosen, other].map(|i| &decision.candidates[i]);
     let scene = scenario.present();
     let ego = scene.ego_now().state.pose.position;
     let rows: Vec<Vec<String>> = near(decision, scenario)
@@ -232,8 +232,8 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
                 format!("{:.1}", agent.state.pose.position.distance(ego)),
                 format!("{:.1}", agent.state.speed()),
             ];
-            for prospect in shown {
-                let deeds: Vec<Deed> = prospect
+            for evaluation in shown {
+                let deeds: Vec<Deed> = evaluation
                     .futures
                     .iter()
                     .filter_map(|future| deed(future, agent))
@@ -301,9 +301,9 @@ fn deed(future: &Rollout, agent: &Agent) -> Option<Deed> {
 fn film(scenario: &Scenario, shown: [&CandidateEvaluation; 2]) -> anyhow::Result<Film> {
     let takes: Vec<LabelledRollout<'_>> = shown
         .iter()
-        .map(|prospect| LabelledRollout {
-            rollout: &prospect.futures[0],
-            label: prospect.kind.to_string(),
+        .map(|evaluation| LabelledRollout {
+            rollout: &evaluation.futures[0],
+            label: evaluation.kind.to_string(),
         })
         .collect();
     let camera = Camera::on_ego(&scenario.present(), 70.0, 480, 400);
@@ -325,8 +325,8 @@ fn viewer<'a>(
     let mut viewer = Viewer::new(scenario);
     viewer.note("The first simulated future of every candidate, the chosen one first.");
     for &i in order {
-        let prospect = &decision.prospects[i];
-        viewer.future(prospect.kind.to_string(), &prospect.futures[0]);
+        let evaluation = &decision.candidates[i];
+        viewer.future(evaluation.kind.to_string(), &evaluation.futures[0]);
         viewer.candidate(path(vehicle, decision, i));
     }
     viewer
@@ -334,11 +334,11 @@ fn viewer<'a>(
 
 /// A candidate with its line in the first of its futures, as the viewer takes it.
 pub(crate) fn path(vehicle: &VehicleParameters, decision: &Decision, i: usize) -> CandidatePath {
-    let prospect = &decision.prospects[i];
-    let (parts, states) = (prospect.parts(), prospect.drives[0].iter());
+    let evaluation = &decision.candidates[i];
+    let (parts, states) = (evaluation.parts(), evaluation.drives[0].iter());
     CandidatePath {
-        name: prospect.kind.to_string(),
-        score: Some(prospect.value),
+        name: evaluation.kind.to_string(),
+        score: Some(evaluation.value),
         parts: parts
             .into_iter()
             .map(|(name, value)| (name.to_owned(), value))
@@ -355,11 +355,11 @@ pub(crate) fn summary(decision: &Decision) -> Value {
     let ms = |time: std::time::Duration| time.as_secs_f64() * 1e3;
     let phases = &decision.phases;
     json!({
-        "chosen": decision.prospects[decision.chosen].kind.to_string(),
+        "chosen": decision.candidates[decision.chosen].kind.to_string(),
         "brakes": decision.brakes,
         "horizon_s": decision.horizon,
-        "candidates": decision.prospects.len(),
-        "futures": decision.prospects[decision.chosen].futures.len(),
+        "candidates": decision.candidates.len(),
+        "futures": decision.candidates[decision.chosen].futures.len(),
         "milliseconds": {
             "open": ms(phases.open),
             "frames": ms(phases.frames),

@@ -18,15 +18,15 @@ const MOST_DIFFERENCES: usize = 3;
 /// The best candidate that was not chosen and is not the same drive under another name: one that
 /// ends more than 2 m from the chosen one, or that is worth something else.
 pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
-    let chosen = &decision.prospects[decision.chosen];
-    let differs = |prospect: &CandidateEvaluation| match (end(prospect), end(chosen)) {
+    let chosen = &decision.candidates[decision.chosen];
+    let differs = |evaluation: &CandidateEvaluation| match (end(evaluation), end(chosen)) {
         (Some(a), Some(b)) => a.distance(b) > SAME_PLACE,
-        _ => (prospect.value - chosen.value).abs() > SAME_PART,
+        _ => (evaluation.value - chosen.value).abs() > SAME_PART,
     };
-    let others = (0..decision.prospects.len()).filter(|&i| i != decision.chosen);
-    let different = others.filter(|&i| differs(&decision.prospects[i]));
+    let others = (0..decision.candidates.len()).filter(|&i| i != decision.chosen);
+    let different = others.filter(|&i| differs(&decision.candidates[i]));
     different.max_by(|&a, &b| {
-        let (a, b) = (&decision.prospects[a], &decision.prospects[b]);
+        let (a, b) = (&decision.candidates[a], &decision.candidates[b]);
         // Values of fewer futures do not compare.
         let futures = a.futures.len().cmp(&b.futures.len());
         futures.then(a.value.total_cmp(&b.value))
@@ -36,9 +36,9 @@ pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
 /// The candidate of the ordinary driver: the Intelligent Driver Model at the speed limit in the
 /// middle of the lane.
 pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
-    decision.prospects.iter().position(|prospect| {
+    decision.candidates.iter().position(|evaluation| {
         matches!(
-            prospect.kind,
+            evaluation.kind,
             ProposalKind::Idm { speed_fraction, lateral_offset }
                 if speed_fraction == 1.0 && lateral_offset == 0.0
         )
@@ -48,15 +48,15 @@ pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
 /// Weight of a decision: the margin of the chosen candidate over the ordinary driver, plus a tenth
 /// of its margin over the best rejected candidate.
 pub(crate) fn weight(decision: &Decision) -> f64 {
-    let chosen = decision.prospects[decision.chosen].value;
+    let chosen = decision.candidates[decision.chosen].value;
     let margin = |other: Option<usize>| {
-        other.map_or(0.0, |i| (chosen - decision.prospects[i].value).max(0.0))
+        other.map_or(0.0, |i| (chosen - decision.candidates[i].value).max(0.0))
     };
     margin(ordinary(decision)) + 0.1 * margin(best_rejected(decision))
 }
 
-fn end(prospect: &CandidateEvaluation) -> Option<gump_geometry::DVec2> {
-    let last = prospect.drives.first()?.last()?;
+fn end(evaluation: &CandidateEvaluation) -> Option<gump_geometry::DVec2> {
+    let last = evaluation.drives.first()?.last()?;
     Some(last.rear_axle.position)
 }
 
@@ -127,8 +127,8 @@ fn approaches(
     other: &CandidateEvaluation,
     near: &[&Agent],
 ) -> Vec<String> {
-    let closest = |prospect: &CandidateEvaluation, agent: &Agent| {
-        let deeds = prospect
+    let closest = |evaluation: &CandidateEvaluation, agent: &Agent| {
+        let deeds = evaluation
             .futures
             .iter()
             .filter_map(|f: &Rollout| deed(f, agent));

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use gump_eval::results::{self, Entry, MissingShards};
-use gump_rl::{Columns, Drive, estimate, estimate_difference, score_by_scenario};
+use gump_rl::{Columns, EpisodeResult, estimate, estimate_difference, score_by_scenario};
 use gump_scene::Seed;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -67,11 +67,11 @@ struct Group<'a> {
     train_world: Option<&'a str>,
     test_world: &'a str,
     /// Drives of each policy of the group, by scenario.
-    drives: Vec<Vec<Drive>>,
+    drives: Vec<Vec<EpisodeResult>>,
 }
 
 impl DriveRecord {
-    pub(super) fn new(world: usize, policy: usize, drive: &Drive) -> Self {
+    pub(super) fn new(world: usize, policy: usize, drive: &EpisodeResult) -> Self {
         Self {
             world,
             policy,
@@ -85,8 +85,8 @@ impl DriveRecord {
     }
 
     /// The drive in the scenario at this place of the report.
-    fn drive(&self, scenario: usize) -> Drive {
-        Drive {
+    fn drive(&self, scenario: usize) -> EpisodeResult {
+        EpisodeResult {
             scenario,
             repeat: self.repeat,
             collided: self.collided,
@@ -188,7 +188,7 @@ impl Group<'_> {
 
     /// Scores by policy and scenario.
     fn scores(&self) -> Vec<Vec<f64>> {
-        let of_policy = |drives: &Vec<Drive>| score_by_scenario(drives);
+        let of_policy = |drives: &Vec<EpisodeResult>| score_by_scenario(drives);
         self.drives.iter().map(of_policy).collect()
     }
 

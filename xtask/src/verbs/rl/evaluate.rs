@@ -9,7 +9,7 @@ use gump_eval::datasets::Split;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_rl::{Actor, Driver, EnvConfig, Episodes, PreparedScenario, evaluate};
+use gump_rl::{Actor, EnvConfig, Episodes, EvaluatedPolicy, PreparedScenario, evaluate};
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
@@ -282,12 +282,12 @@ impl Candidate {
         }
     }
 
-    fn driver(&self) -> Driver<'_> {
+    fn driver(&self) -> EvaluatedPolicy<'_> {
         match &self.kind {
-            Kind::Learned(actor) => Driver::Learned(actor),
-            Kind::Expert => Driver::Expert,
-            Kind::Random => Driver::Random,
-            Kind::Constant(action) => Driver::Constant(action),
+            Kind::Learned(actor) => EvaluatedPolicy::Learned(actor),
+            Kind::Expert => EvaluatedPolicy::Expert,
+            Kind::Random => EvaluatedPolicy::Random,
+            Kind::Constant(action) => EvaluatedPolicy::Constant(action),
         }
     }
 }

@@ -5,11 +5,12 @@ use std::path::PathBuf;
 use gump_eval::datasets::Split;
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
+use gump_rl::sac::Algorithm;
 use gump_scene::Seed;
 use serde::Serialize;
 
 use super::evaluate::{Candidate, Test, load};
-use super::train::{AlgorithmName, Job};
+use super::train::Job;
 use super::{RlWorld, Settings, prepared};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
@@ -77,9 +78,9 @@ impl Args {
         let mut files = Vec::new();
         let mut trained = Vec::new();
         for (algorithm, world_name, world, name) in [
-            (AlgorithmName::Imitation, &log_name, &log, "imitation"),
-            (AlgorithmName::Sac, &log_name, &log, "sac-log"),
-            (AlgorithmName::Sac, &self.world, &world, "sac-world"),
+            (Algorithm::Imitation, &log_name, &log, "imitation"),
+            (Algorithm::Sac, &log_name, &log, "sac-log"),
+            (Algorithm::Sac, &self.world, &world, "sac-world"),
         ] {
             for k in 0..self.policies {
                 let folder = run.path(&format!("{name}-{k}"));

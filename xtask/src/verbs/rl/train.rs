@@ -15,6 +15,7 @@ use serde::Serialize;
 
 use super::curves::Curves;
 use super::{Notes, RlWorld, Settings, prepared, read, write};
+use crate::choices::{ALGORITHMS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
@@ -28,8 +29,8 @@ const POINTS_PER_SEGMENT: usize = 10;
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     /// Learning algorithm
-    #[arg(long, value_enum, default_value_t = AlgorithmName::Sac)]
-    algorithm: AlgorithmName,
+    #[arg(long, value_parser = one_of(ALGORITHMS), default_value_t = Algorithm::Sac)]
+    algorithm: Algorithm,
     /// log, idm, constant-velocity or model:WEIGHTS; imitation only with log
     #[arg(long, value_name = "W", default_value = "log")]
     train_world: WorldName,
@@ -53,35 +54,9 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
-/// Learning algorithm.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub(super) enum AlgorithmName {
-    /// Soft actor-critic: rewards, and a share of expert transitions
-    Sac,
-    /// Imitation of the log's actions
-    Imitation,
-}
-
-impl AlgorithmName {
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Self::Sac => "sac",
-            Self::Imitation => "imitation",
-        }
-    }
-
-    fn resolve(self) -> Algorithm {
-        match self {
-            Self::Sac => Algorithm::Sac,
-            Self::Imitation => Algorithm::Imitation,
-        }
-    }
-}
-
 /// One policy to be trained.
 pub(super) struct Job<'a> {
-    pub(super) algorithm: AlgorithmName,
+    pub(super) algorithm: Algorithm,
     pub(super) world_name: &'a WorldName,
     pub(super) world: &'a RlWorld,
     pub(super) prepared: &'a Arc<[PreparedScenario]>,
@@ -97,7 +72,7 @@ pub(super) struct Job<'a> {
 /// Result of a [`Job`].
 #[derive(Debug, Serialize)]
 pub(super) struct Trained {
-    algorithm: &'static str,
+    algorithm: Algorithm,
     train_world: String,
     seed: u64,
     steps: usize,
@@ -120,7 +95,7 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let mut settings = Settings::read(self.common.config.as_deref())?;
         settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
-        if self.algorithm == AlgorithmName::Imitation && self.train_world != WorldName::Log {
+        if self.algorithm == Algorithm::Imitation && self.train_world != WorldName::Log {
             let wrong = "--train-world: imitation learns from the log, expected log";
             return Err(WrongArguments(wrong.into()).into());
         }
@@ -167,7 +142,7 @@ impl Job<'_> {
     pub(super) fn execute(&self, run: &Run) -> anyhow::Result<Trained> {
         let checkpoint = self.folder.join("checkpoint.safetensors");
         let notes = Notes {
-            algorithm: self.algorithm.name().into(),
+            algorithm: self.algorithm.to_string(),
             train_world: self.world_name.to_string(),
             env: self.settings.env,
         };
@@ -176,7 +151,7 @@ impl Job<'_> {
         } else {
             let experts = demonstrations(self.prepared, &self.settings.env)?;
             let config = self.settings.sac.clone();
-            Training::new(self.algorithm.resolve(), config, experts, self.seed)?
+            Training::new(self.algorithm, config, experts, self.seed)?
         };
         let window = (training.config().segment / POINTS_PER_SEGMENT).max(1);
         let mut curves = if self.resume {
@@ -191,7 +166,7 @@ impl Job<'_> {
         let gain = curves.gain();
         let n_env_steps = training.env_steps();
         Ok(Trained {
-            algorithm: self.algorithm.name(),
+            algorithm: self.algorithm,
             train_world: notes.train_world,
             seed: training.seed().0,
             steps: training.steps(),
@@ -249,7 +224,7 @@ impl Job<'_> {
         notes: &Notes,
     ) -> anyhow::Result<()> {
         let total = training.config().steps;
-        let label = format!("{} in {}", self.algorithm.name(), self.world_name);
+        let label = format!("{} in {}", self.algorithm, self.world_name);
         let progress = run.progress(&label, total as u64, "steps");
         progress.advance(training.steps() as u64);
         let traffic = self.world.traffic();
@@ -265,8 +240,8 @@ impl Job<'_> {
                 }
             };
             match self.algorithm {
-                AlgorithmName::Sac => training.segment(&mut env, observe)?,
-                AlgorithmName::Imitation => training.imitation_segment(observe)?,
+                Algorithm::Imitation => training.imitation_segment(observe)?,
+                _ => training.segment(&mut env, observe)?,
             }
             anyhow::ensure!(
                 !run::interrupted(),

@@ -13,7 +13,7 @@ use gump_eval::datasets::{self, Part, Split};
 use gump_eval::fresh::SceneStream;
 use gump_eval::training_set::{self, TrainingSet};
 use gump_kernels::Choice;
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
@@ -164,7 +164,7 @@ impl Args {
         }
         let weights = run.path(WEIGHTS);
         if let Some(network) = network.filter(|_| stages.len() > 1 && processes.rank() == 0) {
-            checkpoint::save(&network, &weights, Precision::Half)?;
+            checkpoint::save(&network, &weights, StorageType::Half)?;
         }
         run.result("resumed", self.resume)?;
         run.result("weights", weights)
@@ -195,7 +195,7 @@ impl Args {
                 trainer
             }
         };
-        let mut trainer = trainer.among(processes.clone())?;
+        let mut trainer = trainer.with_group(processes.clone())?;
         run.setting("model", trainer.network().config())?;
         run.setting("train", trainer.config())?;
         run.reseed(trainer.config().seed);
@@ -363,7 +363,11 @@ impl Learns for Trainer {
 
     fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()> {
         Trainer::save(self, checkpoint)?;
-        Ok(checkpoint::save(self.network(), weights, Precision::Half)?)
+        Ok(checkpoint::save(
+            self.network(),
+            weights,
+            StorageType::Half,
+        )?)
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
-use gump_model::checkpoint::Precision;
+use gump_model::checkpoint::StorageType;
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
 use gump_model::{Device, relative};
 use gump_rollout::WorldModel;
@@ -83,7 +83,7 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
     }
     let weights = run.path(WEIGHTS);
     if let Some(network) = network.filter(|_| stages.len() > 1) {
-        relative::save(&network, &weights, Precision::Half)?;
+        relative::save(&network, &weights, StorageType::Half)?;
     }
     run.result("resumed", args.resume)?;
     run.result("weights", weights)
@@ -274,6 +274,6 @@ impl Learns for RelativeTrainer {
 
     fn save(&self, checkpoint: &Path, weights: &Path) -> anyhow::Result<()> {
         RelativeTrainer::save(self, checkpoint)?;
-        Ok(relative::save(self.network(), weights, Precision::Half)?)
+        Ok(relative::save(self.network(), weights, StorageType::Half)?)
     }
 }

@@ -15,7 +15,8 @@ use toml::{Table, Value};
 
 use super::Args;
 use crate::cli::WrongArguments;
-use crate::config;
+use crate::run::print_error;
+use crate::{config, words};
 
 /// A part of a run with a separate schedule.
 #[derive(Debug)]
@@ -62,6 +63,8 @@ impl Args {
             Some(path) => config::tables(path)?,
             None => Table::new(),
         };
+        let notes = words::rename_former_keys(&mut table);
+        notes.iter().for_each(|note| print_error(note));
         let stages = match table.remove("stage") {
             Some(Value::Array(stages)) => stages,
             _ => Vec::new(),
@@ -163,7 +166,11 @@ fn merge(table: &mut Table, changes: Table) {
 
 fn known_keys() -> anyhow::Result<Table> {
     let mut known = Table::new();
-    known.insert("model".into(), Table::try_from(ModelConfig::tiny())?.into());
+    let mut model = Table::try_from(ModelConfig::tiny())?;
+    // Weights store these two under their former names; files may have either.
+    model.insert("local_context".into(), true.into());
+    model.insert("local_frame".into(), true.into());
+    known.insert("model".into(), model.into());
     let train = TrainConfig {
         ema: Some(0.0),
         closed_loop: Some(ClosedLoopConfig::default()),

@@ -4,10 +4,9 @@
 //! edge, and out to the road edge where only a shoulder lies between. Driveways are added
 //! unchanged.
 
-use gump_geometry::{BoxIndex, DVec2, Polygon};
+use gump_geometry::{BoxIndex, DVec2, Polygon, simplify};
 use gump_scene::{AreaKind, Lane, MapParts};
 
-use super::simplify::simplify;
 use crate::ReadReport;
 
 /// Maximum deviation of a lane's outline from its offset centre line, metres.

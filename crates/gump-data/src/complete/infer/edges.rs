@@ -4,10 +4,9 @@
 //! and no lane leads across it: surfaces overlap and join, and at the border of the map roads are
 //! cut off rather than bounded.
 
-use gump_geometry::{DVec2, Polygon, Polyline, SegmentIndex};
+use gump_geometry::{DVec2, Polygon, Polyline, SegmentIndex, simplify};
 use gump_scene::{MapParts, RoadEdge, RoadEdgeKind};
 
-use super::simplify::simplify;
 use crate::ReadReport;
 
 /// Distance outside a surface at which other surfaces are looked up, metres: gaps are narrower,

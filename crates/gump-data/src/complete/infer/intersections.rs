@@ -6,10 +6,9 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::DVec2;
+use gump_geometry::{DVec2, simplify};
 use gump_scene::{Lane, LaneId};
 
-use super::simplify::simplify;
 use crate::ReadReport;
 
 /// Tolerance of simplified centre lines, metres; a tenth of the narrowest lane.

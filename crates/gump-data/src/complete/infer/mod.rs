@@ -10,7 +10,6 @@ mod lane_graph;
 mod light_gaps;
 mod light_lanes;
 mod route;
-pub(crate) mod simplify;
 mod stop_sign_lanes;
 mod targets;
 mod widths;

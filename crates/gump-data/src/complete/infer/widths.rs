@@ -7,10 +7,9 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::{BoxIndex, DVec2, Pose};
+use gump_geometry::{BoxIndex, DVec2, Pose, simplify};
 use gump_scene::{Lane, LaneId, LaneKind, MapParts};
 
-use super::simplify::simplify;
 use crate::ReadReport;
 
 /// Maximum distance of a bound from the centre, metres; beyond it the lane has none on that side.

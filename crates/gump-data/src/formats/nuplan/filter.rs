@@ -159,6 +159,7 @@ fn in_order(mut selected: Vec<Selected>) -> Vec<Selected> {
 
 /// A published selection of events for evaluation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Split {
     /// 1,118 events of the validation logs.
     Val14,
@@ -212,19 +213,21 @@ impl Split {
     }
 }
 
+/// The error of reading a [`Split`]: none has this name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("expected one of {known}, found \"{0}\"", known = Split::ALL.map(Split::name).join(", "))]
+pub struct ParseSplitError(String);
+
 impl FromStr for Split {
-    type Err = String;
+    type Err = ParseSplitError;
 
     /// Finds a split by name.
     ///
     /// # Errors
-    /// A sentence with the unknown name and the known ones.
-    fn from_str(name: &str) -> Result<Self, String> {
+    /// An unknown name; the message has the known ones.
+    fn from_str(name: &str) -> Result<Self, ParseSplitError> {
         let found = Self::ALL.into_iter().find(|split| split.name() == name);
-        found.ok_or_else(|| {
-            let known = Self::ALL.map(Self::name).join(", ");
-            format!("expected one of {known}, found \"{name}\"")
-        })
+        found.ok_or_else(|| ParseSplitError(name.to_owned()))
     }
 }
 
@@ -297,6 +300,7 @@ mod tests {
             "val15"
                 .parse::<Split>()
                 .unwrap_err()
+                .to_string()
                 .contains("reduced-val14")
         );
     }

@@ -47,12 +47,12 @@ use std::sync::Arc;
 use crate::source::{BoxedSource, Companion, Format, Source};
 use crate::{DataError, Place, ReadOptions, ReadReport, ScenarioRecord};
 
-pub use filter::{CHALLENGE_TYPES, ScenarioFilter, Selected, Split};
+pub use filter::{CHALLENGE_TYPES, ParseSplitError, ScenarioFilter, Selected, Split};
 pub use log::{Census, Event, Log, LogBox, LogRow};
 pub use map::{CityMap, read_map};
 pub use maps::{MAPS_VARIABLE, Maps, find_map};
 pub use scenario::{DT, EGO, Extraction, LogFrame, NuplanScenario};
-pub use token::Token;
+pub use token::{ParseTokenError, Token};
 pub use utm::Utm;
 
 pub(crate) const FORMAT: Format = Format {

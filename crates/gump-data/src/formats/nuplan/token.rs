@@ -44,14 +44,19 @@ impl fmt::Debug for Token {
     }
 }
 
+/// The error of reading a [`Token`]: the text is not hexadecimal digits of one to eight bytes.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("expected a token of 16 hexadecimal digits, found \"{0}\"")]
+pub struct ParseTokenError(String);
+
 impl FromStr for Token {
-    type Err = String;
+    type Err = ParseTokenError;
 
     /// Reads hexadecimal digits, two a byte.
     ///
     /// # Errors
-    /// A sentence with what was found.
-    fn from_str(text: &str) -> Result<Self, String> {
+    /// Other characters, an odd number of digits, none, or more than 16.
+    fn from_str(text: &str) -> Result<Self, ParseTokenError> {
         let digits: Option<Vec<u8>> = text
             .chars()
             .map(|c| c.to_digit(16).map(|digit| digit as u8))
@@ -65,7 +70,7 @@ impl FromStr for Token {
                     .collect::<Vec<_>>()
             })
             .and_then(|bytes| Self::from_bytes(&bytes))
-            .ok_or_else(|| format!("expected a token of 16 hexadecimal digits, found \"{text}\""))
+            .ok_or_else(|| ParseTokenError(text.to_owned()))
     }
 }
 
@@ -88,7 +93,7 @@ mod tests {
     #[test]
     fn what_is_no_token_is_named() {
         for text in ["", "af6", "not hexadecimal!", "af6639f0bc724eadaf", "é"] {
-            let error = text.parse::<Token>().unwrap_err();
+            let error = text.parse::<Token>().unwrap_err().to_string();
             assert!(error.contains(&format!("\"{text}\"")), "{error}");
         }
     }

@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use gump_geometry::{DVec2, DVec3, Polygon, Polyline, distance_to_segment, dvec2};
+use gump_geometry::{DVec2, DVec3, Polygon, Polyline, distance_to_segment, dvec2, simplify};
 use gump_scene::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
     RoadLineKind, StopSign,
@@ -14,7 +14,6 @@ use gump_scene::{
 use super::network::{Connection, Edge, EdgeFunction, Junction, Network, NetworkLane};
 use super::surfaces::{Beyond, Surfaces};
 use crate::ReadReport;
-use crate::complete::infer::simplify::simplify;
 
 /// Metres between points of lines at most: what looks at points only must find some.
 const SPACING: f64 = 3.0;

@@ -99,7 +99,7 @@ impl LiveFuture {
 
     /// Predictive samples of the next half second of all agents except `driven`, independent of the
     /// decision: this number of draws for each. The future does not change.
-    pub fn outlooks(
+    pub fn predictive_samples(
         &self,
         world: &RelativeWorld,
         draws: Range<u64>,
@@ -107,7 +107,7 @@ impl LiveFuture {
     ) -> Vec<PredictiveSamples> {
         let step = self.future.frames;
         self.future
-            .outlooks(&world.engine, &world.sampling, (draws, 0, step), driven)
+            .predictive_samples(&world.engine, &world.sampling, (draws, 0, step), driven)
     }
 
     /// The same present with another seed for what follows.
@@ -178,7 +178,10 @@ mod tests {
                     .unwrap();
                 assert_eq!(ahead.agents(), expected[0].agents());
                 let moving = ahead.agents().iter().filter(|agent| agent.kind.is_moving());
-                assert_eq!(live.outlooks(&world, 0..2, None).len(), moving.count());
+                assert_eq!(
+                    live.predictive_samples(&world, 0..2, None).len(),
+                    moving.count()
+                );
                 assert_eq!(live.go_on(&world, assumed), expected[0]);
             }
         }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use gump_geometry::{DVec2, angle_difference, distance_to_segment};
+use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{AgentState, Lane, LaneId, LaneKind, MapGraph};
 
 /// Largest sideways error of a simplified line, metres.
@@ -93,29 +93,11 @@ fn is_for_vehicles(lane: &Lane) -> bool {
     lane.kind != LaneKind::BikeLane
 }
 
-/// The same line within [`TOLERANCE`] (Douglas and Peucker 1973), with segments of at most
-/// [`SPACING`] and no repeated points.
+/// The same line within [`TOLERANCE`], with segments of at most [`SPACING`] and no repeated points.
 pub(super) fn simplify(points: &[DVec2]) -> Vec<DVec2> {
-    let Some(last) = points.len().checked_sub(1) else {
-        return Vec::new();
-    };
-    let mut keep = vec![false; points.len()];
-    (keep[0], keep[last]) = (true, true);
-    let mut stack = vec![(0, last)];
-    while let Some((from, to)) = stack.pop() {
-        let farthest = (from + 1..to)
-            .map(|i| (distance_to_segment(points[i], points[from], points[to]), i))
-            .max_by(|a, b| a.0.total_cmp(&b.0));
-        if let Some((distance, middle)) = farthest
-            && distance > TOLERANCE
-        {
-            keep[middle] = true;
-            stack.extend([(from, middle), (middle, to)]);
-        }
-    }
-    let kept = points.iter().zip(keep).filter(|(_, keep)| *keep);
     let mut line: Vec<DVec2> = Vec::new();
-    for (&point, _) in kept {
+    for i in gump_geometry::simplify(points, TOLERANCE) {
+        let point = points[i];
         if let Some(&last) = line.last() {
             let n = (last.distance(point) / SPACING).ceil() as usize;
             line.extend((1..n).map(|i| last.lerp(point, i as f64 / n as f64)));

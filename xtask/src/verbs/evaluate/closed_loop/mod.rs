@@ -23,6 +23,7 @@ use gump_rollout::BoxError;
 use serde::Serialize;
 
 use self::planners::{Remote, evaluated};
+use crate::choices::{CONTROLLERS, one_of};
 use crate::cli::WrongArguments;
 use crate::planners::{Chosen, ChosenParser, ImaginationArgs};
 use crate::run::{Common, Run};
@@ -78,20 +79,11 @@ pub(crate) struct Driving {
     #[arg(long, value_name = "S", default_value_t = 15.0)]
     pub(crate) seconds: f64,
     /// Controller that tracks the plans
-    #[arg(long, value_enum, default_value_t = TrackingName::TwoStage)]
-    controller: TrackingName,
+    #[arg(long, value_parser = one_of(CONTROLLERS), default_value_t = Tracking::TwoStage)]
+    controller: Tracking,
     /// Time limit per planning step; a planner that exceeds it fails [default: no limit]
     #[arg(long, value_name = "MS")]
     budget_ms: Option<f64>,
-}
-
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum TrackingName {
-    /// LQR tracker with a kinematic bicycle model
-    TwoStage,
-    /// Perfect tracking of the plan
-    Perfect,
 }
 
 impl Driving {
@@ -116,10 +108,7 @@ impl Driving {
     /// Converts the arguments to a [`DriveConfig`].
     pub(crate) fn config(&self) -> DriveConfig {
         DriveConfig {
-            tracking: match self.controller {
-                TrackingName::TwoStage => Tracking::TwoStage,
-                TrackingName::Perfect => Tracking::Perfect,
-            },
+            tracking: self.controller,
             seconds: self.seconds,
             keep_plans: false,
         }
@@ -206,7 +195,7 @@ impl Args {
             planners: self.planner.iter().map(ToString::to_string).collect(),
             imagination: self.imagination().to_string(),
             driving: serde_json::to_string(&self.driving)?,
-            thinking: serde_json::to_string(&self.thinking)?,
+            imagining: serde_json::to_string(&self.thinking)?,
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
         })

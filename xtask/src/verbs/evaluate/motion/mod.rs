@@ -14,10 +14,11 @@ use gump_eval::results::{Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_wosac::motion::{MotionConfig, ShapeRules};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::exclusions;
 use crate::benchmark;
+use crate::choices::{SHAPES, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -63,8 +64,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value = "32")]
     futures: NonZeroUsize,
     /// Definition of the path shapes that mAP is averaged over
-    #[arg(long, value_enum, default_value_t = Shapes::Current)]
-    shapes: Shapes,
+    #[arg(long, value_parser = one_of(SHAPES), default_value_t = ShapeRules::Current)]
+    shapes: ShapeRules,
     /// Only every N-th scenario from the K-th; see `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
     shard: Shard,
@@ -88,33 +89,17 @@ struct Source {
     world: Option<WorldName>,
 }
 
-/// Definition of path shapes.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-enum Shapes {
-    /// Since March 2024.
-    Current,
-    /// Leaderboards of 2021 to 2023.
-    #[value(name = "until-2023")]
-    #[serde(rename = "until-2023")]
-    Until2023,
-}
-
-impl Shapes {
-    fn config(self) -> MotionConfig {
-        MotionConfig {
-            shapes: match self {
-                Self::Current => ShapeRules::Current,
-                Self::Until2023 => ShapeRules::Until2023,
-            },
-            ..MotionConfig::challenge()
-        }
+/// The challenge's settings with a definition of path shapes.
+fn config(shapes: ShapeRules) -> MotionConfig {
+    MotionConfig {
+        shapes,
+        ..MotionConfig::challenge()
     }
 }
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let config = self.shapes.config();
+        let config = config(self.shapes);
         let mut source = run.phase("load", |run| self.predictions(run))?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
         let header = self.header(run, &scenarios, source.decoding())?;

@@ -10,11 +10,11 @@ use gump_eval::results::{self, Entry, MissingShards};
 use gump_metrics::{Interval, intervals};
 use gump_scene::AgentKind;
 use gump_viz::Bars;
-use gump_wosac::motion::{MotionConfig, MotionRow, MotionTally};
+use gump_wosac::motion::{MotionConfig, MotionRow, MotionTally, ShapeRules};
 use serde::Deserialize as _;
 use serde_json::{Map, Value, json};
 
-use super::{NAME, Shapes};
+use super::{NAME, config};
 use crate::charts;
 use crate::run::Run;
 
@@ -86,7 +86,7 @@ pub(crate) fn report_merged(
     let setting = |key: &str| header.settings.get(key).and_then(toml::Value::as_str);
     let set = setting("scenarios").unwrap_or_default();
     let decoding = setting("decoding").unwrap_or(Decoding::NONE);
-    let config = Shapes::deserialize(shapes)?.config();
+    let config = config(ShapeRules::deserialize(shapes)?);
     report(run, set, &entries, &config, decoding)
 }
 

@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use super::exclusions;
 use crate::benchmark;
+use crate::choices::{YEARS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -48,8 +49,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH", conflicts_with = "world")]
     rollouts: Option<PathBuf>,
     /// Year of the challenge
-    #[arg(long, value_enum, default_value_t = YearName::Y2025)]
-    year: YearName,
+    #[arg(long, value_parser = one_of(YEARS), default_value_t = Year::Y2025)]
+    year: Year,
     /// Rollouts of each scenario
     #[arg(long, value_name = "N", default_value = "32")]
     rollouts_per_scenario: NonZeroUsize,
@@ -68,42 +69,6 @@ pub(crate) struct Args {
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) common: Common,
-}
-
-/// [`Year`] as an argument.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize, clap::ValueEnum)]
-pub(crate) enum YearName {
-    /// As first published: leaderboard V0
-    #[serde(rename = "2023-v0")]
-    #[value(name = "2023-v0")]
-    Y2023V0,
-    /// Leaderboard V1
-    #[serde(rename = "2023")]
-    #[value(name = "2023")]
-    Y2023,
-    #[serde(rename = "2024")]
-    #[value(name = "2024")]
-    Y2024,
-    /// Simulated agents
-    #[serde(rename = "2025")]
-    #[value(name = "2025")]
-    Y2025,
-    /// Scenario generation
-    #[serde(rename = "2025-generation")]
-    #[value(name = "2025-generation")]
-    Y2025Generation,
-}
-
-impl YearName {
-    fn year(self) -> Year {
-        match self {
-            Self::Y2023V0 => Year::Y2023V0,
-            Self::Y2023 => Year::Y2023,
-            Self::Y2024 => Year::Y2024,
-            Self::Y2025 => Year::Y2025,
-            Self::Y2025Generation => Year::Y2025Generation,
-        }
-    }
 }
 
 /// Everything but the scenario that the scores of a scenario depend on.
@@ -153,7 +118,7 @@ impl Args {
             shard,
             settings: toml::Table::try_from(&settings)?,
         };
-        let config = Config::of(self.year.year());
+        let config = Config::of(self.year);
         let mut sources = self.sources(run)?;
         let mut store = ResultStore::open(run.out(), &header)?;
         let mut explained = Vec::new();
@@ -255,7 +220,7 @@ impl Args {
         let world = self.world.as_ref().map(ToString::to_string);
         Ok(Settings {
             world: world.unwrap_or_else(|| "rollouts".into()),
-            year: self.year.year().name().into(),
+            year: self.year.name().into(),
             rollouts_per_scenario: self.rollouts_per_scenario.get(),
             scenarios: scenarios.name.clone(),
             rollouts: self.rollouts.as_ref().map(name).unwrap_or_default(),

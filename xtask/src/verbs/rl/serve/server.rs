@@ -1,45 +1,17 @@
-//! `rl serve`: environments for Python and others, over a Unix socket.
+//! The loop of `rl serve`: counts what is served until Ctrl-C.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use gump_engine::SamplingConfig;
 use gump_eval::datasets::Split;
-use gump_eval::worlds::WorldName;
 use gump_rl::server::{Event, Server};
 use gump_rl::{EnvConfig, PreparedScenario, Sampling, Traffic};
-use serde::Serialize;
 
-use super::{RlWorld, prepared};
-use crate::run::{Common, Run, interrupted};
-
-/// Arguments of `rl serve`.
-#[derive(Debug, Serialize, clap::Args)]
-pub(crate) struct Args {
-    /// Socket to listen on
-    #[arg(long, value_name = "PATH")]
-    socket: PathBuf,
-    /// A file or folder of scenarios to drive through; of a data set those of its train split
-    #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
-    /// Traffic model: log, idm, constant-velocity or model:WEIGHTS
-    #[arg(long, value_name = "W", default_value = "log")]
-    world: WorldName,
-    /// Maximum number of scenarios
-    #[arg(long, value_name = "N")]
-    limit: Option<usize>,
-    /// Seconds until an episode is truncated
-    #[arg(long, value_name = "S", default_value_t = 8.0)]
-    horizon: f64,
-    /// Sample recently failed scenarios more often
-    #[arg(long)]
-    prioritized: bool,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub(crate) common: Common,
-}
+use super::Args;
+use crate::run::{Run, interrupted};
+use crate::verbs::rl::{RlWorld, prepared};
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
@@ -103,6 +75,8 @@ fn serve(
                 "client {client} left after {n} episodes, {lost} under way: {why}"
             ));
         }
+        // Neither counted nor reported.
+        _ => {}
     };
     let is_over = AtomicBool::new(false);
     std::thread::scope(|scope| {

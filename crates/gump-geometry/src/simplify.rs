@@ -1,13 +1,17 @@
-//! Lines with fewer points.
+//! Simplification of lines.
 
-use gump_geometry::{DVec2, distance_to_segment};
+use glam::DVec2;
+
+use crate::distance_to_segment;
 
 /// The indices of the points that keep a line within `tolerance` metres of its shape, ends
-/// included, in order.
+/// included, in order. Of equally distant points the last is kept first.
 ///
 /// Source: Douglas and Peucker 1973.
-pub(crate) fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
-    let last = points.len().saturating_sub(1);
+pub fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
+    let Some(last) = points.len().checked_sub(1) else {
+        return Vec::new();
+    };
     let mut kept = vec![0];
     let mut spans = vec![(0, last)];
     while let Some((from, to)) = spans.pop() {
@@ -30,7 +34,8 @@ pub(crate) fn simplify(points: &[DVec2], tolerance: f64) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use gump_geometry::dvec2;
+    use crate::Polyline;
+    use glam::dvec2;
 
     #[test]
     fn simplifying_keeps_ends_and_corners() {
@@ -44,5 +49,17 @@ mod tests {
         assert_eq!(simplify(&corner, 0.1), [0, 2, 4]);
         assert_eq!(simplify(&corner[..1], 0.1), [0]);
         assert_eq!(simplify(&corner, 0.001), [0, 1, 2, 4]);
+        assert!(simplify(&[], 0.1).is_empty());
+    }
+
+    #[test]
+    fn every_point_stays_within_the_tolerance() {
+        let arc: Vec<DVec2> = (0..=200)
+            .map(|i| DVec2::from_angle(f64::from(i) * 0.0075) * 20.0)
+            .collect();
+        let kept = simplify(&arc, 0.05);
+        assert!(kept.len() < 20, "{} points", kept.len());
+        let line = Polyline::new(kept.iter().map(|&i| arc[i]).collect()).unwrap();
+        assert!(arc.iter().all(|&p| line.project(p).distance <= 0.05));
     }
 }

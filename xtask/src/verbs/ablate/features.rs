@@ -1,6 +1,7 @@
-//! `ablate switches`: what each option of the network and of its training is worth, by leaving it
+//! `ablate features`: what each option of the network and of its training is worth, by leaving it
 //! out or putting it in.
 
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use gump_model::ModelConfig;
 use gump_train::TrainConfig;
 use gump_viz::Bars;
@@ -11,7 +12,7 @@ use super::train_variant::{TrainVariant, of_width};
 use crate::charts;
 use crate::run::{Common, Run};
 
-/// Arguments of `ablate switches`.
+/// Arguments of `ablate features`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -20,7 +21,7 @@ pub(crate) struct Args {
     /// Width of the networks, a multiple of 32 [tiny: 128]
     #[arg(long, value_name = "C", default_value_t = 64, value_parser = width)]
     width: usize,
-    /// Only these switches, beside the recorded configuration
+    /// Only these features, beside the recorded configuration
     #[arg(long, value_name = "NAME", value_delimiter = ',', value_parser = known())]
     only: Vec<String>,
     #[command(flatten)]
@@ -38,10 +39,10 @@ fn width(text: &str) -> Result<usize, String> {
 type Turn = fn(&mut ModelConfig, &mut TrainConfig);
 
 /// The recorded configuration, and what is changed of it.
-const SWITCHES: [(&str, Turn); 9] = [
+const FEATURES: [(&str, Turn); 9] = [
     ("recorded", |_, _| {}),
-    ("no-surroundings", |model, _| model.surroundings = false),
-    ("no-anchors", |model, _| model.anchored = false),
+    ("no-local-context", |model, _| model.local_context = false),
+    ("no-local-frame", |model, _| model.local_frame = false),
     ("no-local-map", |model, _| model.local_map = false),
     ("no-sharing-pairs", |model, _| {
         model.local_map = false;
@@ -55,18 +56,32 @@ const SWITCHES: [(&str, Turn); 9] = [
     ("no-turns", |_, train| train.sample.augment = 0.0),
 ];
 
-fn known() -> clap::builder::PossibleValuesParser {
-    SWITCHES[1..].iter().map(|(name, _)| *name).into()
+/// Features under their former names, which `--only` still takes, and under their present ones.
+const FORMER: [(&str, &str); 3] = [
+    ("no-surroundings", "no-local-context"),
+    ("no-anchors", "no-local-frame"),
+    ("no-sway", "no-perturbation"),
+];
+
+fn known() -> impl TypedValueParser<Value = String> {
+    let value = |&(name, _): &(&'static str, Turn)| {
+        let former = FORMER.iter().filter(move |(_, present)| *present == name);
+        PossibleValue::new(name).aliases(former.map(|(former, _)| *former))
+    };
+    PossibleValuesParser::new(FEATURES[1..].iter().map(value)).map(|name| {
+        let former = FORMER.iter().find(|(former, _)| *former == name);
+        former.map_or(name, |(_, present)| (*present).to_owned())
+    })
 }
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let class = self.train_variant.begin(run)?;
         let is_requested = |name: &str| {
-            name == SWITCHES[0].0 || self.only.is_empty() || self.only.iter().any(|o| o == name)
+            name == FEATURES[0].0 || self.only.is_empty() || self.only.iter().any(|o| o == name)
         };
         let mut rows = Vec::new();
-        for (name, turn) in SWITCHES.into_iter().filter(|(name, _)| is_requested(name)) {
+        for (name, turn) in FEATURES.into_iter().filter(|(name, _)| is_requested(name)) {
             let (mut model, mut train) = of_width(self.width)?;
             turn(&mut model, &mut train);
             let learned = class.teach(run, name, (model, train), &[self.train_variant.steps()])?;
@@ -96,9 +111,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_switch_changes_something_and_makes_a_network() {
+    fn every_feature_changes_something_and_makes_a_network() {
         let recorded = of_width(64).unwrap();
-        for (name, turn) in &SWITCHES[1..] {
+        for (name, turn) in &FEATURES[1..] {
             let mut changed = recorded.clone();
             turn(&mut changed.0, &mut changed.1);
             assert!(changed != recorded, "{name}");

@@ -1,8 +1,8 @@
 //! Keys and values of tokens in pages that futures share until they diverge; and attention over
 //! them.
 //!
-//! [`Pages`] belong to one attention layer, [`Context`] to all layers of one sequence, with the
-//! slots they were computed from; [`attend`] computes attention. Start with [`Context::reuse`],
+//! [`Pages`] belong to one attention layer, [`KvCache`] to all layers of one sequence, with the
+//! slots they were computed from; [`attend`] computes attention. Start with [`KvCache::reuse`],
 //! which keeps the cache exact: an entry is kept only as long as its token and all tokens before it
 //! are unchanged.
 
@@ -78,13 +78,13 @@ impl Pages {
 
 /// The cached keys and values of one sequence, in every layer.
 #[derive(Clone, Debug, Default)]
-pub struct Context {
+pub struct KvCache {
     /// The slots whose keys and values are held.
     pub(super) slots: Vec<PlacedSlot>,
     pub(super) layers: Vec<Pages>,
 }
 
-impl Context {
+impl KvCache {
     /// Clears the cache but keeps its memory.
     pub(crate) fn clear(&mut self) {
         self.slots.clear();

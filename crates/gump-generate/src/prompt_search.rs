@@ -32,7 +32,7 @@ pub(crate) struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// A stage at the requested pose, on whose lanes the ego keeps its lateral offset; `None` if
+    /// A site at the requested pose, on whose lanes the ego keeps its lateral offset; `None` if
     /// the prompts cannot hold there.
     pub(crate) fn here(&self, seed: Seed) -> Option<Site> {
         let pose = self.request.ego.pose;

@@ -58,7 +58,7 @@ pub(super) type Path = Vec<u32>;
 
 /// A map in the scene frame.
 #[derive(Debug, Default)]
-pub struct Survey {
+pub struct LaneMap {
     points: Vec<LanePoint>,
     lanes: Vec<LaneRun>,
     lane_cells: Cells,
@@ -68,11 +68,11 @@ pub struct Survey {
     pub(super) unstated: Unstated,
 }
 
-impl Survey {
+impl LaneMap {
     /// Prepares the map around the origin of a scene.
     pub fn new(map: &MapGraph, world_from_scene: Pose) -> Self {
         let scene_from_world = world_from_scene.inverse();
-        let mut survey = Self {
+        let mut lane_map = Self {
             unstated: map.unstated(),
             ..Self::default()
         };
@@ -84,20 +84,20 @@ impl Survey {
         let known: Vec<_> = known.collect();
         let index: HashMap<LaneId, u32> = known.iter().zip(0..).map(|(l, i)| (l.id, i)).collect();
         for (lane, number) in known.iter().zip(0..) {
-            let first = survey.points.len() as u32;
+            let first = lane_map.points.len() as u32;
             let line = lane.centerline.resample(LANE_STEP_M);
             let poses = line.arc_lengths().iter().map(|&s| LanePoint {
                 pose: scene_from_world * line.pose_at(s),
                 lane: number,
             });
-            survey.points.extend(poses);
+            lane_map.points.extend(poses);
             let stands_at = map.stop_signs().iter().find(|s| s.lanes.contains(&lane.id));
             let stop = stands_at.map(|sign| {
                 let s = line.project(sign.position.truncate()).arc_length;
                 first + (s / LANE_STEP_M).round() as u32
             });
-            let n = survey.points.len() as u32 - first;
-            survey.lanes.push(LaneRun {
+            let n = lane_map.points.len() as u32 - first;
+            lane_map.lanes.push(LaneRun {
                 first,
                 n,
                 successors: lane
@@ -112,13 +112,13 @@ impl Survey {
         }
         for edge in map.road_edges() {
             let stretches = Edge::of(&edge.line, scene_from_world).into_iter();
-            survey
+            lane_map
                 .edges
                 .extend(stretches.filter(|edge| edge.from.abs().max_element() < HALF_SIDE_M));
         }
-        survey.lane_cells = Cells::new(survey.points.iter().map(|point| point.pose.position));
-        survey.edge_cells = Cells::new(survey.edges.iter().map(|edge| edge.from));
-        survey
+        lane_map.lane_cells = Cells::new(lane_map.points.iter().map(|point| point.pose.position));
+        lane_map.edge_cells = Cells::new(lane_map.edges.iter().map(|edge| edge.from));
+        lane_map
     }
 
     /// The road edges within `reach` metres of a place, in the frame of the map; no lanes.

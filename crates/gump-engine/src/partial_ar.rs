@@ -1,4 +1,5 @@
-//! Decoding of windows to states: full and partial autoregression in the engine.
+//! Partial autoregression: all objects of a frame are decoded in one pass, against provisional
+//! states from earlier chunks. Full autoregression, one pass per object, is here as well.
 //!
 //! This module defines windows, their token sequences, and the order in which objects are decoded.
 //! The arithmetic is in `cpu`, and in `reference` for other devices; `rollout_state` processes the
@@ -9,16 +10,16 @@ use std::sync::Arc;
 
 use gump_model::decoder::Bins;
 use gump_model::exact::ExactFrames;
-use gump_model::local_context::Survey;
+use gump_model::local_context::LaneMap;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 use gump_rollout::ProbeConfig;
 use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
 use crate::EngineError;
-use crate::cpu::{Context, Engine, Job, SceneMemory};
+use crate::cpu::{Engine, Job, KvCache, SceneMemory};
 use crate::predictive_samples::{Seen, requests};
-use crate::redraw::Clearance;
+use crate::redraw::RejectionSampler;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
 
@@ -37,7 +38,7 @@ pub(crate) struct Window {
     /// Prediction of each tracked agent of `next`, before decoding.
     pub(crate) requests: Vec<Request>,
     /// The road of its scene.
-    pub(crate) survey: Arc<Survey>,
+    pub(crate) lane_map: Arc<LaneMap>,
 }
 
 /// The slots of a window, up to the last provisional value. If the window would be longer than
@@ -95,11 +96,11 @@ pub(crate) struct Decoded {
 }
 
 impl Step<'_> {
-    /// Decodes the next frame of every window; `contexts` are those of the windows.
-    pub(crate) fn decode(self, contexts: &mut [&mut Context]) -> Decoded {
+    /// Decodes the next frame of every window; `kv_caches` are those of the windows.
+    pub(crate) fn decode(self, kv_caches: &mut [&mut KvCache]) -> Decoded {
         match self.sampling.mode {
-            Mode::PartialAr => self.all_at_once(contexts),
-            Mode::FullAr => self.one_by_one(contexts),
+            Mode::PartialAr => self.all_at_once(kv_caches),
+            Mode::FullAr => self.one_by_one(kv_caches),
         }
     }
 
@@ -121,13 +122,13 @@ impl Step<'_> {
     }
 
     /// Partial autoregression: one pass with surrogates in place, then every key is decoded.
-    fn all_at_once(&self, contexts: &mut [&mut Context]) -> Decoded {
+    fn all_at_once(&self, kv_caches: &mut [&mut KvCache]) -> Decoded {
         let keep = self.sampling.cache == CacheMode::Growing;
-        let of_windows = self.windows.iter().zip(&self.placed).zip(contexts);
+        let of_windows = self.windows.iter().zip(&self.placed).zip(kv_caches);
         let mut jobs: Vec<Job<'_>> = of_windows
-            .map(|((window, slots), context)| {
+            .map(|((window, slots), kv_cache)| {
                 if self.sampling.cache == CacheMode::None {
-                    context.clear();
+                    kv_cache.clear();
                 }
                 let n = window.next.tracked.len();
                 let first = slots.len() - 2 * n;
@@ -135,7 +136,7 @@ impl Step<'_> {
                     slots,
                     wanted: (0..n).map(|i| first + 2 * i).collect(),
                     memory: self.memories[window.scene],
-                    context,
+                    kv_cache,
                     keep,
                 }
             })
@@ -161,7 +162,8 @@ impl Step<'_> {
             let requests: Vec<&Request> = requests.iter().collect();
             Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
         };
-        let Ok(()) = Clearance::new(self.windows, self.sampling).resolve(&mut decoded, again);
+        let Ok(()) =
+            RejectionSampler::new(self.windows, self.sampling).resolve(&mut decoded, again);
         let watched = self.windows.iter().take(self.watch.futures).enumerate();
         let watched =
             watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
@@ -176,31 +178,31 @@ impl Step<'_> {
 
     /// Full autoregression: each object sees the final states of those before it. The windows
     /// advance in step, object by object; those with fewer objects finish earlier.
-    fn one_by_one(mut self, contexts: &mut [&mut Context]) -> Decoded {
+    fn one_by_one(mut self, kv_caches: &mut [&mut KvCache]) -> Decoded {
         let n = |i: usize| self.windows[i].next.tracked.len();
         let most = (0..self.windows.len()).map(n).max().unwrap_or(0);
         let mut decoded: Vec<Vec<Bins>> = vec![Vec::new(); self.windows.len()];
         let mut seen = Vec::new();
-        let mut clearance = Clearance::new(self.windows, self.sampling);
+        let mut rejection_sampler = RejectionSampler::new(self.windows, self.sampling);
         for i in 0..most {
             let mut members = Vec::new();
             let mut jobs: Vec<Job<'_>> = Vec::new();
-            let placed = self.placed.iter().zip(contexts.iter_mut()).enumerate();
-            for (w, (slots, context)) in placed {
+            let placed = self.placed.iter().zip(kv_caches.iter_mut()).enumerate();
+            for (w, (slots, kv_cache)) in placed {
                 let window = &self.windows[w];
                 let n = window.next.tracked.len();
                 if i >= n {
                     continue;
                 }
                 if self.sampling.cache == CacheMode::None {
-                    context.clear();
+                    kv_cache.clear();
                 }
                 members.push(w);
                 jobs.push(Job {
                     slots,
                     wanted: vec![slots.len() - 2 * (n - i)],
                     memory: self.memories[window.scene],
-                    context,
+                    kv_cache,
                     keep: self.sampling.cache != CacheMode::None,
                 });
             }
@@ -223,7 +225,7 @@ impl Step<'_> {
                 let requests: Vec<&Request> = requests.iter().collect();
                 Ok::<_, Infallible>(self.engine.sample(&rows, &requests, self.sampling))
             };
-            let Ok(()) = clearance.resolve(&mut decoded, again);
+            let Ok(()) = rejection_sampler.resolve(&mut decoded, again);
             for (&w, request) in members.iter().zip(requests) {
                 let bins = &decoded[w][i];
                 let settled = request.resolve(bins, self.sampling);
