@@ -63,7 +63,7 @@ pub fn check_clauses(
     clauses
 }
 
-/// Checks the clauses of a [`verdict`] about numbers, overlaps and the road throughout the
+/// Checks the clauses of [`check_clauses`] about numbers, overlaps and the road throughout the
 /// scenario's future, twice a second. Prompts are about an instant and not checked.
 pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<&Counts>) {
     let stride = (LOOK_S / scenario.dt).round().max(1.0) as usize;

@@ -1,7 +1,7 @@
 //! Scene generation: traffic on a given map, optionally from a prompt and constraints.
 //!
 //! Start with [`GenerateRequest`] and [`generate`]. Constraints on single objects are in
-//! [`constraint`], scenes that satisfy a prompt in [`factory`]. `gump_engine::placement` decides
+//! [`constraint`], scenes that satisfy a prompt in [`pipeline`]. `gump_engine::placement` decides
 //! which positions on a map are valid.
 //!
 //! Objects are generated one after another in canonical order, the ego first: a key is appended,

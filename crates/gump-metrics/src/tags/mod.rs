@@ -1,6 +1,6 @@
 //! Scenario tags: which of nuPlan's 73 scenario types, the prompt vocabulary, apply to a scenario.
 //!
-//! Start with [`mine`]. [`rules`] lists every tag with its definition. A tag is about the ego at
+//! Start with [`extract_tags`]. [`rules`] lists every tag with its definition. A tag is about the ego at
 //! the present; the log before and after it is used, because "starting a left turn" is only known
 //! from the turn that follows. Tags of pick-up zones cannot be decided, because maps do not contain
 //! such zones.
