@@ -190,11 +190,7 @@ impl Mlp {
             let above = Mat::new(delta, rows, outputs);
             if let Some(gradient) = &mut gradient {
                 let (weights, biases) = gradient[begin..end].split_at_mut(inputs * outputs);
-                add_product(
-                    weights,
-                    above.t(),
-                    Mat::new(&layers[layer], rows, inputs),
-                );
+                add_product(weights, above.t(), Mat::new(&layers[layer], rows, inputs));
                 for row in delta.chunks_exact(outputs) {
                     for (sum, x) in biases.iter_mut().zip(row) {
                         *sum += x;

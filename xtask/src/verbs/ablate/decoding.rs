@@ -124,7 +124,11 @@ impl Sweep {
                     let turned = base.with(|config| config.precision = precision);
                     (precision.to_string(), (i + 1) as f64, turned)
                 };
-                Precision::ALL.into_iter().enumerate().map(setting).collect()
+                Precision::ALL
+                    .into_iter()
+                    .enumerate()
+                    .map(setting)
+                    .collect()
             }
         }
     }
