@@ -271,9 +271,10 @@ fn build(py: Python<'_>, name: &WorldName, config: &SamplingConfig) -> PyResult<
         )));
     }
     let built = threads::work(py, || {
-        worlds::World::without_log(&Device::Cpu, name, config)
+        let world = worlds::World::without_log(&Device::Cpu, name, config);
+        world.map_err(|error| error.to_string())
     })?;
-    let world = built.map_err(|error| errors::DataError::new_err(error.to_string()))?;
+    let world = built.map_err(errors::DataError::new_err)?;
     let follows_lanes = world.follows_lanes();
     let kind = match world {
         worlds::World::Learned(world) => Kind::Transformer(Arc::from(world)),

@@ -51,7 +51,7 @@ const FEATURES: [(&str, Turn); 9] = [
     ("free-bins", |model, _| model.smooth_bins = false),
     ("sharp-targets", |_, train| train.loss.smoothing_bins = 0.0),
     ("no-perturbation", |_, train| {
-        train.sample.lateral_perturbation = 0.0
+        train.sample.lateral_perturbation = 0.0;
     }),
     ("no-turns", |_, train| train.sample.augment = 0.0),
 ];
