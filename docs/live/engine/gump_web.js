@@ -23,7 +23,7 @@ export class Game {
         }
     }
     /**
-     * The ways of everyone in one of them.
+     * Paths of all agents in one of them.
      * @param {number} k
      * @returns {Float32Array}
      */
@@ -42,7 +42,7 @@ export class Game {
         return ret !== 0;
     }
     /**
-     * How far they are, 0 to 1.
+     * Progress of the eight futures, 0 to 1.
      * @returns {number}
      */
     branch_progress() {
@@ -50,7 +50,7 @@ export class Game {
         return ret;
     }
     /**
-     * How they compare, as JSON.
+     * Comparison of the eight futures, as JSON.
      * @returns {string}
      */
     branch_table() {
@@ -109,7 +109,7 @@ export class Game {
         return ret >>> 0;
     }
     /**
-     * What has happened to the ego, as JSON.
+     * Events of the ego so far, as JSON.
      * @returns {string}
      */
     events() {
@@ -125,7 +125,7 @@ export class Game {
         }
     }
     /**
-     * What agents may do next, one draw for each.
+     * Possible next motions of agents, one draw for each.
      * @param {number} draw
      * @returns {Float32Array}
      */
@@ -136,7 +136,7 @@ export class Game {
         return v1;
     }
     /**
-     * What two equal drives share.
+     * Hash that two equal drives share.
      * @returns {string}
      */
     fingerprint() {
@@ -168,7 +168,7 @@ export class Game {
         return v2;
     }
     /**
-     * Everyone at a moment.
+     * All agents at a moment.
      * @param {number} frame
      * @returns {Float32Array}
      */
@@ -255,7 +255,7 @@ export class Game {
         }
     }
     /**
-     * The drive in numbers for people, as JSON.
+     * Summary of the drive for display, as JSON.
      * @returns {string}
      */
     told() {
@@ -277,7 +277,7 @@ export class Game {
         }
     }
     /**
-     * The way of the ego so far.
+     * Path of the ego so far.
      * @returns {Float32Array}
      */
     trail() {
