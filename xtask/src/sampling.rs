@@ -165,14 +165,14 @@ impl Draw {
 
     /// Flags that cannot both be meant, as a sentence.
     fn contradiction(&self) -> Option<String> {
-        let categories = [
+        let ways = [
             ("--raw", self.raw),
             ("--paper", self.paper),
             ("--ruled", self.ruled),
         ];
-        let mut categories = categories.iter().filter(|(_, is_requested)| *is_requested);
-        let (way, _) = categories.next()?;
-        if let Some((other, _)) = categories.next() {
+        let mut ways = ways.iter().filter(|(_, is_requested)| *is_requested);
+        let (way, _) = ways.next()?;
+        if let Some((other, _)) = ways.next() {
             return Some(format!(
                 "{way}: expected one way of decoding, found {other} too"
             ));

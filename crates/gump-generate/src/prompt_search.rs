@@ -49,7 +49,7 @@ impl Search<'_> {
         lanes.retain(|(lane, _)| lane.kind != LaneKind::BikeLane);
         for _ in 0..TRIALS {
             let (lane, on) = lanes.choose(rng)?;
-            let site = self.stage((lane, on.arc_length), on.lateral, rng);
+            let site = self.site((lane, on.arc_length), on.lateral, rng);
             if let Some(mut site) = site.filter(|site| self.holds(site)) {
                 site.ego.pose = pose;
                 return Some(site);
@@ -79,7 +79,7 @@ impl Search<'_> {
             for &(lane, at) in &places {
                 let at = at + rng.random_range(0.0..SPACING_M);
                 let at = at.min(lane.centerline.length());
-                let site = self.stage((lane, at), 0.0, rng);
+                let site = self.site((lane, at), 0.0, rng);
                 if let Some(site) = site.filter(|site| self.holds(site)) {
                     return Some(site);
                 }
@@ -88,7 +88,7 @@ impl Search<'_> {
         None
     }
 
-    fn stage(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Site> {
+    fn site(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Site> {
         Site::set(self.cast, self.request, place, offset, rng)
     }
 

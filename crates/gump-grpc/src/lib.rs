@@ -98,8 +98,8 @@ pub enum RemoteError {
     )]
     Lane(i64),
     /// A plan was requested before the initialization was set.
-    #[error("the planner was asked to drive before it was given an initialization")]
-    NoMission,
+    #[error("the planner was asked to drive before it was initialized")]
+    NotInitialized,
 }
 
 /// A driver that follows the plans of another process.
@@ -139,7 +139,7 @@ impl Driver for RemoteDriver {
     }
 
     fn drive(&mut self, moment: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let (client, vehicle) = self.begun.as_mut().ok_or(RemoteError::NoMission)?;
+        let (client, vehicle) = self.begun.as_mut().ok_or(RemoteError::NotInitialized)?;
         let message = input(moment, vehicle)?;
         let plan: proto::Trajectory = client.call("ComputeTrajectory", message, self.to_plan)?;
         trajectory(&plan, moment)

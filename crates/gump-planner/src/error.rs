@@ -9,8 +9,8 @@ use gump_scene::{AgentId, RoadblockId};
 #[non_exhaustive]
 pub enum PlanError {
     /// A planner was asked for a plan before it had an initialization.
-    #[error("the planner was asked to drive before it was given an initialization")]
-    NoMission,
+    #[error("the planner was asked to drive before it was initialized")]
+    NotInitialized,
     /// There is no route.
     #[error("the initialization has no route, expected the roadblocks to drive through")]
     NoRoute,

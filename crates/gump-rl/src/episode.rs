@@ -143,7 +143,7 @@ impl EpisodeState {
 }
 
 impl Rules {
-    /// The initial state of every episode on a prepared: the present of its scenario.
+    /// The initial state of every episode of a scenario: its present.
     pub fn reset(&self, prepared: &PreparedScenario) -> EpisodeState {
         let ego = *prepared.scenario().present().ego_now();
         EpisodeState {

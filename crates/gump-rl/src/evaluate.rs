@@ -123,17 +123,17 @@ impl Columns {
 /// The episodes of an evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Episodes {
-    /// Indices of the prepared to drive.
+    /// Indices of the scenarios to drive.
     pub scenarios: Vec<usize>,
     /// Drives of each, in other traffic of the same world.
     pub repeats: usize,
-    /// Source of all randomness: that of an episode depends on this seed, the index of the prepared
+    /// Source of all randomness: that of an episode depends on this seed, the index of the scenario
     /// and the repeat only, so an evaluation in parts equals one in one go.
     pub seed: Seed,
 }
 
 impl Episodes {
-    /// All of `n` prepared.
+    /// All of `n` scenarios.
     pub fn all(n: usize, repeats: usize, seed: Seed) -> Self {
         Self {
             scenarios: (0..n).collect(),

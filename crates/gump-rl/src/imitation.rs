@@ -9,7 +9,7 @@ use crate::{
     Autoreset, DrivingEnv, EnvConfig, EpisodeStart, PreparedScenario, RlError, Traffic, VectorEnv,
 };
 
-/// Drives every prepared once within its log, by the actions that come nearest to the log's, from the
+/// Drives every scenario once within its log, by the actions that come nearest to the log's, from the
 /// present to the end of the episode.
 ///
 /// The transitions are those of the environment, including rewards and ends. If the dynamics cannot

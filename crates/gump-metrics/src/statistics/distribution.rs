@@ -47,8 +47,8 @@ impl Distribution {
 
     /// Adds another distribution of the same bins.
     pub fn merge(&mut self, other: &Self) {
-        for (extract_tags, theirs) in self.counts.iter_mut().zip(&other.counts) {
-            *extract_tags += theirs;
+        for (own, theirs) in self.counts.iter_mut().zip(&other.counts) {
+            *own += theirs;
         }
         self.sum += other.sum;
         self.squares += other.squares;
@@ -93,14 +93,10 @@ impl Distribution {
 
     /// 1-Wasserstein distance, in standard deviations of `reference` (at least a tenth of a bin).
     pub fn wasserstein(&self, reference: &Self) -> f64 {
-        let (extract_tags, theirs) = (self.shares(), reference.shares());
+        let (own, theirs) = (self.shares(), reference.shares());
         let (mut below, mut sum) = (0.0, 0.0);
         // The last bin ends both at 1.
-        for (p, q) in extract_tags
-            .iter()
-            .zip(&theirs)
-            .take(extract_tags.len() - 1)
-        {
+        for (p, q) in own.iter().zip(&theirs).take(own.len() - 1) {
             below += p - q;
             sum += f64::abs(below);
         }
@@ -116,8 +112,8 @@ impl Distribution {
                 0.0
             }
         };
-        let (extract_tags, theirs) = (self.shares(), reference.shares());
-        let pairs = extract_tags.iter().zip(&theirs);
+        let (own, theirs) = (self.shares(), reference.shares());
+        let pairs = own.iter().zip(&theirs);
         let sum: f64 = pairs
             .map(|(&p, &q)| {
                 let middle = f64::midpoint(p, q);

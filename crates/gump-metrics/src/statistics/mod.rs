@@ -138,18 +138,17 @@ impl Statistics {
         let keys = self.counted.keys().chain(reference.counted.keys());
         let keys: std::collections::BTreeSet<_> = keys.copied().collect();
         let compared = keys.into_iter().map(|(measure, class)| {
-            let (extract_tags, theirs) = (self.get(measure, class), reference.get(measure, class));
-            let both = extract_tags.zip(theirs);
+            let (own, theirs) = (self.get(measure, class), reference.get(measure, class));
+            let both = own.zip(theirs);
             Comparison {
                 measure,
                 class,
-                n: extract_tags.map_or(0, Distribution::n),
-                mean: extract_tags.map(Distribution::mean),
+                n: own.map_or(0, Distribution::n),
+                mean: own.map(Distribution::mean),
                 reference_n: theirs.map_or(0, Distribution::n),
                 reference_mean: theirs.map(Distribution::mean),
-                wasserstein: both.map(|(extract_tags, theirs)| extract_tags.wasserstein(theirs)),
-                jensen_shannon: both
-                    .map(|(extract_tags, theirs)| extract_tags.jensen_shannon(theirs)),
+                wasserstein: both.map(|(own, theirs)| own.wasserstein(theirs)),
+                jensen_shannon: both.map(|(own, theirs)| own.jensen_shannon(theirs)),
             }
         });
         compared.collect()

@@ -54,8 +54,8 @@ impl SavitzkyGolay {
         let n = self.polynomial + 1;
         let mut moments = vec![vec![0.0; n]; n];
         for (row, moments) in moments.iter_mut().enumerate() {
-            for (column, input) in moments.iter_mut().enumerate() {
-                *input = positions
+            for (column, moment) in moments.iter_mut().enumerate() {
+                *moment = positions
                     .iter()
                     .map(|u| u.powi((row + column) as i32))
                     .sum();

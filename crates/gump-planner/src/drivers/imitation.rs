@@ -101,7 +101,7 @@ impl Driver for ImitationDriver<'_> {
     }
 
     fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
+        let vehicle = self.vehicle.ok_or(PlanError::NotInitialized)?;
         if let Some(plan) = &self.plan
             && !input.iteration.is_multiple_of(self.every)
         {

@@ -16,7 +16,7 @@ use gump_scene::{
 
 use crate::PlanError;
 use crate::candidates::{Candidate, Explain};
-use crate::pdm::initialization::stated_route;
+use crate::pdm::state::stated_route;
 use crate::route_search::{first_lanes, lanes_of_route};
 
 /// States of a plan besides the present ...
@@ -32,7 +32,7 @@ const RADIUS: f64 = 40.0;
 #[derive(Debug)]
 pub struct NuplanIdmDriver {
     law: IdmConfig,
-    initialization: Option<Known>,
+    known: Option<Known>,
     plan: Vec<Pose>,
 }
 
@@ -45,7 +45,7 @@ struct Known {
     way: Option<Way>,
 }
 
-/// The path and the desired speed, found once per initialization.
+/// The path and the desired speed, found once per drive.
 #[derive(Debug)]
 struct Way {
     path: Path,
@@ -64,7 +64,7 @@ impl Default for NuplanIdmDriver {
                 exponent: 4.0,
                 ..IdmConfig::default()
             },
-            initialization: None,
+            known: None,
             plan: Vec::new(),
         }
     }
@@ -79,7 +79,7 @@ impl Driver for NuplanIdmDriver {
         let route = stated_route(initialization)?;
         let lanes = lanes_of_route(initialization.map, &route);
         self.plan.clear();
-        self.initialization = Some(Known {
+        self.known = Some(Known {
             map: Arc::clone(initialization.map),
             vehicle: initialization.vehicle,
             lanes: lanes.iter().map(|lane| lane.id).collect(),
@@ -90,7 +90,7 @@ impl Driver for NuplanIdmDriver {
     }
 
     fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let known = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+        let known = self.known.as_mut().ok_or(PlanError::NotInitialized)?;
         if known.way.is_none() {
             known.way = Some(known.find_way(input.ego, self.law.target_velocity)?);
         }

@@ -43,7 +43,7 @@ impl Driver for SimpleDriver {
     }
 
     fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let vehicle = self.vehicle.ok_or(PlanError::NoMission)?;
+        let vehicle = self.vehicle.ok_or(PlanError::NotInitialized)?;
         let mut state = EgoState {
             time_us: input.ego.time_us,
             rear_axle: input.ego.rear_axle,

@@ -13,9 +13,9 @@ use super::choice::{Reward, Tally, best_of};
 use super::policies::{self, Policy};
 use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
-use crate::pdm::initialization::State;
 use crate::pdm::propose::{Corridor, DT, Proposal, Proposer};
 use crate::pdm::score::Judge;
+use crate::pdm::state::State;
 use crate::pdm::track::Tracker;
 use crate::{PlanError, ProposalKind};
 
@@ -478,8 +478,8 @@ impl Row {
             };
             let elapsed = (n - before) as f64 * DECISION_S;
             let drift = (to.position - earlier.position) / elapsed;
-            let moments = (first..=last).map(|input| {
-                let t = input as f64 * MOMENT_DT / DECISION_S - (n - 1) as f64;
+            let moments = (first..=last).map(|moment| {
+                let t = moment as f64 * MOMENT_DT / DECISION_S - (n - 1) as f64;
                 from.interpolate(to, t)
             });
             object.imagine(moments, drift);

@@ -28,8 +28,8 @@ use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 use crate::candidates::{Candidate, Explain};
-use crate::pdm::initialization::{State, brake, trajectory};
 use crate::pdm::propose::DT;
+use crate::pdm::state::{State, brake, trajectory};
 use crate::pdm::{self, STEPS, TRAJECTORY_STEPS};
 use crate::{PdmConfig, PlanError, ProposalKind};
 pub use choice::CandidateScore;
@@ -300,7 +300,7 @@ pub struct InteractiveDriver<'w> {
     world: &'w dyn WorldModel,
     config: InteractiveDriverConfig,
     clock: Box<dyn Fn() -> Duration + 'w>,
-    initialization: Option<State>,
+    state: Option<State>,
     decision: Option<Decision>,
     decided_at: usize,
     /// The path of the chosen imitation.
@@ -321,7 +321,7 @@ impl<'w> InteractiveDriver<'w> {
             world,
             config,
             clock: Box::new(|| Duration::ZERO),
-            initialization: None,
+            state: None,
             decision: None,
             decided_at: 0,
             following: None,
@@ -344,7 +344,7 @@ impl<'w> InteractiveDriver<'w> {
     }
 
     fn decide(&mut self, input: &PlannerInput<'_>, speeds: &[f64]) -> Result<(), PlanError> {
-        let state = self.initialization.as_ref().ok_or(PlanError::NoMission)?;
+        let state = self.state.as_ref().ok_or(PlanError::NotInitialized)?;
         let imagination = Imagination {
             world: self.world,
             config: &self.config,
@@ -373,8 +373,8 @@ impl<'w> InteractiveDriver<'w> {
 
     /// Lets the chosen policy drive on from the actual positions of all agents.
     fn follow(&self, input: &PlannerInput<'_>, speeds: &[f64]) -> Result<Trajectory, PlanError> {
-        let state = self.initialization.as_ref().ok_or(PlanError::NoMission)?;
-        let decision = self.decision.as_ref().ok_or(PlanError::NoMission)?;
+        let state = self.state.as_ref().ok_or(PlanError::NotInitialized)?;
+        let decision = self.decision.as_ref().ok_or(PlanError::NotInitialized)?;
         let ego = input.ego;
         if decision.brakes {
             return Ok(trajectory(ego.time_us, &brake(ego, &state.vehicle))?);
@@ -398,13 +398,13 @@ impl Driver for InteractiveDriver<'_> {
     }
 
     fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
-        self.initialization = Some(State::new(initialization)?);
+        self.state = Some(State::new(initialization)?);
         (self.decision, self.following) = (None, None);
         Ok(())
     }
 
     fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+        let state = self.state.as_mut().ok_or(PlanError::NotInitialized)?;
         let speeds = state.prepare(input, &self.config.proposals)?;
         if self.is_due(input) {
             let chosen = |decision: &Decision| decision.candidates[decision.chosen].kind;
@@ -412,7 +412,7 @@ impl Driver for InteractiveDriver<'_> {
                 Some(ProposalKind::LaneChange { side, .. }) => Some(side),
                 _ => None,
             };
-            let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+            let state = self.state.as_mut().ok_or(PlanError::NotInitialized)?;
             if self.config.lane_changes {
                 state.lay_changes(input.ego, &self.config.proposals, under_way)?;
             }

@@ -107,34 +107,34 @@ impl Object {
     }
 
     /// Its centre at a moment.
-    pub(crate) fn center(&self, input: usize) -> DVec2 {
-        let (spot, offset) = self.at(input);
+    pub(crate) fn center(&self, moment: usize) -> DVec2 {
+        let (spot, offset) = self.at(moment);
         spot.pose.position + offset
     }
 
     /// Its footprint at a moment.
-    pub(crate) fn quad(&self, input: usize) -> Quad {
-        let (spot, offset) = self.at(input);
+    pub(crate) fn quad(&self, moment: usize) -> Quad {
+        let (spot, offset) = self.at(moment);
         Quad::new(spot.quad.corners().map(|corner| corner + offset))
     }
 
     /// Bounds of its footprint at a moment.
-    pub(crate) fn bounds(&self, input: usize) -> (DVec2, DVec2) {
-        let (spot, offset) = self.at(input);
+    pub(crate) fn bounds(&self, moment: usize) -> (DVec2, DVec2) {
+        let (spot, offset) = self.at(moment);
         let (min, max) = spot.quad.bounds();
         (min + offset, max + offset)
     }
 
     /// Its speed at a moment along a heading, metres per second.
-    pub(crate) fn speed_along(&self, heading: f64, input: usize) -> f64 {
-        let (spot, _) = self.at(input);
+    pub(crate) fn speed_along(&self, heading: f64, moment: usize) -> f64 {
+        let (spot, _) = self.at(moment);
         let turned = spot.pose.heading - heading;
         spot.speed * turned.cos()
     }
 
     /// The agent at a moment.
-    pub(crate) fn agent(&self, input: usize) -> Agent {
-        let (spot, offset) = self.at(input);
+    pub(crate) fn agent(&self, moment: usize) -> Agent {
+        let (spot, offset) = self.at(moment);
         let mut pose = spot.pose;
         pose.position += offset;
         let velocity = if self.known.len() == 1 {
@@ -150,9 +150,9 @@ impl Object {
     }
 
     /// The last position known by an instant, and the distance driven from there.
-    fn at(&self, input: usize) -> (&Spot, DVec2) {
-        let last = input.min(self.known.len() - 1);
-        let beyond = MOMENT_DT * (input - last) as f64;
+    fn at(&self, moment: usize) -> (&Spot, DVec2) {
+        let last = moment.min(self.known.len() - 1);
+        let beyond = MOMENT_DT * (moment - last) as f64;
         (&self.known[last], self.drift * beyond)
     }
 

@@ -9,7 +9,7 @@ use gump_scene::{AreaKind, LaneId, MapGraph};
 /// Surfaces within this square around the ego are considered, half its side in metres.
 pub(crate) const RADIUS: f64 = 50.0;
 
-/// Surfaces near the ego, prepared once per lane and kept for the initialization.
+/// Surfaces near the ego, prepared once per lane and kept for the drive.
 #[derive(Debug, Default)]
 pub(crate) struct Ground {
     lanes: BTreeMap<LaneId, Arc<PolygonIndex>>,

@@ -11,12 +11,12 @@
 pub(crate) mod comfort;
 pub(crate) mod forecast;
 pub(crate) mod ground;
-pub(crate) mod initialization;
 pub(crate) mod lane_change;
 pub(crate) mod propose;
 #[cfg(test)]
 mod scene_tests;
 pub(crate) mod score;
+pub(crate) mod state;
 #[cfg(test)]
 mod tests;
 pub(crate) mod track;
@@ -33,9 +33,9 @@ use gump_scene::EgoState;
 use crate::candidates::{Candidate, Explain};
 use crate::{PlanError, ProposalKind};
 use comfort::ComfortFilters;
-use initialization::{State, brake, trajectory};
 use propose::{DT, Proposal};
 use score::Judge;
+use state::{State, brake, trajectory};
 use track::Tracker;
 
 /// Steps of a proposal.
@@ -83,7 +83,7 @@ impl Default for PdmConfig {
 #[derive(Debug)]
 pub struct PdmClosed {
     config: PdmConfig,
-    initialization: Option<State>,
+    state: Option<State>,
     tracker: Tracker,
     comfort: ComfortFilters,
     thought: Thought,
@@ -114,7 +114,7 @@ impl PdmClosed {
         check(&config)?;
         Ok(Self {
             config,
-            initialization: None,
+            state: None,
             tracker: Tracker::new(STEPS),
             comfort: ComfortFilters::new(STEPS + 1, DT),
             thought: Thought::default(),
@@ -186,12 +186,12 @@ impl Driver for PdmClosed {
     fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
         let state = State::new(initialization)?;
         self.thought = Thought::default();
-        self.initialization = Some(state);
+        self.state = Some(state);
         Ok(())
     }
 
     fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
-        let state = self.initialization.as_mut().ok_or(PlanError::NoMission)?;
+        let state = self.state.as_mut().ok_or(PlanError::NotInitialized)?;
         let speeds = state.prepare(input, &self.config)?;
         let proposer = state.proposer(&self.config.law, &speeds);
         let ego = input.ego;

@@ -270,11 +270,11 @@ impl<'a> Surroundings<'a> {
                 continue;
             }
             let mut standing: Option<Option<f64>> = None;
-            for input in first..=last {
+            for moment in first..=last {
                 let sees = || {
-                    let inside = corridor.may_reach(object.bounds(input))
-                        && corridor.intersects(&object.quad(input));
-                    inside.then(|| line.project(object.center(input)))
+                    let inside = corridor.may_reach(object.bounds(moment))
+                        && corridor.intersects(&object.quad(moment));
+                    inside.then(|| line.project(object.center(moment)))
                 };
                 let seen = match standing {
                     Some(seen) => seen,
@@ -284,9 +284,9 @@ impl<'a> Surroundings<'a> {
                     standing = Some(seen);
                 }
                 if let Some(progress) = seen {
-                    moments[input - first].push(Obstacle {
+                    moments[moment - first].push(Obstacle {
                         progress,
-                        quad: object.quad(input),
+                        quad: object.quad(moment),
                         object,
                     });
                 }

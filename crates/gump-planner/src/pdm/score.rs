@@ -216,12 +216,12 @@ impl Judge<'_> {
             let mut careful: Option<bool> = None;
             for later in TTC_STEPS {
                 let quad = ahead(step, later);
-                let input = (step + later) / 2;
+                let moment = (step + later) / 2;
                 for object in &nearby {
-                    if !touches(&quad, object, input) || ignored.contains(&object.token()) {
+                    if !touches(&quad, object, moment) || ignored.contains(&object.token()) {
                         continue;
                     }
-                    let place = object.center(input);
+                    let place = object.center(moment);
                     let rear_axle = state.rear_axle;
                     let careful = *careful.get_or_insert_with(|| {
                         tracked.off_lane(step) || self.ground.is_in_intersection(rear_axle.position)
@@ -252,10 +252,10 @@ impl Judge<'_> {
     }
 }
 
-fn touches(quad: &Quad, object: &Object, input: usize) -> bool {
-    let (low, high) = object.bounds(input.min(MOMENTS - 1));
+fn touches(quad: &Quad, object: &Object, moment: usize) -> bool {
+    let (low, high) = object.bounds(moment.min(MOMENTS - 1));
     let (min, max) = quad.bounds();
-    min.cmple(high).all() && low.cmple(max).all() && quad.intersects(&object.quad(input))
+    min.cmple(high).all() && low.cmple(max).all() && quad.intersects(&object.quad(moment))
 }
 
 /// The factor for the longest stretch driven against the traffic.

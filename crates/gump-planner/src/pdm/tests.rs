@@ -231,7 +231,7 @@ fn check_pose(name: &str, found: Pose, row: &[f64]) {
 }
 
 fn check_ground(name: &str, planner: &PdmClosed, golden: &Value) {
-    let state = planner.initialization.as_ref().unwrap();
+    let state = planner.state.as_ref().unwrap();
     let path = &state.centerline().path;
     assert_abs_diff_eq!(
         path.length(),

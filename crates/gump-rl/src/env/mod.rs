@@ -52,7 +52,7 @@ pub struct DrivingEnv<'w> {
 }
 
 impl<'w> DrivingEnv<'w> {
-    /// An environment on these prepared among `traffic`. It has no episodes before the first reset.
+    /// An environment on these prepared scenarios among `traffic`. It has no episodes before the first reset.
     ///
     /// # Errors
     /// [`RlError::NoScenario`], and [`RlError::Parameter`] for parameters out of range.
@@ -205,7 +205,7 @@ impl<'w> DrivingEnv<'w> {
         &self.config
     }
 
-    /// The prepared.
+    /// The prepared scenarios.
     pub fn prepared(&self) -> &Arc<[PreparedScenario]> {
         &self.prepared
     }

@@ -140,7 +140,7 @@ impl From<Picture> for ObservationForm {
 /// An episode at one instant, as input of an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// Its prepared.
+    /// Its scenario.
     pub prepared: &'a PreparedScenario,
     /// Its state.
     pub state: &'a EpisodeState,

@@ -1,6 +1,6 @@
 //! Bird's-eye images of an episode, one bit per pixel and layer.
 //!
-//! The map is rendered once per prepared, north up (`Texture`); an observation samples it and draws
+//! The map is rendered once per scenario, north up (`Texture`); an observation samples it and draws
 //! the moving agents on top.
 
 use gump_geometry::{Canvas, DVec2, Pose, dvec2, fill_polygon, stroke_polyline};
@@ -180,7 +180,7 @@ const TEXEL: f64 = 0.75;
 /// can go and see in eight seconds at 30 m/s.
 const TEXTURE_SIDE: usize = 768;
 
-/// The map of a prepared as a bird's-eye image, north up: per texel one bit per layer of the map.
+/// The map of a prepared scenario as a bird's-eye image, north up: per texel one bit per layer of the map.
 #[derive(Debug)]
 pub(crate) struct Texture {
     /// World position of the texel (0, 0)'s lower left corner.

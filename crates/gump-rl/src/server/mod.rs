@@ -1,6 +1,6 @@
 //! Environments for other processes, over a Unix socket; only on Unix.
 //!
-//! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; prepared and world
+//! [`Server::bind`], then [`Server::run`]. Every client gets its own environment; scenarios and world
 //! are shared. Invalid requests are answered with an error and at worst close that connection; the
 //! server and other clients are not affected. `python/gump_env.py` is a client, and
 //! `python/gump_sb3.py` adapts it to Stable-Baselines3.

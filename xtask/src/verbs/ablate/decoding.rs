@@ -105,7 +105,7 @@ impl Sweep {
             Self::Chunking => {
                 let decay = base.sampling.decay;
                 let average = if decay > 0.0 { decay } else { 1.2 };
-                let categories = [
+                let ways = [
                     ("one pose", Surrogate::ConstantVelocity, 0.0),
                     ("surrogates from chunks", Surrogate::Chunk, 0.0),
                     ("chunks averaged", Surrogate::Chunk, average),
@@ -117,7 +117,7 @@ impl Sweep {
                     });
                     (name.to_owned(), (i + 1) as f64, turned)
                 };
-                categories.into_iter().enumerate().map(setting).collect()
+                ways.into_iter().enumerate().map(setting).collect()
             }
             Self::Quantization => {
                 let setting = |(i, precision): (usize, Precision)| {

@@ -1,4 +1,4 @@
-//! State of an initialization: the way, the road around the ego and the objects on it.
+//! State of a drive: the way, the road around the ego and the objects on it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ use crate::route_search::{correct_route, lanes_of_route, nearest_vertex, shortes
 /// Roadblocks of the route that the centre line is laid through.
 const WINDOW: usize = 30;
 
-/// State since the initialization began.
+/// State since the drive began.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(crate) map: Arc<MapGraph>,
@@ -190,7 +190,7 @@ impl State {
         nearest.copied().ok_or(PlanError::NoRoute)
     }
 
-    /// Lays the lines through the route, once per initialization.
+    /// Lays the lines through the route, once per drive.
     fn lay_lines(&mut self, start: LaneId, config: &PdmConfig) -> Result<(), PlanError> {
         let way = self.way.as_mut().ok_or(PlanError::NoRoute)?;
         if !way.lines.is_empty() {
