@@ -26,7 +26,8 @@ pub struct Arrivals {
 }
 
 impl Default for Arrivals {
-    /// A window of 110 m, in which recordings show most agents; 50 m of sight.
+    /// A window of 110 m, in which recordings show most agents; 50 m of sight, about half of it.
+    /// Not tuned.
     fn default() -> Self {
         Self {
             window_m: 110.0,
@@ -37,31 +38,41 @@ impl Default for Arrivals {
 
 /// The kinds of agents that enter, with their usual values.
 const KINDS: [AgentKind; 3] = AgentKind::MOVING;
+// Chosen by hand. Result 23 has the number of agents and the films that they lead to together; none
+// was tuned by itself.
+
 /// Usual speeds of moving agents, metres per second, where the scene shows none.
 const USUAL_SPEED: [f64; 3] = [7.0, 1.3, 4.5];
-/// Share of the window's width that an entering agent crosses.
+/// Share of the window's width that an entering agent crosses: 1 is a path through the middle;
+/// others cut a corner or turn off.
 const CROSSED: f64 = 0.6;
 /// Distance that the ego may move before it gets its own window, or its gates are determined again,
-/// metres.
+/// metres: well below the 60 m from its sight to the window's border.
 const MOVED_M: f64 = 20.0;
-/// An agent that is this far outside the window and moves away leaves, metres.
+/// An agent that is this far outside the window and moves away leaves, metres: not just where
+/// others enter.
 const BEYOND_M: f64 = 12.0;
-/// Sampling distance along lanes, metres.
+/// Sampling distance along lanes, metres: shorter crossings of the border are missed.
 const STEP_M: f64 = 5.0;
-/// Agents this many windows away leave, even if they do not move.
+/// Agents this many windows away leave, even if they do not move: 200 m.
 const FAR: f64 = 1.8;
-/// An agent nearer than this to the end of the map leaves there, metres.
+/// An agent nearer than this to the end of the map leaves there, metres: half a second at 10 m/s.
 const END_M: f64 = 5.0;
-/// Length of the path examined beyond a gate, metres.
+/// Length of the path examined beyond a gate, metres: more than a stop from 14 m/s by gentle
+/// braking.
 const PATH_M: f64 = 70.0;
-/// Gaps ahead and behind that an entering agent needs, metres.
+/// Gaps ahead and behind that an entering agent needs, metres: who is behind has not seen it
+/// before.
 const LEAST_GAP_M: f64 = 7.0;
 const LEAST_REAR_M: f64 = 10.0;
-/// The longest queue before a gate.
+/// The longest queue before a gate; further arrivals are lost, else a jam would let them in for
+/// minutes after it.
 const LONGEST_QUEUE: u32 = 4;
-/// Faster roads have signals that let traffic through in platoons, metres per second.
+/// Faster roads have signals that let traffic through in platoons, metres per second: from 30
+/// km/h on.
 const PLATOON_LIMIT: f64 = 8.0;
-/// Periods of such signals, seconds, and the share in which they let traffic through.
+/// Periods of such signals, seconds, and the share in which they let traffic through: usual cycles
+/// of two phases.
 const PERIOD_S: (f64, f64) = (40.0, 80.0);
 const OPEN: f64 = 0.5;
 
@@ -248,6 +259,7 @@ impl Flow {
         // As many come as leave in the mean, more of them while some are missing.
         let crossing = CROSSED * 2.0 * self.config.window_m / self.speed[k];
         let missing = (usual - counts[gate.window][k]) / usual;
+        // None above 1.5 times the usual number, three times the rate on an empty road.
         let rate = usual / crossing * (1.0 + 2.0 * missing).clamp(0.0, 3.0);
         let expected = rate / same * self.platoon(gate) * dt;
         let key = (gate.lane, k);
@@ -263,6 +275,7 @@ impl Flow {
             [] => KINDS[k].usual_size(),
             sizes => sizes[rng.random_range(0..sizes.len())],
         };
+        // Drivers keep to the limit, about, and people differ by a fifth; chosen by hand.
         let wanted = match KINDS[k] {
             AgentKind::Vehicle => gate.limit * rng.random_range(0.8..1.05),
             _ => USUAL_SPEED[k] * rng.random_range(0.8..1.2),
@@ -411,12 +424,14 @@ fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Ve
             let edge = if is_for_bicycles {
                 0.0
             } else {
+                // 0.7 m from the right edge: half a bicycle and some room.
                 0.7 - lane.width / 2.0
             };
             gates.push(gate(2, aside(pose, edge)));
         }
         for (inward, turned) in [(1.0, 0.0), (-1.0, std::f64::consts::PI)] {
             for s in crossings(lane, centres, config.window_m, inward) {
+                // 2 m beyond the lane, on a sidewalk.
                 let pose = aside(lane.centerline.pose_at(s), -lane.width / 2.0 - 2.0);
                 let is_seen = pose.position.distance(ego) < config.sight_m;
                 if is_seen || map.lanes_containing(pose.position).next().is_some() {
@@ -467,7 +482,8 @@ fn crossings(lane: &Lane, centres: &[DVec2], radius: f64, inward: f64) -> Vec<f6
         .collect()
 }
 
-/// The path ahead from a position on a lane, straight on where it forks; `None` if it is short.
+/// The path ahead from a position on a lane, straight on where it forks; `None` if it is short: 25
+/// m, too little to be worth an arrival.
 fn path_from(map: &MapGraph, lane: &Lane, s: f64) -> Option<Polyline> {
     let mut path = lane.centerline.slice(s, lane.centerline.length());
     let mut last = lane;

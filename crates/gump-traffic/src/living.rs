@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::gates::{Arrivals, Flow};
 use crate::signals::{SignalPlan, Signals};
 
-/// Separates the random numbers of the surroundings from those of the world.
+/// Separates the random numbers of the surroundings from those of the world, which are far fewer.
 const SIGNALS: u64 = 1 << 56;
 const ARRIVALS: u64 = 1 << 57;
 

@@ -54,6 +54,16 @@ fn plan(scenario: &Scenario) -> Arc<SignalPlan> {
     Arc::new(SignalPlan::of(scene.map, scene.history, scene.dt))
 }
 
+/// The lights of a future in which every junction has detectors.
+fn detecting(plan: &Arc<SignalPlan>, seed: u64) -> Signals {
+    let mut signals = Signals::begin(plan, Seed(seed));
+    signals
+        .turns
+        .iter_mut()
+        .for_each(|turn| turn.detects = true);
+    signals
+}
+
 fn states(signals: &Signals) -> Vec<LightState> {
     signals.lights().iter().map(|light| light.state).collect()
 }
@@ -158,7 +168,7 @@ fn phases_last_as_long_as_signals_do() {
 #[test]
 fn what_nobody_waits_for_is_left_out() {
     let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
-    let mut signals = Signals::begin(&plan, Seed(0));
+    let mut signals = detecting(&plan, 0);
     for _ in 0..400 {
         signals.advance(0.5, Some(&[]));
         assert_eq!(states(&signals), [Green, Green, Red, Red, Red]);
@@ -171,6 +181,46 @@ fn what_nobody_waits_for_is_left_out() {
         states(&signals)[4] == Green
     });
     assert!(turned);
+}
+
+#[test]
+fn green_without_traffic_ends_early_where_others_wait() {
+    let plan = plan(&crossing(["red", "red", "green", "green", "red"]));
+    // Seconds until the road from south and north, where nobody is, loses green.
+    let until = |seed: u64, vehicles: &[Pose]| {
+        let mut signals = detecting(&plan, seed);
+        let mut steps = 0..200;
+        steps.position(|_| {
+            signals.advance(0.5, Some(vehicles));
+            states(&signals)[2] != Green
+        })
+    };
+    let west = [everywhere()[0]];
+    for seed in 0..20 {
+        let (alone, all) = (until(seed, &west), until(seed, &everywhere()));
+        // Its least green is 10 s, and some of it has passed.
+        assert!(
+            alone.is_some_and(|steps| steps <= 20),
+            "seed {seed}: {alone:?}"
+        );
+        assert!(alone <= all, "seed {seed}: {alone:?} {all:?}");
+    }
+    let earlier = (0..20).filter(|&seed| until(seed, &west) < until(seed, &everywhere()));
+    assert!(earlier.count() > 10);
+}
+
+#[test]
+fn half_of_the_junctions_take_turns_whoever_waits() {
+    let plan = plan(&crossing(["green", "green", "red", "red", "red"]));
+    let turns = (0..200).filter(|&seed| {
+        let mut signals = Signals::begin(&plan, Seed(seed));
+        (0..120).any(|_| {
+            signals.advance(0.5, Some(&[]));
+            states(&signals)[2] == Green
+        })
+    });
+    let n = turns.count();
+    assert!((75..=125).contains(&n), "{n} of 200");
 }
 
 #[test]

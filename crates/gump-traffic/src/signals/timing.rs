@@ -15,7 +15,8 @@ pub(super) const CLEARANCE_S: f64 = 1.5;
 const GREEN_S: (f64, f64) = (10.0, 40.0);
 /// The same for a phase in which traffic only turns left.
 const LEFT_S: (f64, f64) = (5.0, 14.0);
-/// Number of draws of a duration consistent with the observations before the maximum is used.
+/// Number of draws of a duration consistent with the observations before the maximum is used; most
+/// ages need a few. Not tuned.
 const TRIES: usize = 64;
 
 /// The time that a phase has been green already, seconds.
@@ -25,7 +26,7 @@ pub(super) enum Age {
     AtLeast(f64),
 }
 
-/// Seconds of yellow at this speed limit.
+/// Seconds of yellow at this speed limit, metres per second; 6.1 is twice the braking above.
 pub(super) fn yellow_s(limit: f64) -> f64 {
     (1.0 + limit / 6.1).clamp(3.0, 6.0)
 }
@@ -40,26 +41,31 @@ fn draw(is_left: bool, rng: &mut Rng) -> f64 {
     rng.random_range(least..most)
 }
 
-/// Seconds of green left of a phase that is observed at a random time.
+/// Least seconds of green of a phase, however little traffic it has.
+pub(super) fn least_green_s(is_left: bool) -> f64 {
+    if is_left { LEFT_S.0 } else { GREEN_S.0 }
+}
+
+/// Seconds of green so far, and left, of a phase that is observed at a random time.
 ///
 /// A long phase is more likely to be observed than a short one, at each of its instants equally;
 /// durations that contradict the observations are excluded.
-pub(super) fn rest_s(is_left: bool, age: Age, seed: Seed) -> f64 {
+pub(super) fn met_s(is_left: bool, age: Age, seed: Seed) -> (f64, f64) {
     let mut rng = seed.rng();
     let most = if is_left { LEFT_S.1 } else { GREEN_S.1 };
     for _ in 0..TRIES {
         let whole = draw(is_left, &mut rng);
         let (is_met, share): (f64, f64) = (rng.random(), rng.random());
         match age {
-            Age::Exactly(age) if age < whole => return whole - age,
+            Age::Exactly(age) if age < whole => return (age, whole - age),
             Age::AtLeast(least) if is_met * most < whole && share * whole >= least => {
-                return (1.0 - share) * whole;
+                return (share * whole, (1.0 - share) * whole);
             }
             _ => {}
         }
     }
     // It has been green for longer than is usual: it ends soon.
-    rng.random_range(0.0..LEFT_S.0)
+    (most, rng.random_range(0.0..LEFT_S.0))
 }
 
 #[cfg(test)]
@@ -69,7 +75,7 @@ mod tests {
     #[test]
     fn what_is_left_agrees_with_what_was_seen() {
         let mean = |age: Age| {
-            let rests = (0..4000).map(|k| rest_s(false, age, Seed(k)));
+            let rests = (0..4000).map(|k| met_s(false, age, Seed(k)).1);
             rests
                 .inspect(|rest| assert!((0.0..=40.0).contains(rest)))
                 .sum::<f64>()
