@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 
 use gump_geometry::{DVec2, Pose, dvec2};
-use gump_scene::{Agent, Rollout, SceneState};
+use gump_scene::{Agent, MapGraph, Rollout, SceneState};
 
 /// A view from straight above.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -63,8 +63,8 @@ impl Camera {
         }
     }
 
-    /// Shows where the ego goes in any of these futures, its present heading up; fixed, so that
-    /// the road need be drawn only once per film.
+    /// Shows where the ego goes on the map in any of these futures, its present heading up; fixed,
+    /// so that the road need be drawn only once per film.
     ///
     /// Error: none; without rollouts it looks at the origin.
     pub fn on_futures(rollouts: &[&Rollout], min_metres: f64, size_px: (u32, u32)) -> Self {
@@ -72,11 +72,12 @@ impl Camera {
             .first()
             .and_then(|r| r.start().agent(r.ego()))
             .map_or(0.0, |ego| ego.state.pose.heading);
-        let egos = rollouts.iter().flat_map(|r| {
+        let positions = rollouts.iter().flat_map(|r| {
             let frames = std::iter::once(r.start()).chain(r.imagined());
-            frames.filter_map(|frame| frame.agent(r.ego()))
+            let egos = frames.filter_map(|frame| frame.agent(r.ego()));
+            let places = egos.map(|ego| ego.state.pose.position);
+            places.filter(|place| is_on_map(r.map(), *place))
         });
-        let positions = egos.map(|ego| ego.state.pose.position);
         Self::framing(positions, heading, min_metres, size_px)
     }
 
@@ -108,9 +109,16 @@ impl Camera {
         })
     }
 
-    /// This view from where the ego is, its heading up.
-    pub(crate) fn with_ego(&self, scene: &SceneState<'_>) -> Self {
-        Self::on_ego(scene, self.metres, self.width_px, self.height_px)
+    /// This view from where the ego is after `step` steps, its heading up; from where it left the
+    /// map if it is beyond.
+    pub(crate) fn with_ego(&self, rollout: &Rollout, step: usize) -> Self {
+        let ego = |step| rollout.at(step).ego_now().state.pose;
+        let is_seen = |pose: &Pose| is_on_map(rollout.map(), pose.position);
+        let last = (0..=step).rev().map(ego).find(is_seen);
+        Self {
+            world_from_camera: last.unwrap_or_else(|| ego(step)),
+            ..*self
+        }
     }
 
     /// Pixels per metre.
@@ -135,10 +143,20 @@ impl Camera {
     }
 }
 
-/// Distance from the ego within which moving agents are framed, metres.
+/// Distance from the ego within which moving agents are framed, metres. Chosen by eye: those who
+/// matter to the ego, without making everything small.
 const NEAR: f64 = 30.0;
-/// An agent that goes farther than this counts as moving, metres.
+/// An agent that goes farther than this counts as moving, metres. Chosen by hand.
 const MOVES: f64 = 2.0;
+
+/// Who is farther than this from any lane has left the map, metres: wider than a car park beside
+/// a lane, less than a camera sees.
+const OFF_MAP: f64 = 25.0;
+
+/// Whether a place is on the map or beside it. On a map without lanes every place is.
+fn is_on_map(map: &MapGraph, place: DVec2) -> bool {
+    map.lanes().is_empty() || map.lanes_near(place, OFF_MAP).next().is_some()
+}
 
 /// Positions of the ego, and of all other agents while they are near it and have moved.
 fn moving(rollout: &Rollout) -> Vec<DVec2> {
@@ -149,6 +167,9 @@ fn moving(rollout: &Rollout) -> Vec<DVec2> {
             continue;
         };
         let ego = ego.state.pose.position;
+        if !is_on_map(rollout.map(), ego) {
+            continue;
+        }
         points.push(ego);
         for agent in frame.agents() {
             let at = agent.state.pose.position;

@@ -26,8 +26,8 @@ use crate::{Camera, Theme, VizError, text_layout, video};
 pub struct FilmSpec {
     /// View of one panel.
     pub camera: Camera,
-    /// Whether the camera follows the ego of a panel's first rollout, its heading up, and only the
-    /// size of `camera` counts; otherwise it is fixed in the world.
+    /// Whether the camera follows the ego of a panel's first rollout, its heading up, as long as it is
+    /// on the map, and only the size of `camera` counts; otherwise it is fixed in the world.
     pub follow: bool,
     /// Colour theme.
     pub theme: Theme,
@@ -91,7 +91,7 @@ impl FilmSpec {
     }
 }
 
-/// Metres across a panel whose camera is fixed.
+/// Metres across a panel whose camera is fixed. Chosen by eye, like the next.
 const FRAMED: RangeInclusive<f64> = 50.0..=110.0;
 /// Metres across a panel whose camera follows the ego.
 const FOLLOWED: f64 = 90.0;
@@ -277,6 +277,7 @@ struct Panel<'a> {
     opacity: f32,
 }
 
+// Chosen by eye.
 /// Pixels between panels.
 const GAP: usize = 2;
 /// Height of the line with the clock, pixels.
@@ -425,8 +426,9 @@ fn draw_panel(
         Some(backdrop) => (spec.camera, Pixmap::clone(backdrop)),
         None => {
             let first = panel.rollouts[0];
-            let scene = first.at(step_at(first, time));
-            let camera = spec.camera.with_ego(&scene);
+            let step = step_at(first, time);
+            let scene = first.at(step);
+            let camera = spec.camera.with_ego(first, step);
             let backdrop = draw_backdrop(scene.map, scene.route, camera, colours);
             (camera, backdrop)
         }

@@ -336,6 +336,24 @@ fn a_film_frames_who_moves_and_follows_whom_it_cannot_frame() {
 }
 
 #[test]
+fn a_camera_stays_where_the_ego_leaves_the_map() {
+    let scenario = fixture::scenario(
+        "lane 1: -50,0 60,0\nego vehicle 0: 0,0 velocity 20,0\nhistory 1 future 8 dt 0.1",
+    )
+    .unwrap();
+    let log = log_as_rollout(&scenario);
+    let spec = FilmSpec::framing(&[&log], (100, 100));
+    assert!(spec.camera.metres < 110.0, "{}", spec.camera.metres);
+    let at = |step| {
+        let camera = FilmSpec::following((100, 100)).camera.with_ego(&log, step);
+        camera.world_from_camera.position.x
+    };
+    assert_eq!((at(0), at(10)), (0.0, 20.0));
+    // It is farther than 25 m beyond the end of its lane after 4.25 s.
+    assert!((at(80) - 84.0).abs() < 1e-9, "{}", at(80));
+}
+
+#[test]
 fn a_video_is_written_by_ffmpeg_or_refused() {
     let scenario = street();
     let log = log_as_rollout(&scenario);
