@@ -1,5 +1,5 @@
 //! Similarity of generated and recorded scenes: maximum mean discrepancy of positions, headings,
-//! velocities and sizes of agents.
+//! velocities and sizes of agents, of the gaps between them and of their numbers per lane.
 //!
 //! Start with [`scene_mmd`] for one scene; [`MmdMean`] averages over scenes, [`mmd_squared`] is the
 //! statistic itself.
@@ -17,8 +17,12 @@
 //! assert_eq!(found.velocity, Some(0.0));
 //! ```
 
+use std::collections::BTreeMap;
+
 use gump_geometry::{DVec2, angle_difference};
-use gump_scene::{Agent, AgentId, AgentKind, Frame, SceneState};
+use gump_scene::{Agent, AgentId, AgentKind, Frame, LaneId, MapGraph, SceneState, lanes_ahead};
+
+use crate::behaviour::reach::nearest;
 
 /// The agents and scenes that are compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -57,6 +61,36 @@ pub struct SceneMmd {
     pub velocity: Option<f64>,
     /// Of lengths and widths.
     pub size: Option<f64>,
+    /// Of the distances from bumper to bumper to the next vehicle ahead on its lanes, for vehicles in
+    /// a lane; 50 m if it is farther, or there is none.
+    pub gap: Option<f64>,
+    /// Of the numbers of vehicles in each lane that has any.
+    pub per_lane: Option<f64>,
+}
+
+impl SceneMmd {
+    /// The attributes in their order: `position`, `heading`, `velocity`, `size`, `gap`, `per_lane`.
+    pub fn values(&self) -> [Option<f64>; 6] {
+        [
+            self.position,
+            self.heading,
+            self.velocity,
+            self.size,
+            self.gap,
+            self.per_lane,
+        ]
+    }
+
+    fn of_values([position, heading, velocity, size, gap, per_lane]: [Option<f64>; 6]) -> Self {
+        Self {
+            position,
+            heading,
+            velocity,
+            size,
+            gap,
+            per_lane,
+        }
+    }
 }
 
 /// Compares the vehicles of a generated frame with those recorded at the present, without the ego.
@@ -70,7 +104,7 @@ pub fn scene_mmd(
     generated: &Frame,
     protocol: &MmdProtocol,
 ) -> Option<SceneMmd> {
-    let ego = recorded.ego_now();
+    let (ego, map) = (recorded.ego_now(), recorded.map);
     let recorded = vehicles(recorded.now(), ego, protocol);
     let generated = vehicles(generated, ego, protocol);
     if recorded.len() < protocol.min_vehicles.max(1) || generated.is_empty() {
@@ -91,7 +125,49 @@ pub fn scene_mmd(
         }),
         velocity: compare(&|a| pair(ego_from_world.rotate(a.state.velocity))),
         size: compare(&|a| [a.length, a.width]),
+        gap: mmd_squared(&gaps(map, &generated, ego), &gaps(map, &recorded, ego)),
+        per_lane: mmd_squared(&per_lane(map, &generated), &per_lane(map, &recorded)),
     })
+}
+
+/// Gaps are cut off at this distance, metres: half of the square that is compared, and at 50 km/h
+/// more than three seconds away.
+const MAX_GAP_M: f64 = 50.0;
+/// A vehicle is in the lane whose centre is nearest, within this, metres (half a lane), ...
+const IN_LANE_M: f64 = 1.75;
+/// ... if it heads along it within this, radians.
+const ALONG: f64 = std::f64::consts::FRAC_PI_6;
+
+/// The gap ahead of every vehicle that is in a lane, metres; the ego counts as a vehicle ahead.
+fn gaps(map: &MapGraph, vehicles: &[Agent], ego: &Agent) -> Vec<[f64; 1]> {
+    let gap = |vehicle: &Agent| {
+        let (lane, foot) = nearest(map, vehicle.state.pose, IN_LANE_M, ALONG)?;
+        let front = foot.arc_length + vehicle.length / 2.0;
+        let (reached, _) = lanes_ahead(map, lane, front, MAX_GAP_M);
+        let others = vehicles.iter().chain([ego]).filter(|o| o.id != vehicle.id);
+        let ahead = others.flat_map(|other| {
+            reached.iter().filter_map(move |part| {
+                let place = part.locate(other.state.pose.position);
+                // The centre of a vehicle ahead is beyond its own.
+                let is_ahead = place.ahead_m > -vehicle.length / 2.0;
+                let gap = place.ahead_m - other.length / 2.0;
+                (is_ahead && place.beside_m <= IN_LANE_M).then_some(gap.max(0.0))
+            })
+        });
+        Some([ahead.fold(MAX_GAP_M, f64::min)])
+    };
+    vehicles.iter().filter_map(gap).collect()
+}
+
+/// The number of vehicles in every lane that has any.
+fn per_lane(map: &MapGraph, vehicles: &[Agent]) -> Vec<[f64; 1]> {
+    let mut counts: BTreeMap<LaneId, f64> = BTreeMap::new();
+    for vehicle in vehicles {
+        if let Some((lane, _)) = nearest(map, vehicle.state.pose, IN_LANE_M, ALONG) {
+            *counts.entry(lane.id).or_default() += 1.0;
+        }
+    }
+    counts.into_values().map(|count| [count]).collect()
 }
 
 /// The vehicles that are compared, the nearest first.
@@ -153,16 +229,15 @@ pub fn mmd_squared<const D: usize>(a: &[[f64; D]], b: &[[f64; D]]) -> Option<f64
 /// Means over scenes, each attribute over the scenes that have it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MmdMean {
-    sums: [f64; 4],
-    counts: [usize; 4],
+    sums: [f64; 6],
+    counts: [usize; 6],
     scenes: usize,
 }
 
 impl MmdMean {
     /// Adds a scene.
     pub fn add(&mut self, scene: &SceneMmd) {
-        let values = [scene.position, scene.heading, scene.velocity, scene.size];
-        for (i, value) in values.into_iter().enumerate() {
+        for (i, value) in scene.values().into_iter().enumerate() {
             if let Some(value) = value {
                 self.sums[i] += value;
                 self.counts[i] += 1;
@@ -177,12 +252,7 @@ impl MmdMean {
             let n = self.counts[i];
             (n > 0).then(|| self.sums[i] / n as f64)
         };
-        SceneMmd {
-            position: of(0),
-            heading: of(1),
-            velocity: of(2),
-            size: of(3),
-        }
+        SceneMmd::of_values(std::array::from_fn(of))
     }
 
     /// Number of scenes added.
@@ -311,6 +381,31 @@ mod tests {
             assert_abs_diff_eq!(a, b, epsilon = 1e-9);
         }
         assert!(all(&plain).iter().all(|&x| x > 0.0));
+    }
+
+    #[test]
+    fn gaps_and_numbers_per_lane_are_those_of_lanes() {
+        let of = |agents: &str| {
+            let scenario = fixture::scenario(&format!(
+                "lane 1: -40,0 20,0 next 2\nlane 2: 20,0 200,0\nlane 3: -40,3.5 200,3.5\n\
+                 ego vehicle 0: 0,0 size 4,2\n{agents}"
+            ))
+            .unwrap();
+            let frame = scenario.present().now().clone();
+            let vehicles: Vec<Agent> = frame.agents()[1..].to_vec();
+            let flat = |values: Vec<[f64; 1]>| values.into_iter().flatten().collect::<Vec<f64>>();
+            let ego = scenario.present().ego_now();
+            (
+                flat(gaps(&scenario.map, &vehicles, ego)),
+                flat(per_lane(&scenario.map, &vehicles)),
+            )
+        };
+        // Behind the ego, before it on the next lane, alone beside it, and across.
+        let (gaps, counts) = of("agent vehicle 1: -10,0.5 size 4,2\n\
+             agent vehicle 2: 25,0 size 4,2\nagent vehicle 3: 40,0 size 6,2\n\
+             agent vehicle 4: 5,3.5 size 4,2\nagent vehicle 5: 60,0 heading 1.57 size 4,2");
+        assert_eq!(gaps, [6.0, 10.0, 15.0, 50.0]);
+        assert_eq!(counts, [1.0, 2.0, 1.0]);
     }
 
     #[test]

@@ -11,11 +11,12 @@ use serde::Serialize;
 
 use crate::EvalError;
 
-/// Length of the futures, seconds.
+/// Length of the futures, seconds: agents come and leave, and lights change, within it.
 const SECONDS: f64 = 30.0;
 /// Worlds are looked at as often as networks step, seconds.
 const DT: f64 = 0.5;
-/// Agents are counted up to this distance from the ego along either axis of the world, metres.
+/// Agents are counted up to this distance from the ego along either axis of the world, metres: a
+/// network's window of 100 m, which follows the ego every 20 m, always has it.
 const COUNTED_M: f64 = 80.0;
 
 /// Observations of one scene over half a minute.

@@ -14,15 +14,16 @@ use serde::Serialize;
 
 use crate::{EvalError, Monitor};
 
-/// Objects of the scenes that prompts are judged on.
+/// Objects of the scenes that prompts are judged on: a street with some of each. Chosen by hand.
 const PROMPTED: Counts = Counts {
     vehicles: 10,
     pedestrians: 4,
     bicycles: 3,
 };
-/// Seconds simulated of every scene, to see which tags hold and whether it stays free of overlaps.
+/// Seconds simulated of every scene, to see which tags hold and whether it stays free of overlaps:
+/// the horizon of Waymo's challenges.
 const JUDGED_S: f64 = 8.0;
-/// Unprompted scenes per map on which a tag is requested.
+/// Unprompted scenes per map on which a tag is requested. Chosen by hand.
 const UNPROMPTED: usize = 16;
 
 /// Settings of the prompted scenes.
@@ -82,7 +83,6 @@ pub struct PromptRow {
     pub log: f64,
 }
 
-/// A prompted scene.
 struct PromptedScene {
     tag: usize,
     holds: bool,
@@ -139,8 +139,8 @@ pub fn prompt_satisfaction(
         .into_par_iter()
         .filter_map(|i| {
             let order = order(shuffled[i % shuffled.len()], None, once(config));
-            let made = make(worlds, &order, i as u64, seed.fork(8)).ok()?;
-            Some(tags::extract_tags(&made.scenario))
+            let checked = make(worlds, &order, i as u64, seed.fork(8)).ok()?;
+            Some(tags::extract_tags(&checked.scenario))
         })
         .collect();
     let logged: Vec<Vec<ScenarioTag>> = scenarios.par_iter().map(tags::extract_tags).collect();
@@ -212,15 +212,15 @@ fn make_prompted(
 ) -> PromptedScene {
     let prompt = order.request.prompts[0];
     match make(worlds, order, number, seed) {
-        Ok(made) => PromptedScene {
+        Ok(checked) => PromptedScene {
             tag,
-            holds: made.holds(),
-            is_tag: tags::holds(prompt, &made.scenario) == Some(true),
-            is_clear: stays_clear(&made.clauses),
-            first: made.first_satisfied,
-            attempts: made.attempts,
-            is_steered: made.is_steered,
-            moment_s: made.moment_s,
+            holds: checked.holds(),
+            is_tag: tags::holds(prompt, &checked.scenario) == Some(true),
+            is_clear: stays_clear(&checked.clauses),
+            first: checked.first_satisfied,
+            attempts: checked.attempts,
+            is_steered: checked.is_steered,
+            moment_s: checked.moment_s,
         },
         Err(_) => PromptedScene {
             tag,

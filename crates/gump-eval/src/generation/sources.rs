@@ -10,7 +10,7 @@ use gump_metrics::mmd::{MmdProtocol, scene_mmd};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario, Seed};
 use rand::Rng as _;
 
-/// Draws of a moment and a vehicle per scene that is to be found in a recording.
+/// Draws of a moment and a vehicle per scene that is to be found in a recording. Chosen by hand.
 const TRIES: usize = 20;
 
 /// A source of scenes.

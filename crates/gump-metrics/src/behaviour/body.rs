@@ -11,11 +11,12 @@ const HARD: f64 = 8.0;
 /// Half of the time over which a velocity is measured, and half of that between two of them,
 /// seconds. An error of 5 cm in positions then gives an acceleration of 0.4 m/s².
 const REACH_S: f64 = 0.25;
-/// Events separated by less than this are one event, seconds.
+/// Events separated by less than this are one event, seconds: the time over which one is measured.
 const APART_S: f64 = 0.5;
-/// A vehicle that moves sideways faster than this slips, m/s.
+/// A vehicle that moves sideways faster than this slips, m/s: recorded vehicles do for less than
+/// 0.1 % of the time (docs/results/0018-frozen-sets.md). Chosen by hand.
 const SLIDES: f64 = 0.5;
-/// Slip for at least this long is an incident, seconds.
+/// Slip for at least this long is an incident, seconds: not a jump of a box. Chosen by hand.
 const SLIDE_S: f64 = 0.3;
 
 impl Counter<'_> {

@@ -6,18 +6,29 @@
 //! is not green, a stop line, a stop sign or the end of the road; an intersection is within 15 m
 //! and within 50 m an agent on another path approaches. A stop is free if there is no reason at its
 //! start, at its end or in between.
+//!
+//! `relative/waiting.rs` of `gump-engine` and `reason.rs` of `gump-generate` ask similar questions of
+//! standing vehicles. A metric must not count stops that a driver might make, so the reasons here
+//! are the most, and reach farthest:
+//!
+//! * Stop lines, stop signs without lanes and the end of the road are reasons nowhere else.
+//! * Agents are reasons up to 15 m ahead (12 m for draws, 5 m for starts) and people up to 3 m beside
+//!   the path, because one may stop for somebody who only might step onto it.
+//! * A junction is a reason only while somebody approaches it: for draws it always is, because
+//!   nothing is known of the motion of what is not drawn yet, and for starts it never is by itself.
+//! * Only vehicles are judged, and not on bicycle lanes.
 
 use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
-use gump_scene::{
-    Agent, AgentKind, Frame, LaneAhead, LightState, MapGraph, lanes_ahead, stop_line,
-};
+use gump_scene::{Agent, AgentKind, Frame, LaneAhead, LightState, MapGraph, lanes_ahead};
 
 use super::reach::nearest;
 use super::track::Track;
 use super::{Counter, MOVES, STANDS};
 
+// Bounds are chosen by hand and generous: what may be a reason counts as one. The logs of
+// recorded/tune and recorded/test have no free stop with them.
 /// A vehicle farther than this beside the centre line is not on the lane, metres.
 const ON_LANE_M: f64 = 1.0;
 /// Distance ahead of the front bumper within which agents are considered, and lights, signs and the
@@ -76,23 +87,21 @@ fn has_no_reason(
 
 /// A light that is not green, a stop line or a stop sign.
 fn is_ruled(map: &MapGraph, frame: &Frame, part: &LaneAhead<'_>) -> bool {
-    let line = &part.lane.centerline;
-    let is_ahead = |arc_m: f64| (-BEHIND_M..=ROAD_M).contains(&(part.base_m + arc_m));
+    let is_ahead = |metres: f64| (-BEHIND_M..=ROAD_M).contains(&metres);
     let light = frame.light(part.lane.id).is_some_and(|light| {
-        let at = line.project(stop_line(part.lane, light).position);
-        light.state != LightState::Green && is_ahead(at.arc_length)
+        light.state != LightState::Green && is_ahead(part.metres_to_stop_line(light))
     });
     let stop = map.stop_lines(part.lane.id).next().is_some();
     light
         || stop
         || map.stop_signs().iter().any(|sign| {
-            let at = line.project(sign.position.truncate());
+            let place = part.locate(sign.position.truncate());
             let rules = if sign.lanes.is_empty() {
-                at.distance <= SIGN_M
+                place.beside_m <= SIGN_M
             } else {
                 sign.lanes.contains(&part.lane.id)
             };
-            rules && is_ahead(at.arc_length)
+            rules && is_ahead(place.ahead_m)
         })
 }
 
@@ -103,14 +112,13 @@ fn is_in_way(part: &LaneAhead<'_>, other: &Agent, width: f64) -> bool {
     let own = other.oriented_box();
     let corners = own.corners().into_iter();
     // Far boxes need no corners.
-    let centre = part.lane.centerline.project(other.state.pose.position);
-    if centre.distance > within + other.length.hypot(other.width) / 2.0 {
+    let centre = part.locate(other.state.pose.position);
+    if centre.beside_m > within + other.length.hypot(other.width) / 2.0 {
         return false;
     }
     corners.chain([other.state.pose.position]).any(|point| {
-        let at = part.lane.centerline.project(point);
-        let ahead = part.base_m + at.arc_length;
-        at.distance <= within && (-BEHIND_M..=OTHERS_M).contains(&ahead)
+        let place = part.locate(point);
+        place.beside_m <= within && (-BEHIND_M..=OTHERS_M).contains(&place.ahead_m)
     })
 }
 

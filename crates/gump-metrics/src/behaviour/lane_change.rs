@@ -9,13 +9,15 @@ use super::reach::{along, nearest};
 use super::track::Track;
 use super::{Class, Counter, Measure, vehicles};
 
-/// Interval at which the lane of a vehicle is determined, seconds.
+/// Interval at which the lane of a vehicle is determined, seconds: a change takes several. Chosen
+/// by hand, as what follows.
 const LOOK_S: f64 = 0.5;
 /// Number of intervals for which a lane must be held before and after the change: a second.
 const HELD: usize = 2;
-/// A vehicle stays on its lane until it is this many lane widths beside the centre line.
+/// A vehicle stays on its lane until it is this many lane widths beside the centre line: beyond the
+/// border at 0.5, so that one on the line does not go back and forth.
 const KEEP: f64 = 0.6;
-/// Distance of adjacent lanes, metres.
+/// Distance of adjacent lanes, metres: from narrow ones to wide ones with a strip between.
 const BESIDE_M: std::ops::RangeInclusive<f64> = 2.0..=6.0;
 /// A vehicle that moves less than this does not change lanes, metres.
 const SHORT_M: f64 = 5.0;

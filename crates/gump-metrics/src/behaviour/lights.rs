@@ -13,12 +13,14 @@ use super::{Class, Counter, Measure, vehicles};
 use crate::red_light::passes;
 
 /// Lines passed within this time of the first belong to one passage, seconds: the lanes that fork
-/// from an approach have a line each.
+/// from an approach have a line each. Chosen by hand, as what follows.
 const ONE_PASSAGE_S: f64 = 1.0;
-/// The time, or distance, after which the followed lane is determined: seconds, metres.
+/// The time, or distance, after which the followed lane is determined, seconds, metres: by then
+/// lanes that fork have parted.
 const FOLLOWED_S: f64 = 2.0;
 const FOLLOWED_M: f64 = 8.0;
-/// Weight of a radian of difference in heading, in metres, when the followed lane is determined.
+/// Weight of a radian of difference in heading, in metres, when the followed lane is determined: a
+/// right angle weighs more than a lane's width.
 const M_PER_RADIAN: f64 = 3.0;
 
 /// A light that controls a lane, frame by frame.
@@ -116,6 +118,31 @@ impl Counter<'_> {
             }
         }
         Some(last)
+    }
+
+    /// Of lights whose colour is known in the present: a world shows lights for ever that a recording
+    /// sees for a moment.
+    pub(super) fn light_changes(&mut self) {
+        let known = |state: Option<LightState>| state.filter(|s| *s != LightState::Unknown);
+        let (mut seen, mut red, mut changes) = (0, 0, 0);
+        for gate in gates(self.map, self.take) {
+            if known(gate.states[self.take.now]).is_none() {
+                continue;
+            }
+            for k in self.take.ahead() {
+                let Some(now) = known(gate.states[k]) else {
+                    continue;
+                };
+                seen += 1;
+                red += usize::from(now == LightState::Red);
+                changes += usize::from(known(gate.states[k - 1]).is_some_and(|was| was != now));
+            }
+        }
+        if seen > 0 {
+            let (minutes, all) = (self.minutes(seen), seen as f64);
+            self.add(Measure::LightChange, Class::Light, changes as f64, minutes);
+            self.add(Measure::LightRed, Class::Light, red as f64, all);
+        }
     }
 
     pub(super) fn conflicting_greens(&mut self) {

@@ -29,11 +29,15 @@ pub enum Measure {
     Standing,
     /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
+    /// A light changes its colour.
+    LightChange,
+    /// A light is red.
+    LightRed,
 }
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::ParkedMove,
         Self::FreeRoadStop,
         Self::NewOverlap,
@@ -44,6 +48,8 @@ impl Measure {
         Self::SetOff,
         Self::Standing,
         Self::ConflictingGreen,
+        Self::LightChange,
+        Self::LightRed,
     ];
 
     /// Name in reports, `snake_case`.
@@ -59,6 +65,8 @@ impl Measure {
             Self::SetOff => "set_off",
             Self::Standing => "standing",
             Self::ConflictingGreen => "conflicting_green",
+            Self::LightChange => "light_change",
+            Self::LightRed => "light_red",
         }
     }
 
@@ -74,6 +82,8 @@ impl Measure {
             Self::FreeRoadStop | Self::LaneChange => "minute of moving",
             Self::NewOverlap | Self::Standing => "agent",
             Self::HardAcceleration | Self::SetOff => "minute",
+            Self::LightChange => "minute of a light",
+            Self::LightRed => "time of a light",
             Self::Slip => "time of moving",
             Self::RedLight => "passage of a light",
             Self::ConflictingGreen => "time of crossing lights",

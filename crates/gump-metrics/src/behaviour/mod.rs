@@ -16,6 +16,8 @@
 //! | `set_off` | who stood for a second goes faster than 1 m/s | minute that agents are there |
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
+//! | `light_change` | a light that controls a lane of the map, and whose colour is known in the present, changes it | minute that its colour is known |
+//! | `light_red` | such a light is red | time that its colour is known |
 //!
 //! To *stand* is to move less than 0.3 m within a second, to *move* more than 1 m. Speeds are
 //! computed from positions, not from velocities that a tracker or a network states. Counted are
@@ -65,12 +67,14 @@ pub use conduct::{Conduct, Deed, Judged, judge};
 pub use measure::{Class, Count, Incident, Key, Measure, Seen, Tally};
 use track::{Take, Track};
 
-/// Times at which standing agents are counted, seconds after the present.
+/// Times at which standing agents are counted, seconds after the present: denser at first, up to
+/// the horizons of 8, 30 and 60 s that are evaluated.
 pub const MOMENTS: [u32; 8] = [2, 4, 8, 10, 20, 30, 40, 60];
 
-/// An agent slower than this stands, m/s.
+/// An agent slower than this stands, m/s: a tracker's jitter of 10 cm is 0.1 m/s over a second.
 const STANDS: f64 = 0.3;
-/// An agent faster than this moves, m/s. Between the two it neither stands nor moves.
+/// An agent faster than this moves, m/s, a slow walk. Between the two it neither stands nor moves,
+/// so that who creeps does not start and stop all the time. Chosen by hand.
 const MOVES: f64 = 1.0;
 
 /// Counts events in the futures of one scenario.
@@ -145,6 +149,7 @@ impl<'a> Behaviour<'a> {
         counter.lane_changes();
         counter.red_lights();
         counter.conflicting_greens();
+        counter.light_changes();
         let mut seen = counter.seen;
         seen.incidents.sort_by(|a, b| {
             (a.measure, a.agent)

@@ -10,11 +10,14 @@ use crate::behaviour::track::Track;
 
 /// Tolerance for the jitter of a standing vehicle's box, metres.
 const DRIFT_M: f64 = 0.5;
-/// A parked vehicle farther than this from its place has moved, metres.
+/// A parked vehicle farther than this from its place has moved, metres: well beyond jitter, half a
+/// car's length. Chosen by hand.
 const AWAY_M: f64 = 2.0;
-/// Share of the log in which a parked vehicle must be observed.
+/// Share of the log in which a parked vehicle must be observed; with less, it may have arrived or
+/// left unseen. Chosen by hand.
 const SEEN_SHARE: f64 = 0.5;
-/// Duration of standing, after [`Track::pace`] first shows it, that makes a stop, seconds.
+/// Duration of standing, after [`Track::pace`] first shows it, that makes a stop, seconds: not a
+/// brief halt. Chosen by hand.
 const STOP_S: f64 = 1.0;
 
 /// Vehicles of the present that stand for the whole log, as far as they are observed.

@@ -275,6 +275,29 @@ fn red_lights_are_those_of_the_lane_that_is_followed() {
 }
 
 #[test]
+fn lights_that_change_count_per_minute_of_a_light() {
+    let mut scenario = scenario(&format!("{ROAD}light 1 red: 40,0"));
+    let now = scenario.now;
+    // Unknown for a second, then green for two, yellow for three, and red to the end.
+    for (k, frame) in scenario.log[now + 1..].iter_mut().enumerate() {
+        let state = match k {
+            0..10 => LightState::Unknown,
+            10..30 => LightState::Green,
+            30..60 => LightState::Yellow,
+            _ => LightState::Red,
+        };
+        let mut light = frame.lights()[0];
+        light.state = state;
+        *frame = Frame::new(frame.agents().to_vec(), vec![light]);
+    }
+    let tally = Behaviour::new(&scenario, 8).log().tally;
+    let changes = tally.count(Measure::LightChange, Class::Light, 8);
+    let red = tally.count(Measure::LightRed, Class::Light, 8);
+    assert_eq!((changes.events, red.events, red.of), (2.0, 20.0, 70.0));
+    assert!((changes.of * 60.0 - 7.0).abs() < 1e-9, "{changes:?}");
+}
+
+#[test]
 fn lane_changes_go_to_the_lane_beside() {
     let lanes = "lane 1: -50,0 60,0 next 3
         lane 2: -50,3.5 60,3.5 next 4

@@ -13,11 +13,13 @@ use crate::encounter::classify;
 /// Shallower overlaps do not count, metres: they are within tracker errors.
 const DEEP_M: f64 = 0.1;
 /// An agent slower than this stands and runs into no other, m/s: trackers have as much jitter.
+/// (nuPlan's bound of 0.05 is for simulated motion.)
 const STANDS: f64 = 0.3;
 /// The ego keeps its lane within this distance of the centre line, metres: a car of 2 m is then
 /// still on a lane of usual width.
 const KEEPS_M: f64 = 0.9;
-/// Boxes farther above one another do not meet, metres: bridges are higher.
+/// Boxes farther above one another do not meet, metres: bridges are higher, slopes within a box's
+/// length lower.
 const ABOVE_M: f64 = 3.0;
 /// Distance of a car's rear axle behind its centre, as a share of its length.
 ///

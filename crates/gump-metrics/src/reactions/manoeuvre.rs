@@ -10,31 +10,36 @@ use super::{Reactions, Reason};
 use crate::behaviour::reach;
 use crate::red_light::passes;
 
-/// An ego slower than this cannot perform a change of speed, m/s.
+/// An ego slower than this cannot perform a change of speed, m/s: it would stand within a second.
+/// Chosen by hand.
 const DRIVES: f64 = 3.0;
-/// A comfortable to firm braking and an emergency, m/s².
+/// A comfortable to firm braking and an emergency, m/s². Chosen by hand.
 const BRAKES: f64 = 3.0;
 const STOPS: f64 = 6.0;
-/// A brisk acceleration, m/s², and the increase in speed, m/s.
+/// A brisk acceleration, m/s², and the increase in speed, m/s. Chosen by hand.
 const GAINS: f64 = 2.0;
 const FASTER: f64 = 5.0;
-/// The minimum final speed of an ego that runs a light, m/s.
+/// The minimum final speed of an ego that runs a light, m/s: a usual one in towns. Chosen by hand.
 const RUNS: f64 = 8.0;
-/// A log whose speed falls below this has stopped, m/s.
+/// A log whose speed falls below this has stopped, m/s: above the jitter of trackers.
 const HAS_STOPPED: f64 = 0.5;
-/// A slower ego would have to turn by more than 24 degrees to change lane in time, m/s.
+/// A slower ego would have to turn by more than 24 degrees to change lane in time, m/s. First 3,
+/// raised after a look at cases (docs/results/0024-reactions.md).
 const CHANGES: f64 = 5.0;
-/// Duration of a lane change, seconds.
+/// Duration of a lane change, seconds: a quick one, which presses who is behind. Chosen by hand.
 const CHANGE_S: f64 = 3.0;
-/// Distance of adjacent lanes, metres.
+/// Distance of adjacent lanes, metres: from narrow ones to wide ones with a strip between.
 const BESIDE_M: std::ops::RangeInclusive<f64> = 2.0..=6.0;
-/// Maximum distance of the ego from its lane's centre line at the start of a change, metres.
+/// Maximum distance of the ego from its lane's centre line at the start of a change, metres:
+/// somewhere on a wide lane.
 const ON_LANE_M: f64 = 2.5;
 /// Free space that a lane change needs before and behind the ego, metres, and additional space
-/// behind it per difference in speed, seconds: it must be free until the change is complete.
+/// behind it per difference in speed, seconds: it must be free until the change is complete. First
+/// one second, raised with the speed above.
 const ROOM_M: f64 = 2.0;
 const ROOM_S: f64 = CHANGE_S;
-/// A motion shorter than this between two frames has no direction, metres.
+/// A motion shorter than this between two frames has no direction, metres: a tenth of a
+/// metre per second at 10 Hz, measured over two frames.
 const STILL_M: f64 = 0.02;
 
 /// A manoeuvre of the ego.

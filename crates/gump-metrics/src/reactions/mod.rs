@@ -68,7 +68,8 @@ use gump_scene::{AgentId, AgentState, Rollout, Scenario};
 pub use contact::{Contact, Outcome};
 pub use manoeuvre::Manoeuvre;
 
-/// A manoeuvre that stays nearer to the log than this does not leave it, metres.
+/// A manoeuvre that stays nearer to the log than this does not leave it, metres: about a lane's
+/// width. Chosen by hand.
 const LEAVES_M: f64 = 3.0;
 
 /// Why a scenario cannot be used.

@@ -3,6 +3,7 @@
 use gump_geometry::OrientedBox;
 use gump_scene::{Agent, AgentId, AgentState, Scenario};
 
+// Chosen by hand: whoever would have to react, and few besides; the same agents for every world.
 /// An agent that moves less than this from its place in the log stands, metres.
 const MOVES_M: f64 = 1.0;
 /// Maximum distance, box to box, of an agent from a place that the ego occupies, metres.

@@ -7,6 +7,7 @@ use gump_scene::{AgentState, Lane, MapGraph};
 
 use crate::behaviour::reach;
 
+// Chosen by hand.
 /// Positions of the log nearer than this to the last one used are jitter, metres.
 const SPACING_M: f64 = 0.5;
 /// A lane farther than this beside the path does not continue it, metres.

@@ -182,7 +182,8 @@ impl Measure {
         Self::ALL.into_iter().find(|measure| measure.name() == name)
     }
 
-    /// Lower and upper end of its bins, and their number. Shares have two bins: no and yes.
+    /// Lower and upper end of its bins, and their number. Shares have two bins: no and yes. Ranges
+    /// are chosen by hand; stored targets have these bins.
     pub fn bins(self) -> (f64, f64, usize) {
         match self {
             Self::Standing

@@ -56,9 +56,9 @@ pub struct Statistics {
     counted: BTreeMap<(Measure, Class), Distribution>,
 }
 
-/// One distribution.
+/// The distribution of a measure over a class of agents.
 #[derive(Clone, Debug)]
-pub struct Row<'a> {
+pub struct MeasuredDistribution<'a> {
     /// The measure.
     pub measure: Measure,
     /// The class.
@@ -119,8 +119,8 @@ impl Statistics {
     }
 
     /// All distributions, by measure and class.
-    pub fn rows(&self) -> Vec<Row<'_>> {
-        let row = |(&(measure, class), distribution)| Row {
+    pub fn rows(&self) -> Vec<MeasuredDistribution<'_>> {
+        let row = |(&(measure, class), distribution)| MeasuredDistribution {
             measure,
             class,
             distribution,

@@ -9,6 +9,8 @@ use gump_scene::{Agent, AgentId, AgentKind, Scenario};
 use super::surroundings::{note_place, note_road, note_room};
 use super::{Class, Measure as M, Statistics};
 
+// Definitions of the measures. Chosen by hand; `configs/targets/waymo-like.toml` was counted with
+// them and has to be counted anew if they change.
 /// Slower agents stand, m/s.
 pub(super) const STANDING: f64 = 0.3;
 /// A track that is ever faster than this drives, m/s.

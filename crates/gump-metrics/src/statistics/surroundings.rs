@@ -7,6 +7,7 @@ use super::observe::STANDING;
 use super::{Class, Measure as M, Statistics};
 use crate::signed_distance_to_road_edge;
 
+// Definitions of the measures, chosen by hand: see `observe.rs`.
 /// An agent farther than this from the centre of any lane is off the lanes, metres.
 const OFF_LANE: f64 = 2.0;
 /// Distance from a lane centre within which a moving agent is on the lane, metres.

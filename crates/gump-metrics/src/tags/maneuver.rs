@@ -6,6 +6,7 @@ use gump_scene::{Agent, Lane, MapGraph};
 
 use super::situation::{View, is_on_intersection, lane_of};
 
+// Chosen by hand, where nuPlan publishes no numbers.
 /// Time window around the present in which entering an intersection counts, seconds.
 const ENTRY_S: [f64; 2] = [0.5, 1.0];
 /// A smaller change of heading is not a turn, radians (30 degrees).

@@ -12,6 +12,7 @@ use gump_scene::{
 use super::maneuver::{Turn, lane_change, turn};
 use crate::kinematics;
 
+// Chosen by hand, where nuPlan publishes no numbers.
 /// Maximum lateral offset of an agent in the ego's path, metres.
 const CORRIDOR: f64 = 1.5;
 /// Search distance for a leader ahead, metres.

@@ -283,17 +283,18 @@ fn gain(rows: &[Value]) -> Value {
 fn row(source: SceneSource, tally: &GenerationTally, prompt_satisfaction: Option<f64>) -> Value {
     let mean = tally.mean();
     let rate = |n: usize, of: usize| n as f64 / of.max(1) as f64;
-    json!({
-        "source": source.name(),
-        "position": mean.position,
-        "heading": mean.heading,
-        "speed": mean.velocity,
-        "size": mean.size,
-        "overlap_rate": rate(tally.overlapping, tally.vehicles),
-        "offroad_rate": rate(tally.off_road, tally.vehicles),
-        "wrong_way_rate": rate(tally.wrong_way, tally.moving),
-        "prompt_satisfaction": prompt_satisfaction,
-        "scenes": tally.mmd.len(),
-        "failed": tally.failed,
-    })
+    let mut row = Map::from_iter([("source".to_owned(), json!(source.name()))]);
+    for (name, value) in ATTRIBUTES.iter().zip(mean.values()) {
+        row.insert((*name).to_owned(), json!(value));
+    }
+    let rates = [
+        ("overlap_rate", rate(tally.overlapping, tally.vehicles)),
+        ("offroad_rate", rate(tally.off_road, tally.vehicles)),
+        ("wrong_way_rate", rate(tally.wrong_way, tally.moving)),
+    ];
+    row.extend(rates.map(|(name, value)| (name.to_owned(), json!(value))));
+    row.insert("prompt_satisfaction".to_owned(), json!(prompt_satisfaction));
+    row.insert("scenes".to_owned(), json!(tally.mmd.len()));
+    row.insert("failed".to_owned(), json!(tally.failed));
+    Value::Object(row)
 }
