@@ -19,7 +19,7 @@ use gump_scene::Seed;
 
 use crate::nucleus::{least_kept, uniform};
 
-/// Number of frames kept of an agent: the present and its past.
+/// Number of frames kept of an agent: the present and all that the network attends to.
 pub(super) const KEPT: usize = PAST + 1;
 
 /// The network with packed weights.

@@ -16,19 +16,24 @@ use gump_scene::{
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 
-/// Below this speed braking has no effect, metres per second.
+// The thresholds are chosen by hand; none has been varied in a measurement.
+
+/// A slower vehicle is not braked, and one that braking makes slower stands, metres per second: a
+/// quarter of a metre in a step.
 const CREEPING: f64 = 0.5;
-/// Distance that a front bumper may be over a line before it counts as passed, metres.
+/// Distance that a front bumper may be over a line before it counts as passed, metres: a vehicle
+/// that stopped a little late still waits.
 const OVER_M: f64 = 0.5;
-/// Lines of one junction lie within this, metres.
+/// Lines of one junction lie within this, metres: those of neighbouring lanes may be staggered.
 const ONE_LINE_M: f64 = 4.0;
-/// A path that turns right by more than this is a right turn, radians.
+/// A path that turns right by more than this is a right turn, radians (30 degrees).
 const RIGHT: f64 = 0.52;
-/// A vehicle slower than this may turn right at red, metres per second.
+/// A vehicle slower than this may turn right at red, metres per second: slowed to a fast walk. A
+/// full stop is not demanded.
 const TURNS_AT_RED: f64 = 2.0;
 /// Braking for a light begins where this deceleration is sufficient, metres per second squared, ...
 const GENTLY: f64 = 4.0;
-/// ... and never exceeds this.
+/// ... and never exceeds this, below the 8 of a dry road: a vehicle that would need more drives on.
 const HARDEST: f64 = 6.0;
 
 /// Draws the moves of agents, given by index, again for an attempt.
@@ -93,6 +98,7 @@ impl StopLine {
     fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
         let half = now.body.length / 2.0;
         let to = now.pose * step;
+        // Within 60 degrees of the lane: others cross or leave it.
         let along = to.direction().dot(self.line.direction()) > 0.5;
         let ahead = |pose: Pose| self.line.inverse() * (pose.position + pose.direction() * half);
         let (before, after) = (ahead(now.pose), ahead(to));
@@ -187,7 +193,7 @@ pub(super) fn obey_lights(
     }
 }
 
-/// The attempt of [`start`], apart from those of other rules.
+/// The attempt of [`start`], beyond those of other rules, which count from 0.
 const STARTS: usize = 1 << 10;
 
 /// Draws the moves of agents that stand although nothing holds them once more. More draws would

@@ -35,12 +35,13 @@ use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
 };
 use crate::relative::seen::{Seen, add_presents};
-use crate::relative::waiting::{Standing, free_to_go};
+use crate::relative::waiting::{OPEN_S, Standing, free_to_go};
 use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
 
-/// Radius of the map around the ego, metres.
+/// Radius of the map around the ego, metres: `FOLLOW_M` and 120 m beyond, so that it reaches around
+/// an ego at that limit. Not tuned.
 pub const MAP_M: f64 = 300.0;
 
 /// Maximum known time since a light changed, seconds: the length of the training scenes.
@@ -48,17 +49,20 @@ const REMEMBERED_S: f64 = 9.0;
 
 /// Maximum time for which an agent in a lane is shown as standing, seconds. Training scenes last
 /// nine seconds: vehicles that stood throughout were usually parked, and stayed. In a long rollout
-/// vehicles that wait at a junction would look like parked ones and never start.
+/// vehicles that wait at a junction would look like parked ones and never start. With 1 s, twice as
+/// many run red lights (result 23).
 const WAITED_S: f64 = 4.0;
 /// An agent that has stood in a lane for longer than this although nothing holds it is shown as
 /// having stood for [`RELEASED_S`], and under rules it is redrawn once if it stays, seconds. Longer
 /// than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute (result 23).
 const PATIENCE_S: f64 = 9.0;
+/// Not varied there: as if it had just stopped, seconds.
 const RELEASED_S: f64 = 1.0;
-/// An agent that was faster than this is not parked, metres per second.
+/// An agent that was faster than this is not parked, metres per second: more than the jitter of
+/// recorded boxes. Chosen by hand (decision 26).
 const DRIVES: f64 = 2.0;
 /// An agent this near to a lane's centre, and this well aligned with it, stands in the lane:
-/// metres, radians.
+/// metres, radians; as in `waiting`. Otherwise it is taken for parked. Chosen by hand.
 const IN_LANE: (f64, f64) = (1.0, 0.35);
 
 /// Maximum distance of the ego from the centre of the prepared map, metres: more than in 8 s of
@@ -71,12 +75,12 @@ const FOLLOW_M: f64 = 180.0;
 const TOP_P: f64 = 0.95;
 
 /// Maximum number of futures that are computed together: with more, the weights are already loaded
-/// rarely enough, and the data no longer fits a core's cache.
+/// rarely enough, and the data no longer fits a core's cache. Results do not depend on it.
 const TOGETHER: usize = 8;
 
-/// Separates the streams of redraws from those of fields.
+/// Separates the streams of redraws from those of fields, which are few, ...
 const REDRAW: u64 = 1 << 20;
-/// Separates the streams of predictive samples.
+/// ... and those of predictive samples from both.
 const WATCH: u64 = 1 << 40;
 
 /// Settings of rollouts.
@@ -551,7 +555,8 @@ impl Future {
         let mut is_one_waiting = false;
         for member in &mut self.members {
             member.could_go = false;
-            is_one_waiting |= member.waited > PATIENCE_S;
+            let has_stopped = member.has_driven && member.waited > OPEN_S;
+            is_one_waiting |= has_stopped || member.waited > PATIENCE_S;
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
