@@ -5,7 +5,7 @@ use gump_rollout::{PredictiveSamples, ProbeConfig};
 use gump_scene::{Rollout, Scenario};
 use gump_viz::{HeatMap, MetricTrack, Viewer};
 
-/// Draws per agent and step of a heat map.
+/// Draws per agent and step of a heat map: smooth enough to the eye. Chosen by eye.
 const DRAWS: usize = 128;
 
 /// Shows how plausible the futures of the agents near the ego are, and what the challenge measures

@@ -14,14 +14,14 @@ use crate::machine::repository;
 use crate::run::{Run, Unseen};
 
 /// Default output folder of `data benchmark`.
-const MADE: &str = "out/data-benchmark";
+const GENERATED: &str = "out/data-benchmark";
 
 /// Finds the scenarios of `--scenarios`.
 ///
 /// Error: as [`ScenarioSetName::find`].
 pub(crate) fn find(run: &mut Run, name: &ScenarioSetName) -> anyhow::Result<ScenarioSet> {
     let folders = BenchmarkFolders {
-        made: MADE.into(),
+        generated: GENERATED.into(),
         recorded: recorded_data(),
     };
     run.phase("find", |_| Ok(name.find(&folders, &Unseen)?))

@@ -35,7 +35,6 @@ pub(crate) fn planner() -> impl TypedValueParser<Value = PlannerName> {
 /// A planner: one of ours, or a process that serves nuPlan's planner protocol.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Chosen {
-    /// One of ours.
     Ours(PlannerName),
     /// The one at `HOST:PORT`.
     Remote(String),

@@ -9,7 +9,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::run::{interrupted, print_error};
 
-/// Seconds between lines where there is no terminal.
+/// Time between lines where there is no terminal: seen soon, and a log of an hour stays short.
+/// Chosen by hand.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
 /// Progress of one piece of work; may be advanced from many threads.

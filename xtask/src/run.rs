@@ -109,7 +109,7 @@ fn quietly<T, E: std::fmt::Display>(open: impl FnOnce() -> Result<T, E>) -> Resu
     Err(first.unwrap_or("it does not say why").to_owned())
 }
 
-/// Columns of a terminal that tables fit into.
+/// Columns of a terminal that tables fit into: a usual wide one. Chosen by hand.
 const WIDTH: usize = 120;
 
 /// A run in progress.

@@ -33,7 +33,7 @@ pub(crate) fn text(results: &Value, width: usize) -> String {
     text
 }
 
-/// Rows of a table shown on a terminal.
+/// Rows of a table shown on a terminal: about a screen. Chosen by hand.
 const MAX_ROWS: usize = 40;
 
 type Rows = Vec<Vec<String>>;
@@ -200,7 +200,7 @@ fn shortened(name: &str) -> String {
     }
 }
 
-/// Characters of a column's name where there is little room.
+/// Characters of a column's name where there is little room. Chosen by eye.
 const LONGEST_NAME: usize = 24;
 
 fn width_of(rows: &Rows) -> usize {

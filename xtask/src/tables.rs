@@ -3,7 +3,7 @@
 
 use gump_data::Table;
 use gump_metrics::{ALL, average_displacement, over_rollout};
-use gump_nuplan::metrics::{MetricScores, Row, ScenarioScores, Scoring};
+use gump_nuplan::metrics::{AggregateRow, MetricScores, ScenarioScores, Scoring};
 use gump_scene::{Agent, AgentId, Rollout, Scenario};
 use rayon::prelude::*;
 use serde_json::Value;
@@ -119,7 +119,7 @@ impl NuPlan {
             score: d.score,
             metrics: d.metrics.clone(),
         });
-        let summed = |name: &str, row: &Row| NuPlanRow {
+        let summed = |name: &str, row: &AggregateRow| NuPlanRow {
             scenario: name.into(),
             log_name: None,
             scenario_type: name.into(),

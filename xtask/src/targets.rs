@@ -7,7 +7,9 @@ use std::io::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
-use gump_metrics::statistics::{Distribution, Measure, Row, Statistics, class_name, class_of_name};
+use gump_metrics::statistics::{
+    Distribution, Measure, MeasuredDistribution, Statistics, class_name, class_of_name,
+};
 use serde::{Deserialize, Serialize};
 
 /// The file: how many scenes were measured, then one entry per measure and class.
@@ -101,7 +103,7 @@ pub(crate) fn write(path: &Path, provenance: &str, statistics: &Statistics) -> a
     })
 }
 
-fn target(row: &Row<'_>) -> Target {
+fn target(row: &MeasuredDistribution<'_>) -> Target {
     let counts = row.distribution.counts();
     let used = counts
         .iter()

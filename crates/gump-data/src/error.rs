@@ -9,7 +9,7 @@ use gump_scene::{MapError, ScenarioError};
 
 /// The location of a record: its file, index and offset.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct RecordLocation {
     /// Index of the record in its file, from 0.
     pub record: usize,
     /// Start of the record, bytes from the start of the (uncompressed) content.
@@ -18,7 +18,7 @@ pub struct Place {
     pub path: PathBuf,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for RecordLocation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (record, offset) = (self.record, self.offset);
         write!(
@@ -157,7 +157,7 @@ pub enum DataError {
         /// Bytes present.
         found: u64,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A checksum does not match.
     #[error("expected checksum {expected:#010x} of {part}, found {found:#010x}: {place}")]
@@ -169,7 +169,7 @@ pub enum DataError {
         /// The computed checksum.
         found: u32,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A record has an implausible length.
     #[error("expected a record of at most {limit} bytes, found a length of {length}: {place}")]
@@ -179,7 +179,7 @@ pub enum DataError {
         /// The length found, bytes.
         length: u64,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A file of the cache is damaged, truncated or of another version.
     #[error("expected {expected}, found {found}: at byte {offset} of {}", path.display())]
@@ -217,7 +217,7 @@ pub enum DataError {
         /// The decoder's message.
         source: prost::DecodeError,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A message contains an invalid value.
     #[error("expected {expected}, found {found}: {place}")]
@@ -227,7 +227,7 @@ pub enum DataError {
         /// The content found.
         found: String,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A record can be decoded but is not a usable scenario.
     #[error("scenario {id}: {problem}: {place}")]
@@ -237,7 +237,7 @@ pub enum DataError {
         /// The problem.
         problem: Problem,
         /// The record.
-        place: Place,
+        place: RecordLocation,
     },
     /// A scenario cannot be expressed in the format to be written.
     #[error("scenario {id} cannot be written: {problem}")]

@@ -67,7 +67,7 @@ mod tracks;
 mod verify;
 
 pub use convert::{Converted, OutputFormat, convert, groups};
-pub use error::{DataError, INCOMPLETE, Place, Problem};
+pub use error::{DataError, INCOMPLETE, Problem, RecordLocation};
 #[cfg(feature = "nuplan")]
 pub use formats::nuplan;
 #[cfg(feature = "sumo")]

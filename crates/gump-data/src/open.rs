@@ -10,7 +10,7 @@ use crate::formats::registry::{self, Role};
 #[cfg(feature = "sumo")]
 use crate::formats::sumo;
 use crate::io::files;
-use crate::source::{BoxedSource, Source};
+use crate::source::{BoxedSource, RecordSource};
 use crate::{DataError, ReadOptions, ScenarioRecord};
 
 /// Opens a file, or every file of a directory that holds scenarios, in order of their paths and
@@ -123,7 +123,7 @@ impl Reader {
     /// error of opening one of them.
     fn first_of<T>(
         &mut self,
-        mut ask: impl FnMut(&mut dyn Source) -> Option<Result<T, DataError>>,
+        mut ask: impl FnMut(&mut dyn RecordSource) -> Option<Result<T, DataError>>,
     ) -> Option<Result<T, DataError>> {
         if let Some(error) = self.unopened.take() {
             return Some(Err(error));
@@ -175,7 +175,7 @@ impl Iterator for Reader {
 /// A record that has been read.
 struct OneRecord(Option<ScenarioRecord>);
 
-impl Source for OneRecord {
+impl RecordSource for OneRecord {
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,
@@ -189,7 +189,7 @@ impl Source for OneRecord {
 
 struct NoRecords;
 
-impl Source for NoRecords {
+impl RecordSource for NoRecords {
     fn next_wanted(
         &mut self,
         _: &mut dyn FnMut(&str) -> bool,

@@ -13,10 +13,10 @@ use crate::formats::document::Document;
 use crate::formats::{gpudrive, scenario_json, womd};
 use crate::io::json::{self, MAX_BYTES};
 use crate::io::{stream, tfrecord};
-use crate::source::Source as _;
-use crate::{DataError, Place, ReadOptions, ReadReport};
+use crate::source::RecordSource as _;
+use crate::{DataError, ReadOptions, ReadReport, RecordLocation};
 
-/// Number of bytes from the start that distinguish the formats.
+/// Number of bytes from the start that distinguish the formats, as for files.
 const HEAD_BYTES: usize = 64 << 10;
 
 /// Reads the first scenario of a file's bytes: Waymo's TFRecord, Scenario-JSON or GPUDrive's JSON,
@@ -86,7 +86,7 @@ fn document<D: Document + DeserializeOwned>(
     scenario.map_err(|problem| DataError::Scenario {
         id,
         problem,
-        place: Place {
+        place: RecordLocation {
             record: 0,
             offset: 0,
             path: path.into(),

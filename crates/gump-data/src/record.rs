@@ -44,7 +44,7 @@ pub struct Note {
     pub detail: String,
 }
 
-/// Maximum number of damaged items that are listed one by one; all are counted.
+/// Maximum number of damaged items that are listed one by one; all are counted. Chosen by hand.
 pub const MAX_NOTES: usize = 200;
 
 impl ReadReport {

@@ -28,15 +28,16 @@ pub(crate) struct Companion {
     pub(crate) recognises: fn(&[u8]) -> bool,
 }
 
-/// Bytes of the content that a recogniser gets.
+/// Bytes of the content that a recogniser gets: far more than the marks of any format need, and
+/// quick to unpack.
 pub(crate) const HEAD_BYTES: u64 = 64 << 10;
 
 /// Access to the scenarios of a file.
-pub(crate) type BoxedSource = Box<dyn Source>;
+pub(crate) type BoxedSource = Box<dyn RecordSource>;
 
 // ANCHOR: source
 /// The scenarios of one file, in order.
-pub(crate) trait Source: Send {
+pub(crate) trait RecordSource: Send {
     /// The next scenario whose id is `wanted`; the others are skipped at lower cost. `wanted` is
     /// called exactly once per record whose id can be read. After an error the next call continues
     /// with the next record where that is possible; `None` is the end.

@@ -86,7 +86,8 @@ pub struct FormatCounts {
     pub suspicious: usize,
 }
 
-/// Maximum number of findings that are listed; all are counted.
+/// Maximum number of findings that are listed; all are counted. Chosen by hand: a report of a few
+/// megabytes.
 pub const MAX_FINDINGS: usize = 20_000;
 
 impl Verification {
@@ -331,9 +332,10 @@ fn top_speed(kind: AgentKind) -> f64 {
 }
 
 /// An agent may end a step this far from where its velocity leads, metres, beside what the
-/// hardest braking or turning explains.
+/// hardest braking or turning explains: above the noise of trackers. Chosen by hand.
 const JUMP: f64 = 1.0;
-/// The hardest braking or turning that explains a deviation, metres per second squared.
+/// The hardest braking or turning that explains a deviation, metres per second squared: beyond what
+/// tyres hold, so that what is found is no driving.
 const HARDEST: f64 = 15.0;
 
 fn motion(scenario: &Scenario, suspect: &mut impl FnMut(&'static str, String)) {

@@ -163,7 +163,7 @@ fn doubled_scenarios_and_unreadable_records_are_broken() {
 }
 
 #[test]
-fn a_summary_counts_a_made_scenario() {
+fn a_summary_counts_a_synthetic_scenario() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("some.tfrecord");
     write_scenarios(&path, [common::crossing()]).unwrap();

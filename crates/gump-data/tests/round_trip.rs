@@ -66,7 +66,7 @@ fn read_one(path: &Path) -> Scenario {
 }
 
 #[test]
-fn a_made_scenario_comes_back() {
+fn a_synthetic_scenario_comes_back() {
     let folder = TempDir::new().unwrap();
     let original = common::crossing();
     for name in ["made.tfrecord", "made.tfrecord.gz"] {

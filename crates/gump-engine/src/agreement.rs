@@ -19,7 +19,7 @@ use gump_scene::AgentState;
 /// Maximum difference between the speed at the end of half a second and the mean, metres per
 /// second: 8 m/s² throughout, the hardest braking on a dry road.
 const REACH_M_PER_S: f64 = 8.0 * TOKEN_DT / 2.0;
-/// Speeds nearer than this are equal, metres per second: a bin and a half of a token.
+/// Speeds nearer than this are equal, metres per second: a little more than a token's bin (0.25).
 const SLACK_M_PER_S: f64 = 0.3;
 /// Displacements shorter than this have neither direction nor proportion, metres: two bins of the
 /// finest chunk.

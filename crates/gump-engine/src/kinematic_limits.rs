@@ -8,10 +8,10 @@
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AgentKind, AgentState};
 
-/// An object that moves less than this in half a second stays, metres: within the resolution of a
-/// token.
+/// An object that moves less than this in half a second stays, metres: one bin of the first pose of
+/// a chunk.
 const STILL_M: f64 = 0.05;
-/// And whose speed is below this, metres per second: a bin and a half.
+/// And whose speed is below this, metres per second: a little more than a bin (0.25).
 const STILL_M_PER_S: f64 = 0.3;
 
 /// Limits on the motion of a kind of object. `agreement` adjusts the velocity of a limited pose.
@@ -26,8 +26,8 @@ pub struct Limits {
 impl Limits {
     /// The limits of a kind; `None` for kinds that may turn and step anywhere.
     ///
-    /// A car turns about its rear axle with a radius of 4.5 m; its centre then slips by about 0.3.
-    /// A bicycle turns with a radius of 1.5 m.
+    /// A car turns about its rear axle with a radius of 4.5 m; its centre, 1.4 m ahead of it, then
+    /// slips by about 0.3. A bicycle turns with a radius of 1.5 m; 0.4 is a centre 0.6 m ahead.
     pub(crate) fn of(kind: AgentKind) -> Option<Self> {
         match kind {
             AgentKind::Vehicle => Some(Self {

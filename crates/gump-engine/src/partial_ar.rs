@@ -28,8 +28,8 @@ use crate::sampling::{CacheMode, Mode, SamplingConfig};
 pub(crate) struct Window {
     /// Index of its scene's memory.
     pub(crate) scene: usize,
-    /// Final states, oldest first.
-    pub(crate) history: Vec<TokenFrame>,
+    /// Final states, oldest first; the same frames as those of the future.
+    pub(crate) history: Vec<Arc<TokenFrame>>,
     /// The same, not rounded.
     pub(crate) exact: ExactFrames,
     /// The frame to decode, with provisional states; the order of its tracked agents is the order
@@ -57,7 +57,8 @@ pub(crate) fn presented(
         })
         .count();
     let first = window.history.len() - n.max(1);
-    let mut frames = window.history[first..].to_vec();
+    let shown = window.history[first..].iter();
+    let mut frames: Vec<TokenFrame> = shown.map(|frame| TokenFrame::clone(frame)).collect();
     frames[0] = std::mem::take(&mut frames[0]).into_first();
     frames.push(window.next.clone());
     let sequence = TokenSequence::new(Vec::new(), frames).map_err(EngineError::Grammar)?;

@@ -17,7 +17,7 @@ pub(crate) struct Seen {
     pub(crate) bins: Vec<Bins>,
 }
 
-/// Separates the streams of predictive samples from those of fields and redraws.
+/// Separates the streams of predictive samples from those of fields and redraws (from 2^20 on).
 const WATCH: u64 = 1 << 40;
 
 /// The same request many times, each with its own random stream.

@@ -16,7 +16,8 @@ mod tests;
 use gump_geometry::{OrientedBox, Pose, angle_difference};
 use gump_model::local_context::{Edge, LaneMap, metres_across, metres_off};
 
-/// Poses of a chunk that must be clear: 1.5 s.
+/// Poses of a chunk that must be clear: 1.5 s, in which [`BRAKING`] stops a vehicle from 7.5 m/s.
+/// Not varied.
 pub(crate) const POSES: usize = 3;
 /// Number of positions checked between two poses, including the second: every 0.1 s.
 const PLACES: usize = 5;
@@ -25,7 +26,8 @@ pub(crate) type Way = [Pose; POSES * PLACES];
 /// An object over an edge by less than this is on the road, metres, and one that is off it counts
 /// as farther off only beyond this: bins and maps are not more precise.
 const SLACK_M: f64 = 0.05;
-/// Braking of a vehicle without a clear path, metres per second squared: firm, on a dry road.
+/// Braking of a vehicle without a clear path, metres per second squared: firm, on a dry road. Not
+/// tuned.
 pub(crate) const BRAKING: f64 = 5.0;
 /// The way through poses half a second apart; what comes from nowhere is at the first all along.
 pub(crate) fn way(from: Option<Pose>, poses: [Pose; POSES]) -> Way {
@@ -134,6 +136,7 @@ impl Member {
         let Some(before) = self.before else {
             return;
         };
+        // As far as its path, or its speed in the same 1.5 s, takes it, and a metre to spare.
         let radius = self.reach + (self.moves() + 1.0).max(self.speed * 1.5);
         let near = lane_map.edges_near(before.position, radius);
         self.edges = near

@@ -32,7 +32,8 @@ pub(crate) struct RolloutState {
     pub(crate) scene: usize,
     pub(crate) seed: Seed,
     /// The last token frames: at most `history` of them, or as many as a growing window holds.
-    pub(crate) frames: Vec<TokenFrame>,
+    /// Those of the start are shared by all futures of the scene.
+    pub(crate) frames: Vec<Arc<TokenFrame>>,
     /// Index of the last frame.
     pub(crate) index: usize,
     /// Its value at the start.
@@ -218,10 +219,10 @@ impl RolloutState {
         });
         // Lights keep the colour they were seen in.
         let frame = Frame::new(agents.collect(), now.lights().to_vec());
-        let (before, longest) = (self.frames.last(), world.longest_frame());
+        let (before, longest) = (self.last_frame(), world.longest_frame());
         next.newborn = scene.arrivals(&frame, &next, before, longest, &self.identities);
         self.recent.push(frame.clone());
-        self.frames.push(next);
+        self.frames.push(Arc::new(next));
         let history = sampling.history.max(1);
         if sampling.cache != CacheMode::Growing || self.overflows(world) {
             self.frames
@@ -230,16 +231,19 @@ impl RolloutState {
         let kept = history.max(self.frames.len());
         self.recent.drain(..self.recent.len().saturating_sub(kept));
         self.rings.retain(|id, _| moved.contains_key(id));
-        // In the first frame of a window no agent is newborn: those that were count as tracked.
-        let first = std::mem::take(&mut self.frames[0]);
-        self.frames[0] = first.into_first();
+        make_first(&mut self.frames[0]);
         frame
+    }
+
+    /// The tokens of the present.
+    pub(crate) fn last_frame(&self) -> Option<&TokenFrame> {
+        self.frames.last().map(|frame| &**frame)
     }
 
     /// Whether the window with a next frame like the last would be longer than a block.
     fn overflows(&self, world: &TransformerWorld) -> bool {
-        let last = self.frames.last().map_or(0, TokenFrame::len_slots);
-        let all: usize = self.frames.iter().map(TokenFrame::len_slots).sum();
+        let last = self.last_frame().map_or(0, TokenFrame::len_slots);
+        let all: usize = self.frames.iter().map(|frame| frame.len_slots()).sum();
         all + last > world.network().config().block_size
     }
 
@@ -260,6 +264,16 @@ impl RolloutState {
             .values_mut()
             .for_each(|ring| ring.transform(to_from_from));
     }
+}
+
+/// Makes a frame the first of a window, in which no agent is newborn: those that were count as
+/// tracked. A frame that is as it should be stays shared.
+fn make_first(frame: &mut Arc<TokenFrame>) {
+    if frame.newborn.is_empty() && frame.tracked.is_sorted_by_key(|agent| agent.key) {
+        return;
+    }
+    let frame = Arc::make_mut(frame);
+    *frame = std::mem::take(frame).into_first();
 }
 
 /// The random stream of one object in one frame of one future, independent of the batch.

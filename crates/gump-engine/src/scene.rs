@@ -62,8 +62,8 @@ pub struct SceneContext {
     pub memory: Memory,
     /// The history as computed by the engine, from which futures continue.
     pub(crate) prefix: KvCache,
-    /// Frames before the start, scene frame.
-    pub history: Vec<TokenFrame>,
+    /// Frames before the start, scene frame; futures share them.
+    pub history: Vec<Arc<TokenFrame>>,
     /// The lane that each light token controls, light 1 first.
     pub(crate) lights: Vec<LaneId>,
     /// The same frames in world coordinates; the last is the present.
@@ -76,6 +76,12 @@ pub struct SceneContext {
     grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
     /// The part of them where agents may enter the window.
     entries: [OnceLock<Arc<Ground>>; N_CLASSES],
+}
+
+/// The sequence of shared frames.
+pub(crate) fn sequence(frames: &[Arc<TokenFrame>]) -> Result<TokenSequence, EngineError> {
+    let frames = frames.iter().map(|frame| TokenFrame::clone(frame));
+    TokenSequence::new(Vec::new(), frames.collect()).map_err(EngineError::Grammar)
 }
 
 impl SceneContext {
@@ -139,7 +145,7 @@ impl SceneContext {
                 None => Memory::Reference(memory),
             },
             prefix: KvCache::default(),
-            history: sequence.frames().to_vec(),
+            history: sequence.frames().iter().cloned().map(Arc::new).collect(),
             lights: encoded.lights,
             recent,
             map,
@@ -164,8 +170,7 @@ impl SceneContext {
 
     /// The slots of its history.
     pub fn slots(&self) -> Result<Vec<PlacedSlot>, EngineError> {
-        let sequence =
-            TokenSequence::new(Vec::new(), self.history.clone()).map_err(EngineError::Grammar)?;
+        let sequence = sequence(&self.history)?;
         let n = self.history.len();
         let exact = ExactFrames::last(n, &self.recent, &self.identities, self.world_from_scene);
         Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))

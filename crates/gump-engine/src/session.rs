@@ -18,11 +18,11 @@ use crate::rollout_state::RolloutState;
 use crate::scene::SceneContext;
 use crate::world::TransformerWorld;
 
-/// An ego farther than this from the origin of its scene gets a new scene around it, metres.
-/// Training has windows up to 85 m away.
+/// An ego farther than this from the origin of its scene gets a new scene around it, metres. Less
+/// than the 85 m that training covers; a new scene costs a pass of the visual encoder (decision 5).
 const RECENTRE_M: f64 = 60.0;
-/// The same with spawning: agents enter and leave at the border of the window, which must not come
-/// near.
+/// The same with spawning: agents enter and leave at the border of the window (100 m), which must
+/// not come near; with 60 m it did (result 12).
 const RECENTRE_ALIVE_M: f64 = 20.0;
 
 pub(crate) struct TransformerSession<'a> {

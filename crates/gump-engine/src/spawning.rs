@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 use gump_geometry::OrientedBox;
 use gump_scene::{AgentKind, AgentState, Frame, Light, Seed};
-use gump_tokenizer::{Key, TokenAgent, TokenFrame, TokenSequence};
+use gump_tokenizer::{Key, TokenAgent, TokenFrame};
 
 pub(crate) use crate::spawning::lights::Phases;
 use gump_model::decoder::STEPS;
@@ -35,18 +35,22 @@ use crate::placement::object_spec::{ObjectSpec, agent_of};
 use crate::placement::rules::{Manner, Rules, box_of, state_of};
 use crate::request::Request;
 use crate::rollout_state::{RolloutState, stream};
-use crate::scene::SceneContext;
+use crate::scene::{SceneContext, sequence};
 use crate::session::TransformerSession;
 use crate::temporal_ensemble::ChunkBuffer;
 
-/// Maximum number of agents that enter in one frame of a future.
+/// Maximum number of agents that enter in one frame of a future. Each costs a pass; the log of
+/// simulated scenes has one in two seconds (result 12), so this bounds runaways only.
 const MOST_BIRTHS: usize = 4;
-/// Number of draws of a new agent before it is dropped.
+/// Number of draws of a new agent before it is dropped; drawn in one product, so that more cost
+/// little. Not tuned.
 const TRIES: u64 = 6;
-/// No agent enters or leaves nearer to the ego than this, metres.
+/// No agent enters or leaves nearer to the ego than this, metres: half of the window, so that it
+/// does not happen in view. Not tuned.
 const SEEN_M: f64 = 50.0;
 
-/// The purpose of a decision, as the part of a seed.
+/// The purpose of a decision, as the part of a seed; beyond the indices that other seeds are forked
+/// by.
 #[derive(Clone, Copy)]
 enum About {
     Lights = 1001,
@@ -281,7 +285,7 @@ impl TransformerSession<'_> {
             );
             let kept = bins.into_iter().find(|bins| {
                 let state = state_of(bins);
-                let ego = future.frames.last().and_then(|frame| frame.tracked.first());
+                let ego = future.last_frame().and_then(|frame| frame.tracked.first());
                 let ego = ego.map_or_else(Default::default, |ego| ego.state.pose().position);
                 let is_far = state.pose().position.distance(ego) >= SEEN_M;
                 is_far
@@ -303,6 +307,7 @@ impl TransformerSession<'_> {
                 .or_default()
                 .push(future.index, LocalFrame::SCENE.poses(&bins));
             let now = future.frames.last_mut().expect("a future has a present");
+            let now = Arc::make_mut(now);
             now.newborn.push(token);
             now.newborn.sort_by_key(|agent| agent.key);
             let own = box_of(&state);
@@ -343,8 +348,8 @@ impl RolloutState {
             agents.map(|agent| agent.key.id).collect()
         };
         let (before, now) = (
-            ids(n.checked_sub(2).map(|i| &self.frames[i])),
-            ids(self.frames.last()),
+            ids(n.checked_sub(2).map(|i| &*self.frames[i])),
+            ids(self.last_frame()),
         );
         let gone = |id: &u16| before.contains(id) && !now.contains(id);
         let stays = |agent: &&gump_scene::Agent| {
@@ -352,7 +357,7 @@ impl RolloutState {
             id.is_none_or(|id| id == 0 || !gone(&id))
         };
         let agents = frame.agents().iter().filter(stays).copied().collect();
-        let tokens = self.frames.last().map_or(&[][..], |frame| &frame.lights);
+        let tokens = self.last_frame().map_or(&[][..], |frame| &frame.lights);
         let lights = frame.lights().iter().map(|light| {
             let index = scene.lights.iter().position(|lane| *lane == light.lane);
             let token = tokens
@@ -376,8 +381,7 @@ impl RolloutState {
 
     /// All slots of the window, the present frame included, up to where a new agent may come.
     fn slots_to_end(&self, scene: &SceneContext) -> Result<Vec<PlacedSlot>, EngineError> {
-        let sequence = TokenSequence::new(Vec::new(), self.frames.clone());
-        let sequence = sequence.map_err(EngineError::Grammar)?;
+        let sequence = sequence(&self.frames)?;
         let exact = self.exact(scene);
         Ok(place_exactly(&sequence, |frame, id| exact.of(frame, id)))
     }
@@ -386,12 +390,11 @@ impl RolloutState {
     fn slots_to_key(&self, key: Key, scene: &SceneContext) -> Result<Vec<PlacedSlot>, EngineError> {
         let mut frames = self.frames.clone();
         let now = frames.last_mut().expect("a future has a present");
-        now.newborn.push(TokenAgent {
+        Arc::make_mut(now).newborn.push(TokenAgent {
             key,
             state: Default::default(),
         });
-        let sequence = TokenSequence::new(Vec::new(), frames);
-        let sequence = sequence.map_err(EngineError::Grammar)?;
+        let sequence = sequence(&frames)?;
         let exact = self.exact(scene);
         let mut slots = place_exactly(&sequence, |frame, id| exact.of(frame, id));
         slots.pop();
@@ -401,9 +404,9 @@ impl RolloutState {
     /// The constraints of a new agent: positions where lanes or walkways enter the window, clear of
     /// all agents.
     fn rules(&self, kind: AgentKind, scene: &SceneContext) -> Rules {
-        let now = self.frames.last().into_iter().flat_map(TokenFrame::agents);
+        let now = self.last_frame().into_iter().flat_map(TokenFrame::agents);
         let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();
-        let ego = self.frames.last().and_then(|frame| frame.tracked.first());
+        let ego = self.last_frame().and_then(|frame| frame.tracked.first());
         let ego = ego.map(|ego| (ego.state.pose().position, ego.state.velocity()));
         Rules {
             kind,

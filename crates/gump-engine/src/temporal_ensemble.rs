@@ -10,7 +10,8 @@ use gump_model::decoder::CHUNK;
 /// A prediction farther than this from the present one belongs to another plan and is ignored,
 /// metres (released code: 5).
 const GATE_M: f64 = 5.0;
-/// Likewise for headings, radians.
+/// Likewise for headings, radians: beyond a right angle two directions have no useful mean. The
+/// released code has no such limit.
 const GATE_RAD: f64 = std::f64::consts::FRAC_PI_2;
 
 /// The predicted poses of an agent, half a second apart, scene frame.

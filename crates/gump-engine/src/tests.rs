@@ -10,7 +10,7 @@ use gump_model::mct::Cache;
 use gump_model::steps::TOKEN_DT;
 use gump_model::testing::{hidden, memory, network, scenario, slots};
 use gump_model::{ModelError, Network};
-use gump_rollout::{Start, WorldModel};
+use gump_rollout::{Session as _, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, Frame, Scenario, Seed, fixture};
 use gump_tokenizer::Slot;
 
@@ -246,6 +246,31 @@ fn starts_of_one_scene_share_what_they_look_at() {
 }
 
 #[test]
+fn futures_share_the_frames_of_their_past() {
+    let scenario = scenario();
+    let world = TransformerWorld::new(network(), SamplingConfig::default());
+    let start = Start {
+        scene: scenario.present(),
+        n_futures: 3,
+        seed: Seed(0),
+    };
+    let mut session = world.open_session(&[start]).unwrap();
+    let past = session.scenes[0].history.clone();
+    assert!(past.len() > 1);
+    for future in &session.futures {
+        assert_eq!(future.frames.len(), past.len());
+        let mut frames = future.frames.iter().zip(&past);
+        assert!(frames.all(|(own, shared)| Arc::ptr_eq(own, shared)));
+    }
+    // The next frame is each future's own; the frame before it is still the same.
+    session.step(None).unwrap();
+    for future in &session.futures {
+        let before = &future.frames[future.frames.len() - 2];
+        assert!(Arc::ptr_eq(before, &past[past.len() - 1]));
+    }
+}
+
+#[test]
 fn nothing_looks_at_the_logged_future() {
     let scenario = scenario();
     let mut blinded = scenario.clone();
@@ -468,7 +493,7 @@ fn window(scenario: &Scenario) -> Window {
     let requests = next.tracked.iter().enumerate().map(request).collect();
     Window {
         scene: 0,
-        history,
+        history: history.into_iter().map(Arc::new).collect(),
         exact: Default::default(),
         next,
         requests,

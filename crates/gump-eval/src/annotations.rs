@@ -6,11 +6,11 @@ use gump_scene::{Agent, AgentId, Rollout, Scenario, SceneState};
 use gump_wosac::realism::{Component, Config, Features, Log, Reference, Rollouts, Year};
 
 /// Agents with annotations, those nearest to the ego: more would make pages larger than they need
-/// to be.
+/// to be. Chosen by hand.
 const AGENTS: usize = 32;
 /// Length of the futures in the challenge, seconds.
 const HORIZON_S: u32 = 8;
-/// Distances beyond this mean that there is no object, metres.
+/// Distances beyond this mean that there is no object, metres: the metric then has 1e10.
 const NOTHING: f32 = 1e9;
 
 /// Metrics with their names, by the benchmark's components.

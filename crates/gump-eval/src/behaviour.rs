@@ -13,7 +13,7 @@ use crate::decoding::{DecodedWorld, DecodedWorldName, columns};
 use crate::imagine::{frames, imagine};
 use crate::results::Entry;
 use crate::worlds::Worlds;
-use crate::{EvalError, Monitor};
+use crate::{EvalError, Monitor, ResultsError};
 
 /// Name of the benchmark in stored results.
 pub const BENCHMARK: &str = "behaviour";
@@ -87,17 +87,15 @@ impl StoredTally {
     /// The tally.
     ///
     /// # Errors
-    /// [`EvalError::Results`] for an unknown measure or class.
+    /// [`ResultsError::UnknownCount`].
     pub fn tally(&self) -> Result<Tally, EvalError> {
         let mut tally = Tally::default();
         for cell in &self.cells {
             let measure = Measure::of_name(&cell.measure);
             let class = Class::of_name(&cell.class);
             let (measure, class) = measure.zip(class).ok_or_else(|| {
-                EvalError::Results(format!(
-                    "expected a known measure and class in the ledger, found {} of {}",
-                    cell.measure, cell.class
-                ))
+                let (measure, class) = (cell.measure.clone(), cell.class.clone());
+                ResultsError::UnknownCount { measure, class }
             })?;
             let key = Key {
                 measure,

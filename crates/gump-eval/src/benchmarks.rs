@@ -17,14 +17,14 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
 use crate::datasets::Split;
+use crate::{BenchmarkError, EvalError, PartProblem};
 
 pub use checksum::checksum;
 pub use draw::{DrawRule, ListDraw};
 pub use make::{freeze, make};
 pub use scenario_set::{BenchmarkFolders, ScenarioSet, ScenarioSetName};
-pub use verify::{checksums, sha256, verify_made, verify_recorded};
+pub use verify::{checksums, sha256, verify_generated, verify_recorded};
 
 /// Seeds that only lists may use, so that no training set has the roads of a frozen set.
 pub const RESERVED_SEEDS: Range<u64> = 900_000_000..1_000_000_000;
@@ -39,7 +39,7 @@ pub struct BenchmarkList {
     pub about: String,
     /// Generated scenes.
     #[serde(default, rename = "made", skip_serializing_if = "Vec::is_empty")]
-    pub made: Vec<MadePart>,
+    pub generated: Vec<GeneratedPart>,
     /// Recorded scenes.
     #[serde(default, rename = "recorded", skip_serializing_if = "Vec::is_empty")]
     pub recorded: Vec<RecordedPart>,
@@ -51,7 +51,7 @@ pub struct BenchmarkList {
 /// Scenes from one generator and seed: one file.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
-pub struct MadePart {
+pub struct GeneratedPart {
     /// Its name, without the ending.
     pub file: String,
     /// Split of its scenes.
@@ -128,23 +128,25 @@ impl BenchmarkList {
     pub fn read(path: &Path) -> Result<Self, EvalError> {
         let text = std::fs::read_to_string(path)
             .map_err(|cause| EvalError::io("read the list", path, cause))?;
-        let list: Self = toml::from_str(&text).map_err(|error| {
+        let list: Self = toml::from_str(&text).map_err(|error: toml::de::Error| {
             let before = &text[..error.span().map_or(0, |span| span.start)];
             let line = 1 + before.matches('\n').count();
-            EvalError::Benchmark(format!(
-                "expected a list of scenes, found in line {line} of {}: {}",
-                path.display(),
-                error.message().replace('\n', ", ")
-            ))
+            BenchmarkError::Malformed {
+                path: path.to_owned(),
+                line,
+                cause: Box::new(error),
+            }
         })?;
         let list = Self {
             path: path.to_owned(),
             ..list
         };
-        for part in &list.made {
-            let place = || format!("part {} of {}", part.file, path.display());
-            part.validate()
-                .map_err(|what| EvalError::Benchmark(format!("{}: {what}", place())))?;
+        for part in &list.generated {
+            part.validate().map_err(|problem| BenchmarkError::Part {
+                part: part.file.clone(),
+                list: path.to_owned(),
+                problem,
+            })?;
         }
         for scene in list.recorded.iter().flat_map(|part| &part.scenes) {
             RecordedScene::parse(scene)?;
@@ -154,8 +156,8 @@ impl BenchmarkList {
 
     /// The splits that have scenes, each once.
     pub fn splits(&self) -> Vec<Split> {
-        let made = self.made.iter().map(|part| part.split);
-        let all: Vec<Split> = made
+        let generated = self.generated.iter().map(|part| part.split);
+        let all: Vec<Split> = generated
             .chain(self.recorded.iter().map(|part| part.split))
             .collect();
         let is_there = |split: &Split| all.contains(split);
@@ -181,51 +183,39 @@ impl BenchmarkList {
     }
 
     /// The generated file of a part.
-    pub fn file(&self, folder: &Path, part: &MadePart) -> PathBuf {
+    pub fn file(&self, folder: &Path, part: &GeneratedPart) -> PathBuf {
         folder
             .join(&self.name)
             .join(format!("{}.tfrecord.gz", part.file))
     }
 }
 
-impl MadePart {
-    /// Checks the part; the error says what is wrong.
-    fn validate(&self) -> Result<(), String> {
-        let expect = |is_met: bool, what: String| if is_met { Ok(()) } else { Err(what) };
-        let (n, kept) = (self.scenes.len(), self.kept());
-        expect(
-            RESERVED_SEEDS.contains(&self.seed),
-            format!(
-                "expected a seed from {} to {}, which training never uses, found {}",
-                RESERVED_SEEDS.start,
-                RESERVED_SEEDS.end - 1,
-                self.seed
-            ),
-        )?;
-        expect(
-            n == kept || n == 0,
-            format!("expected {kept} scenes with their sums, found {n}"),
-        )?;
-        expect(
-            self.keep.is_sorted_by(|a, b| a < b) && self.keep.iter().all(|&i| i < self.count),
-            format!(
-                "expected the indices to keep in order, all below {}",
-                self.count
-            ),
-        )?;
-        expect(
-            self.density
-                .is_none_or(|density| (0.1..=3.0).contains(&density)),
-            format!("expected a density from 0.1 to 3, found {:?}", self.density),
-        )?;
+impl GeneratedPart {
+    /// Checks the part.
+    fn validate(&self) -> Result<(), PartProblem> {
+        if !RESERVED_SEEDS.contains(&self.seed) {
+            return Err(PartProblem::Seed { found: self.seed });
+        }
+        let (found, expected) = (self.scenes.len(), self.kept());
+        if found != expected && found != 0 {
+            return Err(PartProblem::ChecksumCount { expected, found });
+        }
+        let count = self.count;
+        if !self.keep.is_sorted_by(|a, b| a < b) || self.keep.iter().any(|&i| i >= count) {
+            return Err(PartProblem::Keep { count });
+        }
+        match self.density {
+            Some(found) if !(0.1..=3.0).contains(&found) => {
+                return Err(PartProblem::Density { found });
+            }
+            _ => {}
+        }
         let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-';
-        expect(
-            self.file.chars().all(is_plain) && !self.file.is_empty(),
-            format!(
-                "expected a name of letters, digits and -, found \"{}\"",
-                self.file
-            ),
-        )
+        if self.file.is_empty() || !self.file.chars().all(is_plain) {
+            let found = self.file.clone();
+            return Err(PartProblem::Name { found });
+        }
+        Ok(())
     }
 
     /// Number of scenes in its file.
@@ -255,9 +245,10 @@ impl<'a> RecordedScene<'a> {
                 file,
                 id: id.first().copied(),
             }),
-            _ => Err(EvalError::Benchmark(format!(
-                "expected \"SHA256 FILE [ID]\", found \"{line}\""
-            ))),
+            _ => {
+                let found = line.into();
+                Err(BenchmarkError::SceneLine { found }.into())
+            }
         }
     }
 }
@@ -279,9 +270,9 @@ pub fn frozen_ids(folder: &Path) -> Result<BTreeMap<String, String>, EvalError> 
             continue;
         }
         let list = BenchmarkList::read(&path)?;
-        let made = list.made.iter().map(|part| (part.split, &part.scenes));
+        let generated = list.generated.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
-        let frozen = made
+        let frozen = generated
             .chain(recorded)
             .filter(|(split, _)| *split != Split::Train);
         for (split, scenes) in frozen {
@@ -319,14 +310,14 @@ pub(crate) mod tests {
         let mut n_parts = 0;
         for list in &lists {
             let count = |kind: &str| -> usize {
-                let parts = list.made.iter();
+                let parts = list.generated.iter();
                 let parts = parts.filter(|part| part.generator.starts_with(kind));
                 parts.map(|part| part.scenes.len()).sum()
             };
             assert_eq!(count("procedural/"), count("sumo/"), "{}", list.name);
             assert!(count("procedural/") >= 100, "{}", list.name);
             assert_eq!(list.splits().len(), 1);
-            for part in &list.made {
+            for part in &list.generated {
                 n_parts += 1;
                 seeds.insert(part.seed);
                 for network in &part.networks {

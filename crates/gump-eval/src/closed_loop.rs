@@ -23,7 +23,7 @@ use crate::planners::{PlannerConfig, PlannerName, PlanningWorld, TimedDriver};
 use crate::recordings::{Case, Named};
 use crate::results::{Entry, ResultStore};
 use crate::worlds::WorldName;
-use crate::{EvalError, Monitor};
+use crate::{EvalError, Monitor, ResumePoint};
 
 /// Name of the benchmark in stored results.
 pub const BENCHMARK: &str = "closed-loop";
@@ -221,7 +221,7 @@ impl ClosedLoopEvaluation<'_> {
         };
         done.into_iter().collect::<Result<(), EvalError>>()?;
         if monitor.is_stopped() {
-            let from = "where this one stopped".into();
+            let from = ResumePoint::Remaining;
             return Err(EvalError::StoppedAndStored { from });
         }
         let store = store.into_inner();
@@ -286,7 +286,6 @@ impl ClosedLoopEvaluation<'_> {
         })
     }
 
-    /// The planners of all rows.
     fn row_planners(&self) -> Vec<RowPlanner<'_>> {
         let mut planners = Vec::new();
         for &planner in self.planners {

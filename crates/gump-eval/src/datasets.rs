@@ -118,8 +118,9 @@ impl Manifest {
         }
         let text =
             std::fs::read_to_string(&path).map_err(|cause| EvalError::io("read", &path, cause))?;
-        let manifest = toml::from_str(&text).map_err(|error| {
-            EvalError::Dataset(format!("{}: {}", path.display(), error.message()))
+        let manifest = toml::from_str(&text).map_err(|cause| EvalError::Dataset {
+            path,
+            cause: Box::new(cause),
         })?;
         Ok(Some(manifest))
     }

@@ -15,7 +15,7 @@ use gump_scene::{Scenario, Seed};
 use gump_synthesis::{Profile, SynthesisConfig};
 use rayon::prelude::*;
 
-use crate::EvalError;
+use crate::{ArgumentError, EvalError};
 
 /// The beginning of a stream's name.
 pub const PREFIX: &str = "fresh:";
@@ -52,7 +52,7 @@ struct Shared {
     /// Notified when the window moves on.
     moved: Condvar,
     ends: AtomicBool,
-    made: AtomicUsize,
+    n_generated: AtomicUsize,
 }
 
 /// The window.
@@ -66,7 +66,7 @@ impl SceneStream {
     /// The stream of this name, `fresh:PROFILE` or `fresh:PROFILE:SEED`; `None` for other names.
     ///
     /// # Errors
-    /// [`EvalError::Argument`] for a profile that does not exist or a seed that is no number.
+    /// [`ArgumentError::NoSuchProfile`], or [`ArgumentError::StreamSeed`].
     pub fn of_name(name: &Path) -> Result<Option<Self>, EvalError> {
         let Some(rest) = name.to_str().and_then(|name| name.strip_prefix(PREFIX)) else {
             return Ok(None);
@@ -74,7 +74,8 @@ impl SceneStream {
         let (profile, seed) = rest.split_once(':').unwrap_or((rest, "0"));
         let profile = profile_of_name(profile)?;
         let seed = seed.parse().map_err(|_| {
-            EvalError::Argument(format!("expected a whole number as seed in {PREFIX}{rest}"))
+            let stream = rest.into();
+            ArgumentError::StreamSeed { stream }
         })?;
         Ok(Some(Self {
             profile,
@@ -100,13 +101,11 @@ impl SceneStream {
 /// The profile of this name.
 ///
 /// # Errors
-/// [`EvalError::Argument`] that names the profiles that exist.
+/// [`ArgumentError::NoSuchProfile`].
 pub fn profile_of_name(name: &str) -> Result<Profile, EvalError> {
     Profile::of_name(name).ok_or_else(|| {
-        let known = Profile::ALL.map(Profile::name).join(", ");
-        EvalError::Argument(format!(
-            "expected one of the profiles {known}, found {name:?}"
-        ))
+        let found = name.into();
+        ArgumentError::NoSuchProfile { found }.into()
     })
 }
 
@@ -117,7 +116,7 @@ impl FreshScenes {
             held: Mutex::default(),
             moved: Condvar::new(),
             ends: AtomicBool::new(false),
-            made: AtomicUsize::new(0),
+            n_generated: AtomicUsize::new(0),
         });
         let fresh = Self {
             stream,
@@ -152,10 +151,10 @@ impl FreshScenes {
         Cow::Owned(Arc::unwrap_or_clone(scene))
     }
 
-    /// Scenes made so far, by any thread.
+    /// Scenes generated so far, by any thread.
     #[cfg(test)]
-    fn made(&self) -> usize {
-        self.shared.made.load(Ordering::Relaxed)
+    fn n_generated(&self) -> usize {
+        self.shared.n_generated.load(Ordering::Relaxed)
     }
 }
 
@@ -186,7 +185,7 @@ impl Shared {
 
     /// Keeps a scene while it is in the window.
     fn keep(&self, index: usize, scene: &Arc<Scenario>) {
-        self.made.fetch_add(1, Ordering::Relaxed);
+        self.n_generated.fetch_add(1, Ordering::Relaxed);
         let mut held = self.lock();
         if (held.first..held.first + 2 * WINDOW).contains(&index) {
             held.scenes.insert(index, Arc::clone(scene));
@@ -258,7 +257,7 @@ mod tests {
                 }
             }
         }
-        assert!(one.made() > 0);
+        assert!(one.n_generated() > 0);
     }
 
     #[test]

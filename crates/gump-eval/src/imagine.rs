@@ -16,7 +16,7 @@ use gump_rollout::{
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, Rollout, Scenario, Seed};
 
 use crate::worlds::World;
-use crate::{EvalError, Monitor};
+use crate::{EvalError, LanePurpose, Monitor, RecordingError};
 
 /// Futures of one scene, and their cost.
 pub struct Imagined {
@@ -86,7 +86,7 @@ pub fn imagine_around(
 /// the samples take counts as the world's.
 ///
 /// # Errors
-/// As [`imagine`], and [`EvalError::Recording`] for a world that draws nothing.
+/// As [`imagine`], and [`RecordingError::NoPredictiveSamples`] for a world that follows rules.
 pub fn imagine_probed(
     world: &World,
     scenario: &Scenario,
@@ -116,10 +116,11 @@ fn simulate_watched(
     monitor: &dyn Monitor,
 ) -> Result<Imagined, EvalError> {
     if world.follows_lanes() && scenario.map.lanes().is_empty() {
-        return Err(EvalError::Recording(format!(
-            "scenario {}: expected a map with lanes to drive on, found none",
-            scenario.id
-        )));
+        return Err(RecordingError::NoLanes {
+            scenario: scenario.id.clone(),
+            purpose: LanePurpose::Drive,
+        }
+        .into());
     }
     let scene = scenario.present().unguided();
     let start = Start {
@@ -184,8 +185,7 @@ impl WorldModel for Watched<'_> {
         let began = Instant::now();
         let mut session = self.world.model().open(starts)?;
         if self.probe.futures > 0 && !session.probe(self.probe) {
-            let ruled = "a world that follows rules draws nothing";
-            return Err(EvalError::Recording(ruled.into()).into());
+            return Err(EvalError::from(RecordingError::NoPredictiveSamples).into());
         }
         self.add(|cost| {
             cost.elapsed += began.elapsed();

@@ -66,6 +66,10 @@ pub mod sumo;
 pub mod training_set;
 pub mod worlds;
 
-pub use error::EvalError;
+pub use error::{
+    ArgumentError, BenchmarkError, ErrorContext, EvalError, HeadlessNetwork, LanePurpose,
+    PartProblem, RecordingError, ResultsError, ResumePoint, RolloutFileError, ShardError,
+    SumoError,
+};
 pub use exclusions::Exclusions;
 pub use monitor::Monitor;

@@ -21,7 +21,7 @@ use crate::imagine::{frames, imagine};
 use crate::monitor::simulating;
 use crate::results::{Entry, ResultStore};
 use crate::worlds::{WorldName, Worlds};
-use crate::{EvalError, Exclusions, Monitor, digest};
+use crate::{ArgumentError, EvalError, Exclusions, HeadlessNetwork, Monitor, ResumePoint, digest};
 
 pub use self::scores::ScenarioPredictions;
 
@@ -59,20 +59,18 @@ impl<'a> PredictionSource<'a> {
     /// The trajectory heads of a network.
     ///
     /// # Errors
-    /// [`EvalError::Argument`] for a network without heads; weights that cannot be read.
+    /// [`ArgumentError::NoTrajectoryHeads`], and weights that cannot be read.
     pub fn heads(path: &Path, device: &Device) -> Result<Self, EvalError> {
-        let without = |what: &str| {
-            EvalError::Argument(format!(
-                "expected a sequence network with trajectory heads, found {what}: {}",
-                path.display()
-            ))
+        let without = |found| ArgumentError::NoTrajectoryHeads {
+            found,
+            path: path.to_owned(),
         };
         if relative::is_relative(path)? {
-            return Err(without("a relative network"));
+            return Err(without(HeadlessNetwork::Relative).into());
         }
         let network = checkpoint::load(path, device)?;
         if network.trajectory_heads.is_empty() {
-            return Err(without("one without"));
+            return Err(without(HeadlessNetwork::Sequence).into());
         }
         let world = TransformerWorld::reference(network, SamplingConfig::default());
         Ok(Self(Kind::Heads(Box::new(world))))
@@ -189,7 +187,7 @@ impl<'a> PredictionSource<'a> {
         let (mut ids, mut exclusions) = (BTreeSet::new(), Exclusions::default());
         for (index, record) in records.enumerate() {
             if monitor.is_stopped() {
-                let from = format!("from scenario {index} on");
+                let from = ResumePoint::From(index);
                 return Err(EvalError::StoppedAndStored { from });
             }
             let mut scenario = record?.scenario;

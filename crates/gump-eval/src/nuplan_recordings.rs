@@ -10,8 +10,8 @@ use gump_data::nuplan::{Extraction, Log, Maps, NuplanScenario, ScenarioFilter, S
 use gump_nuplan::closed_loop::Recording;
 use gump_scene::VehicleParameters;
 
-use crate::EvalError;
 use crate::recordings::{Case, Named};
+use crate::{EvalError, RecordingError};
 
 /// First bytes of an SQLite file.
 const MAGIC: &[u8] = b"SQLite format 3\0";
@@ -50,8 +50,8 @@ pub(crate) fn open(paths: &[PathBuf]) -> Result<Box<dyn Iterator<Item = Named> +
         .collect::<Result<_, _>>()?;
     let selected = ScenarioFilter::default().select(&logs)?;
     if selected.is_empty() {
-        let none = "expected tagged scenarios, found none in the logs";
-        return Err(EvalError::Recording(none.into()));
+        let logs = paths.to_vec();
+        return Err(RecordingError::NoTaggedScenarios { logs }.into());
     }
     let mut maps = Maps::default();
     Ok(Box::new(selected.into_iter().map(move |selected| Named {
@@ -72,10 +72,12 @@ fn case(log: &Log, selected: &Selected, maps: &mut Maps) -> Result<Case, EvalErr
     let map = Arc::clone(&maps.of(log)?.graph);
     let (event, kind) = (&selected.event, &selected.scenario_type);
     let read = NuplanScenario::read(log, event, kind, &map, &Extraction::default())?;
-    let (scenario, _) = read.to_scenario(ReadOptions::ALL).map_err(|error| {
-        let place = log.path().display();
-        EvalError::Recording(format!("{place}, scenario {}: {error}", event.token))
-    })?;
+    let unusable = |problem| RecordingError::UnusableInLog {
+        log: log.path().to_owned(),
+        token: event.token,
+        problem,
+    };
+    let (scenario, _) = read.to_scenario(ReadOptions::ALL).map_err(unusable)?;
     let frames = read.history.iter().chain(&read.iterations);
     let ego = frames.map(|frame| frame.ego).collect();
     Ok(Case {

@@ -13,7 +13,7 @@ use crate::planners::{PlannerConfig, PlannerName};
 use crate::recordings::{Case, Named};
 use crate::{EvalError, Monitor};
 
-/// Seconds that plans are compared over.
+/// Seconds that plans are compared over: the longest horizon of nuPlan's open-loop metrics.
 pub const HORIZON_S: f64 = 8.0;
 
 /// The comparison in one scenario, or why there is none.
@@ -84,6 +84,7 @@ mod tests {
     use gump_rollout::worlds::Idm;
 
     use super::*;
+    use crate::RecordingError;
     use crate::recordings::of_boxes;
 
     #[test]
@@ -98,7 +99,7 @@ mod tests {
             scenario_type: "unknown".into(),
             case,
         };
-        let broken = Err(EvalError::Recording("no map".into()));
+        let broken = Err(RecordingError::NoScenarios.into());
         let cases = [named("a", of_boxes(scenario)), named("b", broken)];
         let world = Idm::default();
         let config = PlannerConfig::default();

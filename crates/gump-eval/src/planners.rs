@@ -24,9 +24,9 @@ use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
 use serde::{Serialize, Serializer};
 
-use crate::EvalError;
 use crate::recordings::Case;
 use crate::worlds::{World, WorldName};
+use crate::{ArgumentError, EvalError};
 
 /// A planner by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,10 +109,7 @@ impl PlannerName {
             Self::PdmClosed => Box::new(PdmClosed::default()),
             Self::Imitation => Box::new(config.imitation(imagination, seed)?),
             Self::Interactive => Box::new(config.interactive(imagination, seed)?),
-            Self::Proposals => {
-                let wrong = "proposals are fifteen planners, only evaluate closed-loop takes them";
-                return Err(EvalError::Argument(wrong.into()));
-            }
+            Self::Proposals => return Err(ArgumentError::SeveralPlanners.into()),
         })
     }
 }
@@ -126,10 +123,8 @@ impl FromStr for PlannerName {
         }
         let found = Self::ALL.into_iter().find(|planner| planner.name() == name);
         found.ok_or_else(|| {
-            let known = Self::ALL.map(Self::name).join(", ");
-            EvalError::Argument(format!(
-                "no planner is called {name}, expected one of {known}"
-            ))
+            let found = name.into();
+            ArgumentError::NoSuchPlanner { found }.into()
         })
     }
 }
@@ -172,6 +167,8 @@ pub struct PlannerConfig {
 }
 
 impl Default for PlannerConfig {
+    /// Four futures of four seconds are the paper's; a decision every half second, the step of the
+    /// networks, and twelve agents are chosen by hand.
     fn default() -> Self {
         Self {
             futures: 4,

@@ -17,7 +17,7 @@ use crate::decoding::{DecodedWorld, DecodedWorldName, columns};
 use crate::imagine::{frames, imagine_around};
 use crate::results::Entry;
 use crate::worlds::Worlds;
-use crate::{EvalError, Monitor};
+use crate::{EvalError, Monitor, ResultsError};
 
 /// Name of the benchmark in stored results.
 pub const BENCHMARK: &str = "reactions";
@@ -259,7 +259,7 @@ impl<'a> ReactionEvaluation<'a> {
 /// Fails with the most frequent reason if no manoeuvre of any scenario is scored.
 ///
 /// # Errors
-/// [`EvalError::Results`].
+/// [`ResultsError::NoManoeuvre`].
 pub fn any_scored(entries: &[Entry<ScenarioReactions>]) -> Result<(), EvalError> {
     let tried = || entries.iter().flat_map(|entry| &entry.scores.tried);
     if tried().any(|one| one.why.is_none()) {
@@ -272,11 +272,11 @@ pub fn any_scored(entries: &[Entry<ScenarioReactions>]) -> Result<(), EvalError>
         *counts.entry(reason).or_default() += 1;
     }
     let most = counts.iter().max_by_key(|(_, n)| **n);
-    Err(EvalError::Results(format!(
-        "expected a scenario in which the ego can leave its log, found none among {}: most often {}",
-        entries.len(),
-        most.map_or("there was nothing to try", |(reason, _)| reason)
-    )))
+    Err(ResultsError::NoManoeuvre {
+        scenarios: entries.len(),
+        reason: most.map(|(reason, _)| (*reason).to_owned()),
+    }
+    .into())
 }
 
 #[cfg(test)]

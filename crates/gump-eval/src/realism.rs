@@ -43,7 +43,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::monitor::simulating;
 use crate::results::{Entry, ResultStore};
-use crate::{EvalError, Exclusions, Monitor};
+use crate::{ArgumentError, ErrorContext, EvalError, Exclusions, Monitor, ResumePoint};
 
 pub use recordings::{Recorded, Recordings, recordings};
 pub use rollouts::{FoundRollouts, RolloutSource};
@@ -111,8 +111,8 @@ impl RealismEvaluation<'_> {
         monitor: &dyn Monitor,
         visit: &mut dyn FnMut(VisitedRollouts<'_>) -> Result<(), BoxError>,
     ) -> Result<Exclusions, EvalError> {
-        let none = || EvalError::Argument("expected a source of rollouts, found none".into());
-        let options = sources.first().ok_or_else(none)?.read_options();
+        let first = sources.first().ok_or(ArgumentError::NoRollouts)?;
+        let options = first.read_options();
         let (done, shard) = (store.indices(), store.shard());
         let wanted = move |index| shard.holds(index) && !done.contains(&index);
         let mut exclusions = Exclusions::default();
@@ -128,7 +128,7 @@ impl RealismEvaluation<'_> {
             store.add(Entry { index, id, scores })?;
             monitor.advance(1);
             if monitor.is_stopped() {
-                let from = format!("after scenario {index}");
+                let from = ResumePoint::After(index);
                 return Err(EvalError::StoppedAndStored { from });
             }
         }
@@ -142,11 +142,13 @@ impl RealismEvaluation<'_> {
         monitor: &dyn Monitor,
         visit: &mut dyn FnMut(VisitedRollouts<'_>) -> Result<(), BoxError>,
     ) -> Result<ScenarioScores, EvalError> {
-        let place = || format!("cannot evaluate scenario {}", recorded.log.scenario);
+        let place = || ErrorContext::Evaluation {
+            id: recorded.log.scenario.clone(),
+        };
         let found = sources.iter_mut().map(|source| {
             let monitor = simulating(monitor, source.frames(&recorded.scenario));
             let found = source.rollouts(self.device, recorded, self.config.mode, &*monitor);
-            found.map_err(|error| error.at(&place()))
+            found.map_err(|error| error.at(place()))
         });
         let found = found.collect::<Result<Vec<_>, _>>()?;
         let (mut source, mut visited) = (0, Ok(()));
@@ -185,7 +187,7 @@ pub fn evaluate(
     mut visit: impl FnMut(&FoundRollouts, &Evaluation<'_>),
 ) -> Result<ScenarioScores, EvalError> {
     let id = &recorded.log.scenario;
-    let of_this = |error: EvalError| error.at(&format!("cannot evaluate scenario {id}"));
+    let of_this = |error: EvalError| error.at(ErrorContext::Evaluation { id: id.clone() });
     let baseline = constant_velocity(recorded, config.mode).map_err(of_this)?;
     let oracle = recorded
         .log

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
 use gump_scene::{EgoState, MapGraph, Scenario};
 
-use crate::{EvalError, nuplan_recordings};
+use crate::{ArgumentError, EvalError, LanePurpose, RecordingError, nuplan_recordings};
 
 /// A recording with the additional data that scoring needs.
 pub struct Case {
@@ -63,8 +63,7 @@ pub fn open(path: &Path) -> Result<Box<dyn Iterator<Item = Named> + Send>, EvalE
 pub fn open_all(
     paths: &[PathBuf],
 ) -> Result<Box<dyn Iterator<Item = Named> + Send + '_>, EvalError> {
-    let none = || EvalError::Argument("expected scenarios, found none".into());
-    let (first, others) = paths.split_first().ok_or_else(none)?;
+    let (first, others) = paths.split_first().ok_or(ArgumentError::NoScenarios)?;
     let others = others.iter().flat_map(|path| match open(path) {
         Ok(cases) => cases,
         Err(error) => Box::new(std::iter::once(Named {
@@ -100,7 +99,10 @@ pub fn find(source: &str) -> Result<Case, EvalError> {
         }
         let mut all = nuplan_recordings::open(&logs)?.enumerate();
         let found = all.find(|(i, named)| named.id == wanted || i.to_string() == wanted);
-        let none = || EvalError::Argument(format!("no scenario {wanted} in {path}"));
+        let none = || ArgumentError::NoSuchScenario {
+            wanted: wanted.into(),
+            path: path.into(),
+        };
         let (_, named) = found.ok_or_else(none)?;
         return named.case;
     }
@@ -113,10 +115,11 @@ pub fn find(source: &str) -> Result<Case, EvalError> {
 /// No lanes, or a scenario that cannot be driven through.
 pub fn of_boxes(mut scenario: Scenario) -> Result<Case, EvalError> {
     if scenario.map.lanes().is_empty() {
-        return Err(EvalError::Recording(format!(
-            "scenario {}: expected a map with lanes to plan on, found none",
-            scenario.id
-        )));
+        return Err(RecordingError::NoLanes {
+            scenario: scenario.id,
+            purpose: LanePurpose::Plan,
+        }
+        .into());
     }
     let map = Arc::clone(&scenario.map);
     derive_roadblocks(&mut scenario);

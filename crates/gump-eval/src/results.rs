@@ -15,7 +15,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::shard::Shard;
-use crate::{EvalError, Monitor};
+use crate::{ErrorContext, EvalError, Monitor, ResultsError, ResumePoint};
 
 /// Name of a complete store in an output folder.
 const NAME: &str = "scenarios.toml";
@@ -105,8 +105,10 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
                 continue;
             }
             let scenario = record?.scenario;
-            let place = || format!("cannot evaluate scenario {}", scenario.id);
-            let scores = score(index, &scenario).map_err(|error| error.at(&place()))?;
+            let place = || ErrorContext::Evaluation {
+                id: scenario.id.clone(),
+            };
+            let scores = score(index, &scenario).map_err(|error| error.at(place()))?;
             self.add(Entry {
                 index,
                 id: scenario.id.clone(),
@@ -114,7 +116,7 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
             })?;
             monitor.advance(1);
             if monitor.is_stopped() {
-                let from = format!("after scenario {index}");
+                let from = ResumePoint::After(index);
                 return Err(EvalError::StoppedAndStored { from });
             }
         }
@@ -159,9 +161,7 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
     }
 
     fn write(&mut self, document: &Document<Entry<T>>) -> Result<(), EvalError> {
-        let mut text = toml::to_string(document).map_err(|error| {
-            EvalError::Results(format!("results that TOML cannot hold: {error}"))
-        })?;
+        let mut text = toml::to_string(document).map_err(ResultsError::Unwritable)?;
         text.push('\n');
         self.file
             .write_all(text.as_bytes())
@@ -216,33 +216,31 @@ pub fn merge<T: DeserializeOwned>(
         let (expected, example) = first.get_or_insert_with(|| (header.clone(), folder));
         check_same(expected, example, &header, folder)?;
         if let Some(other) = shards.insert(header.shard.k, folder) {
-            return Err(EvalError::Results(format!(
-                "expected every shard once, found {} in {} and {}",
-                header.shard,
-                other.display(),
-                folder.display()
-            )));
+            return Err(ResultsError::RepeatedShard {
+                shard: header.shard,
+                first: other.to_owned(),
+                second: folder.clone(),
+            }
+            .into());
         }
         for entry in scenarios {
             let shard = header.shard;
             if !shard.holds(entry.index) {
-                return Err(EvalError::Results(format!(
-                    "scenario {} is not of shard {shard}: {}",
-                    entry.index,
-                    folder.display()
-                )));
+                return Err(ResultsError::ForeignScenario {
+                    index: entry.index,
+                    shard,
+                    folder: folder.clone(),
+                }
+                .into());
             }
             entries.insert(entry.index, entry);
         }
     }
-    let none = || EvalError::Results("expected at least one folder".into());
-    let (header, _) = first.ok_or_else(none)?;
+    let (header, _) = first.ok_or(ResultsError::NoFolders)?;
     let n = header.shard.n;
     let missing: Vec<_> = (1..=n).filter(|k| !shards.contains_key(k)).collect();
     if !missing.is_empty() && when_missing == MissingShards::Refuse {
-        return Err(EvalError::Results(format!(
-            "expected all {n} shards, missing are {missing:?}"
-        )));
+        return Err(ResultsError::MissingShards { n, missing }.into());
     }
     let shard = Shard::WHOLE;
     Ok((Header { shard, ..header }, entries.into_values().collect()))
@@ -260,43 +258,31 @@ fn check_same(
     if same {
         return Ok(());
     }
-    Err(EvalError::Results(format!(
-        "expected shards of one evaluation, found {} {} of {} in {} but {} {} of {} in {}",
-        expected.benchmark,
-        expected.settings,
-        expected.shard.n,
-        example.display(),
-        found.benchmark,
-        found.settings,
-        found.shard.n,
-        folder.display()
-    )))
+    Err(ResultsError::DifferentEvaluations {
+        expected: Box::new(expected.clone()),
+        expected_in: example.to_owned(),
+        found: Box::new(found.clone()),
+        found_in: folder.to_owned(),
+    }
+    .into())
 }
 
 fn text(folder: &Path) -> Result<String, EvalError> {
     let path = folder.join(NAME);
-    fs::read_to_string(&path).map_err(|cause| {
-        EvalError::Results(format!(
-            "expected a finished evaluation, cannot read {}: {cause}",
-            path.display()
-        ))
-    })
+    fs::read_to_string(&path).map_err(|cause| ResultsError::Unfinished { path, cause }.into())
 }
 
 fn parse<T: DeserializeOwned>(text: &str, folder: &Path) -> Result<(Header, Vec<T>), EvalError> {
     let path = folder.join(NAME);
-    let document: Document<T> = toml::from_str(text).map_err(|error| {
-        EvalError::Results(format!(
-            "expected the scenarios of an evaluation in {}: {error}",
-            path.display()
-        ))
-    })?;
-    let header = document.evaluation;
-    let none = || {
-        let path = path.display();
-        EvalError::Results(format!("expected a table evaluation in {path}"))
+    let document: Document<T> = match toml::from_str(text) {
+        Ok(document) => document,
+        Err(error) => {
+            let cause = Box::new(error);
+            return Err(ResultsError::Malformed { path, cause }.into());
+        }
     };
-    let header = header.ok_or_else(none)?;
+    let header = document.evaluation;
+    let header = header.ok_or(ResultsError::NoHeader { path })?;
     Ok((header, document.scenario))
 }
 

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::EvalError;
+use crate::{ArgumentError, EvalError};
 
 /// The file, or all files of a folder with `.binproto` in their names, sorted.
 ///
@@ -24,10 +24,8 @@ pub fn files(path: &Path) -> Result<Vec<PathBuf>, EvalError> {
         }
     }
     if files.is_empty() {
-        return Err(EvalError::Argument(format!(
-            "expected files named *.binproto*, found none in the folder {}",
-            path.display()
-        )));
+        let folder = path.to_owned();
+        return Err(ArgumentError::NoRolloutFiles { folder }.into());
     }
     files.sort();
     Ok(files)

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
+use crate::{ArgumentError, EvalError, ShardError};
 
 /// Part `k` of `n`. Scenarios are assigned in turn, so shards are similar in size and content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -30,17 +30,18 @@ impl Shard {
     /// shards: `GUMP_SHARDS` does, and it also overrides the count of Slurm.
     ///
     /// # Errors
-    /// [`EvalError::Argument`] that says which variable is missing or wrong.
+    /// [`ShardError`], which has the variable that is missing or wrong.
     pub fn of_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Self, EvalError> {
-        let number = |name: &str| {
+        let number = |name: &'static str| {
             let text = variable(name).filter(|text| !text.is_empty());
             let parsed = text.map(|text| {
-                let wrong = format!("expected a number in {name}, found \"{text}\"");
-                text.trim()
-                    .parse::<usize>()
-                    .map_err(|_| EvalError::Argument(wrong))
+                let number = text.trim().parse::<usize>();
+                number.map_err(|_| ShardError::Variable {
+                    variable: name,
+                    found: text,
+                })
             });
-            parsed.transpose()
+            parsed.transpose().map_err(ArgumentError::Shard)
         };
         let array = match number("SLURM_ARRAY_TASK_ID")? {
             Some(id) => {
@@ -61,23 +62,12 @@ impl Shard {
             (Some((i, n)), Some((k, Some(m))), _) if m > 1 => (i * m + k, n.map(|n| n * m)),
             (Some(found), ..) | (None, Some(found), _) => found,
             (None, None, Some(index)) => (index, None),
-            (None, None, None) => {
-                let wrong = "expected SLURM_ARRAY_TASK_ID, SLURM_PROCID or \
-                             JOB_COMPLETION_INDEX for auto, found none of them";
-                return Err(EvalError::Argument(wrong.into()));
-            }
+            (None, None, None) => return Err(wrong(ShardError::NoScheduler)),
         };
-        let n = match number("GUMP_SHARDS")?.or(known) {
-            Some(n) => n,
-            None => {
-                let wrong = "expected the number of shards in GUMP_SHARDS, found none";
-                return Err(EvalError::Argument(wrong.into()));
-            }
-        };
+        let n = number("GUMP_SHARDS")?.or(known);
+        let n = n.ok_or_else(|| wrong(ShardError::NoCount))?;
         if index >= n {
-            return Err(EvalError::Argument(format!(
-                "expected fewer than {n} shards counted from 0, found number {index}"
-            )));
+            return Err(wrong(ShardError::BeyondLast { n, index }));
         }
         Ok(Self { k: index + 1, n })
     }
@@ -88,20 +78,25 @@ impl Shard {
     }
 }
 
+fn wrong(error: ShardError) -> EvalError {
+    ArgumentError::Shard(error).into()
+}
+
 impl FromStr for Shard {
     type Err = EvalError;
 
     /// Reads `K/N`.
     ///
     /// # Errors
-    /// [`EvalError::Argument`] unless K is from 1 to N.
+    /// [`ShardError::Malformed`].
     fn from_str(text: &str) -> Result<Self, EvalError> {
         let parts = text.split_once('/');
         match parts.map(|(k, n)| (k.parse(), n.parse())) {
             Some((Ok(k), Ok(n))) if 1 <= k && k <= n => Ok(Self { k, n }),
-            _ => Err(EvalError::Argument(
-                "expected K/N with K from 1 to N, like 2/8".into(),
-            )),
+            _ => {
+                let found = text.into();
+                Err(wrong(ShardError::Malformed { found }))
+            }
         }
     }
 }

@@ -14,17 +14,17 @@ use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion};
 use rand::Rng as _;
 
-use crate::EvalError;
+use crate::{EvalError, SumoError};
 
-/// Simulated seconds before the first window, so that queues have formed.
+/// Simulated seconds before the first window, so that queues have formed. Chosen by hand.
 const WARMUP_S: f64 = 60.0;
-/// Default length of a scene after its present, seconds.
+/// Default length of a scene after its present, seconds: the horizon of Waymo's challenges.
 pub const FUTURE_S: f64 = 8.0;
-/// Windows per run.
+/// Windows per run: they share the time that the run warms up. Chosen by hand.
 const WINDOWS: usize = 6;
-/// Seconds between two windows, so that scenes of one run differ.
+/// Seconds between two windows, so that scenes of one run differ. Chosen by hand.
 const PAUSE_S: f64 = 5.0;
-/// Seconds between frames.
+/// Seconds between frames, as in the Waymo Open Motion Dataset.
 const STEP_S: f64 = 0.1;
 
 /// Lateral acceleration at which curves of junctions are driven, metres per second squared.
@@ -32,7 +32,7 @@ const STEP_S: f64 = 0.1;
 const TURN_ACCELERATION: f64 = 2.2;
 /// Highest speed of a SUMO pedestrian, metres per second: none of them runs, so more is a jump.
 const FASTEST_WALK: f64 = 4.0;
-/// Points of a curve through a junction; SUMO's default of 5 leaves corners.
+/// Points of a curve through a junction; SUMO's default of 5 leaves corners. Chosen by eye.
 const CURVE_POINTS: u32 = 12;
 
 /// The programs of a SUMO installation.
@@ -55,7 +55,7 @@ impl Sumo {
     /// Looks for SUMO in `SUMO_HOME`, on the path, and among the packages of Python.
     ///
     /// # Errors
-    /// [`EvalError::Sumo`], which says how to install it.
+    /// [`SumoError::NotInstalled`], which says how to install it.
     pub fn find() -> Result<Self, EvalError> {
         let has = |folder: &Path| folder.join("sumo").is_file();
         if let Some(home) = std::env::var_os("SUMO_HOME").map(PathBuf::from) {
@@ -77,12 +77,7 @@ impl Sumo {
                 return Ok(Self { programs, home });
             }
         }
-        Err(EvalError::Sumo(
-            "--kind sumo needs SUMO and found none in SUMO_HOME, on the PATH or in Python: \
-             install it with `pip install eclipse-sumo` or `apt-get install sumo`; \
-             --kind procedural needs nothing"
-                .into(),
-        ))
+        Err(SumoError::NotInstalled.into())
     }
 
     /// The first line of `sumo --version`.
@@ -103,6 +98,7 @@ impl Sumo {
     pub fn generate(&self, seed: Seed, folder: &Path) -> Result<SumoNetwork, EvalError> {
         let mut rng = seed.rng();
         let shape = ["grid", "spider", "random"][rng.random_range(0..3)];
+        // Blocks, lanes, limits and shares of what a town may have, chosen by hand.
         let length = rng.random_range(90..190).to_string();
         let arms = rng.random_range(4..7).to_string();
         let mut arguments: Vec<&str> = match shape {
@@ -288,15 +284,14 @@ pub fn networks(path: &Path) -> Result<Vec<PathBuf>, EvalError> {
         found.sort();
     } else {
         if !path.is_file() {
-            let none = format!("expected a network, found none: {}", path.display());
-            return Err(EvalError::Sumo(none));
+            let path = path.to_owned();
+            return Err(SumoError::NoNetwork { path }.into());
         }
         found.push(path.to_owned());
     }
     if found.is_empty() {
-        let folder = path.display();
-        let none = format!("expected *.net.xml or *.net.xml.gz, found none: {folder}");
-        return Err(EvalError::Sumo(none));
+        let folder = path.to_owned();
+        return Err(SumoError::NoNetworks { folder }.into());
     }
     Ok(found)
 }
@@ -361,11 +356,12 @@ fn run(command: &mut Command) -> Result<(), EvalError> {
         .lines()
         .filter(|line| line.contains("rror"))
         .collect();
-    Err(EvalError::Sumo(format!(
-        "{program} failed ({}): {}",
-        output.status,
-        lines.join(" ")
-    )))
+    Err(SumoError::Failed {
+        program,
+        status: output.status,
+        stderr: lines.join(" "),
+    }
+    .into())
 }
 
 fn home_of_python_package() -> Option<PathBuf> {

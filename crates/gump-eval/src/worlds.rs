@@ -15,7 +15,7 @@ use gump_scene::Scenario;
 use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, RecordedLights};
 use serde::{Serialize, Serializer};
 
-use crate::EvalError;
+use crate::{ArgumentError, EvalError};
 
 /// A world by name.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,7 +38,7 @@ impl FromStr for WorldName {
     /// model.
     ///
     /// # Errors
-    /// [`EvalError::Argument`], with a suggestion where the name looks like a path.
+    /// [`ArgumentError::NoSuchWorld`].
     fn from_str(name: &str) -> Result<Self, EvalError> {
         match name {
             "log" => Ok(Self::Log),
@@ -48,7 +48,7 @@ impl FromStr for WorldName {
                 Some(path) if !path.is_empty() => Ok(Self::Model(path.into())),
                 // No other world has such a name, so the meaning is clear.
                 None if name.ends_with(WEIGHTS) => Ok(Self::Model(name.into())),
-                _ => Err(EvalError::Argument(no_world(name))),
+                _ => Err(no_such_world(name).into()),
             },
         }
     }
@@ -78,24 +78,21 @@ const WEIGHTS: &str = ".safetensors";
 /// A file of weights, given by its path or by the name of a world.
 ///
 /// # Errors
-/// [`EvalError::Argument`] if it is a world without weights.
+/// [`ArgumentError::NoWeights`].
 pub fn weights(name: &str) -> Result<PathBuf, EvalError> {
     match name.parse() {
         Ok(WorldName::Model(path)) => Ok(path),
-        Ok(world) => Err(EvalError::Argument(format!(
-            "expected a file of weights, found the world {world}"
-        ))),
+        Ok(found) => Err(ArgumentError::NoWeights { found }.into()),
         Err(_) => Ok(name.into()),
     }
 }
 
-/// Why a name is not a world, and a suggestion.
-fn no_world(name: &str) -> String {
-    let expected = "expected log, idm, constant-velocity or model:WEIGHTS";
+/// Why a name is not a world.
+fn no_such_world(name: &str) -> ArgumentError {
     let is_path = name.contains(['/', '\\', '.']) || Path::new(name).exists();
-    match is_path && !name.starts_with("model:") {
-        true => format!("{expected}; for weights in a file: model:{name}"),
-        false => expected.into(),
+    ArgumentError::NoSuchWorld {
+        found: name.into(),
+        is_path: is_path && !name.starts_with("model:"),
     }
 }
 
@@ -158,8 +155,7 @@ impl World {
         sampling: &SamplingConfig,
     ) -> Result<Self, EvalError> {
         if sampling.lights == LightSource::Log {
-            let wrong = "lights as recorded need a world of one scenario; expected model or hold";
-            return Err(EvalError::Argument(wrong.into()));
+            return Err(ArgumentError::RecordedLightsWithoutScenario.into());
         }
         Self::with_lights(device, name, sampling, || LightControl::Hold)
     }
@@ -175,18 +171,12 @@ impl World {
                 LightSource::Model => LightControl::Signals,
                 LightSource::Hold => LightControl::Hold,
                 LightSource::Log => recorded(),
-                other => {
-                    let wrong = format!("expected lights of model, hold or log, found {other}");
-                    return Err(EvalError::Argument(wrong));
-                }
+                found => return Err(ArgumentError::UnsupportedLights { found }.into()),
             },
             arrivals: sampling.spawn.then(Arrivals::default),
         };
         Ok(match name {
-            WorldName::Log => {
-                let wrong = "the world log needs a scenario to replay";
-                return Err(EvalError::Argument(wrong.into()));
-            }
+            WorldName::Log => return Err(ArgumentError::LogWithoutScenario.into()),
             WorldName::Idm => Self::Rule(Box::new(Living::new(Idm::default(), living))),
             WorldName::ConstantVelocity => {
                 Self::Rule(Box::new(Living::new(ConstantVelocity, living)))

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 use crate::partial_scene::PartialScene;
 use crate::{GenerateError, Placement, reason};
 
-/// Number of draws of an object made at once: most objects need no more.
+/// Number of draws of an object made at once after the first: most objects need no more. Not tuned.
 const VOLLEY: usize = 4;
 
 /// Gives every unfinished scene its next object; false once all are finished.

@@ -9,9 +9,10 @@ use gump_scene::{
 };
 use rand::Rng as _;
 
-/// Draws of a vehicle before it is left out.
+/// Draws per wanted vehicle before the rest is left out; they are cheap. Not tuned.
 const TRIES: usize = 50;
-/// Moving vehicles this near to a lane's centre line are compared with its direction, metres.
+/// Moving vehicles this near to a lane's centre line are compared with its direction, metres: half
+/// of a wide lane. Chosen by hand.
 const ON_LANE_M: f64 = 2.0;
 
 /// The ego of a scene and `n` vehicles at random on lanes within `half_side` metres of it along

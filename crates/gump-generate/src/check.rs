@@ -7,7 +7,7 @@ use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, SceneState};
 
 use crate::Counts;
 
-/// Sampling interval of futures, seconds.
+/// Sampling interval of futures, seconds: a step of the networks. Contacts in between are missed.
 pub(crate) const LOOK_S: f64 = 0.5;
 
 /// The clause that no agents overlap.

@@ -24,7 +24,7 @@ use crate::GenerateError;
 
 /// Name of the ego among the objects.
 pub const EGO: &str = "ego";
-/// Fastest a state can be along an axis, metres per second.
+/// Fastest a state can be along an axis, metres per second: the end of [`Field::VelocityX`].
 const FASTEST: f64 = 25.0;
 
 #[derive(Deserialize)]

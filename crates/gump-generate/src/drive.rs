@@ -6,23 +6,27 @@ use gump_rollout::{BoxError, Command, Policy};
 use gump_scene::{AgentState, Lane, LaneId, Light, LightState, MapGraph, Rng, SceneState};
 use rand::Rng as _;
 
-/// Horizon of a planned drive, seconds.
+/// Horizon of a planned drive, seconds: tags look up to 4 s ahead, from a moment at most 1 s after
+/// the start (`prompt_search::MOMENTS`).
 pub(crate) const PLANNED_S: f64 = 5.0;
-/// Duration of an acceleration, seconds.
+/// Duration of an acceleration, seconds: longer than tags need to see it (0.6 s). Chosen by hand.
 const PULL_S: f64 = 2.0;
-/// A jolt: start and end of the braking, seconds, and deceleration, metres per second squared.
+/// A jolt: start and end of the braking, seconds, and deceleration, metres per second squared. About
+/// 10 m/s³ at the moment after 1 s, where the tag asks for 5.
 const JOLT: ([f64; 2], f64) = ([1.0, 1.5], 6.0);
-/// Distance of the axles from the centre, metres; both are on the path.
+/// Distance of the axles from the centre, metres, half of a car's wheelbase; both are on the path.
 const AXLE_M: f64 = 1.4;
-/// Maximum length of a drive beyond the end of the road, metres.
+/// Maximum length of a drive beyond the end of the road, metres: for rounding, where lanes are
+/// joined.
 const ENDS_M: f64 = 1.0;
-/// A vehicle that moves less than this stands, metres.
+/// A vehicle that moves less than this during the drive stands, metres: too little to run a light.
 const STANDS_M: f64 = 1.0;
-/// Maximum distance along the road between the starts of adjacent lanes, metres.
+/// Maximum distance along the road between the starts of adjacent lanes, metres. Chosen by hand;
+/// beyond it the other lane's path may end too early, and no drive is planned.
 const BEGINS_M: f64 = 20.0;
-/// Maximum number of lanes of a drive.
+/// Maximum number of lanes of a drive, against maps of endless short ones.
 const MOST_LANES: usize = 24;
-/// Lateral distance of adjacent lanes, metres.
+/// Lateral distance of adjacent lanes, metres: from narrow to very wide ones.
 const BESIDE_M: [f64; 2] = [2.2, 5.5];
 
 /// The manoeuvre, besides following lanes at a constant speed.
@@ -52,6 +56,7 @@ impl Maneuver {
         if self.jolts || self.acceleration > 0.0 {
             PULL_S
         } else {
+            // A change of lanes takes up to 3.4 s.
             4.0
         }
     }
@@ -59,7 +64,7 @@ impl Maneuver {
 
 /// A path to drive, with a start and a speed.
 #[derive(Clone, Debug)]
-pub(crate) struct Drive {
+pub(crate) struct PlannedDrive {
     path: Polyline,
     /// Metres along the path at which it begins.
     from: f64,
@@ -72,7 +77,7 @@ pub(crate) struct Drive {
     pub(crate) neighbor: Option<LaneId>,
 }
 
-impl Drive {
+impl PlannedDrive {
     /// From `at` metres along a lane, `offset` metres left of its centre line, along a random path
     /// through junctions; `None` if the road ends before, or there is no lane to change to.
     pub(crate) fn along(
@@ -104,6 +109,7 @@ impl Drive {
         // The lights of the start lane represent those of the neighbour.
         drive.entered = entered;
         let path = Polyline::new(points).filter(|path| path.length() >= needed - ENDS_M)?;
+        // Nearer than 5 cm the centre line does as well, without the offset's kinks.
         drive.path = if offset.abs() > 0.05 {
             path.offset(offset)
         } else {
@@ -177,12 +183,12 @@ impl Drive {
 
 /// The policy of an ego with this drive.
 pub(crate) struct Steered<'a> {
-    drive: &'a Drive,
+    drive: &'a PlannedDrive,
     seconds: f64,
 }
 
 impl<'a> Steered<'a> {
-    pub(crate) fn new(drive: &'a Drive) -> Self {
+    pub(crate) fn new(drive: &'a PlannedDrive) -> Self {
         Self {
             drive,
             seconds: 0.0,
@@ -282,7 +288,7 @@ mod tests {
 
     use super::*;
 
-    fn drive(at: f64, speed: f64, maneuver: Maneuver) -> Option<Drive> {
+    fn drive(at: f64, speed: f64, maneuver: Maneuver) -> Option<PlannedDrive> {
         let scenario = fixture::scenario(
             "lane 1: 0,0 60,0 next 3 left 2\nlane 2: 0,3.5 60,3.5 right 1\nlane 3: 60,0 60,40\n\
              light 3 red: 59,0\nego vehicle 0: 0,0",
@@ -291,7 +297,7 @@ mod tests {
         let map = &scenario.map;
         let lane = &map.lanes()[0];
         let rng = &mut Seed(1).rng();
-        Drive::along(map, (lane, at), 0.0, speed, maneuver, rng)
+        PlannedDrive::along(map, (lane, at), 0.0, speed, maneuver, rng)
     }
 
     #[test]

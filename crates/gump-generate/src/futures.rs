@@ -6,21 +6,24 @@ use gump_scene::{Frame, Rollout, Scenario, Seed};
 
 use crate::GenerateError;
 use crate::check::{LOOK_S, overlaps_in};
-use crate::drive::{Drive, Steered};
+use crate::drive::{PlannedDrive, Steered};
 
 #[cfg(doc)]
 use crate::check::through_time;
 
-/// Number of futures simulated of a scene, after a first one that is often sufficient.
+/// Number of futures simulated of a scene, after a first one that is often sufficient. Each costs as
+/// much as the first; not tuned.
 pub(super) const FUTURES: usize = 4;
-/// Seconds of future that tags need.
+/// Seconds of future that tags need: a change of lanes is looked for 4 s ahead
+/// (`gump_metrics::tags`).
 pub(super) const JUDGED_S: f64 = 4.0;
-/// Maximum time from the generated scene to the instant, seconds.
+/// Maximum time from the generated scene to the instant, seconds: longer, and what was generated has
+/// moved away. Chosen by hand.
 const MOMENTS_S: f64 = 2.0;
 /// Seconds before the instant that are kept, as long as recorded histories.
 const HISTORY_S: f64 = 1.0;
 
-/// Separates the streams of further futures.
+/// Separates the streams of further futures from those that the world forks from the same seed.
 const AGAIN: u64 = 1 << 20;
 
 /// Whether no agents overlap from the present of a scenario on.
@@ -56,7 +59,7 @@ pub(super) fn free(
 pub(super) fn steered(
     world: &dyn WorldModel,
     scene: &Scenario,
-    drive: &Drive,
+    drive: &PlannedDrive,
     seed: Seed,
 ) -> Result<Vec<Scenario>, GenerateError> {
     let start = Start {
@@ -147,7 +150,7 @@ pub(super) fn extend(
 fn imagine(
     world: &dyn WorldModel,
     starts: &[Start<'_>],
-    drive: Option<&Drive>,
+    drive: Option<&PlannedDrive>,
     seconds: f64,
 ) -> Result<Vec<Rollout>, GenerateError> {
     let config = SimulateConfig {

@@ -114,8 +114,10 @@ impl PromptSpec {
         };
         let change = match self.changes {
             None => None,
+            // Seconds; the tag looks 4 s ahead.
             Some(Changes::Lanes(side)) => Some(change(side, [2.8, 3.4])),
             Some(Changes::Swift) => {
+                // Over the width of a lane 2.4 to 3.8 m/s² at most: the tag asks for 1.5 to 3.
                 let swift = change(None, [2.3, 2.9]);
                 rng.random::<bool>().then_some(swift)
             }
@@ -129,6 +131,9 @@ impl PromptSpec {
 }
 
 /// Requirements of one tag.
+///
+/// All numbers here and below lie inside the thresholds of the tags' rules (`gump_metrics::tags`),
+/// with some room for the grid of tokens and for what the world makes of them; chosen by hand.
 fn of_tag(name: &str) -> PromptSpec {
     let acceleration = if name.starts_with("accelerating") {
         1.8

@@ -13,15 +13,19 @@ use crate::prompt::PromptSpec;
 use crate::site::Site;
 use crate::{EgoStart, GenerateRequest};
 
-/// Maximum distance of the ego from the requested pose, metres.
+/// Maximum distance of the ego from the requested pose, metres: a few blocks. Chosen by hand; the
+/// larger, the more prompts a map admits.
 const ROAM_M: f64 = 150.0;
-/// Spacing of candidate places along a lane, metres.
+/// Spacing of candidate places along a lane, metres: some tags ask for a stop line within 2 m.
 const SPACING_M: f64 = 2.0;
-/// Trials of a given place.
+/// Trials of a given place, each with another path and speed. They need no network, so many are
+/// cheap.
 const TRIALS: usize = 60;
-/// Trials of every place of a map, each with other paths through the junctions ahead.
+/// Trials of every place of a map, each with other paths through the junctions ahead. Chosen by
+/// hand.
 const ROUNDS: usize = 2;
-/// The frames of a trial at which the tags may hold; later ones for tags that take time.
+/// The frames of a trial at which the tags may hold; later ones for tags that take time: after 1 s a
+/// jolt begins, and tags measure it from both sides.
 const MOMENTS: [usize; 2] = [0, 10];
 
 /// The search criteria.
@@ -39,6 +43,7 @@ impl Search<'_> {
         let map: &MapGraph = &self.request.map;
         let rng = &mut seed.rng();
         let mut lanes = Vec::new();
+        // The lane that the ego is on, or beside: about a lane's width off and 30 degrees turned.
         for (lane, _) in map.lanes_near(pose.position, 3.0) {
             let on = lane.centerline.project(pose.position);
             let way = lane.centerline.pose_at(on.arc_length).heading;

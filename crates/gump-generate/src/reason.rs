@@ -4,22 +4,38 @@
 //! A network that draws one object after another places standing vehicles in the middle of open
 //! lanes. Rollouts leave them there, like double-parked vehicles, and half a minute later all
 //! traffic stands behind them.
+//!
+//! `behaviour/free_road.rs` of `gump-metrics` and `relative/waiting.rs` of `gump-engine` ask similar
+//! questions of standing vehicles, with other reasons. Here a draw is judged while its scene is half
+//! drawn, and judged again and again, so the test is short and knows less:
+//!
+//! * The others are boxes without velocities, since those drawn later are not there yet. A junction
+//!   ahead is therefore a reason by itself; the other two look for traffic that approaches it.
+//! * A way ahead is the rest of the lane joined with one following lane, and everything is measured
+//!   along the joined line. The other two measure on each lane by itself (`gump_scene::LaneAhead`)
+//!   and follow lanes as far as they look; near the seam of two lanes the results differ, and with
+//!   them the scenes that a seed gives.
+//! * Another agent is a reason if its centre is within 1.8 m of the path and its rear within 12 m
+//!   ahead, whatever its kind; the other two look at its corners and keep farther from people.
 
 use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, angle_difference};
 use gump_scene::{Lane, Light, LightState, MapGraph, stop_line};
 
-/// A slower vehicle stands, metres per second.
+// Chosen by hand: result 23 has the effect of the rule, not of its numbers.
+
+/// A slower vehicle stands, metres per second: two bins of a token.
 const STANDS: f64 = 0.5;
 /// A vehicle this near to a lane's centre, and this well aligned with it, stands in traffic;
-/// otherwise it is parked. Metres and radians.
+/// otherwise it is parked. Metres and radians, as in the relative network's world.
 const IN_LANE_M: f64 = 1.0;
 const ALONG: f64 = 0.35;
-/// Maximum distance of a reason ahead of the front bumper, metres: a light or sign, a junction,
-/// another agent.
+/// Maximum distance of a reason ahead of the front bumper, metres: a light or sign (it waits a few
+/// cars behind the line), a junction, another agent (a gap of two cars).
 const LINE_M: f64 = 25.0;
 const JUNCTION_M: f64 = 10.0;
 const NEXT_M: f64 = 12.0;
-/// Maximum distance beside the path of another agent that blocks it, metres.
+/// Maximum distance beside the path of another agent that blocks it, metres: about the width of a
+/// car.
 const BESIDE_M: f64 = 1.8;
 
 /// True if a box, world frame, stands in a lane without a reason.
@@ -46,6 +62,7 @@ pub(crate) fn stands_without(
         let is_held_by_line = lanes.iter().any(|lane| {
             let ahead = |at: DVec2| {
                 let gap = way.project(at).arc_length - front;
+                // Up to 3 m past the line it may still wait; signs stand beside the road.
                 (-3.0..LINE_M).contains(&gap) && way.project(at).distance < 5.0
             };
             let binds = |light: &&Light| light.lane == lane.id && light.state != LightState::Green;

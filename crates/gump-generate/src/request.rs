@@ -165,7 +165,8 @@ impl GenerateConfig {
 
 impl Default for GenerateConfig {
     /// The settings with the scenes most similar to recorded ones, with the shipped weights
-    /// (docs/results/0012-generation.md).
+    /// (docs/results/0012-generation.md). The limits (`tries`, `restarts`, `max_agents`) bound the
+    /// time of a scene and were not tuned.
     fn default() -> Self {
         Self {
             temperature: 1.0,

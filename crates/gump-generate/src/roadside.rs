@@ -6,16 +6,21 @@ use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, dvec2};
 use gump_scene::{Agent, AgentId, AgentKind, AgentState, AreaKind, Lane, LaneKind, MapGraph};
 
 use crate::EgoStart;
-use crate::drive::Drive;
+use crate::drive::PlannedDrive;
 use crate::prompt::WorkZone;
+
+// Within the distances of the tags (`gump_metrics::tags`): 8 m to cones, barriers and people, 20 m
+// to signs and to who crosses. The rest is chosen by hand.
 
 /// Distance of the first roadside object from the ego's front, and spacing, metres.
 const WORKS_M: [f64; 2] = [2.5, 3.0];
-/// Metres from lane to lane centre that stay clear.
+/// Distance to the centre of every lane that stays clear, metres: half of a car and 0.4 m.
 const CLEAR_M: f64 = 1.35;
-/// Maximum distance of a crosswalk with a pedestrian from the ego's centre, metres.
+/// Maximum distance of a crosswalk with a pedestrian from the ego's centre along either axis,
+/// metres: 7 m from its box, and half of its length.
 const WALK_M: f64 = 9.0;
-/// Range ahead of the ego's front in which its line may be crossed, metres.
+/// Range ahead of the ego's front in which its line may be crossed, metres: not so near that who
+/// crosses would hit it.
 const CROSSED_M: [f64; 2] = [4.0, 15.0];
 
 /// Cones or barriers along the edge of the lane that is driven, ahead of the ego and clear of the
@@ -23,7 +28,7 @@ const CROSSED_M: [f64; 2] = [4.0, 15.0];
 pub(super) fn put(
     map: &MapGraph,
     lane: &Lane,
-    drive: &Drive,
+    drive: &PlannedDrive,
     ego_length: f64,
     works: WorkZone,
 ) -> Option<Vec<Agent>> {
@@ -99,6 +104,7 @@ pub(super) fn crossings<'a>(map: &'a MapGraph, ego: &EgoStart) -> Vec<(&'a Lane,
             let share = from.y / (from.y - to.y);
             let x = from.x + (to.x - from.x) * share;
             let turn = angle_difference((to - from).to_angle(), 0.0);
+            // At more than 53 degrees.
             let is_across = from.y * to.y < 0.0 && turn.sin().abs() > 0.8;
             if is_across && (CROSSED_M[0]..CROSSED_M[1]).contains(&(x - front)) {
                 crossings.push((lane, along + share * a.distance(b)));
@@ -153,7 +159,8 @@ mod tests {
         let map = &scenario.map;
         let lane = &map.lanes()[0];
         let rng = &mut Seed(1).rng();
-        let drive = Drive::along(map, (lane, 10.0), 0.0, 5.0, Maneuver::default(), rng).unwrap();
+        let drive =
+            PlannedDrive::along(map, (lane, 10.0), 0.0, 5.0, Maneuver::default(), rng).unwrap();
         put(map, lane, &drive, 4.8, works).unwrap()
     }
 

@@ -10,13 +10,14 @@ use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
 
 use crate::constraint::EGO;
-use crate::drive::{Drive, PLANNED_S};
+use crate::drive::{PLANNED_S, PlannedDrive};
 use crate::prompt::{OnCrosswalk, PromptSpec};
 use crate::{EgoStart, GenerateRequest, roadside};
 
-/// Frames of a trial per second.
+/// Frames of a trial per second: those of scenarios.
 const TRIAL_HZ: f64 = 10.0;
-/// Time at which a crossing agent crosses, seconds.
+/// Time at which a crossing agent crosses, seconds: the tag allows 3, and the world may slow it
+/// down.
 const CROSSES_S: f64 = 1.8;
 
 /// The place of a scene, with the agents that its prompts need.
@@ -24,7 +25,7 @@ const CROSSES_S: f64 = 1.8;
 pub(crate) struct Site {
     pub(super) ego: EgoStart,
     /// The ego's drive if it is steered.
-    drive: Drive,
+    drive: PlannedDrive,
     /// All constraints, of the user and of the prompts.
     pub(super) objects: Vec<ObjectSpec>,
     fixtures: Vec<Agent>,
@@ -48,7 +49,7 @@ enum Way {
     /// At a constant velocity.
     Straight(AgentState),
     /// Along a drive, like an ego.
-    Along(Drive),
+    Along(PlannedDrive),
 }
 
 impl Site {
@@ -69,7 +70,7 @@ impl Site {
             .or_else(|| Some(drawn(wished?, rng)))
             .unwrap_or_else(|| rng.random_range(3.0..8.0));
         let maneuver = cast.maneuver(rng);
-        let drive = Drive::along(map, place, offset, speed, maneuver, rng)?;
+        let drive = PlannedDrive::along(map, place, offset, speed, maneuver, rng)?;
         if drive.runs_red(&request.lights, request.ego.length) {
             return None;
         }
@@ -102,7 +103,7 @@ impl Site {
     }
 
     /// The drive of the ego in a scene generated here: at its own speed, if that was open.
-    pub(crate) fn drive_from(&self, ego: &Agent) -> Drive {
+    pub(crate) fn drive_from(&self, ego: &Agent) -> PlannedDrive {
         let mut drive = self.drive.clone();
         drive.speed = ego.state.speed();
         drive
@@ -247,6 +248,7 @@ impl Site {
 
     /// The agent that crosses ahead: on a lane that crosses the line ahead, shortly before it.
     fn put_crossing(&mut self, class: Class, map: &MapGraph, rng: &mut Rng) -> Option<()> {
+        // Usual speeds at junctions, metres per second; chosen by hand.
         let speeds = match class {
             Class::Bicycle => [3.0, 5.0],
             _ => [4.5, 7.5],
@@ -260,7 +262,7 @@ impl Site {
             lane = before.choose(rng)?;
             from += lane.centerline.length();
         }
-        let drive = Drive::along(map, (lane, from), 0.0, speed, Default::default(), rng)?;
+        let drive = PlannedDrive::along(map, (lane, from), 0.0, speed, Default::default(), rng)?;
         self.put_along("crossing", class, lane, drive);
         Some(())
     }
@@ -269,17 +271,18 @@ impl Site {
     fn put_trail(&mut self, speed: f64, map: &MapGraph, rng: &mut Rng) -> Option<()> {
         let lane = map.lane(self.drive.neighbor?)?;
         let on = lane.centerline.project(self.ego.pose.position);
+        // The tag allows 20 m behind; less than 9 m is no room to change lanes.
         let from = on.arc_length - rng.random_range(9.0..15.0);
         if from < 0.0 {
             return None;
         }
-        let drive = Drive::along(map, (lane, from), 0.0, speed, Default::default(), rng)?;
+        let drive = PlannedDrive::along(map, (lane, from), 0.0, speed, Default::default(), rng)?;
         self.put_along("trail", Class::Vehicle, lane, drive);
         Some(())
     }
 
     /// An agent that drives along a lane from now on.
-    fn put_along(&mut self, id: &str, class: Class, lane: &Lane, drive: Drive) {
+    fn put_along(&mut self, id: &str, class: Class, lane: &Lane, drive: PlannedDrive) {
         let start = self.ego.pose.inverse() * drive.pose_ahead(0.0).position;
         // Wider than the bounds of a fixed place: the lane determines the rest.
         let near = |at: f64| Some(Bounds::new(at - 0.8, at + 0.8));
@@ -333,7 +336,7 @@ fn drawn(bounds: Bounds, rng: &mut Rng) -> f64 {
     rng.random_range(bounds.low..=bounds.high)
 }
 
-/// The extent of an agent.
+/// The extent of an agent, metres: a usual one of its class, where none is asked for.
 fn size_of(object: &ObjectSpec) -> [f64; 2] {
     let [length, width] = match object.class {
         Class::Vehicle => [4.5, 1.9],

@@ -171,18 +171,23 @@ fn what_a_prompt_says_is_made_and_judged() {
         seconds: 0.0,
         attempts: 20,
     };
-    let made = pipeline::make_many(
+    let checked = pipeline::make_many(
         pipeline::GenerationWorlds::of(&world()),
         &order,
         0..2,
         Seed(1),
     )
     .unwrap();
-    for made in made.into_iter().map(Result::unwrap) {
-        assert_eq!(made.clauses[0].clause, "behind_bike");
-        assert_eq!(made.clauses[0].holds, Some(true), "{:?}", made.clauses);
+    for checked in checked.into_iter().map(Result::unwrap) {
+        assert_eq!(checked.clauses[0].clause, "behind_bike");
+        assert_eq!(
+            checked.clauses[0].holds,
+            Some(true),
+            "{:?}",
+            checked.clauses
+        );
         // Judging looks four seconds ahead, and histories are a second long at most.
-        assert!(made.scenario.future().len() >= 40 && made.scenario.now <= 10);
+        assert!(checked.scenario.future().len() >= 40 && checked.scenario.now <= 10);
     }
 }
 
@@ -198,9 +203,9 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
         attempts: 20,
     };
     let order = order("stopping_with_lead");
-    let made_by = |threads: usize| {
+    let checked_with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        let made = || {
+        let generate = || {
             pipeline::make_many(
                 pipeline::GenerationWorlds::of(&world()),
                 &order,
@@ -209,12 +214,16 @@ fn prompted_scenes_do_not_depend_on_the_threads() {
             )
             .unwrap()
         };
-        pool.build().unwrap().install(made)
+        pool.build().unwrap().install(generate)
     };
-    let made: Vec<_> = made_by(1).into_iter().map(Result::unwrap).collect();
-    assert!(made.iter().all(pipeline::CheckedScene::holds));
-    assert!(made.iter().all(|made| made.scenario.future().len() >= 50));
-    for (one, two) in made.iter().zip(made_by(2)) {
+    let checked: Vec<_> = checked_with(1).into_iter().map(Result::unwrap).collect();
+    assert!(checked.iter().all(pipeline::CheckedScene::holds));
+    assert!(
+        checked
+            .iter()
+            .all(|checked| checked.scenario.future().len() >= 50)
+    );
+    for (one, two) in checked.iter().zip(checked_with(2)) {
         assert_eq!(one.scenario.log, two.unwrap().scenario.log);
     }
 }
@@ -238,8 +247,8 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
     let error = make(&order("on_carpark", Placement::Guided)).unwrap_err();
     assert!(error.to_string().contains("can hold on_carpark"), "{error}");
     // With free placement no stage is searched, and the verdict reports what is wrong.
-    let made = make(&order("on_carpark", Placement::Free));
-    assert!(!matches!(made, Err(GenerateError::NoStage { .. })));
+    let checked = make(&order("on_carpark", Placement::Free));
+    assert!(!matches!(checked, Err(GenerateError::NoStage { .. })));
 }
 
 #[test]
@@ -260,10 +269,14 @@ fn a_place_where_nobody_walks_is_left_for_another() {
         seconds: 0.0,
         attempts: 60,
     };
-    let made =
+    let checked =
         pipeline::make(pipeline::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
-    assert!(made.attempts > 1 && made.holds(), "{:?}", made.clauses);
-    let ego = made.scene.frame.agent(made.scene.ego).unwrap();
+    assert!(
+        checked.attempts > 1 && checked.holds(),
+        "{:?}",
+        checked.clauses
+    );
+    let ego = checked.scene.frame.agent(checked.scene.ego).unwrap();
     assert!((-40.0..0.0).contains(&ego.state.pose.position.x));
 }
 
@@ -278,7 +291,7 @@ fn a_steered_ego_is_where_its_drive_says() {
     };
     let rng = &mut Seed(2).rng();
     let lane = (&map.lanes()[0], 100.0);
-    let drive = drive::Drive::along(map, lane, 0.0, 3.0, maneuver, rng).unwrap();
+    let drive = drive::PlannedDrive::along(map, lane, 0.0, 3.0, maneuver, rng).unwrap();
     let takes = futures::steered(&world(), &scenario, &drive, Seed(4)).unwrap();
     assert!(!takes.is_empty());
     for take in takes {
@@ -302,10 +315,10 @@ fn cones_stand_clear_of_everybody() {
         seconds: 0.0,
         attempts: 20,
     };
-    let made =
+    let checked =
         pipeline::make(pipeline::GenerationWorlds::of(&world()), &order, 0, Seed(1)).unwrap();
-    assert!(made.holds(), "{:?}", made.clauses);
-    let present = made.scenario.present();
+    assert!(checked.holds(), "{:?}", checked.clauses);
+    let present = checked.scenario.present();
     let agents = present.now().agents().iter();
     let cones: Vec<&Agent> = agents
         .filter(|agent| agent.kind == AgentKind::TrafficCone)

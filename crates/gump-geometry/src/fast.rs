@@ -4,6 +4,7 @@ use glam::DVec2;
 
 use crate::{Polygon, Polyline, Projection};
 
+// Answers do not depend on these; no measurement of other sizes is recorded.
 /// Segments that share a bounding box.
 const CHUNK: usize = 12;
 /// Rows that a polygon is cut into, for each of which the edges that reach into it are known.

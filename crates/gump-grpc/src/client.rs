@@ -12,7 +12,7 @@ use tonic_prost::ProstCodec;
 
 use super::RemoteError;
 
-/// Time limit for connecting.
+/// Time limit for connecting: a running planner answers at once. Chosen by hand.
 const REACH: Duration = Duration::from_secs(5);
 
 /// A connection to one planner.

@@ -35,11 +35,13 @@ use gump_scene::{EgoState, LightState, VehicleParameters};
 
 use self::client::Client;
 
-/// Time limit for loading maps and weights before the drive.
+/// Time limit for loading maps and weights before the drive. Chosen by hand.
 const TO_INITIALIZE: Duration = Duration::from_secs(60);
-/// Time limit per step if no budget is set; the challenges allowed one second.
+/// Time limit per step if no budget is set; the challenges allowed one second, and slower machines
+/// should not fail. Chosen by hand.
 const TO_PLAN: Duration = Duration::from_secs(30);
-/// Moments that nuPlan's planners see: the present and 2.1 s before it, at 10 Hz.
+/// Moments that nuPlan's planners see: the present and 2.1 s before it, at 10 Hz, as
+/// nuplan-devkit's history buffer holds.
 const BUFFER: usize = 22;
 
 /// Why a remote planner returned no plan.

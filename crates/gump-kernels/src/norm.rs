@@ -2,7 +2,7 @@
 
 use crate::rows::{sum, sum_squares_from};
 
-/// Constant that the networks add to the variance of a row.
+/// Constant that the networks add to the variance of a row. Source: PyTorch's default.
 pub const NORM_EPS: f64 = 1e-5;
 
 /// Normalises one row; returns its mean and reciprocal deviation.

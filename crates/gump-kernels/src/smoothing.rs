@@ -1,7 +1,7 @@
 //! Targets that spread over neighbouring bins.
 
 /// Spreads a target over its neighbours on an ordered scale of bins, as a discrete normal
-/// distribution cut at four deviations and scaled to sum 1.
+/// distribution cut at four deviations, beyond which are 6e-5 of it, and scaled to sum 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OrdinalSmoothing {
     /// Standard deviation in bins, above 0.

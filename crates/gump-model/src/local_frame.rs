@@ -12,11 +12,11 @@ use gump_tokenizer::{Field, QuantizedState};
 use crate::decoder::{Bins, CHUNK, STEPS};
 
 /// Factor by which the positions of a chunk are finer in an object's own frame, pose by pose: the
-/// first reaches 25 m, each further one 25 m more.
+/// first reaches 25 m (50 m/s), each further one 25 m more.
 const FINER_PLACES: [f64; CHUNK] = [4.0, 2.0, 4.0 / 3.0, 1.0];
 /// Likewise for headings. The first reaches a quarter turn; beyond, opposite directions coincide.
 const FINER_HEADINGS: [f64; CHUNK] = [2.0, 1.0, 1.0, 1.0];
-/// Steps of the decoder before the first pose.
+/// Steps of the decoder before the first pose: width, length and velocity.
 const POSES: usize = 4;
 
 /// The frame in which a chunk is expressed.

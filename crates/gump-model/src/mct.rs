@@ -117,6 +117,7 @@ impl CrossBlock {
                     Some(scope.get("gate_mlp", 1, zero)?),
                 )
             }
+            // The released code's deviation.
             Gate::Released => (scope.get("gate_attention", 1, Init::Normal(0.3))?, None),
         };
         let norm = LayerNorm::new(&mut scope, "norm", c)?;
@@ -306,7 +307,8 @@ impl TokenBatch {
     }
 }
 
-/// Positions at which an object reads the map: seconds ahead on its present course.
+/// Positions at which an object reads the map: seconds ahead on its present course. Up to the reach
+/// of a chunk, about; not tuned (decision 10).
 pub const PLACES: [f64; 3] = [0.0, 1.0, 2.0];
 
 impl Mct {

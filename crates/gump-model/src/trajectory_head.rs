@@ -9,6 +9,8 @@ use gump_nn::parameters::Scope;
 
 use crate::ModelError;
 
+// The released code's numbers: 3 s back, 8 s ahead, and the six modes of motion prediction.
+
 /// Half-second steps of the past that a head predicts.
 pub const PAST: usize = 6;
 /// Half-second steps of the future that a head predicts.

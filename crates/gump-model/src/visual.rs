@@ -86,6 +86,7 @@ impl BatchNorm {
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor> {
         if training {
             let (y, [mean, variance]) = ops::batch_norm(x, &self.weight, &self.bias)?;
+            // PyTorch's momentum, and below its addition to variances.
             for (running, batch) in [(&self.mean, mean), (&self.variance, variance)] {
                 running.set(&((running.as_tensor() * 0.9)? + (batch * 0.1)?)?)?;
             }
@@ -264,6 +265,7 @@ struct Compact {
 }
 
 impl Compact {
+    /// At a quarter and at an eighth of the side. Chosen by hand for a CPU's time; not tuned.
     const CHANNELS: [usize; 2] = [32, 96];
 
     fn new(mut scope: Scope<'_>, planes: usize) -> Built<Self> {
@@ -354,6 +356,7 @@ impl Visual {
         let adapted = match &self.adaptor.1 {
             Some(norm) => {
                 let x = norm.forward(&adapted, training)?;
+                // The released code's leaky ReLU.
                 x.maximum(&(&x * 0.01)?)?
             }
             None => adapted,

@@ -18,14 +18,14 @@ pub type Gradients = BTreeMap<String, Tensor>;
 pub struct OptimizerConfig {
     /// Peak learning rate (paper: 2e-4).
     pub learning_rate: f64,
-    /// Steps of linear warm-up.
+    /// Steps of linear warm-up (paper: none stated; ours, not tuned).
     pub warmup: usize,
-    /// Learning rate at the end of the cosine, as a fraction of the peak.
+    /// Learning rate at the end of the cosine, as a fraction of the peak (ours, not tuned).
     pub final_fraction: f64,
     /// Points of the run, as fractions of it, at which the rate is multiplied by `drop`; with any,
     /// the rate is constant between them and there is no cosine.
     pub milestones: Vec<f64>,
-    /// Factor of the rate at each milestone.
+    /// Factor of the rate at each milestone (paper: 0.1).
     pub drop: f64,
     /// Decoupled weight decay of matrices (paper: 1e-3); norms, biases, tables and gates have none.
     pub weight_decay: f64,
@@ -85,6 +85,7 @@ impl OptimizerConfig {
     }
 }
 
+/// Source of all three: PyTorch's defaults; the paper states none.
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPS: f64 = 1e-8;

@@ -6,11 +6,16 @@
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference, wrap_angle};
 use gump_scene::Lane;
 
-/// Points closer than this to the next are the same point, metres.
+/// Points closer than this to the next are the same point, metres. The devkit drops steps of about
+/// zero; a millimetre is chosen by hand.
 const SAME: f64 = 1e-3;
 /// Distance between the points that a curvature is computed from, metres.
+///
+/// Source: nuplan-devkit.
 const CURVATURE_SPAN: f64 = 2.0;
 /// Distance over which a baseline's direction is determined, metres.
+///
+/// Source: nuplan-devkit.
 const HEADING_SPAN: f64 = 0.5;
 
 /// Poses along a line; at least one.
@@ -168,7 +173,7 @@ pub fn nearest_on_baseline(lane: &Lane, point: DVec2) -> (f64, Pose) {
 
 /// Curvature where a lane starts, radians per metre, positive to the left; 0 if it is too short.
 ///
-/// Source: nuPlan's three-point estimate.
+/// Source: nuPlan's three-point estimate, with its bound for points on one line.
 pub fn curvature_at_start(lane: &Lane) -> f64 {
     let line = &lane.centerline;
     let at = |s: f64| line.pose_at(s.min(line.length())).position;

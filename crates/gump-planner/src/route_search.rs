@@ -11,6 +11,8 @@ use gump_geometry::{DVec2, Polygon, Pose, angle_difference, dvec2};
 use gump_nuplan::path::baseline;
 use gump_scene::{Lane, LaneId, MapGraph, Roadblock, RoadblockId};
 
+// tuPlan Garage's values, up to `SHARED_AREA`.
+
 /// Half the side of the square around the rear axle in which its roadblock is searched, metres.
 const HERE: f64 = 1.0;
 /// A roadblock fits if one of its lanes passes this near, metres, ...
@@ -23,7 +25,8 @@ const DEPTH_BACK: usize = 15;
 const DEPTH_AHEAD: usize = 30;
 /// Connectors that overlap by more than this are the same place, square metres.
 const SHARED_AREA: f64 = 1.0;
-/// Side of the squares by which shared areas are counted, metres.
+/// Side of the squares by which shared areas are counted, metres: fine enough to compare with 1 m²
+/// (decision 27).
 const AREA_CELL: f64 = 0.2;
 
 /// The route from the ego's roadblock on, without gaps and without returning to a place.

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use gump_rl::{
     Autoreset, BicycleLimits, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
-    PreparedScenario, RasterView, RlError, Sampling, Traffic, VectorEnv, VectorView,
+    PreparedScenario, RasterView, RlError, Sampling, TrafficSource, VectorEnv, VectorView,
 };
 use gump_scene::Seed;
 use numpy::PyArrayDyn;
@@ -139,8 +139,8 @@ impl Env {
         let (asks, requests) = channel();
         threads::alone(move || {
             let traffic = match &model {
-                Some(model) => Traffic::World(&**model),
-                None => Traffic::Log,
+                Some(model) => TrafficSource::World(&**model),
+                None => TrafficSource::Log,
             };
             match DrivingEnv::new(prepared, traffic, config) {
                 Ok(env) => {

@@ -11,7 +11,7 @@ use crate::scenario::{Scenario, Scene};
 use crate::world::{Kind, World};
 use crate::{errors, threads};
 
-/// Scenes made together.
+/// Scenes made together, by all threads, before an interrupt is looked for. Chosen by hand.
 const BATCH: u64 = 32;
 
 /// Arguments of `gump.generate`.
@@ -94,7 +94,7 @@ pub(crate) fn generate<'py>(
     for first in (0..wish.count).step_by(BATCH as usize) {
         py.check_signals()?;
         let numbers = first..(first + BATCH).min(wish.count);
-        let made = threads::work(py, || {
+        let checked = threads::work(py, || {
             make_many(
                 GenerationWorlds::of(model),
                 &order,
@@ -102,24 +102,24 @@ pub(crate) fn generate<'py>(
                 Seed(wish.seed),
             )
         })?;
-        for made in made.map_err(errors::value)? {
-            list.append(scene_dict(py, made.map_err(errors::runtime)?)?)?;
+        for checked in checked.map_err(errors::value)? {
+            list.append(scene_dict(py, checked.map_err(errors::runtime)?)?)?;
         }
     }
     Ok(list)
 }
 
-fn scene_dict(py: Python<'_>, made: CheckedScene) -> PyResult<Bound<'_, PyDict>> {
+fn scene_dict(py: Python<'_>, checked: CheckedScene) -> PyResult<Bound<'_, PyDict>> {
     let dict = PyDict::new(py);
-    dict.set_item("holds", made.holds())?;
-    dict.set_item("attempts", made.attempts)?;
-    dict.set_item("is_steered", made.is_steered)?;
-    let clauses = made
+    dict.set_item("holds", checked.holds())?;
+    dict.set_item("attempts", checked.attempts)?;
+    dict.set_item("is_steered", checked.is_steered)?;
+    let clauses = checked
         .clauses
         .iter()
         .map(|clause| (&clause.clause, clause.holds));
     dict.set_item("clauses", clauses.collect::<Vec<_>>())?;
-    let scenario = Scenario::new(Scene::of(made.scenario));
+    let scenario = Scenario::new(Scene::of(checked.scenario));
     dict.set_item("scenario", Bound::new(py, scenario)?)?;
     Ok(dict)
 }

@@ -26,11 +26,11 @@ const OPTIONS: ReadOptions = ReadOptions {
 #[pyclass(frozen, module = "gump")]
 pub(crate) struct Reader {
     /// `None` once it is closed.
-    source: Mutex<Option<Source>>,
+    queue: Mutex<Option<FileQueue>>,
 }
 
 /// Files that are still to be read, and the one being read.
-struct Source {
+struct FileQueue {
     files: VecDeque<PathBuf>,
     open: Open,
 }
@@ -51,8 +51,8 @@ impl Reader {
             drop(gump_data::open_with(&path, OPTIONS)?);
             let files = list_files(&path)?.into();
             let open = Open::Nothing;
-            let source = Mutex::new(Some(Source { files, open }));
-            Ok(Self { source })
+            let queue = Mutex::new(Some(FileQueue { files, open }));
+            Ok(Self { queue })
         })
         .map_err(|error| errors::data(&error))
     }
@@ -63,8 +63,8 @@ impl Reader {
 
     fn __next__(&self, py: Python<'_>) -> PyResult<Option<Scenario>> {
         let next = py.detach(|| {
-            let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
-            source.as_mut().map(Source::next)
+            let mut queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+            queue.as_mut().map(FileQueue::next)
         });
         match next {
             None => Err(errors::value(
@@ -79,8 +79,8 @@ impl Reader {
     /// Closes the file being read; `next()` raises `ValueError` from then on.
     fn close(&self, py: Python<'_>) {
         py.detach(|| {
-            let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
-            *source = None;
+            let mut queue = self.queue.lock().unwrap_or_else(PoisonError::into_inner);
+            *queue = None;
         });
     }
 
@@ -94,7 +94,7 @@ impl Reader {
     }
 }
 
-impl Source {
+impl FileQueue {
     fn next(&mut self) -> Option<Result<Scene, DataError>> {
         loop {
             let next = match &mut self.open {

@@ -13,13 +13,15 @@ use std::sync::Arc;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use gump_rl::{
-    DrivingEnv, EnvConfig, ObservationSpec, PreparedScenario, RasterView, Rules, Traffic, VectorEnv,
+    DrivingEnv, EnvConfig, ObservationSpec, PreparedScenario, RasterView, Rules, TrafficSource,
+    VectorEnv,
 };
 use gump_rollout::worlds::Idm;
 use gump_scene::Seed;
 use gump_synthesis::{SynthesisConfig, synthesize_many};
 use rand::Rng as _;
 
+/// As many as in the paper.
 const N_ENVS: usize = 128;
 
 fn prepared() -> Arc<[PreparedScenario]> {
@@ -37,7 +39,12 @@ fn actions(len: usize) -> Vec<Vec<f32>> {
     (0..64).map(|_| batch()).collect()
 }
 
-fn measure(c: &mut Criterion, name: &str, traffic: Traffic<'_>, observation: ObservationSpec) {
+fn measure(
+    c: &mut Criterion,
+    name: &str,
+    traffic: TrafficSource<'_>,
+    observation: ObservationSpec,
+) {
     let config = EnvConfig {
         n_envs: N_ENVS,
         rules: Rules::default(),
@@ -64,10 +71,10 @@ fn measure(c: &mut Criterion, name: &str, traffic: Traffic<'_>, observation: Obs
 fn env(c: &mut Criterion) {
     let vector = ObservationSpec::default();
     let raster = ObservationSpec::Raster(RasterView::default());
-    measure(c, "log/vector", Traffic::Log, vector);
-    measure(c, "log/raster-64", Traffic::Log, raster);
+    measure(c, "log/vector", TrafficSource::Log, vector);
+    measure(c, "log/raster-64", TrafficSource::Log, raster);
     let idm = Idm::default();
-    measure(c, "idm/vector", Traffic::World(&idm), vector);
+    measure(c, "idm/vector", TrafficSource::World(&idm), vector);
 }
 
 criterion_group!(benches, env);

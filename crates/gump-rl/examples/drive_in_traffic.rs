@@ -6,7 +6,7 @@
 use std::error::Error;
 use std::path::PathBuf;
 
-use gump_rl::{DrivingEnv, EnvConfig, PreparedScenario, RlError, Traffic, VectorEnv};
+use gump_rl::{DrivingEnv, EnvConfig, PreparedScenario, RlError, TrafficSource, VectorEnv};
 use gump_rollout::worlds::Idm;
 use gump_scene::Seed;
 
@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         n_envs: 8,
         ..EnvConfig::default()
     };
-    let mut env = DrivingEnv::new(prepared, Traffic::World(&world), config)?;
+    let mut env = DrivingEnv::new(prepared, TrafficSource::World(&world), config)?;
     // ANCHOR_END: env
 
     let coast: Policy = |_, actions| {

@@ -8,7 +8,7 @@ use rand::Rng as _;
 
 use crate::{
     Actor, Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, PreparedScenario, RlError,
-    Traffic, VectorEnv,
+    TrafficSource, VectorEnv,
 };
 
 /// Mean progress of the logged drivers in the paper's test set, metres, by which progress is
@@ -17,7 +17,7 @@ use crate::{
 /// Source: reproduces the paper's scores from its other columns.
 pub const LOGGED_PROGRESS: f64 = 62.0;
 
-/// Resamples of a bootstrap.
+/// Resamples of a bootstrap; the ends of an interval then vary by about 2 % of its width.
 const N_RESAMPLES: usize = 2000;
 
 /// The driver.
@@ -153,7 +153,7 @@ impl Episodes {
 /// Errors of the environment; [`RlError::Shape`] for a driver with other observations or actions.
 pub fn evaluate(
     prepared: &Arc<[PreparedScenario]>,
-    traffic: Traffic<'_>,
+    traffic: TrafficSource<'_>,
     config: &EnvConfig,
     driver: EvaluatedPolicy<'_>,
     episodes: &Episodes,
@@ -422,7 +422,7 @@ mod tests {
             ..EnvConfig::default()
         };
         let world = Idm::default();
-        let traffic = Traffic::World(&world);
+        let traffic = TrafficSource::World(&world);
         let episodes = Episodes::all(3, 2, Seed(3));
         evaluate(&prepared(), traffic, &config, driver, &episodes).unwrap()
     }
@@ -468,7 +468,7 @@ mod tests {
         let config = EnvConfig::default();
         let driver = EvaluatedPolicy::Learned(&actor);
         let episodes = Episodes::all(3, 1, Seed(0));
-        let result = evaluate(&prepared(), Traffic::Log, &config, driver, &episodes);
+        let result = evaluate(&prepared(), TrafficSource::Log, &config, driver, &episodes);
         assert!(matches!(result, Err(RlError::Shape { expected: 3, .. })));
     }
 }

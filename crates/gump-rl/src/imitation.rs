@@ -6,7 +6,8 @@ use gump_scene::Seed;
 
 use crate::sac::{ReplayBuffer, Transition};
 use crate::{
-    Autoreset, DrivingEnv, EnvConfig, EpisodeStart, PreparedScenario, RlError, Traffic, VectorEnv,
+    Autoreset, DrivingEnv, EnvConfig, EpisodeStart, PreparedScenario, RlError, TrafficSource,
+    VectorEnv,
 };
 
 /// Drives every scenario once within its log, by the actions that come nearest to the log's, from the
@@ -27,7 +28,7 @@ pub fn demonstrations(
         autoreset: Autoreset::SameStep,
         ..*config
     };
-    let mut env = DrivingEnv::new(Arc::clone(prepared), Traffic::Log, config)?;
+    let mut env = DrivingEnv::new(Arc::clone(prepared), TrafficSource::Log, config)?;
     let start = |scenario| EpisodeStart {
         scenario,
         seed: Seed(0),

@@ -14,7 +14,7 @@
 //! * **step**: the duration of an action, half a second; one or more frames of a world.
 //!
 //! ```
-//! use gump_rl::{PreparedScenario, DrivingEnv, EnvConfig, Traffic, VectorEnv};
+//! use gump_rl::{PreparedScenario, DrivingEnv, EnvConfig, TrafficSource, VectorEnv};
 //! use gump_scene::Seed;
 //!
 //! let scenario = gump_scene::fixture::scenario(
@@ -22,7 +22,7 @@
 //! ).unwrap();
 //! let prepared = PreparedScenario::prepare([scenario], 0.5).unwrap();
 //! let config = EnvConfig { n_envs: 4, ..EnvConfig::default() };
-//! let mut env = DrivingEnv::new(prepared, Traffic::Log, config).unwrap();
+//! let mut env = DrivingEnv::new(prepared, TrafficSource::Log, config).unwrap();
 //! env.reset(Seed(0)).unwrap();
 //! // Half of the hardest acceleration, straight ahead.
 //! env.step(&[0.5, 0.0].repeat(4)).unwrap();
@@ -47,7 +47,7 @@ mod vector_env;
 
 pub use actor::Actor;
 pub use dynamics::{BicycleLimits, Dynamics, PoseLimits};
-pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling, Traffic};
+pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling, TrafficSource};
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
 pub use error::RlError;
 pub use evaluate::{

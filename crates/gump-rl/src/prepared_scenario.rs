@@ -9,8 +9,8 @@ use gump_scene::{AgentId, AgentState, Frame, LaneId, LightState, Scenario};
 use crate::RlError;
 use crate::observation::Texture;
 
-/// Distance from the ego's start within which the road border is prepared, metres to each side.
-/// Beyond it queries give the same results more slowly.
+/// Distance from the ego's start within which the road border is prepared, metres to each side: 8 s
+/// at 30 m/s. Beyond it queries give the same results more slowly.
 const HALF: f64 = 256.0;
 
 /// A scenario to drive in, with steps of a fixed length.

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use common::{Transition, busy, config, env, part, roam, street, wander};
 use gump_rl::{
     Autoreset, DrivingEnv, EnvConfig, ObservationSpec, PreparedScenario, RasterView, RlError,
-    Sampling, Traffic, VectorEnv, expand,
+    Sampling, TrafficSource, VectorEnv, expand,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
@@ -18,7 +18,7 @@ use gump_scene::{AgentState, Frame, Seed};
 
 fn with_mode<'w>(
     prepared: &Arc<[PreparedScenario]>,
-    traffic: Traffic<'w>,
+    traffic: TrafficSource<'w>,
     mode: Autoreset,
 ) -> DrivingEnv<'w> {
     let config = EnvConfig {
@@ -75,7 +75,7 @@ fn transitions(env: &mut DrivingEnv<'_>, n: usize) -> Vec<Vec<Transition>> {
 fn transitions_are_the_same_in_all_autoreset_modes() {
     let prepared = busy(6);
     let idm = Idm::default();
-    for traffic in [Traffic::Log, Traffic::World(&idm)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
         let of = |mode| transitions(&mut with_mode(&prepared, traffic, mode), 40);
         let same_step = of(Autoreset::SameStep);
         assert_eq!(same_step, of(Autoreset::NextStep));
@@ -90,7 +90,7 @@ fn transitions_are_the_same_in_all_autoreset_modes() {
 fn the_same_seed_gives_the_same_episodes() {
     let prepared = busy(6);
     let idm = Idm::default();
-    for traffic in [Traffic::Log, Traffic::World(&idm)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
         let of = |seed| roam(&mut env(&prepared, traffic, 3), Seed(seed), 30);
         assert_eq!(of(1), of(1));
         assert_ne!(of(1), of(2));
@@ -101,7 +101,7 @@ fn the_same_seed_gives_the_same_episodes() {
 fn a_row_does_not_notice_its_neighbours() {
     let prepared = busy(6);
     let idm = Idm::default();
-    for traffic in [Traffic::Log, Traffic::World(&idm)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
         let few = roam(&mut env(&prepared, traffic, 2), Seed(1), 40);
         let many = roam(&mut env(&prepared, traffic, 5), Seed(1), 40);
         assert_eq!(few[..], many[..2]);
@@ -113,7 +113,7 @@ fn the_number_of_threads_changes_nothing() {
     let prepared = busy(6);
     let idm = Idm::default();
     let raster = ObservationSpec::Raster(RasterView::default());
-    for traffic in [Traffic::Log, Traffic::World(&idm)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
         for observation in [ObservationSpec::default(), raster] {
             let with_threads = |n: usize| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(n);
@@ -142,7 +142,8 @@ fn agents_far_away_follow_the_log() {
             nearest,
             ..config(3)
         };
-        let mut env = DrivingEnv::new(prepared.clone(), Traffic::World(&idm), config).unwrap();
+        let mut env =
+            DrivingEnv::new(prepared.clone(), TrafficSource::World(&idm), config).unwrap();
         roam(&mut env, Seed(1), 40)
     };
     let all = of(None);
@@ -157,8 +158,12 @@ fn the_log_is_the_world_that_replays_it() {
     for one in busy(4).iter() {
         let prepared = PreparedScenario::prepare([one.scenario().clone()], one.dt()).unwrap();
         let replay = LogReplay::new(one.scenario());
-        let fast = roam(&mut env(&prepared, Traffic::Log, 2), Seed(1), 30);
-        let slow = roam(&mut env(&prepared, Traffic::World(&replay), 2), Seed(1), 30);
+        let fast = roam(&mut env(&prepared, TrafficSource::Log, 2), Seed(1), 30);
+        let slow = roam(
+            &mut env(&prepared, TrafficSource::World(&replay), 2),
+            Seed(1),
+            30,
+        );
         assert_eq!(fast, slow);
     }
 }
@@ -167,7 +172,7 @@ fn the_log_is_the_world_that_replays_it() {
 fn an_episode_can_be_driven_again() {
     let prepared = busy(6);
     let idm = Idm::default();
-    let mut original = env(&prepared, Traffic::World(&idm), 3);
+    let mut original = env(&prepared, TrafficSource::World(&idm), 3);
     original.reset(Seed(8)).unwrap();
     // The second episode of row 1, with the actions it took.
     let mut actions = Vec::new();
@@ -185,7 +190,7 @@ fn an_episode_can_be_driven_again() {
             (n_ended == 2).then_some(ended)
         })
         .unwrap();
-    let mut again = env(&prepared, Traffic::World(&idm), 1);
+    let mut again = env(&prepared, TrafficSource::World(&idm), 1);
     again.reset_to(&[outcome.start]).unwrap();
     for action in &actions {
         assert!(again.finished().is_empty());
@@ -200,7 +205,7 @@ fn rasters_are_what_their_bits_say() {
         observation: ObservationSpec::Raster(RasterView::default()),
         ..config(4)
     };
-    let mut env = DrivingEnv::new(busy(3), Traffic::Log, config).unwrap();
+    let mut env = DrivingEnv::new(busy(3), TrafficSource::Log, config).unwrap();
     roam(&mut env, Seed(1), 17);
     let check = |packed: &[u8], numbers: &[f32]| {
         let mut expected = vec![f32::NAN; numbers.len()];
@@ -217,8 +222,8 @@ fn rasters_are_what_their_bits_say() {
 fn refused_actions_change_nothing() {
     let prepared = street("");
     let (mut env, mut untouched) = (
-        with_mode(&prepared, Traffic::Log, Autoreset::Disabled),
-        with_mode(&prepared, Traffic::Log, Autoreset::Disabled),
+        with_mode(&prepared, TrafficSource::Log, Autoreset::Disabled),
+        with_mode(&prepared, TrafficSource::Log, Autoreset::Disabled),
     );
     assert!(matches!(env.step(&[0.0; 8]), Err(RlError::NotReset)));
     assert!(matches!(
@@ -255,7 +260,7 @@ fn refused_actions_change_nothing() {
 
 #[test]
 fn a_finished_row_is_not_stepped() {
-    let mut env = with_mode(&street(""), Traffic::Log, Autoreset::Disabled);
+    let mut env = with_mode(&street(""), TrafficSource::Log, Autoreset::Disabled);
     env.reset(Seed(0)).unwrap();
     for _ in 0..16 {
         env.step(&[0.0; 8]).unwrap();
@@ -318,7 +323,7 @@ impl Session for FragileSession<'_> {
 fn failures_of_the_world_are_reported() {
     let prepared = street("");
     let world = Fragile::default();
-    let mut fragile = env(&prepared, Traffic::World(&world), 2);
+    let mut fragile = env(&prepared, TrafficSource::World(&world), 2);
     fragile.reset(Seed(0)).unwrap();
     world.broken.store(true, Ordering::Relaxed);
     let error = fragile.step(&[0.0; 4]).unwrap_err();
@@ -335,6 +340,6 @@ fn failures_of_the_world_are_reported() {
         dt: Some(0.3),
         ..Fragile::default()
     };
-    let error = env(&prepared, Traffic::World(&odd), 2).reset(Seed(0));
+    let error = env(&prepared, TrafficSource::World(&odd), 2).reset(Seed(0));
     assert!(matches!(error, Err(RlError::TimeStep { frames: 0.3, .. })));
 }

@@ -8,7 +8,7 @@ use common::{DT, STREET, busy, config, env, street, until_end, wander};
 use gump_metrics::{Collision, Metric, OffRoad, Reward};
 use gump_rl::{
     BicycleLimits, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Failure, PoseLimits,
-    PreparedScenario, RlError, Rules, Traffic, VectorEnv,
+    PreparedScenario, RlError, Rules, TrafficSource, VectorEnv,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
@@ -19,7 +19,7 @@ const COAST: [f32; 2] = [0.0, 0.0];
 fn a_free_road_is_driven_to_the_horizon() {
     let prepared = street("agent vehicle 1: 60,9");
     let idm = Idm::default();
-    for traffic in [Traffic::Log, Traffic::World(&idm)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
         let mut env = env(&prepared, traffic, 3);
         env.reset(Seed(0)).unwrap();
         let first = env.observations().to_vec();
@@ -44,7 +44,7 @@ fn a_free_road_is_driven_to_the_horizon() {
 #[test]
 fn a_collision_terminates() {
     let prepared = street("agent vehicle 1: 34.85,0");
-    for traffic in [Traffic::Log, Traffic::World(&ConstantVelocity)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&ConstantVelocity)] {
         let (n, outcome) = until_end(&mut env(&prepared, traffic, 1), &COAST);
         // 20.05 m of free road at 5 m per step.
         assert_eq!((n, outcome.end), (5, End::Terminated(Failure::Collision)));
@@ -57,7 +57,7 @@ fn a_collision_terminates() {
 #[test]
 fn a_collision_within_a_step_terminates() {
     let prepared = street("agent vehicle 1: 37.5,-55.5 heading 1.5708 velocity 0,20");
-    for traffic in [Traffic::Log, Traffic::World(&ConstantVelocity)] {
+    for traffic in [TrafficSource::Log, TrafficSource::World(&ConstantVelocity)] {
         let (n, outcome) = until_end(&mut env(&prepared, traffic, 1), &COAST);
         assert_eq!((n, outcome.end), (6, End::Terminated(Failure::Collision)));
     }
@@ -66,7 +66,7 @@ fn a_collision_within_a_step_terminates() {
 #[test]
 fn leaving_the_road_terminates() {
     let prepared = street("edge: -10,-3 400,-3\nedge: 400,3 -10,3");
-    let (n, outcome) = until_end(&mut env(&prepared, Traffic::Log, 1), &[0.0, 1.0]);
+    let (n, outcome) = until_end(&mut env(&prepared, TrafficSource::Log, 1), &[0.0, 1.0]);
     assert_eq!(outcome.end, End::Terminated(Failure::OffRoad));
     assert!(n < 5 && outcome.totals.off_road, "{n}");
 }
@@ -76,12 +76,12 @@ fn the_end_of_the_route_and_of_the_log_truncate() {
     let text = "lane 1: 0,0 30,0\nroute 1\nego vehicle 0: 10,0 velocity 10,0";
     let short = fixture::scenario(text).unwrap();
     let prepared = PreparedScenario::prepare([short], DT).unwrap();
-    let (n, outcome) = until_end(&mut env(&prepared, Traffic::Log, 1), &COAST);
+    let (n, outcome) = until_end(&mut env(&prepared, TrafficSource::Log, 1), &COAST);
     assert_eq!((n, outcome.end), (4, End::Truncated));
     let prepared = street("history 1.0 future 3.0 dt 0.1");
     let steps = |traffic| until_end(&mut env(&prepared, traffic, 1), &COAST).0;
-    assert_eq!(steps(Traffic::Log), 6);
-    assert_eq!(steps(Traffic::World(&ConstantVelocity)), 16);
+    assert_eq!(steps(TrafficSource::Log), 6);
+    assert_eq!(steps(TrafficSource::World(&ConstantVelocity)), 16);
 }
 
 /// Every step earns what the reward of the metrics says about the same frames; collisions count at
@@ -170,7 +170,7 @@ fn follow_the_log(dynamics: Dynamics) -> (f64, f64) {
         autoreset: gump_rl::Autoreset::Disabled,
         ..EnvConfig::default()
     };
-    let mut env = DrivingEnv::new(prepared, Traffic::Log, config).unwrap();
+    let mut env = DrivingEnv::new(prepared, TrafficSource::Log, config).unwrap();
     env.reset(Seed(0)).unwrap();
     let mut actions = vec![0.0; env.n_envs() * env.action_len()];
     let (mut worst, mut safe) = (0.0f64, 0);
@@ -251,7 +251,7 @@ fn parameters_out_of_range_are_refused() {
     let check = |change: &dyn Fn(&mut EnvConfig)| {
         let mut config = config(2);
         change(&mut config);
-        let found = DrivingEnv::new(prepared.clone(), Traffic::Log, config);
+        let found = DrivingEnv::new(prepared.clone(), TrafficSource::Log, config);
         assert!(matches!(found.err(), Some(RlError::Parameter { .. })));
     };
     check(&|c| c.n_envs = 0);
@@ -274,7 +274,7 @@ fn parameters_out_of_range_are_refused() {
             forget: 0.1,
         };
     });
-    let nothing = DrivingEnv::new([].into(), Traffic::Log, config(2));
+    let nothing = DrivingEnv::new([].into(), TrafficSource::Log, config(2));
     assert!(matches!(nothing.err(), Some(RlError::NoScenario)));
     let none = fixture::scenario(STREET).unwrap();
     assert!(PreparedScenario::new(none, 0.03).is_err());

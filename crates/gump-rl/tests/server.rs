@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex};
 
 use common::{busy, config, env};
 use gump_rl::server::{Event, Server, ServerError};
-use gump_rl::{PreparedScenario, Traffic, VectorEnv};
+use gump_rl::{PreparedScenario, TrafficSource, VectorEnv};
 use gump_scene::Seed;
 
 const N: usize = 3;
@@ -34,7 +34,7 @@ fn with_server(
     let events = Mutex::new(Vec::new());
     let record = |event| events.lock().unwrap().push(event);
     std::thread::scope(|scope| {
-        let run = || server.run(prepared, Traffic::Log, &config(1), &record);
+        let run = || server.run(prepared, TrafficSource::Log, &config(1), &record);
         let running = scope.spawn(run);
         let stop = StopOnDrop(&server);
         talk(&path);
@@ -149,7 +149,7 @@ fn farewell(events: &[Event]) -> &gump_rl::server::Farewell {
 #[test]
 fn a_client_sees_what_the_environment_shows() {
     let prepared = busy(4);
-    let mut own = env(&prepared, Traffic::Log, N);
+    let mut own = env(&prepared, TrafficSource::Log, N);
     own.reset_with(&[Seed(7), Seed(8), Seed(9)]).unwrap();
     let events = with_server("sees", &prepared, |path| {
         let mut client = Client::greeted(path, 1);

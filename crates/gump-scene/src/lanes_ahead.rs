@@ -1,6 +1,8 @@
-//! The lanes that a vehicle may reach.
+//! The lanes that a vehicle may reach, and where on them things are.
 
-use crate::{Lane, MapGraph};
+use gump_geometry::DVec2;
+
+use crate::{Lane, Light, MapGraph, stop_line};
 
 /// A lane that a vehicle may reach.
 #[derive(Clone, Copy, Debug)]
@@ -9,6 +11,31 @@ pub struct LaneAhead<'a> {
     pub lane: &'a Lane,
     /// Metres from the vehicle to the start of the lane, below 0 for the lane it is on.
     pub base_m: f64,
+}
+
+/// The place of a point on a lane that a vehicle may reach.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PointAhead {
+    /// Metres along the path from the vehicle to the point, below 0 behind it.
+    pub ahead_m: f64,
+    /// Metres from the lane's centre to the point.
+    pub beside_m: f64,
+}
+
+impl LaneAhead<'_> {
+    /// The place of a point, world frame.
+    pub fn locate(&self, point: DVec2) -> PointAhead {
+        let foot = self.lane.centerline.project(point);
+        PointAhead {
+            ahead_m: self.base_m + foot.arc_length,
+            beside_m: foot.distance,
+        }
+    }
+
+    /// Metres from the vehicle to the stop line of a light of the lane.
+    pub fn metres_to_stop_line(&self, light: &Light) -> f64 {
+        self.locate(stop_line(self.lane, light).position).ahead_m
+    }
 }
 
 /// The lane of a vehicle, `arc_m` metres from its start, all its successors within `metres`, and
@@ -65,5 +92,23 @@ mod tests {
         assert_eq!(ids(5.0), (vec![1], -20.0, true));
         assert_eq!(ids(15.0), (vec![1, 2, 3], -20.0, true));
         assert_eq!(ids(200.0), (vec![1, 2, 3], -20.0, false));
+    }
+
+    #[test]
+    fn points_and_stop_lines_are_measured_from_the_vehicle() {
+        let scenario = fixture::scenario(
+            "lane 1: 0,0 30,0 next 2\nlane 2: 30,0 60,0\nlight 2 red: 50,0\nego vehicle 0: 20,0",
+        )
+        .unwrap();
+        let lane = scenario.map.lane(LaneId(1)).unwrap();
+        let (reached, _) = lanes_ahead(&scenario.map, lane, 20.0, 25.0);
+        let [own, next] = reached[..] else {
+            panic!("{reached:?}");
+        };
+        let place = |ahead_m, beside_m| PointAhead { ahead_m, beside_m };
+        assert_eq!(own.locate(DVec2::new(15.0, 2.0)), place(-5.0, 2.0));
+        assert_eq!(next.locate(DVec2::new(45.0, -3.0)), place(25.0, 3.0));
+        let lights = scenario.present().now().lights();
+        assert_eq!(next.metres_to_stop_line(&lights[0]), 30.0);
     }
 }

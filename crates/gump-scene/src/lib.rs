@@ -49,7 +49,7 @@ pub use agent::{Agent, AgentId, AgentKind, AgentState};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
 pub use gump_seed::{Rng, Seed, standard_normal};
-pub use lanes_ahead::{LaneAhead, lanes_ahead};
+pub use lanes_ahead::{LaneAhead, PointAhead, lanes_ahead};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
     Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,

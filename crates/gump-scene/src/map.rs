@@ -57,7 +57,7 @@ impl LaneKind {
 }
 
 /// The default that is used where a number is needed for an unknown speed limit, metres per second:
-/// 30 mph.
+/// 30 mph, the usual limit in American cities.
 pub const TYPICAL_SPEED_LIMIT: f64 = 13.4;
 
 /// Information that the source of a scene cannot express, so that its absence from the scene
@@ -108,8 +108,8 @@ pub struct Lane {
 }
 
 impl Lane {
-    /// A lane with these points and no neighbours: 3.5 m wide, of no stated type. Readers then set
-    /// the fields that their format states.
+    /// A lane with these points and no neighbours: 3.5 m wide, a common width, of no stated type.
+    /// Readers then set the fields that their format states.
     pub fn new(id: LaneId, centerline: Polyline, elevation: Vec<f64>) -> Self {
         Self {
             id,

@@ -6,7 +6,8 @@ use gump_geometry::{DVec2, Polyline, Pose, angle_difference, segments_intersect}
 
 use crate::{Lane, Light, MapGraph};
 
-/// Lanes that start, or end, so near to one another fork, or join, and do not cross, metres.
+/// Lanes that start, or end, so near to one another fork, or join, and do not cross, metres: less
+/// than lanes beside each other are apart. Chosen by hand.
 const FORK_M: f64 = 2.0;
 
 /// The middle of the stop line of a light, heading along its lane.

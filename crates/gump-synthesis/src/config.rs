@@ -31,7 +31,7 @@ pub struct SynthesisConfig {
 
 impl SynthesisConfig {
     /// Nine seconds at 10 Hz with the present at one second, as in the Waymo Open Motion Dataset,
-    /// and 10 to 50 vehicles within about 100 m.
+    /// and 10 to 50 vehicles within about 100 m; numbers are chosen by hand.
     pub fn standard() -> Self {
         Self {
             history_s: 1.0,

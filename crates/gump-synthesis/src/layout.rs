@@ -1,4 +1,5 @@
-//! Plans of the road families: which roads meet where, with random dimensions.
+//! Plans of the road families: which roads meet where, with random dimensions, whose ranges are
+//! common ones of streets, chosen by hand.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 

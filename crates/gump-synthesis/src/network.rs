@@ -102,11 +102,9 @@ pub(crate) struct Furniture {
 /// The direction of a connector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Turn {
-    /// To the left.
     Left,
     /// On, within about 35 degrees.
     Straight,
-    /// To the right.
     Right,
 }
 
@@ -164,7 +162,6 @@ impl NetworkLane {
 /// Data of a lane that is a path through a junction. Vehicles wait for it at its start.
 #[derive(Debug)]
 pub(crate) struct Connector {
-    /// The junction.
     pub(crate) junction: usize,
     /// The leg it comes from.
     pub(crate) from_leg: usize,
@@ -225,7 +222,6 @@ pub(crate) struct Junction {
     pub(crate) control: Control,
     /// Light phases, if it has lights.
     pub(crate) cycle: Option<Cycle>,
-    /// Its connectors.
     pub(crate) connectors: Vec<LaneIdx>,
 }
 

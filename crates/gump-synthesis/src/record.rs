@@ -7,7 +7,7 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
 
 use crate::map::Placement;
 use crate::network::LaneIdx;
-use crate::traffic::{Body, Traffic};
+use crate::traffic::{Body, TrafficSimulation};
 
 /// Snapshots of traffic; one more before the first frame and after the last, for velocities.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ pub(crate) struct Track {
 
 impl Recording {
     /// Continues `traffic` for `n_frames` frames and records them.
-    pub(crate) fn make(traffic: &mut Traffic<'_>, n_frames: usize) -> Self {
+    pub(crate) fn make(traffic: &mut TrafficSimulation<'_>, n_frames: usize) -> Self {
         let mut recording = Self {
             n_frames,
             tracks: BTreeMap::new(),
@@ -177,7 +177,6 @@ impl Track {
         self.poses[frame + 1]
     }
 
-    /// The pose in a snapshot.
     pub(crate) fn pose_at_snapshot(&self, snapshot: usize) -> Option<Pose> {
         self.poses[snapshot]
     }

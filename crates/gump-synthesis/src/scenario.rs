@@ -12,14 +12,15 @@ use crate::layout::draw_plan;
 use crate::map::{Placement, build_map, lane_id};
 use crate::network::{LaneIdx, Network};
 use crate::record::{Recording, Track};
-use crate::traffic::{Demand, Scenery, Traffic};
+use crate::traffic::{Demand, Scenery, TrafficSimulation};
 use crate::{RoadFamily, SynthesisConfig};
 
 /// Maximum number of draws of roads and traffic; a few suffice, see the test of this module.
 const ATTEMPTS: u64 = 64;
-/// Maximum number of prediction targets.
+/// Maximum number of prediction targets, as in the Waymo Open Motion Dataset.
 const MAX_TARGETS: usize = 8;
-/// Distance from the ego within which agents may be targets, metres.
+/// Distance from the ego within which agents may be targets, metres: as where readers infer
+/// targets. Chosen by hand.
 const TARGET_RANGE: f64 = 60.0;
 
 /// Generates one scenario; the same seed and config always give the same one.
@@ -59,7 +60,7 @@ fn draw_scenario(
     let plan = draw_plan(family, config.extent_m, &mut rng);
     let network = Network::new(&plan, &mut rng);
     let demand = draw_demand(config, &network, &mut rng);
-    let mut traffic = Traffic::new(
+    let mut traffic = TrafficSimulation::new(
         &network,
         demand,
         config.dt,
@@ -103,6 +104,7 @@ fn draw_demand(config: &SynthesisConfig, network: &Network, rng: &mut gump_scene
         draw(&config.pedestrians),
         draw(&config.bicycles),
     );
+    // Shares and rates here are chosen by hand.
     let can_park = !network.parking.is_empty() || !network.lot_places.is_empty();
     let share = if can_park {
         rng.random_range(0.25..0.75)
@@ -128,6 +130,8 @@ fn draw_demand(config: &SynthesisConfig, network: &Network, rng: &mut gump_scene
     }
 }
 
+/// Somewhere in a world like that of recordings: kilometres from the origin, at any heading and
+/// height, on slopes of up to 3 %. Ranges are chosen by hand.
 pub(crate) fn draw_placement(rng: &mut gump_scene::Rng) -> Placement {
     let mut coordinate = || rng.random_range(-6000.0..6000.0);
     let position = dvec2(coordinate(), coordinate());
@@ -142,7 +146,8 @@ pub(crate) fn draw_placement(rng: &mut gump_scene::Rng) -> Placement {
     }
 }
 
-/// A car that is present all the time, drives, and is near the centre.
+/// A car that is present all the time, drives, and is near the centre, with 30 m of chance. Bounds
+/// are chosen by hand.
 fn choose_ego<'a>(
     recording: &'a Recording,
     now: usize,
@@ -191,7 +196,7 @@ pub(crate) fn targets(recording: &Recording, ego: &Track, now: usize) -> Vec<Age
 pub(crate) fn route(
     network: &Network,
     ego: &Track,
-    traffic: &Traffic<'_>,
+    traffic: &TrafficSimulation<'_>,
     placement: &Placement,
 ) -> Route {
     let mut runs: Vec<(LaneIdx, f64, f64)> = Vec::new();
@@ -283,7 +288,7 @@ mod tests {
             let family = RoadFamily::ALL[*k as usize % RoadFamily::ALL.len()];
             let network = Network::new(&draw_plan(family, config.extent_m, &mut rng), &mut rng);
             let demand = draw_demand(&config, &network, &mut rng);
-            let mut traffic = Traffic::new(&network, demand, config.dt, rng);
+            let mut traffic = TrafficSimulation::new(&network, demand, config.dt, rng);
             for _ in 0..250 {
                 traffic.step();
             }

@@ -9,8 +9,10 @@ use gump_geometry::{DVec2, angle_difference, wrap_angle};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario};
 
 /// Standard deviation of the average over time, seconds: vehicles steer over about a second.
+/// Together with rounder curves it brings yaw rates near to recorded ones
+/// (docs/results/0006-factory.md).
 const SIGMA_S: f64 = 0.35;
-/// Standard deviations after which the average ends.
+/// Standard deviations after which the average ends: 0.3 % of the weight lies beyond.
 const REACH: f64 = 3.0;
 
 /// Averages the motion of vehicles and bicycles over time and derives their velocities from it.

@@ -28,7 +28,7 @@ pub struct SumoDemand {
 }
 
 impl SumoDemand {
-    /// Streets of a city by day.
+    /// Streets of a city by day; numbers chosen by hand.
     pub fn standard() -> Self {
         Self {
             until_s: 150.0,
@@ -54,6 +54,7 @@ impl SumoDemand {
     }
 }
 
+// These are chosen by hand.
 /// Minimum metres of lane per vehicle: with more vehicles traffic jams.
 const METRES_PER_VEHICLE: f64 = 45.0;
 /// Share of the trips that begin in the first seconds, to fill empty streets.
@@ -82,7 +83,7 @@ struct Family {
 }
 
 /// Sizes are those of vehicles on sale; accelerations are comfortable ones, below SUMO's defaults
-/// of 2.6 and 4.5, because recorded drivers are gentler.
+/// of 2.6 and 4.5, because recorded drivers are gentler. Shares are chosen by hand.
 const FAMILIES: [Family; 5] = [
     Family {
         name: "car",

@@ -32,7 +32,6 @@ use vehicle::Vehicle;
 pub(crate) struct Body {
     /// Unique in the simulation.
     pub(crate) id: i64,
-    /// Its kind.
     pub(crate) kind: AgentKind,
     /// Length, width and height, metres.
     pub(crate) size: [f64; 3],
@@ -46,7 +45,7 @@ pub(crate) struct Body {
 
 /// Traffic in progress.
 #[derive(Debug)]
-pub(crate) struct Traffic<'a> {
+pub(crate) struct TrafficSimulation<'a> {
     network: &'a Network,
     demand: Demand,
     rng: Rng,
@@ -61,7 +60,7 @@ pub(crate) struct Traffic<'a> {
     crossers: Vec<Crosser>,
 }
 
-impl<'a> Traffic<'a> {
+impl<'a> TrafficSimulation<'a> {
     /// Adds the initial vehicles and pedestrians to the network.
     pub(crate) fn new(network: &'a Network, demand: Demand, dt: f64, rng: Rng) -> Self {
         let mut traffic = Self {

@@ -28,7 +28,8 @@ use crate::{
     AGENT_KEYS, BEGIN, FIRST_LIGHT, Key, LIGHTS_END, MAX_LIGHTS, NEWBORN, PAD, Slot, TokenLight,
 };
 
-/// Maximum number of prompts of a sequence.
+/// Maximum number of prompts of a sequence. Our choice: the paper states none, and few tags hold
+/// together.
 pub const MAX_PROMPTS: usize = 4;
 
 /// Why tokens are not a valid scene.
@@ -56,7 +57,7 @@ pub enum GrammarError {
 /// Reads slots one by one and determines what may come next.
 #[derive(Clone, Debug, Default)]
 pub struct Grammar {
-    place: Place,
+    part: SequencePart,
     position: usize,
     prompts: Vec<Option<ScenarioTag>>,
     n_frames: usize,
@@ -70,7 +71,7 @@ pub struct Grammar {
 
 /// The part of a sequence that the next slot belongs to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum Place {
+enum SequencePart {
     #[default]
     Prompts,
     Lights,
@@ -100,41 +101,41 @@ impl Grammar {
             };
             return Err(self.unexpected(found));
         }
-        self.place = match *slot {
+        self.part = match *slot {
             Slot::Prompt(prompt) => {
                 self.prompts.push(prompt);
-                Place::Prompts
+                SequencePart::Prompts
             }
             Slot::Begin => {
                 self.n_frames += 1;
                 self.previous = std::mem::take(&mut self.present);
                 (self.last_light, self.last_key) = (0, None);
-                Place::Lights
+                SequencePart::Lights
             }
             Slot::Light(light) => {
                 self.last_light = light.index;
                 self.lights.insert(light.index, light.place());
-                Place::Lights
+                SequencePart::Lights
             }
-            Slot::LightsEnd => Place::Tracked,
+            Slot::LightsEnd => SequencePart::Tracked,
             Slot::Key(key) => {
                 self.last_key = Some(key);
                 self.present.insert(key.id);
                 self.kinds.insert(key.id, key.kind);
-                match self.place {
-                    Place::Tracked => Place::TrackedValue,
-                    _ => Place::NewbornValue,
+                match self.part {
+                    SequencePart::Tracked => SequencePart::TrackedValue,
+                    _ => SequencePart::NewbornValue,
                 }
             }
-            Slot::Value(_) => match self.place {
-                Place::TrackedValue => Place::Tracked,
-                _ => Place::Newborn,
+            Slot::Value(_) => match self.part {
+                SequencePart::TrackedValue => SequencePart::Tracked,
+                _ => SequencePart::Newborn,
             },
             Slot::Newborn => {
                 self.last_key = None;
-                Place::Newborn
+                SequencePart::Newborn
             }
-            Slot::Pad => Place::Padding,
+            Slot::Pad => SequencePart::Padding,
         };
         self.position += 1;
         Ok(())
@@ -194,18 +195,21 @@ impl Allowed<'_> {
             None => before.is_empty(),
             Some(_) => !before.contains(&None) && !before.contains(&prompt),
         };
-        self.grammar.place == Place::Prompts && before.len() < MAX_PROMPTS && fits
+        self.grammar.part == SequencePart::Prompts && before.len() < MAX_PROMPTS && fits
     }
 
     /// True if a frame may begin.
     pub fn begin(&self) -> bool {
-        matches!(self.grammar.place, Place::Prompts | Place::Newborn)
+        matches!(
+            self.grammar.part,
+            SequencePart::Prompts | SequencePart::Newborn
+        )
     }
 
     /// The indices that the next light may have; empty where no light may come.
     pub fn light_indices(&self) -> RangeInclusive<u16> {
-        let first = match self.grammar.place {
-            Place::Lights => self.grammar.last_light + 1,
+        let first = match self.grammar.part {
+            SequencePart::Lights => self.grammar.last_light + 1,
             _ => MAX_LIGHTS as u16 + 1,
         };
         first..=MAX_LIGHTS as u16
@@ -221,16 +225,16 @@ impl Allowed<'_> {
 
     /// True if the lights may end.
     pub fn lights_end(&self) -> bool {
-        self.grammar.place == Place::Lights
+        self.grammar.part == SequencePart::Lights
     }
 
     /// True if this key may come next.
     pub fn key(&self, key: Key) -> bool {
         let grammar = self.grammar;
-        let belongs = match grammar.place {
-            Place::Tracked if grammar.present.is_empty() => key.is_ego(),
-            Place::Tracked => grammar.n_frames == 1 || grammar.previous.contains(&key.id),
-            Place::Newborn => grammar.n_frames > 1 && !grammar.previous.contains(&key.id),
+        let belongs = match grammar.part {
+            SequencePart::Tracked if grammar.present.is_empty() => key.is_ego(),
+            SequencePart::Tracked => grammar.n_frames == 1 || grammar.previous.contains(&key.id),
+            SequencePart::Newborn => grammar.n_frames > 1 && !grammar.previous.contains(&key.id),
             _ => false,
         };
         let in_order = grammar.last_key.is_none_or(|last| last < key);
@@ -252,19 +256,19 @@ impl Allowed<'_> {
     /// True if a value may come next; it then must.
     pub fn value(&self) -> bool {
         matches!(
-            self.grammar.place,
-            Place::TrackedValue | Place::NewbornValue
+            self.grammar.part,
+            SequencePart::TrackedValue | SequencePart::NewbornValue
         )
     }
 
     /// True if the tracked agents may end.
     pub fn newborn(&self) -> bool {
-        self.grammar.place == Place::Tracked && !self.grammar.present.is_empty()
+        self.grammar.part == SequencePart::Tracked && !self.grammar.present.is_empty()
     }
 
     /// True if the sequence may end here, or be padded.
     pub fn end(&self) -> bool {
-        self.begin() || self.grammar.place == Place::Padding
+        self.begin() || self.grammar.part == SequencePart::Padding
     }
 
     /// The tokens of all single-token slots that may come next, ascending; none before a value,
@@ -290,7 +294,7 @@ impl Allowed<'_> {
 impl fmt::Display for Allowed<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut words: Vec<String> = Vec::new();
-        if self.grammar.place == Place::Prompts {
+        if self.grammar.part == SequencePart::Prompts {
             words.push("a prompt".into());
         }
         let lights = self.light_indices();

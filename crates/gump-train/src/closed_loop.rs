@@ -21,7 +21,8 @@ use serde::{Deserialize, Serialize};
 use crate::TrainError;
 use crate::scenes::ScenarioSource;
 
-/// Weight of a radian of heading error, in metres, when candidates are compared.
+/// Weight of a radian of heading error, in metres, when candidates are compared: about half a car's
+/// length, by which its corners move then. Chosen by hand.
 const METRES_PER_RADIAN: f64 = 2.0;
 
 /// Settings of closed-loop training data.
@@ -42,6 +43,7 @@ pub struct ClosedLoopConfig {
 }
 
 impl Default for ClosedLoopConfig {
+    /// Chosen by hand.
     fn default() -> Self {
         Self {
             drives: 1000,
@@ -55,7 +57,7 @@ impl Default for ClosedLoopConfig {
 
 /// A scenario as driven by the network.
 #[derive(Clone, Debug)]
-pub(crate) struct Drive {
+pub(crate) struct DrivenScenario {
     /// Index of the scenario.
     pub(crate) scenario: usize,
     /// Index of the log frame from which it starts.
@@ -66,7 +68,7 @@ pub(crate) struct Drive {
     pub(crate) frames: Vec<Frame>,
 }
 
-impl Drive {
+impl DrivenScenario {
     /// The driven frame at a log index; `None` at and before the present, beyond the drive, and
     /// between its frames.
     pub(crate) fn frame(&self, index: usize) -> Option<&Frame> {
@@ -87,13 +89,13 @@ pub(crate) fn drive(
     scenarios: &dyn ScenarioSource,
     config: &ClosedLoopConfig,
     seed: Seed,
-) -> Result<Vec<Drive>, TrainError> {
+) -> Result<Vec<DrivenScenario>, TrainError> {
     let sampling = SamplingConfig {
         temperature: Some(config.temperature),
         ..SamplingConfig::default()
     };
     let world = TransformerWorld::new(network, sampling);
-    let drives: Vec<Option<Drive>> = (0..config.drives)
+    let drives: Vec<Option<DrivenScenario>> = (0..config.drives)
         .into_par_iter()
         .map(|i| {
             let seed = seed.fork(i as u64);
@@ -116,7 +118,7 @@ fn drive_one(
     index: usize,
     candidates: usize,
     seed: Seed,
-) -> Result<Option<Drive>, TrainError> {
+) -> Result<Option<DrivenScenario>, TrainError> {
     let scenario = &*scenarios.get(index)?;
     let stride = stride_of(scenario.dt);
     let lead = (HISTORY - 1) * stride;
@@ -161,7 +163,7 @@ fn drive_one(
             .map_err(TrainError::Rollout)?;
         history.push(nearest(&draws, logged));
     }
-    Ok(Some(Drive {
+    Ok(Some(DrivenScenario {
         scenario: index,
         present,
         stride,
@@ -241,7 +243,7 @@ mod tests {
             };
             drive(network(), &scenarios, &config, Seed(3)).unwrap()
         };
-        let off = |drives: &[Drive]| -> f64 {
+        let off = |drives: &[DrivenScenario]| -> f64 {
             let first = drives.iter().map(|drive| {
                 let logged = &scenarios[0].log[drive.present + drive.stride];
                 let driven = drive.frame(drive.present + drive.stride).unwrap();

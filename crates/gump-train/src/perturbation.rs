@@ -13,13 +13,14 @@ use gump_geometry::{DVec2, wrap_angle};
 use gump_scene::{AgentId, AgentKind, Frame, Rng, Scenario};
 use rand::Rng as _;
 
-use crate::closed_loop::Drive;
+use crate::closed_loop::DrivenScenario;
 
-/// Share of the displacement that is left half a second later.
+/// Share of the displacement that is left half a second later: about half after a second. Chosen by
+/// hand; docs/results/0011-surroundings.md has the effect of the whole.
 pub(crate) const SLACK: f64 = 0.7;
 /// Slower objects are not displaced, metres per second: nothing moves sideways in place.
 const SLOWEST: f64 = 2.0;
-/// Turn per metre of displacement, radians.
+/// Turn per metre of displacement, radians: 7 degrees. Chosen by hand.
 const TURN: f64 = 0.12;
 
 /// The `frames` token frames of a log from index `start` on, perturbed after the first; a push is
@@ -31,7 +32,7 @@ pub(crate) fn lateral_perturbation(
     frames: usize,
     reach_m: f64,
     rng: &mut Rng,
-) -> Drive {
+) -> DrivenScenario {
     let mut offs: BTreeMap<AgentId, Off> = BTreeMap::new();
     let shown = (1..frames).filter_map(|k| scenario.log.get(start + k * stride));
     let frames = shown.map(|frame| {
@@ -55,7 +56,7 @@ pub(crate) fn lateral_perturbation(
         });
         Frame::new(agents.collect(), frame.lights().to_vec())
     });
-    Drive {
+    DrivenScenario {
         scenario: 0,
         present: start,
         stride,

@@ -8,22 +8,22 @@ use gump_scene::{Scenario, Seed};
 use rand::Rng as _;
 
 use crate::TrainError;
-use crate::closed_loop::{ClosedLoopConfig, Drive};
+use crate::closed_loop::{ClosedLoopConfig, DrivenScenario};
 use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 
 /// The source of samples, shared with the threads that draw them.
-pub(super) struct Source {
+pub(super) struct SampleSource {
     pub(super) scenarios: Box<dyn ScenarioSource>,
     /// Scenes as driven by the network.
-    pub(super) drives: Vec<Drive>,
+    pub(super) drives: Vec<DrivenScenario>,
     pub(super) closed_loop: ClosedLoopConfig,
     pub(super) reader: Reader,
     pub(super) config: SampleConfig,
     pub(super) seed: Seed,
 }
 
-impl Source {
+impl SampleSource {
     /// The samples of a step with these numbers. A scenario too short for a sample is replaced by
     /// another draw.
     pub(super) fn samples(
@@ -31,6 +31,7 @@ impl Source {
         step: usize,
         numbers: &[usize],
     ) -> Result<Vec<Sample>, TrainError> {
+        // More mean that hardly any scenario is long enough.
         const ATTEMPTS: u64 = 64;
         let seed = self.seed.fork(step as u64);
         let mut samples = Vec::with_capacity(numbers.len());
@@ -93,7 +94,11 @@ pub(super) type SampleReceiver = Receiver<Result<Vec<Sample>, TrainError>>;
 ///
 /// On its own thread: a job of the thread pool could wait for ever behind the step that waits for
 /// it.
-pub(super) fn prefetch(source: &Arc<Source>, step: usize, numbers: Vec<usize>) -> SampleReceiver {
+pub(super) fn prefetch(
+    source: &Arc<SampleSource>,
+    step: usize,
+    numbers: Vec<usize>,
+) -> SampleReceiver {
     let (sender, receiver) = channel();
     let source = Arc::clone(source);
     // A receiver that is gone belongs to a trainer that is gone.

@@ -28,7 +28,7 @@ use crate::loss::{Counts, LossConfig, LossParts, export, loss};
 use crate::process_group::{ProcessGroup, SingleProcess};
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
-use crate::source::{SampleReceiver, Source, check_rate, prefetch};
+use crate::source::{SampleReceiver, SampleSource, check_rate, prefetch};
 
 /// The result of one step.
 #[derive(Clone, Debug, Serialize)]
@@ -64,7 +64,7 @@ pub struct Trainer {
     pub(crate) learner: TrainState,
     pub(crate) config: TrainConfig,
     pub(crate) group: Box<dyn ProcessGroup>,
-    pub(crate) source: Arc<Source>,
+    pub(crate) source: Arc<SampleSource>,
     /// Samples of the next step, being drawn while the present one is computed.
     pub(crate) next: SampleReceiver,
 }
@@ -129,7 +129,7 @@ impl Trainer {
             }
             None => Vec::new(),
         };
-        let source = Arc::new(Source {
+        let source = Arc::new(SampleSource {
             drives,
             closed_loop: config.closed_loop.clone().unwrap_or_default(),
             scenarios,

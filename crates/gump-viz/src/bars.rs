@@ -39,6 +39,7 @@ pub struct Bar {
     pub span: Option<(f64, f64)>,
 }
 
+// Layout, chosen by eye.
 /// Width of the drawing, pixels.
 const WIDTH: u32 = 760;
 /// Height of a bar, and of the gap between groups, pixels.

@@ -42,7 +42,7 @@ pub struct Series {
     pub spans: Vec<(f64, f64, f64)>,
 }
 
-/// Size of the drawing, pixels; SVG scales.
+/// Size of the drawing, pixels; SVG scales. Chosen by eye.
 const SIZE: (u32, u32) = (760, 400);
 
 impl Chart {

@@ -17,9 +17,11 @@ use crate::theme::Rgb;
 
 /// Pixels per unit of the drawing, so that it is sharp on dense screens and on paper.
 pub(crate) const DENSITY: f32 = 2.0;
-/// Height of a capital as a share of the size of a font.
+/// Height of a capital as a share of the size of a font: about that of common sans-serif fonts.
 const CAPITAL: f64 = 0.7;
-/// Divisor of font sizes in the other backend.
+/// Divisor of font sizes in the other backend, so that both draw alike.
+///
+/// Source: plotters' SVG backend.
 const FONT_SCALE: f64 = 1.24;
 
 /// A pixmap in units of the drawing.

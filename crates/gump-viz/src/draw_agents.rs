@@ -19,7 +19,7 @@ const KINDS: [AgentKind; 7] = [
     AgentKind::Pedestrian,
 ];
 
-/// Boxes smaller than this are drawn as discs, pixels.
+/// Boxes smaller than this are drawn as discs, pixels: their shape would not show.
 const SMALLEST_BOX: f32 = 4.0;
 
 /// Boxes narrower than this have neither border nor round corners, pixels: these would be

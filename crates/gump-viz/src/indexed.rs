@@ -10,7 +10,8 @@ use crate::theme::{Colours, Rgb, mix};
 /// The number that means "as in the frame before".
 pub(crate) const UNCHANGED: u8 = 255;
 
-/// Slots of the memory of colours already matched; a power of two.
+/// Slots of the memory of colours already matched; a power of two, and many times the few hundred
+/// colours of a film. Chosen by hand.
 const MEMORY: usize = 1 << 14;
 
 /// Up to 255 colours, and which of them is nearest to any other.

@@ -12,7 +12,8 @@
 //! * **theme**: light or dark; classes keep their colours, from the colour-blind safe set of
 //!   Okabe and Ito (2008).
 //!
-//! Drawing cannot fail; writing files and compressing can, with [`VizError`].
+//! Drawing cannot fail; writing files and compressing can, with [`VizError`]. Sizes, widths and
+//! opacities of what is drawn are chosen by eye.
 //!
 //! ```
 //! use gump_viz::{Camera, Page, PictureSpec, draw_scene};

@@ -38,6 +38,7 @@ impl<'a> Pen<'a> {
     /// Fills a path with bars of a colour across `direction` (a pixel-space vector), `period`
     /// pixels apart and half as wide.
     pub(crate) fn hatch(&mut self, path: Shape, colour: Rgb, direction: DVec2, period: f32) {
+        // Pixels of the pattern, half of them coloured; they are scaled to the period.
         const STEPS: u32 = 16;
         let (Some(path), Some(mut tile)) = (path.finish(), Pixmap::new(STEPS, 1)) else {
             return;

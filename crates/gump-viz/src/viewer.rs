@@ -27,7 +27,8 @@ pub use annotations::{CandidatePath, HeatMap, MetricTrack};
 pub use gallery::Gallery;
 use pack::{CENTI, Class, HEADINGS, Packer, units};
 
-/// The map is kept within this distance of any agent, metres.
+/// The map is kept within this distance of any agent, metres: what a look at it shows. Chosen by
+/// hand; more makes pages larger.
 const MARGIN: f64 = 120.0;
 
 /// A scene under preparation for the browser.

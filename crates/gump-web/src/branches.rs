@@ -7,9 +7,9 @@ use crate::engine::{LiveFuture, RelativeWorld};
 use crate::game::{STRIDE, is_off_road};
 use crate::signals::Signals;
 
-/// Number of futures.
+/// Number of futures: as many as can be told apart on the page. Chosen by eye.
 pub const FUTURES: usize = 8;
-/// Half seconds of each future: eight seconds.
+/// Half seconds of each future: eight seconds, the horizon of Waymo's challenges.
 pub const STEPS: usize = 16;
 /// Separates the randomness of futures from that of the drive.
 const STREAM: u64 = 1 << 32;

@@ -7,13 +7,13 @@ use gump_rollout::BoxError;
 use gump_scene::{AgentState, EgoState, SceneState};
 
 use crate::GameError;
-use crate::tape::Driver;
+use crate::tape::EgoDriver;
 
 /// Microseconds between frames.
 const FRAME_US: i64 = 100_000;
 
-/// PlannerInput of the drive at which a driver plans.
-pub(crate) struct Place<'a> {
+/// What a driver plans from.
+pub(crate) struct PlanningContext<'a> {
     pub(crate) recording: &'a Recording,
     pub(crate) scene: SceneState<'a>,
     /// The ego from the start of the drive to now.
@@ -25,14 +25,14 @@ pub(crate) struct Place<'a> {
 ///
 /// Error: a driver that cannot drive here, or one that is not rule-based.
 pub(crate) fn plan(
-    driver: Driver,
-    place: &Place<'_>,
+    driver: EgoDriver,
+    context: &PlanningContext<'_>,
     n: usize,
 ) -> Result<Vec<AgentState>, GameError> {
     let planned = match driver {
-        Driver::Idm => follow(&mut NuplanIdmDriver::default(), place, n),
-        Driver::Pdm => follow(&mut PdmClosed::default(), place, n),
-        Driver::Hand | Driver::Network => Ok(Vec::new()),
+        EgoDriver::Idm => follow(&mut NuplanIdmDriver::default(), context, n),
+        EgoDriver::Pdm => follow(&mut PdmClosed::default(), context, n),
+        EgoDriver::Hand | EgoDriver::Network => Ok(Vec::new()),
     };
     planned.map_err(|error| GameError::Driver {
         driver: driver.name(),
@@ -42,20 +42,20 @@ pub(crate) fn plan(
 
 fn follow(
     planner: &mut dyn Planner,
-    place: &Place<'_>,
+    context: &PlanningContext<'_>,
     n: usize,
 ) -> Result<Vec<AgentState>, BoxError> {
-    planner.start(&place.recording.initialization())?;
-    let Some((ego, past)) = place.ego.split_last() else {
+    planner.start(&context.recording.initialization())?;
+    let Some((ego, past)) = context.ego.split_last() else {
         return Ok(Vec::new());
     };
     let plan = planner.drive(&PlannerInput {
         iteration: past.len(),
-        scene: place.scene,
+        scene: context.scene,
         ego,
         past,
     })?;
-    let vehicle = place.recording.vehicle();
+    let vehicle = context.recording.vehicle();
     let at = |i: usize| plan.at(ego.time_us + FRAME_US * i as i64);
     let states = (1..=n).map(|i| Ok(at(i)?.agent_state(vehicle)));
     states.collect()

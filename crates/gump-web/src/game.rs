@@ -17,20 +17,22 @@ use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, Scenario, SceneS
 
 use crate::GameError;
 use crate::branches::Branches;
-use crate::drivers::{self, Place, ego_state};
+use crate::drivers::{self, PlanningContext, ego_state};
 use crate::engine::{self, LiveFuture, RelativeWorld};
 use crate::signals::Signals;
-use crate::tape::{Driver, Input};
+use crate::tape::{EgoDriver, Input};
 
 /// Seconds between frames.
 pub const DT: f64 = 0.1;
 /// Frames in a half second of the network.
 pub(crate) const STRIDE: usize = 5;
-/// Frames of the longest drive, five minutes.
+/// Frames of the longest drive, five minutes. Chosen by hand: its states stay in memory.
 pub const MAX_FRAMES: usize = 3000;
-/// Agents that a scene may have at its start: more could not be simulated in time on a phone.
+/// Agents that a scene may have at its start: three times those of the shipped scenes, which take
+/// 36 ms per half second on a desktop (docs/results/0022-live-page.md). Phones were not measured.
 pub const MAX_AGENTS: usize = 128;
-/// Points that a map may have; a scene of Waymo's has some ten thousand.
+/// Points that a map may have; a scene of Waymo's has some ten thousand. Chosen by hand, against
+/// files that would fill the memory.
 pub const MAX_POINTS: usize = 200_000;
 /// Half seconds between two kept copies of the network's state; states in between are computed
 /// again from the copy before them. A copy for 40 agents takes a megabyte.
@@ -41,14 +43,15 @@ const COPY_EVERY: usize = 16;
 const PEDAL: [f64; 2] = [-7.0, 3.0];
 /// Sharpest turn, radians per metre: a radius of 5 m, as passenger cars have.
 const MAX_CURVATURE: f64 = 0.2;
-/// Sharpest turn at speed, metres per second squared across.
+/// Sharpest turn at speed, metres per second squared across: near what tyres hold on a dry road.
+/// Chosen by hand.
 const MAX_LATERAL: f64 = 6.0;
-/// Highest speed, metres per second.
+/// Highest speed, metres per second (144 km/h). Chosen by hand.
 const MAX_SPEED: f64 = 40.0;
 /// Hardest acceleration in reverse, metres per second squared, and highest speed in reverse, metres
-/// per second (18 km/h).
+/// per second (18 km/h). Chosen by hand.
 const REVERSE: (f64, f64) = (2.0, 5.0);
-/// Deceleration when no pedal is pressed, metres per second squared.
+/// Deceleration when no pedal is pressed, metres per second squared. Chosen by feel.
 const ROLLING: f64 = 0.3;
 
 /// Settings of a drive. The temperature is an input instead, since it may change during the drive.
@@ -92,7 +95,7 @@ pub enum EventKind {
 /// State kept for a half second.
 #[derive(Clone, Debug)]
 pub(crate) struct Knot {
-    driver: Driver,
+    driver: EgoDriver,
     temperature: f64,
     /// Assumed state of the ego at its end; `None` if the network decides.
     assumed: Option<AgentState>,
@@ -224,9 +227,9 @@ impl Game {
         let driver = self.knots.last().map_or(input.driver, |knot| knot.driver);
         let decided = self.ahead[into].agent(ego).map(|agent| agent.state);
         let next = match driver {
-            Driver::Hand => by_hand(&now, input, DT),
-            Driver::Network => decided.unwrap_or(now),
-            Driver::Idm | Driver::Pdm => self.planned.get(into).copied().unwrap_or(now),
+            EgoDriver::Hand => by_hand(&now, input, DT),
+            EgoDriver::Network => decided.unwrap_or(now),
+            EgoDriver::Idm | EgoDriver::Pdm => self.planned.get(into).copied().unwrap_or(now),
         };
         let shown = &self.ahead[into];
         let agents = shown.agents().iter().map(|agent| match agent.id == ego {
@@ -242,7 +245,7 @@ impl Game {
         self.inputs.push(input);
         self.note();
         if into + 1 == STRIDE {
-            let actual = (driver != Driver::Network).then_some(next);
+            let actual = (driver != EgoDriver::Network).then_some(next);
             self.live.go_on(&self.world, actual);
             self.ahead.clear();
         }
@@ -253,7 +256,7 @@ impl Game {
     fn begin_knot(&mut self, input: Input) -> Result<(), GameError> {
         let frame = self.driven();
         let now = self.scene().ego_now().state;
-        let place = Place {
+        let context = PlanningContext {
             recording: &self.recording,
             scene: SceneState {
                 map: &self.recording.scenario().map,
@@ -264,11 +267,11 @@ impl Game {
             },
             ego: &self.ego,
         };
-        self.planned = drivers::plan(input.driver, &place, STRIDE)?;
+        self.planned = drivers::plan(input.driver, &context, STRIDE)?;
         let assumed = match input.driver {
-            Driver::Hand => Some(by_hand(&now, input, DT * STRIDE as f64)),
-            Driver::Network => None,
-            Driver::Idm | Driver::Pdm => Some(self.planned.last().copied().unwrap_or(now)),
+            EgoDriver::Hand => Some(by_hand(&now, input, DT * STRIDE as f64)),
+            EgoDriver::Network => None,
+            EgoDriver::Idm | EgoDriver::Pdm => Some(self.planned.last().copied().unwrap_or(now)),
         };
         let index = frame / STRIDE;
         self.knots.truncate(index);
@@ -349,7 +352,7 @@ impl Game {
         let begun = self.knots[knot].clone();
         self.decide(&begun)?;
         self.planned = match begun.assumed {
-            Some(_) if begun.driver != Driver::Hand => self.rest_of_plan(knot),
+            Some(_) if begun.driver != EgoDriver::Hand => self.rest_of_plan(knot),
             _ => Vec::new(),
         };
         Ok(())
@@ -358,7 +361,7 @@ impl Game {
     /// Computes again what a rule-based driver had planned for a half second that has begun.
     fn rest_of_plan(&mut self, knot: usize) -> Vec<AgentState> {
         let frame = knot * STRIDE;
-        let place = Place {
+        let context = PlanningContext {
             recording: &self.recording,
             scene: SceneState {
                 map: &self.recording.scenario().map,
@@ -370,7 +373,7 @@ impl Game {
             ego: &self.ego[..=frame],
         };
         let driver = self.knots[knot].driver;
-        let planned = drivers::plan(driver, &place, STRIDE);
+        let planned = drivers::plan(driver, &context, STRIDE);
         planned.unwrap_or_default()
     }
 
@@ -396,7 +399,7 @@ impl Game {
             live.decide(&self.world, assumed);
             let end = &self.frames[self.scenario.now + (i + 1) * STRIDE];
             let ego = end.agent(self.scenario.ego).map(|agent| agent.state);
-            live.go_on(&self.world, ego.filter(|_| driver != Driver::Network));
+            live.go_on(&self.world, ego.filter(|_| driver != EgoDriver::Network));
         }
         live
     }
@@ -547,7 +550,7 @@ impl Game {
     }
 }
 
-/// Half seconds that a fan shows.
+/// Half seconds that a fan shows. Chosen by eye.
 pub const FAN_STEPS: usize = 3;
 
 /// Possible next motions of an agent.

@@ -26,5 +26,5 @@ pub use game::{
     DT, Event, EventKind, FAN_STEPS, Fan, Game, MAX_AGENTS, MAX_FRAMES, MAX_POINTS, Settings,
 };
 pub use score::DriveScore;
-pub use tape::{Driver, Input, decode, encode};
+pub use tape::{EgoDriver, Input, decode, encode};
 pub use view::{AGENT, HEAD, WAY, checksum};

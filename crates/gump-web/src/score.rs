@@ -5,7 +5,7 @@ use gump_wosac::realism::{self, Config, Log, N_FUTURE, Rollouts, Year};
 
 use crate::{Game, GameError};
 
-/// Frames of the shortest drive that is scored: comfort wants some seconds.
+/// Frames of the shortest drive that is scored: the longest filter of comfort spans 15.
 const SHORTEST: usize = 20;
 /// Parts that compare with what the recorded driver did in the same time.
 const COMPARED: [&str; 2] = ["ego_progress_along_expert_route", "ego_is_making_progress"];

@@ -5,9 +5,10 @@ use std::sync::Arc;
 use gump_scene::{Light, Scenario, Seed};
 use gump_traffic::{SignalPlan, Signals as Course};
 
-/// Seconds after the recording for which the lights are worked out; then they hold.
+/// Seconds after the recording for which the lights are worked out; then they hold. Three times the
+/// longest drive.
 const LONGEST_S: f64 = 900.0;
-/// Frames in which they may change, seconds.
+/// Frames in which they may change, seconds: the step of the network.
 const STEP_S: f64 = 0.5;
 
 /// States of the lights of a scene by frame of the drive, in any order, since a drive can be

@@ -11,7 +11,7 @@ use crate::GameError;
 
 /// Driver of the ego.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Driver {
+pub enum EgoDriver {
     /// The player.
     #[default]
     Hand,
@@ -23,7 +23,7 @@ pub enum Driver {
     Pdm,
 }
 
-impl Driver {
+impl EgoDriver {
     /// All of them, by number.
     pub const ALL: [Self; 4] = [Self::Hand, Self::Network, Self::Idm, Self::Pdm];
 
@@ -42,7 +42,7 @@ impl Driver {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Input {
     /// The driver; a change takes effect at the next half second.
-    pub driver: Driver,
+    pub driver: EgoDriver,
     /// From -100, the hardest braking, to 100, the hardest acceleration; in reverse, from -100, the
     /// hardest acceleration backwards, to 100, the hardest braking.
     pub pedal: i8,
@@ -57,7 +57,7 @@ pub struct Input {
 impl Default for Input {
     fn default() -> Self {
         Self {
-            driver: Driver::Hand,
+            driver: EgoDriver::Hand,
             pedal: 0,
             wheel: 0,
             temperature: Self::PER_UNIT as u8,
@@ -139,7 +139,7 @@ fn decode_run(run: &[u8]) -> Result<(usize, Input), GameError> {
     let &[low, high, driver, pedal, wheel, temperature, ref gear @ ..] = run else {
         return Err(GameError::Link("it was cut off"));
     };
-    let driver = Driver::ALL.get(usize::from(driver));
+    let driver = EgoDriver::ALL.get(usize::from(driver));
     let driver = *driver.ok_or(GameError::Link("it names a driver that there is not"))?;
     let reverse = match gear {
         [] | [0] => false,
@@ -167,7 +167,7 @@ mod tests {
             ..Input::default()
         };
         let second = Input {
-            driver: Driver::Pdm,
+            driver: EgoDriver::Pdm,
             temperature: 26,
             ..Input::default()
         };

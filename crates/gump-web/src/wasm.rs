@@ -5,7 +5,7 @@
 
 use wasm_bindgen::prelude::*;
 
-use crate::{Driver, Game, GameError, Input, MAX_FRAMES, Settings, decode};
+use crate::{EgoDriver, Game, GameError, Input, MAX_FRAMES, Settings, decode};
 
 /// A drive through a scene.
 #[wasm_bindgen(js_name = Game)]
@@ -54,7 +54,7 @@ impl WebGame {
         temperature: u8,
         reverse: bool,
     ) -> Result<(), JsError> {
-        let driver = Driver::ALL.get(usize::from(driver)).copied();
+        let driver = EgoDriver::ALL.get(usize::from(driver)).copied();
         let input = Input {
             driver: driver.unwrap_or_default(),
             pedal,
@@ -138,7 +138,7 @@ impl WebGame {
     }
 
     /// Summary of the drive for display, as JSON.
-    pub fn told(&self) -> Result<String, JsError> {
+    pub fn summary(&self) -> Result<String, JsError> {
         self.game.summary().map_err(sentence)
     }
 

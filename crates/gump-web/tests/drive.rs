@@ -4,7 +4,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use gump_web::{Driver, FUTURES, Game, HEAD, Input, MAX_FRAMES, STEPS, Settings, decode, encode};
+use gump_web::{
+    EgoDriver, FUTURES, Game, HEAD, Input, MAX_FRAMES, STEPS, Settings, decode, encode,
+};
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -26,10 +28,10 @@ fn game(settings: Settings) -> Game {
 fn inputs(n: usize) -> Vec<Input> {
     let input = |i: usize| Input {
         driver: match i {
-            20..30 => Driver::Network,
-            30..37 => Driver::Idm,
-            37..43 => Driver::Pdm,
-            _ => Driver::Hand,
+            20..30 => EgoDriver::Network,
+            30..37 => EgoDriver::Idm,
+            37..43 => EgoDriver::Pdm,
+            _ => EgoDriver::Hand,
         },
         pedal: if i < 15 { 80 } else { -30 },
         wheel: (i % 7) as i8 * 5 - 15,
@@ -55,7 +57,7 @@ fn ego_metres(game: &Game) -> f64 {
 
 #[test]
 fn whoever_drives_gets_somewhere_and_the_others_move() {
-    for driver in Driver::ALL {
+    for driver in EgoDriver::ALL {
         let mut game = game(Settings::default());
         let input = Input {
             driver,
@@ -65,7 +67,7 @@ fn whoever_drives_gets_somewhere_and_the_others_move() {
         drive(&mut game, &[input; 40]);
         assert_eq!(game.driven(), 40);
         // The others wait where they see a reason to.
-        let least = if driver == Driver::Hand { 2.0 } else { 0.1 };
+        let least = if driver == EgoDriver::Hand { 2.0 } else { 0.1 };
         assert!(
             ego_metres(&game) > least,
             "{driver:?}: {}",
@@ -225,7 +227,7 @@ fn a_drive_is_scored_and_drawn() {
             .contains("two seconds")
     );
     let input = Input {
-        driver: Driver::Network,
+        driver: EgoDriver::Network,
         ..Input::default()
     };
     drive(&mut game, &[input; 79]);

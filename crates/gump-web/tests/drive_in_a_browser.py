@@ -66,7 +66,7 @@ class Visit:
 
     def trouble(self):
         self.page.wait_for_selector("#trouble:not([hidden])", timeout=60_000)
-        return self.page.inner_text("#trouble-told")
+        return self.page.inner_text("#trouble-text")
 
     def state(self, what):
         return self.page.evaluate(f"gump.state.{what}")
@@ -135,11 +135,11 @@ def steer_for_twenty_seconds(browser, address, picture):
     picture(visit, "desktop-end")
     visit.page.click("#share")
     visit.page.wait_for_function("location.hash.includes('drive=')")
-    told = visit.page.evaluate("gump.engine.ask('code')")
+    answer = visit.page.evaluate("gump.engine.ask('code')")
     link = visit.page.evaluate("location.hash")
     assert visit.errors == [], visit.errors
     visit.close()
-    return link, told
+    return link, answer
 
 
 def reverse_gear(browser, address, picture):
@@ -171,20 +171,20 @@ def reverse_gear(browser, address, picture):
     keys.up("w")
     visit.page.click("#pause")
     visit.page.wait_for_function("!gump.state.busy")
-    told = visit.page.evaluate("gump.engine.ask('code')")
+    answer = visit.page.evaluate("gump.engine.ask('code')")
     assert visit.errors == [], visit.errors
     visit.close()
-    a_link_replays_the_drive(browser, address, f"#scene=crossing&seed=1&density=1&drive={told['code']}", told)
+    a_link_replays_the_drive(browser, address, f"#scene=crossing&seed=1&density=1&drive={answer['code']}", answer)
 
 
-def a_link_replays_the_drive(browser, address, link, told):
+def a_link_replays_the_drive(browser, address, link, answer):
     visit = Visit(browser, address, viewport={"width": 1280, "height": 800}, color_scheme="dark")
     visit.open(link).ready()
     assert visit.page.inner_text("#go") == "Watch this drive"
     visit.page.click("#go")
     visit.page.wait_for_function("document.body.dataset.mode === 'paused'", timeout=120_000)
     again = visit.page.evaluate("gump.engine.ask('code')")
-    assert again == told, "the link drove another drive"
+    assert again == answer, "the link drove another drive"
     assert visit.errors == [], visit.errors
     visit.close()
 
@@ -291,8 +291,8 @@ def what_goes_wrong_is_told(browser, address, picture):
         if act:
             visit.ready()
             act(visit)
-        told = visit.trouble()
-        assert expected in told, f"expected {expected!r}, found {told!r}"
+        message = visit.trouble()
+        assert expected in message, f"expected {expected!r}, found {message!r}"
         if "SIMD" in expected:
             picture(visit, "error")
         visit.close()
@@ -377,8 +377,8 @@ def main():
         if arguments.bench:
             bench(browser, address, arguments.bench)
         else:
-            link, told = steer_for_twenty_seconds(browser, address, picture)
-            a_link_replays_the_drive(browser, address, link, told)
+            link, answer = steer_for_twenty_seconds(browser, address, picture)
+            a_link_replays_the_drive(browser, address, link, answer)
             reverse_gear(browser, address, picture)
             drivers_by_rule_drive(browser, address)
             every_scene_opens(browser, address)

@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gump_web::{Driver, Game, Input, Settings};
+use gump_web::{EgoDriver, Game, Input, Settings};
 
 /// Half seconds that are compared.
 const HALF_SECONDS: usize = 12;
@@ -32,7 +32,7 @@ fn native() -> Vec<Vec<f64>> {
     let scene = fs::read(scene()).unwrap();
     let mut game = Game::open(&scene, "crossing", &weights, Settings::default()).unwrap();
     let input = Input {
-        driver: Driver::Network,
+        driver: EgoDriver::Network,
         ..Input::default()
     };
     let half_second = |_| {

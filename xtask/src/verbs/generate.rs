@@ -25,13 +25,14 @@ use crate::films::FilmArgs;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::shipped;
 
-/// Scenes made together.
+/// Scenes made together, by all threads, before progress is shown and an interrupt looked for.
+/// Chosen by hand.
 const BATCH: u64 = 32;
 
-/// Maximum number of prompts of a scene.
+/// Maximum number of prompts of a scene: as many as a sequence of the tokenizer holds.
 const MOST_PROMPTS: usize = 4;
 
-/// Slower is standing, metres per second.
+/// Slower is standing, metres per second, as in `data stats`: for the report alone.
 const STANDS: f64 = 0.5;
 
 /// Arguments of `generate`.
@@ -144,9 +145,9 @@ impl Args {
             seconds: self.simulate,
             attempts: self.attempts.get(),
         };
-        let (made, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
-        run.phase("write", |run| write(run, &made, &self.film))?;
-        report(run, &made, elapsed)
+        let (checked, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
+        run.phase("write", |run| write(run, &checked, &self.film))?;
+        report(run, &checked, elapsed)
     }
 
     fn check_numbers(&self) -> anyhow::Result<()> {
@@ -216,8 +217,8 @@ impl Args {
         for first in (0..n).step_by(batch as usize) {
             stop_if_interrupted()?;
             let numbers = first..(first + batch).min(n);
-            for made in make_many(worlds, order, numbers, run.seed()).map_err(too_many)? {
-                all.push(made.map_err(too_many)?);
+            for checked in make_many(worlds, order, numbers, run.seed()).map_err(too_many)? {
+                all.push(checked.map_err(too_many)?);
                 progress.advance(1);
             }
         }
@@ -298,8 +299,8 @@ pub(crate) fn world(
 }
 
 /// All scenes as Waymo records, the first as JSON, as a picture, and as a film if it moves.
-fn write(run: &Run, made: &[CheckedScene], film: &FilmArgs) -> anyhow::Result<()> {
-    let scenarios: Vec<&Scenario> = made.iter().map(|made| &made.scenario).collect();
+fn write(run: &Run, checked: &[CheckedScene], film: &FilmArgs) -> anyhow::Result<()> {
+    let scenarios: Vec<&Scenario> = checked.iter().map(|checked| &checked.scenario).collect();
     gump_data::womd::write_scenarios(&run.path("scenes.tfrecord"), scenarios.iter().copied())?;
     let Some(&first) = scenarios.first() else {
         return Ok(());
@@ -327,44 +328,47 @@ fn write(run: &Run, made: &[CheckedScene], film: &FilmArgs) -> anyhow::Result<()
     Ok(())
 }
 
-fn report(run: &mut Run, made: &[CheckedScene], elapsed: Duration) -> anyhow::Result<()> {
-    let n = made.len() as f64;
-    let agents: usize = made.iter().map(agents).sum();
-    let vehicles: usize = made
+fn report(run: &mut Run, checked: &[CheckedScene], elapsed: Duration) -> anyhow::Result<()> {
+    let n = checked.len() as f64;
+    let agents: usize = checked.iter().map(agents).sum();
+    let vehicles: usize = checked
         .iter()
-        .map(|made| count(made, |kind| kind == AgentKind::Vehicle))
+        .map(|checked| count(checked, |kind| kind == AgentKind::Vehicle))
         .sum();
-    let sum = |of: fn(&Scenario) -> usize| made.iter().map(|m| of(&m.scenario)).sum::<usize>();
+    let sum = |of: fn(&Scenario) -> usize| checked.iter().map(|m| of(&m.scenario)).sum::<usize>();
     let (overlapping, off) = (sum(overlaps), sum(off_road));
-    run.result("scenes", made.len())?;
+    run.result("scenes", checked.len())?;
     run.result("agents", agents)?;
     run.result("agents_per_scene", agents as f64 / n)?;
     run.result("overlaps", overlapping)?;
     run.result("offroad", off)?;
     run.result("overlap_rate", overlapping as f64 / agents.max(1) as f64)?;
     run.result("offroad_rate", off as f64 / vehicles.max(1) as f64)?;
-    let holding = made.iter().filter(|made| made.holds()).count();
+    let holding = checked.iter().filter(|checked| checked.holds()).count();
     run.result("holding", holding as f64 / n)?;
-    run.result("attempts", made.iter().map(|m| m.attempts).sum::<usize>())?;
-    let steered = made.iter().filter(|made| made.is_steered).count();
+    run.result(
+        "attempts",
+        checked.iter().map(|m| m.attempts).sum::<usize>(),
+    )?;
+    let steered = checked.iter().filter(|checked| checked.is_steered).count();
     run.result("steered", steered as f64 / n)?;
-    let redraws: usize = made.iter().map(|made| made.scene.redraws).sum();
+    let redraws: usize = checked.iter().map(|checked| checked.scene.redraws).sum();
     run.result("redraws", redraws)?;
-    let restarts: usize = made.iter().map(|made| made.scene.restarts).sum();
+    let restarts: usize = checked.iter().map(|checked| checked.scene.restarts).sum();
     run.result("restarts", restarts)?;
-    if let Some(share) = standing_at_end(made) {
+    if let Some(share) = standing_at_end(checked) {
         run.result("standing_at_end", share)?;
     }
-    run.result("clauses", clauses(made))?;
+    run.result("clauses", clauses(checked))?;
     run.result("scenes_per_second", n / elapsed.as_secs_f64().max(1e-9))
 }
 
 /// Share of vehicles at standstill in the last frames of the simulated futures; `None` without any.
-fn standing_at_end(made: &[CheckedScene]) -> Option<f64> {
-    let imagined = made
+fn standing_at_end(checked: &[CheckedScene]) -> Option<f64> {
+    let imagined = checked
         .iter()
-        .filter(|made| !made.scenario.future().is_empty());
-    let last = imagined.filter_map(|made| made.scenario.log.last());
+        .filter(|checked| !checked.scenario.future().is_empty());
+    let last = imagined.filter_map(|checked| checked.scenario.log.last());
     let speeds: Vec<f64> = last
         .flat_map(|frame| frame.agents())
         .filter(|agent| agent.kind == AgentKind::Vehicle)
@@ -374,32 +378,38 @@ fn standing_at_end(made: &[CheckedScene]) -> Option<f64> {
     (!speeds.is_empty()).then(|| standing as f64 / speeds.len() as f64)
 }
 
-fn agents(made: &CheckedScene) -> usize {
-    count(made, AgentKind::is_moving)
+fn agents(checked: &CheckedScene) -> usize {
+    count(checked, AgentKind::is_moving)
 }
 
-fn count(made: &CheckedScene, wanted: impl Fn(AgentKind) -> bool) -> usize {
-    let present = made.scenario.present();
+fn count(checked: &CheckedScene, wanted: impl Fn(AgentKind) -> bool) -> usize {
+    let present = checked.scenario.present();
     let agents = present.now().agents().iter();
     agents.filter(|agent| wanted(agent.kind)).count()
 }
 
 /// Per clause whether it holds; of several scenes, in all of them, with the share in which it does.
-fn clauses(made: &[CheckedScene]) -> Vec<Value> {
-    let first = made.first().map_or(&[][..], |made| &made.clauses);
+fn clauses(checked: &[CheckedScene]) -> Vec<Value> {
+    let first = checked.first().map_or(&[][..], |checked| &checked.clauses);
     let row = |(i, clause): (usize, &gump_generate::check::Clause)| {
-        let verdicts: Vec<Option<bool>> = made.iter().map(|made| made.clauses[i].holds).collect();
+        let verdicts: Vec<Option<bool>> = checked
+            .iter()
+            .map(|checked| checked.clauses[i].holds)
+            .collect();
         let holding = verdicts
             .iter()
             .filter(|holds| **holds == Some(true))
             .count();
         let failing = verdicts.contains(&Some(false));
-        let later: Vec<Option<bool>> = made.iter().map(|m| m.clauses[i].holds_throughout).collect();
+        let later: Vec<Option<bool>> = checked
+            .iter()
+            .map(|m| m.clauses[i].holds_throughout)
+            .collect();
         let is_told = later.iter().all(Option::is_some);
         json!({
             "clause": clause.clause,
             "holds": if failing { Some(false) } else { clause.holds },
-            "share": holding as f64 / made.len() as f64,
+            "share": holding as f64 / checked.len() as f64,
             "holds_throughout": is_told.then(|| !later.contains(&Some(false))),
         })
     };

@@ -20,7 +20,7 @@ use crate::run::{Common, Run};
 const TARGET: &str = "wasm32-unknown-unknown";
 /// The version of `wasm-bindgen` in the workspace; the command must have the same.
 const BINDGEN: &str = "0.2.130";
-/// Maximum size of the page, bytes.
+/// Maximum size of the page, bytes: the goal of docs/results/0022-live-page.md.
 const MOST: u64 = 12_000_000;
 /// Script that draws roads and agents, shared with the pages of `gump-viz`.
 const DRAWING: &str = "crates/gump-viz/src/traffic.js";

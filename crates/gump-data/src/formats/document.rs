@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use gump_scene::Scenario;
 
-use crate::source::{BoxedSource, Source};
-use crate::{DataError, Place, Problem, ReadOptions, ReadReport, ScenarioRecord};
+use crate::source::{BoxedSource, RecordSource};
+use crate::{DataError, Problem, ReadOptions, ReadReport, RecordLocation, ScenarioRecord};
 
 /// A file that was read and understood, but not yet turned into a scenario.
 pub(crate) trait Document: Sized + Send + 'static {
@@ -53,7 +53,7 @@ struct OneScenario<D> {
     kind: std::marker::PhantomData<fn() -> D>,
 }
 
-impl<D: Document> Source for OneScenario<D> {
+impl<D: Document> RecordSource for OneScenario<D> {
     fn skip(&mut self) -> Option<Result<(), DataError>> {
         self.path.take().map(|_| Ok(()))
     }
@@ -89,7 +89,7 @@ fn record<D: Document>(
         Err(problem) => Err(DataError::Scenario {
             id,
             problem,
-            place: Place {
+            place: RecordLocation {
                 record: 0,
                 offset: 0,
                 path,

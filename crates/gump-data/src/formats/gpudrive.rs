@@ -317,7 +317,8 @@ fn in_degrees(objects: &[Object]) -> bool {
     all.any(|(heading, _)| heading.abs() > TWO_TURNS)
 }
 
-/// So much agreement of moving agents, as a sum of cosines, decides about the unit.
+/// So much agreement of moving agents, as a sum of cosines, decides about the unit: a few steps of
+/// one agent suffice. Chosen by hand.
 const ENOUGH: f64 = 1.0;
 /// Radians that no unwrapped heading of nine seconds in a parked scene reaches.
 const TWO_TURNS: f64 = 2.0 * std::f64::consts::TAU;

@@ -9,7 +9,7 @@ use std::io::{self, BufRead, Read, Write};
 use std::path::PathBuf;
 
 use super::stream::{Stream, io_error};
-use crate::{DataError, Place};
+use crate::{DataError, RecordLocation};
 
 /// The maximum length of a payload, bytes.
 ///
@@ -51,7 +51,7 @@ pub struct Payload {
     /// The bytes inside the frame.
     pub bytes: Vec<u8>,
     /// The record it came from.
-    pub place: Place,
+    pub place: RecordLocation,
 }
 
 impl TfRecordReader {
@@ -74,8 +74,8 @@ impl TfRecordReader {
         }
     }
 
-    fn place(&self) -> Place {
-        Place {
+    fn place(&self) -> RecordLocation {
+        RecordLocation {
             record: self.record,
             offset: self.offset,
             path: self.path.clone(),

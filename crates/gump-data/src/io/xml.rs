@@ -11,7 +11,7 @@ use quick_xml::events::{BytesStart, Event};
 use super::stream;
 use crate::DataError;
 
-/// The longest document that is read, bytes after unpacking.
+/// The longest document that is read, bytes after unpacking: damaged files may unpack to anything.
 const MAX_BYTES: u64 = 64 << 20;
 /// The most elements of a document. An element takes about 100 bytes.
 const MAX_ELEMENTS: usize = 4_000_000;

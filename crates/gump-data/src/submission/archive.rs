@@ -21,7 +21,7 @@ use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission, SubmissionType}
 
 /// A shard is closed at this size; protobuf has a limit of 2 GB.
 const SHARD_BYTES: u64 = 1 << 30;
-/// Maximum number of problems kept as sentences; further ones are only counted.
+/// Maximum number of problems kept as sentences; further ones are only counted. Chosen by hand.
 const MAX_SENTENCES: usize = 1000;
 /// Prefix of the names of shards.
 const SHARD_STEM: &str = "submission.binproto";

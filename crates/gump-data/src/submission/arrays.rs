@@ -26,7 +26,8 @@ use crate::io::columns as table;
 use crate::io::stream;
 use gump_proto::{JointScene, ScenarioRollouts, SimulatedTrajectory};
 
-/// The largest file that is read, and the most that a member of it may unpack to, bytes.
+/// The largest file that is read, and the most that a member of it may unpack to, bytes: what a
+/// usual machine holds; damaged files may unpack to anything.
 const MAX_BYTES: u64 = 4 << 30;
 /// The first bytes of an `.npy` file.
 const NPY: &[u8] = b"\x93NUMPY";

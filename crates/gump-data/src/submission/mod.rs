@@ -18,7 +18,7 @@ use gump_scene::{AgentId, AgentState, Frame, Rollout, Scenario};
 use prost::Message;
 
 use crate::io::stream::{self, io_error};
-use crate::{DataError, Place, Problem, write_atomically};
+use crate::{DataError, Problem, RecordLocation, write_atomically};
 use gump_proto::{JointScene, ScenarioRollouts, SimAgentsChallengeSubmission, SimulatedTrajectory};
 
 pub use archive::{
@@ -137,7 +137,7 @@ pub fn read_rollouts(path: &Path) -> Result<Vec<ScenarioRollouts>, DataError> {
     let one = ScenarioRollouts::decode(bytes.as_slice()).map_err(|source| DataError::Proto {
         message: "waymo.open_dataset.ScenarioRollouts",
         source,
-        place: Place {
+        place: RecordLocation {
             record: 0,
             offset: 0,
             path: path.into(),

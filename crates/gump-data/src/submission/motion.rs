@@ -12,7 +12,7 @@ use gump_scene::{AgentId, PredictedMode, Prediction, Scenario};
 use prost::Message;
 
 use crate::io::stream::{self, io_error};
-use crate::{DataError, Place, Problem, write_atomically};
+use crate::{DataError, Problem, RecordLocation, write_atomically};
 use gump_proto::motion::{
     ChallengeScenarioPredictions, JointPrediction, MotionChallengeSubmission, ObjectTrajectory,
     PredictionKind, PredictionSet, ScoredJointTrajectory, ScoredTrajectory, SingleObjectPrediction,
@@ -36,7 +36,7 @@ pub fn read_predictions(path: &Path) -> Result<MotionChallengeSubmission, DataEr
     MotionChallengeSubmission::decode(bytes.as_slice()).map_err(|source| DataError::Proto {
         message: "waymo.open_dataset.MotionChallengeSubmission",
         source,
-        place: Place {
+        place: RecordLocation {
             record: 0,
             offset: 0,
             path: path.into(),

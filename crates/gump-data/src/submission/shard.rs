@@ -10,7 +10,7 @@ use prost::Message;
 
 use crate::io::stream::io_error;
 use crate::io::tfrecord::MAX_RECORD_BYTES;
-use crate::{DataError, Place};
+use crate::{DataError, RecordLocation};
 use gump_proto::{ScenarioRollouts, SimAgentsChallengeSubmission};
 
 /// Field number of the scenarios in `SimAgentsChallengeSubmission`.
@@ -67,8 +67,8 @@ impl<R: BufRead> ShardReader<R> {
         })
     }
 
-    fn place(&self) -> Place {
-        Place {
+    fn place(&self) -> RecordLocation {
+        RecordLocation {
             record: self.record,
             offset: self.offset,
             path: self.path.clone(),
@@ -87,7 +87,7 @@ impl<R: BufRead> ShardReader<R> {
             let (field, wire_type) = (key >> 3, key & 7);
             if field == SCENARIO_ROLLOUTS && wire_type == LENGTH_DELIMITED {
                 let payload = self.payload(start)?;
-                let place = Place {
+                let place = RecordLocation {
                     offset: start,
                     ..self.place()
                 };
@@ -124,7 +124,7 @@ impl<R: BufRead> ShardReader<R> {
             return Err(DataError::TooLong {
                 limit: MAX_RECORD_BYTES,
                 length,
-                place: Place {
+                place: RecordLocation {
                     offset: start,
                     ..self.place()
                 },

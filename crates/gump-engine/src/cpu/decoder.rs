@@ -13,7 +13,7 @@ use gump_model::decoder::{Bins, STEPS};
 use gump_tokenizer::{Field, TABLE_ROWS};
 use rayon::prelude::*;
 
-use super::weights::{Source, numbers};
+use super::weights::{WeightReader, numbers};
 use super::{Pool, Workspace, chunk_rows};
 use crate::draw::draw_field;
 use crate::request::Request;
@@ -35,14 +35,14 @@ pub(super) struct Decoder {
 }
 
 impl Decoder {
-    pub(super) fn new(source: &Source<'_>) -> Result<Self, ModelError> {
-        let network = source.network;
+    pub(super) fn new(weights: &WeightReader<'_>) -> Result<Self, ModelError> {
+        let network = weights.network;
         let c = network.config().width;
         let layers = 0..network.config().gru_layers;
         // Multiplied out once, so in full precision.
-        let exact = Source {
+        let exact = WeightReader {
             precision: gump_kernels::panels::Precision::F32,
-            ..*source
+            ..*weights
         };
         let first = exact.linear("decoder.gru.0.input", c)?;
         let weight = exact.get("decoder.gru.0.input.weight")?;
@@ -57,19 +57,19 @@ impl Decoder {
         let table = network.decoder.input_table(&network.mct.token_table()?)?;
         let head = |field: &Field| {
             let rows = numbers(&network.decoder.output_rows(*field)?)?;
-            Ok::<_, ModelError>(Panels::new(&rows, c, None, source.precision))
+            Ok::<_, ModelError>(Panels::new(&rows, c, None, weights.precision))
         };
         Ok(Self {
             width: c,
             token_gates: gates(&unbiased, &numbers(&table)?),
-            step_gates: gates(&first, &source.get("decoder.slots")?),
+            step_gates: gates(&first, &weights.get("decoder.slots")?),
             hidden: layers
                 .clone()
-                .map(|i| source.linear(&format!("decoder.gru.{i}.hidden"), c))
+                .map(|i| weights.linear(&format!("decoder.gru.{i}.hidden"), c))
                 .collect::<Result<_, _>>()?,
             input: layers
                 .skip(1)
-                .map(|i| source.linear(&format!("decoder.gru.{i}.input"), c))
+                .map(|i| weights.linear(&format!("decoder.gru.{i}.input"), c))
                 .collect::<Result<_, _>>()?,
             heads: Field::ALL.iter().map(head).collect::<Result<_, _>>()?,
         })

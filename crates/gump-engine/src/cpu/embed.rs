@@ -17,7 +17,7 @@ use gump_model::mct::PLACES;
 use gump_model::placed_slot::PlacedSlot;
 use rayon::prelude::*;
 
-use super::weights::{Norm, Source, numbers};
+use super::weights::{Norm, WeightReader, numbers};
 use super::{Pool, chunk_rows};
 
 /// Turns slots into vectors.
@@ -43,24 +43,24 @@ pub(super) struct Embedder {
 pub(super) struct Ground(Vec<Vec<f32>>);
 
 impl Embedder {
-    pub(super) fn new(source: &Source<'_>) -> Result<Self, ModelError> {
-        let config = source.network.config();
+    pub(super) fn new(weights: &WeightReader<'_>) -> Result<Self, ModelError> {
+        let config = weights.network.config();
         let c = config.width;
         let n_places = if config.local_map { PLACES.len() } else { 0 };
         Ok(Self {
             width: c,
             packer: Packer::new(config),
-            table: source.get("mct.tables")?,
-            sine_in: source.linear("mct.sine_in", c)?,
-            sine_norm: source.norm("mct.sine_norm")?,
-            sine_out: source.linear("mct.sine_out", 2 * c)?,
+            table: weights.get("mct.tables")?,
+            sine_in: weights.linear("mct.sine_in", c)?,
+            sine_norm: weights.norm("mct.sine_norm")?,
+            sine_out: weights.linear("mct.sine_out", 2 * c)?,
             local: (0..n_places)
-                .map(|i| source.linear(&format!("mct.local.{i}"), c))
+                .map(|i| weights.linear(&format!("mct.local.{i}"), c))
                 .collect::<Result<_, _>>()?,
             local_context: match config.local_context {
                 true => Some([
-                    source.linear("mct.surroundings.in", n_numbers(config))?,
-                    source.linear("mct.surroundings.out", 2 * c)?,
+                    weights.linear("mct.surroundings.in", n_numbers(config))?,
+                    weights.linear("mct.surroundings.out", 2 * c)?,
                 ]),
                 false => None,
             },

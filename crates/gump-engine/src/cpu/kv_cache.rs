@@ -2,9 +2,9 @@
 //! them.
 //!
 //! [`Pages`] belong to one attention layer, [`KvCache`] to all layers of one sequence, with the
-//! slots they were computed from; [`attend`] computes attention. Start with [`KvCache::reuse`],
-//! which keeps the cache exact: an entry is kept only as long as its token and all tokens before it
-//! are unchanged.
+//! slots they were computed from, which are in shared pages as well ([`SlotPages`]); [`attend`]
+//! computes attention. Start with [`KvCache::reuse`], which keeps the cache exact: an entry is kept
+//! only as long as its token and all tokens before it are unchanged.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use gump_kernels::rows::{exp_shifted_sum, max};
 use gump_kernels::{tile, wide};
 use gump_model::placed_slot::PlacedSlot;
 
-/// Tokens of a page.
+/// Tokens of a page: as many as a panel has columns, so that a page's keys are one panel.
 const PAGE: usize = PANEL;
 
 /// The division of channels into heads.
@@ -76,18 +76,60 @@ impl Pages {
     }
 }
 
+/// The slots of cached tokens, page by page; clones share their pages until one of them writes.
+#[derive(Clone, Debug, Default)]
+pub(super) struct SlotPages {
+    /// All are full except the last, which may hold slots beyond `len`.
+    pages: Vec<Arc<Vec<PlacedSlot>>>,
+    len: usize,
+}
+
+impl SlotPages {
+    /// Number of slots.
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.len
+    }
+
+    /// The slots in order.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &PlacedSlot> {
+        let all = self.pages.iter().flat_map(|page| page.iter());
+        all.take(self.len)
+    }
+
+    /// Keeps the first `len` slots.
+    pub(super) fn truncate(&mut self, len: usize) {
+        self.len = self.len.min(len);
+        self.pages.truncate(self.len.div_ceil(PAGE));
+    }
+
+    /// Adds slots at the end.
+    pub(super) fn extend(&mut self, slots: &[PlacedSlot]) {
+        let room = self.len.next_multiple_of(PAGE) - self.len;
+        let (first, rest) = slots.split_at(room.min(slots.len()));
+        if let Some(page) = self.pages.last_mut().filter(|_| !first.is_empty()) {
+            let page = Arc::make_mut(page);
+            page.truncate(self.len % PAGE);
+            page.extend_from_slice(first);
+        }
+        let pages = rest.chunks(PAGE).map(|page| Arc::new(page.to_vec()));
+        self.pages.extend(pages);
+        self.len += slots.len();
+    }
+}
+
 /// The cached keys and values of one sequence, in every layer.
 #[derive(Clone, Debug, Default)]
 pub struct KvCache {
     /// The slots whose keys and values are held.
-    pub(super) slots: Vec<PlacedSlot>,
+    pub(super) slots: SlotPages,
     pub(super) layers: Vec<Pages>,
 }
 
 impl KvCache {
-    /// Clears the cache but keeps its memory.
+    /// Clears the cache but keeps the memory of its keys and values.
     pub(crate) fn clear(&mut self) {
-        self.slots.clear();
+        self.slots.truncate(0);
     }
 
     /// Returns the number of leading tokens of `slots` that are cached, compared token by token.

@@ -40,12 +40,13 @@ use gump_model::mct::VisualMemory;
 use gump_model::placed_slot::PlacedSlot;
 
 use self::successor::Successors;
-use self::weights::{Attention, Layer, Mlp, Norm, Source, numbers};
+use self::weights::{Attention, Layer, Mlp, Norm, WeightReader, numbers};
 use crate::draw::Candidates;
 use crate::request::Request;
 use crate::sampling::SamplingConfig;
 
-/// Number of new tokens that go through the layers together; bounds the memory of a pass.
+/// Number of new tokens that go through the layers together. Bounds the memory of a pass: 12 MB
+/// for 128 channels. Not tuned.
 const WAVE: usize = 8 * 1024;
 
 /// A network with packed weights, ready to simulate on a CPU.
@@ -91,7 +92,7 @@ pub struct Job<'a> {
 }
 
 /// The location of a row: its job within the wave, its place in the job's sequence.
-type Row = (usize, usize);
+type JobPosition = (usize, usize);
 
 impl Engine {
     /// Packs the weights of a network.
@@ -101,20 +102,20 @@ impl Engine {
     pub(crate) fn new(network: &Network, precision: Precision) -> Result<Self, ModelError> {
         let config = network.config();
         let c = config.width;
-        let source = Source { network, precision };
+        let weights = WeightReader { network, precision };
         Ok(Self {
             width: c,
             heads: Heads {
                 n: config.heads,
                 d: c / config.heads,
             },
-            embedder: Embedder::new(&source)?,
+            embedder: Embedder::new(&weights)?,
             layers: (0..config.layers)
-                .map(|i| Layer::new(&source, i, c))
+                .map(|i| Layer::new(&weights, i, c))
                 .collect::<Result<_, _>>()?,
-            norm: source.norm("mct.norm")?,
-            decoder: Decoder::new(&source)?,
-            successors: Successors::new(&source)?,
+            norm: weights.norm("mct.norm")?,
+            decoder: Decoder::new(&weights)?,
+            successors: Successors::new(&weights)?,
             rooms: Pool::default(),
             waves: Pool::default(),
             products: AtomicU64::new(0),
@@ -224,7 +225,7 @@ impl Engine {
 
     fn run_wave(&self, jobs: &mut [Job<'_>], Wave { x, kv }: &mut Wave) -> Vec<f32> {
         let c = self.width;
-        let mut rows: Vec<Row> = Vec::new();
+        let mut rows: Vec<JobPosition> = Vec::new();
         let mut starts = Vec::with_capacity(jobs.len());
         for (i, job) in jobs.iter_mut().enumerate() {
             let end = job.wanted.last().map_or(0, |last| last + 1);
@@ -257,7 +258,7 @@ impl Engine {
         }
         for (job, start) in jobs.iter_mut().zip(starts) {
             if job.keep {
-                job.kv_cache.slots.extend_from_slice(&job.slots[start..]);
+                job.kv_cache.slots.extend(&job.slots[start..]);
             } else {
                 job.kv_cache.clear();
             }
@@ -292,7 +293,12 @@ impl Engine {
     }
 
     /// Leaves of `x` only the rows that are asked for.
-    fn keep_wanted(&self, jobs: &[Job<'_>], starts: &[usize], x: &mut Vec<f32>) -> Vec<Row> {
+    fn keep_wanted(
+        &self,
+        jobs: &[Job<'_>],
+        starts: &[usize],
+        x: &mut Vec<f32>,
+    ) -> Vec<JobPosition> {
         let (mut rows, mut first) = (Vec::new(), 0);
         for (i, (job, start)) in jobs.iter().zip(starts).enumerate() {
             for &place in &job.wanted {
@@ -325,15 +331,22 @@ impl Engine {
     }
 
     /// Everything of a layer but its keys and values, in place; `x` holds `rows`.
-    fn layer(&self, l: usize, layer: &Layer, jobs: &[Job<'_>], rows: &[Row], x: &mut [f32]) {
+    fn layer(
+        &self,
+        l: usize,
+        layer: &Layer,
+        jobs: &[Job<'_>],
+        rows: &[JobPosition],
+        x: &mut [f32],
+    ) {
         let c = self.width;
         self.count_layer(layer, jobs, rows);
-        let own = |row: &Row| {
+        let own = |row: &JobPosition| {
             let kv_cache = &*jobs[row.0].kv_cache;
             let l = if kv_cache.layers.len() == 1 { 0 } else { l };
             (&kv_cache.layers[l], row.1 + 1)
         };
-        let map = |row: &Row| {
+        let map = |row: &JobPosition| {
             let memory = jobs[row.0].memory;
             (&memory.cross[l / 3], memory.n)
         };
@@ -352,10 +365,10 @@ impl Engine {
             });
     }
 
-    fn count_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[Row]) {
+    fn count_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[JobPosition]) {
         let dense = layer.matrices().map(|panels| panels.products(rows.len()));
         let dense = dense.sum::<u64>() - layer.key_value.products(rows.len());
-        let seen = |row: &Row| {
+        let seen = |row: &JobPosition| {
             let map = layer.cross.as_ref().map_or(0, |_| jobs[row.0].memory.n);
             (row.1 + 1 + map) as u64
         };
@@ -368,8 +381,8 @@ impl Engine {
     fn attend<'a>(
         &self,
         attention: &Attention,
-        rows: &[Row],
-        keys: impl Fn(&Row) -> (&'a Pages, usize),
+        rows: &[JobPosition],
+        keys: impl Fn(&JobPosition) -> (&'a Pages, usize),
         x: &mut [f32],
         room: &mut Workspace,
     ) {

@@ -10,7 +10,7 @@ use gump_model::decoder::{CONTROL_KEYS, N_LIGHT_STATES};
 use gump_model::embedding::Tables;
 use gump_tokenizer::{BEGIN, FIRST_LIGHT, N_CLASSES};
 
-use super::weights::Source;
+use super::weights::WeightReader;
 
 /// Logits over the successors of one token.
 #[derive(Clone, Debug)]
@@ -28,10 +28,10 @@ pub struct Successor {
 pub(super) struct Successors(Panels);
 
 impl Successors {
-    pub(super) fn new(source: &Source<'_>) -> Result<Self, ModelError> {
-        let c = source.network.config().width;
-        let head = source.get("decoder.head.weight")?;
-        let tables = source.get("mct.tables")?;
+    pub(super) fn new(weights: &WeightReader<'_>) -> Result<Self, ModelError> {
+        let c = weights.network.config().width;
+        let head = weights.get("decoder.head.weight")?;
+        let tables = weights.get("mct.tables")?;
         let rows = |of: &[f32], first: usize, n: usize| of[first * c..(first + n) * c].to_vec();
         let all = [
             rows(&head, 0, CONTROL_KEYS),

@@ -127,6 +127,35 @@ fn a_context_changes_no_bit() {
 }
 
 #[test]
+fn pages_of_slots_hold_what_a_list_would() {
+    let slots = slots(&scenario()).repeat(4);
+    let mut pages = kv_cache::SlotPages::default();
+    let mut list: Vec<PlacedSlot> = Vec::new();
+    // Extended and cut within pages, at their ends and beyond them.
+    for (cut, add) in [
+        (0, 5),
+        (5, 11),
+        (16, 40),
+        (50, 1),
+        (32, 20),
+        (7, 0),
+        (7, 9),
+        (99, 3),
+        (0, 2),
+    ] {
+        let before = (pages.clone(), list.clone());
+        pages.truncate(cut);
+        list.truncate(cut);
+        let added = &slots[list.len()..][..add];
+        pages.extend(added);
+        list.extend_from_slice(added);
+        assert_eq!(pages.len(), list.len());
+        assert!(pages.iter().eq(&list));
+        assert!(before.0.iter().eq(&before.1), "a clone has changed");
+    }
+}
+
+#[test]
 fn sequences_do_not_know_their_neighbours_or_the_threads() {
     let (network, scenario) = (network(), scenario());
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));

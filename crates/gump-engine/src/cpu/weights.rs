@@ -12,12 +12,12 @@ use gump_model::ModelError;
 use gump_model::Network;
 
 /// The parameters of a network by name.
-pub(super) struct Source<'a> {
+pub(super) struct WeightReader<'a> {
     pub(super) network: &'a Network,
     pub(super) precision: Precision,
 }
 
-impl Source<'_> {
+impl WeightReader<'_> {
     /// The numbers called `name`, if the network has them.
     pub(super) fn find(&self, name: &str) -> Result<Option<Vec<f32>>, ModelError> {
         let var = self.network.parameters().find(name);
@@ -143,37 +143,37 @@ pub(super) struct Layer {
 }
 
 impl Layer {
-    pub(super) fn new(source: &Source<'_>, i: usize, c: usize) -> Result<Self, ModelError> {
+    pub(super) fn new(weights: &WeightReader<'_>, i: usize, c: usize) -> Result<Self, ModelError> {
         let name = format!("mct.blocks.{i}");
         let cross = format!("mct.cross.{i}");
         let mlp = |name: &str, gate: f32| {
             Ok::<_, ModelError>(Mlp {
-                norm: source.norm(&format!("{name}.norm_mlp"))?,
-                expand: source.linear(&format!("{name}.mlp_in"), c)?,
-                contract: source.linear(&format!("{name}.mlp_out"), 4 * c)?,
+                norm: weights.norm(&format!("{name}.norm_mlp"))?,
+                expand: weights.linear(&format!("{name}.mlp_in"), c)?,
+                contract: weights.linear(&format!("{name}.mlp_out"), 4 * c)?,
                 gate,
             })
         };
         let cross = if i.is_multiple_of(3) {
             let attention = Attention {
-                norm: source.norm(&format!("{cross}.norm"))?,
-                query: source.linear(&format!("{cross}.query"), c)?,
-                out: source.linear(&format!("{cross}.out"), c)?,
-                gate: source.gate(&format!("{cross}.gate_attention"))?,
+                norm: weights.norm(&format!("{cross}.norm"))?,
+                query: weights.linear(&format!("{cross}.query"), c)?,
+                out: weights.linear(&format!("{cross}.out"), c)?,
+                gate: weights.gate(&format!("{cross}.gate_attention"))?,
             };
-            let gate = source.gate(&format!("{cross}.gate_mlp"))?;
+            let gate = weights.gate(&format!("{cross}.gate_mlp"))?;
             Some((attention, mlp(&cross, gate)?))
         } else {
             None
         };
         Ok(Self {
             attention: Attention {
-                norm: source.norm(&format!("{name}.norm_attention"))?,
-                query: source.linear_rows(&format!("{name}.qkv"), c, 0, c)?,
-                out: source.linear(&format!("{name}.attention_out"), c)?,
+                norm: weights.norm(&format!("{name}.norm_attention"))?,
+                query: weights.linear_rows(&format!("{name}.qkv"), c, 0, c)?,
+                out: weights.linear(&format!("{name}.attention_out"), c)?,
                 gate: 1.0,
             },
-            key_value: source.linear_rows(&format!("{name}.qkv"), c, c, 2 * c)?,
+            key_value: weights.linear_rows(&format!("{name}.qkv"), c, c, 2 * c)?,
             mlp: mlp(&name, 1.0)?,
             cross,
         })

@@ -9,7 +9,7 @@ use gump_tokenizer::{AGENT_KEYS, Key, class_index};
 use crate::cpu::Successor;
 use crate::nucleus::uniform;
 
-/// Index of BEGIN among the control logits; NEWBORN follows.
+/// Index of BEGIN among the control logits, after the keys; NEWBORN follows.
 pub(crate) const BEGIN_AT: usize = CONTROL_KEYS;
 /// Index of NEWBORN among the control logits.
 pub const NEWBORN_AT: usize = CONTROL_KEYS + 1;

@@ -11,20 +11,23 @@ use gump_model::config::KEEP_RANGE_M;
 use gump_scene::{AgentKind, AreaKind, Lane, LaneId, LaneKind, MapGraph};
 use gump_tokenizer::Field;
 
-/// Cells along each side.
+/// Cells along each side: a metre each.
 pub(crate) const CELLS: usize = 200;
-/// Half the side of the square, metres.
+/// Half the side of the square, metres: that of the positions' grid ([`Field::X`]).
 const REACH: f64 = 100.0;
-/// Directions closer than this are equal, radians.
+/// Directions closer than this are equal, radians: 9 degrees, chosen by hand. Lanes that fork
+/// differ by less near the fork, and one of them is enough there.
 const SAME_WAY: f64 = 0.15;
-/// An agent nearer than this to the border of the window along an axis may cross it, metres.
+/// An agent nearer than this to the border of the window along an axis may cross it, metres: a step
+/// of half a second at 24 m/s. Not tuned.
 const RIM: f64 = 12.0;
 /// An agent nearer than this to the beginning or end of a lane at the end of the map may enter or
-/// leave there, metres.
+/// leave there, metres: a step of half a second at 16 m/s. Not tuned.
 const GATE: f64 = 8.0;
-/// Slower agents have no direction of motion, metres per second.
+/// Slower agents have no direction of motion, metres per second: below three bins, rounding alone
+/// turns a velocity by more than [`SAME_WAY`].
 pub(crate) const SLOW: f64 = 0.75;
-/// Number of sectors of directions.
+/// Number of sectors of directions: 0.1 rad each, narrower than [`SAME_WAY`].
 const SECTORS: usize = 64;
 
 /// The open cells of one scene for one class.
@@ -70,6 +73,7 @@ impl Ground {
             let offset = match (kind, lane.kind) {
                 (AgentKind::Vehicle, LaneKind::BikeLane) => continue,
                 (AgentKind::Vehicle, _) | (AgentKind::Bicycle, LaneKind::BikeLane) => 0.0,
+                // 0.8 m from the right edge: half a bicycle's width and some clearance.
                 (AgentKind::Bicycle, LaneKind::SurfaceStreet | LaneKind::Undefined) => {
                     -(lane.width / 2.0 - 0.8).max(0.0)
                 }
@@ -225,7 +229,7 @@ impl Ground {
             }
         }
         for edge in map.road_edges() {
-            // The road is on the left of its edges.
+            // The road is on the left of its edges. A sidewalk is taken to be 1 to 3 m beyond.
             for offset in [-1.5, -2.5] {
                 let line = edge.line.offset(offset).resample(1.0);
                 for point in line.points() {

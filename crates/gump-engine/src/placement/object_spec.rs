@@ -119,7 +119,7 @@ pub struct Relation {
     pub metres: f64,
 }
 
-/// An object in the world frame; heights are typical of the class.
+/// An object in the world frame; heights are typical of the class, a car's and a person's.
 pub fn agent_of(
     id: AgentId,
     kind: AgentKind,

@@ -29,11 +29,12 @@ const LIGHT_STATES: [LightState; 4] = [
     LightState::Red,
     LightState::Unknown,
 ];
-/// Frames that green and red last at least: 5 s.
+/// Frames that green and red last at least: 5 s, as above.
 const LEAST: usize = 10;
-/// Frames that yellow lasts at least and at most: 3 and 6 s.
+/// Frames that yellow lasts at least and at most: 3 and 6 s, as above.
 const YELLOW: (usize, usize) = (6, 12);
-/// Lights that stop vehicles this near to each other belong to one stop line, metres.
+/// Lights that stop vehicles this near to each other belong to one stop line, metres: the paths
+/// that begin at one place. The next lane's line is farther.
 const ONE_LINE_M: f64 = 1.0;
 
 /// For how many frames each light has shown what it shows.

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use gump_scene::Seed;
 use rand::Rng as _;
 
-use super::{BenchmarkList, MadePart, RecordedPart};
-use crate::EvalError;
+use super::{BenchmarkList, GeneratedPart, RecordedPart};
 use crate::datasets::Split;
+use crate::{BenchmarkError, EvalError};
 
 /// The choice of scenes for a new list.
 #[derive(Clone, Debug)]
@@ -35,17 +35,15 @@ impl ListDraw<'_> {
     /// The scenes of `list` that are drawn, in their order.
     ///
     /// # Errors
-    /// [`EvalError::Benchmark`] for a list without checksums, or if nothing may be drawn.
+    /// [`BenchmarkError::DrawWithoutChecksums`], or [`BenchmarkError::NothingToDraw`].
     pub fn of(&self, list: &BenchmarkList) -> Result<BenchmarkList, EvalError> {
         let mut drawn: BTreeMap<Split, Vec<(u64, usize, usize)>> = BTreeMap::new();
-        let made = list.made.iter().map(|part| (part.split, &part.scenes));
+        let generated = list.generated.iter().map(|part| (part.split, &part.scenes));
         let recorded = list.recorded.iter().map(|part| (part.split, &part.scenes));
-        for (p, (split, scenes)) in made.chain(recorded).enumerate() {
+        for (p, (split, scenes)) in generated.chain(recorded).enumerate() {
             if scenes.is_empty() {
-                return Err(EvalError::Benchmark(
-                    "expected a list with sums, found a part without: `data benchmark --freeze`"
-                        .into(),
-                ));
+                let name = list.name.clone();
+                return Err(BenchmarkError::DrawWithoutChecksums { name }.into());
             }
             for (i, scene) in scenes.iter().enumerate() {
                 let id = scene.rsplit(' ').next().unwrap_or_default();
@@ -57,8 +55,8 @@ impl ListDraw<'_> {
             }
         }
         if drawn.is_empty() {
-            let none = format!("no scene of {} may be drawn", list.name);
-            return Err(EvalError::Benchmark(none));
+            let name = list.name.clone();
+            return Err(BenchmarkError::NothingToDraw { name }.into());
         }
         for scenes in drawn.values_mut() {
             scenes.sort_unstable();
@@ -70,9 +68,9 @@ impl ListDraw<'_> {
             kept.sort_unstable();
             kept
         };
-        let made = list.made.iter().enumerate().map(|(p, part)| {
+        let generated = list.generated.iter().enumerate().map(|(p, part)| {
             let kept = of_part(p);
-            MadePart {
+            GeneratedPart {
                 scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
                 keep: kept
                     .iter()
@@ -82,7 +80,7 @@ impl ListDraw<'_> {
             }
         });
         let recorded = list.recorded.iter().enumerate().map(|(p, part)| {
-            let kept = of_part(list.made.len() + p);
+            let kept = of_part(list.generated.len() + p);
             RecordedPart {
                 scenes: kept.iter().map(|&i| part.scenes[i].clone()).collect(),
                 ..part.clone()
@@ -91,7 +89,7 @@ impl ListDraw<'_> {
         let mut drawn_list = list.clone();
         drawn_list.name.clone_from(&self.name);
         drawn_list.about = format!("{} {}", list.about, self.rule.sentence(&list.name));
-        drawn_list.made = made.filter(|part| !part.keep.is_empty()).collect();
+        drawn_list.generated = generated.filter(|part| !part.keep.is_empty()).collect();
         drawn_list.recorded = recorded.filter(|part| !part.scenes.is_empty()).collect();
         Ok(drawn_list)
     }
@@ -158,7 +156,7 @@ mod tests {
         let worst = worst.map(|(id, score)| (id.to_owned(), score)).into();
         let list = draw(DrawRule::Below(0.9, &worst), 10, 0).unwrap();
         let parts: Vec<_> = list
-            .made
+            .generated
             .iter()
             .map(|p| (&p.keep[..], &p.scenes[..]))
             .collect();
@@ -172,7 +170,7 @@ mod tests {
         // It reads back as it was written.
         let text = toml::to_string_pretty(&list).unwrap();
         let again: BenchmarkList = toml::from_str(&text).unwrap();
-        assert_eq!(again.made[1].keep, [0, 5]);
+        assert_eq!(again.generated[1].keep, [0, 5]);
         assert!(draw(DrawRule::Below(-1.0, &worst), 10, 0).is_err());
     }
 
@@ -180,7 +178,7 @@ mod tests {
     fn a_draw_by_chance_has_so_many_of_every_split_and_depends_on_the_seed() {
         let kept = |seed: u64| -> Vec<Vec<usize>> {
             let list = draw(DrawRule::Any, 3, seed).unwrap();
-            list.made.into_iter().map(|part| part.keep).collect()
+            list.generated.into_iter().map(|part| part.keep).collect()
         };
         let all: Vec<_> = (0..8).map(kept).collect();
         assert!(

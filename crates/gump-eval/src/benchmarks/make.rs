@@ -6,11 +6,11 @@ use gump_scene::{Scenario, Seed};
 use gump_synthesis::{SumoDemand, SynthesisConfig, synthesize};
 use rayon::prelude::*;
 
-use super::{BenchmarkList, MadePart, checksums, sha256, verify_made};
+use super::{BenchmarkList, GeneratedPart, checksums, sha256, verify_generated};
 use crate::sumo::{FUTURE_S, Sumo, SumoNetwork};
-use crate::{EvalError, Monitor};
+use crate::{BenchmarkError, ErrorContext, EvalError, Monitor, SumoError};
 
-/// Runs of SUMO beyond those needed, after which there is no room to drive.
+/// Runs of SUMO beyond those needed, after which there is no room to drive. Chosen by hand.
 const SPARE_RUNS: u64 = 200;
 
 /// A generator of some version.
@@ -23,7 +23,7 @@ impl Generator {
     /// The generator of a part.
     ///
     /// Error: a generator or a version that this build does not have.
-    fn of(part: &MadePart) -> Result<Self, EvalError> {
+    fn of(part: &GeneratedPart) -> Result<Self, EvalError> {
         let mut generator = Self::named(&part.generator)?;
         if let Some(requested) = part.density {
             let (Self::Procedural(SynthesisConfig { density, .. })
@@ -43,11 +43,8 @@ impl Generator {
             }
         });
         known.ok_or_else(|| {
-            let newest = gump_synthesis::GENERATOR_VERSION;
-            EvalError::Benchmark(format!(
-                "expected the generator procedural/N or sumo/N with N from 1 to {newest}, \
-                 found {name}"
-            ))
+            let found = name.into();
+            BenchmarkError::NoSuchGenerator { found }.into()
         })
     }
 }
@@ -60,22 +57,19 @@ impl Generator {
 /// checksums, or [`EvalError::Stopped`].
 pub fn make(
     list: &BenchmarkList,
-    part: &MadePart,
+    part: &GeneratedPart,
     folder: &Path,
     monitor: &dyn Monitor,
 ) -> Result<bool, EvalError> {
-    let check = || verify_made(list, part, folder, monitor);
+    let check = || verify_generated(list, part, folder, monitor);
     if !part.scenes.is_empty() && check().is_ok() {
         monitor.advance(part.kept() as u64);
         return Ok(false);
     }
     write(list, part, folder, monitor)?;
     check().map_err(|error| {
-        let n = gump_synthesis::GENERATOR_VERSION;
-        error.at(&format!(
-            "scenes of {} come out otherwise than they were frozen (newest version: {n})",
-            part.generator
-        ))
+        let generator = part.generator.clone();
+        error.at(ErrorContext::Remaking { generator })
     })?;
     Ok(true)
 }
@@ -87,7 +81,7 @@ pub fn make(
 /// As [`make`], checksums aside.
 pub fn freeze(
     list: &BenchmarkList,
-    part: &MadePart,
+    part: &GeneratedPart,
     folder: &Path,
     monitor: &dyn Monitor,
 ) -> Result<Vec<String>, EvalError> {
@@ -97,7 +91,7 @@ pub fn freeze(
 
 fn write(
     list: &BenchmarkList,
-    part: &MadePart,
+    part: &GeneratedPart,
     folder: &Path,
     monitor: &dyn Monitor,
 ) -> Result<(), EvalError> {
@@ -136,7 +130,7 @@ fn create_folder(path: &Path) -> Result<(), EvalError> {
 
 /// SUMO at work on a part.
 struct Simulation<'a> {
-    part: &'a MadePart,
+    part: &'a GeneratedPart,
     sumo: Sumo,
     demand: SumoDemand,
     /// Networks to take in turn; none: made anew for every run.
@@ -147,21 +141,24 @@ struct Simulation<'a> {
 impl<'a> Simulation<'a> {
     fn begin(
         list: &BenchmarkList,
-        part: &'a MadePart,
+        part: &'a GeneratedPart,
         demand: SumoDemand,
         work: PathBuf,
     ) -> Result<Self, EvalError> {
-        let place = format!("cannot make the part {}", part.file);
-        let sumo = Sumo::find().map_err(|error| error.at(&place))?;
+        let place = || ErrorContext::Making {
+            part: part.file.clone(),
+        };
+        let sumo = Sumo::find().map_err(|error| error.at(place()))?;
         let (expected, found) = (part.sumo.as_deref().unwrap_or_default(), sumo.version()?);
         let mut words = found.split_whitespace();
         if !words.any(|word| word.trim_start_matches(['v', 'V']) == expected) {
-            return Err(EvalError::Sumo(format!(
-                "the part {} of {} expects SUMO {expected} \
-                 (`pip install eclipse-sumo=={expected}`), found \"{found}\"",
-                part.file,
-                list.path().display()
-            )));
+            return Err(SumoError::Version {
+                part: part.file.clone(),
+                list: list.path().to_owned(),
+                expected: expected.into(),
+                found,
+            }
+            .into());
         }
         create_folder(&work)?;
         let mut places = Vec::new();
@@ -169,11 +166,12 @@ impl<'a> Simulation<'a> {
             let path = list.beside(&network.path);
             let found = sha256(&path)?;
             if found != network.sha256 {
-                return Err(EvalError::Benchmark(format!(
-                    "expected a network of SHA-256 {}, found {found}: {}",
-                    network.sha256,
-                    path.display()
-                )));
+                return Err(BenchmarkError::NetworkChecksum {
+                    expected: network.sha256.clone(),
+                    found,
+                    path,
+                }
+                .into());
             }
             places.push(sumo.prepare(&path, &work)?);
         }
@@ -194,12 +192,13 @@ impl<'a> Simulation<'a> {
         let most = count.div_ceil(per_run) as u64 + SPARE_RUNS;
         while scenes.len() < count {
             if next >= most {
-                return Err(EvalError::Sumo(format!(
-                    "{next} runs of SUMO gave {} scenes of the {count} of part {}: \
-                     is there room to drive?",
-                    scenes.len(),
-                    self.part.file
-                )));
+                return Err(SumoError::TooFewScenes {
+                    runs: next,
+                    found: scenes.len(),
+                    expected: count,
+                    part: self.part.file.clone(),
+                }
+                .into());
             }
             let runs = (count - scenes.len()).div_ceil(per_run) as u64;
             let found = (next..next + runs).into_par_iter().map(|r| {
@@ -256,13 +255,13 @@ mod tests {
     }
 
     /// Checks that the first scenes of the parts that are `wanted` have the checksums of the lists.
-    fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&MadePart) -> bool) {
+    fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&GeneratedPart) -> bool) {
         let folder = tempfile::tempdir().unwrap();
         let mut parts = 0;
         for name in ["synthetic-tune", "synthetic-test"] {
             let list = shipped(name);
-            for part in list.made.iter().filter(|part| wanted(part)) {
-                let first = MadePart {
+            for part in list.generated.iter().filter(|part| wanted(part)) {
+                let first = GeneratedPart {
                     count: n,
                     scenes: part.scenes[..n].to_vec(),
                     ..part.clone()
@@ -289,7 +288,7 @@ mod tests {
         }
         // One run of the smallest part, unless there is time for a run of each.
         let all = std::env::var_os("RUN_SLOW_TESTS").is_some();
-        let is_small = |part: &MadePart| {
+        let is_small = |part: &GeneratedPart| {
             part.networks
                 .iter()
                 .any(|n| n.path.ends_with("i80.net.xml.gz"))
@@ -303,12 +302,12 @@ mod tests {
     fn scenes_that_differ_and_generators_that_are_not_there_are_told() {
         let folder = tempfile::tempdir().unwrap();
         let list = shipped("synthetic-tune");
-        let part = MadePart {
+        let part = GeneratedPart {
             count: 1,
             scenes: vec!["0123456789abcdef other".into()],
-            ..list.made[0].clone()
+            ..list.generated[0].clone()
         };
-        let error = |part: &MadePart| {
+        let error = |part: &GeneratedPart| {
             let result = make(&list, part, folder.path(), &());
             result.unwrap_err().to_string()
         };
@@ -318,7 +317,7 @@ mod tests {
             "{message}"
         );
         assert!(message.contains("synthetic-tune.toml"), "{message}");
-        let unknown = MadePart {
+        let unknown = GeneratedPart {
             generator: "procedural/99".into(),
             ..part
         };

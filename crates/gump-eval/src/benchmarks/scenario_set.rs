@@ -8,9 +8,9 @@ use std::str::FromStr;
 use gump_data::{DataError, ReadOptions, Reader};
 use serde::{Serialize, Serializer};
 
-use super::{BenchmarkList, verify_made, verify_recorded};
+use super::{BenchmarkList, verify_generated, verify_recorded};
 use crate::datasets::Split;
-use crate::{EvalError, Monitor};
+use crate::{BenchmarkError, EvalError, Monitor};
 
 /// Scenarios by name: `PATH`, or `LIST.toml#SPLIT`.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,7 +29,7 @@ pub struct ScenarioSet {
 #[derive(Clone, Debug, PartialEq)]
 pub struct BenchmarkFolders {
     /// The folder of generated scenes, with one folder per list.
-    pub made: PathBuf,
+    pub generated: PathBuf,
     /// The folder of recorded data.
     pub recorded: PathBuf,
 }
@@ -70,18 +70,17 @@ fn find_listed(
     let list = BenchmarkList::read(path)?;
     let split = choose(&list, split)?;
     let mut paths = Vec::new();
-    for part in list.made.iter().filter(|part| part.split == split) {
-        let file = list.file(&folders.made, part);
+    for part in list.generated.iter().filter(|part| part.split == split) {
+        let file = list.file(&folders.generated, part);
         if !file.is_file() {
-            return Err(EvalError::Benchmark(format!(
-                "expected scenes of the list {} at {}, found none: \
-                 `cargo xtask data benchmark --list {}` makes them",
-                list.name,
-                file.display(),
-                path.display()
-            )));
+            return Err(BenchmarkError::NotMade {
+                name: list.name,
+                path: file,
+                list: path.to_owned(),
+            }
+            .into());
         }
-        verify_made(&list, part, &folders.made, monitor)?;
+        verify_generated(&list, part, &folders.generated, monitor)?;
         paths.push(file);
     }
     for part in list.recorded.iter().filter(|part| part.split == split) {
@@ -94,19 +93,18 @@ fn find_listed(
 /// The requested split, or the only one.
 fn choose(list: &BenchmarkList, requested: Option<&str>) -> Result<Split, EvalError> {
     let splits = list.splits();
-    let names: Vec<&str> = splits.iter().map(|split| split.name()).collect();
     let found = match (requested, &splits[..]) {
         (Some(name), _) => splits.iter().find(|split| split.name() == name).copied(),
         (None, [only]) => Some(*only),
         (None, _) => None,
     };
-    let path = list.path().display();
     found.ok_or_else(|| {
-        EvalError::Benchmark(format!(
-            "expected {path}#SPLIT with {}, found {path}{}",
-            names.join(" or "),
-            requested.map(|name| format!("#{name}")).unwrap_or_default()
-        ))
+        BenchmarkError::NoSuchSplit {
+            list: list.path().to_owned(),
+            expected: splits,
+            found: requested.map(str::to_owned),
+        }
+        .into()
     })
 }
 
@@ -159,7 +157,7 @@ mod tests {
 
     fn folders() -> BenchmarkFolders {
         BenchmarkFolders {
-            made: "nowhere".into(),
+            generated: "nowhere".into(),
             recorded: repository().join("../shared/data"),
         }
     }

@@ -5,45 +5,48 @@ use std::path::{Path, PathBuf};
 use gump_data::tfrecord::TfRecordReader;
 use gump_data::womd::decode_scenario;
 
-use super::{BenchmarkList, MadePart, RecordedPart, RecordedScene, checksum};
-use crate::{EvalError, Monitor, digest};
+use super::{BenchmarkList, GeneratedPart, RecordedPart, RecordedScene, checksum};
+use crate::{BenchmarkError, EvalError, Monitor, digest};
 
 /// Verifies the file of a part below `folder` against the checksums of the list.
 ///
 /// # Errors
 /// A file that is missing, or the first scene that differs.
-pub fn verify_made(
+pub fn verify_generated(
     list: &BenchmarkList,
-    part: &MadePart,
+    part: &GeneratedPart,
     folder: &Path,
     monitor: &dyn Monitor,
 ) -> Result<(), EvalError> {
-    let (path, list_path) = (list.file(folder, part), list.path().display());
+    let (path, list_path) = (list.file(folder, part), list.path().to_owned());
     if part.scenes.is_empty() {
-        return Err(EvalError::Benchmark(format!(
-            "expected sums of the part {} in {list_path}, found none: `data benchmark --freeze` \
-             writes those of a new list",
-            part.file,
-        )));
+        return Err(BenchmarkError::NoChecksums {
+            part: part.file.clone(),
+            list: list_path,
+        }
+        .into());
     }
     let found = checksums(&path, monitor)?;
     let differs = part.scenes.iter().zip(&found).position(|(a, b)| a != b);
     if let Some(k) = differs {
-        return Err(EvalError::Benchmark(format!(
-            "expected scene {k} of {} to be \"{}\" as {list_path} says, found \"{}\": {}",
-            part.file,
-            part.scenes[k],
-            found[k],
-            path.display()
-        )));
+        return Err(BenchmarkError::SceneChecksum {
+            part: part.file.as_str().into(),
+            index: k,
+            expected: part.scenes[k].as_str().into(),
+            found: found[k].as_str().into(),
+            list: list_path,
+            path,
+        }
+        .into());
     }
     if found.len() != part.kept() || part.scenes.len() != part.kept() {
-        return Err(EvalError::Benchmark(format!(
-            "expected {} scenes as {list_path} says, found {}: {}",
-            part.kept(),
-            found.len(),
-            path.display()
-        )));
+        return Err(BenchmarkError::SceneCount {
+            expected: part.kept(),
+            found: found.len(),
+            list: list_path,
+            path,
+        }
+        .into());
     }
     Ok(())
 }
@@ -56,8 +59,10 @@ pub fn checksums(path: &Path, monitor: &dyn Monitor) -> Result<Vec<String>, Eval
     let sum = |payload: Result<gump_data::tfrecord::Payload, _>| {
         monitor.check()?;
         let payload = payload?;
-        let message = decode_scenario(&payload.bytes)
-            .map_err(|problem| EvalError::Benchmark(format!("{problem}: {}", payload.place)))?;
+        let message = decode_scenario(&payload.bytes).map_err(|problem| {
+            let place = payload.place.clone();
+            BenchmarkError::Unreadable { problem, place }
+        })?;
         let id = message.scenario_id();
         Ok(format!("{} {id}", checksum(&message)))
     };
@@ -81,22 +86,22 @@ pub fn verify_recorded(
         let scene = RecordedScene::parse(line)?;
         let path = data.join(&part.folder).join(scene.file);
         if !path.is_file() {
-            return Err(EvalError::Benchmark(format!(
-                "expected the recorded scene {} of the list {}, found no file {}; \
-                 GUMP_RECORDED names the folder of recorded data",
-                scene.id.unwrap_or(scene.file),
-                list.name,
-                path.display()
-            )));
+            return Err(BenchmarkError::NotRecorded {
+                scene: scene.id.unwrap_or(scene.file).into(),
+                name: list.name.clone(),
+                path,
+            }
+            .into());
         }
         let found = sha256(&path)?;
         if found != scene.sha256 {
-            return Err(EvalError::Benchmark(format!(
-                "expected SHA-256 {} as {} says, found {found}: {}",
-                scene.sha256,
-                list.path().display(),
-                path.display()
-            )));
+            return Err(BenchmarkError::FileChecksum {
+                expected: scene.sha256.into(),
+                found: found.into(),
+                list: list.path().to_owned(),
+                path,
+            }
+            .into());
         }
         files.push(path);
     }

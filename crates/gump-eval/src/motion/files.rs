@@ -12,7 +12,7 @@ use gump_proto::motion::{ChallengeScenarioPredictions, MotionChallengeSubmission
 use gump_scene::{Prediction, Scenario};
 use gump_wosac::motion::{MotionConfig, forecast};
 
-use crate::{EvalError, rollout_files};
+use crate::{ErrorContext, EvalError, RolloutFileError, rollout_files};
 
 /// Predictions in files, by scenario.
 pub(super) struct Predictions {
@@ -34,10 +34,11 @@ impl Predictions {
         for file in rollout_files::files(path)? {
             for (id, message) in messages(&file)? {
                 if by_scenario.insert(id.clone(), message).is_some() {
-                    return Err(EvalError::Rollouts(format!(
-                        "expected scenario {id} once, found it twice: {}",
-                        file.display()
-                    )));
+                    return Err(RolloutFileError::RepeatedPredictions {
+                        scenario: id,
+                        path: file,
+                    }
+                    .into());
                 }
             }
         }
@@ -54,29 +55,36 @@ impl Predictions {
         config: &MotionConfig,
     ) -> Result<Vec<Prediction>, EvalError> {
         let id = &scenario.id;
-        let path = self.path.display();
-        let wrong =
-            |problem: Problem| EvalError::Rollouts(format!("scenario {id} of {path}: {problem}"));
+        let wrong = |problem: Problem| RolloutFileError::Unusable {
+            scenario: id.clone(),
+            path: self.path.clone(),
+            problem,
+        };
         match self.by_scenario.get(id) {
-            Some(Message::Predictions(message)) => predictions_from_proto(message).map_err(wrong),
+            Some(Message::Predictions(message)) => {
+                Ok(predictions_from_proto(message).map_err(wrong)?)
+            }
             Some(Message::Rollouts(message)) => {
                 let rollouts = rollouts_from_proto(message, scenario);
                 let rollouts = rollouts.map_err(wrong)?;
                 Ok(forecast(scenario, &rollouts, config)?)
             }
-            None => Err(EvalError::Rollouts(format!(
-                "expected predictions of scenario {id}, found none: {path}"
-            ))),
+            None => Err(RolloutFileError::NoPredictions {
+                scenario: id.clone(),
+                path: self.path.clone(),
+            }
+            .into()),
         }
     }
 
     /// Refuses predictions of scenarios that are not among `ids`.
     pub(super) fn check_all_known(&self, ids: &BTreeSet<String>) -> Result<(), EvalError> {
         match self.by_scenario.keys().find(|id| !ids.contains(*id)) {
-            Some(id) => Err(EvalError::Rollouts(format!(
-                "found predictions of \"{id}\", which is not among the scenarios: {}",
-                self.path.display()
-            ))),
+            Some(id) => Err(RolloutFileError::UnknownScenario {
+                scenario: id.clone(),
+                path: self.path.clone(),
+            }
+            .into()),
             None => Ok(()),
         }
     }
@@ -93,9 +101,8 @@ fn messages(file: &Path) -> Result<Vec<(String, Message)>, EvalError> {
         Ok(_) | Err(DataError::Proto { .. }) => {}
         Err(error) => return Err(error.into()),
     }
-    let expected = "expected a MotionChallengeSubmission, a ScenarioRollouts or a \
-                    SimAgentsChallengeSubmission";
-    let rollouts = read_rollouts(file).map_err(|error| EvalError::from(error).at(&expected))?;
+    let rollouts = read_rollouts(file)
+        .map_err(|error| EvalError::from(error).at(ErrorContext::Predictions))?;
     Ok(rollouts
         .into_iter()
         .map(|m| (m.scenario_id().to_owned(), Message::Rollouts(m)))

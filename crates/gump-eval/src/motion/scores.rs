@@ -4,7 +4,7 @@ use gump_scene::{AgentId, AgentKind};
 use gump_wosac::motion::{HorizonScore, ModeScore, PredictionScore, Shape};
 use serde::{Deserialize, Serialize};
 
-use crate::EvalError;
+use crate::{EvalError, ResultsError};
 
 /// Scores of one scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -81,7 +81,10 @@ fn at_horizon(score: &HorizonScore) -> AtHorizon {
 
 impl Line {
     fn score(&self) -> Result<PredictionScore, EvalError> {
-        let unknown = |what: &str, word: &str| EvalError::Results(format!("{word} is no {what}"));
+        let unknown = |expected, word: &str| ResultsError::UnknownWord {
+            expected,
+            found: word.into(),
+        };
         let mut kinds = AgentKind::MOVING.into_iter().chain(AgentKind::STATIC);
         let kind = kinds.find(|kind| kind.name() == self.class);
         let shape = self.shape.as_deref().map(|name| {
@@ -104,17 +107,21 @@ impl Line {
 
 impl AtHorizon {
     fn score(&self) -> Result<HorizonScore, EvalError> {
-        let (n, found) = (self.confidences.len(), self.matches.len());
-        if n != found {
-            let wrong = format!("expected {n} matches, found {found}");
-            return Err(EvalError::Results(wrong));
+        let (expected, found) = (self.confidences.len(), self.matches.len());
+        if expected != found {
+            return Err(ResultsError::MatchCount { expected, found }.into());
         }
         let mode = |(&confidence, letter)| {
             let matches = match letter {
                 'y' => Some(true),
                 'n' => Some(false),
                 '?' => None,
-                other => return Err(EvalError::Results(format!("{other} is no match"))),
+                other => {
+                    return Err(ResultsError::UnknownWord {
+                        expected: "match",
+                        found: other.into(),
+                    });
+                }
             };
             Ok(ModeScore {
                 confidence,
@@ -126,7 +133,7 @@ impl AtHorizon {
             min_ade: self.min_ade,
             min_fde: self.min_fde,
             overlaps: self.overlaps,
-            modes: modes.collect::<Result<_, EvalError>>()?,
+            modes: modes.collect::<Result<_, _>>()?,
         })
     }
 }

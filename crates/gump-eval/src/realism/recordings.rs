@@ -14,7 +14,7 @@ use gump_data::womd::{decode_scenario, scenario_from_proto};
 use gump_scene::Scenario;
 use gump_wosac::realism::{Log, N_HISTORY, N_STEPS};
 
-use crate::EvalError;
+use crate::{ErrorContext, EvalError, RecordingError};
 
 /// A recorded scenario.
 pub struct Recorded {
@@ -41,8 +41,7 @@ pub fn recordings<'a>(
 ) -> Result<Recordings<'a>, EvalError> {
     let (next, wanted): (_, Rc<dyn Fn(usize) -> bool>) = (Rc::default(), Rc::new(wanted));
     let open = move |path: &PathBuf| of_path(path, options, Rc::clone(&wanted), Rc::clone(&next));
-    let none = || EvalError::Recording("expected scenarios, found none".into());
-    let (first, others) = paths.split_first().ok_or_else(none)?;
+    let (first, others) = paths.split_first().ok_or(RecordingError::NoScenarios)?;
     // A single path that holds none is an error at once; others are opened as they are reached.
     let first = open(first)?;
     Ok(Box::new(first.chain(others.iter().flat_map(
@@ -100,7 +99,8 @@ fn of_path<'a>(
             });
     Ok(Box::new(payloads.map(move |(index, payload)| {
         let payload = payload?;
-        recorded(index, &payload.bytes, options).map_err(|error| error.at(&payload.place))
+        recorded(index, &payload.bytes, options)
+            .map_err(|error| error.at(ErrorContext::Record(payload.place)))
     })))
 }
 
@@ -125,10 +125,11 @@ fn waymo_files(path: &Path) -> Result<Vec<PathBuf>, EvalError> {
 }
 
 fn recorded(index: usize, bytes: &[u8], options: ReadOptions) -> Result<Recorded, EvalError> {
-    let wrong = |problem: &dyn std::fmt::Display| EvalError::Recording(problem.to_string());
-    let message = decode_scenario(bytes).map_err(|problem| wrong(&problem))?;
-    let (scenario, _) = scenario_from_proto(&message, options)
-        .map_err(|problem| wrong(&problem).at(&format!("scenario {}", message.scenario_id())))?;
+    let message = decode_scenario(bytes).map_err(RecordingError::Unusable)?;
+    let (scenario, _) = scenario_from_proto(&message, options).map_err(|problem| {
+        let id = message.scenario_id().into();
+        EvalError::from(RecordingError::Unusable(problem)).at(ErrorContext::Scenario { id })
+    })?;
     // Waymo's own messages all have this clock; others are scored as scenarios.
     let log = match (scenario.now + 1, scenario.log.len()) {
         (N_HISTORY, N_STEPS) => Log {

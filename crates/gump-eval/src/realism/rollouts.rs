@@ -14,7 +14,7 @@ use super::Recorded;
 use crate::decoding::Decoding;
 use crate::imagine::{frames, imagine};
 use crate::worlds::{World, WorldName};
-use crate::{EvalError, Monitor, digest};
+use crate::{EvalError, Monitor, RolloutFileError, digest};
 
 /// Seconds that the challenge requires.
 const HORIZON_S: f64 = 8.0;
@@ -71,20 +71,18 @@ impl RolloutSource {
             for message in read_rollouts(&file)? {
                 let id = message.scenario_id().to_owned();
                 if let Some(other) = by_scenario.insert(id, file.clone()) {
-                    return Err(EvalError::Rollouts(format!(
-                        "expected rollouts of scenario {} once, found them in {} and {}",
-                        message.scenario_id(),
-                        other.display(),
-                        file.display()
-                    )));
+                    return Err(RolloutFileError::RepeatedRollouts {
+                        scenario: message.scenario_id().into(),
+                        first: other,
+                        second: file,
+                    }
+                    .into());
                 }
             }
         }
         if by_scenario.is_empty() {
-            return Err(EvalError::Rollouts(format!(
-                "expected rollouts in files named *.binproto*, found none: {}",
-                path.display()
-            )));
+            let path = path.to_owned();
+            return Err(RolloutFileError::NoFiles { path }.into());
         }
         Ok(Self(Kind::Files {
             folder: path.to_owned(),
@@ -165,9 +163,9 @@ impl RolloutSource {
                 by_scenario,
                 open,
             } => {
-                let missing = || {
-                    let folder = folder.display();
-                    EvalError::Rollouts(format!("expected rollouts of it, found none: {folder}"))
+                let missing = || RolloutFileError::NoRollouts {
+                    scenario: scenario.id.clone(),
+                    path: folder.clone(),
                 };
                 let file = by_scenario.get(&scenario.id).ok_or_else(missing)?;
                 if open.as_ref().is_none_or(|(path, _)| path != file) {
@@ -177,7 +175,8 @@ impl RolloutSource {
                 let message = messages
                     .find(|message| message.scenario_id() == scenario.id)
                     .ok_or_else(|| {
-                        EvalError::Rollouts(format!("the file has changed: {}", file.display()))
+                        let path = file.clone();
+                        RolloutFileError::Changed { path }
                     })?;
                 Ok(FoundRollouts {
                     decoding: Decoding::NONE,

@@ -23,10 +23,10 @@ use super::avx512_bf16::{Avx512Bf16, store_row};
 use super::bf16::{Lanes, Target, Unit};
 use crate::panels::PANEL;
 
-/// Rows of a tile.
+/// Rows of a tile, the most that the hardware has.
 const TILE: usize = 16;
 
-/// Bytes of a row of a tile.
+/// Bytes of a row of a tile, likewise.
 const TILE_BYTES: usize = 64;
 
 /// Rows of a block: two tiles.
@@ -71,6 +71,7 @@ fn saves_tiles() -> bool {
 /// Asks Linux for the permission to use the tiles' data, for all threads of the process.
 #[cfg(target_os = "linux")]
 fn are_tiles_lent() -> bool {
+    // From the kernel's `unistd_64.h`, `prctl.h` and `fpu/types.h` for x86.
     const ARCH_PRCTL: i64 = 158;
     const ARCH_REQ_XCOMP_PERM: u64 = 0x1023;
     const XFEATURE_XTILEDATA: u64 = 18;

@@ -26,7 +26,7 @@ use crate::panels::PANEL;
 /// Rows of a block.
 const BLOCK: usize = 8;
 
-/// Lanes turned at a time.
+/// Lanes turned at a time: a vector of 512 bits.
 const GROUP: usize = 16;
 
 /// Proof that the processor has the instructions.
@@ -253,6 +253,7 @@ fn padded<const N: usize>(numbers: &[f32]) -> [f32; N] {
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 #[inline]
 fn interleave(even: &[f32; GROUP], odd: &[f32; GROUP]) -> [u32; GROUP] {
+    // 0, 16, 1, 17, ...: the even row's numbers come first.
     const ORDER: [u16; 32] = {
         let mut order = [0; 32];
         let mut i = 0;

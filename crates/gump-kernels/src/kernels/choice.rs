@@ -214,6 +214,7 @@ impl Choice {
 /// of sums in f32.
 #[cfg(target_arch = "x86_64")]
 pub(super) fn is_unit_right<U: bf16::Unit>(unit: U) -> bool {
+    // No multiples of any block, panel or vector.
     let (m, k, n) = (19, 37, 45);
     let number = |i: usize| i as f32 / 507.0 - 1.0;
     let (a, b) = (numbers(m * k, number), numbers(k * n, number));
@@ -243,6 +244,7 @@ fn are_tiles_right(
     tile: impl Fn([&[f32]; 3], std::iter::Once<&[f32]>) -> [[f32; PANEL]; 3],
     byte_tile: impl Fn([&[u8]; 3], &[i8]) -> [[i32; PANEL]; 3],
 ) -> bool {
+    // A multiple of the four bytes of a group, but of no vector.
     const DEPTH: usize = 20;
     let a = numbers(3 * DEPTH, |i| i as f32 / 507.0 - 1.0);
     let b = numbers(DEPTH * PANEL, |i| i as f32 / 507.0 - 1.0);
@@ -258,6 +260,7 @@ fn are_tiles_right(
 /// Whether tiles of bytes sum exactly.
 #[cfg(target_arch = "x86_64")]
 fn are_bytes_right(unit: Amx) -> bool {
+    // Two steps of a tile, 64 bytes each.
     const DEPTH: usize = 128;
     let bytes = numbers(16 * DEPTH, |i| i as u8);
     let panel = numbers(DEPTH * PANEL, |i| i as i8);

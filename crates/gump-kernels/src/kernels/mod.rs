@@ -223,7 +223,7 @@ pub(crate) fn byte_tile<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32
     portable::byte_tile(rows, panel)
 }
 
-/// Rows that [`byte_tiles`] takes together.
+/// Rows that [`byte_tiles`] takes together: those of a tile of AMX.
 pub(crate) const BYTE_ROWS: usize = 16;
 
 /// [`byte_tile`] of 16 rows one after another, where the chosen kernel has tiles of bytes.

@@ -8,30 +8,34 @@ use gump_scene::{AreaKind, LaneId, MapGraph, Unstated};
 
 use super::edges::Edge;
 
+// What the sequence network sees: chosen by hand, not tuned, and fixed by its weights.
+
 /// Distance between the points of a lane, metres.
 pub(super) const LANE_STEP_M: f64 = 2.0;
-/// Points of a path ahead, the first abeam: 44 m.
+/// Points of a path ahead, the first abeam: 44 m, more than two seconds at 20 m/s.
 pub(super) const PATH_POINTS: usize = 23;
-/// Maximum number of paths of an object.
+/// Maximum number of paths of an object: left, straight on, right.
 pub(super) const N_PATHS: usize = 3;
 /// Half the side of the prepared area, metres: the window of tokens and the surroundings of its
 /// outermost objects.
 const HALF_SIDE_M: f64 = 128.0;
-/// Side of a cell of the grid, metres.
+/// Side of a cell of the grid, metres. Affects time only.
 const CELL_M: f64 = 8.0;
 /// An edge this near to a driveway is its mouth, metres: the two are drawn apart from each other.
 const DRIVEWAY_M: f64 = 1.0;
-/// An object follows a lane whose centre is at most this far away, metres.
+/// An object follows a lane whose centre is at most this far away, metres: bicycles at its edge,
+/// too.
 const LANE_REACH_M: f64 = 4.0;
-/// And whose direction differs at most this much, radians.
+/// And whose direction differs at most this much, radians (60 degrees).
 const LANE_TURN: f64 = 1.05;
 /// Weight of a radian, in metres, in choosing the followed lane.
 const METRES_PER_RADIAN: f64 = 3.0;
-/// A lane this much worse than the best is not an alternative, metres.
+/// A lane this much worse than the best is not an alternative, metres: branches of one lane are,
+/// the next lane is not.
 const ALTERNATIVE_M: f64 = 1.0;
-/// Maximum number of lanes of a path after its first.
+/// Maximum number of lanes of a path after its first; bounds the time where lanes are short.
 const MOST_LANES: usize = 12;
-/// Maximum number of paths from which the most different ones are chosen.
+/// Maximum number of paths from which the most different ones are chosen; bounds the time at forks.
 const MOST_PATHS: usize = 8;
 
 /// A point of a lane.

@@ -21,6 +21,7 @@ pub struct RelativeConfig {
 }
 
 impl Default for RelativeConfig {
+    /// 1.5 million parameters, which a core trains in hours (result 19). No other size was tried.
     fn default() -> Self {
         Self {
             width: 128,

@@ -13,18 +13,21 @@ use crate::relative::grid::STILL_M;
 use crate::relative::map::{PATHS, PieceKind, VectorMap};
 use crate::steps::TOKEN_DT;
 
+// How much a node sees was chosen by hand, with the time of a frame in mind, and is fixed by the
+// weights. The scales of all numbers are typical values, so that they stay within a few units.
+
 /// Numbers of a node.
 pub const NODE_NUMBERS: usize = 28;
 /// Numbers of an edge.
 pub const EDGE_NUMBERS: usize = 46;
 
-/// Number of past frames of the agent that a node attends to, besides itself.
+/// Number of past frames of the agent that a node attends to, besides itself: 3 s.
 pub const PAST: usize = 6;
-/// Number of neighbours of a node: the nearest ones now and soon.
+/// Number of neighbours of a node: the nearest ones now and soon. Twenty did not help (result 25).
 const NEIGHBOURS: usize = 16;
 /// Time ahead that counts as soon, seconds.
 const SOON_S: f64 = 2.0;
-/// Maximum distance of a neighbour, metres.
+/// Maximum distance of a neighbour, metres. 140 m for oncoming ones did not help (result 25).
 const NEIGHBOUR_REACH_M: f64 = 60.0;
 /// Number of lane pieces beside the paths ahead, the nearest ones.
 const LANES: usize = 10;
@@ -201,7 +204,7 @@ const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
 const OF_GAP: usize = OF_LANE + 10;
 /// The time at which the predicted gap to a neighbour is evaluated, with constant velocities,
-/// seconds.
+/// seconds: up to [`SOON_S`], as rules look 1.5 s ahead.
 const GAPS_S: [f64; 4] = [0.5, 1.0, 1.5, 2.0];
 
 /// A place and a direction, whose sine and cosine are taken once for many edges.
@@ -370,10 +373,12 @@ fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
         let at = path.iter().find_map(|&(i, away)| {
             let piece = &map.pieces[i as usize];
             let local = piece.axes.see(other.pose.position);
+            // Surely beside a piece of 8 m, for time.
             if local.x.abs() > 6.0 || local.y.abs() > 8.0 {
                 return None;
             }
             let (distance, _) = piece.offset(other.pose.position);
+            // Its side is within 1.2 m of the line: about half of a car. Chosen by hand.
             (distance < 0.5 * other.body.width + 1.2).then_some(away + local.x)
         });
         if let Some(away) = at.filter(|away| *away > 0.0) {

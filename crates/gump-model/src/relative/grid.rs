@@ -15,19 +15,21 @@ pub const ALL_BINS: usize = 2 + AHEAD + SIDE + TURN;
 /// The bin of the first field for a standing agent.
 pub const STANDS: u16 = 1;
 
+/// From -4 m to 21.5 m, 43 m/s; wider than any limit.
 const AHEAD: usize = 512;
+/// Odd, so that one bin is exactly 0.
 const SIDE: usize = 255;
 const TURN: usize = 255;
 
-/// Width of a bin ahead, metres: 0.1 m/s of mean speed.
+/// Width of a bin ahead, metres: 0.1 m/s of mean speed. Not tuned.
 const AHEAD_STEP_M: f64 = 0.05;
 /// Bins ahead that have negative values: 4 m, 8 m/s in reverse.
 const BEHIND: f64 = 80.0;
-/// The maximum sideways move, metres.
+/// The maximum sideways move, metres: 7 m/s across its heading. Not tuned.
 const SIDE_REACH_M: f64 = 3.5;
-/// Stretching of sideways moves around zero: bins are 4 mm wide there.
+/// Stretching of sideways moves around zero: bins are 4 mm wide there. Not tuned.
 const SIDE_FOCUS: f64 = 4.0;
-/// Stretching of turns around zero: bins are 1.7 mrad wide there.
+/// Stretching of turns around zero: bins are 1.7 mrad wide there. Not tuned.
 const TURN_FOCUS: f64 = 5.0;
 
 /// An agent that moves less than this in half a second, metres, stands: the jitter of recorded

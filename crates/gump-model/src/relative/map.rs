@@ -10,14 +10,18 @@ use gump_scene::{AreaKind, LaneId, LaneKind, MapGraph, RoadEdgeKind};
 
 use crate::relative::graph::Axes;
 
+// What the network sees of a map: chosen by hand, not tuned, and fixed by its weights.
+
 /// Maximum length of a piece of a lane, metres.
 const LANE_PIECE_M: f64 = 8.0;
 /// Maximum length of a piece of a road edge, metres.
 const EDGE_PIECE_M: f64 = 10.0;
-/// Points that describe the shape of a piece.
+/// Points that describe the shape of a piece, about 2 m apart.
 pub(super) const SHAPE: usize = 5;
-/// Side of a cell of the grid, metres.
+/// Side of a cell of the grid, metres. Affects time only.
 const CELL_M: f64 = 16.0;
+// The next four as in `local_context`.
+
 /// An agent may follow a lane whose centre is at most this far away, metres.
 const LANE_REACH_M: f64 = 4.0;
 /// And whose direction differs at most this much, radians.
@@ -26,11 +30,11 @@ const LANE_TURN: f64 = 1.05;
 const METRES_PER_RADIAN: f64 = 3.0;
 /// A lane this much worse than the best is not an alternative, metres.
 const ALTERNATIVE_M: f64 = 1.0;
-/// Length of a path ahead, metres.
+/// Length of a path ahead, metres: about three seconds at 20 m/s.
 const PATH_M: f64 = 64.0;
-/// Number of distinct paths ahead.
+/// Number of distinct paths ahead: left, straight on, right.
 pub(super) const PATHS: usize = 3;
-/// Maximum number of paths from which the most different ones are chosen.
+/// Maximum number of paths from which the most different ones are chosen; bounds the time at forks.
 const MOST_PATHS: usize = 8;
 
 /// Numbers of a piece.

@@ -6,7 +6,7 @@ use super::{Host, elements, fusible, gradient, output};
 use gump_kernels::rows::{for_pieces, sum};
 use gump_kernels::wide;
 
-/// Elements a task takes.
+/// Elements a task takes, as in `gump_kernels::rows`; fixes the order of sums.
 const PIECE: usize = 16 * 1024;
 
 /// The mean over all elements of `|x - target|`; the gradient reaches `x` only, and is 0 where both
@@ -97,7 +97,7 @@ impl CustomOp2 for Difference {
     }
 }
 
-/// Independent sums.
+/// Independent sums: two vectors of 512 bits, as in `gump_kernels::rows`.
 const LANES: usize = 32;
 
 #[cfg(test)]

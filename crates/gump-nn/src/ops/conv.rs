@@ -13,10 +13,12 @@ use gump_kernels::gemm::{Mat, MatMut, Store, Threads, gemm};
 use gump_kernels::rows::{add_partials, add_to, for_pieces, for_pieces2, sum};
 use gump_kernels::wide;
 
-/// Column elements of a band.
+/// Column elements of a band: 512 KB, a part of a second-level cache. Not tuned.
 const BAND: usize = 128 * 1024;
 
-/// Pieces of the batch whose weight gradients are summed apart.
+/// Pieces of the batch whose weight gradients are summed apart, each as large as the weights:
+/// bounds the memory and the threads that share the work. Fixed, so that sums do not depend on
+/// their number.
 const MAX_PARTIALS: usize = 8;
 
 /// Cross-correlates `x` with `weight` and adds `bias`, with zeros around the border.
@@ -182,6 +184,7 @@ impl Conv {
             return self.gather_fours(x, first, n, cols);
         }
         let rows_per_piece = match self.threads() {
+            // Elements per task, as in `gump_kernels::rows`.
             Threads::Pool => (16 * 1024usize).div_ceil(n),
             Threads::One => self.patch(),
         };

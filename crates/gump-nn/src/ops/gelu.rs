@@ -11,7 +11,7 @@ use gump_kernels::wide;
 
 use super::{Host, elements, fusible, gradient, output};
 
-/// Elements per task.
+/// Elements per task, as in `gump_kernels::rows`.
 const PIECE: usize = 16 * 1024;
 
 /// `x` times the standard normal probability of being below `x`; any shape.

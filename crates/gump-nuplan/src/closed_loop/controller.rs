@@ -13,6 +13,8 @@ use crate::tracking::{LqrTracker, Trajectory, propagate};
 use gump_rollout::RolloutError;
 
 /// A faster tracked speed means that the plan cannot be driven, metres per second.
+///
+/// Source: nuplan-devkit's perfect tracking.
 const IMPOSSIBLE_SPEED: f64 = 50.0;
 
 /// The way in which the ego follows its plan.

@@ -187,6 +187,7 @@ fn ego_states(scenario: &Scenario, vehicle: &VehicleParameters) -> Vec<EgoState>
                 rear_axle: vehicle.rear_axle_of(centers[i].pose),
                 velocity: gump_geometry::dvec2(speed, 0.0),
                 acceleration: gump_geometry::dvec2((speed_at(b) - speed_at(a)) / elapsed, 0.0),
+                // Nearly standing, the quotient of turning and speed is noise. Bounds by hand.
                 steering_angle: if speed.abs() > 0.5 {
                     (yaw_rate * vehicle.wheel_base / speed)
                         .atan()

@@ -11,9 +11,11 @@ use gump_scene::{
 
 /// Distance by which a route is extended past its end, metres: no planner looks farther ahead.
 const BEYOND: f64 = 200.0;
-/// Distance into a lane over which its turn is determined, metres.
+/// Distance into a lane over which its turn is determined, metres: branches of a junction point
+/// different ways by then. Chosen by hand.
 const TURN_SEEN: f64 = 10.0;
-/// Distance that a derived surface goes on past a linked end of its lane, metres.
+/// Distance that a derived surface goes on past a linked end of its lane, metres: closes the wedge
+/// between lanes of 3.7 m that meet at up to 30 degrees.
 const OVERLAP: f64 = 0.5;
 /// Ids of derived areas start here, above those of the formats.
 const FIRST_AREA: i64 = 1 << 40;

@@ -14,7 +14,9 @@ use super::lanes::{
 use super::progress::{ExpertProgress, expert_progress};
 use super::scoring::{MetricScores, Scoring};
 use super::speed_limit::{SpeedLimit, speed_limit};
-use super::time_to_collision::{Place, TimeToCollision, TimeToCollisionConfig, time_to_collision};
+use super::time_to_collision::{
+    RoadContext, TimeToCollision, TimeToCollisionConfig, time_to_collision,
+};
 use super::{NuPlanError, SimulationHistory};
 use gump_metrics::ComfortBounds;
 
@@ -66,11 +68,11 @@ pub fn score(drive: &SimulationHistory<'_>) -> Result<ClosedLoop, NuPlanError> {
     let corners = corner_lanes(drive.map, &boxes);
     let keeping = judged(&corners);
     let in_one_lane: Vec<bool> = keeping.iter().map(Keeping::is_within).collect();
-    let places: Vec<Place> = drive
+    let contexts: Vec<RoadContext> = drive
         .samples
         .iter()
         .zip(&in_one_lane)
-        .map(|(sample, &in_one_lane)| Place {
+        .map(|(sample, &in_one_lane)| RoadContext {
             in_one_lane,
             in_intersection: is_in_intersection(drive.map, sample.ego.rear_axle.position),
         })
@@ -83,7 +85,7 @@ pub fn score(drive: &SimulationHistory<'_>) -> Result<ClosedLoop, NuPlanError> {
         progress: expert_progress(drive),
         time_to_collision: time_to_collision(
             drive,
-            &places,
+            &contexts,
             &collisions,
             &TimeToCollisionConfig::default(),
         ),

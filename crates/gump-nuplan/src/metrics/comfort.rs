@@ -67,6 +67,9 @@ pub struct ComfortSeries {
 }
 
 /// Windows of the filters, samples.
+///
+/// Source: nuplan-devkit; its own window of 15 for yaw rates is never passed on, so the default of
+/// 5 is in force.
 const ACCELERATION_WINDOW: usize = 8;
 const JERK_WINDOW: usize = 15;
 const YAW_WINDOW: usize = 5;

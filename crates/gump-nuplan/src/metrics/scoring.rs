@@ -114,11 +114,11 @@ impl Scoring {
             let of_kind = by_kind.entry(&scenario.kind).or_default();
             of_kind.push((score, &scenario.scores));
         }
-        let kinds: BTreeMap<String, Row> = by_kind
+        let kinds: BTreeMap<String, AggregateRow> = by_kind
             .into_iter()
-            .map(|(kind, members)| (kind.to_owned(), Row::of_kind(&members)))
+            .map(|(kind, members)| (kind.to_owned(), AggregateRow::of_kind(&members)))
             .collect();
-        let total = Row::of_all(kinds.values());
+        let total = AggregateRow::of_all(kinds.values());
         Aggregate {
             scores,
             kinds,
@@ -142,14 +142,14 @@ pub struct Aggregate {
     /// Score of each scenario, in the order given.
     pub scores: Vec<f64>,
     /// By type: mean score and **sums** of the metrics, as nuPlan reports them.
-    pub kinds: BTreeMap<String, Row>,
+    pub kinds: BTreeMap<String, AggregateRow>,
     /// Over all scenarios: mean score and means of the metrics.
-    pub total: Row,
+    pub total: AggregateRow,
 }
 
-/// One row of a table.
+/// One row of the aggregated scores: a type of scenario, or all.
 #[derive(Clone, Debug, PartialEq, Default)]
-pub struct Row {
+pub struct AggregateRow {
     /// Number of scenarios.
     pub n: usize,
     /// Mean score of the scenarios; 0 if there are none.
@@ -158,7 +158,7 @@ pub struct Row {
     pub metrics: MetricScores,
 }
 
-impl Row {
+impl AggregateRow {
     fn of_kind(members: &[(f64, &MetricScores)]) -> Self {
         let mut metrics = MetricScores::new();
         for (_, scores) in members {

@@ -54,16 +54,16 @@ impl TimeToCollision {
     }
 }
 
-/// Position of the ego, as far as times to collision depend on it.
+/// Where on the road the ego is, as far as times to collision depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct RoadContext {
     /// Within one lane or within connected ones.
     pub in_one_lane: bool,
     /// The rear axle is in an intersection.
     pub in_intersection: bool,
 }
 
-/// Measures the times of a drive; one place per sample.
+/// Measures the times of a drive; one context per sample.
 ///
 /// Agents ahead always count; those to the side only in intersections and when the ego is not
 /// within one lane; those behind never, nor those the ego has already collided with.
@@ -71,7 +71,7 @@ pub struct Place {
 /// Source: nuPlan's `time_to_collision_within_bound`: headings determine the directions of motion.
 pub fn time_to_collision(
     drive: &SimulationHistory<'_>,
-    places: &[Place],
+    contexts: &[RoadContext],
     collisions: &Collisions,
     config: &TimeToCollisionConfig,
 ) -> TimeToCollision {
@@ -80,8 +80,8 @@ pub fn time_to_collision(
         .iter()
         .map(|event| (event.agent, event.sample))
         .collect();
-    let series = drive.samples.iter().zip(places).enumerate();
-    let series = series.map(|(i, (sample, place))| {
+    let series = drive.samples.iter().zip(contexts).enumerate();
+    let series = series.map(|(i, (sample, context))| {
         if collisions.at_fault().any(|event| event.sample == i) {
             return 0.0;
         }
@@ -90,7 +90,7 @@ pub fn time_to_collision(
             return f64::INFINITY;
         }
         let rear_axle = sample.ego.rear_axle;
-        let looks_aside = !place.in_one_lane || place.in_intersection;
+        let looks_aside = !context.in_one_lane || context.in_intersection;
         let counts = |agent: &&Agent| {
             let at = agent.state.pose.position;
             let may_hit = hit_at.get(&agent.id).is_none_or(|&first| first > i);

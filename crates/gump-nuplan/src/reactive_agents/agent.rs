@@ -11,6 +11,8 @@ use crate::path::{Path, baseline, curvature_at_start, nearest_on_baseline};
 use gump_rollout::worlds::idm_euler_step;
 
 /// Number of past lanes that a vehicle remembers.
+///
+/// Source: the IDM agents of nuplan-devkit.
 const REMEMBERED_LANES: usize = 5;
 
 /// A vehicle on its path.

@@ -12,6 +12,7 @@ use super::profile::{Profile, ProfileFit, Smoothness};
 use super::{Controls, Trajectory};
 use gump_rollout::RolloutError;
 
+// All numbers of this file are defaults of nuPlan's LQR tracker.
 /// Seconds between the steps that the tracker looks ahead, and between poses of its reference.
 pub const TRACKING_DT: f64 = 0.1;
 /// Steps that the tracker looks ahead.

@@ -8,6 +8,7 @@
 
 use gump_geometry::{Pose, angle_difference};
 
+// The weights are defaults of nuPlan's LQR tracker.
 /// Weight of the squared change of acceleration between steps.
 const JERK_WEIGHT: f64 = 1e-4;
 /// Weight of the squared rate of change of curvature.

@@ -8,6 +8,7 @@ use std::f64::consts::FRAC_PI_3;
 use gump_geometry::{DVec2, Pose, dvec2, wrap_angle};
 use gump_scene::EgoState;
 
+// Lags and the largest angle are defaults of nuPlan's kinematic bicycle model.
 /// Time constant of the engine and brakes, seconds.
 const ACCELERATION_LAG: f64 = 0.2;
 /// Time constant of the steering, seconds.

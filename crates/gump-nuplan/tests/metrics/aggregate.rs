@@ -1,6 +1,6 @@
 //! From metrics to scenarios, types of scenarios and the final score.
 
-use gump_nuplan::metrics::{MetricScores, Row, ScenarioScores, Scoring};
+use gump_nuplan::metrics::{AggregateRow, MetricScores, ScenarioScores, Scoring};
 use serde_json::Value;
 
 use crate::common::{assert_close, entries, golden, number};
@@ -21,7 +21,7 @@ fn scores(row: &Value) -> MetricScores {
     metrics.map(|(name, v)| (name.clone(), score(v))).collect()
 }
 
-fn assert_row(found: &Row, expected: &Value, what: &str) {
+fn assert_row(found: &AggregateRow, expected: &Value, what: &str) {
     assert_eq!(found.n as u64, expected["num_scenarios"].as_u64().unwrap());
     if let Some(score) = expected.get("score").filter(|score| !score.is_null()) {
         assert_close(found.score, number(score), 1e-9, what);

@@ -2,7 +2,7 @@
 
 use gump_geometry::{OrientedBox, Pose, dvec2};
 use gump_nuplan::metrics::{
-    CollisionKind, Place, Sample, TimeToCollisionConfig, collisions, time_to_collision,
+    CollisionKind, RoadContext, Sample, TimeToCollisionConfig, collisions, time_to_collision,
 };
 use gump_scene::{Agent, AgentId, EgoState, MapGraph};
 use serde_json::Value;
@@ -85,11 +85,11 @@ fn collisions_and_times_to_collision_agree() {
         let samples = moving_samples(case);
         let map = MapGraph::default();
         let drive = drive(&samples, &[], &map);
-        let place = Place {
+        let context = RoadContext {
             in_one_lane: case["in_single_lane"].as_bool().unwrap(),
             in_intersection: case["in_intersection"].as_bool().unwrap(),
         };
-        let found = collisions(&drive, &vec![place.in_one_lane; samples.len()]);
+        let found = collisions(&drive, &vec![context.in_one_lane; samples.len()]);
         let id = |token: &str| {
             let mut tracks = list(&case["tracks"]).iter();
             AgentId(tracks.position(|row| row[0] == token).unwrap() as i64)
@@ -120,9 +120,9 @@ fn collisions_and_times_to_collision_agree() {
             .collect();
         assert_eq!(times, expected, "case {i}");
 
-        let places = vec![place; samples.len()];
+        let contexts = vec![context; samples.len()];
         let config = TimeToCollisionConfig::default();
-        let ttc = time_to_collision(&drive, &places, &found, &config);
+        let ttc = time_to_collision(&drive, &contexts, &found, &config);
         assert_all_close(
             &ttc.series,
             &numbers(&case["ttc"]),

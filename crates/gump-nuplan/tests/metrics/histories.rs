@@ -4,12 +4,12 @@
 use gump_nuplan::metrics::score;
 
 use crate::common::{drive, egos, entries, golden, samples};
-use crate::map::made_up_map;
+use crate::map::synthetic_map;
 use crate::recorded::assert_closed_loop;
 
 #[test]
 fn crafted_drives_score_as_recorded() {
-    let map = made_up_map();
+    let map = synthetic_map();
     let golden = golden("synth_histories_a");
     assert_eq!(entries(&golden["cases"]).count(), 13);
     for (name, case) in entries(&golden["cases"]) {

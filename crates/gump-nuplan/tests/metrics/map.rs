@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::common::{golden, list, number};
 
-pub(crate) fn made_up_map() -> MapGraph {
+pub(crate) fn synthetic_map() -> MapGraph {
     let golden = golden("synth_map");
     let mut lanes: Vec<Lane> = list(&golden["lanes"]).iter().map(lane).collect();
     let links: Vec<(LaneId, Vec<LaneId>)> = lanes

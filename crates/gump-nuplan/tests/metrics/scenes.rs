@@ -3,8 +3,9 @@
 use gump_geometry::{Pose, dvec2};
 use gump_metrics::ComfortBounds;
 use gump_nuplan::metrics::{
-    CollisionKind, Collisions, ComfortSeries, Motion, OpenLoopConfig, Place, SimulationHistory,
-    Statistics, TimeToCollisionConfig, collisions, expert_errors, open_loop, time_to_collision,
+    CollisionKind, Collisions, ComfortSeries, Motion, OpenLoopConfig, RoadContext,
+    SimulationHistory, Statistics, TimeToCollisionConfig, collisions, expert_errors, open_loop,
+    time_to_collision,
 };
 use gump_scene::{Agent, AgentKind, MapGraph, VehicleParameters};
 use serde_json::Value;
@@ -232,13 +233,13 @@ fn check_time_to_collision(
         horizon: number(&parameters["time_horizon"]),
         least: number(&parameters["least_min_ttc"]),
     };
-    let place = Place {
+    let context = RoadContext {
         in_one_lane: false,
         in_intersection: false,
     };
     let n = drive.samples.len();
     let hits = collisions(drive, &vec![false; n]);
-    let found = time_to_collision(drive, &vec![place; n], &hits, &config);
+    let found = time_to_collision(drive, &vec![context; n], &hits, &config);
     let values = [found.min(), found.score];
     expected.check(&values, Some(found.score), Some(&found.series), name);
 }

@@ -11,7 +11,7 @@ use crate::{PlanError, Proposal, ProposalKind};
 
 /// Horizon of a plan, seconds: that of nuPlan's open loop.
 const SECONDS: f64 = 8.0;
-/// Seconds between the states of a plan.
+/// Seconds between the states of a plan: those between nuPlan's iterations.
 const DT: f64 = 0.1;
 
 /// Plans the mean of the ego's motion in several futures of a world.

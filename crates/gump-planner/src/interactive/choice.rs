@@ -7,14 +7,15 @@ use gump_nuplan::metrics::{ComfortSeries, MAX_OVERSPEED, Motion};
 use gump_scene::{EgoState, Frame, Rollout};
 use rayon::prelude::*;
 
-use super::imagine::{DECISION, Row};
+use super::imagine::{CandidateFuture, DECISION};
 use super::{Aggregate, CandidateEvaluation, InteractiveDriverConfig, ValueEstimate};
 use crate::ProposalKind;
 use crate::pdm::propose::DT;
 use crate::pdm::score::{Judge, NO_PROGRESS, PdmScore, normalize};
 use crate::pdm::{BRAKE_SPEED, BRAKE_STEPS};
 
-/// Values within this are a tie, so that rounding does not decide.
+/// Values within this are a tie, so that rounding does not decide: far more than its errors, far
+/// less than any difference of scores that matters.
 const TIE: f64 = 1e-6;
 
 /// The result of a candidate over its futures.
@@ -83,7 +84,7 @@ pub(super) struct Reward<'a> {
     pub(super) limit: Option<f64>,
 }
 
-/// The score of a row with its parts.
+/// The score of a future with its parts.
 #[derive(Clone, Debug)]
 pub(super) struct Judged {
     parts: PdmScore,
@@ -109,29 +110,29 @@ impl Judged {
 }
 
 impl Reward<'_> {
-    /// The score of every row, with the `n_futures` of a candidate after another; progress is
+    /// The score of every future, with the `n_futures` of a candidate after another; progress is
     /// relative to the farthest candidate in the same future.
-    pub(super) fn judge(&self, rows: &[Row], n_futures: usize) -> Vec<Judged> {
-        let judged = rows.par_iter().map(|row| {
+    pub(super) fn judge(&self, futures: &[CandidateFuture], n_futures: usize) -> Vec<Judged> {
+        let judged = futures.par_iter().map(|future| {
             let judge = Judge {
-                forecast: &row.forecast,
+                forecast: &future.forecast,
                 ..self.judge
             };
-            judge.parts(&row.drive, self.is_comfortable(&row.drive))
+            judge.parts(&future.drive, self.is_comfortable(&future.drive))
         });
         let mut parts: Vec<PdmScore> = judged.collect();
         for future in 0..n_futures {
-            let of_future = || (future..rows.len()).step_by(n_futures);
+            let of_future = || (future..futures.len()).step_by(n_futures);
             let mut group: Vec<PdmScore> = of_future().map(|i| parts[i].clone()).collect();
             normalize(&mut group);
             of_future()
                 .zip(group)
                 .for_each(|(i, score)| parts[i] = score);
         }
-        let all = rows.iter().zip(parts).map(|(row, parts)| {
+        let all = futures.iter().zip(parts).map(|(future, parts)| {
             let mut judged = Judged {
                 parts,
-                speed_limit: self.speed_limit(&row.drive),
+                speed_limit: self.speed_limit(&future.drive),
                 total: 0.0,
             };
             judged.total = judged.parts.gates() * weighted_mean(judged.terms());
@@ -142,10 +143,10 @@ impl Reward<'_> {
             for future in 0..n_futures {
                 let mut of_future: Vec<(&mut Judged, &[EgoState])> = all
                     .iter_mut()
-                    .zip(rows)
+                    .zip(futures)
                     .skip(future)
                     .step_by(n_futures)
-                    .map(|(judged, row)| (judged, &row.drive[..]))
+                    .map(|(judged, simulated)| (judged, &simulated.drive[..]))
                     .collect();
                 discount(&mut of_future, &self.judge, gamma);
             }
@@ -226,7 +227,7 @@ fn weighted_mean(terms: [f64; 4]) -> f64 {
 /// The futures of one candidate so far.
 #[derive(Default)]
 pub(super) struct Tally {
-    rows: Vec<Row>,
+    futures: Vec<CandidateFuture>,
     scores: Vec<Judged>,
     /// The score among agents that keep their velocity, where it counts.
     hedge: Option<Judged>,
@@ -253,9 +254,9 @@ impl Tally {
     }
 
     /// Adds simulated and scored futures.
-    pub(super) fn add(&mut self, judged: impl Iterator<Item = (Row, Judged)>) {
-        for (row, score) in judged {
-            self.rows.push(row);
+    pub(super) fn add(&mut self, judged: impl Iterator<Item = (CandidateFuture, Judged)>) {
+        for (future, score) in judged {
+            self.futures.push(future);
             self.scores.push(score);
         }
     }
@@ -267,7 +268,7 @@ impl Tally {
 
     /// The ego's motion in the first future.
     pub(super) fn first_drive(&self) -> &[EgoState] {
-        &self.rows[0].drive
+        &self.futures[0].drive
     }
 
     fn score(&self) -> CandidateScore {
@@ -277,7 +278,7 @@ impl Tally {
 
     fn standing(&self, config: &InteractiveDriverConfig) -> Standing {
         let n = self.scores.len() as f64;
-        let steps = self.rows[0].drive.len() - 1;
+        let steps = self.futures[0].drive.len() - 1;
         let mean = |part: &dyn Fn(&PdmScore) -> f64| {
             let parts = self.scores.iter().map(|judged| part(&judged.parts));
             parts.sum::<f64>() / n
@@ -321,9 +322,9 @@ impl Tally {
         let score = self.score();
         let hedge = self.hedge.as_ref().map(score_of);
         let (mut futures, mut drives) = (Vec::new(), Vec::new());
-        for row in self.rows {
-            futures.push(film(row.frames));
-            drives.push(row.drive);
+        for future in self.futures {
+            futures.push(film(future.frames));
+            drives.push(future.drive);
         }
         CandidateEvaluation {
             kind,

@@ -19,7 +19,8 @@ use crate::pdm::state::State;
 use crate::pdm::track::Tracker;
 use crate::{PlanError, ProposalKind};
 
-/// Steps of a tenth of a second that a policy drives before the world reacts ...
+/// Steps of a tenth of a second that a policy drives before the world reacts, a step of the learned
+/// world ...
 pub(super) const DECISION: usize = 5;
 /// ... and the same in seconds.
 pub(super) const DECISION_S: f64 = 0.5;
@@ -40,10 +41,11 @@ pub(super) struct Imagination<'a> {
     pub(super) clock: &'a dyn Fn() -> Duration,
 }
 
-/// Past states, a tenth of a second apart, used for comfort: nuPlan's longest filter needs 1.5 s.
+/// Past states, a tenth of a second apart, used for comfort: nuPlan's longest filter needs 1.5 s,
+/// and the rest is a margin.
 const COMFORT_PAST: usize = 20;
 
-/// Separates the random numbers of later rounds from those of iterations.
+/// Separates the random numbers of later rounds from those of iterations, which never reach it.
 const ROUND: u64 = 1 << 32;
 
 /// Some futures of some candidates, simulated together.
@@ -83,7 +85,7 @@ impl Allocation {
 }
 
 /// One future of one candidate.
-pub(super) struct Row {
+pub(super) struct CandidateFuture {
     /// The other agents as simulated so far.
     pub(super) forecast: Forecast,
     /// The policy's own line so far; none for imitation.
@@ -136,15 +138,15 @@ impl<'a> Imagination<'a> {
                 n_decisions: horizon,
                 seed: self.seed(r),
             };
-            let (rows, imagined) = self.round(&round, &begun, &mut opened, &mut phases)?;
+            let (futures, imagined) = self.round(&round, &begun, &mut opened, &mut phases)?;
             if r > 0 && imagined < horizon {
                 // Time is up. What all others were judged by reaches farther.
                 break;
             }
             horizon = imagined;
             let time = (self.clock)();
-            let scores = self.reward().judge(&rows, n_futures);
-            let mut judged = rows.into_iter().zip(scores);
+            let scores = self.reward().judge(&futures, n_futures);
+            let mut judged = futures.into_iter().zip(scores);
             for &candidate in &left {
                 let own = judged.by_ref().take(n_futures);
                 tallies[candidate].add(own);
@@ -188,15 +190,15 @@ impl<'a> Imagination<'a> {
             n_futures: 1,
             ..*round
         };
-        let mut rows = self.rows(&one, begun);
-        let n_ruled = begun.len().min(rows.len());
+        let mut futures = self.futures(&one, begun);
+        let n_ruled = begun.len().min(futures.len());
         for _ in 0..n_decisions {
-            self.drive(one.proposer, one.corridors, &mut rows[..n_ruled]);
+            self.drive(one.proposer, one.corridors, &mut futures[..n_ruled]);
         }
-        for (row, tally) in rows.iter_mut().zip(&*tallies).skip(n_ruled) {
-            row.drive = tally.first_drive().to_vec();
+        for (future, tally) in futures.iter_mut().zip(&*tallies).skip(n_ruled) {
+            future.drive = tally.first_drive().to_vec();
         }
-        let scores = self.reward().judge(&rows, 1);
+        let scores = self.reward().judge(&futures, 1);
         for (&candidate, score) in round.candidates.iter().zip(scores) {
             tallies[candidate].hedge(score);
         }
@@ -211,19 +213,19 @@ impl<'a> Imagination<'a> {
         }
     }
 
-    /// Simulates some futures of some candidates: their rows, with the futures of one candidate
-    /// after another, and the number of half seconds reached.
+    /// Simulates some futures of some candidates; returns them, those of one candidate after
+    /// another, and the number of half seconds reached.
     fn round(
         &self,
         round: &Round<'_>,
         begun: &[(Proposal, IdmConfig)],
         opened: &mut Vec<Box<dyn Session + 'a>>,
         phases: &mut Phases,
-    ) -> Result<(Vec<Row>, usize), PlanError> {
+    ) -> Result<(Vec<CandidateFuture>, usize), PlanError> {
         let time = (self.clock)();
-        let mut rows = self.rows(round, begun);
+        let mut futures = self.futures(round, begun);
         let imitates = round.candidates.last() == Some(&begun.len());
-        let n_ruled = rows.len() - if imitates { round.n_futures } else { 0 };
+        let n_ruled = futures.len() - if imitates { round.n_futures } else { 0 };
         let start = Start {
             scene: round.scene,
             n_futures: round.n_futures,
@@ -247,32 +249,35 @@ impl<'a> Imagination<'a> {
             if decision > 1 && self.config.budget.wall.is_some_and(|wall| spent > wall) {
                 break;
             }
-            self.drive(round.proposer, round.corridors, &mut rows[..n_ruled]);
-            let open: Vec<usize> = (0..live.len()).filter(|&i| !rows[live[i]].lost).collect();
+            self.drive(round.proposer, round.corridors, &mut futures[..n_ruled]);
+            let open: Vec<usize> = (0..live.len())
+                .filter(|&i| !futures[live[i]].lost)
+                .collect();
             if open.len() < live.len() && !open.is_empty() && ruled.keep(&open) {
                 live = open.into_iter().map(|i| live[i]).collect();
             }
             let driven = (self.clock)();
             phases.policies += driven - time;
-            let (ruled_rows, own_rows) = rows.split_at_mut(n_ruled);
-            self.answer(&mut *ruled, ruled_rows, &live, per, true)?;
+            let (ruled_futures, own_futures) = futures.split_at_mut(n_ruled);
+            self.answer(&mut *ruled, ruled_futures, &live, per, true)?;
             if let Some(own) = &mut own {
-                let all: Vec<usize> = (0..own_rows.len()).collect();
-                self.answer(&mut **own, own_rows, &all, per, false)?;
+                let all: Vec<usize> = (0..own_futures.len()).collect();
+                self.answer(&mut **own, own_futures, &all, per, false)?;
             }
             let answered = (self.clock)();
             phases.frames += answered - driven;
             let present = round.scene.now();
-            rows.par_iter_mut()
-                .filter(|row| row.frames.len() == decision)
-                .for_each(|row| row.remember(present));
+            futures
+                .par_iter_mut()
+                .filter(|future| future.frames.len() == decision)
+                .for_each(|future| future.remember(present));
             phases.policies += (self.clock)() - answered;
             imagined = decision;
         }
-        self.imitate(&mut rows[n_ruled..], imagined);
+        self.imitate(&mut futures[n_ruled..], imagined);
         opened.push(ruled);
         opened.extend(own);
-        Ok((rows, imagined))
+        Ok((futures, imagined))
     }
 
     /// The last second of the ego and of the agents nearest to it.
@@ -307,11 +312,11 @@ impl<'a> Imagination<'a> {
         policies.iter().map(begin).collect()
     }
 
-    /// The rows of a round at its start. Imitation has no policy.
-    fn rows(&self, round: &Round<'_>, begun: &[(Proposal, IdmConfig)]) -> Vec<Row> {
-        let row = |&candidate: &usize| {
+    /// The futures of a round at its start. Imitation has no policy.
+    fn futures(&self, round: &Round<'_>, begun: &[(Proposal, IdmConfig)]) -> Vec<CandidateFuture> {
+        let future = |&candidate: &usize| {
             let (policy, law) = begun.get(candidate).cloned().unwrap_or_default();
-            Row {
+            CandidateFuture {
                 forecast: self.state.forecast.clone(),
                 policy,
                 law,
@@ -321,47 +326,54 @@ impl<'a> Imagination<'a> {
             }
         };
         let candidates = round.candidates.iter();
-        let rows = candidates.flat_map(|c| (0..round.n_futures).map(move |_| row(c)));
-        rows.collect()
+        let futures = candidates.flat_map(|c| (0..round.n_futures).map(move |_| future(c)));
+        futures.collect()
     }
 
     /// Lets every policy drive for half a second among the other agents as known so far.
-    fn drive(&self, proposer: &Proposer<'_>, corridors: &[Corridor], rows: &mut [Row]) {
+    fn drive(
+        &self,
+        proposer: &Proposer<'_>,
+        corridors: &[Corridor],
+        futures: &mut [CandidateFuture],
+    ) {
         let wheel_base = self.state.vehicle.wheel_base;
         let judge = self.judge_of();
         let room = || (Tracker::new(LOOK), Vec::new());
-        rows.par_iter_mut()
-            .for_each_init(room, |(tracker, states), row| {
-                let k = row.drive.len() - 1;
-                if row.lost {
-                    coast(&mut row.drive);
+        futures
+            .par_iter_mut()
+            .for_each_init(room, |(tracker, states), future| {
+                let k = future.drive.len() - 1;
+                if future.lost {
+                    coast(&mut future.drive);
                     return;
                 }
                 let proposer = Proposer {
-                    forecast: &row.forecast,
-                    law: &row.law,
+                    forecast: &future.forecast,
+                    law: &future.law,
                     ..*proposer
                 };
-                let corridor = &corridors[row.policy.line];
-                let policy = std::slice::from_mut(&mut row.policy);
+                let corridor = &corridors[future.policy.line];
+                let policy = std::slice::from_mut(&mut future.policy);
                 proposer.drive_within(corridor, policy, k + 1..=k + LOOK);
-                let reference = &row.policy.poses[k..];
-                tracker.drive(&row.drive[k], reference, wheel_base, states);
-                row.drive.extend_from_slice(&states[1..=DECISION]);
-                row.policy.truncate(k + DECISION);
+                let reference = &future.policy.poses[k..];
+                tracker.drive(&future.drive[k], reference, wheel_base, states);
+                future.drive.extend_from_slice(&states[1..=DECISION]);
+                future.policy.truncate(k + DECISION);
                 let judge = Judge {
-                    forecast: &row.forecast,
+                    forecast: &future.forecast,
                     ..judge
                 };
-                row.lost = judge.is_lost(&row.drive);
+                future.lost = judge.is_lost(&future.drive);
             });
     }
 
-    /// Steps the world through the half second that was just driven, in the rows still simulated.
+    /// Steps the world through the half second that was just driven, in the futures that are still
+    /// simulated.
     fn answer(
         &self,
         session: &mut (dyn Session + '_),
-        rows: &mut [Row],
+        futures: &mut [CandidateFuture],
         live: &[usize],
         per: usize,
         driven: bool,
@@ -372,7 +384,7 @@ impl<'a> Imagination<'a> {
             // The half second ends with the last state.
             let behind = DECISION - i * DECISION / per;
             let ego = |&i: &usize| {
-                let drive = &rows[i].drive;
+                let drive = &futures[i].drive;
                 drive[drive.len() - 1 - behind].agent_state(vehicle)
             };
             let egos: Option<Vec<AgentState>> = driven.then(|| live.iter().map(ego).collect());
@@ -393,27 +405,30 @@ impl<'a> Imagination<'a> {
         if !agents.map(|agent| agent.state).all(|s| s.is_finite()) {
             return Err(self.failed(RolloutError::NotFinite { who }.into()));
         }
-        for (future, (&i, frame)) in live.iter().zip(frames).enumerate() {
-            let row = &mut rows[i];
+        for (n, (&i, frame)) in live.iter().zip(frames).enumerate() {
+            let future = &mut futures[i];
             let ego = self.input.scene.ego;
             if !driven && frame.agent(ego).is_none() {
-                let step = row.frames.len();
-                let gone = RolloutError::EgoVanished { ego, future, step };
+                let gone = RolloutError::EgoVanished {
+                    ego,
+                    future: n,
+                    step: future.frames.len(),
+                };
                 return Err(self.failed(gone.into()));
             }
-            row.frames.push(frame);
+            future.frames.push(frame);
         }
         Ok(())
     }
 
     /// Lets the vehicle follow the world's motion of the ego.
-    fn imitate(&self, rows: &mut [Row], n_decisions: usize) {
+    fn imitate(&self, futures: &mut [CandidateFuture], n_decisions: usize) {
         let (scene, vehicle) = (self.input.scene, &self.state.vehicle);
         let now = scene.ego_now().state;
         let mut tracker = Tracker::new(n_decisions * DECISION);
-        for row in rows {
+        for future in futures {
             let places: Vec<Pose> = std::iter::once(now.pose)
-                .chain(row.frames.iter().filter_map(|frame| {
+                .chain(future.frames.iter().filter_map(|frame| {
                     let ego = frame.agent(scene.ego)?;
                     Some(ego.state.pose)
                 }))
@@ -426,7 +441,7 @@ impl<'a> Imagination<'a> {
                 .map(|center| vehicle.rear_axle_of(center))
                 .collect();
             let ego = self.input.ego;
-            tracker.drive(ego, &poses, vehicle.wheel_base, &mut row.drive);
+            tracker.drive(ego, &poses, vehicle.wheel_base, &mut future.drive);
         }
     }
 
@@ -459,7 +474,7 @@ impl<'a> Imagination<'a> {
     }
 }
 
-impl Row {
+impl CandidateFuture {
     /// Records the positions of the others in the last frame: linear between frames, and after it
     /// at the velocity of the last second, since positions are quantised.
     fn remember(&mut self, present: &Frame) {

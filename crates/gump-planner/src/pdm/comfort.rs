@@ -1,7 +1,7 @@
 //! Comfort of tracked proposals.
 //!
-//! The bounds are those of the metric; the windows are PDM's, because a proposal is only as long as
-//! a window.
+//! The bounds are those of the metric; windows and polynomials are PDM's, because a proposal is
+//! only as long as a window.
 
 use gump_geometry::angle_difference;
 use gump_metrics::{ComfortBounds, ComfortMeasurements};

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use gump_geometry::{DVec2, PolygonIndex};
 use gump_scene::{AreaKind, LaneId, MapGraph};
 
-/// Surfaces within this square around the ego are considered, half its side in metres.
+/// Surfaces within this square around the ego are considered, half its side in metres. Source:
+/// tuPlan Garage.
 pub(crate) const RADIUS: f64 = 50.0;
 
 /// Surfaces near the ego, prepared once per lane and kept for the drive.

@@ -10,19 +10,24 @@ use crate::route_search::shortest_lanes;
 /// Duration of a change, seconds. At a lane's width to the side the lateral acceleration then
 /// stays below 2 m/s².
 const CHANGE_S: f64 = 3.5;
-/// The least length of a change, metres.
+/// The least length of a change, metres: over the width of a lane it bends with a radius of 11 m at
+/// least, which a car can steer. Neither was tuned.
 const CHANGE_M: f64 = 15.0;
-/// Spacing of the points of a change, metres.
+/// Spacing of the points of a change, metres: half of that of nuPlan's lines, as it bends more.
 const SPACING: f64 = 0.5;
-/// Lanes are beside each other up to this distance of their centre lines, metres.
+// Chosen by hand (decision 23); none was tuned.
+
+/// Lanes are beside each other up to this distance of their centre lines, metres: wide lanes with a
+/// line or a bicycle lane in between.
 const BESIDE_M: f64 = 6.0;
-/// A lane that ends or begins within this is no place to change to, metres.
+/// A lane that ends or begins within this is no place to change to, metres: a car's length.
 const ROOM_M: f64 = 5.0;
 /// A change is followed to its end unless the ego is farther than this from its line, metres, ...
 const LEFT_M: f64 = 0.5;
 /// ... or nearer than this to the centre of the other lane.
 const DONE_M: f64 = 0.3;
-/// Beyond this distance from the centre of its line the ego is in another lane, metres.
+/// Beyond this distance from the centre of its line the ego is in another lane, metres: half of a
+/// usual lane.
 pub(crate) const OTHER_LANE_M: f64 = 1.8;
 
 /// The side of a lane change.

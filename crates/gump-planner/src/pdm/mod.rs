@@ -38,6 +38,8 @@ use score::Judge;
 use state::{State, brake, trajectory};
 use track::Tracker;
 
+// tuPlan Garage's values: 4 s, 8 s, 2 s and 5 m/s.
+
 /// Steps of a proposal.
 pub(crate) const STEPS: usize = 40;
 /// Steps of the trajectory that is followed.

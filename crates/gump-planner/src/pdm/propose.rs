@@ -10,7 +10,7 @@ use super::forecast::{Forecast, Object};
 
 /// Seconds between the states of a proposal.
 pub(crate) const DT: f64 = 0.1;
-/// Length over which a line is examined, seconds at the highest desired speed.
+/// Length over which a line is examined, seconds at the highest desired speed, as in tuPlan Garage.
 const CORRIDOR_SECONDS: f64 = 8.0;
 /// Distance between points of a line beyond which a corridor does not begin and end at points but
 /// at the ends of its range, metres; nuPlan's lines have a point every metre.
@@ -91,7 +91,7 @@ fn straightened(points: &[DVec2]) -> Vec<DVec2> {
 
 /// Progress along the line and speed, metres and metres per second.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Drive {
+pub(crate) struct LongitudinalState {
     pub(crate) progress: f64,
     pub(crate) speed: f64,
 }
@@ -111,7 +111,7 @@ pub(crate) struct Proposal {
     pub(crate) line: usize,
     /// Metres per second.
     pub(crate) desired_speed: f64,
-    pub(crate) drives: Vec<Drive>,
+    pub(crate) states: Vec<LongitudinalState>,
     pub(crate) leads: Vec<Lead>,
     /// Rear-axle poses.
     pub(crate) poses: Vec<Pose>,
@@ -120,7 +120,7 @@ pub(crate) struct Proposal {
 impl Proposal {
     /// Drops all steps after the first `n`.
     pub(crate) fn truncate(&mut self, n: usize) {
-        self.drives.truncate(n + 1);
+        self.states.truncate(n + 1);
         self.leads.truncate(n + 1);
         self.poses.truncate(n + 1);
     }
@@ -158,7 +158,7 @@ impl Proposer<'_> {
         Proposal {
             line,
             desired_speed: self.desired_speeds[0],
-            drives: vec![Drive { progress, speed }],
+            states: vec![LongitudinalState { progress, speed }],
             leads: vec![Lead::default()],
             poses: vec![way.pose_at(progress)],
         }
@@ -167,7 +167,7 @@ impl Proposer<'_> {
     /// Drives proposals of one line on over further steps.
     pub(crate) fn drive(&self, batch: &mut [Proposal], steps: std::ops::RangeInclusive<usize>) {
         let Some(first) = batch.first() else { return };
-        let corridor = self.corridor(first.line, first.drives[0].progress);
+        let corridor = self.corridor(first.line, first.states[0].progress);
         self.drive_within(&corridor, batch, steps);
     }
 
@@ -201,18 +201,18 @@ impl Proposer<'_> {
             for proposal in batch.iter_mut() {
                 let next = self.follow(proposal, k);
                 proposal.poses.push(line.pose_at(next.progress));
-                proposal.drives.push(next);
+                proposal.states.push(next);
             }
         }
     }
 
-    fn follow(&self, proposal: &Proposal, k: usize) -> Drive {
-        let (law, now, lead) = (self.law, proposal.drives[k - 1], proposal.leads[k]);
+    fn follow(&self, proposal: &Proposal, k: usize) -> LongitudinalState {
+        let (law, now, lead) = (self.law, proposal.states[k - 1], proposal.leads[k]);
         let gap = lead.progress - now.progress - lead.rear;
         let before = (now.progress, now.speed);
         let (progress, speed) =
             idm_euler_step(law, before, proposal.desired_speed, gap, lead.speed, DT);
-        Drive { progress, speed }
+        LongitudinalState { progress, speed }
     }
 
     /// Finds the leader of every proposal at step `k`.
@@ -222,7 +222,7 @@ impl Proposer<'_> {
     fn look(&self, line: &Line, around: &Surroundings<'_>, batch: &mut [Proposal], k: usize) {
         let mut lead = Lead::default();
         for proposal in batch {
-            let progress = proposal.drives[k - 1].progress;
+            let progress = proposal.states[k - 1].progress;
             let pose = proposal.poses[k - 1];
             let own = Quad::from(&self.vehicle.footprint(pose));
             match around.nearest(k, progress, &own) {
@@ -330,7 +330,7 @@ impl<'a> Surroundings<'a> {
     }
 }
 
-/// Pieces of a corridor that share bounds.
+/// Pieces of a corridor that share bounds. Saves time, changes no result; not tuned.
 const CHUNK: usize = 8;
 
 /// Convex pieces of road, with the bounds of all and of every few.

@@ -49,7 +49,7 @@ fn every_speed_is_proposed_on_every_line() {
         let lateral_offset = [0.0, -1.0, 1.0][i / 5];
         let end = proposal.poses[STEPS];
         assert_abs_diff_eq!(end.position.y, lateral_offset, epsilon = 1e-9);
-        assert_abs_diff_eq!(proposal.drives[STEPS].speed, speed, epsilon = 0.2);
+        assert_abs_diff_eq!(proposal.states[STEPS].speed, speed, epsilon = 0.2);
         assert!(drive[0].rear_axle.position.x == 10.0 - behind);
     }
 }
@@ -57,7 +57,7 @@ fn every_speed_is_proposed_on_every_line() {
 #[test]
 fn a_free_start_follows_the_law() {
     let (_, planner) = check(&format!("{STREET} ego vehicle 0: 10,0"));
-    let fastest = &planner.thought().proposals[4].drives;
+    let fastest = &planner.thought().proposals[4].states;
     // (v / 10)^10 is below 0.03 up to 7 m/s, so it gains 0.15 m/s every tenth of a second.
     for pair in fastest[1..20].windows(2) {
         assert_abs_diff_eq!(pair[1].speed - pair[0].speed, 0.15, epsilon = 1e-3);

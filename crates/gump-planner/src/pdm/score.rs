@@ -1,7 +1,7 @@
 //! Scores of the tracked proposals.
 //!
 //! Definitions shared with nuPlan's metrics (fault of collisions, what is ahead, comfort) come from
-//! `gump_nuplan::metrics`; this module has PDM's own.
+//! `gump_nuplan::metrics`; this module has PDM's own. All constants are tuPlan Garage's.
 
 use std::collections::BTreeSet;
 

@@ -21,7 +21,7 @@ use super::{PdmConfig, TRAJECTORY_STEPS};
 use crate::PlanError;
 use crate::route_search::{correct_route, lanes_of_route, nearest_vertex, shortest_lanes};
 
-/// Roadblocks of the route that the centre line is laid through.
+/// Roadblocks of the route that the centre line is laid through. Source: tuPlan Garage.
 const WINDOW: usize = 30;
 
 /// State since the drive began.
@@ -353,6 +353,8 @@ pub(crate) fn trajectory(start_us: i64, poses: &[Pose]) -> Result<Trajectory, Ro
 
 /// A reference straight ahead at a constant speed that makes the tracker brake hard. That speed is
 /// mostly negative: the reference runs backwards, and is computed again at every step.
+///
+/// Source: the gains are tuPlan Garage's, the bounds nuPlan's of comfortable acceleration, m/s².
 pub(crate) fn brake(ego: &EgoState, vehicle: &VehicleParameters) -> Vec<Pose> {
     let (low, high) = (-4.05, 2.4);
     let speed = ego.velocity.x;

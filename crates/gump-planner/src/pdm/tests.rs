@@ -273,9 +273,9 @@ fn check_ground(name: &str, planner: &PdmClosed, golden: &Value) {
 fn check_proposals(name: &str, thought: &Thought, golden: &Value) {
     for (i, proposal) in thought.proposals.iter().enumerate() {
         let leads = rows(&golden["leading"][i]);
-        let drives = rows(&golden["idm_states"][i]);
-        assert_eq!(proposal.drives.len(), drives.len());
-        for (k, (drive, row)) in proposal.drives.iter().zip(&drives).enumerate() {
+        let states = rows(&golden["idm_states"][i]);
+        assert_eq!(proposal.states.len(), states.len());
+        for (k, (drive, row)) in proposal.states.iter().zip(&states).enumerate() {
             let lead = proposal.leads[k];
             for (found, expected) in [lead.progress, lead.speed, lead.rear].iter().zip(&leads[k]) {
                 let off = (found - expected).abs();

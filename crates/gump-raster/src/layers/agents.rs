@@ -4,7 +4,7 @@ use gump_scene::SceneState;
 
 use super::Plane;
 
-/// Length of the fading history, seconds.
+/// Length of the fading history, seconds: about what nuPlan's planners see. Chosen by hand.
 const HISTORY: f64 = 2.0;
 
 pub(crate) fn draw_ego(plane: &mut Plane<'_>, scene: &SceneState<'_>) {

@@ -7,7 +7,8 @@ use super::Plane;
 /// Radius of the disc at the start of a signalled lane, metres: 4 px of the paper's raster.
 const DISC_RADIUS: f64 = 2.0;
 
-/// Lights are numbered below this; the index plane is divided by it.
+/// Lights are numbered below this, the capacity in the paper's code; the index plane is divided by
+/// it.
 const INDEX_SCALE: f32 = 64.0;
 
 /// Paints the lanes whose light is in a state that `shows` accepts.

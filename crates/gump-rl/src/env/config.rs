@@ -61,7 +61,7 @@ pub enum Autoreset {
 
 /// The source of the other agents' motion.
 #[derive(Clone, Copy)]
-pub enum Traffic<'w> {
+pub enum TrafficSource<'w> {
     /// The log: agents follow their recording, whatever the ego does. An episode is truncated where
     /// the log ends.
     Log,
@@ -69,7 +69,7 @@ pub enum Traffic<'w> {
     World(&'w dyn WorldModel),
 }
 
-impl Traffic<'_> {
+impl TrafficSource<'_> {
     /// A short name for tables and reports.
     pub fn name(&self) -> &str {
         match self {
@@ -79,7 +79,7 @@ impl Traffic<'_> {
     }
 }
 
-impl fmt::Debug for Traffic<'_> {
+impl fmt::Debug for TrafficSource<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }

@@ -15,15 +15,16 @@ use rayon::prelude::*;
 
 use crate::observation::Observed;
 use crate::{End, EpisodeState, PreparedScenario, RlError, VectorEnv};
-use row::Row;
+use row::EnvRow;
 use sampler::Sampler;
 use traffic::Others;
 
-pub use config::{Autoreset, EnvConfig, Traffic};
+pub use config::{Autoreset, EnvConfig, TrafficSource};
 pub use row::{EpisodeStart, Outcome};
 pub use sampler::Sampling;
 
-/// Rows that one thread takes at a time: a step of a row takes microseconds.
+/// Rows that one thread takes at a time: a step of a row takes microseconds. Results do not depend
+/// on it; not tuned.
 const ROWS_PER_TASK: usize = 8;
 
 /// Driving episodes, one per row, in borrowed buffers.
@@ -41,7 +42,7 @@ pub struct DrivingEnv<'w> {
     config: EnvConfig,
     sampler: Sampler,
     /// Empty before the first reset and after a step that failed.
-    rows: Vec<Row>,
+    rows: Vec<EnvRow>,
     observations: Observed,
     finals: Observed,
     rewards: Vec<f32>,
@@ -58,7 +59,7 @@ impl<'w> DrivingEnv<'w> {
     /// [`RlError::NoScenario`], and [`RlError::Parameter`] for parameters out of range.
     pub fn new(
         prepared: Arc<[PreparedScenario]>,
-        traffic: Traffic<'w>,
+        traffic: TrafficSource<'w>,
         config: EnvConfig,
     ) -> Result<Self, RlError> {
         if prepared.is_empty() {
@@ -103,7 +104,7 @@ impl<'w> DrivingEnv<'w> {
         let blank = self.blank();
         let row = |(i, start): (usize, &EpisodeStart)| {
             // What comes after the given episodes is drawn from their seeds.
-            let mut row = Row::new(start.seed.fork(i as u64), &blank);
+            let mut row = EnvRow::new(start.seed.fork(i as u64), &blank);
             row.n_episodes = 1;
             row.start = *start;
             row
@@ -136,7 +137,7 @@ impl<'w> DrivingEnv<'w> {
         if let Some(seeds) = seeds {
             let blank = self.blank();
             for ((row, seed), _) in self.rows.iter_mut().zip(seeds).zip(which).filter(|z| *z.1) {
-                *row = Row::new(*seed, &blank);
+                *row = EnvRow::new(*seed, &blank);
             }
         }
         let chosen: Vec<usize> = (0..expected).filter(|i| which[*i]).collect();
@@ -226,7 +227,10 @@ impl<'w> DrivingEnv<'w> {
         }
         self.sampler = Sampler::new(self.config.sampling, expected, self.prepared.len());
         let blank = self.blank();
-        self.rows = seeds.iter().map(|seed| Row::new(*seed, &blank)).collect();
+        self.rows = seeds
+            .iter()
+            .map(|seed| EnvRow::new(*seed, &blank))
+            .collect();
         for (i, row) in self.rows.iter_mut().enumerate() {
             row.draw(i, &self.sampler);
         }
@@ -238,7 +242,7 @@ impl<'w> DrivingEnv<'w> {
         self.config.rules.reset(&self.prepared[0])
     }
 
-    fn live(&self) -> Result<&[Row], RlError> {
+    fn live(&self) -> Result<&[EnvRow], RlError> {
         if self.rows.is_empty() {
             return Err(RlError::NotReset);
         }

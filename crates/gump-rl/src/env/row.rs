@@ -30,9 +30,9 @@ pub struct Outcome {
     pub end: End,
 }
 
-/// A row of the batch.
+/// A row of the batch: an environment with its episode in progress.
 #[derive(Clone, Debug)]
-pub(super) struct Row {
+pub(super) struct EnvRow {
     /// Source of the seeds of its episodes.
     seed: Seed,
     /// Number of episodes the row has started.
@@ -47,7 +47,7 @@ pub(super) struct Row {
     pub(super) history: Vec<Frame>,
 }
 
-impl Row {
+impl EnvRow {
     /// A row without an episode; its state is not meaningful yet.
     pub(super) fn new(seed: Seed, blank: &EpisodeState) -> Self {
         Self {
@@ -178,7 +178,7 @@ mod tests {
             agent vehicle 3: 120,5 velocity -10,0\n";
         let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
         let rules = Rules::default();
-        let mut row = Row::new(Seed(0), &rules.reset(&prepared));
+        let mut row = EnvRow::new(Seed(0), &rules.reset(&prepared));
         let ids = |frame: &Frame| -> Vec<i64> { frame.agents().iter().map(|a| a.id.0).collect() };
 
         row.limit(&prepared, Some(2));

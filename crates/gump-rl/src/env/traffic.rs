@@ -3,8 +3,8 @@
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 use gump_scene::{AgentState, Frame};
 
-use super::Traffic;
-use super::row::Row;
+use super::TrafficSource;
+use super::row::EnvRow;
 use crate::{PreparedScenario, RlError, Rules};
 
 /// The other agents of all rows.
@@ -16,12 +16,12 @@ pub(super) struct Others<'w> {
 }
 
 impl<'w> Others<'w> {
-    pub(super) fn new(traffic: Traffic<'w>, nearest: Option<usize>) -> Self {
+    pub(super) fn new(traffic: TrafficSource<'w>, nearest: Option<usize>) -> Self {
         Self {
             nearest,
             world: match traffic {
-                Traffic::Log => None,
-                Traffic::World(world) => Some(world),
+                TrafficSource::Log => None,
+                TrafficSource::World(world) => Some(world),
             },
             session: None,
         }
@@ -31,7 +31,7 @@ impl<'w> Others<'w> {
     pub(super) fn open(
         &mut self,
         prepared: &[PreparedScenario],
-        rows: &mut [Row],
+        rows: &mut [EnvRow],
     ) -> Result<(), RlError> {
         self.session = None;
         for row in rows.iter_mut() {
@@ -55,7 +55,7 @@ impl<'w> Others<'w> {
     pub(super) fn restart(
         &mut self,
         prepared: &[PreparedScenario],
-        rows: &mut [Row],
+        rows: &mut [EnvRow],
         chosen: &[usize],
     ) -> Result<(), RlError> {
         if chosen.len() == rows.len() {
@@ -83,7 +83,7 @@ impl<'w> Others<'w> {
         &mut self,
         prepared: &[PreparedScenario],
         rules: &Rules,
-        rows: &mut [Row],
+        rows: &mut [EnvRow],
         actions: &[f32],
     ) -> Result<(), RlError> {
         let Some(world) = self.world else {
@@ -99,7 +99,7 @@ impl<'w> Others<'w> {
         let mut frames = Vec::new();
         for k in 1..=n {
             let elapsed = dt * k as f64 / n as f64;
-            let drive = |(row, action): (&Row, &[f32])| {
+            let drive = |(row, action): (&EnvRow, &[f32])| {
                 let now = row.state.ego.state;
                 match row.state.end {
                     Some(_) => now,
@@ -124,7 +124,7 @@ impl<'w> Others<'w> {
     }
 }
 
-fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
+fn check(rows: &[EnvRow], frames: &[Frame]) -> Result<(), RlError> {
     if frames.len() != rows.len() {
         return Err(RlError::Count {
             who: "the world",
@@ -132,7 +132,7 @@ fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
             found: frames.len(),
         });
     }
-    let lost = |(row, frame): (&Row, &Frame)| frame.agent(row.state.ego.id).is_none();
+    let lost = |(row, frame): (&EnvRow, &Frame)| frame.agent(row.state.ego.id).is_none();
     match rows.iter().zip(frames).position(lost) {
         Some(row) => Err(RlError::EgoVanished {
             ego: rows[row].state.ego.id,
@@ -142,7 +142,7 @@ fn check(rows: &[Row], frames: &[Frame]) -> Result<(), RlError> {
     }
 }
 
-fn start<'a>(prepared: &'a [PreparedScenario], row: &'a Row) -> Start<'a> {
+fn start<'a>(prepared: &'a [PreparedScenario], row: &'a EnvRow) -> Start<'a> {
     Start {
         scene: row.scene(&prepared[row.start.scenario]),
         n_futures: 1,

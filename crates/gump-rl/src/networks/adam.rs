@@ -1,5 +1,6 @@
 //! Adam (Kingma and Ba 2015) over a slice of parameters.
 
+/// Source of all three: the paper's defaults.
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;

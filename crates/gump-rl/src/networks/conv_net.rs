@@ -11,7 +11,8 @@ use super::convolution::Convolution;
 /// Rows of a batch that go through the layers together: few enough for their columns to stay near
 /// the processor. Fixed, so that sums do not depend on the number of threads.
 pub(super) const ROWS_PER_PIECE: usize = 16;
-/// Partial gradients of a batch, each as long as the parameters.
+/// Partial gradients of a batch, each as long as the parameters; as many threads as can work on
+/// them. Bounds the memory; fixed for the same reason. Not tuned.
 const PARTIAL_SUMS: usize = 4;
 
 /// The architecture of the layers between an image and its features.

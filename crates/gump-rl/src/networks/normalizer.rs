@@ -41,6 +41,7 @@ impl Normalizer {
                 *sum += (f64::from(x) - mean).powi(2) / n;
             }
         }
+        // What does not vary is not blown up.
         let scale = |v: f64| if v > 1e-8 { 1.0 / v.sqrt() } else { 1.0 } as f32;
         Self {
             shift: mean.into_iter().map(|m| m as f32).collect(),

@@ -43,7 +43,8 @@ const MAP_LAYERS: [Layer; 4] = [
     Layer::Route,
     Layer::RoadEdge,
 ];
-/// Speed at which the speed layer is full, metres per second.
+/// Speed at which the speed layer is full, metres per second. Source: the raster of GUMP's released
+/// code.
 const FULL_SPEED: f64 = 24.0;
 
 impl Default for RasterView {
@@ -137,7 +138,8 @@ impl RasterView {
     }
 }
 
-/// Bits behind the point of a place in texels.
+/// Bits behind the point of a place in texels: half of an `i64`, so that neither places nor the
+/// errors of a row of steps ever matter.
 const FRACTION: u32 = 32;
 
 /// A place in texels with a fixed point: one addition leads to the next pixel.
@@ -174,7 +176,7 @@ pub(crate) fn pack(pixels: &[f32], packed: &mut [u8]) {
     }
 }
 
-/// Side of a texel, metres.
+/// Side of a texel, metres: half of a pixel of the default view.
 const TEXEL: f64 = 0.75;
 /// Texels along the side of a texture: 288 m to each side of the start, farther than an episode
 /// can go and see in eight seconds at 30 m/s.

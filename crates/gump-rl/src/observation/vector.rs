@@ -55,8 +55,10 @@ impl Default for VectorView {
     }
 }
 
-/// Maximum distance of lights and of the end of the route, metres.
+/// Maximum distance of lights and of the end of the route, metres: as far as the default's points
+/// of the route reach.
 const AHEAD: f64 = 50.0;
+/// Scales of positions and speeds, as [`VectorView`] has them.
 const PLACE: f64 = 1.0 / 20.0;
 const SPEED: f64 = 1.0 / 10.0;
 
@@ -183,7 +185,8 @@ impl VectorView {
     /// Metres from `from` to the border in one direction, at most the range: walks as far as the
     /// clearance allows until that turns negative (sphere tracing).
     fn trace(&self, view: &View<'_>, from: DVec2, direction: DVec2) -> f64 {
-        /// Shortest stride, metres: along a kerb the clearance allows hardly any.
+        /// Shortest stride, metres: along a kerb the clearance allows hardly any. Bounds the error
+        /// of a ray and its time; not tuned.
         const STRIDE: f64 = 0.5;
         let mut walked = 0.0;
         let mut before: Option<(f64, f64)> = None;

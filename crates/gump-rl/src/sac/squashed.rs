@@ -6,7 +6,8 @@
 
 use std::f64::consts::{LN_2, PI};
 
-/// Farthest from 0 that an action may be before it is taken back through tanh.
+/// Farthest from 0 that an action may be before it is taken back through tanh, where the value
+/// before is 7.25: logged actions at a limit would have an infinite one.
 const EDGE: f64 = 1.0 - 1e-6;
 
 /// The distribution of one component of an action.

@@ -7,12 +7,12 @@ use super::ServerError;
 use super::frame::{self, kind};
 use crate::{
     Autoreset, BicycleLimits, DrivingEnv, Dynamics, EnvConfig, ObservationSpec, PoseLimits,
-    PreparedScenario, RasterView, Rules, Traffic, VectorEnv, VectorView,
+    PreparedScenario, RasterView, Rules, TrafficSource, VectorEnv, VectorView,
 };
 
-/// The protocol version.
+/// Version of the protocol; a client with another one is refused.
 const VERSION: u16 = 1;
-/// Bytes of a handshake.
+/// Bytes of a handshake, as the protocol states.
 const HELLO_LEN: usize = 13;
 /// A limit on rows, far above practical use and small enough not to exhaust the memory.
 const MAX_ROWS: u32 = 4096;
@@ -22,7 +22,7 @@ const MAX_ROWS: u32 = 4096;
 pub struct Connection<'a, S> {
     stream: BufReader<S>,
     prepared: &'a Arc<[PreparedScenario]>,
-    traffic: Traffic<'a>,
+    traffic: TrafficSource<'a>,
     config: EnvConfig,
 }
 
@@ -42,7 +42,7 @@ impl<'a, S: Read + Write> Connection<'a, S> {
     pub fn new(
         stream: S,
         prepared: &'a Arc<[PreparedScenario]>,
-        traffic: Traffic<'a>,
+        traffic: TrafficSource<'a>,
         config: &EnvConfig,
     ) -> Self {
         Self {

@@ -45,7 +45,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::{EnvConfig, PreparedScenario, Traffic};
+use crate::{EnvConfig, PreparedScenario, TrafficSource};
 
 pub use connection::{Connection, Farewell};
 pub use error::ServerError;
@@ -121,7 +121,7 @@ impl Server {
     pub fn run(
         &self,
         prepared: &Arc<[PreparedScenario]>,
-        traffic: Traffic<'_>,
+        traffic: TrafficSource<'_>,
         config: &EnvConfig,
         report: &(dyn Fn(Event) + Sync),
     ) -> Result<(), ServerError> {

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use gump_rl::{DrivingEnv, EnvConfig, Outcome, PreparedScenario, Traffic, VectorEnv};
+use gump_rl::{DrivingEnv, EnvConfig, Outcome, PreparedScenario, TrafficSource, VectorEnv};
 use gump_scene::{Seed, fixture};
 use gump_synthesis::{SynthesisConfig, synthesize_many};
 use rand::Rng as _;
@@ -36,7 +36,7 @@ pub(crate) fn config(n_envs: usize) -> EnvConfig {
 
 pub(crate) fn env<'w>(
     prepared: &Arc<[PreparedScenario]>,
-    traffic: Traffic<'w>,
+    traffic: TrafficSource<'w>,
     n_envs: usize,
 ) -> DrivingEnv<'w> {
     DrivingEnv::new(Arc::clone(prepared), traffic, config(n_envs)).unwrap()

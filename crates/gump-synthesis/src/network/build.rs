@@ -9,15 +9,18 @@ use crate::network::leg::{Leg, legs_of};
 use crate::network::{Connector, Junction, LaneIdx, Network, NetworkLane, Turn, signal};
 use crate::plan::{BIKE_LANE_WIDTH, Control, Plan, RoadPlan};
 
-/// Sideways acceleration that drivers accept in a bend, m/s².
+/// Sideways acceleration that drivers accept in a bend, m/s², the same as in SUMO's junctions: more
+/// makes yaw rates exceed recorded ones (docs/results/0006-factory.md).
 const COMFORTABLE_LATERAL: f64 = 2.2;
-/// Deceleration ahead of a bend, m/s².
+/// Deceleration ahead of a bend, m/s²: no more than any driver's comfortable one. Chosen by hand.
 const COMFORTABLE_BRAKING: f64 = 1.3;
-/// Turns up to this many radians count as straight on.
+/// Turns up to this many radians count as straight on: roads meet askew by up to 0.3
+/// ([`crate::layout`]), so real turns have over 1.2.
 const STRAIGHT: f64 = 0.62;
 
 impl Network {
-    /// Builds everything in the plan; `rng` decides on light phases, turning lanes and parking lots.
+    /// Builds everything in the plan; `rng` decides on light phases, turning lanes and parking
+    /// lots.
     pub(crate) fn new(plan: &Plan, rng: &mut Rng) -> Self {
         let (mut network, trimmed) = Self::roads(plan, rng);
         let n_lots = rng.random_range(0..=4);
@@ -225,6 +228,7 @@ fn links(legs: &[Leg], from: usize, lanes_for_left: usize) -> Vec<Link> {
             };
             (to, turn, angle)
         })
+        // Sharper ones are U-turns.
         .filter(|(_, _, angle)| angle.abs() < 2.4)
         .collect();
     let has = |turn| ways.iter().any(|way| way.1 == turn);

@@ -8,7 +8,8 @@ use crate::network::leg::{Leg, STOP_GAP};
 use crate::network::{Mouth, Network};
 use crate::plan::{BIKE_LANE_WIDTH, Control, Plan, RoadPlan};
 
-/// Medians narrower than this are paint, wider ones have curbs; metres.
+/// Medians narrower than this are paint, wider ones have curbs; metres. [`crate::layout`] draws up
+/// to 1 m for the former and 1.8 m or more for the latter.
 const CURBED_MEDIAN: f64 = 1.2;
 
 impl Network {

@@ -5,17 +5,17 @@ use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use crate::network::LaneIdx;
 use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 
-/// Depth of a crosswalk along the road, metres.
+/// Depth of a crosswalk along the road, metres. Chosen by hand; the Manual on Uniform Traffic
+/// Control Devices asks for at least 1.8 m.
 pub(crate) const CROSSWALK_DEPTH: f64 = 3.2;
-/// From the stop line to the crosswalk, metres.
+/// From the stop line to the crosswalk, metres; that manual asks for at least 1.2 m.
 pub(crate) const STOP_GAP: f64 = 1.3;
-/// From the crosswalk to the rounding of the curb, metres.
+/// From the crosswalk to the rounding of the curb, metres. Chosen by eye.
 const CURB_GAP: f64 = 0.5;
 
 /// One road end at a junction, seen looking away from the junction.
 #[derive(Clone, Debug)]
 pub(crate) struct Leg {
-    /// The road.
     pub(crate) road: usize,
     /// True if the road's reference starts here.
     pub(crate) at_start: bool,

@@ -10,9 +10,10 @@ use crate::curve::Track;
 use crate::network::Network;
 use crate::plan::Plan;
 
+// Dimensions of lots are common ones, chosen by eye.
 /// From the curb to the near end of the places: sidewalk, strip of green, aisle; metres.
 const SET_BACK: f64 = 7.0;
-/// Depth of a place, metres.
+/// Depth of a place, metres: vehicles that park are no longer.
 const DEPTH: f64 = 5.6;
 /// Width of the aisle between two pairs of rows, metres.
 const AISLE: f64 = 6.4;

@@ -7,7 +7,8 @@ use crate::network::leg::{CROSSWALK_DEPTH, Leg, STOP_GAP};
 use crate::network::{Crosswalk, Network, Walk};
 use crate::plan::Plan;
 
-/// Distance of a sidewalk's middle from the curb, metres.
+/// Distance of a sidewalk's middle from the curb, metres: people keep up to 1.1 m beside the
+/// middle, so half of it is left between them and the road.
 const BESIDE: f64 = 2.2;
 
 /// Distance of a crosswalk's middle from the mouth of its leg, towards the junction, metres.

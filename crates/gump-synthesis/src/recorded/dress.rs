@@ -11,6 +11,7 @@ use crate::curve::{Track, bend};
 use crate::layout::street;
 use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 
+// Distances are chosen by eye, shares fitted by hand: see the module above.
 /// Shortest road that is left on either side of a new junction, metres.
 const SHORTEST: f64 = 34.0;
 /// Metres between the sidewalks of a new road and those of the others.

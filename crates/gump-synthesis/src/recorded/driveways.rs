@@ -9,6 +9,7 @@ use crate::network::Network;
 use crate::plan::Plan;
 use crate::traffic::{Standing, draw_real_size};
 
+// Distances are chosen by eye.
 /// From the curb to the end of a driveway, behind the sidewalk, metres.
 const DEPTH: f64 = 4.6;
 /// Metres of road without driveways at its ends.

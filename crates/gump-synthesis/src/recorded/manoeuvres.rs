@@ -13,20 +13,23 @@ use crate::plan::CAR_PARK_SPEED;
 use crate::record::Recording;
 use crate::traffic::Body;
 
+// Numbers are chosen by hand; no target measures how many vehicles park.
 /// Maximum number of such vehicles in a scene.
 const MOST: usize = 5;
 /// Number of parked vehicles tried, and paths for each.
 const TRIED: usize = 40;
 const PATHS: usize = 5;
-/// Only vehicles this near to the centre of the scene are tried, metres.
+/// Only vehicles this near to the centre of the scene are tried, metres: the ego sees 79 m far.
 const REACH_M: f64 = 70.0;
-/// From the centre of a lane of a road, metres; those of car parks may be driven on.
+/// From the centre of a lane of a road, metres: half a lane, half a vehicle, and 0.4 m. Lanes of
+/// car parks may be driven on.
 const OFF_ROAD_M: f64 = 3.4;
-/// Distance kept to standing and to moving agents, metres.
+/// Distance kept to standing and to moving agents, metres. Chosen by eye.
 const ROOM_M: [f64; 2] = [0.15, 0.8];
-/// From the middle of a vehicle to its rear axle, as a share of its length.
+/// From the middle of a vehicle to its rear axle, as a share of its length: 1.46 m of 5.18 m in
+/// nuPlan's Pacifica.
 const REAR_AXLE: f64 = 0.28;
-/// Tightest turn, 1/m.
+/// Tightest turn, 1/m: a radius of 5 m, as passenger cars have.
 const CURVATURE: f64 = 0.2;
 
 /// Makes some parked vehicles leave or arrive.

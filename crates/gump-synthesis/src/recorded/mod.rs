@@ -2,8 +2,9 @@
 //!
 //! `dress` adds side roads, car parks and parking to a plan; `scenery` adds parked vehicles,
 //! standing pedestrians and crossing ones anywhere on the network; `manoeuvres` and `walkers` add
-//! motion in car parks; this module combines them. Numbers are fitted to
-//! `configs/targets/waymo-like.toml`.
+//! motion in car parks; this module combines them. Numbers and shares are fitted by hand to
+//! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
+//! measures are chosen by eye.
 
 mod dress;
 mod driveways;
@@ -24,10 +25,11 @@ use crate::network::Network;
 use crate::plan::CAR_PARK_SPEED;
 use crate::record::{Recording, Track};
 use crate::scenario::{draw_placement, frames, route, targets};
-use crate::traffic::{Demand, Traffic};
+use crate::traffic::{Demand, TrafficSimulation};
 use crate::{RoadFamily, SynthesisConfig};
 
-/// Weights of the families: recordings are made in towns, rarely on motorways.
+/// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
+/// several rounds, towards roads as fast as recorded ones.
 const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::SignalizedCrossing, 16),
     (RoadFamily::StopCrossing, 8),
@@ -39,6 +41,8 @@ const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::MidBlockCrosswalk, 8),
     (RoadFamily::Grid, 12),
 ];
+// Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
+// are chosen by hand, so that a network meets both.
 /// Share of scenes whose map states no speed limits.
 const NO_LIMITS: f64 = 0.5;
 /// Share of scenes whose map states no stop signs, though drivers comply with them.
@@ -50,9 +54,10 @@ const UNMAPPED_CAR_PARKS: f64 = 0.7;
 /// Share of these whose road edges run across the mouths of car parks and yards, as they do across
 /// driveways in recordings.
 const CLOSED_MOUTHS: f64 = 0.75;
-/// Roads with a higher limit are wide and carry more traffic, m/s.
+/// Roads with a higher limit are wide and carry more traffic, m/s. Chosen by hand.
 const WIDE_ROAD_SPEED: f64 = 15.0;
-/// Metres from the centre of the scene within which the ego is chosen.
+/// Metres from the centre of the scene within which the ego is chosen: with the
+/// 79 m that its tracker sees, this stays within the 150 m that roads reach.
 const EGO_REACH: f64 = 60.0;
 
 /// Targets of a scene with the statistics of recorded ones.
@@ -95,7 +100,7 @@ pub(crate) fn draw_scenario(
     let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
     let demand = draw_demand(config, &network, &driveways, &mut rng);
     let traffic_rng = seed.fork(attempt).fork(1).rng();
-    let mut traffic = Traffic::new(&network, demand, config.dt, traffic_rng);
+    let mut traffic = TrafficSimulation::new(&network, demand, config.dt, traffic_rng);
     for _ in 0..(config.warmup_s / config.dt).round() as usize {
         traffic.step();
     }

@@ -11,21 +11,24 @@ use crate::curve::{Track, line};
 use crate::network::{LaneIdx, Network};
 use crate::traffic::{Jaywalk, Scenery, Span, Standing, draw_person_size, draw_real_size};
 
-/// From the middle of a parking strip to the curb, metres.
+/// From the middle of a parking strip to the curb, metres: half of the strip and the gutter of
+/// [`crate::plan`].
 const STRIP_TO_CURB: f64 = 1.6;
-/// Widest vehicle that parks along a curb, and in a bay, metres.
+/// Widest vehicle that parks along a curb, and in a bay, metres: what fits into a strip of 2.4 m,
+/// and leaves 0.6 m to the next in bays of 2.75 m.
 const WIDEST: [f64; 2] = [2.3, 2.15];
-/// Longest vehicle that parks along a curb, and in a bay, metres.
+/// Longest vehicle that parks along a curb, and in a bay, metres: a van, and what fits into 5.8 m.
 const LONGEST: [f64; 2] = [7.5, 5.5];
-/// Metres of curb without parked vehicles beside a way across the road.
+/// Metres of curb without parked vehicles beside a way across the road. Chosen by eye.
 const JAYWALK_ROOM: f64 = 4.0;
-/// From the middle of a sidewalk to the curb, metres.
+/// From the middle of a sidewalk to the curb, metres: as `network/sidewalk.rs` lays them.
 const WALK_TO_CURB: f64 = 2.2;
-/// From the middle of a sidewalk to people who stand beside it, metres.
+/// From the middle of a sidewalk to people who stand beside it, metres: out of the way of those who
+/// walk. Chosen by eye.
 const BESIDE_WALK: std::ops::Range<f64> = 2.2..3.3;
-/// Share of scenes in which a vehicle has stopped in its lane.
+/// Share of scenes in which a vehicle has stopped in its lane. Chosen by hand.
 const HELD: f64 = 0.12;
-/// Parked vehicles of a scene, at most, before density.
+/// Parked vehicles of a scene, at most, before density. Fitted by hand.
 const MOST_PARKED: f64 = 190.0;
 
 /// Draws standing agents and crossing places; `bustle` from 0 to 1 sets the activity of the scene.

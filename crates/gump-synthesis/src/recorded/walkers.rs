@@ -13,15 +13,16 @@ use crate::network::Network;
 use crate::record::Recording;
 use crate::traffic::{Body, draw_person_size};
 
+// Numbers are fitted by hand, distances chosen by eye: see the module above.
 /// Maximum number of such pedestrians, or pairs of them, in a scene.
 const MOST: f64 = 16.0;
 /// Number of paths tried for each.
 const TRIED: usize = 8;
 /// Scenes with fewer parked vehicles near the centre have none.
 const LEAST_PARKED: usize = 6;
-/// Only vehicles this near to the centre of the scene are walked to, metres.
+/// Only vehicles this near to the centre of the scene are walked to, metres: the ego sees 79 m far.
 const REACH_M: f64 = 70.0;
-/// Maximum length of a walk, metres.
+/// Length of a walk, metres.
 const WAY_M: std::ops::Range<f64> = 6.0..45.0;
 /// Distances from the centre of a lane of a road, metres: beyond the first people are off the road;
 /// from the second they may stand, as at the door of a vehicle beside the lane.

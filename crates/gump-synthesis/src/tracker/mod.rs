@@ -37,7 +37,8 @@ pub struct Tracker {
 }
 
 impl Tracker {
-    /// The quality of the recordings from which `configs/targets/waymo-like.toml` was measured.
+    /// The quality of the recordings from which `configs/targets/waymo-like.toml` was measured,
+    /// fitted by hand to those distributions.
     pub fn recorded_like() -> Self {
         Self {
             range_m: Some(79.0),
@@ -102,7 +103,8 @@ pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
     scenario.objects_of_interest.retain(is_there);
 }
 
-/// Lights are visible from farther than boxes, because they face the traffic.
+/// Lights are visible from farther than boxes, because they face the traffic; a tenth is a
+/// guess.
 fn is_light_seen(light: &Light, ego: Option<gump_geometry::DVec2>, tracker: &Tracker) -> bool {
     match (light.stop_point, ego, tracker.range_m) {
         (Some(at), Some(ego), Some(range)) => at.distance(ego) < 1.1 * range,

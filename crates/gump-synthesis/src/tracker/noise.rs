@@ -6,6 +6,8 @@ use rand::Rng as _;
 
 use super::stands;
 
+// Errors, here and in `level`, are fitted by hand to `configs/targets/waymo-like.toml`; the bounds
+// keep the worst tracks plausible.
 /// Correlation time of errors of position and heading, seconds.
 const MEMORY_S: f64 = 0.6;
 /// The same for errors of velocity.

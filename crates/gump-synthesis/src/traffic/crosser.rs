@@ -8,17 +8,18 @@ use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::AgentKind;
 
 use super::vehicle::Vehicle;
-use super::{Body, Traffic};
+use super::{Body, TrafficSimulation};
 use crate::curve::Track;
 use crate::network::{LaneIdx, Network};
 
+// Chosen by hand.
 /// Seconds left between a person who has crossed a lane and the next vehicle.
 const SPARE_S: f64 = 2.0;
 /// Vehicles slower than this could start at any time: they are assumed to drive at this speed, m/s.
 const AT_LEAST: f64 = 3.0;
 /// Metres before and behind a lane in which a person is in the way.
 const IN_THE_WAY: f64 = 0.9;
-/// Change of walking speed, m/s².
+/// Change of walking speed, m/s²: that of all people here.
 const CHANGE: f64 = 1.2;
 /// Lanes of its path on which a vehicle is looked for ahead of where it is.
 const LOOK_AHEAD: usize = 5;
@@ -35,7 +36,6 @@ pub(crate) struct Jaywalk {
 /// A lane on the way.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Span {
-    /// The lane.
     pub(crate) lane: LaneIdx,
     /// Arc length on the lane, metres.
     pub(crate) at: f64,
@@ -110,7 +110,7 @@ impl Crosser {
     }
 }
 
-impl Traffic<'_> {
+impl TrafficSimulation<'_> {
     /// Moves crossing people, and puts them in the way of vehicles; after the lanes were filled.
     pub(super) fn step_crossers(&mut self) {
         let ways = std::mem::take(&mut self.demand.scenery.jaywalks);

@@ -5,17 +5,17 @@ use gump_scene::AgentKind;
 use rand::Rng as _;
 
 use super::crosser::{Crosser, Jaywalk};
-use super::driver::Driver;
+use super::driver::DriverParameters;
 use super::people::Person;
 use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size};
 use super::vehicle::Vehicle;
-use super::{Body, Traffic};
+use super::{Body, TrafficSimulation};
 use crate::network::{LaneIdx, Turn};
 use crate::plan::CAR_PARK_SPEED;
 
-/// Longest path that is planned, in lanes.
+/// Longest path that is planned, in lanes: an end for ways around a circle or a block.
 const LONGEST_PATH: usize = 40;
-/// Sideways metres that a long vehicle may sweep beside its centre line.
+/// Sideways metres that a long vehicle may sweep beside its centre line. Chosen by eye.
 const SWEEP: f64 = 0.55;
 
 /// Numbers of agents in a scene.
@@ -27,7 +27,6 @@ pub(crate) struct Demand {
     pub(crate) parked: usize,
     /// People on foot.
     pub(crate) people: usize,
-    /// Bicycles.
     pub(crate) bicycles: usize,
     /// Vehicles that want to enter, per second and entry lane.
     pub(crate) arrivals: f64,
@@ -61,12 +60,15 @@ pub(crate) struct Standing {
     pub(crate) pose: Pose,
 }
 
-/// Weight of a turn into a yard or car park relative to one into another road.
+/// Weight of a turn into a yard or car park relative to one into another road. Chosen by hand:
+/// about as many vehicles leave the road as in recordings
+/// (docs/results/0025-where-realism-is-lost.md).
 const INTO_YARDS: f64 = 0.5;
-/// From this limit on a lane of a scene like a recorded one is fully used, m/s.
+/// From this limit on a lane of a scene like a recorded one is fully used, m/s. Fitted by hand:
+/// recorded traffic drives faster than a plain draw of lanes.
 const FAST_LANE: f64 = 16.0;
 
-impl Traffic<'_> {
+impl TrafficSimulation<'_> {
     /// Fills the network once, before the first step.
     pub(super) fn populate(&mut self) {
         if self.demand.scenery.is_real {
@@ -124,7 +126,7 @@ impl Traffic<'_> {
         for (lane, s) in std::mem::take(&mut self.demand.scenery.held) {
             let size = draw_real_size(&mut self.rng);
             let size = [size[0].min(9.0), size[1], size[2]];
-            let driver = Driver::of_any_temper(&mut self.rng);
+            let driver = DriverParameters::of_any_temper(&mut self.rng);
             let path = self.plan_path(lane, size[0]);
             let id = self.new_id();
             let held = (AgentKind::Vehicle, size, driver);
@@ -273,7 +275,7 @@ impl Traffic<'_> {
         })
     }
 
-    fn draw_vehicle(&mut self, kind: AgentKind) -> ([f64; 3], Driver) {
+    fn draw_vehicle(&mut self, kind: AgentKind) -> ([f64; 3], DriverParameters) {
         let rng = &mut self.rng;
         if kind == AgentKind::Bicycle {
             let size = [
@@ -284,16 +286,16 @@ impl Traffic<'_> {
             if self.demand.scenery.is_real {
                 let size = draw_bicycle_size(rng);
                 let top_speed = rng.random_range(3.2..8.0);
-                let driver = Driver::of_bicycle(rng);
+                let driver = DriverParameters::of_bicycle(rng);
                 return (
                     size,
-                    Driver {
+                    DriverParameters {
                         top_speed,
                         ..driver
                     },
                 );
             }
-            return (size, Driver::of_bicycle(rng));
+            return (size, DriverParameters::of_bicycle(rng));
         }
         let is_real = self.demand.scenery.is_real;
         let size = if is_real {
@@ -302,11 +304,11 @@ impl Traffic<'_> {
             draw_size(rng)
         };
         let driver = if size[0] > 7.0 {
-            Driver::of_heavy_vehicle(rng)
+            DriverParameters::of_heavy_vehicle(rng)
         } else if is_real {
-            Driver::of_any_temper(rng)
+            DriverParameters::of_any_temper(rng)
         } else {
-            Driver::of_car(rng)
+            DriverParameters::of_car(rng)
         };
         (size, driver)
     }

@@ -3,7 +3,7 @@
 use gump_scene::Rng;
 use rand::Rng as _;
 
-/// Strongest deceleration of any vehicle, m/s².
+/// Strongest deceleration of any vehicle, m/s²: less than the 8 to 9 of dry tyres.
 pub(crate) const HARDEST_BRAKING: f64 = 7.0;
 
 /// The leader: the free gap to it and its speed along the follower's path.
@@ -15,9 +15,10 @@ pub(crate) struct Leader {
     pub(crate) speed: f64,
 }
 
-/// Parameters of a driver, which vary between drivers.
+/// Parameters of a driver, which vary between drivers. Their ranges are chosen by hand around the
+/// usual ones of the model.
 #[derive(Clone, Debug)]
-pub(crate) struct Driver {
+pub(crate) struct DriverParameters {
     /// Desired speed as a multiple of the limit.
     pub(crate) speed_factor: f64,
     /// Cap on the desired speed, metres per second (bicycles, heavy vehicles).
@@ -50,7 +51,7 @@ pub(crate) struct Driver {
     pub(crate) unrest: f64,
 }
 
-impl Driver {
+impl DriverParameters {
     /// A car driver.
     pub(crate) fn of_car(rng: &mut Rng) -> Self {
         Self {
@@ -194,7 +195,7 @@ mod tests {
 
     /// Drives towards an obstacle `distance` metres ahead; returns the gap left at rest and the
     /// hardest braking.
-    fn approach(driver: &Driver, speed: f64, distance: f64) -> (f64, f64) {
+    fn approach(driver: &DriverParameters, speed: f64, distance: f64) -> (f64, f64) {
         let (mut gap, mut speed, mut hardest) = (distance, speed, 0.0);
         for _ in 0..600 {
             let leader = Leader { gap, speed: 0.0 };
@@ -212,9 +213,9 @@ mod tests {
         let mut rng = Seed(1).rng();
         for _ in 0..50 {
             for driver in [
-                Driver::of_car(&mut rng),
-                Driver::of_heavy_vehicle(&mut rng),
-                Driver::of_bicycle(&mut rng),
+                DriverParameters::of_car(&mut rng),
+                DriverParameters::of_heavy_vehicle(&mut rng),
+                DriverParameters::of_bicycle(&mut rng),
             ] {
                 let (gap, hardest) = approach(&driver, 12.0, 80.0);
                 assert!(gap > 0.8 && gap < driver.standstill + 1.0, "{gap} m left");
@@ -225,7 +226,7 @@ mod tests {
 
     #[test]
     fn an_open_road_is_driven_at_the_desired_speed() {
-        let driver = Driver::of_car(&mut Seed(2).rng());
+        let driver = DriverParameters::of_car(&mut Seed(2).rng());
         let mut speed = 0.0;
         for _ in 0..600 {
             speed += driver.acceleration(speed, 10.0, None, None) * 0.1;

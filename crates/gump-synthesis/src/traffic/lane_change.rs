@@ -3,22 +3,24 @@
 use gump_scene::AgentKind;
 use rand::Rng as _;
 
-use super::Traffic;
+use super::TrafficSimulation;
 use super::driver::Leader;
 use super::vehicle::{LaneChange, Vehicle};
 use crate::network::LaneIdx;
 
-/// Shortest lane that is left after a change, metres.
+/// Shortest lane that is left after a change, metres. Chosen by hand.
 const ROOM_AFTER: f64 = 15.0;
-/// Deceleration that a change may impose on the vehicle behind, m/s².
+/// Deceleration that a change may impose on the vehicle behind, m/s²: a comfortable one. Chosen by
+/// hand.
 const IMPOSED_BRAKING: f64 = 2.0;
-/// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones.
+/// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones,
+/// which change lanes more often (docs/results/0020-learning-from-realism.md). Chosen by hand.
 const GAIN: [f64; 2] = [0.25, 0.05];
 /// Probability of a lane change without gain when a vehicle considers one: in plain scenes, and in
-/// those like recorded ones.
+/// those like recorded ones, for the same reason. Chosen by hand.
 const WHIM: [f64; 2] = [0.04, 0.7];
 
-impl Traffic<'_> {
+impl TrafficSimulation<'_> {
     /// Starts lane changes and moves over for bicycles.
     pub(super) fn choose_lanes(&mut self) {
         for i in 0..self.vehicles.len() {

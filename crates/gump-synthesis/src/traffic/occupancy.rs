@@ -6,9 +6,9 @@ use super::driver::Leader;
 use super::vehicle::Vehicle;
 use crate::network::{LaneIdx, Network};
 
-/// Metres that drivers look ahead.
+/// Metres that drivers look ahead. Chosen by hand.
 const SIGHT: f64 = 100.0;
-/// Metres between the sides of two bodies that pass each other within a lane.
+/// Metres between the sides of two bodies that pass each other within a lane. Chosen by hand.
 pub(crate) const SIDE_CLEARANCE: f64 = 0.5;
 
 /// A body, or a part of one, on a lane.
@@ -16,7 +16,6 @@ pub(crate) const SIDE_CLEARANCE: f64 = 0.5;
 pub(crate) struct Entry {
     /// Index of the vehicle.
     pub(crate) vehicle: usize,
-    /// Its id.
     pub(crate) id: i64,
     /// Arc length of its rear on this lane, metres.
     pub(crate) rear: f64,

@@ -7,9 +7,10 @@ use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
 
 use super::size::draw_person_size;
-use super::{Body, Traffic};
+use super::{Body, TrafficSimulation};
 use crate::network::Network;
 
+// Chosen by eye.
 /// Metres ahead on the walk that a person steers to.
 const CARROT: f64 = 1.6;
 /// Fastest turn of a person, radians per second.
@@ -223,7 +224,7 @@ impl Person {
     }
 }
 
-impl Traffic<'_> {
+impl TrafficSimulation<'_> {
     /// Moves all pedestrians by one step.
     pub(super) fn step_people(&mut self) {
         for i in 0..self.people.len() {

@@ -7,18 +7,19 @@
 
 use gump_scene::LightState;
 
-use super::Traffic;
+use super::TrafficSimulation;
 use super::people::Activity;
 use super::vehicle::Vehicle;
 use crate::network::{Connector, LaneIdx};
 use crate::plan::Control;
 
+// Clearances and the thresholds below are chosen by hand; tests check that boxes seldom overlap.
 /// Metres behind the last conflict at which a claim ends.
 const CLEAR: f64 = 1.0;
 /// Metres of pavement beside a vehicle's way that must be free of people.
 const PERSON_CLEARANCE: f64 = 0.9;
 
-impl Traffic<'_> {
+impl TrafficSimulation<'_> {
     /// Ends claims that are used up, then lets vehicles claim, those with priority first.
     pub(super) fn settle_claims(&mut self) {
         for i in 0..self.vehicles.len() {

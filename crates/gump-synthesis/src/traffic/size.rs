@@ -82,7 +82,8 @@ fn quantile<const N: usize>(quantiles: &Quantiles<N>, share: f64) -> f64 {
 
 /// Length, width and height of a vehicle as they are met on the road, metres.
 pub(crate) fn draw_real_size(rng: &mut Rng) -> [f64; 3] {
-    // Long vehicles are wide and high, but not strictly.
+    // Long vehicles are wide and high, but not strictly. Heights, which no target states, are
+    // chosen by hand, here and below.
     let big: f64 = rng.random_range(0.0..1.0);
     let share = |rng: &mut Rng| (big + rng.random_range(-0.22..0.22)).clamp(0.0, 0.9999);
     let width = quantile(&VEHICLE_WIDTHS, share(rng));
@@ -107,7 +108,8 @@ pub(super) fn draw_bicycle_size(rng: &mut Rng) -> [f64; 3] {
     [length, width, rng.random_range(1.6..1.9)]
 }
 
-/// Length, width and height of a vehicle, metres: mostly cars, some vans, few trucks and buses.
+/// Length, width and height of a vehicle, metres: mostly cars, some vans, few trucks and buses, in
+/// shares and sizes chosen by hand.
 pub(super) fn draw_size(rng: &mut Rng) -> [f64; 3] {
     match rng.random_range(0..100) {
         0..=86 => {

@@ -5,17 +5,19 @@ use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
 
 use super::Body;
-use super::driver::Driver;
+use super::driver::DriverParameters;
 use crate::curve::{smooth_step, smooth_step_slope};
 use crate::network::{LaneIdx, Network};
 
+// Chosen by eye, for smooth paths.
 /// Seconds in which drivers correct their place in the lane.
 const STEERING_TIME: f64 = 0.75;
 /// The same at low speed, metres.
 const STEERING_LENGTH: f64 = 5.0;
-/// Steepest change of acceleration when accelerating or easing off, m/s³.
+/// Steepest change of acceleration when accelerating or easing off, m/s³. Chosen by hand.
 const JERK: f64 = 5.0;
-/// Steepest change of acceleration when braking hard, m/s³.
+/// Steepest change of acceleration when braking hard, m/s³: full braking within a quarter of a
+/// second.
 const BRAKING_JERK: f64 = 30.0;
 
 /// A lane change in progress.
@@ -39,7 +41,7 @@ pub(crate) struct Vehicle {
     pub(crate) id: i64,
     pub(crate) kind: AgentKind,
     pub(crate) size: [f64; 3],
-    pub(crate) driver: Driver,
+    pub(crate) driver: DriverParameters,
     /// Lanes to drive, driven ones included.
     pub(crate) path: Vec<LaneIdx>,
     /// Index into `path` of the lane that the centre is on.
@@ -73,7 +75,7 @@ impl Vehicle {
     /// A vehicle at arc length `s` of the first lane of `path`.
     pub(crate) fn new(
         id: i64,
-        (kind, size, driver): (AgentKind, [f64; 3], Driver),
+        (kind, size, driver): (AgentKind, [f64; 3], DriverParameters),
         path: Vec<LaneIdx>,
         s: f64,
         speed: f64,

@@ -65,6 +65,8 @@ pub struct LossConfig {
 }
 
 impl Default for LossConfig {
+    /// Where the fields state no source, chosen by hand: lights and classes weigh what the released
+    /// code gives control tokens.
     fn default() -> Self {
         Self {
             control: 0.1,

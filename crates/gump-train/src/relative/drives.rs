@@ -27,12 +27,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 
-/// Frames that are shown as logged before the network drives.
+/// Frames that are shown as logged before the network drives: one move, so that it has seen agents
+/// move.
 const WARM_UP: usize = 2;
-/// Weight of a radian, in metres, in choosing the move nearest to the log.
+/// Weight of a radian, in metres, in choosing the move nearest to the log: about half a car's
+/// length, by which its corners move then. Chosen by hand.
 const METRES_PER_RADIAN: f64 = 2.0;
 
-/// Radius around a sample in which road edges are considered, metres.
+/// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
 const RULED: u64 = 1 << 32;
@@ -64,6 +66,8 @@ pub struct RelativeDrives {
 }
 
 impl Default for RelativeDrives {
+    /// Without a limit of 0.6 m targets ask agents to jump, and without a cut of 5 % collisions are
+    /// more frequent (docs/results/0019-relative-network.md); the others are chosen by hand.
     fn default() -> Self {
         Self {
             share: 0.5,
@@ -104,12 +108,12 @@ impl RelativeDrives {
 }
 
 /// A snapshot of the network at a step, which drives.
-pub(crate) struct Driver {
+pub(crate) struct NetworkDriver {
     engine: Engine,
     config: RelativeDrives,
 }
 
-impl Driver {
+impl NetworkDriver {
     pub(super) fn new(
         network: &RelativeNetwork,
         config: &RelativeDrives,
@@ -121,7 +125,7 @@ impl Driver {
     }
 }
 
-impl TrackDriver for Driver {
+impl TrackDriver for NetworkDriver {
     fn share(&self) -> f64 {
         self.config.share
     }
@@ -193,7 +197,7 @@ impl TrackDriver for Driver {
     }
 }
 
-impl Driver {
+impl NetworkDriver {
     /// A move of every agent in its own frame, redrawn where the rules forbid it.
     fn moves_by_the_rules(
         &self,

@@ -21,9 +21,10 @@ use serde::{Deserialize, Serialize};
 use crate::TrainError;
 use crate::scenes::with_log;
 
-/// Returns are clipped to this many standard deviations.
+/// Returns are clipped to this many standard deviations, so that rare ones do not outweigh a batch.
+/// Chosen by hand.
 const MOST: f64 = 3.0;
-/// Differences of returns smaller than this are ignored, in units of the metametric.
+/// Differences of returns smaller than this are rounding and ignored, in units of the metametric.
 const LEAST: f64 = 1e-9;
 
 /// Settings of learning from rollouts.
@@ -42,6 +43,7 @@ pub struct RelativeRewards {
 }
 
 impl Default for RelativeRewards {
+    /// Chosen by hand (docs/decisions/0018-learning-from-realism.md).
     fn default() -> Self {
         Self {
             rollouts: 8,

@@ -179,9 +179,9 @@ fn driven_agents_leave_the_log_and_learn_the_way_back() {
             candidates,
             ..RelativeDrives::default()
         };
-        drives::Driver::new(&network, &config).unwrap()
+        drives::NetworkDriver::new(&network, &config).unwrap()
     };
-    let far = |driver: Option<&drives::Driver>| {
+    let far = |driver: Option<&drives::NetworkDriver>| {
         let driver = driver.map(|driver| driver as _);
         let sample = draw(&scenario(), &SampleConfig::plain(), driver, Seed(1)).unwrap();
         let plain = draw(&scenario(), &SampleConfig::plain(), None, Seed(1)).unwrap();
@@ -213,7 +213,7 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
             ruled,
             ..RelativeDrives::default()
         };
-        let driver = drives::Driver::new(&network, &config).unwrap();
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
         draw(&alone, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap()
     };
     // Metres ahead in the step that led to a node, and in the target of the node before; the first

@@ -22,11 +22,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::relative::drives::{Driver, RelativeDrives};
+use crate::relative::drives::{NetworkDriver, RelativeDrives};
 use crate::relative::rewards::{Group, Judged, RelativeRewards};
 use crate::scenes::ScenarioSource;
 
-/// Maximum number of scenes tried for a sample.
+/// Maximum number of scenes tried for a sample: more mean that hardly any is long enough.
 const ATTEMPTS: u64 = 64;
 /// Separates the scenes to roll out from those of the samples.
 const GROUP: u64 = 1 << 40;
@@ -135,7 +135,7 @@ pub struct RelativeTrainer {
     optimizer: AdamW,
     config: RelativeTrainConfig,
     step: usize,
-    source: Arc<Source>,
+    source: Arc<BatchSource>,
     /// The network that drives the agents of samples, as of the last update.
     driving: Option<RelativeNetwork>,
     next: Receiver<Result<Batch, TrainError>>,
@@ -150,18 +150,18 @@ struct Batch {
 /// The driving network, for drives and for rewards.
 #[derive(Default)]
 struct Drivers {
-    driver: Option<Driver>,
+    driver: Option<NetworkDriver>,
     judged: Option<Judged>,
 }
 
-struct Source {
+struct BatchSource {
     scenarios: Box<dyn ScenarioSource>,
     config: SampleConfig,
     seed: Seed,
     batch: usize,
 }
 
-impl Source {
+impl BatchSource {
     fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, TrainError> {
         let group = drivers.judged.as_ref();
         let group = group.map(|judged| self.group(step, judged));
@@ -188,7 +188,11 @@ impl Source {
         ))
     }
 
-    fn samples(&self, step: usize, driver: Option<&Driver>) -> Result<Vec<Sample>, TrainError> {
+    fn samples(
+        &self,
+        step: usize,
+        driver: Option<&NetworkDriver>,
+    ) -> Result<Vec<Sample>, TrainError> {
         let seed = self.seed.fork(step as u64);
         let drawn = (0..self.batch).map(|i| {
             let seed = seed.fork(i as u64);
@@ -213,7 +217,7 @@ impl Source {
 }
 
 fn prefetch(
-    source: &Arc<Source>,
+    source: &Arc<BatchSource>,
     step: usize,
     drivers: Drivers,
 ) -> Receiver<Result<Batch, TrainError>> {
@@ -302,7 +306,7 @@ impl RelativeTrainer {
         if scenarios.is_empty() {
             return Err(TrainError::NoData { frames: 3 });
         }
-        let source = Arc::new(Source {
+        let source = Arc::new(BatchSource {
             scenarios,
             config: config.sample.clone(),
             seed: Seed(config.seed).fork(1),
@@ -504,7 +508,7 @@ fn drivers(
     config: &RelativeTrainConfig,
 ) -> Result<Drivers, TrainError> {
     let driver = driving.zip(config.closed_loop.as_ref());
-    let driver = driver.map(|(network, drives)| Driver::new(network, drives));
+    let driver = driver.map(|(network, drives)| NetworkDriver::new(network, drives));
     let judged = driving.zip(config.realism.as_ref());
     let judged = judged.map(|(network, rewards)| Judged::new(network, rewards));
     Ok(Drivers {

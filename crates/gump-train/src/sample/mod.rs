@@ -89,6 +89,8 @@ pub struct SampleConfig {
 }
 
 impl Default for SampleConfig {
+    /// The paper's values where the fields name them; the shares of hidden inputs are from
+    /// docs/decisions/0014-unknown-inputs.md, the others chosen by hand.
     fn default() -> Self {
         Self {
             frames: 5,
@@ -374,7 +376,8 @@ fn perturb_last_frame(slots: &mut [PlacedSlot], frames: &[TokenFrame], rng: &mut
     }
 }
 
-/// A pose off by up to a metre along and 0.4 m across the motion, growing with speed.
+/// A pose off by up to a metre along and 0.4 m across the motion, growing with speed up
+/// to 10 m/s. Chosen by hand.
 fn perturb(state: QuantizedState, scale: f64, rng: &mut Rng) -> QuantizedState {
     let (pose, velocity) = (state.pose(), state.velocity());
     let reach = scale * (velocity.length() * 0.1).min(1.0);

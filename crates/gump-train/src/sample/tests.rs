@@ -7,7 +7,7 @@ use gump_scene::fixture;
 
 use super::targets::{CONTROL_BEGIN, CONTROL_LIGHTS_END, CONTROL_NEWBORN};
 use super::*;
-use crate::closed_loop::Drive;
+use crate::closed_loop::DrivenScenario;
 
 fn reader() -> Reader {
     Reader {
@@ -158,7 +158,7 @@ fn a_drive_is_shown_and_the_way_back_is_asked_for() {
         });
         Frame::new(agents.collect(), Vec::new())
     };
-    let drive = Drive {
+    let drive = DrivenScenario {
         scenario: 0,
         present,
         stride,

@@ -6,15 +6,16 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario};
 use rand::Rng as _;
 
 use super::SampleConfig;
-use crate::closed_loop::Drive;
+use crate::closed_loop::DrivenScenario;
 
-/// Maximum distance of the centre from its reference pose, metres; a rollout re-centres before.
+/// Maximum distance of the centre from its reference pose, metres: with the 5 m of augmentation it
+/// stays within the grid of 100 m. A rollout re-centres before.
 const CENTRE_REACH_M: f64 = 85.0;
 
 /// A drive to present in place of the log, and the rate of the return to the log.
 #[derive(Clone, Copy)]
 pub(crate) struct Driven<'a> {
-    pub(crate) drive: &'a Drive,
+    pub(crate) drive: &'a DrivenScenario,
     /// Share of the distance from the log that may be left after a frame.
     pub(crate) slack: f64,
 }

@@ -56,6 +56,7 @@ pub struct HeatMap {
     pub draws: Vec<AgentState>,
 }
 
+// The resolution of heat maps, chosen by eye; finer ones make pages larger.
 /// Side of a cell, metres.
 pub(super) const CELL: f64 = 0.1;
 /// Width of a bar of speeds, metres per second.

@@ -11,9 +11,10 @@ use std::f64::consts::TAU;
 use gump_geometry::DVec2;
 use gump_scene::{Agent, AgentId, Frame, LaneId, LightState};
 
-/// Metres, and metres per second, per unit.
+/// Metres, and metres per second, per unit: a centimetre is less than a pixel.
 pub(super) const CENTI: f64 = 0.01;
-/// Headings per turn; a power of two, so that a full turn is a whole number of them.
+/// Headings per turn; a power of two, so that a full turn is a whole number of them. One is 0.04
+/// degrees, 2 mm at the end of a long car.
 pub(super) const HEADINGS: i64 = 8192;
 
 /// The class of a map feature, which determines how it is drawn. The page knows classes by number.

@@ -43,7 +43,7 @@ const LIGHTS: [(LightState, &str); 4] = [
     (LightState::Unknown, "unknown light"),
 ];
 
-/// Heights of lines and lights above the ground, metres.
+/// Heights of lines and lights above the ground, metres: so that neither is hidden. Chosen by eye.
 const LINE_Z: f32 = 0.02;
 const LIGHT_Z: f32 = 0.5;
 

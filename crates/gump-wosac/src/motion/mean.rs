@@ -10,7 +10,7 @@ pub struct Mean {
     n: u64,
 }
 
-/// Quanta per unit.
+/// Quanta per unit: see [`Mean`].
 const QUANTA: f64 = (1_u64 << 40) as f64;
 
 impl Mean {

@@ -94,6 +94,8 @@ struct Limits {
 }
 
 /// Faster than this at either end is not standing, metres per second.
+///
+/// Source, as of the other thresholds: the challenge's published metric code.
 const STANDING_SPEED: f32 = 2.0;
 
 impl Limits {

@@ -15,14 +15,14 @@ use super::input::{Log, N_FUTURE, N_HISTORY, N_STEPS, Rollouts, State, Track, Tr
 const NOW: usize = N_HISTORY - 1;
 
 /// All simulated agents over [`N_STEPS`].
-pub(crate) struct Traffic {
+pub(crate) struct SimulatedAgents {
     /// State of an agent at a step, agent-major.
     states: Vec<State>,
     /// The kinds of the agents.
     pub(crate) kinds: Vec<AgentKind>,
 }
 
-impl Traffic {
+impl SimulatedAgents {
     /// Number of agents.
     pub(crate) fn n_agents(&self) -> usize {
         self.kinds.len()

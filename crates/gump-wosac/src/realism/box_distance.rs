@@ -1,16 +1,18 @@
 //! Signed distances between boxes, and from each scored agent to the nearest other.
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::config::Algorithm;
 use super::input::State;
 
-/// The distance used where there is no other box.
+/// The distance used where there is no other box. Source, as of the rounding: the challenge's
+/// published metric code.
 pub(crate) const FAR: f32 = 1e10;
 
 /// Share of a box's half width that rounds its corners since 2024.
 pub(crate) const ROUNDING_2024: f32 = 0.7;
 
-/// Rounding can move a distance at world coordinates by far less than this, metres.
+/// Rounding can move a distance at world coordinates by far less than this, metres: neighbouring
+/// f32 values are a millimetre apart at 10 km.
 const MARGIN: f32 = 0.05;
 
 type Corners = [[f32; 2]; 4];
@@ -111,7 +113,7 @@ fn norm(v: [f32; 2]) -> f32 {
 
 /// Distance from one agent to the nearest other at the steps from `first`, [`FAR`] without one.
 pub(crate) fn nearest_object(
-    traffic: &Traffic,
+    simulated: &SimulatedAgents,
     agent: usize,
     first: usize,
     algorithm: Algorithm,
@@ -121,9 +123,9 @@ pub(crate) fn nearest_object(
     } else {
         ROUNDING_2024
     };
-    let own = traffic.states(agent);
-    let others = (0..traffic.n_agents()).filter(|&other| other != agent);
-    let others: Vec<_> = others.map(|other| traffic.states(other)).collect();
+    let own = simulated.states(agent);
+    let others = (0..simulated.n_agents()).filter(|&other| other != agent);
+    let others: Vec<_> = others.map(|other| simulated.states(other)).collect();
     // The last nearest is likely near again; testing it first lets the others be skipped.
     let mut hint = 0;
     let mut reaches = vec![0.0; others.len()];

@@ -2,7 +2,7 @@
 
 use gump_scene::{AgentId, AgentKind};
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::config::{Algorithm, Component};
 use super::kinematics::{Differences, kinematics};
 use super::lights::Lights;
@@ -52,9 +52,9 @@ pub(crate) struct Surroundings {
     pub(crate) lights: Option<Lights>,
 }
 
-/// Measures the `scored` agents of some traffic from step `first` on.
+/// Measures the `scored` agents of a log or a rollout from step `first` on.
 pub(crate) fn measure(
-    traffic: &Traffic,
+    simulated: &SimulatedAgents,
     ids: &[AgentId],
     scored: &[usize],
     first: usize,
@@ -64,13 +64,13 @@ pub(crate) fn measure(
     let differences = Differences::from(algorithm);
     let mut features = Features {
         agents: ids.to_vec(),
-        kinds: scored.iter().map(|&agent| traffic.kinds[agent]).collect(),
+        kinds: scored.iter().map(|&agent| simulated.kinds[agent]).collect(),
         n_steps: 0,
         values: Default::default(),
         red_light: Vec::new(),
     };
     for &agent in scored {
-        let motion = kinematics(traffic.states(agent), differences);
+        let motion = kinematics(simulated.states(agent), differences);
         let mut add = |component: Component, values: &[f32]| {
             features.values[component as usize].extend_from_slice(values);
             features.n_steps = values.len();
@@ -85,15 +85,15 @@ pub(crate) fn measure(
             Component::AngularAcceleration,
             &motion.angular_acceleration[first..],
         );
-        let distance = box_distance::nearest_object(traffic, agent, first, algorithm);
+        let distance = box_distance::nearest_object(simulated, agent, first, algorithm);
         add(Component::DistanceToNearestObject, &distance);
-        let time = following::times(traffic, agent, first, differences);
+        let time = following::times(simulated, agent, first, differences);
         add(Component::TimeToCollision, &time);
-        let edge = road_edge::outermost(traffic, agent, first, &surroundings.edges);
+        let edge = road_edge::outermost(simulated, agent, first, &surroundings.edges);
         add(Component::DistanceToRoadEdge, &edge);
         let n_steps = features.n_steps;
         features.red_light.extend(match &surroundings.lights {
-            Some(lights) => lights.violations(traffic, agent, first),
+            Some(lights) => lights.violations(simulated, agent, first),
             None => vec![false; n_steps],
         });
     }

@@ -1,10 +1,11 @@
 //! Time to collision with the vehicle ahead.
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::box_distance::FAR;
 use super::input::State;
 use super::kinematics::Differences;
 
+// All of these are from the challenge's published metric code.
 /// The maximum value, seconds.
 const MAX_TIME: f32 = 5.0;
 /// A vehicle whose heading differs by more than this is not followed: 75 degrees.
@@ -16,12 +17,14 @@ const ENOUGH_OVERLAP: f32 = 0.5;
 
 /// Seconds until agent `agent` hits the one it follows, at most 5, at the steps from `first`.
 pub(crate) fn times(
-    traffic: &Traffic,
+    simulated: &SimulatedAgents,
     agent: usize,
     first: usize,
     differences: Differences,
 ) -> Vec<f32> {
-    let tracks: Vec<_> = (0..traffic.n_agents()).map(|i| traffic.states(i)).collect();
+    let tracks: Vec<_> = (0..simulated.n_agents())
+        .map(|i| simulated.states(i))
+        .collect();
     (first..tracks[agent].len())
         .map(|step| time_to_collision(&tracks, agent, step, differences))
         .collect()

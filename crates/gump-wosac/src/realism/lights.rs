@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::blocks::{Blocks, Bounds};
 use super::input::{Log, Signal, SignalLane};
 
@@ -99,8 +99,13 @@ impl Lights {
     }
 
     /// Whether agent `agent` passes a red light at each step from `first`.
-    pub(crate) fn violations(&self, traffic: &Traffic, agent: usize, first: usize) -> Vec<bool> {
-        let states = traffic.states(agent);
+    pub(crate) fn violations(
+        &self,
+        simulated: &SimulatedAgents,
+        agent: usize,
+        first: usize,
+    ) -> Vec<bool> {
+        let states = simulated.states(agent);
         let place = |step: usize| [states[step].position[0], states[step].position[1]];
         let mut violations = vec![false; states.len() - first];
         let mut hint = 0;

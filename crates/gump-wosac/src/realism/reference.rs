@@ -7,7 +7,7 @@ use gump_scene::{AgentId, AgentKind};
 use rayon::prelude::*;
 
 use super::WosacError;
-use super::assemble::{self, Traffic};
+use super::assemble::{self, SimulatedAgents};
 use super::config::{Algorithm, Component, Config, Mode};
 use super::estimate::{Shape, log_likelihoods};
 use super::features::{Features, Surroundings, measure};
@@ -56,9 +56,9 @@ impl<'a> Reference<'a> {
         };
         let ids: Vec<AgentId> = scored.iter().map(|&i| simulated[i].id).collect();
         let first = first_step(config.mode);
-        let traffic = Traffic::logged(&simulated, config);
+        let logged = SimulatedAgents::logged(&simulated, config);
         let algorithm = config.algorithm;
-        let features = measure(&traffic, &ids, &scored, first, &surroundings, algorithm);
+        let features = measure(&logged, &ids, &scored, first, &surroundings, algorithm);
         let mut reference = Self {
             config,
             scenario: &log.scenario,
@@ -102,16 +102,16 @@ impl<'a> Reference<'a> {
         assemble::check_rollouts(self.scenario, &self.simulated, rollouts, mode)?;
         let ids = &self.features.agents;
         let measured = rollouts.futures.par_iter().map(|future| {
-            let traffic = Traffic::imagined(&self.simulated, future, mode);
+            let simulated = SimulatedAgents::imagined(&self.simulated, future, mode);
             let features = measure(
-                &traffic,
+                &simulated,
                 ids,
                 &self.scored,
                 first_step(mode),
                 &self.surroundings,
                 self.config.algorithm,
             );
-            (features, self.displacements(&traffic))
+            (features, self.displacements(&simulated))
         });
         let (imagined, displacements) = measured.unzip();
         Ok(Evaluation::new(
@@ -123,10 +123,10 @@ impl<'a> Reference<'a> {
     }
 
     /// Mean distance of each scored agent from its log, metres.
-    fn displacements(&self, traffic: &Traffic) -> Vec<f32> {
+    fn displacements(&self, simulated: &SimulatedAgents) -> Vec<f32> {
         let of = |&agent: &usize| {
             let (mut sum, mut n) = (0.0f32, 0.0f32);
-            let pairs = traffic
+            let pairs = simulated
                 .states(agent)
                 .iter()
                 .zip(&self.simulated[agent].states);

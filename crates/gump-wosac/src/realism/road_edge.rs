@@ -1,12 +1,13 @@
 //! Signed distance to the road edge: negative on the road, positive off it.
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::blocks::{Blocks, Bounds};
 use super::box_distance::{FAR, box_corners};
 use super::config::Algorithm;
 use super::input::State;
 
 /// Factor of height differences relative to distances on the ground, since 2024: for bridges.
+/// Source, as of the ring: the challenge's published metric code.
 const ELEVATION_STRETCH: f32 = 3.0;
 
 /// A polyline whose ends are within this is a ring, metres squared.
@@ -243,14 +244,14 @@ fn push(segments: &mut Vec<Segment>, edge: &[[f32; 3]], closed: bool) {
 /// Distance of the outermost bottom corner of one agent at the steps from `first`, metres; -[`FAR`]
 /// where it is not valid.
 pub(crate) fn outermost(
-    traffic: &Traffic,
+    simulated: &SimulatedAgents,
     agent: usize,
     first: usize,
     edges: &RoadEdges,
 ) -> Vec<f32> {
     // Each corner has its own hints: it moves little from step to step.
     let mut hints: [Vec<usize>; 4] = Default::default();
-    let states = &traffic.states(agent)[first..];
+    let states = &simulated.states(agent)[first..];
     let outermost = |state: &State| {
         if !state.valid {
             return -FAR;

@@ -5,7 +5,7 @@ use std::io::Read as _;
 use gump_scene::{AgentId, AgentKind};
 use serde_json::Value;
 
-use super::assemble::Traffic;
+use super::assemble::SimulatedAgents;
 use super::box_distance::{ROUNDING_2024, signed_box_distance};
 use super::estimate::Histogram;
 use super::following::time_to_collision;
@@ -222,9 +222,9 @@ fn red_light_violations_are_the_references() {
     let lights = Lights::new(&log).unwrap();
     let config = Config::of(Year::Y2025);
     let simulated: Vec<&Track> = log.tracks.iter().collect();
-    let traffic = Traffic::logged(&simulated, &config);
+    let logged = SimulatedAgents::logged(&simulated, &config);
     for agent in 0..x.len() {
-        let found = lights.violations(&traffic, agent, 0);
+        let found = lights.violations(&logged, agent, 0);
         assert_eq!(found[..n], bits(&golden["violation"][agent]));
     }
     // The reference numbers lanes by index and segments within their padded lane.

@@ -27,7 +27,7 @@ use crate::shipped;
 
 /// Training configuration of the laptop model.
 pub(super) const CONFIG: &str = include_str!("../../../../configs/tiny.toml");
-/// Width of an attention head.
+/// Width of an attention head: that of `tiny`.
 const HEAD: usize = 32;
 
 /// Arguments shared by ablations that train networks: data, steps and evaluation.

@@ -395,7 +395,8 @@ fn measure(
     })
 }
 
-/// Measurements of each implementation, alternating; the median is reported.
+/// Measurements of each implementation, alternating; the median is reported. The fewest that have
+/// one.
 const ROUNDS: usize = 3;
 
 /// Products per measurement: half a second of work, for a clock of hundredths.

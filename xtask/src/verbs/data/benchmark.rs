@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_eval::benchmarks::{
-    BenchmarkList, DrawRule, ListDraw, MadePart, freeze, make, verify_made, verify_recorded,
+    BenchmarkList, DrawRule, GeneratedPart, ListDraw, freeze, make, verify_generated,
+    verify_recorded,
 };
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -55,9 +56,9 @@ impl Args {
         }
         let mut rows: Vec<Value> = Vec::new();
         let folder = self.check.clone().unwrap_or_else(|| run.out().to_owned());
-        for i in 0..list.made.len() {
-            let part = &list.made[i];
-            let row = |part: &MadePart, state: &str| {
+        for i in 0..list.generated.len() {
+            let part = &list.generated[i];
+            let row = |part: &GeneratedPart, state: &str| {
                 json!({
                     "part": part.file,
                     "split": part.split,
@@ -68,7 +69,9 @@ impl Args {
                 })
             };
             if self.check.is_some() {
-                run.phase("check", |_| Ok(verify_made(&list, part, &folder, &Unseen)?))?;
+                run.phase("check", |_| {
+                    Ok(verify_generated(&list, part, &folder, &Unseen)?)
+                })?;
                 rows.push(row(part, "as listed"));
                 continue;
             }
@@ -77,7 +80,7 @@ impl Args {
                 let scenes =
                     run.phase(&part.file, |_| Ok(freeze(&list, part, &folder, &progress)?))?;
                 rows.push(row(part, "frozen"));
-                list.made[i].scenes = scenes;
+                list.generated[i].scenes = scenes;
                 continue;
             }
             let is_new = run.phase(&part.file, |_| Ok(make(&list, part, &folder, &progress)?))?;
@@ -141,7 +144,7 @@ impl Args {
             file.write_all(text.as_bytes())
                 .with_context(|| format!("cannot write {}", into.display()))
         })?;
-        let made = drawn.made.iter().map(|part| {
+        let generated = drawn.generated.iter().map(|part| {
             json!({
                 "part": part.file,
                 "split": part.split,
@@ -153,7 +156,7 @@ impl Args {
             |part| json!({ "part": part.folder, "split": part.split, "scenes": part.scenes.len() }),
         );
         run.result("list", &drawn.name)?;
-        run.result("rows", made.chain(recorded).collect::<Vec<Value>>())
+        run.result("rows", generated.chain(recorded).collect::<Vec<Value>>())
     }
 
     /// The list with its new sums under the comment that it begins with.

@@ -224,7 +224,7 @@ impl Args {
     }
 }
 
-/// Number of refused records printed on the terminal; the report has all.
+/// Number of refused records printed on the terminal; the report has all. Chosen by hand.
 const MOST_PRINTED: usize = 10;
 
 fn lock(ledger: &Mutex<Conversion>) -> std::sync::MutexGuard<'_, Conversion> {

@@ -16,16 +16,19 @@ use serde::Serialize;
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
 
-/// Files to spread scenes over; fewer if there are fewer scenes.
+/// Files to spread scenes over, for readers with several threads; fewer if there are fewer scenes.
+/// Chosen by hand.
 const SHARDS: usize = 8;
-/// Procedural scenes made together, by all threads, before they are written.
+/// Procedural scenes made together, by all threads, before they are written. Chosen by hand; they
+/// are held in memory until then.
 const AT_A_TIME: usize = 64;
 /// Scenes of SUMO per file at most, where the number of files is not given: they are held in
-/// memory until their file is written.
+/// memory until their file is written. Chosen by hand.
 const SHARD_SCENES: usize = 200;
-/// Scenes that a run of SUMO gives at least, as a rule.
+/// Scenes that a run of SUMO gives at least, as a rule (docs/results/0006-factory.md: 200 scenes of
+/// 17 runs).
 const RUN_SCENES: u64 = 12;
-/// So many runs without a scene mean that there will be none.
+/// So many runs without a scene mean that there will be none. Chosen by hand.
 const BARREN_RUNS: u64 = 8;
 
 /// Arguments of `data synthesize`.

@@ -19,13 +19,13 @@ use crate::table::decimal;
 use crate::verbs::explain;
 use crate::{films, futures, shipped};
 
-/// Futures per world.
+/// Futures per world: as many as the challenge asks for.
 const FUTURES: usize = 32;
-/// Length of the futures, seconds.
+/// Length of the futures, seconds: the horizon of the challenge.
 pub(super) const SECONDS: f64 = 8.0;
-/// Futures per proposal of the planner.
+/// Futures per proposal of the planner: half of the paper's, so that the demo stays short.
 const PLANNED: usize = 2;
-/// Candidates of the planner on the page; the viewer has all.
+/// Candidates of the planner on the page; the viewer has all. Chosen by eye.
 const LISTED: usize = 5;
 
 pub(super) fn worlds(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {

@@ -12,9 +12,9 @@ use crate::shipped;
 
 /// Steps a new network takes: enough to see the loss fall, few enough for a demo.
 const STEPS: usize = 16;
-/// Samples per step.
+/// Samples per step: few, for the same reason.
 const BATCH: usize = 2;
-/// Scenarios the loss is measured on, none of them trained on.
+/// Scenarios the loss is measured on, none of them trained on; few, for the same reason.
 const VALIDATED: usize = 4;
 
 /// Parts of the network by the names of their parameters.

@@ -22,7 +22,7 @@ const SHOWN: [Layer; 6] = [
     Layer::RoadEdge,
 ];
 
-/// Lines of the token listing on the page.
+/// Lines of the token listing on the page. Chosen by eye.
 const LISTED: usize = 16;
 
 pub(super) fn read(demo: &mut Demo, _: &mut Run) -> anyhow::Result<Value> {

@@ -16,12 +16,13 @@ use crate::{films, shipped};
 
 /// Prompt of the generated scene.
 const PROMPT: &str = "near_multiple_vehicles";
+/// Agents of the generated scene: so many that the prompt can hold. Chosen by hand.
 const COUNTS: Counts = Counts {
     vehicles: 14,
     pedestrians: 4,
     bicycles: 2,
 };
-/// Length of its future in the learned world, seconds.
+/// Length of its future in the learned world, seconds. Chosen by hand, like the next.
 const SECONDS: f64 = 6.0;
 /// Attempts before a scene that misses the prompt is shown.
 const ATTEMPTS: usize = 20;
@@ -48,9 +49,9 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         seconds: SECONDS,
         attempts: ATTEMPTS,
     };
-    let mut made = make_many(worlds, &order, 0..1, run.seed())?;
-    let made = made.remove(0)?;
-    let scene = &made.scenario;
+    let mut checked = make_many(worlds, &order, 0..1, run.seed())?;
+    let checked = checked.remove(0)?;
+    let scene = &checked.scenario;
     let spec = PictureSpec {
         legend: true,
         ..PictureSpec::new(Camera::on_ego(&scene.present(), 100.0, 960, 640))
@@ -63,7 +64,7 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
     };
     let film = films::film(&alone, &[("generated", &log_as_rollout(scene))])?;
     film.save(&run.path("generated.gif"))?;
-    let table: Vec<Vec<String>> = made
+    let table: Vec<Vec<String>> = checked
         .clauses
         .iter()
         .map(|clause| {
@@ -88,9 +89,9 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         .link("generated.gif", "Play the rollout in the learned world");
     Ok(json!({
         "agents": present.now().agents().len(),
-        "attempts": made.attempts,
+        "attempts": checked.attempts,
         "overlaps": overlaps(scene),
         "offroad": off_road(scene),
-        "holds": made.holds(),
+        "holds": checked.holds(),
     }))
 }

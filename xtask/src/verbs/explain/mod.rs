@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 pub(crate) use self::reasons::weight;
 use crate::run::Run;
 
-/// Number of agents to describe, those nearest to the ego.
+/// Number of agents to describe, those nearest to the ego. Chosen by hand: what fits a page.
 const OTHERS: usize = 8;
 
 /// A decision made in the present of a scenario, which need not have a future.

@@ -6,6 +6,7 @@ use gump_scene::{Agent, Rollout};
 use super::{Deed, deed};
 use crate::table::decimal;
 
+// Chosen by hand, so that sentences tell differences that a reader would see.
 /// Ends nearer than this are the same place, metres.
 const SAME_PLACE: f64 = 2.0;
 /// Parts of a score that differ by less are equal.
@@ -46,7 +47,7 @@ pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
 }
 
 /// Weight of a decision: the margin of the chosen candidate over the ordinary driver, plus a tenth
-/// of its margin over the best rejected candidate.
+/// of its margin over the best rejected candidate. The tenth is chosen by hand.
 pub(crate) fn weight(decision: &Decision) -> f64 {
     let chosen = decision.candidates[decision.chosen].value;
     let margin = |other: Option<usize>| {

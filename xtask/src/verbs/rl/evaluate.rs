@@ -23,7 +23,8 @@ use crate::sharding::shard;
 /// Name of the benchmark in stores of results.
 pub(crate) const BENCHMARK: &str = "rl";
 
-/// Scenarios that are driven before their results are stored.
+/// Scenarios that are driven before their results are stored: what an interruption costs. Chosen by
+/// hand.
 const SCENARIOS_PER_ROUND: usize = 32;
 
 /// Arguments of `rl evaluate`.

@@ -19,7 +19,7 @@ use gump_eval::worlds::{World, WorldName};
 use gump_model::Device;
 use gump_rl::networks::Architecture;
 use gump_rl::sac::SacConfig;
-use gump_rl::{Autoreset, EnvConfig, PreparedScenario, Traffic};
+use gump_rl::{Autoreset, EnvConfig, PreparedScenario, TrafficSource};
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
@@ -111,10 +111,10 @@ impl RlWorld {
         })
     }
 
-    fn traffic(&self) -> Traffic<'_> {
+    fn traffic(&self) -> TrafficSource<'_> {
         match self {
-            Self::Log => Traffic::Log,
-            Self::Imagined(world) => Traffic::World(world.model()),
+            Self::Log => TrafficSource::Log,
+            Self::Imagined(world) => TrafficSource::World(world.model()),
         }
     }
 }

@@ -22,7 +22,7 @@ use crate::sampling::Sampling;
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
-/// Points of the curves per segment.
+/// Points of the curves per segment. Chosen by eye.
 const POINTS_PER_SEGMENT: usize = 10;
 
 /// Arguments of `rl train`.

@@ -29,7 +29,7 @@ pub(crate) struct Args {
     scenarios: PathBuf,
     #[command(flatten)]
     #[serde(flatten)]
-    source: Source,
+    source: RolloutArgs,
     #[command(flatten)]
     #[serde(flatten)]
     maker: Maker,
@@ -44,7 +44,7 @@ pub(crate) struct Args {
 /// Source of the rollouts.
 #[derive(Debug, Serialize, clap::Args)]
 #[group(required = true, multiple = false)]
-struct Source {
+struct RolloutArgs {
     /// A file of `ScenarioRollouts`, or a folder of such files
     #[arg(long, value_name = "PATH")]
     rollouts: Option<PathBuf>,

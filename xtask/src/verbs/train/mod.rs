@@ -31,11 +31,12 @@ use crate::run::{self, Common, Run};
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
-/// Validations in a run, evenly spread.
+/// Validations in a run, evenly spread: enough for a curve. Chosen by hand.
 const VALIDATIONS: usize = 10;
-/// Validation samples, at most.
+/// Validation samples, at most: each validation has to be quick beside training. Chosen by hand.
 const VALIDATION_SAMPLES: usize = 64;
-/// Steps over which the first and the last loss are averaged.
+/// Steps over which the first and the last loss are averaged, against the noise of batches. Chosen
+/// by hand.
 const WINDOW: usize = 20;
 
 /// Files that a stage writes.

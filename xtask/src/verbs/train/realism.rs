@@ -7,7 +7,8 @@ use gump_wosac::realism::{Config, Log, Reference, Rollouts, Scores, Year};
 
 use crate::run::stop_if_interrupted;
 
-/// Maximum number of simulated scenes: the evaluation between two steps has to be quick.
+/// Maximum number of simulated scenes: the evaluation between two steps has to be quick. Chosen by
+/// hand.
 const SCENES: usize = 8;
 /// Seconds that the challenge requires.
 const HORIZON_S: f64 = 8.0;

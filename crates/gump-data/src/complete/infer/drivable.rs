@@ -9,7 +9,8 @@ use gump_scene::{AreaKind, Lane, MapParts};
 
 use crate::ReadReport;
 
-/// Maximum deviation of a lane's outline from its offset centre line, metres.
+/// Maximum deviation of a lane's outline from its offset centre line, metres: less than
+/// [`OVERLAP`], for fewer corners.
 const TOLERANCE: f64 = 0.05;
 /// Metres between two cross sections at most: road edges bend where lanes are straight.
 const SPACING: f64 = 4.0;
@@ -21,7 +22,8 @@ const MAX_SECTIONS: f64 = 1000.0;
 const MAX_SHOULDER: f64 = 3.0;
 /// Overlap of neighbouring surfaces, metres, so that errors of estimated widths leave no gaps.
 const OVERLAP: f64 = 0.1;
-/// Edges further above or below the lane than this belong to another level.
+/// Edges further above or below the lane than this belong to another level, metres: a vehicle must
+/// fit between two.
 const MAX_STEP: f64 = 2.5;
 
 /// Adds a surface for every lane that has length, and for every driveway.

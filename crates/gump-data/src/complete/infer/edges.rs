@@ -12,11 +12,12 @@ use crate::ReadReport;
 /// Distance outside a surface at which other surfaces are looked up, metres: gaps are narrower,
 /// medians wider.
 const OUTSIDE: f64 = 0.4;
-/// Pieces are at most this long, metres.
+/// Pieces are at most this long, metres: the resolution of a border, finer than a lane is wide.
 const PIECE: f64 = 2.0;
 /// At most so many pieces of one side: a damaged file may claim surfaces around the world.
 const MAX_PIECES: f64 = 500.0;
-/// A lane this near that runs across (sine of 45 degrees) leads over the border, metres.
+/// A lane this near that runs across (sine of 45 degrees) leads over the border, metres: as far as
+/// half a piece reaches. Chosen by hand.
 const ACROSS: f64 = 1.0;
 const MIN_SINE: f64 = 0.7;
 /// Inferred features are numbered from here, far beyond the ids of any known format.

@@ -14,6 +14,7 @@ use crate::ReadReport;
 /// Tolerance of simplified centre lines, metres; a tenth of the narrowest lane.
 const TOLERANCE: f64 = 0.15;
 /// Lines that meet at less than this angle (sine of 15 degrees) run together rather than cross.
+/// Chosen by hand.
 const MIN_SINE: f64 = 0.26;
 /// Roads further apart than this in height pass over each other; a vehicle with a load must fit
 /// between them, so real overpasses leave more.

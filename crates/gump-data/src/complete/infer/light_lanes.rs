@@ -5,7 +5,8 @@ use gump_scene::{LaneId, Light, MapGraph};
 
 use crate::ReadReport;
 
-/// A controlled lane starts this near to where vehicles stop, metres.
+/// A controlled lane starts this near to where vehicles stop, metres: lines lie before the
+/// crosswalk, lanes may begin behind it. Chosen by hand.
 const MAX_DISTANCE: f64 = 6.0;
 
 /// Attaches lights whose lane is not in the map to the lane that starts nearest to them.

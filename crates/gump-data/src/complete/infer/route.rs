@@ -10,6 +10,8 @@
 use gump_geometry::{DVec2, Polyline, Pose, SegmentIndex, angle_difference};
 use gump_scene::{Lane, LaneId, MapGraph, Route, Scenario};
 
+// Chosen by hand. What matters is the order of costs: a sample half a lane beside the centre costs
+// less than a change of lane, and that far less than a gap in the graph.
 /// Metres the ego moves between two samples.
 const SPACING: f64 = 2.0;
 /// Lanes further away than this are not driven on, metres.

@@ -8,6 +8,8 @@ use gump_scene::{Lane, MapParts};
 
 use crate::ReadReport;
 
+// Chosen by hand; the test below counts how many of the lanes that signs of Waymo's maps state are
+// found.
 /// A ruled lane begins at most so far before or behind the sign, metres.
 const MAX_ALONG: f64 = 3.0;
 /// And at most so far to a side.

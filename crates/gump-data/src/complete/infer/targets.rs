@@ -6,7 +6,7 @@ use gump_scene::{AgentId, Frame};
 
 /// Maximum number of targets, as in Waymo's benchmark.
 const MAX_TARGETS: usize = 8;
-/// Maximum distance of targets from the ego, metres.
+/// Maximum distance of targets from the ego, metres. Chosen by hand.
 const RANGE: f64 = 60.0;
 
 /// The moving agents nearest to the ego that are present for at least half of the future, including

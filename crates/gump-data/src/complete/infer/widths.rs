@@ -12,9 +12,10 @@ use gump_scene::{Lane, LaneId, LaneKind, MapParts};
 
 use crate::ReadReport;
 
-/// Maximum distance of a bound from the centre, metres; beyond it the lane has none on that side.
+/// Maximum distance of a bound from the centre, metres; beyond it the lane has none on that side:
+/// half of the widest lane, and a metre.
 const MAX_REACH: f64 = 4.0;
-/// Metres between two measurements along a lane.
+/// Metres between two measurements along a lane; their median counts, so more change little.
 const SPACING: f64 = 5.0;
 /// At most so many measurements per lane: a damaged file may claim lanes around the world.
 const MAX_MEASUREMENTS: f64 = 200.0;
@@ -108,7 +109,7 @@ fn width(lane: &Lane, neighbors: &[Vec<&Lane>; 2], bounds: &Bounds) -> Option<f6
     (!widths.is_empty()).then(|| widths[widths.len() / 2])
 }
 
-/// Wider or narrower than any lane means that something else was measured.
+/// Wider or narrower than any lane means that something else was measured. Bounds by hand.
 fn plausible(kind: LaneKind, width: f64) -> bool {
     let least = if kind == LaneKind::BikeLane { 1.0 } else { 2.2 };
     (least..=6.0).contains(&width)

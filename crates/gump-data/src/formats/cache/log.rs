@@ -16,7 +16,8 @@ use super::map;
 use crate::DataError;
 use crate::complete::recording::MAX_STEPS;
 
-/// The most lights over all frames. A run of equal lights takes little room for each.
+/// The most lights over all frames, far more than any log has. A run of equal lights takes little
+/// room for each, so a damaged file could ask for any amount of memory.
 const MAX_LIGHTS: usize = 1 << 24;
 
 const AGENT_KINDS: [AgentKind; 7] = [

@@ -26,7 +26,7 @@ use std::sync::Arc;
 use gump_scene::Scenario;
 
 use crate::io::files;
-use crate::source::{BoxedSource, Format, Source};
+use crate::source::{BoxedSource, Format, RecordSource};
 use crate::{DataError, ReadOptions, ReadReport, ScenarioRecord};
 use shard::{MAGIC, Shard};
 
@@ -132,7 +132,7 @@ struct Records {
     next: usize,
 }
 
-impl Source for Records {
+impl RecordSource for Records {
     fn skip(&mut self) -> Option<Result<(), DataError>> {
         let more = self.next < self.shard.records.len();
         self.next += usize::from(more);

@@ -19,7 +19,7 @@ use gump_scene::Scenario;
 use super::bytes::{Damage, Decoded, Decoder, Encoder};
 use super::log;
 use crate::io::stream::io_error;
-use crate::{DataError, Place, write_atomically};
+use crate::{DataError, RecordLocation, write_atomically};
 
 /// The first bytes of every shard.
 pub(super) const MAGIC: &[u8; 8] = b"GUMPDATA";
@@ -195,7 +195,7 @@ impl Shard {
         let entry = &self.records[record];
         let path = self.path.as_path();
         let bytes = read_at(&mut open_file(path)?, entry.offset, entry.length, path)?;
-        let place = || Place {
+        let place = || RecordLocation {
             record,
             offset: entry.offset,
             path: path.into(),

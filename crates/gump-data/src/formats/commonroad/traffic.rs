@@ -12,7 +12,8 @@ use crate::complete::recording::{MAX_STEPS, Recording};
 use crate::complete::track::{self, State, Track, UNSTATED};
 use crate::io::xml::Element;
 
-/// An obstacle this near to the planning problem's start, metres, is its vehicle.
+/// An obstacle this near to the planning problem's start, metres, is its vehicle: two would
+/// overlap.
 const SAME_PLACE: f64 = 0.5;
 
 /// Everything that moves or changes.

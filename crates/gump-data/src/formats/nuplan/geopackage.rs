@@ -138,7 +138,6 @@ impl<T> Feature<T> {
         }
     }
 
-    /// All its polygons.
     pub(super) fn polygons(&self) -> &[Polygon] {
         match &self.shape {
             PlaneShape::Polygons(polygons) => polygons,

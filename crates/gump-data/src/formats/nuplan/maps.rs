@@ -31,7 +31,8 @@ const PUBLISHED: [(&str, &str); 4] = [
     ("us-pa-pittsburgh-hazelwood", "9.17.1937"),
 ];
 
-/// Number of folders searched for maps, from that of the log upwards.
+/// Number of folders searched for maps, from that of the log upwards: nuPlan's own layout needs
+/// four.
 const MAX_LEVELS: usize = 6;
 
 /// Finds the map of a log.
@@ -176,7 +177,8 @@ impl Maps {
     }
 }
 
-/// A log further from every lane than this is elsewhere, metres.
+/// A log further from every lane than this is elsewhere, metres: far less than cities are apart,
+/// far more than a car park is from a road.
 const MAX_DISTANCE: f64 = 2000.0;
 
 fn check_place(log: &Log, map: &CityMap, path: &Path) -> Result<(), DataError> {

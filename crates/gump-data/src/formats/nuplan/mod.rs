@@ -44,8 +44,8 @@ mod wkb;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::source::{BoxedSource, Companion, Format, Source};
-use crate::{DataError, Place, ReadOptions, ReadReport, ScenarioRecord};
+use crate::source::{BoxedSource, Companion, Format, RecordSource};
+use crate::{DataError, ReadOptions, ReadReport, RecordLocation, ScenarioRecord};
 
 pub use filter::{CHALLENGE_TYPES, ParseSplitError, ScenarioFilter, Selected, Split};
 pub use log::{Census, Event, Log, LogBox, LogRow};
@@ -135,7 +135,7 @@ impl Scenarios {
         let (scenario, mut report) = converted.map_err(|problem| DataError::Scenario {
             id: event.token.to_string(),
             problem,
-            place: Place {
+            place: RecordLocation {
                 record,
                 offset: 0,
                 path: self.path.to_path_buf(),
@@ -153,7 +153,7 @@ impl Scenarios {
     }
 }
 
-impl Source for Scenarios {
+impl RecordSource for Scenarios {
     fn skip(&mut self) -> Option<Result<(), DataError>> {
         self.events.next().map(|_| Ok(()))
     }

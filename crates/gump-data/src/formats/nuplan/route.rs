@@ -10,6 +10,7 @@ use super::log::unexpected;
 use crate::complete::infer;
 use crate::{Problem, ReadOptions, ReadReport};
 
+// Chosen by hand: the ego may stand beside the road, or across, as when it leaves a parking place.
 /// A lane of the route further away than this is not where the ego starts, metres.
 const MAX_DISTANCE: f64 = 8.0;
 /// Nor is one that points elsewhere, radians.

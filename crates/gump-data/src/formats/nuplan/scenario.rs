@@ -16,7 +16,7 @@ use gump_scene::{
 use super::log::{Event, Log, LogBox, LogRow, unexpected};
 use super::{Token, route};
 use crate::error::MAX_COORDINATE;
-use crate::{DataError, Place, Problem, ReadOptions, ReadReport};
+use crate::{DataError, Problem, ReadOptions, ReadReport, RecordLocation};
 
 /// The ego's id; tracks count from 1.
 pub const EGO: AgentId = AgentId(0);
@@ -233,7 +233,7 @@ fn scenario_error(log: &Log, token: Token, problem: Problem) -> DataError {
     DataError::Scenario {
         id: token.to_string(),
         problem,
-        place: Place {
+        place: RecordLocation {
             record: 0,
             offset: 0,
             path: log.path().into(),

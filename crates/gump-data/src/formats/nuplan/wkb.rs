@@ -7,7 +7,6 @@
 /// A shape in the plane; further dimensions are left out.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Shape {
-    /// Points.
     Points(Vec<[f64; 2]>),
     /// Lines, each of any number of points.
     Lines(Vec<Vec<[f64; 2]>>),

@@ -11,7 +11,7 @@ use super::xml::{Element, Xml};
 use crate::error::MAX_COORDINATE;
 use crate::{DataError, ReadReport};
 
-/// At most so many bodies at once: a damaged file must not fill the memory.
+/// At most so many bodies at once: a damaged file must not fill the memory. Chosen by hand.
 const MAX_BODIES: usize = 200_000;
 
 /// All bodies at one time.

@@ -26,7 +26,7 @@ use std::sync::Arc;
 use crate::complete::recording::{Recording, assemble};
 use crate::io::stream::{self, io_error};
 use crate::source::{BoxedSource, Format};
-use crate::{DataError, Place, ReadOptions};
+use crate::{DataError, ReadOptions, RecordLocation};
 use floating_cars::FloatingCars;
 use gump_scene::Scenario;
 use signals::Signals;
@@ -47,6 +47,7 @@ pub(crate) const FORMAT: Format = Format {
 pub(crate) const NETWORK: &str = "SUMO network";
 
 /// Number of bytes from the start of a file that identify its kind; SUMO writes its options first.
+/// Chosen by hand.
 const HEAD_BYTES: u64 = 16 * 1024;
 
 /// Files of a folder by what they hold.
@@ -127,7 +128,7 @@ pub(crate) fn map_alone(path: &Path, options: ReadOptions) -> Result<Scenario, D
     scenario.map_err(|problem| DataError::Scenario {
         id,
         problem,
-        place: Place {
+        place: RecordLocation {
             record: 0,
             offset: 0,
             path: path.into(),

@@ -20,7 +20,7 @@ const SPACING: f64 = 3.0;
 /// Roads at least this fast without a stated type are grade-separated, metres per second
 /// (90 km/h: streets with junctions are slower).
 const FREEWAY_SPEED: f64 = 25.0;
-/// Height of a stop sign, metres.
+/// Height of a stop sign, metres: a usual one.
 const SIGN_HEIGHT: f64 = 2.0;
 
 /// A converted network, from which maps of scenarios are cut.

@@ -13,9 +13,10 @@ use super::roads::Roads;
 use super::signals::Signals;
 use crate::complete::infer;
 use crate::record::OVERLAP_TOLERANCE;
-use crate::source::Source;
-use crate::{DataError, Place, Problem, ReadOptions, ScenarioRecord};
+use crate::source::RecordSource;
+use crate::{DataError, Problem, ReadOptions, RecordLocation, ScenarioRecord};
 
+// Chosen by hand, here and in [`CutOptions::standard`] where it names no source.
 /// Metres around a vehicle in which others make it an interesting ego.
 const INTEREST_RANGE: f64 = 50.0;
 /// More neighbours than this make no ego more interesting.
@@ -252,7 +253,7 @@ impl Scenes {
         let problem = |problem: Problem| DataError::Scenario {
             id: id.to_owned(),
             problem,
-            place: Place {
+            place: RecordLocation {
                 record: self.n_windows as usize - 1,
                 offset: self.cars.offset(),
                 path: self.path.to_path_buf(),
@@ -334,7 +335,7 @@ impl Scenes {
     }
 }
 
-impl Source for Scenes {
+impl RecordSource for Scenes {
     fn next_wanted(
         &mut self,
         wanted: &mut dyn FnMut(&str) -> bool,

@@ -11,7 +11,7 @@ const PIECE: f64 = 0.5;
 /// Distance beyond a line at which surfaces are looked up, metres: narrower gaps between surfaces
 /// that were drawn side by side are no border.
 const BEYOND: f64 = 0.4;
-/// Stretches shorter than this are left over from joints, metres.
+/// Stretches shorter than this are left over from joints, metres: two pieces.
 const SHORTEST: f64 = 1.0;
 
 /// Surfaces with a look-up by place.

@@ -16,6 +16,7 @@ const EARTH: f64 = 6_378_137.0;
 const METERS_PER_SECOND_IN_KMH: f64 = 1.0 / 3.6;
 
 /// The most points of all bounds together: lanelets share ways, so a small file can ask for many.
+/// These take a hundred megabytes.
 const MAX_POINTS: usize = 4_000_000;
 
 /// A way: its nodes in order.

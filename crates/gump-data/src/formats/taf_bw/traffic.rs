@@ -9,7 +9,8 @@ use crate::complete::recording::{MAX_STEPS, Recording};
 use crate::complete::track::{self, State, Track, UNSTATED};
 use crate::{Problem, ReadReport};
 
-/// A time stamp may stray from the nearest step by this fraction of one.
+/// A time stamp may stray from the nearest step by this fraction of one: rounding, not another
+/// rate.
 const TIME_TOLERANCE: f64 = 0.1;
 
 /// True for a table of tracks.

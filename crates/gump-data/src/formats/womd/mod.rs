@@ -12,7 +12,7 @@ use prost::Message;
 
 use crate::io::stream::Stream;
 use crate::io::tfrecord::{self, TfRecordReader};
-use crate::source::{BoxedSource, Format, Source};
+use crate::source::{BoxedSource, Format, RecordSource};
 use crate::{DataError, Problem, ReadOptions, ScenarioRecord};
 
 pub use read::scenario_from_proto;
@@ -34,7 +34,7 @@ fn open(path: &Path, options: ReadOptions) -> Result<BoxedSource, DataError> {
 }
 
 /// The scenarios of an opened stream.
-pub(crate) fn records(content: Stream, path: &Path, options: ReadOptions) -> impl Source {
+pub(crate) fn records(content: Stream, path: &Path, options: ReadOptions) -> impl RecordSource {
     Scenarios {
         records: TfRecordReader::of(content, path.to_path_buf()),
         options,
@@ -60,7 +60,7 @@ struct Scenarios {
     path: Arc<PathBuf>,
 }
 
-impl Source for Scenarios {
+impl RecordSource for Scenarios {
     fn skip(&mut self) -> Option<Result<(), DataError>> {
         self.records.skip_record()
     }

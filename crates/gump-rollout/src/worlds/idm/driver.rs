@@ -10,23 +10,28 @@ use super::obstacles::{Lead, Observer, Obstacle};
 use super::path::{Path, Stop};
 use super::road::{Road, STANDING};
 
-/// A standing vehicle farther from the centre of its lane is parked, metres.
+// Distances and speeds are chosen by hand; none was tuned.
+
+/// A standing vehicle farther from the centre of its lane is parked, metres: its side is then over
+/// the edge of a usual lane.
 const PARKED_OFFSET: f64 = 1.0;
-/// A moving vehicle has passed a stop line this far behind its front bumper, metres; a standing one
-/// only when its centre is past it.
+/// A moving vehicle has passed a stop line this far behind its front bumper, metres: the law stops a
+/// little late at times. A standing one has only when its centre is past it.
 const PASSED: f64 = 1.0;
 /// A vehicle that is slower than this at the start, metres per second, ...
 const WAITING: f64 = 1.0;
-/// ... waits for a light of unknown colour within this distance of its front bumper, metres.
+/// ... waits for a light of unknown colour within this distance of its front bumper, metres: the
+/// first two or three of a queue, whom the others follow.
 const WAITING_REACH: f64 = 15.0;
-/// A route farther away than this is not the one being driven, metres.
+/// A route farther away than this is not the one being driven, metres: more than a lane's width, as
+/// routes may run in the next lane.
 const ROUTE_REACH: f64 = 5.0;
 /// Path prepared beyond what the driver looks at, so that it is seldom extended, metres.
 const RESERVE: f64 = 100.0;
 
 /// Motion of an agent.
 #[derive(Clone, Debug)]
-pub(super) enum Driver {
+pub(super) enum MotionModel {
     /// Along the lane graph.
     Follow(Box<Follower>),
     /// Along its heading, braking comfortably.
@@ -47,7 +52,7 @@ pub(super) enum Situation {
     /// One of these lanes.
     Lanes(Vec<LaneId>),
     /// No choice.
-    Fixed(Driver),
+    Fixed(MotionModel),
 }
 
 /// The settings, road and lights from which a follower gets its path.
@@ -68,10 +73,10 @@ impl Situation {
             .filter_map(|frame| frame.agent(agent.id))
             .all(|past| past.state.speed() < STANDING);
         match lanes.first() {
-            None if standing => Self::Fixed(Driver::Park),
-            None => Self::Fixed(Driver::Brake),
+            None if standing => Self::Fixed(MotionModel::Park),
+            None => Self::Fixed(MotionModel::Brake),
             Some((_, lateral)) if standing && lateral.abs() > PARKED_OFFSET => {
-                Self::Fixed(Driver::Park)
+                Self::Fixed(MotionModel::Park)
             }
             Some(_) => Self::Lanes(lanes.into_iter().map(|(lane, _)| lane).collect()),
         }
@@ -98,7 +103,7 @@ impl Situation {
     }
 
     /// Makes the random choices of one future.
-    pub(super) fn decide(&self, agent: &Agent, ground: Ground<'_>, seed: Seed) -> Driver {
+    pub(super) fn decide(&self, agent: &Agent, ground: Ground<'_>, seed: Seed) -> MotionModel {
         let follower = match self {
             Self::Fixed(driver) => return driver.clone(),
             Self::Route(path) => Follower::new(agent, path.clone(), ground, seed),
@@ -111,7 +116,9 @@ impl Situation {
                 Follower::new(agent, path, ground, seed)
             }
         };
-        follower.map_or(Driver::Brake, |follower| Driver::Follow(Box::new(follower)))
+        follower.map_or(MotionModel::Brake, |follower| {
+            MotionModel::Follow(Box::new(follower))
+        })
     }
 }
 
@@ -288,6 +295,7 @@ impl Follower {
         let (limit, curve) = self.path.speeds_at(self.s);
         let guess = limit.usual.unwrap_or(config.target_velocity);
         let limit = limit.stated.unwrap_or(guess.max(self.start_speed));
+        // The law divides by it.
         let wanted = limit.min(curve).max(1.0);
         wanted.max(gentle_speed(config, self.speed))
     }
@@ -342,7 +350,7 @@ impl Follower {
     }
 }
 
-impl Driver {
+impl MotionModel {
     /// Updates the lights that it sees.
     pub(super) fn show(&mut self, lights: &[Light]) {
         if let Self::Follow(follower) = self {

@@ -51,7 +51,8 @@ pub struct IdmConfig {
 impl Default for IdmConfig {
     /// The law of Treiber et al. (2000) with nuPlan's values for its IDM planner. Vehicles may
     /// brake harder than comfortably, as drivers do (6 m/s², well within dry-road grip), and take
-    /// curves at no more than 3 m/s², a usual comfort bound.
+    /// curves at no more than 3 m/s², a usual comfort bound. They look as far ahead as it takes to
+    /// stop comfortably from 22 m/s.
     fn default() -> Self {
         Self {
             target_velocity: 10.0,

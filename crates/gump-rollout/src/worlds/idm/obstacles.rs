@@ -86,7 +86,7 @@ impl<Lateral: Fn(f64) -> f64> Observer<'_, Lateral> {
     }
 
     /// Distance ahead within which agents are considered, metres: the distance of a comfortable
-    /// stop, plus the same again as a margin.
+    /// stop, plus the same again as a margin, and 15 m for slow vehicles.
     fn reach(&self) -> f64 {
         let config = self.config;
         let stopping = self.speed * self.speed / (2.0 * config.max_deceleration);

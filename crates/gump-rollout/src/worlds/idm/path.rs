@@ -6,13 +6,17 @@ use gump_scene::{Lane, LaneId, Light, LightState};
 use super::IdmConfig;
 use super::road::Road;
 
-/// Metres of path kept behind the vehicle when the path is extended.
+/// Metres of path kept behind the vehicle when the path is extended: more than half of any vehicle,
+/// so that a stop line under one is kept.
 const TAIL: f64 = 20.0;
-/// A stop point farther than this from the path belongs to another place, metres.
+/// A stop point farther than this from the path belongs to another place, metres: more than a lane's
+/// width, as they are drawn beside it, too. Chosen by hand.
 const STOP_REACH: f64 = 5.0;
-/// Curvature is the turn over this far before and after a point, metres.
+/// Curvature is the turn over this far before and after a point, metres: evens out the corners of
+/// simplified lines. Chosen by hand.
 const CURVATURE_SPAN: f64 = 3.0;
-/// No curve is driven more slowly than this, metres per second.
+/// No curve is driven more slowly than this, metres per second, so that a kink in a map stops
+/// nobody.
 const CRAWL: f64 = 2.0;
 
 /// A directed line with arc lengths that stay valid while it is extended ahead and cut behind.

@@ -6,21 +6,24 @@ use std::sync::Arc;
 use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{AgentState, Lane, LaneId, LaneKind, MapGraph};
 
-/// Largest sideways error of a simplified line, metres.
+/// Largest sideways error of a simplified line, metres: far less than vehicles stray in their lane.
 const TOLERANCE: f64 = 0.05;
 /// Longest segment of a simplified line, metres; headings are interpolated along segments.
 const SPACING: f64 = 5.0;
-/// A vehicle is on a lane if it points along it within this, radians.
+/// A vehicle is on a lane if it points along it within this, radians: nearer to along than across.
 const MAX_TURN: f64 = std::f64::consts::FRAC_PI_4;
-/// A vehicle slower than this is standing, metres per second.
+/// A vehicle slower than this is standing, metres per second (docs/glossary.md).
 pub(super) const STANDING: f64 = 0.3;
-/// A moving vehicle this close to a lane's centre is on it or about to be, metres.
+/// A moving vehicle this close to a lane's centre is on it or about to be, metres: less than the
+/// width of a lane. Chosen by hand.
 const ENTERING: f64 = 3.0;
-/// Half the width of the widest lane, metres.
+/// Half the width of the widest lane, metres, for the search only. Chosen by hand.
 const WIDEST: f64 = 4.0;
-/// Cost of a radian off the lane's direction when lanes are compared, in metres off its centre.
+/// Cost of a radian off the lane's direction when lanes are compared, in metres off its centre:
+/// where lanes fork or cross, the direction decides. Chosen by hand.
 const METRES_PER_RADIAN: f64 = 3.0;
-/// Lanes that fit this much worse than the best are still within reach, metres.
+/// Lanes that fit this much worse than the best are still within reach, metres: branches of one lane
+/// near its fork, but not the next lane. Chosen by hand.
 const REACH: f64 = 0.5;
 
 /// Simplified centre lines of all lanes a vehicle may take.
@@ -64,6 +67,7 @@ impl Road {
     /// first, then others nearly as good.
     pub(super) fn lanes_of(&self, state: &AgentState) -> Vec<(LaneId, f64)> {
         let position = state.pose.position;
+        // Half of a narrow lane.
         let reach = if state.speed() < STANDING {
             1.5
         } else {

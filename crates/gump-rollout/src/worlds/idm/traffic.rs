@@ -6,7 +6,7 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Light, Rollout, S
 use rayon::prelude::*;
 
 use super::IdmConfig;
-use super::driver::{Driver, Ground, Situation};
+use super::driver::{Ground, MotionModel, Situation};
 use super::obstacles::Obstacle;
 use super::road::Road;
 use crate::Start;
@@ -17,7 +17,7 @@ pub(super) fn open<'a>(
     config: &'a IdmConfig,
     road: &Arc<Road>,
     start: &Start<'_>,
-) -> Vec<Traffic<'a>> {
+) -> Vec<IdmFuture<'a>> {
     let scene = start.scene;
     let now = scene.now();
     let ground = Ground {
@@ -31,7 +31,7 @@ pub(super) fn open<'a>(
         .map(|agent| match agent.kind {
             AgentKind::Vehicle if agent.id == scene.ego => Situation::of_ego(agent, scene, ground),
             AgentKind::Vehicle => Situation::of(agent, scene, road),
-            _ => Situation::Fixed(Driver::Coast),
+            _ => Situation::Fixed(MotionModel::Coast),
         })
         .collect();
     // The ego can be handed back to the world later; it then looks at its route afresh.
@@ -43,20 +43,20 @@ pub(super) fn open<'a>(
         .into_par_iter()
         .map(|k| {
             let seed = start.seed.fork(k as u64);
-            let drivers = now
+            let motions = now
                 .agents()
                 .iter()
                 .zip(&situations)
                 .map(|(agent, situation)| {
-                    situation.decide(agent, ground, driver_seed(seed, agent.id, 0))
+                    situation.decide(agent, ground, agent_seed(seed, agent.id, 0))
                 });
-            Traffic {
+            IdmFuture {
                 config,
                 road: Arc::clone(road),
                 origin: Arc::clone(&origin),
                 dt: scene.dt,
                 ego: scene.ego,
-                drivers: drivers.collect(),
+                motions: motions.collect(),
                 frame: now.clone(),
                 obstacles: Vec::new(),
                 next_lights: None,
@@ -69,18 +69,18 @@ pub(super) fn open<'a>(
 
 /// Every agent draws from its own stream, so its draws do not depend on which other agents are
 /// present.
-fn driver_seed(seed: Seed, id: AgentId, handover: u64) -> Seed {
+fn agent_seed(seed: Seed, id: AgentId, handover: u64) -> Seed {
     seed.fork(id.0 as u64).fork(handover)
 }
 
-pub(super) struct Traffic<'a> {
+pub(super) struct IdmFuture<'a> {
     config: &'a IdmConfig,
     road: Arc<Road>,
     origin: Arc<Rollout>,
     dt: f64,
     ego: AgentId,
     /// One for each agent of the frame, in its order.
-    drivers: Vec<Driver>,
+    motions: Vec<MotionModel>,
     frame: Frame,
     obstacles: Vec<Obstacle>,
     /// The lights of the next frame, if they were set.
@@ -89,16 +89,16 @@ pub(super) struct Traffic<'a> {
     n_handovers: u64,
 }
 
-impl Traffic<'_> {
+impl IdmFuture<'_> {
     /// Applies the states of externally driven agents.
     fn hand_over(&mut self, driven: bool) {
         let agents = self.frame.agents();
         let Ok(i) = agents.binary_search_by_key(&self.ego, |agent| agent.id) else {
             return;
         };
-        match (driven, &self.drivers[i]) {
-            (true, _) => self.drivers[i] = Driver::Driven,
-            (false, Driver::Driven) => {
+        match (driven, &self.motions[i]) {
+            (true, _) => self.motions[i] = MotionModel::Driven,
+            (false, MotionModel::Driven) => {
                 let agent = &agents[i];
                 let ground = Ground {
                     config: self.config,
@@ -106,14 +106,14 @@ impl Traffic<'_> {
                     lights: self.frame.lights(),
                 };
                 self.n_handovers += 1;
-                let seed = driver_seed(self.seed, agent.id, self.n_handovers);
-                self.drivers[i] = if agent.kind == AgentKind::Vehicle {
+                let seed = agent_seed(self.seed, agent.id, self.n_handovers);
+                self.motions[i] = if agent.kind == AgentKind::Vehicle {
                     let mut scene = self.origin.at(0);
                     let history = std::slice::from_ref(&self.frame);
                     scene.history = history;
                     Situation::of_ego(agent, scene, ground).decide(agent, ground, seed)
                 } else {
-                    Driver::Coast
+                    MotionModel::Coast
                 };
             }
             (false, _) => {}
@@ -121,11 +121,11 @@ impl Traffic<'_> {
     }
 }
 
-impl Traffic<'_> {
-    /// The driver of an agent that has just entered.
-    fn driver_of(&self, agent: &Agent) -> Driver {
+impl IdmFuture<'_> {
+    /// The motion of an agent that has just entered.
+    fn motion_of(&self, agent: &Agent) -> MotionModel {
         if agent.kind != AgentKind::Vehicle {
-            return Driver::Coast;
+            return MotionModel::Coast;
         }
         let ground = Ground {
             config: self.config,
@@ -135,12 +135,12 @@ impl Traffic<'_> {
         let now = Frame::new(vec![*agent], Vec::new());
         let mut scene = self.origin.at(0);
         scene.history = std::slice::from_ref(&now);
-        let seed = driver_seed(self.seed, agent.id, 0);
+        let seed = agent_seed(self.seed, agent.id, 0);
         Situation::of(agent, scene, &self.road).decide(agent, ground, seed)
     }
 }
 
-impl Future for Traffic<'_> {
+impl Future for IdmFuture<'_> {
     fn show(&mut self, lights: &[Light]) -> bool {
         self.next_lights = Some(lights.to_vec());
         true
@@ -148,14 +148,14 @@ impl Future for Traffic<'_> {
 
     fn exchange(&mut self, leave: &[AgentId], come: &[Agent]) -> bool {
         let agents = self.frame.agents().iter().copied();
-        let drivers = std::mem::take(&mut self.drivers);
-        let stay = agents.zip(drivers);
+        let motions = std::mem::take(&mut self.motions);
+        let stay = agents.zip(motions);
         let stay = stay.filter(|(agent, _)| agent.id == self.ego || !leave.contains(&agent.id));
-        let new = come.iter().map(|agent| (*agent, self.driver_of(agent)));
-        let mut all: Vec<(Agent, Driver)> = stay.chain(new).collect();
+        let new = come.iter().map(|agent| (*agent, self.motion_of(agent)));
+        let mut all: Vec<(Agent, MotionModel)> = stay.chain(new).collect();
         all.sort_by_key(|(agent, _)| agent.id);
-        let (agents, drivers) = all.into_iter().unzip();
-        self.drivers = drivers;
+        let (agents, motions) = all.into_iter().unzip();
+        self.motions = motions;
         self.frame = Frame::new(agents, self.frame.lights().to_vec());
         true
     }
@@ -179,24 +179,24 @@ impl Future for Traffic<'_> {
                 .iter()
                 .map(|agent| Obstacle::new(&seen(agent))),
         );
-        let mut agents = Vec::with_capacity(self.drivers.len());
-        for (i, (agent, driver)) in self
+        let mut agents = Vec::with_capacity(self.motions.len());
+        for (i, (agent, motion)) in self
             .frame
             .agents()
             .iter()
-            .zip(&mut self.drivers)
+            .zip(&mut self.motions)
             .enumerate()
         {
             agents.push(match ego {
                 Some(state) if agent.id == self.ego => agent.with_state(state),
-                _ => agent.with_state(driver.step(agent, &self.obstacles, i, ground, self.dt)),
+                _ => agent.with_state(motion.step(agent, &self.obstacles, i, ground, self.dt)),
             });
         }
         let lights = match self.next_lights.take() {
             Some(lights) => {
-                self.drivers
+                self.motions
                     .iter_mut()
-                    .for_each(|driver| driver.show(&lights));
+                    .for_each(|motion| motion.show(&lights));
                 lights
             }
             None => self.frame.lights().to_vec(),

@@ -24,7 +24,7 @@ use crate::sampling::Sampling;
 use crate::sharding::shard;
 pub(crate) use report::report_merged;
 
-/// The possible horizons, seconds.
+/// The possible horizons, seconds: that of the challenges, half a minute and a minute.
 const HORIZONS: [u32; 3] = [8, 30, 60];
 
 /// Arguments of `evaluate behaviour`.

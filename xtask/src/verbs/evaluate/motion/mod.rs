@@ -56,7 +56,7 @@ pub(crate) struct Args {
     scenarios: ScenarioSetName,
     #[command(flatten)]
     #[serde(flatten)]
-    source: Source,
+    source: PredictionArgs,
     /// Predictions of the network's trajectory heads instead of futures; only of sequence networks
     #[arg(long, requires = "world", conflicts_with_all = OF_FUTURES)]
     heads: bool,
@@ -80,7 +80,7 @@ pub(crate) struct Args {
 /// Source of the predictions.
 #[derive(Debug, Serialize, clap::Args)]
 #[group(required = true, multiple = false)]
-struct Source {
+struct PredictionArgs {
     /// A `MotionChallengeSubmission` or `ScenarioRollouts` message, or a folder of such files
     #[arg(long, value_name = "PATH")]
     rollouts: Option<PathBuf>,

@@ -17,7 +17,7 @@ use super::super::columns::label;
 use crate::run::Run;
 use crate::{charts, table};
 
-/// Draws of scenarios for an interval.
+/// Draws of scenarios for an interval; its ends move by a few percent of its width with the seed.
 const DRAWS: usize = 1000;
 /// The row of all manoeuvres that leave the log.
 const ALL: &str = "all";

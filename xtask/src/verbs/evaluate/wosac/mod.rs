@@ -105,7 +105,7 @@ pub(crate) struct Explained {
 /// Rollouts of every scenario that the challenge asks for.
 const CHALLENGE: usize = 32;
 
-/// Explanations shown in the report.
+/// Explanations shown in the report: what a person reads. Chosen by hand.
 const N_EXPLAINED: usize = 20;
 
 impl Args {

@@ -13,7 +13,7 @@ use crate::tables;
 
 /// Horizon of the challenge, seconds.
 const HORIZON_S: u32 = 8;
-/// Agents shown in the report.
+/// Agents shown in the report: what a person reads. Chosen by hand.
 const N_SHOWN: usize = 20;
 
 /// Agents of all scenarios.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use gump_engine::SamplingConfig;
 use gump_eval::datasets::Split;
 use gump_rl::server::{Event, Server};
-use gump_rl::{EnvConfig, PreparedScenario, Sampling, Traffic};
+use gump_rl::{EnvConfig, PreparedScenario, Sampling, TrafficSource};
 
 use super::Args;
 use crate::run::{Run, interrupted};
@@ -55,7 +55,7 @@ fn serve(
     run: &Run,
     server: &Server,
     prepared: &Arc<[PreparedScenario]>,
-    traffic: Traffic<'_>,
+    traffic: TrafficSource<'_>,
     config: &EnvConfig,
 ) -> anyhow::Result<Served> {
     let served = Served::default();
