@@ -10,7 +10,8 @@
 //! drawn, and judged again and again, so the test is short and knows less:
 //!
 //! * The others are boxes without velocities, since those drawn later are not there yet. A junction
-//!   ahead is therefore a reason by itself; the other two look for traffic that approaches it.
+//!   ahead is therefore a reason by itself; the metric, and starts after nine seconds, look for
+//!   traffic that approaches it.
 //! * A way ahead is the rest of the lane joined with one following lane, and everything is measured
 //!   along the joined line. The other two measure on each lane by itself (`gump_scene::LaneAhead`)
 //!   and follow lanes as far as they look; near the seam of two lanes the results differ, and with

@@ -132,21 +132,14 @@ fn pages_of_slots_hold_what_a_list_would() {
     let mut pages = kv_cache::SlotPages::default();
     let mut list: Vec<PlacedSlot> = Vec::new();
     // Extended and cut within pages, at their ends and beyond them.
-    for (cut, add) in [
-        (0, 5),
-        (5, 11),
-        (16, 40),
-        (50, 1),
-        (32, 20),
-        (7, 0),
-        (7, 9),
-        (99, 3),
-        (0, 2),
-    ] {
+    let cuts = [0, 5, 16, 50, 32, 7, 7, 99, 0];
+    let additions = [5, 11, 40, 1, 20, 0, 9, 3, 2];
+    for (k, (cut, add)) in cuts.into_iter().zip(additions).enumerate() {
         let before = (pages.clone(), list.clone());
         pages.truncate(cut);
         list.truncate(cut);
-        let added = &slots[list.len()..][..add];
+        // Other slots each time, so that what was cut does not come back unnoticed.
+        let added = &slots[list.len() + k..][..add];
         pages.extend(added);
         list.extend_from_slice(added);
         assert_eq!(pages.len(), list.len());

@@ -9,15 +9,16 @@
 //! Two other places ask why a vehicle stands, for other purposes and therefore with other reasons:
 //! `behaviour/free_road.rs` of `gump-metrics`, which counts stops, and `reason.rs` of
 //! `gump-generate`, which rejects draws. All three find lanes and stop lines with `gump-scene`. Here
-//! the question is not whether it makes sense to stand but whether there is room to start, after
-//! nine seconds:
+//! the question is not whether it makes sense to stand but whether there is room to start:
 //!
 //! * A light holds unless another way ahead has green, since whoever waits may leave by that. In the
 //!   other two a single light that is not green is a reason.
-//! * Stop signs, junctions and the end of the road do not hold. Whoever stopped for them has stopped
-//!   for long enough; at a junction only traffic that is about to cross holds.
-//! * Agents hold within 5 m, the free path that a start needs; in the other two within 12 and 15 m,
-//!   so that all of a queue has a reason.
+//! * After nine seconds stop signs, junctions and the end of the road do not hold. Whoever stopped
+//!   for them has stopped for long enough; at a junction only traffic that is about to cross holds.
+//!   After two seconds ([`OPEN_S`]) the end of the road still holds, and so does a junction, whether
+//!   or not anybody approaches it. Stop signs never hold.
+//! * After nine seconds agents hold within 5 m, the free path that a start needs; after two, and in
+//!   `free_road.rs`, within 15 m, so that all of a queue has a reason.
 //! * Bicycles, and agents that were seen to drive, count as in a lane farther from its centre.
 
 use gump_geometry::{DVec2, angle_difference};
@@ -90,10 +91,8 @@ pub(super) fn free_to_go(
     let (mut free, mut people) = (Vec::new(), Vec::new());
     for (i, standing) in agents.iter().enumerate() {
         let has_stopped = standing.has_driven && standing.waited_s > OPEN_S;
-        if has_stopped && standing.waited_s <= patience_s {
-            if is_open(map, lights, agents, i) {
-                free.push(i);
-            }
+        if has_stopped && standing.waited_s <= patience_s && is_open(map, lights, agents, i) {
+            free.push(i);
         }
     }
     for &i in &waiting {

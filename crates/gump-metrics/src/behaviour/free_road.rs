@@ -11,11 +11,12 @@
 //! standing vehicles. A metric must not count stops that a driver might make, so the reasons here
 //! are the most, and reach farthest:
 //!
-//! * Stop lines, stop signs without lanes and the end of the road are reasons nowhere else.
-//! * Agents are reasons up to 15 m ahead (12 m for draws, 5 m for starts) and people up to 3 m beside
-//!   the path, because one may stop for somebody who only might step onto it.
-//! * A junction is a reason only while somebody approaches it: for draws it always is, because
-//!   nothing is known of the motion of what is not drawn yet, and for starts it never is by itself.
+//! * Stop lines and stop signs without lanes are reasons nowhere else.
+//! * Agents are reasons up to 15 m ahead (12 m for draws, 15 or 5 m for starts) and people up to 3 m
+//!   beside the path, because one may stop for somebody who only might step onto it.
+//! * A junction is a reason only while somebody approaches it. For draws it always is, because
+//!   nothing is known of the motion of what is not drawn yet; for starts it always is at first and
+//!   later never by itself.
 //! * Only vehicles are judged, and not on bicycle lanes.
 
 use std::f64::consts::FRAC_PI_6;
