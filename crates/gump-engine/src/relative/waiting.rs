@@ -9,16 +9,15 @@
 //! Two other places ask why a vehicle stands, for other purposes and therefore with other reasons:
 //! `behaviour/free_road.rs` of `gump-metrics`, which counts stops, and `reason.rs` of
 //! `gump-generate`, which rejects draws. All three find lanes and stop lines with `gump-scene`. Here
-//! the question is not whether it makes sense to stand but whether there is room to start:
+//! the question is not whether it makes sense to stand but whether there is room to start, after
+//! nine seconds:
 //!
 //! * A light holds unless another way ahead has green, since whoever waits may leave by that. In the
 //!   other two a single light that is not green is a reason.
-//! * After nine seconds stop signs, junctions and the end of the road do not hold. Whoever stopped
-//!   for them has stopped for long enough; at a junction only traffic that is about to cross holds.
-//!   After two seconds ([`OPEN_S`]) the end of the road still holds, and so does a junction, whether
-//!   or not anybody approaches it. Stop signs never hold.
-//! * After nine seconds agents hold within 5 m, the free path that a start needs; after two, and in
-//!   `free_road.rs`, within 15 m, so that all of a queue has a reason.
+//! * Stop signs, junctions and the end of the road do not hold. Whoever stopped for them has stopped
+//!   for long enough; at a junction only traffic that is about to cross holds.
+//! * Agents hold within 5 m, the free path that a start needs; in the other two within 12 and 15 m,
+//!   so that all of a queue has a reason.
 //! * Bicycles, and agents that were seen to drive, count as in a lane farther from its centre.
 
 use gump_geometry::{DVec2, angle_difference};
@@ -41,12 +40,6 @@ const TURNED: f64 = 0.9;
 const LOOK_M: f64 = 25.0;
 /// The free path that a start needs beyond the front bumper, metres: a car's length.
 const ROOM_M: f64 = 5.0;
-/// Whoever was seen to drive and stands on an open road may go on after this, seconds: longer than a
-/// stop that is over before anybody notices.
-pub(super) const OPEN_S: f64 = 2.0;
-/// A road is open if nobody is on the path and no junction begins within this beyond the front
-/// bumper, metres: three cars' lengths, so that queues keep their gaps.
-const OPEN_M: f64 = 15.0;
 /// Space beside the path, from the side of the agent, that others are not in, metres; people need
 /// more, unless they have stood there for as long.
 const SIDE_M: f64 = 0.3;
@@ -72,8 +65,7 @@ pub(super) struct Standing {
     pub(super) has_driven: bool,
 }
 
-/// Returns the indices of the agents that have stood for more than `patience_s`, or on an open road
-/// for more than [`OPEN_S`], and could go on.
+/// Returns the indices of the agents that have stood for more than `patience_s` and could go on.
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
 /// light forbids it, and of those that meet there it has waited longest. A pedestrian could if it
@@ -89,21 +81,15 @@ pub(super) fn free_to_go(
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
     let walks = |i: usize| agents[i].agent.kind == AgentKind::Pedestrian;
     let (mut free, mut people) = (Vec::new(), Vec::new());
-    for (i, standing) in agents.iter().enumerate() {
-        let has_stopped = standing.has_driven && standing.waited_s > OPEN_S;
-        if has_stopped && standing.waited_s <= patience_s && is_open(map, lights, agents, i) {
-            free.push(i);
-        }
-    }
     for &i in &waiting {
         let agent = &agents[i].agent;
-        let (reached, _) = ahead(map, &agents[i]);
+        let reached = ahead(map, &agents[i]);
         if reached.is_empty() {
             continue;
         }
         let holding = |&j: &usize| {
             let stays = agents[j].waited_s > patience_s;
-            j != i && holds(&reached, ROOM_M, agent, &agents[j].agent, stays)
+            j != i && holds(&reached, agent, &agents[j].agent, stays)
         };
         let in_the_way = waiting.iter().copied().filter(|&j| walks(j));
         people.extend(in_the_way.filter(holding));
@@ -126,30 +112,15 @@ pub(super) fn free_to_go(
     next
 }
 
-/// Whether an agent stands on an open road: no light, nobody, no junction and no end of the road
-/// ahead.
-fn is_open(map: &MapGraph, lights: &[Light], agents: &[Standing], i: usize) -> bool {
-    let (reached, goes_on) = ahead(map, &agents[i]);
-    let is_junction = |part: &LaneAhead<'_>| part.lane.in_intersection && part.base_m < OPEN_M;
-    let holds = |other: &Standing| holds(&reached, OPEN_M, &agents[i].agent, &other.agent, false);
-    goes_on
-        && !is_shut(&reached, lights)
-        && !reached.iter().any(is_junction)
-        && !agents
-            .iter()
-            .enumerate()
-            .any(|(j, other)| j != i && holds(other))
-}
-
-/// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`], and whether
-/// any goes on beyond; none for agents beside the lanes. Distances are from its front bumper.
-fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> (Vec<LaneAhead<'m>>, bool) {
+/// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
+/// agents beside the lanes. Distances are from its front bumper.
+fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
     let agent = &standing.agent;
     let (beside, turned) = match (agent.kind, standing.has_driven) {
         (AgentKind::Vehicle | AgentKind::Bicycle, true) => (ASTRAY_M, TURNED),
         (AgentKind::Vehicle, false) => (IN_LANE_M, ALONG),
         (AgentKind::Bicycle, false) => (BESIDE_M, ALONG),
-        _ => return (Vec::new(), false),
+        _ => return Vec::new(),
     };
     let pose = agent.state.pose;
     let along = |lane: &Lane| {
@@ -159,9 +130,9 @@ fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> (Vec<LaneAhead<'m>>, boo
     };
     let mut near = map.lanes_near(pose.position, beside);
     let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
-        return (Vec::new(), false);
+        return Vec::new();
     };
-    lanes_ahead(map, lane, at + agent.length / 2.0, LOOK_M)
+    lanes_ahead(map, lane, at + agent.length / 2.0, LOOK_M).0
 }
 
 /// Whether the lights ahead forbid every way on.
@@ -183,15 +154,9 @@ fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light]) -> bool {
     is_one_shut
 }
 
-/// Whether another agent is in the way within `room_m`, or will be when it crosses; one that `stays`
-/// is not about to step onto the path.
-fn holds(
-    reached: &[LaneAhead<'_>],
-    room_m: f64,
-    agent: &Agent,
-    other: &Agent,
-    stays: bool,
-) -> bool {
+/// Whether another agent is in the way, or will be when it crosses; one that `stays` is not about to
+/// step onto the path.
+fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent, stays: bool) -> bool {
     let (pose, at) = (other.state.pose, other.state.pose.position);
     let own = agent.state.pose;
     let reach = LOOK_M + agent.length + other.length + GAP_S * other.state.speed();
@@ -216,7 +181,7 @@ fn holds(
         _ => aside.min(IN_LANE_M),
     };
     let mut body = corners.into_iter().chain([at]);
-    if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, room_m)) {
+    if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, ROOM_M)) {
         return true;
     }
     let velocity = other.state.velocity;
@@ -315,36 +280,6 @@ mod tests {
         assert_eq!(free(&with(1.8), &[(0, 9.0), (1, 9.0)]), [0]);
         assert!(free(&with(1.8), &[(0, 9.0), (1, 2.0)]).is_empty());
         assert_eq!(free(&with(4.0), &[(0, 9.0), (1, 9.0)]), [0]);
-    }
-
-    #[test]
-    fn who_has_stopped_on_an_open_road_goes_on_at_once() {
-        let with = |rest: &str| {
-            let road = "lane 1: 0,0 200,0\nlane 2: 150,-60 150,60\nego vehicle 0: 20,0\n";
-            scenario(&format!("{road}{rest}"))
-        };
-        let waited = [(0, 2.5)];
-        assert_eq!(free_after(true, &with(""), &waited), [0]);
-        // Parked, or stopped a moment ago.
-        assert!(free_after(false, &with(""), &waited).is_empty());
-        assert!(free_after(true, &with(""), &[(0, 1.5)]).is_empty());
-        // A queue ahead, a red light, a pedestrian beside the path, the end of the road.
-        for reason in [
-            "agent vehicle 1: 36,0",
-            "light 1 red: 40,0",
-            "agent pedestrian 1: 26,1.8",
-        ] {
-            assert!(
-                free_after(true, &with(reason), &waited).is_empty(),
-                "{reason}"
-            );
-        }
-        assert_eq!(
-            free_after(true, &with("agent vehicle 1: 45,0"), &waited),
-            [0]
-        );
-        let end = scenario("lane 1: 0,0 40,0\nego vehicle 0: 20,0\n");
-        assert!(free_after(true, &end, &waited).is_empty());
     }
 
     #[test]

@@ -35,7 +35,7 @@ use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
 };
 use crate::relative::seen::{Seen, add_presents};
-use crate::relative::waiting::{OPEN_S, Standing, free_to_go};
+use crate::relative::waiting::{Standing, free_to_go};
 use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
@@ -555,8 +555,7 @@ impl Future {
         let mut is_one_waiting = false;
         for member in &mut self.members {
             member.could_go = false;
-            let has_stopped = member.has_driven && member.waited > OPEN_S;
-            is_one_waiting |= has_stopped || member.waited > PATIENCE_S;
+            is_one_waiting |= member.waited > PATIENCE_S;
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
