@@ -36,7 +36,6 @@ const state = {
   trail: null,
   fans: [],
   events: [],
-  told: 0,
   driven: 0,
   shown: 0,
   script: null,
@@ -53,7 +52,7 @@ const view = new View($('view'));
 const hands = new Hands({ wheel: $('touch-wheel'), gas: $('touch-gas'), brake: $('touch-brake') });
 
 function trouble(error) {
-  $('trouble-told').textContent = error.message ?? String(error);
+  $('trouble-text').textContent = error.message ?? String(error);
   $('trouble').hidden = false;
   $('loading').textContent = '';
 }
@@ -172,7 +171,7 @@ function take(picture) {
   view.dirty = true;
   $('time').max = String(picture.driven);
   $('time').value = String(picture.frame);
-  $('time-told').textContent = `${(picture.frame / 10).toFixed(1)} s`;
+  $('time-value').textContent = `${(picture.frame / 10).toFixed(1)} s`;
   tellSpeed();
 }
 
@@ -389,11 +388,11 @@ async function end() {
   if (!['driving', 'paused'].includes(state.mode)) return;
   setMode('paused');
   await resume();
-  const told = await engine.ask('told');
+  const summary = await engine.ask('summary');
   setMode('ended');
   $('panel').hidden = true;
-  $('total').textContent = told.total.toFixed(2);
-  const rows = told.parts.map(([name, value]) => {
+  $('total').textContent = summary.total.toFixed(2);
+  const rows = summary.parts.map(([name, value]) => {
     const tr = document.createElement('tr');
     for (const text of [PARTS[name] ?? name.replaceAll('_', ' '), value === null ? '–' : value.toFixed(2)]) {
       const td = document.createElement('td');
@@ -405,9 +404,9 @@ async function end() {
   });
   $('parts').replaceChildren(...rows);
   const counted = (n, one, many) => `${n} ${n === 1 ? one : many}`;
-  const realism = told.realism === null ? told.realism_missing ?? 'Realism could not be measured here.' : `Realism of the first 8 s (Waymo’s metric, this one drive): ${told.realism.toFixed(3)}.`;
-  $('summary').textContent = `${told.metres.toFixed(0)} m in ${told.seconds.toFixed(1)} s, ${counted(told.collisions, 'collision', 'collisions')}, ${counted(told.off_roads, 'time', 'times')} off the road, ${counted(told.red_lights, 'red light', 'red lights')}. ${realism}`;
-  $('score-hint').textContent = `Progress is compared with the recorded driver over ${told.compared_seconds.toFixed(1)} s; everything else is judged over the whole drive.`;
+  const realism = summary.realism === null ? summary.realism_missing ?? 'Realism could not be measured here.' : `Realism of the first 8 s (Waymo’s metric, this one drive): ${summary.realism.toFixed(3)}.`;
+  $('summary').textContent = `${summary.metres.toFixed(0)} m in ${summary.seconds.toFixed(1)} s, ${counted(summary.collisions, 'collision', 'collisions')}, ${counted(summary.off_roads, 'time', 'times')} off the road, ${counted(summary.red_lights, 'red light', 'red lights')}. ${realism}`;
+  $('score-hint').textContent = `Progress is compared with the recorded driver over ${summary.compared_seconds.toFixed(1)} s; everything else is judged over the whole drive.`;
   $('score').hidden = false;
 }
 
@@ -456,8 +455,8 @@ async function bench() {
 // ---- What is on the page --------------------------------------------------------------------
 
 function tellSettings() {
-  $('temperature-told').textContent = Number($('temperature').value).toFixed(2);
-  $('density-told').textContent = `${Math.round(Number($('density').value) * 100)} %`;
+  $('temperature-value').textContent = Number($('temperature').value).toFixed(2);
+  $('density-value').textContent = `${Math.round(Number($('density').value) * 100)} %`;
 }
 
 function restartWith(name, value) {

@@ -20,15 +20,15 @@ function hasVectors() {
   return typeof WebAssembly === 'object' && WebAssembly.validate(new Uint8Array(vectorFunction));
 }
 
-async function fetched(path, told) {
+async function fetched(path, what) {
   let response;
   try {
     response = await fetch(path);
   } catch {
-    throw new Error(`${told} could not be fetched: the server of this page does not answer.`);
+    throw new Error(`${what} could not be fetched: the server of this page does not answer.`);
   }
   if (!response.ok) {
-    throw new Error(`${told} could not be fetched: the server answers ${response.status} for ${path}.`);
+    throw new Error(`${what} could not be fetched: the server answers ${response.status} for ${path}.`);
   }
   return new Uint8Array(await response.arrayBuffer());
 }
@@ -110,8 +110,8 @@ const doing = {
     return { progress: 1, ways, table: JSON.parse(game.branch_table()) };
   },
 
-  told() {
-    return JSON.parse(game.told());
+  summary() {
+    return JSON.parse(game.summary());
   },
 
   code() {

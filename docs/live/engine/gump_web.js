@@ -241,28 +241,14 @@ export class Game {
         }
     }
     /**
-     * Drives for a tenth of a second.
-     * @param {number} driver
-     * @param {number} pedal
-     * @param {number} wheel
-     * @param {number} temperature
-     * @param {boolean} reverse
-     */
-    tick(driver, pedal, wheel, temperature, reverse) {
-        const ret = wasm.game_tick(this.__wbg_ptr, driver, pedal, wheel, temperature, reverse);
-        if (ret[1]) {
-            throw takeFromExternrefTable0(ret[0]);
-        }
-    }
-    /**
      * Summary of the drive for display, as JSON.
      * @returns {string}
      */
-    told() {
+    summary() {
         let deferred2_0;
         let deferred2_1;
         try {
-            const ret = wasm.game_told(this.__wbg_ptr);
+            const ret = wasm.game_summary(this.__wbg_ptr);
             var ptr1 = ret[0];
             var len1 = ret[1];
             if (ret[3]) {
@@ -274,6 +260,20 @@ export class Game {
             return getStringFromWasm0(ptr1, len1);
         } finally {
             wasm.__wbindgen_free(deferred2_0, deferred2_1, 1);
+        }
+    }
+    /**
+     * Drives for a tenth of a second.
+     * @param {number} driver
+     * @param {number} pedal
+     * @param {number} wheel
+     * @param {number} temperature
+     * @param {boolean} reverse
+     */
+    tick(driver, pedal, wheel, temperature, reverse) {
+        const ret = wasm.game_tick(this.__wbg_ptr, driver, pedal, wheel, temperature, reverse);
+        if (ret[1]) {
+            throw takeFromExternrefTable0(ret[0]);
         }
     }
     /**
