@@ -34,7 +34,7 @@ pub(crate) fn text(results: &Value, width: usize) -> String {
 }
 
 /// Rows of a table shown on a terminal: about a screen. Chosen by hand.
-const MAX_ROWS: usize = 40;
+const MAX_ROWS: usize = 50;
 
 type Rows = Vec<Vec<String>>;
 

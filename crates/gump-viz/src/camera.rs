@@ -149,8 +149,8 @@ const NEAR: f64 = 30.0;
 /// An agent that goes farther than this counts as moving, metres. Chosen by hand.
 const MOVES: f64 = 2.0;
 
-/// Who is farther than this from any lane has left the map, metres: wider than a car park beside
-/// a lane, less than a camera sees.
+/// Whoever is farther than this from any lane has left the map, metres: more than the width of a car
+/// park beside a lane, less than a camera sees. Chosen by hand.
 const OFF_MAP: f64 = 25.0;
 
 /// Whether a place is on the map or beside it. On a map without lanes every place is.

@@ -120,8 +120,8 @@ impl Counter<'_> {
         Some(last)
     }
 
-    /// Of lights whose colour is known in the present: a world shows lights for ever that a recording
-    /// sees for a moment.
+    /// Counts changes of lights and their time at red. Lights unknown in the present are left out: a
+    /// world shows them to the end, while a recording sees them for a moment.
     pub(super) fn light_changes(&mut self) {
         let known = |state: Option<LightState>| state.filter(|s| *s != LightState::Unknown);
         let (mut seen, mut red, mut changes) = (0, 0, 0);

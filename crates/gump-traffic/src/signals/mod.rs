@@ -13,9 +13,9 @@ pub use plan::SignalPlan;
 use plan::{Begun, Junction, Phase};
 use timing::{CLEARANCE_S, green_s, least_green_s, met_s};
 
-/// Share of junctions whose signals have detectors. Which do is not seen in a scene; fixed times and
-/// detectors are both common, and a half is between the recorded rate of changes and SUMO's
-/// (result 23).
+/// Share of junctions whose signals have detectors. Which do is not seen in a scene, and both kinds
+/// are common. With detectors everywhere lights change as often as recorded ones, but too rarely in
+/// SUMO's scenes, whose times are fixed; a half comes near both (result 23).
 const DETECTING: f64 = 0.5;
 /// Seconds for which a phase continues if no vehicle waits for another, before that is looked at
 /// again. Not tuned.
