@@ -109,14 +109,14 @@ impl Camera {
         })
     }
 
-    /// This view from where the ego is after `step` steps, its heading up; from where it left the
-    /// map if it is beyond.
+    /// This view from where the ego is after `step` steps, its heading up. Once it has left the map
+    /// nothing else is there to be seen, so the view is that of the start.
     pub(crate) fn with_ego(&self, rollout: &Rollout, step: usize) -> Self {
         let ego = |step| rollout.at(step).ego_now().state.pose;
-        let is_seen = |pose: &Pose| is_on_map(rollout.map(), pose.position);
-        let last = (0..=step).rev().map(ego).find(is_seen);
+        let now = ego(step);
+        let is_seen = is_on_map(rollout.map(), now.position);
         Self {
-            world_from_camera: last.unwrap_or_else(|| ego(step)),
+            world_from_camera: if is_seen { now } else { ego(0) },
             ..*self
         }
     }

@@ -26,8 +26,9 @@ use crate::{Camera, Theme, VizError, text_layout, video};
 pub struct FilmSpec {
     /// View of one panel.
     pub camera: Camera,
-    /// Whether the camera follows the ego of a panel's first rollout, its heading up, as long as it is
-    /// on the map, and only the size of `camera` counts; otherwise it is fixed in the world.
+    /// Whether the camera follows the ego of a panel's first rollout, its heading up, and only the
+    /// size of `camera` counts; otherwise it is fixed in the world. Once the ego has left the map the
+    /// camera shows the place of the start.
     pub follow: bool,
     /// Colour theme.
     pub theme: Theme,
