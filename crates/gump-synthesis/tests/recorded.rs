@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-use gump_metrics::statistics::{Measure as M, Statistics};
+use gump_metrics::statistics::{Statistic as M, Statistics};
 use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use gump_synthesis::{Profile, Tracker, track};
 use rayon::prelude::*;

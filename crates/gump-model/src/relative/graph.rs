@@ -13,8 +13,9 @@ use crate::relative::grid::STILL_M;
 use crate::relative::map::{PATHS, PieceKind, VectorMap};
 use crate::steps::TOKEN_DT;
 
-// How much a node sees was chosen by hand, with the time of a frame in mind, and is fixed by the
-// weights. The scales of all numbers are typical values, so that they stay within a few units.
+// How much a node sees was chosen by hand, with the time of a frame in mind, and not varied except
+// where it says so; weights are trained with it and need the same values. The divisors of all
+// numbers below are typical values, chosen by hand, so that inputs stay within a few units.
 
 /// Numbers of a node.
 pub const NODE_NUMBERS: usize = 28;
@@ -373,7 +374,7 @@ fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
         let at = path.iter().find_map(|&(i, away)| {
             let piece = &map.pieces[i as usize];
             let local = piece.axes.see(other.pose.position);
-            // Surely beside a piece of 8 m, for time.
+            // A piece is 8 m long, so this is not on it; the exact offset takes longer.
             if local.x.abs() > 6.0 || local.y.abs() > 8.0 {
                 return None;
             }

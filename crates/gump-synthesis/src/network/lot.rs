@@ -10,7 +10,8 @@ use crate::curve::Track;
 use crate::network::Network;
 use crate::plan::Plan;
 
-// Dimensions of lots are common ones, chosen by eye.
+// Dimensions of lots, here and in the functions below, are common ones. They were chosen by eye and
+// not varied.
 /// From the curb to the near end of the places: sidewalk, strip of green, aisle; metres.
 const SET_BACK: f64 = 7.0;
 /// Depth of a place, metres: vehicles that park are no longer.

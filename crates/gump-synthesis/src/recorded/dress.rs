@@ -11,7 +11,9 @@ use crate::curve::{Track, bend};
 use crate::layout::street;
 use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 
-// Distances are chosen by eye, shares fitted by hand: see the module above.
+// Shares and counts, here and in the functions below, were fitted by hand to the targets (see the
+// module above). Lengths, widths and angles were chosen by eye and not varied one by one: no target
+// measures them.
 /// Shortest road that is left on either side of a new junction, metres.
 const SHORTEST: f64 = 34.0;
 /// Metres between the sidewalks of a new road and those of the others.

@@ -13,7 +13,9 @@ use crate::network::Network;
 use crate::record::Recording;
 use crate::traffic::{Body, draw_person_size};
 
-// Numbers are fitted by hand, distances chosen by eye: see the module above.
+// The number of people was fitted by hand to the targets (see the module above). Distances, speeds
+// and the coefficients of `way` were chosen by eye, so that people walk past vehicles and do not
+// get stuck between them; they were not varied one by one.
 /// Maximum number of such pedestrians, or pairs of them, in a scene.
 const MOST: f64 = 16.0;
 /// Number of paths tried for each.

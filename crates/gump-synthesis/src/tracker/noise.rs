@@ -6,8 +6,9 @@ use rand::Rng as _;
 
 use super::stands;
 
-// Errors, here and in `level`, are fitted by hand to `configs/targets/waymo-like.toml`; the bounds
-// keep the worst tracks plausible.
+// Errors, here, in `level` and in `Noise::step`, were fitted by hand to
+// `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md). The bounds keep the worst
+// tracks plausible; they were chosen by hand and not varied.
 /// Correlation time of errors of position and heading, seconds.
 const MEMORY_S: f64 = 0.6;
 /// The same for errors of velocity.
