@@ -4,6 +4,8 @@
 //! counts are stored as [`ScenarioCounts`], which [`ScenarioTallies`] reads back. What is counted,
 //! and per what, is in [`gump_metrics::behaviour`].
 
+use std::collections::BTreeMap;
+
 use gump_metrics::behaviour::{Behaviour, Class, Count, Key, Measure, Tally};
 use gump_model::Device;
 use gump_scene::{Scenario, Seed};
@@ -13,7 +15,7 @@ use crate::decoding::{DecodedWorld, DecodedWorldName, columns};
 use crate::imagine::{frames, imagine};
 use crate::results::Entry;
 use crate::worlds::Worlds;
-use crate::{EvalError, Monitor, ResultsError};
+use crate::{EvalError, Monitor, Note, Notes, ResultsError};
 
 /// Name of the benchmark in stored results.
 pub const BENCHMARK: &str = "behaviour";
@@ -45,6 +47,33 @@ pub struct ScenarioCounts {
     pub log: StoredTally,
     /// Of the worlds, in the order of the settings.
     pub worlds: Vec<StoredTally>,
+    /// Number of cases by [`Note::name`].
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub notes: BTreeMap<String, usize>,
+}
+
+impl ScenarioCounts {
+    /// What the scene lacks for signals and arrivals, which are the same in every world that has
+    /// them. Notes of unknown names are left out.
+    pub fn notes(&self) -> Notes {
+        let mut notes = Notes::default();
+        for (name, cases) in &self.notes {
+            if let Some(note) = Note::of_name(name) {
+                notes.add(note, *cases);
+            }
+        }
+        notes
+    }
+
+    /// Keeps the notes of the first world that has any.
+    fn note(&mut self, notes: &Notes) {
+        if self.notes.is_empty() {
+            let stored = notes
+                .iter()
+                .map(|(note, count)| (note.name().into(), count.cases));
+            self.notes = stored.collect();
+        }
+    }
 }
 
 /// A [`Tally`] as it is stored.
@@ -186,9 +215,11 @@ impl<'a> BehaviourEvaluation<'a> {
         let mut counts = ScenarioCounts {
             log: StoredTally::of(&behaviour.log().tally),
             worlds: Vec::with_capacity(self.worlds.len()),
+            notes: BTreeMap::new(),
         };
         for (column, worlds) in &mut self.worlds {
             let world = worlds.of(scenario)?;
+            counts.note(&world.notes(scenario));
             let n = column.futures(config.futures);
             let simulate = column.decoding.frames(config.seconds.into());
             let part = monitor.part("simulating", frames(scenario, n, &simulate), "frames");
@@ -240,6 +271,35 @@ mod tests {
         let tallies = ScenarioTallies::of(&[entry], 3).unwrap();
         assert_eq!(tallies.worlds[0][0].0, tallies.log[0].0);
         assert!(tallies.worlds[2][0].0.is_empty());
+    }
+
+    #[test]
+    fn what_a_scene_lacks_is_stored_with_its_counts() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 250,0\nlight 8 red:\nlight 9 red:\n\
+             ego vehicle 3: 10,0 velocity 10,0\nhistory 1 future 8 dt 0.1",
+        )
+        .unwrap();
+        let columns = [WorldName::Log, WorldName::ConstantVelocity].map(|world| DecodedWorld {
+            decoding: Decoding::of(SamplingConfig::default()).for_world(&world),
+            world,
+        });
+        let config = BehaviourConfig {
+            seconds: 8,
+            futures: 1,
+            spawning: false,
+            seed: Seed(0),
+        };
+        let mut evaluation = BehaviourEvaluation::new(&Device::Cpu, &columns, config);
+        let counts = evaluation.count(0, &scenario, &()).unwrap();
+        assert_eq!(counts.notes().cases(Note::UnmappedLight), 2);
+        let text = toml::to_string(&counts).unwrap();
+        let read: ScenarioCounts = toml::from_str(&text).unwrap();
+        assert_eq!(read.notes(), counts.notes());
+        // Results of former versions have no notes.
+        let former = text.split("[notes]").next().unwrap();
+        let former: ScenarioCounts = toml::from_str(former).unwrap();
+        assert!(former.notes().is_empty() && former.log == counts.log);
     }
 
     #[test]

@@ -12,7 +12,7 @@ use gump_model::{Device, checkpoint, relative};
 use gump_rollout::WorldModel;
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_scene::Scenario;
-use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, RecordedLights};
+use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, Notes, RecordedLights};
 use serde::{Serialize, Serializer};
 
 use crate::{ArgumentError, EvalError};
@@ -116,8 +116,10 @@ impl Serialize for WorldName {
 /// A world that is ready to simulate.
 #[non_exhaustive]
 pub enum World {
-    /// A rule-based world.
+    /// A rule-based world with its own lights and agents: the log.
     Rule(Box<dyn WorldModel>),
+    /// A rule-based world with signals, arrivals and departures.
+    Living(Box<Living<Box<dyn WorldModel>>>),
     /// A trained network of sequences.
     Learned(Box<TransformerWorld>),
     /// A trained network with relative attention.
@@ -175,12 +177,12 @@ impl World {
             },
             arrivals: sampling.spawn.then(Arrivals::default),
         };
+        let with_life =
+            |world: Box<dyn WorldModel>, living| Self::Living(Box::new(Living::new(world, living)));
         Ok(match name {
             WorldName::Log => return Err(ArgumentError::LogWithoutScenario.into()),
-            WorldName::Idm => Self::Rule(Box::new(Living::new(Idm::default(), living))),
-            WorldName::ConstantVelocity => {
-                Self::Rule(Box::new(Living::new(ConstantVelocity, living)))
-            }
+            WorldName::Idm => with_life(Box::<Idm>::default(), living),
+            WorldName::ConstantVelocity => with_life(Box::new(ConstantVelocity), living),
             WorldName::Model(path) if relative::is_relative(path)? => {
                 let network = relative::load(path, device)?;
                 let world = RelativeWorld::new(&network, RelativeSampling::from(sampling))?;
@@ -202,6 +204,7 @@ impl World {
     pub fn model(&self) -> &dyn WorldModel {
         match self {
             Self::Rule(world) => &**world,
+            Self::Living(world) => &**world,
             Self::Learned(world) => &**world,
             Self::Relative(world) => &**world,
         }
@@ -212,6 +215,7 @@ impl World {
     pub fn into_model(self) -> Arc<dyn WorldModel> {
         match self {
             Self::Rule(world) => world.into(),
+            Self::Living(world) => Arc::<Living<Box<dyn WorldModel>>>::from(world),
             Self::Learned(world) => Arc::<TransformerWorld>::from(world),
             Self::Relative(world) => Arc::<Living<RelativeWorld>>::from(world),
         }
@@ -220,17 +224,19 @@ impl World {
     /// Whether the world cannot simulate on a map without lanes.
     pub fn follows_lanes(&self) -> bool {
         match self {
-            Self::Rule(world) => world.name() == "idm",
+            Self::Rule(_) => false,
+            Self::Living(world) => world.name() == "idm",
             Self::Learned(_) | Self::Relative(_) => true,
         }
     }
 
-    /// Passes of the network so far, whatever their batch size; 0 for rule-based worlds.
-    pub fn passes(&self) -> u64 {
+    /// What the present of a scenario lacks for signals, arrivals and departures; nothing for worlds
+    /// that have their own.
+    pub fn notes(&self, scenario: &Scenario) -> Notes {
         match self {
-            Self::Rule(_) => 0,
-            Self::Learned(world) => world.passes(),
-            Self::Relative(world) => world.world().passes(),
+            Self::Rule(_) | Self::Learned(_) => Notes::default(),
+            Self::Living(world) => world.notes(&scenario.present()),
+            Self::Relative(world) => world.notes(&scenario.present()),
         }
     }
 }
@@ -270,7 +276,31 @@ impl<'a> Worlds<'a> {
 
 #[cfg(test)]
 mod tests {
+    use gump_traffic::Note;
+
     use super::*;
+
+    #[test]
+    fn worlds_note_what_a_scene_lacks() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -60,0 60,0\nlight 9 red:\nego vehicle 0: 0,0 velocity 8,0",
+        )
+        .unwrap();
+        let cases = |name: &str, lights: LightSource| {
+            let sampling = SamplingConfig {
+                lights,
+                ..SamplingConfig::default()
+            };
+            let name = name.parse().unwrap();
+            let world = World::build(&Device::Cpu, &name, &scenario, &sampling).unwrap();
+            world.notes(&scenario).cases(Note::UnmappedLight)
+        };
+        assert_eq!(cases("idm", LightSource::Model), 1);
+        assert_eq!(cases("constant-velocity", LightSource::Model), 1);
+        // Lights that stay, or that the log has, need no lane.
+        assert_eq!(cases("idm", LightSource::Hold), 0);
+        assert_eq!(cases("log", LightSource::Model), 0);
+    }
 
     #[test]
     fn names_read_as_they_are_written() {

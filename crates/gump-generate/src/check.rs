@@ -13,6 +13,9 @@ pub(crate) const LOOK_S: f64 = 0.5;
 /// The clause that no agents overlap.
 pub const NOBODY_OVERLAPS: &str = "nobody overlaps";
 
+/// The clause that no vehicle is off the road.
+pub const VEHICLES_ON_ROAD: &str = "vehicles are on the road";
+
 /// One clause of a request.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clause {
@@ -23,6 +26,9 @@ pub struct Clause {
     /// Whether it also holds at every instant after the present; `None` for clauses about an
     /// instant, or without a rollout. See [`through_time`].
     pub holds_throughout: Option<bool>,
+    /// Share of the instants from the present on at which it holds, of prompts too; `None` without a
+    /// rollout, or if it cannot be decided. See [`through_time`].
+    pub share_of_time: Option<f64>,
 }
 
 impl Clause {
@@ -31,6 +37,7 @@ impl Clause {
             clause,
             holds,
             holds_throughout: None,
+            share_of_time: None,
         }
     }
 }
@@ -63,17 +70,40 @@ pub fn check_clauses(
     clauses
 }
 
-/// Checks the clauses of [`check_clauses`] about numbers, overlaps and the road throughout the
-/// scenario's future, twice a second. Prompts are about an instant and not checked.
+/// Checks the clauses of [`check_clauses`] throughout the scenario's future, twice a second.
+///
+/// Prompts are about an instant, so that only the share of instants at which they hold is of
+/// interest. A prompt about what begins is decided by the frames that are left, and therefore
+/// rarely holds near the end.
 pub fn through_time(clauses: &mut [Clause], scenario: &Scenario, counts: Option<&Counts>) {
     let stride = (LOOK_S / scenario.dt).round().max(1.0) as usize;
-    for k in (scenario.now..scenario.log.len()).step_by(stride).skip(1) {
-        let now = standing(&scenario.at(k), counts);
-        // They come last, after the prompts.
-        for (clause, now) in clauses.iter_mut().rev().zip(now.into_iter().rev()) {
+    let instants = (scenario.now..scenario.log.len()).step_by(stride);
+    if instants.len() < 2 {
+        return;
+    }
+    let mut held = vec![Some(0_usize); clauses.len()];
+    let mut count = |i: usize, holds: Option<bool>| {
+        held[i] = held[i].zip(holds).map(|(n, holds)| n + usize::from(holds));
+    };
+    // Clauses of any instant come last, after the prompts.
+    let n_prompts = clauses.len() - standing(&scenario.present(), counts).len();
+    let prompts = clauses[..n_prompts].iter();
+    let prompts: Vec<Option<ScenarioTag>> = prompts.map(|c| c.clause.parse().ok()).collect();
+    let mut later = scenario.clone();
+    for k in instants.clone() {
+        later.now = k;
+        for (i, tag) in prompts.iter().enumerate() {
+            count(i, tag.and_then(|tag| tags::holds(tag, &later)));
+        }
+        for (i, now) in standing(&scenario.at(k), counts).into_iter().enumerate() {
+            count(n_prompts + i, now.holds);
+            let clause = &mut clauses[n_prompts + i];
             let before = clause.holds_throughout.or(clause.holds);
             clause.holds_throughout = before.zip(now.holds).map(|(a, b)| a && b);
         }
+    }
+    for (clause, held) in clauses.iter_mut().zip(held) {
+        clause.share_of_time = held.map(|n| n as f64 / instants.len() as f64);
     }
 }
 
@@ -92,10 +122,7 @@ fn standing(present: &SceneState<'_>, counts: Option<&Counts>) -> Vec<Clause> {
     let clear = overlaps_in(present.now()) == 0;
     clauses.push(Clause::new(NOBODY_OVERLAPS.into(), Some(clear)));
     let on_road = off_road_in(present) == 0;
-    clauses.push(Clause::new(
-        "vehicles are on the road".into(),
-        Some(on_road),
-    ));
+    clauses.push(Clause::new(VEHICLES_ON_ROAD.into(), Some(on_road)));
     clauses
 }
 
@@ -151,6 +178,25 @@ mod tests {
     }
 
     #[test]
+    fn a_prompt_holds_for_a_share_of_the_time() {
+        // The gap to the bicycle is 16.7 m and shrinks by 2 m a second: below 10 m from 3.5 s on.
+        let scenario = fixture::scenario(
+            "lane 1: -50,0 90,0\nego vehicle 0: 0,0 velocity 4,0\n\
+             agent bicycle 1: 20,0 velocity 2,0",
+        )
+        .unwrap();
+        let prompts = ["behind_bike", "on_pickup_dropoff"];
+        let prompts = prompts.map(|name| name.parse::<ScenarioTag>().unwrap());
+        let mut clauses = check_clauses(&scenario, &prompts, None);
+        through_time(&mut clauses, &scenario, None);
+        let found: Vec<_> = clauses[..2]
+            .iter()
+            .map(|c| (c.holds, c.share_of_time))
+            .collect();
+        assert_eq!(found, [(Some(false), Some(10.0 / 17.0)), (None, None)]);
+    }
+
+    #[test]
     fn what_holds_now_need_not_hold_later() {
         // In four seconds the ego has reached the standing vehicle.
         let scenario = fixture::scenario(
@@ -173,6 +219,10 @@ mod tests {
         let (yes, no) = (Some(true), Some(false));
         assert_eq!(throughout, [None, yes, yes, yes, no, yes]);
         assert_eq!(clauses[4].holds, yes);
+        // They overlap at three of 17 instants, from 4 s to 5 s; 8 m/s are no high speed.
+        let shares: Vec<_> = clauses.iter().map(|c| c.share_of_time).collect();
+        let (all, clear) = (Some(1.0), Some(14.0 / 17.0));
+        assert_eq!(shares, [Some(0.0), all, all, all, clear, all]);
         let mut alone = scenario.clone();
         alone.log.truncate(alone.now + 1);
         let mut clauses = check_clauses(&alone, &[], None);

@@ -115,8 +115,15 @@ fn index_of(kind: AgentKind) -> Option<usize> {
     KINDS.iter().position(|known| *known == kind)
 }
 
+/// Whether agents can enter: a lane begins in the window around the ego or leads into it.
+pub(crate) fn leads_anywhere(config: &Arrivals, scene: SceneState<'_>) -> bool {
+    let ego = scene.ego_now().state.pose.position;
+    !gates(scene.map, &[ego], ego, config).is_empty()
+}
+
 impl Flow {
-    /// From the visible part of a scene; `None` if no lane leads into it.
+    /// From the visible part of a scene; `None` if no lane leads into it, which is
+    /// [noted](crate::Note::NoEntry).
     pub(crate) fn begin(config: &Arrivals, scene: SceneState<'_>, seed: Seed) -> Option<Self> {
         let ego = scene.ego_now().state.pose.position;
         let now = scene.now();

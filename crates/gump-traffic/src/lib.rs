@@ -32,8 +32,10 @@
 
 mod gates;
 mod living;
+mod notes;
 mod signals;
 
 pub use gates::Arrivals;
 pub use living::{LightControl, Living, LivingConfig, RecordedLights};
+pub use notes::{Note, NoteCount, Notes};
 pub use signals::{SignalPlan, Signals};

@@ -3,13 +3,16 @@
 use std::sync::Arc;
 
 use gump_geometry::Pose;
-use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start, WorldModel};
+use gump_rollout::{
+    BoxError, PredictiveSamples, ProbeConfig, Session, SessionStats, Start, WorldModel,
+};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Frame, Light, MapGraph, Scenario, SceneState,
 };
 use rayon::prelude::*;
 
 use crate::gates::{Arrivals, Flow};
+use crate::notes::Notes;
 use crate::signals::{SignalPlan, Signals};
 
 /// Separates the random numbers of the surroundings from those of the world, which are far fewer.
@@ -44,6 +47,11 @@ impl RecordedLights {
             frames: frames.map(|frame| frame.lights().to_vec()).collect(),
             dt: scenario.dt,
         }
+    }
+
+    /// The lights of every frame from the present on.
+    pub(crate) fn frames(&self) -> impl Iterator<Item = &[Light]> {
+        self.frames.iter().map(Vec::as_slice)
     }
 
     /// The lights this many seconds after the present.
@@ -82,6 +90,11 @@ impl<W> Living<W> {
     /// The wrapped world, which moves the agents.
     pub fn world(&self) -> &W {
         &self.world
+    }
+
+    /// What a scene lacks for the lights, arrivals and departures of this world.
+    pub fn notes(&self, scene: &SceneState<'_>) -> Notes {
+        Notes::of(&self.config, scene)
     }
 
     /// The same surroundings around the world that `change` returns.
@@ -260,6 +273,10 @@ impl Session for LivingSession<'_> {
 
     fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
         self.session.take_predictive_samples()
+    }
+
+    fn stats(&self) -> SessionStats {
+        self.session.stats()
     }
 
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {

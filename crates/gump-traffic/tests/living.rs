@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use gump_rollout::worlds::{ConstantVelocity, Idm, LogReplay};
 use gump_rollout::{SimulateConfig, Start, WorldModel, simulate};
 use gump_scene::{AgentId, AgentKind, Frame, LightState, Rollout, Scenario, Seed, fixture};
-use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, RecordedLights};
+use gump_traffic::{Arrivals, LightControl, Living, LivingConfig, Note, RecordedLights};
 
 /// Half a kilometre of road with a lane in either direction, a junction with a light in its middle,
 /// and an ego parked beside it.
@@ -238,6 +238,95 @@ fn sessions_let_futures_go_and_take_others_up() {
 fn a_place_that_nothing_leads_to_stays_as_it_is() {
     let scenario = fixture::scenario("edge: 0,0 9,0\nego vehicle 0: 0,0 velocity 3,0").unwrap();
     let world = Living::new(ConstantVelocity, spawning());
+    assert_eq!(world.notes(&scenario.present()).cases(Note::NoEntry), 1);
     let future = &futures(&world, &scenario, 1, 30.0)[0];
     assert_eq!(future.last().now().agents().len(), 1);
+}
+
+#[test]
+fn on_a_map_without_lane_ends_nobody_enters_or_leaves() {
+    let ring: String = (0..=16)
+        .map(|i| {
+            let angle = f64::from(i) * std::f64::consts::PI / 8.0;
+            format!("{:.3},{:.3} ", 40.0 * angle.cos(), 40.0 * angle.sin())
+        })
+        .collect();
+    let scenario = fixture::scenario(&format!(
+        "lane 1: {ring}next 1
+         ego vehicle 0: 40,0 heading 1.57 velocity 0,6
+         agent vehicle 1: -40,0 heading -1.57 velocity 0,-6"
+    ))
+    .unwrap();
+    let world = Living::new(Idm::default(), spawning());
+    assert_eq!(world.notes(&scenario.present()).cases(Note::NoEntry), 1);
+    let last = &futures(&world, &scenario, 1, 120.0)[0];
+    assert_eq!(last.last().now().agents().len(), 2);
+    // Without arrivals there is nothing to note, nor where a lane leads in.
+    let alone = Living::new(Idm::default(), LivingConfig::default());
+    assert!(alone.notes(&scenario.present()).is_empty());
+    assert!(world.notes(&road("").present()).is_empty());
+}
+
+#[test]
+fn recorded_lights_that_contradict_each_other_later_are_noted() {
+    let mut scenario = road("light 1 red:\nlight 5 green:");
+    let notes = |scenario: &Scenario| {
+        let lights = LightControl::Recorded(std::sync::Arc::new(RecordedLights::of(scenario)));
+        let config = LivingConfig {
+            lights,
+            arrivals: None,
+        };
+        let world = Living::new(ConstantVelocity, config);
+        world
+            .notes(&scenario.present())
+            .cases(Note::ContradictingLights)
+    };
+    assert_eq!(notes(&scenario), 0);
+    for frame in &mut scenario.log[scenario.now + 20..] {
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = LightState::Green;
+        *frame = Frame::new(frame.agents().to_vec(), lights);
+    }
+    assert_eq!(notes(&scenario), 1);
+    // Signals do not look ahead.
+    let signals = Living::new(ConstantVelocity, LivingConfig::default());
+    assert!(signals.notes(&scenario.present()).is_empty());
+}
+
+#[test]
+fn an_hour_goes_by_without_conflicting_greens() {
+    let scenario = road("light 1 red:\nlight 5 green:\nlight 77 green:");
+    let world = Living::new(ConstantVelocity, spawning());
+    let start = Start {
+        scene: scenario.present(),
+        n_futures: 1,
+        seed: Seed(3),
+    };
+    let mut session = world.open(&[start]).unwrap();
+    let (mut greens, mut most, mut known) = ([0; 2], 0, BTreeSet::new());
+    for step in 0..(3600.0 / scenario.dt) as usize {
+        let frame = session.step(None).unwrap().swap_remove(0);
+        let is_green = |lane: i64| {
+            let light = frame.light(gump_scene::LaneId(lane)).unwrap();
+            light.state == LightState::Green
+        };
+        let shown = [is_green(1), is_green(5)];
+        assert_ne!(shown, [true, true], "step {step}");
+        for (n, green) in greens.iter_mut().zip(shown) {
+            *n += usize::from(green);
+        }
+        most = most.max(frame.agents().len());
+        known.extend(others(&frame));
+    }
+    // Both have had their turns, and traffic goes on without growing.
+    assert!(greens.iter().all(|n| *n > 5000), "{greens:?}");
+    assert!(
+        known.len() > 200 && most < 40,
+        "{} came, {most} at once",
+        known.len()
+    );
+    assert_eq!(
+        world.notes(&scenario.present()).cases(Note::UnmappedLight),
+        1
+    );
 }

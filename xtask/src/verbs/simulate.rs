@@ -20,7 +20,7 @@ use crate::films::{self, FilmArgs};
 use crate::imagine::{Imagined, imagine_probed};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
-use crate::{annotations, futures, tables};
+use crate::{annotations, futures, notes, tables};
 
 /// The most futures of one run: they are held in memory until they are written.
 const MOST_FUTURES: usize = 65_536;
@@ -142,7 +142,8 @@ impl Args {
             self.write(run, &scenario, &imagined.rollouts, viewer)
         })?;
         run.result("decoding", decoding.name)?;
-        self.report(run, &scenario, &imagined, &summary)
+        self.report(run, &scenario, &imagined, &summary)?;
+        notes::report(run, &world.notes(&scenario), 1)
     }
 
     fn write<'a>(

@@ -26,7 +26,7 @@ use crate::{EvalError, Monitor};
 pub use long::{
     LongObservation, LongSummary, long_scenes, observe_logs, observe_world, summarize_long,
 };
-pub use prompts::{PromptConfig, PromptRow, PromptSatisfaction, prompt_satisfaction};
+pub use prompts::{PromptConfig, PromptMeans, PromptRow, PromptSatisfaction, prompt_satisfaction};
 pub use sources::{ComparedScene, SceneMakers, SceneSource};
 
 /// Draws of recordings for an interval; its ends move by a few percent of its width with the seed.

@@ -3,7 +3,7 @@
 //! A tag is requested on maps that admit it, which is determined without the network; a tag that
 //! none of the maps admits (a car park, an all-way stop) is listed and does not count.
 
-use gump_generate::check::{Clause, NOBODY_OVERLAPS};
+use gump_generate::check::{Clause, NOBODY_OVERLAPS, VEHICLES_ON_ROAD};
 use gump_generate::pipeline::{GenerationJob, GenerationWorlds, admits, make};
 use gump_generate::{Counts, GenerateConfig, GenerateRequest};
 use gump_metrics::tags::{self, rules};
@@ -20,8 +20,8 @@ const PROMPTED: Counts = Counts {
     pedestrians: 4,
     bicycles: 3,
 };
-/// Seconds simulated of every scene, to see which tags hold and whether it stays free of overlaps:
-/// the horizon of Waymo's challenges.
+/// Seconds simulated of every scene, to see which tags hold, for how long, and whether it stays free
+/// of overlaps and on the road: the horizon of Waymo's challenges.
 const JUDGED_S: f64 = 8.0;
 /// Unprompted scenes per map on which a tag is requested. Chosen by hand.
 const UNPROMPTED: usize = 16;
@@ -50,6 +50,61 @@ pub struct PromptSatisfaction {
     pub logged: Option<f64>,
     /// One per tag.
     pub rows: Vec<PromptRow>,
+    /// Means over all prompted scenes, whatever their tag; `None` without any.
+    pub scenes: Option<PromptMeans>,
+}
+
+/// Means over prompted scenes.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PromptMeans {
+    /// Number of scenes.
+    pub scenes: usize,
+    /// Share of scenes in which the tag holds with every other clause.
+    pub satisfaction: f64,
+    /// Share of scenes in which the tag holds.
+    pub tag_alone: f64,
+    /// Share of scenes that satisfy their prompt at the first attempt.
+    pub first_attempt: f64,
+    /// Share of scenes that satisfy it at the first attempt without steering.
+    pub first_unsteered: f64,
+    /// Share of scenes in which no agents overlap in the 8 s after the present.
+    pub clear_throughout: f64,
+    /// Share of scenes in which no vehicle is off the road in the 8 s after the present.
+    pub on_road_throughout: f64,
+    /// Mean share of the instants of these 8 s at which the tag holds, two a second and the present.
+    /// Tags about what begins hold for a moment only.
+    pub tag_share_of_time: f64,
+    /// Mean number of attempts.
+    pub attempts: f64,
+    /// Share of scenes whose agents were steered.
+    pub steered: f64,
+    /// Mean seconds from the generated scene to its present.
+    pub moment_s: f64,
+}
+
+impl PromptMeans {
+    fn of(all: &[&PromptedScene]) -> Option<Self> {
+        let mean = |value: &dyn Fn(&PromptedScene) -> f64| {
+            let sum: f64 = all.iter().map(|prompted| value(prompted)).sum();
+            sum / all.len() as f64
+        };
+        let share = |is: &dyn Fn(&PromptedScene) -> bool| mean(&|prompted| f64::from(is(prompted)));
+        (!all.is_empty()).then(|| Self {
+            scenes: all.len(),
+            satisfaction: share(&|prompted| prompted.holds),
+            tag_alone: share(&|prompted| prompted.is_tag),
+            first_attempt: share(&|prompted| {
+                prompted.first.is_some_and(|(attempt, _)| attempt == 1)
+            }),
+            first_unsteered: share(&|prompted| prompted.first == Some((1, false))),
+            clear_throughout: share(&|prompted| prompted.is_clear),
+            on_road_throughout: share(&|prompted| prompted.is_on_road),
+            tag_share_of_time: mean(&|prompted| prompted.tag_share),
+            attempts: mean(&|prompted| prompted.attempts as f64),
+            steered: share(&|prompted| prompted.is_steered),
+            moment_s: mean(&|prompted| prompted.moment_s),
+        })
+    }
 }
 
 /// The results of one tag; `None` where no map admits it.
@@ -71,6 +126,10 @@ pub struct PromptRow {
     pub first_unsteered: Option<f64>,
     /// Share of scenes in which no agents overlap in the 8 s after the present.
     pub clear_throughout: Option<f64>,
+    /// Share of scenes in which no vehicle is off the road in the 8 s after the present.
+    pub on_road_throughout: Option<f64>,
+    /// Mean share of the instants of these 8 s at which the tag holds.
+    pub tag_share_of_time: Option<f64>,
     /// Mean number of attempts.
     pub attempts: Option<f64>,
     /// Share of scenes whose agents were steered.
@@ -88,6 +147,9 @@ struct PromptedScene {
     holds: bool,
     is_tag: bool,
     is_clear: bool,
+    is_on_road: bool,
+    /// Share of the instants at which the tag holds.
+    tag_share: f64,
     /// The first attempt that satisfied it, and whether the ego was steered then.
     first: Option<(usize, bool)>,
     attempts: usize,
@@ -216,7 +278,11 @@ fn make_prompted(
             tag,
             holds: checked.holds(),
             is_tag: tags::holds(prompt, &checked.scenario) == Some(true),
-            is_clear: stays_clear(&checked.clauses),
+            is_clear: holds_throughout(&checked.clauses, NOBODY_OVERLAPS),
+            is_on_road: holds_throughout(&checked.clauses, VEHICLES_ON_ROAD),
+            tag_share: find(&checked.clauses, prompt.name())
+                .and_then(|clause| clause.share_of_time)
+                .unwrap_or(0.0),
             first: checked.first_satisfied,
             attempts: checked.attempts,
             is_steered: checked.is_steered,
@@ -227,6 +293,8 @@ fn make_prompted(
             holds: false,
             is_tag: false,
             is_clear: false,
+            is_on_road: false,
+            tag_share: 0.0,
             first: None,
             attempts: order.attempts,
             is_steered: false,
@@ -235,12 +303,13 @@ fn make_prompted(
     }
 }
 
-/// Whether no agents overlap from the present on.
-fn stays_clear(clauses: &[Clause]) -> bool {
-    let overlaps = clauses
-        .iter()
-        .find(|clause| clause.clause == NOBODY_OVERLAPS);
-    overlaps.and_then(|clause| clause.holds_throughout) == Some(true)
+fn find<'a>(clauses: &'a [Clause], name: &str) -> Option<&'a Clause> {
+    clauses.iter().find(|clause| clause.clause == name)
+}
+
+/// Whether a clause holds from the present on.
+fn holds_throughout(clauses: &[Clause], name: &str) -> bool {
+    find(clauses, name).and_then(|clause| clause.holds_throughout) == Some(true)
 }
 
 fn summed(
@@ -260,13 +329,9 @@ fn summed(
             .iter()
             .filter(|prompted| prompted.tag == i)
             .collect();
-        let of = |value: &dyn Fn(&PromptedScene) -> f64| {
-            let sum: f64 = own.iter().map(|prompted| value(prompted)).sum();
-            (!own.is_empty()).then(|| sum / own.len() as f64)
-        };
-        let satisfaction = of(&|prompted| f64::from(prompted.holds));
-        if let Some(satisfaction) = satisfaction {
-            held.push(satisfaction);
+        let means = PromptMeans::of(&own);
+        if let Some(means) = means {
+            held.push(means.satisfaction);
             free.push(share(unprompted, tag));
             log.push(share(logged, tag));
         }
@@ -274,16 +339,16 @@ fn summed(
             tag: tag.name(),
             maps: own.len(),
             looked_at: places[i].looked_at,
-            satisfaction,
-            tag_alone: of(&|prompted| f64::from(prompted.is_tag)),
-            first_attempt: of(&|prompted| {
-                f64::from(prompted.first.is_some_and(|(attempt, _)| attempt == 1))
-            }),
-            first_unsteered: of(&|prompted| f64::from(prompted.first == Some((1, false)))),
-            clear_throughout: of(&|prompted| f64::from(prompted.is_clear)),
-            attempts: of(&|prompted| prompted.attempts as f64),
-            steered: of(&|prompted| f64::from(prompted.is_steered)),
-            moment_s: of(&|prompted| prompted.moment_s),
+            satisfaction: means.map(|means| means.satisfaction),
+            tag_alone: means.map(|means| means.tag_alone),
+            first_attempt: means.map(|means| means.first_attempt),
+            first_unsteered: means.map(|means| means.first_unsteered),
+            clear_throughout: means.map(|means| means.clear_throughout),
+            on_road_throughout: means.map(|means| means.on_road_throughout),
+            tag_share_of_time: means.map(|means| means.tag_share_of_time),
+            attempts: means.map(|means| means.attempts),
+            steered: means.map(|means| means.steered),
+            moment_s: means.map(|means| means.moment_s),
             unconditional: share(unprompted, tag),
             log: share(logged, tag),
         });
@@ -297,11 +362,14 @@ fn summed(
         unconditional: mean(&free),
         logged: mean(&log),
         rows,
+        scenes: PromptMeans::of(&prompted.iter().collect::<Vec<_>>()),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use gump_generate::check::{check_clauses, through_time};
+
     use super::*;
 
     #[test]
@@ -312,6 +380,8 @@ mod tests {
             holds,
             is_tag: true,
             is_clear: !holds,
+            is_on_road: holds,
+            tag_share: if holds { 0.25 } else { 0.0 },
             first: holds.then_some((1, holds)),
             attempts: 3,
             is_steered: holds,
@@ -328,8 +398,34 @@ mod tests {
         assert_eq!(prompts.rows[0].first_attempt, Some(0.5));
         assert_eq!(prompts.rows[0].first_unsteered, Some(0.0));
         assert_eq!(prompts.rows[0].clear_throughout, Some(0.5));
+        assert_eq!(prompts.rows[0].on_road_throughout, Some(0.5));
+        assert_eq!(prompts.rows[0].tag_share_of_time, Some(0.125));
+        // Over scenes, not over tags.
+        let all = prompts.scenes.unwrap();
+        assert_eq!((all.scenes, all.satisfaction), (3, 2.0 / 3.0));
+        assert_eq!((all.clear_throughout, all.steered), (1.0 / 3.0, 2.0 / 3.0));
+        assert_eq!(
+            (all.on_road_throughout, all.tag_share_of_time),
+            (2.0 / 3.0, 0.5 / 3.0)
+        );
         let unadmitted = &prompts.rows[1];
         assert_eq!((unadmitted.maps, unadmitted.satisfaction), (0, None));
         assert_eq!(summed(&tags, &places, &[], &[], &[]).satisfaction, None);
+        assert_eq!(summed(&tags, &places, &[], &[], &[]).scenes, None);
+    }
+
+    #[test]
+    fn clauses_are_found_by_their_names() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: -50,0 90,0\nego vehicle 0: 0,0 velocity 10,0\nagent vehicle 1: 44,0",
+        )
+        .unwrap();
+        let tag: ScenarioTag = "high_magnitude_speed".parse().unwrap();
+        let mut clauses = check_clauses(&scenario, &[tag], None);
+        through_time(&mut clauses, &scenario, None);
+        assert!(holds_throughout(&clauses, VEHICLES_ON_ROAD));
+        assert!(!holds_throughout(&clauses, NOBODY_OVERLAPS));
+        let prompt = find(&clauses, tag.name()).unwrap();
+        assert_eq!(prompt.share_of_time, Some(1.0));
     }
 }

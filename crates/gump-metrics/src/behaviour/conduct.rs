@@ -11,6 +11,7 @@ use crate::summary::{is_on_road, leaves_road};
 
 /// An implausible action that the log of the agent does not show.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
 pub enum Deed {
     /// One of the measures of this module.
     Measured(Measure),

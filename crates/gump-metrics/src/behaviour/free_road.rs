@@ -5,7 +5,7 @@
 //! half a metre of its path, pedestrians and bicycles within 3 m; within 25 m ahead is a light that
 //! is not green, a stop line, a stop sign or the end of the road; an intersection is within 15 m
 //! and within 50 m an agent on another path approaches. A stop is free if there is no reason at its
-//! start, at its end or in between.
+//! start, at its end or in between; a vehicle that stands for long is looked at every second.
 //!
 //! `relative/waiting.rs` of `gump-engine` and `reason.rs` of `gump-generate` ask similar questions of
 //! standing vehicles. A metric must not count stops that a driver might make, so the reasons here
@@ -53,14 +53,16 @@ impl Counter<'_> {
     /// Whether a vehicle that stands from one frame to another has no reason to.
     pub(super) fn is_free(&self, track: &Track, from: usize, until: usize) -> bool {
         let moments = [from, (from + until) / 2, until];
-        moments.into_iter().all(|k| {
-            let frame = self.take.frames[k];
-            let place = track.pose(k);
-            place.is_some_and(|pose| {
-                let other = |agent: &&Agent| agent.id != track.id;
-                let others: Vec<&Agent> = frame.agents().iter().filter(other).collect();
-                has_no_reason(self.map, frame, &others, track, pose)
-            })
+        moments.into_iter().all(|k| self.is_free_at(track, k))
+    }
+
+    /// Whether a vehicle that stands at frame `k` has no reason to.
+    pub(super) fn is_free_at(&self, track: &Track, k: usize) -> bool {
+        let frame = self.take.frames[k];
+        track.pose(k).is_some_and(|pose| {
+            let other = |agent: &&Agent| agent.id != track.id;
+            let others: Vec<&Agent> = frame.agents().iter().filter(other).collect();
+            has_no_reason(self.map, frame, &others, track, pose)
         })
     }
 }

@@ -31,6 +31,36 @@ struct Gate<'a> {
     states: Vec<Option<LightState>>,
 }
 
+/// Time that lights show one colour, and how often that ends.
+///
+/// The ratio of the two is the mean length of phases, also where most are cut: over a window that
+/// begins at any moment, a phase contributes to either in proportion to how often it comes. A mean
+/// over the phases that are seen from their beginning to their end would favour short ones.
+struct Phases {
+    colour: LightState,
+    /// Number of frames that follow one in which a light has the colour.
+    frames: usize,
+    ends: usize,
+}
+
+impl Phases {
+    fn of(colour: LightState) -> Self {
+        Self {
+            colour,
+            frames: 0,
+            ends: 0,
+        }
+    }
+
+    /// Adds two successive frames of a light that is known in both.
+    fn add(&mut self, was: LightState, now: LightState) {
+        if was == self.colour {
+            self.frames += 1;
+            self.ends += usize::from(now != was);
+        }
+    }
+}
+
 /// A vehicle that passes a line.
 struct Crossing<'a> {
     k: usize,
@@ -120,11 +150,12 @@ impl Counter<'_> {
         Some(last)
     }
 
-    /// Counts changes of lights and their time at red. Lights unknown in the present are left out: a
-    /// world shows them to the end, while a recording sees them for a moment.
+    /// Counts changes of lights, their time at red and the lengths of phases. Lights unknown in the
+    /// present are left out: a world shows them to the end, while a recording sees them for a moment.
     pub(super) fn light_changes(&mut self) {
         let known = |state: Option<LightState>| state.filter(|s| *s != LightState::Unknown);
         let (mut seen, mut red, mut changes) = (0, 0, 0);
+        let mut phases = [LightState::Red, LightState::Green].map(Phases::of);
         for gate in gates(self.map, self.take) {
             if known(gate.states[self.take.now]).is_none() {
                 continue;
@@ -135,7 +166,19 @@ impl Counter<'_> {
                 };
                 seen += 1;
                 red += usize::from(now == LightState::Red);
-                changes += usize::from(known(gate.states[k - 1]).is_some_and(|was| was != now));
+                if let Some(was) = known(gate.states[k - 1]) {
+                    changes += usize::from(was != now);
+                    phases.iter_mut().for_each(|phases| phases.add(was, now));
+                }
+            }
+        }
+        for (measure, phases) in [Measure::RedPhase, Measure::GreenPhase]
+            .into_iter()
+            .zip(phases)
+        {
+            if phases.frames > 0 {
+                let seconds = phases.frames as f64 * self.take.dt;
+                self.add(measure, Class::Light, seconds, phases.ends as f64);
             }
         }
         if seen > 0 {

@@ -13,6 +13,8 @@ pub enum Measure {
     ParkedMove,
     /// A vehicle stops without a reason.
     FreeRoadStop,
+    /// A vehicle that has moved stands for ten seconds without a reason.
+    FreeRoadStanding,
     /// Two boxes overlap that did not in the present.
     NewOverlap,
     /// A change of velocity beyond the grip of tyres.
@@ -33,13 +35,18 @@ pub enum Measure {
     LightChange,
     /// A light is red.
     LightRed,
+    /// Seconds that a light is red at a time.
+    RedPhase,
+    /// Seconds that a light is green at a time.
+    GreenPhase,
 }
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 15] = [
         Self::ParkedMove,
         Self::FreeRoadStop,
+        Self::FreeRoadStanding,
         Self::NewOverlap,
         Self::HardAcceleration,
         Self::Slip,
@@ -50,6 +57,8 @@ impl Measure {
         Self::ConflictingGreen,
         Self::LightChange,
         Self::LightRed,
+        Self::RedPhase,
+        Self::GreenPhase,
     ];
 
     /// Name in reports, `snake_case`.
@@ -57,6 +66,7 @@ impl Measure {
         match self {
             Self::ParkedMove => "parked_move",
             Self::FreeRoadStop => "free_road_stop",
+            Self::FreeRoadStanding => "free_road_standing",
             Self::NewOverlap => "new_overlap",
             Self::HardAcceleration => "hard_acceleration",
             Self::Slip => "slip",
@@ -67,6 +77,8 @@ impl Measure {
             Self::ConflictingGreen => "conflicting_green",
             Self::LightChange => "light_change",
             Self::LightRed => "light_red",
+            Self::RedPhase => "red_phase_s",
+            Self::GreenPhase => "green_phase_s",
         }
     }
 
@@ -80,24 +92,36 @@ impl Measure {
         match self {
             Self::ParkedMove => "parked vehicle",
             Self::FreeRoadStop | Self::LaneChange => "minute of moving",
+            Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
             Self::HardAcceleration | Self::SetOff => "minute",
             Self::LightChange => "minute of a light",
             Self::LightRed => "time of a light",
+            Self::RedPhase => "red that ends",
+            Self::GreenPhase => "green that ends",
             Self::Slip => "time of moving",
             Self::RedLight => "passage of a light",
             Self::ConflictingGreen => "time of crossing lights",
         }
     }
 
-    /// True if the value is a rate per minute, false if it is a share or a count per agent.
+    /// True if the value is a rate per minute.
     pub fn is_rate(self) -> bool {
         self.per().starts_with("minute")
     }
 
+    /// True if the value is a mean duration in seconds. What is neither a rate nor a duration is a
+    /// share or a number per agent.
+    pub fn is_duration(self) -> bool {
+        matches!(self, Self::RedPhase | Self::GreenPhase)
+    }
+
     /// True if the value depends on the horizon, so that a shorter log has none.
     pub fn needs_whole_horizon(self) -> bool {
-        matches!(self, Self::ParkedMove | Self::NewOverlap)
+        matches!(
+            self,
+            Self::ParkedMove | Self::NewOverlap | Self::FreeRoadStanding
+        )
     }
 }
 
@@ -191,7 +215,7 @@ pub struct Key {
 /// Events and their denominator.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Count {
-    /// Events.
+    /// Events; of a measure that [is a duration](Measure::is_duration) seconds.
     pub events: f64,
     /// The denominator, in the unit of [`Measure::per`].
     pub of: f64,

@@ -8,6 +8,7 @@
 //! |---|---|---|
 //! | `parked_move` | a vehicle that stood for the whole log (never over 0.5 m from its present place, seen in at least half of the frames) gets over 2 m away from it | vehicle that stood |
 //! | `free_road_stop` | a vehicle that has moved stands for at least 1 s, for no reason that can be seen: `free_road.rs` lists the reasons | minute that vehicles move |
+//! | `free_road_standing` | a vehicle that has moved then stands for at least 10 s after the present, without such a reason at any of these seconds; each vehicle once | vehicle that moves, before or after the present, and is there for at least 10 s after it |
 //! | `new_overlap` | a pair of boxes is over 0.1 m deep in one another and did not overlap in the present; each pair once | agent, of all classes |
 //! | `hard_acceleration` | the velocity changes by more than 8 m/s² over half a second; times less than 0.5 s apart are one event | minute that agents are there |
 //! | `slip` | a vehicle faster than 1 m/s slides sideways at more than 0.5 m/s wherever its rear axle may be | time that vehicles move |
@@ -18,12 +19,20 @@
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
 //! | `light_change` | a light that controls a lane of the map, and whose colour is known in the present, changes it | minute that its colour is known |
 //! | `light_red` | such a light is red | time that its colour is known |
+//! | `red_phase_s`, `green_phase_s` | seconds that such a light is red, or green | red, or green, that ends while its colour is known |
 //!
 //! To *stand* is to move less than 0.3 m within a second, to *move* more than 1 m. Speeds are
 //! computed from positions, not from velocities that a tracker or a network states. Counted are
 //! moving kinds of agents that are in the present frame; where agents enter and leave, see
-//! [`Behaviour::with_newcomers`]. Futures that end before the horizon have no `parked_move` and no
-//! `new_overlap`, which grow with time.
+//! [`Behaviour::with_newcomers`]. Futures that end before the horizon have no `parked_move`, no
+//! `new_overlap` and no `free_road_standing`, which grow with time.
+//!
+//! Few phases of lights begin and end within the 8 s of a log. `red_phase_s` and `green_phase_s` are
+//! therefore the total time of the colour divided by the number of its ends, over all lights and
+//! futures. That estimates the mean length of phases although most are cut by the window, if the
+//! present is at a moment that has nothing to do with the lights: a light that keeps its colour
+//! throughout adds its time and no end. Where no phase ends there is no value, and with few ends the
+//! interval is wide.
 //!
 //! Lights control lanes, not turns: a legal right turn at red after a stop counts as a red light
 //! here. The same happens in the log, so values should be compared with the log's.

@@ -19,6 +19,11 @@ const SEEN_SHARE: f64 = 0.5;
 /// Duration of standing, after [`Track::pace`] first shows it, that makes a stop, seconds: not a
 /// brief halt. Chosen by hand.
 const STOP_S: f64 = 1.0;
+/// Duration of standing without a reason after which a driver behind would be sure that it is not a
+/// pause, seconds: the bound that result 23 has as its goal.
+const LONG_S: f64 = 10.0;
+/// Interval at which the reasons of a vehicle that stands for long are looked for, seconds.
+const LOOK_S: f64 = 1.0;
 
 /// Vehicles of the present that stand for the whole log, as far as they are observed.
 pub(super) fn parked(scenario: &Scenario) -> BTreeSet<AgentId> {
@@ -108,7 +113,58 @@ impl Counter<'_> {
             self.add(Measure::FreeRoadStop, class, f64::from(n), moving);
             self.add(Measure::LaneChange, class, 0.0, moving);
         }
+        if has_lanes {
+            self.free_road_standing();
+        }
         self.parked_moves();
+    }
+
+    fn free_road_standing(&mut self) {
+        let (take, long) = (self.take, self.take.steps(LONG_S));
+        for track in vehicles(self.tracks) {
+            // Who is there for a shorter time cannot stand that long.
+            let there = take.ahead().filter(|&k| track.pose(k).is_some()).count();
+            let moves = |k: usize| track.pace(k).is_some_and(|pace| pace > MOVES);
+            if there < long || !(0..take.frames.len()).any(moves) {
+                continue;
+            }
+            let found = self.stands_long(track);
+            let events = f64::from(u8::from(found.is_some()));
+            self.add(Measure::FreeRoadStanding, Class::Vehicle, events, 1.0);
+            if let Some(k) = found {
+                self.note(Measure::FreeRoadStanding, track.id, None, k);
+            }
+        }
+    }
+
+    /// The frame at which a vehicle that has moved has stood for [`LONG_S`] after the present and
+    /// had no reason to all that time.
+    fn stands_long(&self, track: &Track) -> Option<usize> {
+        let (now, take) = (self.take.now, self.take);
+        let (look, long) = (take.steps(LOOK_S), take.steps(LONG_S));
+        let mut has_moved = false;
+        // The next frame to look at while it stands, and since when there is no reason.
+        let (mut next, mut free): (Option<usize>, Option<usize>) = (None, None);
+        for k in 0..take.frames.len() {
+            let pace = track.pace(k);
+            has_moved |= pace.is_some_and(|pace| pace > MOVES);
+            if !has_moved || k < now || pace.is_none_or(|pace| pace >= STANDS) {
+                (next, free) = (None, None);
+                continue;
+            }
+            // It has stood since before the pace first shows it.
+            let mut at = next.unwrap_or_else(|| k.saturating_sub(track.pace_steps()).max(now));
+            while at <= k {
+                if !self.is_free_at(track, at) {
+                    free = None;
+                } else if at - *free.get_or_insert(at) >= long {
+                    return Some(at);
+                }
+                at += look;
+            }
+            next = Some(at);
+        }
+        None
     }
 
     fn parked_moves(&mut self) {

@@ -178,6 +178,98 @@ fn a_halt_of_a_moment_is_no_stop() {
     assert_eq!(events(&scenario, &rollout, Measure::FreeRoadStop), 0.0);
 }
 
+/// Vehicles that stand for ten seconds without a reason, and those that could, within `seconds` of
+/// futures in which only the ego moves: to the place that `drive` returns.
+fn standing_free(
+    text: &str,
+    seconds: u32,
+    drive: impl Fn(f64) -> f64,
+    lights: impl Fn(f64) -> LightState,
+) -> (f64, f64) {
+    let scenario = scenario(text);
+    let mut rollout = Rollout::begin(scenario.present());
+    for step in 1..=10 * seconds {
+        let t = f64::from(step) * 0.1;
+        let agents = scenario.present().now().agents().iter().map(|agent| {
+            let mut agent = *agent;
+            if agent.id == AgentId(0) {
+                agent.state.pose = ahead(agent.state.pose, drive(t));
+            }
+            agent
+        });
+        let shown = scenario.present().now().lights().iter();
+        let shown = shown.map(|light| Light {
+            state: lights(t),
+            ..*light
+        });
+        rollout.push(Frame::new(agents.collect(), shown.collect()));
+    }
+    let tally = Behaviour::new(&scenario, seconds).of(&rollout).tally;
+    let found = tally.count(Measure::FreeRoadStanding, Class::Vehicle, seconds);
+    (found.events, found.of)
+}
+
+#[test]
+fn who_stands_long_on_a_free_road_counts_once() {
+    let stop = |t: f64| braking(10.0, t);
+    let check = |further: &str, drive: &dyn Fn(f64) -> f64| {
+        let text = format!("{ROAD}{further}");
+        standing_free(&text, 30, drive, |_| LightState::Red)
+    };
+    assert_eq!(check("", &stop), (1.0, 1.0));
+    // What has a reason does not count, and neither does who goes on before ten seconds are over.
+    assert_eq!(check("agent vehicle 1: 35,0.5", &stop), (0.0, 1.0));
+    assert_eq!(check("light 1 red: 30,0", &stop), (0.0, 1.0));
+    let pause = |wait: f64| move |t: f64| stop(t) + 5.0 * (t - 3.4 - wait).max(0.0);
+    assert_eq!(check("", &pause(9.0)), (0.0, 1.0));
+    assert_eq!(check("", &pause(13.0)), (1.0, 1.0));
+    // Once for each vehicle, however long and however often it stands.
+    let twice = |t: f64| stop(t.min(15.0)) + stop((t - 15.0).max(0.0));
+    assert_eq!(check("", &twice), (1.0, 1.0));
+    // Who has never moved is parked, on the lane or beside it. The wait of one that starts late is
+    // none, but it is among those that move.
+    let parked = "agent vehicle 1: -60,0\nagent vehicle 2: 90,-5";
+    assert_eq!(check(parked, &stop), (1.0, 1.0));
+    let waits = "lane 1: -100,0 500,0\nego vehicle 0: 0,0";
+    let late = |t: f64| 8.0 * (t - 20.0).max(0.0);
+    assert_eq!(
+        standing_free(waits, 30, late, |_| LightState::Red),
+        (0.0, 1.0)
+    );
+}
+
+#[test]
+fn ten_seconds_on_a_free_road_begin_when_the_reason_ends() {
+    // The ego stands from 3.3 s on, before a light at 30 m.
+    let at = |green_from: f64, green_until: f64| {
+        let text = format!("{ROAD}light 1 red: 30,0");
+        let lights = |t: f64| match (green_from..green_until).contains(&t) {
+            true => LightState::Green,
+            false => LightState::Red,
+        };
+        standing_free(&text, 30, |t| braking(10.0, t), lights).0
+    };
+    assert_eq!(at(15.0, 99.0), 1.0);
+    assert_eq!(at(22.0, 99.0), 0.0);
+    // A reason in between starts the count again.
+    assert_eq!(at(5.0, 12.0), 0.0);
+    assert_eq!(at(5.0, 18.0), 1.0);
+}
+
+#[test]
+fn standing_long_needs_the_whole_horizon_and_ten_seconds_of_it() {
+    let stop = |t: f64| braking(10.0, t);
+    assert_eq!(
+        standing_free(ROAD, 8, stop, |_| LightState::Red),
+        (0.0, 0.0)
+    );
+    assert_eq!(standing_free(ROAD, 30, stop, |_| LightState::Red).1, 1.0);
+    let scenario = scenario(ROAD);
+    let log = Behaviour::new(&scenario, 30).log().tally;
+    let found = log.count(Measure::FreeRoadStanding, Class::Vehicle, 30);
+    assert_eq!(found.rate(), None);
+}
+
 #[test]
 fn overlaps_are_counted_by_pair_and_class() {
     let check = |other: &str, class: Class, expected: f64| {
@@ -295,6 +387,47 @@ fn lights_that_change_count_per_minute_of_a_light() {
     let red = tally.count(Measure::LightRed, Class::Light, 8);
     assert_eq!((changes.events, red.events, red.of), (2.0, 20.0, 70.0));
     assert!((changes.of * 60.0 - 7.0).abs() < 1e-9, "{changes:?}");
+    // A second of red before it is unknown does not end in sight, nor does the red at the end.
+    let phase = |measure| tally.count(measure, Class::Light, 8);
+    let (red, green) = (phase(Measure::RedPhase), phase(Measure::GreenPhase));
+    assert!((red.events - 1.9).abs() < 1e-9, "{red:?}");
+    assert_eq!((red.of, red.rate()), (0.0, None));
+    assert!((green.events - 2.0).abs() < 1e-9, "{green:?}");
+    assert_eq!(green.of, 1.0);
+}
+
+#[test]
+fn phases_that_a_window_cuts_have_their_mean_length() {
+    // Lights of 25 s red, 3 s yellow and 12 s green, each seen for 8 s from another moment on: less
+    // than any red lasts.
+    let scenario = scenario(&format!("{ROAD}light 1 red: 40,0"));
+    let state = |t: f64| match t.rem_euclid(40.0) {
+        t if t < 25.0 => LightState::Red,
+        t if t < 37.0 => LightState::Green,
+        _ => LightState::Yellow,
+    };
+    let behaviour = Behaviour::new(&scenario, 8);
+    let mut sum = Tally::default();
+    for start in 0..400 {
+        let start = 0.1 * f64::from(start) + 0.05;
+        let light = |t: f64| Light {
+            state: state(start + t),
+            ..scenario.present().now().lights()[0]
+        };
+        let mut first = scenario.clone();
+        let now = first.now;
+        first.log[now] = Frame::new(first.log[now].agents().to_vec(), vec![light(0.0)]);
+        let mut rollout = Rollout::begin(first.present());
+        for step in 1..=80 {
+            let agents = first.present().now().agents().to_vec();
+            rollout.push(Frame::new(agents, vec![light(f64::from(step) * 0.1)]));
+        }
+        sum.merge(&behaviour.of(&rollout).tally);
+    }
+    let seconds = |measure| sum.count(measure, Class::Light, 8).rate();
+    let (red, green) = (seconds(Measure::RedPhase), seconds(Measure::GreenPhase));
+    assert!((red.unwrap() - 25.0).abs() < 0.01, "{red:?}");
+    assert!((green.unwrap() - 12.0).abs() < 0.01, "{green:?}");
 }
 
 #[test]

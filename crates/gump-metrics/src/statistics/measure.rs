@@ -3,7 +3,7 @@
 /// A statistic of scenes. Rates and shares are fractions, other units are SI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
-pub enum Measure {
+pub enum Statistic {
     /// Share of steps slower than 0.3 m/s.
     Standing,
     /// Share of tracks of at least two seconds that stay within 1 m of their first position.
@@ -86,7 +86,7 @@ pub enum Measure {
     Driveways,
 }
 
-impl Measure {
+impl Statistic {
     /// Every measure.
     pub const ALL: [Self; 40] = [
         Self::Standing,

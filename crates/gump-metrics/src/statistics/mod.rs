@@ -1,13 +1,13 @@
 //! Statistics of traffic as distributions, collected over any number of scenes in constant memory
 //! and compared with those of other scenes.
 //!
-//! Start with [`Statistics::add`] and [`Statistics::compare`]; [`Measure::ALL`] lists the measures.
-//! A measure is counted for vehicles, pedestrians and bicycles separately, or once per scene. Every
-//! distribution has fixed bins, so that partial counts can be added and two sets can be compared
-//! without their scenes.
+//! Start with [`Statistics::add`] and [`Statistics::compare`]; [`Statistic::ALL`] lists the
+//! measures. A measure is counted for vehicles, pedestrians and bicycles separately, or once per
+//! scene. Every distribution has fixed bins, so that partial counts can be added and two sets can be
+//! compared without their scenes.
 //!
 //! ```
-//! use gump_metrics::statistics::{Measure, Statistics};
+//! use gump_metrics::statistics::{Statistic, Statistics};
 //!
 //! let scenario = gump_scene::fixture::scenario(
 //!     "lane 1: 0,0 200,0
@@ -17,7 +17,7 @@
 //! let mut statistics = Statistics::default();
 //! statistics.add(&scenario);
 //! let rows = statistics.rows();
-//! let standing = rows.iter().find(|row| row.measure == Measure::Standing).unwrap();
+//! let standing = rows.iter().find(|row| row.measure == Statistic::Standing).unwrap();
 //! assert_eq!(standing.distribution.mean(), 0.5);
 //! assert!(statistics.compare(&statistics).iter().all(|row| row.wasserstein == Some(0.0)));
 //! ```
@@ -32,18 +32,18 @@ use std::collections::BTreeMap;
 use gump_scene::{AgentKind, Scenario};
 
 pub use self::distribution::Distribution;
-pub use self::measure::Measure;
+pub use self::measure::Statistic;
 
 /// The class that a measure is counted for: a kind of agent, or `None` for the scene as a whole.
-pub type Class = Option<AgentKind>;
+pub type StatisticClass = Option<AgentKind>;
 
 /// The name of a class in tables.
-pub fn class_name(class: Class) -> &'static str {
+pub fn class_name(class: StatisticClass) -> &'static str {
     class.map_or("scene", AgentKind::name)
 }
 
 /// The class with this name in tables.
-pub fn class_of_name(name: &str) -> Option<Class> {
+pub fn class_of_name(name: &str) -> Option<StatisticClass> {
     let kinds = AgentKind::MOVING.into_iter().map(Some);
     let mut all = std::iter::once(None).chain(kinds);
     all.find(|class| class_name(*class) == name)
@@ -53,16 +53,16 @@ pub fn class_of_name(name: &str) -> Option<Class> {
 #[derive(Clone, Debug, Default)]
 pub struct Statistics {
     scenes: u64,
-    counted: BTreeMap<(Measure, Class), Distribution>,
+    counted: BTreeMap<(Statistic, StatisticClass), Distribution>,
 }
 
 /// The distribution of a measure over a class of agents.
 #[derive(Clone, Debug)]
 pub struct MeasuredDistribution<'a> {
     /// The measure.
-    pub measure: Measure,
+    pub measure: Statistic,
     /// The class.
-    pub class: Class,
+    pub class: StatisticClass,
     /// Its values.
     pub distribution: &'a Distribution,
 }
@@ -71,9 +71,9 @@ pub struct MeasuredDistribution<'a> {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Comparison {
     /// The measure.
-    pub measure: Measure,
+    pub measure: Statistic,
     /// The class.
-    pub class: Class,
+    pub class: StatisticClass,
     /// Observations in the set.
     pub n: u64,
     /// Mean of the set; `None` without observations.
@@ -112,7 +112,7 @@ impl Statistics {
     /// Statistics of `scenes` scenes from stored distributions.
     pub fn from_rows(
         scenes: u64,
-        rows: impl IntoIterator<Item = (Measure, Class, Distribution)>,
+        rows: impl IntoIterator<Item = (Statistic, StatisticClass, Distribution)>,
     ) -> Self {
         let counted = rows.into_iter().map(|(m, c, d)| ((m, c), d)).collect();
         Self { scenes, counted }
@@ -129,7 +129,7 @@ impl Statistics {
     }
 
     /// The distribution of a measure; `None` if nothing was observed.
-    pub fn get(&self, measure: Measure, class: Class) -> Option<&Distribution> {
+    pub fn get(&self, measure: Statistic, class: StatisticClass) -> Option<&Distribution> {
         self.counted.get(&(measure, class))
     }
 
@@ -155,16 +155,16 @@ impl Statistics {
     }
 
     /// Records an observation.
-    fn note(&mut self, measure: Measure, class: Class, value: f64) {
+    fn note(&mut self, measure: Statistic, class: StatisticClass, value: f64) {
         self.of((measure, class)).add(value);
     }
 
     /// Records whether a condition holds.
-    fn note_if(&mut self, measure: Measure, class: Class, holds: bool) {
+    fn note_if(&mut self, measure: Statistic, class: StatisticClass, holds: bool) {
         self.note(measure, class, f64::from(u8::from(holds)));
     }
 
-    fn of(&mut self, key: (Measure, Class)) -> &mut Distribution {
+    fn of(&mut self, key: (Statistic, StatisticClass)) -> &mut Distribution {
         let empty = || {
             let (low, high, bins) = key.0.bins();
             Distribution::new(low, high, bins)
@@ -176,9 +176,9 @@ impl Statistics {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use Measure as M;
+    use Statistic as M;
 
-    const VEHICLE: Class = Some(AgentKind::Vehicle);
+    const VEHICLE: StatisticClass = Some(AgentKind::Vehicle);
 
     fn counted(text: &str) -> Statistics {
         let mut statistics = Statistics::default();
@@ -186,7 +186,7 @@ mod tests {
         statistics
     }
 
-    fn mean(statistics: &Statistics, measure: Measure, class: Class) -> f64 {
+    fn mean(statistics: &Statistics, measure: Statistic, class: StatisticClass) -> f64 {
         statistics.get(measure, class).unwrap().mean()
     }
 
@@ -266,8 +266,8 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_known() {
-        for measure in Measure::ALL {
-            assert_eq!(Measure::of_name(measure.name()), Some(measure));
+        for measure in Statistic::ALL {
+            assert_eq!(Statistic::of_name(measure.name()), Some(measure));
         }
         for name in ["scene", "vehicle", "pedestrian", "bicycle"] {
             assert_eq!(class_of_name(name).map(class_name), Some(name));

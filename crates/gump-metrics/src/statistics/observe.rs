@@ -7,7 +7,7 @@ use gump_geometry::angle_difference;
 use gump_scene::{Agent, AgentId, AgentKind, Scenario};
 
 use super::surroundings::{note_place, note_road, note_room};
-use super::{Class, Measure as M, Statistics};
+use super::{Statistic as M, StatisticClass, Statistics};
 
 // Definitions of the measures. Chosen by hand; `configs/targets/waymo-like.toml` was counted with
 // them and has to be counted anew if they change.
@@ -51,7 +51,7 @@ pub(super) fn observe(scenario: &Scenario, statistics: &mut Statistics) {
 /// Records a track as a whole and its steps.
 fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: &mut Statistics) {
     let (first, last) = (track[0], track[track.len() - 1]);
-    let class: Class = Some(first.1.kind);
+    let class: StatisticClass = Some(first.1.kind);
     let end = scenario.log.len() - 1;
     statistics.note(M::Length, class, median(track, |agent| agent.length));
     statistics.note(M::Width, class, median(track, |agent| agent.width));
@@ -107,7 +107,7 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
 
 /// Records values that need more than one step: acceleration, turning and jitter.
 fn note_steps(dt: f64, track: &Track<'_>, parked: bool, statistics: &mut Statistics) {
-    let class: Class = Some(track[0].1.kind);
+    let class: StatisticClass = Some(track[0].1.kind);
     for triple in track.windows(3) {
         let [(a, before), (_, now), (c, after)] = [triple[0], triple[1], triple[2]];
         if c - a != 2 || now.state.speed() < STANDING {

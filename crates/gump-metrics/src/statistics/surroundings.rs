@@ -4,7 +4,7 @@ use gump_geometry::{DVec2, angle_difference};
 use gump_scene::{Agent, AgentKind, AreaKind, MapGraph, Scenario};
 
 use super::observe::STANDING;
-use super::{Class, Measure as M, Statistics};
+use super::{Statistic as M, StatisticClass, Statistics};
 use crate::signed_distance_to_road_edge;
 
 // Definitions of the measures, chosen by hand: see `observe.rs`.
@@ -27,7 +27,7 @@ const JUNCTION_REACH: f64 = 25.0;
 
 /// Records the position of an agent relative to the road.
 pub(super) fn note_place(scenario: &Scenario, agent: &Agent, parked: bool, to: &mut Statistics) {
-    let (map, class): (_, Class) = (&scenario.map, Some(agent.kind));
+    let (map, class): (_, StatisticClass) = (&scenario.map, Some(agent.kind));
     let position = agent.state.pose.position;
     if map.lanes().is_empty() {
         return;
@@ -79,7 +79,7 @@ pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
         .collect();
     let has_lanes = !scenario.map.lanes().is_empty();
     for (i, agent) in agents.iter().enumerate() {
-        let class: Class = Some(agent.kind);
+        let class: StatisticClass = Some(agent.kind);
         let here = agent.state.pose.position;
         let others = || agents.iter().enumerate().filter(move |(j, _)| *j != i);
         let others = || others().map(|(_, other)| *other);

@@ -109,6 +109,11 @@ impl Movement {
         }
     }
 
+    /// Whether the map has a path beyond the line.
+    pub(super) fn leads_on(&self) -> bool {
+        !self.ways.is_empty()
+    }
+
     /// Whether both come to their lines from the same road.
     pub(super) fn shares_approach(&self, other: &Self) -> bool {
         let between = angle_difference(self.line.heading, other.line.heading).abs();

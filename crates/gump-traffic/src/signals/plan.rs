@@ -8,6 +8,7 @@ use gump_scene::{Frame, LaneId, Light, LightState, MapGraph};
 
 use super::movement::{Movement, Relation};
 use super::timing::{Age, yellow_s};
+use crate::notes::{Note, Notes};
 
 /// The coordination of lights: which junctions there are, which of their lights show the same
 /// colour, which are never green together, and the order of phases.
@@ -22,6 +23,7 @@ pub struct SignalPlan {
     pub(super) movements: Vec<Option<Movement>>,
     pub(super) junctions: Vec<Junction>,
     contradictions: usize,
+    ungrouped: usize,
 }
 
 #[derive(Clone, Debug)]
@@ -69,12 +71,13 @@ impl SignalPlan {
         let lights = &seen.lights;
         let of = |light: &Light| Some(Movement::of(map, map.lane(light.lane)?, light));
         let movements: Vec<Option<Movement>> = lights.iter().map(of).collect();
-        let mut contradictions = 0;
+        let (mut contradictions, mut ungrouped) = (0, 0);
         let junctions = together(&movements)
             .into_iter()
             .map(|members| {
                 let draft = Draft::new(&movements, &seen, &members);
                 contradictions += draft.contradictions;
+                ungrouped += draft.ungrouped;
                 draft.junction()
             })
             .collect();
@@ -82,6 +85,7 @@ impl SignalPlan {
             movements,
             junctions,
             contradictions,
+            ungrouped,
             lights: seen.lights,
         }
     }
@@ -107,6 +111,19 @@ impl SignalPlan {
     /// roads and meets behind them.
     pub fn contradictions(&self) -> usize {
         self.contradictions
+    }
+
+    /// What could not be derived from the lights and the map, as the notes of one scene.
+    pub fn notes(&self) -> Notes {
+        let unmapped = self.movements.iter().filter(|movement| movement.is_none());
+        let mapped = self.movements.iter().flatten();
+        let unconnected = mapped.filter(|movement| !movement.leads_on());
+        let mut notes = Notes::default();
+        notes.add(Note::UnmappedLight, unmapped.count());
+        notes.add(Note::UnconnectedLight, unconnected.count());
+        notes.add(Note::UngroupedLight, self.ungrouped);
+        notes.add(Note::ContradictingLights, self.contradictions);
+        notes
     }
 }
 
@@ -208,6 +225,9 @@ struct Draft<'a> {
     /// Pairs of groups that must not be green together, row by row.
     conflicts: Vec<Vec<bool>>,
     contradictions: usize,
+    /// Number of lights that form another group than an earlier one of their approach, because they
+    /// showed another colour.
+    ungrouped: usize,
 }
 
 impl<'a> Draft<'a> {
@@ -220,6 +240,7 @@ impl<'a> Draft<'a> {
             groups: Vec::new(),
             conflicts: Vec::new(),
             contradictions: 0,
+            ungrouped: 0,
         };
         this.find_groups();
         this.find_conflicts();
@@ -236,19 +257,24 @@ impl<'a> Draft<'a> {
     fn find_groups(&mut self) {
         for (i, &light) in self.lights.iter().enumerate() {
             let own = self.movements[i];
-            let fits = |group: &Group| {
+            let is_beside = |group: &Group| {
+                let mut members = self.within(group).into_iter();
                 group.is_left_only == own.is_left_only
-                    && self.within(group).iter().all(|&j| {
-                        own.shares_approach(self.movements[j])
-                            && self.seen.agree(light, self.lights[j])
-                    })
+                    && members.all(|j| own.shares_approach(self.movements[j]))
+            };
+            let fits = |group: &Group| {
+                let mut members = group.members.iter();
+                is_beside(group) && members.all(|&other| self.seen.agree(light, other))
             };
             match self.groups.iter().position(fits) {
                 Some(group) => self.groups[group].members.push(light),
-                None => self.groups.push(Group {
-                    members: vec![light],
-                    is_left_only: own.is_left_only,
-                }),
+                None => {
+                    self.ungrouped += usize::from(self.groups.iter().any(is_beside));
+                    self.groups.push(Group {
+                        members: vec![light],
+                        is_left_only: own.is_left_only,
+                    });
+                }
             }
         }
     }

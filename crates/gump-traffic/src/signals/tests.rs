@@ -4,6 +4,7 @@ use gump_geometry::dvec2;
 use gump_scene::{Frame, LaneId, Scenario, fixture};
 
 use super::*;
+use crate::notes::{Note, Notes};
 use LightState::{Green, Red, Unknown, Yellow};
 
 /// A junction of two roads: through lanes 1 to 4 from west, east, south and north, and 5, a left turn
@@ -348,5 +349,89 @@ fn yellow_beside_green_ends_alone() {
             states(&signals)[0] == Green
         });
         assert!(stays);
+    }
+}
+
+/// The notes of a plan, as pairs of a note and its number of cases.
+fn cases(notes: &Notes) -> Vec<(Note, usize)> {
+    notes
+        .iter()
+        .map(|(note, count)| (note, count.cases))
+        .collect()
+}
+
+#[test]
+fn a_log_that_contradicts_itself_is_counted_and_not_continued() {
+    let contradicts = plan(&crossing(["green", "green", "green", "red", "red"]));
+    // Lanes 1 and 2 cross lane 3.
+    let expected = [(Note::ContradictingLights, 2)];
+    assert_eq!(cases(&contradicts.notes()), expected);
+    assert_eq!(contradicts.contradictions(), 2);
+    let agrees = plan(&crossing(["green", "green", "red", "red", "red"]));
+    assert!(agrees.notes().is_empty());
+}
+
+#[test]
+fn lights_without_a_lane_and_lanes_that_lead_nowhere_are_counted() {
+    let scenario = fixture::scenario(
+        "lane 1: -60,0 -8,0
+         lane 2: 0,-60 0,-8 next 3
+         lane 3: 0,-8 0,60
+         light 1 red:
+         light 2 green:
+         light 98 green:
+         light 99 red:
+         ego vehicle 0: -30,0",
+    )
+    .unwrap();
+    let plan = plan(&scenario);
+    let expected = [(Note::UnmappedLight, 2), (Note::UnconnectedLight, 1)];
+    assert_eq!(cases(&plan.notes()), expected);
+    let mut signals = Signals::begin(&plan, Seed(2));
+    let mut greens = [0; 2];
+    for _ in 0..1200 {
+        signals.advance(0.5, None);
+        let shown = states(&signals);
+        // Those without a lane stay, the others have their turns.
+        assert_eq!(shown[2..], [Green, Red]);
+        for (n, state) in greens.iter_mut().zip(&shown) {
+            *n += usize::from(*state == Green);
+        }
+    }
+    assert!(greens.iter().all(|n| (100..1100).contains(n)), "{greens:?}");
+}
+
+#[test]
+fn lights_that_cannot_be_grouped_still_take_turns() {
+    // Three lanes from the west whose lights never agree, and one from the south that crosses all.
+    let text = "lane 1: -60,0 -8,0 next 11
+         lane 2: -60,-3 -8,-3 next 12
+         lane 3: -60,-6 -8,-6 next 13
+         lane 4: 0,-60 0,-20 next 14
+         lane 11: -8,0 60,0
+         lane 12: -8,-3 60,-3
+         lane 13: -8,-6 60,-6
+         lane 14: 0,-20 0,60
+         light 1 green:
+         light 2 red:
+         light 3 yellow:
+         light 4 red:
+         ego vehicle 0: -30,0";
+    let plan = plan(&fixture::scenario(text).unwrap());
+    assert_eq!(cases(&plan.notes()), [(Note::UngroupedLight, 2)]);
+    assert_eq!(plan.groups().concat().len(), 4);
+    for seed in 0..10 {
+        let mut signals = Signals::begin(&plan, Seed(seed));
+        let mut greens = [0; 4];
+        for step in 0..1200 {
+            signals.advance(0.5, None);
+            let shown = states(&signals);
+            let crosses = shown[..3].contains(&Green) && shown[3] == Green;
+            assert!(!crosses, "seed {seed}, step {step}: {shown:?}");
+            for (n, state) in greens.iter_mut().zip(&shown) {
+                *n += usize::from(*state == Green);
+            }
+        }
+        assert!(greens.iter().all(|n| *n > 100), "seed {seed}: {greens:?}");
     }
 }

@@ -158,6 +158,9 @@ impl Args {
         run.result("gain_over_random", gain(&rows))?;
         run.result("rows", rows)?;
         run.result("intervals", intervals)?;
+        if let Some(scenes) = prompts.scenes {
+            run.result("prompted_scenes", scenes)?;
+        }
         run.result("prompts", prompts.rows)?;
         if self.long_scenes > 0 {
             let rows = run.phase("long", |run| self.long_rows(run))?;

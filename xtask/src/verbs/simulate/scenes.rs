@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_eval::Notes;
 use gump_eval::decoding::Decoding;
 use gump_eval::digest;
 use gump_eval::worlds::World;
@@ -14,10 +15,10 @@ use gump_viz::{Gallery, Viewer};
 use serde::Serialize;
 
 use super::{Args, by_class};
-use crate::annotations;
 use crate::cli::WrongArguments;
 use crate::imagine::{Imagined, imagine_probed};
 use crate::run::Run;
+use crate::{annotations, notes};
 
 /// A scene in the report.
 #[derive(Serialize)]
@@ -39,6 +40,7 @@ struct Total {
     seconds: f64,
     /// Passes per frame, weighted with the frames.
     passes: f64,
+    notes: Notes,
 }
 
 /// Simulates up to `n` scenes and writes their viewer.
@@ -53,8 +55,9 @@ pub(super) fn execute(args: &Args, n: usize, run: &mut Run) -> anyhow::Result<()
     for record in records.take(n) {
         let scenario = record?.scenario;
         let one = |run: &mut Run| add(args, run, &decoding, &config, &scenario, &mut gallery);
-        let (imagined, summary) = run.phase("simulate", one)?;
+        let (imagined, summary, notes) = run.phase("simulate", one)?;
         total.add(&scenario, &imagined, &summary);
+        total.notes.merge(&notes);
     }
     anyhow::ensure!(
         !gallery.is_empty(),
@@ -80,7 +83,7 @@ fn check(args: &Args) -> Result<(), WrongArguments> {
     Ok(())
 }
 
-/// Simulates a scene and adds it to the viewer.
+/// Simulates a scene and adds it to the viewer; also returns what the scene lacks.
 fn add(
     args: &Args,
     run: &Run,
@@ -88,7 +91,7 @@ fn add(
     config: &SimulateConfig,
     scenario: &Scenario,
     gallery: &mut Gallery,
-) -> anyhow::Result<(Imagined, Summary)> {
+) -> anyhow::Result<(Imagined, Summary, Notes)> {
     let world = World::build(run.device(), &args.world, scenario, &decoding.sampling)?;
     let n = args.futures.get();
     let mut imagined = imagine_probed(run, &world, scenario, n, config, args.probe())
@@ -100,7 +103,7 @@ fn add(
     annotations::realism(&mut viewer, scenario, &imagined.rollouts);
     annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
     gallery.add(&viewer);
-    Ok((imagined, summary))
+    Ok((imagined, summary, world.notes(scenario)))
 }
 
 /// The note beside a scene in the list, which makes the scenes worth a look stand out.
@@ -162,6 +165,7 @@ impl Total {
             futures: args.futures.get(),
             ..self.summary.clone()
         });
-        run.result("by_class", by_class)
+        run.result("by_class", by_class)?;
+        notes::report(run, &self.notes, self.rows.len())
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use gump_eval::Notes;
 use gump_eval::behaviour::{BehaviourSettings, ScenarioCounts, ScenarioTallies};
 use gump_eval::decoding::DecodedWorldName;
 use gump_eval::results::{self, Entry, MissingShards};
@@ -14,7 +15,7 @@ use serde_json::{Map, Value, json};
 
 use super::super::columns::label;
 use crate::run::Run;
-use crate::{charts, table};
+use crate::{charts, notes, table};
 
 /// Draws of scenarios for an interval; its ends move by a few percent of its width with the seed.
 const DRAWS: usize = 1000;
@@ -22,11 +23,11 @@ const DRAWS: usize = 1000;
 /// A chart: its name, what its axis says, and which measures are on it.
 type Chart = (&'static str, &'static str, fn(Measure) -> bool);
 
-const CHARTS: [Chart; 3] = [
+const CHARTS: [Chart; 4] = [
     (
         "shares",
         "share, or number per agent, with 95 % intervals over scenarios",
-        |measure| !measure.is_rate() && measure != Measure::Standing,
+        |measure| !measure.is_rate() && !measure.is_duration() && measure != Measure::Standing,
     ),
     (
         "rates",
@@ -37,6 +38,11 @@ const CHARTS: [Chart; 3] = [
         "standing",
         "share that stands, with 95 % intervals over scenarios",
         |measure| measure == Measure::Standing,
+    ),
+    (
+        "phases",
+        "mean seconds of red and green, with 95 % intervals over scenarios",
+        Measure::is_duration,
     ),
 ];
 
@@ -138,7 +144,11 @@ pub(super) fn report(
     for (stem, label, shows) in CHARTS {
         charts::save(run, stem, &chart(label, &columns, &keys, shows))?;
     }
-    Ok(())
+    let mut noted = Notes::default();
+    entries
+        .iter()
+        .for_each(|entry| noted.merge(&entry.scores.notes()));
+    notes::report(run, &noted, entries.len())
 }
 
 /// The rows of one world.
