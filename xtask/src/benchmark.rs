@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gump_eval::benchmarks::{self, BenchmarkFolders, ScenarioSet, ScenarioSetName};
+use gump_eval::datasets::Split;
 use serde_json::Value;
 
 use crate::installed::home;
@@ -20,19 +21,44 @@ const GENERATED: &str = "out/data-benchmark";
 ///
 /// Error: as [`ScenarioSetName::find`].
 pub(crate) fn find(run: &mut Run, name: &ScenarioSetName) -> anyhow::Result<ScenarioSet> {
+    find_for(run, name, None)
+}
+
+/// As [`find`], with the split of a list that stands for it where the name has none.
+///
+/// Error: as [`ScenarioSetName::find_for`].
+pub(crate) fn find_for(
+    run: &mut Run,
+    name: &ScenarioSetName,
+    purpose: Option<Split>,
+) -> anyhow::Result<ScenarioSet> {
     let folders = BenchmarkFolders {
         generated: GENERATED.into(),
         recorded: recorded_data(),
     };
-    run.phase("find", |_| Ok(name.find(&folders, &Unseen)?))
+    run.phase("find", |_| Ok(name.find_for(purpose, &folders, &Unseen)?))
 }
 
-/// Ids of the scenes that nothing may learn from, each with its set, by the lists that come with
-/// the driver.
+/// Warns if scenes to learn from are of a frozen set, by the lists that come with the driver.
+/// `scores` are those that then say nothing.
 ///
 /// Error: a list that cannot be read.
-pub(crate) fn frozen_ids() -> anyhow::Result<BTreeMap<String, String>> {
-    Ok(benchmarks::frozen_ids(&home().join("datasets/benchmarks"))?)
+pub(crate) fn warn_of_frozen<'a>(
+    run: &Run,
+    ids: impl Iterator<Item = &'a str>,
+    scores: &str,
+) -> anyhow::Result<()> {
+    let frozen = benchmarks::frozen_ids(&home().join("datasets/benchmarks"))?;
+    let sets = ids.filter_map(|id| Some((id, frozen.get(id)?)));
+    let found: Vec<_> = sets.collect();
+    if let Some((id, set)) = found.first() {
+        run.print(&format!(
+            "warning: {} training scenes are of frozen sets, {id} of {set} for one: \
+             {scores} there says nothing",
+            found.len()
+        ));
+    }
+    Ok(())
 }
 
 /// The folder of recorded data: `GUMP_RECORDED`, else `shared/data` beside the checkout.

@@ -119,11 +119,13 @@ pub enum RlError {
         /// Their length.
         found: usize,
     },
-    /// A loss or parameter is not finite.
-    #[error("learning diverged at gradient step {step}: a loss is not a finite number")]
+    /// A number of a run is NaN or infinite.
+    #[error("learning diverged at gradient step {step}: {what} is not finite")]
     Diverged {
-        /// The gradient step.
+        /// The gradient step, 0 before the first one.
         step: usize,
+        /// What is not finite.
+        what: String,
     },
     /// Bytes that are not a stored policy or run.
     #[error("no policy or run of reinforcement learning: {what}")]

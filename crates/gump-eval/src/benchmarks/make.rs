@@ -258,7 +258,12 @@ mod tests {
     fn first_scenes_are_as_frozen(n: usize, wanted: impl Fn(&GeneratedPart) -> bool) {
         let folder = tempfile::tempdir().unwrap();
         let mut parts = 0;
-        for name in ["synthetic-tune", "synthetic-test"] {
+        for name in [
+            "synthetic-tune",
+            "synthetic-test",
+            "learning-usual",
+            "learning-dense",
+        ] {
             let list = shipped(name);
             for part in list.generated.iter().filter(|part| wanted(part)) {
                 let first = GeneratedPart {

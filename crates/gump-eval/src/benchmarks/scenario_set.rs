@@ -54,8 +54,22 @@ impl ScenarioSetName {
         folders: &BenchmarkFolders,
         monitor: &dyn Monitor,
     ) -> Result<ScenarioSet, EvalError> {
+        self.find_for(None, folders, monitor)
+    }
+
+    /// As [`Self::find`], but a list without `#SPLIT` that has several splits stands for its split
+    /// `purpose`.
+    ///
+    /// # Errors
+    /// As [`Self::find`].
+    pub fn find_for(
+        &self,
+        purpose: Option<Split>,
+        folders: &BenchmarkFolders,
+        monitor: &dyn Monitor,
+    ) -> Result<ScenarioSet, EvalError> {
         match self.list() {
-            Some((path, split)) => find_listed(path, split, folders, monitor),
+            Some((path, split)) => find_listed(path, (split, purpose), folders, monitor),
             None => Ok(ScenarioSet::of_path(Path::new(&self.0))),
         }
     }
@@ -63,12 +77,12 @@ impl ScenarioSetName {
 
 fn find_listed(
     path: &Path,
-    split: Option<&str>,
+    (split, purpose): (Option<&str>, Option<Split>),
     folders: &BenchmarkFolders,
     monitor: &dyn Monitor,
 ) -> Result<ScenarioSet, EvalError> {
     let list = BenchmarkList::read(path)?;
-    let split = choose(&list, split)?;
+    let split = choose(&list, split, purpose)?;
     let mut paths = Vec::new();
     for part in list.generated.iter().filter(|part| part.split == split) {
         let file = list.file(&folders.generated, part);
@@ -90,13 +104,17 @@ fn find_listed(
     Ok(ScenarioSet { name, paths })
 }
 
-/// The requested split, or the only one.
-fn choose(list: &BenchmarkList, requested: Option<&str>) -> Result<Split, EvalError> {
+/// The requested split, or the only one, or that of the purpose.
+fn choose(
+    list: &BenchmarkList,
+    requested: Option<&str>,
+    purpose: Option<Split>,
+) -> Result<Split, EvalError> {
     let splits = list.splits();
     let found = match (requested, &splits[..]) {
         (Some(name), _) => splits.iter().find(|split| split.name() == name).copied(),
         (None, [only]) => Some(*only),
-        (None, _) => None,
+        (None, _) => purpose.filter(|split| splits.contains(split)),
     };
     found.ok_or_else(|| {
         BenchmarkError::NoSuchSplit {
@@ -199,13 +217,31 @@ mod tests {
         };
         let error = |name: &str, split| {
             let path = list(name);
-            let found = find_listed(Path::new(&path), split, &nowhere, &());
+            let found = find_listed(Path::new(&path), (split, None), &nowhere, &());
             found.unwrap_err().to_string()
         };
         let message = error("synthetic-test.toml", None);
         assert!(message.contains("data benchmark --list"), "{message}");
         let message = error("recorded.toml", Some("test"));
         assert!(message.contains("GUMP_RECORDED"), "{message}");
+    }
+
+    #[test]
+    fn a_purpose_chooses_among_the_splits_of_a_list() {
+        let list = |name: &str| {
+            let path = repository().join(format!("datasets/benchmarks/{name}.toml"));
+            BenchmarkList::read(&path).unwrap()
+        };
+        let (learning, testing) = (list("learning-dense"), list("planning-hard"));
+        let chosen = |list, requested, purpose| choose(list, requested, purpose).ok();
+        let (train, test) = (Some(Split::Train), Some(Split::Test));
+        assert_eq!(chosen(&learning, None, train), train);
+        assert_eq!(chosen(&learning, None, test), test);
+        assert_eq!(chosen(&learning, Some("test"), train), test);
+        assert_eq!(chosen(&learning, None, Some(Split::Tune)), None);
+        assert_eq!(chosen(&learning, None, None), None);
+        assert_eq!(chosen(&testing, None, train), test);
+        assert_eq!(chosen(&testing, Some("train"), train), None);
     }
 
     #[test]

@@ -195,7 +195,7 @@ pub enum BenchmarkError {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PartProblem {
-    /// The seed is outside [`RESERVED_SEEDS`].
+    /// The seed of a split that is not for training is outside [`RESERVED_SEEDS`].
     #[error(
         "expected a seed from {} to {}, which training never uses, found {found}",
         RESERVED_SEEDS.start,

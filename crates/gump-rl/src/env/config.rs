@@ -61,6 +61,7 @@ pub enum Autoreset {
 
 /// The source of the other agents' motion.
 #[derive(Clone, Copy)]
+#[non_exhaustive]
 pub enum TrafficSource<'w> {
     /// The log: agents follow their recording, whatever the ego does. An episode is truncated where
     /// the log ends.

@@ -112,7 +112,8 @@ impl Training {
     /// The whole run, with notes of the caller; complete between two segments.
     ///
     /// # Errors
-    /// [`RlError::Archive`] if it cannot be encoded.
+    /// [`RlError::Diverged`] for a run with a number that is not finite, from which no run could be
+    /// resumed; [`RlError::Archive`] if it cannot be encoded.
     pub fn to_bytes(&self, notes: &BTreeMap<String, String>) -> Result<Vec<u8>, RlError> {
         let mut writer = Writer::default();
         let learner = &self.learner;
@@ -138,6 +139,10 @@ impl Training {
                 writer.adam("critics.encoder", &training.optimizer);
                 encoder_steps[1] = training.optimizer.steps;
             }
+        }
+        // Losses are those before a step, so that only the parameters show what the last one did.
+        if let Some(name) = writer.not_finite() {
+            return Err(self.diverged(&format!("a number of \"{name}\"")));
         }
         let [first, second] = &learner.critics;
         let adams = [

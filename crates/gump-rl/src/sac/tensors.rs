@@ -24,10 +24,20 @@ pub(super) struct Writer {
     pub(super) tensors: BTreeMap<String, (Dtype, Vec<u8>)>,
     /// One JSON object, so that the bytes do not depend on the order of a hash map.
     header: serde_json::Map<String, serde_json::Value>,
+    /// The first tensor with a number that is NaN or infinite.
+    not_finite: Option<String>,
 }
 
 impl Writer {
+    /// Name of the first tensor with a number that is NaN or infinite.
+    pub(super) fn not_finite(&self) -> Option<&str> {
+        self.not_finite.as_deref()
+    }
+
     pub(super) fn floats(&mut self, name: &str, values: &[f32]) {
+        if self.not_finite.is_none() && !values.iter().all(|value| value.is_finite()) {
+            self.not_finite = Some(name.to_owned());
+        }
         let bytes = values.iter().flat_map(|x| x.to_le_bytes()).collect();
         self.tensors.insert(name.to_owned(), (Dtype::F32, bytes));
     }

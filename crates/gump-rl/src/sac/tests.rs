@@ -8,10 +8,10 @@ use std::ops::ControlFlow;
 use gump_scene::Seed;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
-use super::test_envs::{Reach, Toy};
+use super::test_envs::{Clock, Reach, Toy};
 use super::{Algorithm, Batch, Learner, SacConfig, StepReport, Training};
 use crate::networks::Normalizer;
-use crate::{Actor, RlError, VectorEnv as _};
+use crate::{Actor, RlError, VectorEnv};
 
 fn config() -> SacConfig {
     SacConfig {
@@ -315,6 +315,74 @@ fn a_resumed_run_is_the_run() {
         assert_eq!(rest, all[20..]);
         let [a, b] = [&whole, &resumed].map(|run| run.to_bytes(&notes).unwrap());
         assert!(a == b, "{algorithm:?}");
+    }
+}
+
+/// The error that ends a run of segments of one step, each of which is stored.
+fn how_it_ends(run: &mut Training, env: &mut dyn VectorEnv) -> RlError {
+    for _ in 0..run.config().steps {
+        let none = |_| ControlFlow::Continue(());
+        let segment = match run.algorithm() {
+            Algorithm::Sac => run.segment(env, none),
+            Algorithm::Imitation => run.imitation_segment(none),
+        };
+        if let Err(error) = segment.and_then(|()| run.to_bytes(&BTreeMap::new())) {
+            return error;
+        }
+    }
+    panic!("it should have diverged");
+}
+
+#[test]
+fn a_run_whose_numbers_are_not_finite_ends_and_is_not_stored() {
+    let check = |algorithm, change: fn(&mut Training), expected: &str, at: usize| {
+        let config = SacConfig {
+            segment: 1,
+            ..config()
+        };
+        let mut run = Training::new(algorithm, config, experts(), Seed(1)).unwrap();
+        change(&mut run);
+        let error = how_it_ends(&mut run, &mut Toy::new(Reach, 4));
+        assert!(
+            matches!(error, RlError::Diverged { step, .. } if step == at),
+            "{error}"
+        );
+        assert!(error.to_string().contains(expected), "{error}");
+    };
+    for algorithm in [Algorithm::Sac, Algorithm::Imitation] {
+        // The loss of the only step is fine, its parameters are not.
+        let too_fast: fn(&mut Training) = |run| run.learner.config.learning_rate = 1e38;
+        check(algorithm, too_fast, "\"actor.parameters\"", 1);
+        // An infinite moment freezes its parameter, and no loss ever shows it.
+        let frozen: fn(&mut Training) = |run| run.learner.actor_optimizer.square[0] = f32::INFINITY;
+        check(algorithm, frozen, "\"actor.adam.square\"", 1);
+    }
+    let hot: fn(&mut Training) = |run| run.learner.log_alpha = 1e3;
+    check(Algorithm::Sac, hot, "a loss is not finite", 1);
+    let lost: fn(&mut Training) = |run| {
+        run.env_steps = 100;
+        run.learner.actor.network.parameters_mut().fill(f32::NAN);
+    };
+    check(Algorithm::Sac, lost, "an action is not finite", 0);
+}
+
+#[test]
+fn a_reward_that_is_not_finite_ends_a_run_before_it_is_stored() {
+    for reward in [f64::NAN, f64::INFINITY] {
+        let config = SacConfig {
+            segment: 1,
+            ..config()
+        };
+        let nothing = ReplayBuffer::new(1, 1, 1).unwrap();
+        let mut run = Training::new(Algorithm::Sac, config, nothing, Seed(1)).unwrap();
+        let broken = Clock {
+            reward,
+            terminates: false,
+        };
+        let error = how_it_ends(&mut run, &mut Toy::new(broken, 4));
+        let expected = "learning diverged at gradient step 0: a reward is not finite";
+        assert_eq!(error.to_string(), expected);
+        assert!(run.replay.is_empty() && run.to_bytes(&BTreeMap::new()).is_ok());
     }
 }
 

@@ -212,7 +212,8 @@ impl Training {
     ///
     /// # Errors
     /// Errors of the environment; [`RlError::Shape`] for one with other observations or actions
-    /// than the run was started with; [`RlError::Diverged`] once a number is not finite.
+    /// than the run was started with; [`RlError::Diverged`] for a loss, an action or a reward that
+    /// is not finite.
     pub fn segment(
         &mut self,
         env: &mut dyn VectorEnv,
@@ -249,7 +250,7 @@ impl Training {
     /// As [`Training::segment`], from expert transitions only.
     ///
     /// # Errors
-    /// [`RlError::Diverged`] once a number is not finite.
+    /// [`RlError::Diverged`] for a loss that is not finite.
     pub fn imitation_segment(
         &mut self,
         mut observe: impl FnMut(StepReport) -> ControlFlow<()>,
@@ -280,7 +281,10 @@ impl Training {
         } else {
             self.actor().sample(&before, &mut rng)
         };
+        self.check_finite(&actions, "an action")?;
         env.step(&actions)?;
+        // A buffer with such a reward would spoil every checkpoint from here on.
+        self.check_finite(env.rewards(), "a reward")?;
         let (o, a) = (env.observation_len(), env.action_len());
         for i in 0..env.n_envs() {
             let (reward, terminated) = (env.rewards()[i], env.terminated()[i]);
@@ -324,7 +328,7 @@ impl Training {
             Algorithm::Sac => learner.update(batch, fork(self.seed, Purpose::Noise, step)),
         };
         if !(update.critic_loss + update.actor_loss + update.imitation_loss).is_finite() {
-            return Err(RlError::Diverged { step: self.steps() });
+            return Err(self.diverged("a loss"));
         }
         Ok(StepReport {
             step: self.steps(),
@@ -332,6 +336,22 @@ impl Training {
             update,
             episodes: std::mem::take(&mut self.finished),
         })
+    }
+
+    /// Error: [`RlError::Diverged`] for a value that is not finite.
+    fn check_finite(&self, values: &[f32], what: &str) -> Result<(), RlError> {
+        match values.iter().all(|value| value.is_finite()) {
+            true => Ok(()),
+            false => Err(self.diverged(what)),
+        }
+    }
+
+    /// The error that ends this run where `what` is not finite.
+    pub(super) fn diverged(&self, what: &str) -> RlError {
+        RlError::Diverged {
+            step: self.steps(),
+            what: what.to_owned(),
+        }
     }
 
     /// Fixes the normalization of observations from all known ones.

@@ -1,5 +1,6 @@
 //! The report of an evaluation of policies, from the entries of its store alone.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
@@ -15,7 +16,13 @@ use crate::run::Run;
 /// Everything that the drives depend on.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Tested {
+    /// Name of the set of scenarios; none as of version 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) set: Option<String>,
     pub(super) scenarios: usize,
+    /// Of the scenarios, in worlds that are models; all if none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) model_limit: Option<usize>,
     /// Of their ids, one per line.
     pub(super) sha256_of_ids: String,
     pub(super) repeats: usize,
@@ -25,6 +32,23 @@ pub(super) struct Tested {
     pub(super) sampling: String,
     pub(super) worlds: Vec<String>,
     pub(super) policies: Vec<Policy>,
+    /// Policies that were to be tested as well.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) diverged: Vec<DivergedPolicy>,
+    /// Of the ids and of the worlds' weights; none as of version 0.1.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub(super) checksums: BTreeMap<String, String>,
+}
+
+/// A policy that diverged while it learned, and therefore does not drive.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct DivergedPolicy {
+    pub(super) policy: String,
+    pub(super) train_world: String,
+    /// As text, because TOML has no unsigned numbers of 64 bits.
+    pub(super) seed: String,
+    /// The sentence that its run ended with.
+    pub(super) why: String,
 }
 
 /// A policy that drives.
@@ -117,10 +141,99 @@ pub(super) fn report(
     write(&run.path("drives.csv"), csv(tested, entries)?.as_bytes())?;
     let groups = groups(tested, entries);
     let seed = Seed(tested.seed.parse()?);
-    let rows: Vec<Value> = groups.iter().map(|group| group.row(seed)).collect();
+    if let Some(set) = &tested.set {
+        run.result("set", set)?;
+    }
+    let mut rows: Vec<Value> = groups.iter().map(|group| group.row(seed)).collect();
+    if !tested.diverged.is_empty() {
+        for row in &mut rows {
+            let diverged = tested.diverged.iter();
+            let of_row = diverged.filter(|one| {
+                row["policy"] == one.policy.as_str()
+                    && row["train_world"] == one.train_world.as_str()
+            });
+            row["diverged"] = json!(of_row.count());
+        }
+    }
+    let mut warnings = missing_intervals(&rows);
+    warnings.extend(left_out(tested));
     run.result("rows", rows)?;
     run.result("differences", differences(&groups, seed))?;
+    if !tested.diverged.is_empty() {
+        run.result("diverged", &tested.diverged)?;
+    }
+    for warning in &warnings {
+        run.print(&format!("warning: {warning}"));
+    }
+    run.result_hidden("warnings", warnings)?;
     run.result("scenarios", entries.len())
+}
+
+/// Sentences about rows without an interval, and about those whose interval is over scenarios alone
+/// although they are of policies that learned.
+fn missing_intervals(rows: &[Value]) -> Vec<String> {
+    let names = |is: &dyn Fn(&Value) -> bool| -> String {
+        let mut names: Vec<String> = Vec::new();
+        for row in rows.iter().filter(|row| is(row)) {
+            let policy = row["policy"].as_str().unwrap_or_default();
+            let world = row["test_world"].as_str().unwrap_or_default();
+            let name = match row["train_world"].as_str() {
+                Some(learned_in) => format!("{policy} in {learned_in} among {world}"),
+                None => format!("{policy} among {world}"),
+            };
+            names.push(name);
+        }
+        names.join(", ")
+    };
+    let has_score = |row: &Value| row["score"].is_number();
+    let single = names(&|row| has_score(row) && row["low"].is_null());
+    let alone = names(&|row| {
+        row["low"].is_number() && row["policies"] == 1 && row["train_world"].is_string()
+    });
+    let mut sentences = Vec::new();
+    if !single.is_empty() {
+        sentences.push(format!(
+            "an interval takes at least 2 scenarios, found 1, so there is none for {single}"
+        ));
+    }
+    if !alone.is_empty() {
+        sentences.push(format!(
+            "an interval over policies takes at least 2 of a kind, found 1, so the interval is over \
+             scenarios alone, as if other seeds learned the same, for {alone}"
+        ));
+    }
+    sentences
+}
+
+/// A sentence for every kind of policies of which some diverged.
+fn left_out(tested: &Tested) -> Vec<String> {
+    let mut sentences = Vec::new();
+    for (i, one) in tested.diverged.iter().enumerate() {
+        let is_same = |other: &DivergedPolicy| {
+            (&other.policy, &other.train_world) == (&one.policy, &one.train_world)
+        };
+        if tested.diverged[..i].iter().any(is_same) {
+            continue;
+        }
+        let n = tested
+            .diverged
+            .iter()
+            .filter(|other| is_same(other))
+            .count();
+        let is_tested = |policy: &&Policy| {
+            policy.policy == one.policy && policy.train_world.as_ref() == Some(&one.train_world)
+        };
+        let of = n + tested.policies.iter().filter(is_tested).count();
+        let consequence = match of == n {
+            true => "so it has no row",
+            false => "and its rows are of the others, which favours a kind that diverges often",
+        };
+        sentences.push(format!(
+            "{n} of {of} policies of {} in {} diverged, {consequence}",
+            one.policy, one.train_world
+        ));
+    }
+    sentences
 }
 
 fn groups<'a>(tested: &'a Tested, entries: &[Entry<Driven>]) -> Vec<Group<'a>> {
@@ -171,7 +284,7 @@ fn differences(groups: &[Group<'_>], seed: Seed) -> Vec<Value> {
                 "difference": found.mean,
                 "low": found.interval.map(|span| span.low),
                 "high": found.interval.map(|span| span.high),
-                "interval_over": over(found.over_policies),
+                "interval_over": found.interval.map(|_| over(found.over_policies)),
             }));
         }
     }
@@ -197,6 +310,7 @@ impl Group<'_> {
         let columns = Columns::of(&all);
         let found = estimate(&self.scores(), seed);
         let span = found.and_then(|found| found.interval);
+        let over = span.and(found).map(|found| over(found.over_policies));
         json!({
             "policy": self.policy,
             "train_world": self.train_world,
@@ -206,7 +320,7 @@ impl Group<'_> {
             "score": columns.map(|c| c.score),
             "low": span.map(|span| span.low),
             "high": span.map(|span| span.high),
-            "interval_over": found.map(|found| over(found.over_policies)),
+            "interval_over": over,
             "collision_rate": columns.map(|c| c.collision_rate),
             "offroad_rate": columns.map(|c| c.offroad_rate),
             "progress_m": columns.and_then(|c| c.progress),
@@ -249,4 +363,137 @@ fn csv(tested: &Tested, entries: &[Entry<Driven>]) -> anyhow::Result<String> {
         }
     }
     Ok(csv)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn policy(policy: &str, train_world: Option<&str>) -> Policy {
+        Policy {
+            policy: policy.into(),
+            train_world: train_world.map(str::to_owned),
+            file: policy.into(),
+            sha256: None,
+        }
+    }
+
+    fn tested(policies: Vec<Policy>, diverged: &[(&str, &str)]) -> Tested {
+        let diverged = diverged.iter().map(|(policy, train_world)| DivergedPolicy {
+            policy: (*policy).into(),
+            train_world: (*train_world).into(),
+            seed: "0".into(),
+            why: "a loss is not finite".into(),
+        });
+        Tested {
+            set: None,
+            scenarios: 3,
+            model_limit: None,
+            sha256_of_ids: String::new(),
+            repeats: 1,
+            seed: "0".into(),
+            env: String::new(),
+            sampling: String::new(),
+            worlds: vec!["idm".into(), "model:a".into()],
+            policies,
+            diverged: diverged.collect(),
+            checksums: BTreeMap::new(),
+        }
+    }
+
+    /// Three scenarios, of which the first `n` are driven in the second world as well.
+    fn entries(n_policies: usize, n: usize) -> Vec<Entry<Driven>> {
+        let drive = |world, policy, index: usize| DriveRecord {
+            world,
+            policy,
+            repeat: 0,
+            collided: false,
+            off_road: false,
+            progress: 31.0 * (1 + index + policy) as f64,
+            comfortable: true,
+            steps: 16,
+        };
+        let entry = |index| {
+            let in_world = |world| (0..n_policies).map(move |policy| drive(world, policy, index));
+            let second = in_world(1).filter(|_| index < n);
+            Entry {
+                index,
+                id: index.to_string(),
+                scores: Driven {
+                    drives: in_world(0).chain(second).collect(),
+                },
+            }
+        };
+        (0..3).map(entry).collect()
+    }
+
+    #[test]
+    fn worlds_with_fewer_scenarios_are_compared_on_those() {
+        let policies = vec![policy("sac", Some("log")), policy("brake", None)];
+        let (tested, entries) = (tested(policies, &[]), entries(2, 2));
+        let groups = groups(&tested, &entries);
+        let rows: Vec<Value> = groups.iter().map(|group| group.row(Seed(0))).collect();
+        let episodes: Vec<&Value> = rows.iter().map(|row| &row["episodes"]).collect();
+        assert_eq!(episodes, [3, 3, 2, 2]);
+        // Progress of 31, 62 and 93 m, and of the first two alone.
+        assert_eq!(
+            (&rows[0]["score"], &rows[2]["score"]),
+            (&json!(1.0), &json!(0.875))
+        );
+        let differences = differences(&groups, Seed(0));
+        let of = |i: usize| (&differences[i]["test_world"], &differences[i]["difference"]);
+        assert_eq!(of(0), (&json!("idm"), &json!(0.25)));
+        assert_eq!(of(1), (&json!("model:a"), &json!(0.25)));
+    }
+
+    #[test]
+    fn intervals_that_are_not_there_are_said() {
+        let policies = |n| vec![policy("sac", Some("log")); n];
+        let sentences = |n_policies: usize, n: usize| {
+            let mut tested = tested(policies(n_policies), &[]);
+            tested.policies.push(policy("brake", None));
+            let entries = entries(n_policies + 1, n);
+            let groups = groups(&tested, &entries);
+            let rows: Vec<Value> = groups.iter().map(|group| group.row(Seed(0))).collect();
+            for row in &rows {
+                assert_eq!(
+                    row["low"].is_null(),
+                    row["interval_over"].is_null(),
+                    "{row}"
+                );
+            }
+            missing_intervals(&rows)
+        };
+        assert!(sentences(2, 3).is_empty());
+        let single = sentences(2, 1);
+        let names = "none for sac in log among model:a, brake among model:a";
+        assert!(
+            single.len() == 1 && single[0].ends_with(names),
+            "{single:?}"
+        );
+        // The interval of a fixed rule lacks nothing.
+        let alone = sentences(1, 3);
+        let names = "for sac in log among idm, sac in log among model:a";
+        assert!(alone.len() == 1 && alone[0].ends_with(names), "{alone:?}");
+        assert!(
+            alone[0].starts_with("an interval over policies"),
+            "{alone:?}"
+        );
+        // No drive, no interval to miss.
+        assert!(sentences(2, 0).is_empty());
+    }
+
+    #[test]
+    fn policies_that_diverged_are_counted() {
+        let policies = vec![policy("sac", Some("log")); 3];
+        let diverged = [("sac", "log"), ("sac", "idm"), ("sac", "log")];
+        let sentences = left_out(&tested(policies, &diverged));
+        assert_eq!(sentences.len(), 2);
+        let [of_log, of_idm] = [&sentences[0], &sentences[1]];
+        assert!(of_log.starts_with("2 of 5 policies of sac in log diverged, and its rows are"));
+        assert_eq!(
+            of_idm,
+            "1 of 1 policies of sac in idm diverged, so it has no row"
+        );
+    }
 }

@@ -28,6 +28,12 @@ const HEADER: [&str; N_COLUMNS] = [
     "imitation_gradient",
 ];
 
+/// Index of a column of [`HEADER`].
+fn column(name: &str) -> usize {
+    let index = HEADER.iter().position(|column| *column == name);
+    index.expect("curves are drawn from columns of the table")
+}
+
 /// The curves of a run, one row per window.
 #[derive(Debug)]
 pub(super) struct Curves {
@@ -75,7 +81,9 @@ impl Curves {
             })?;
             curves.rows.push(row);
         }
-        curves.rows.retain(|row| row[0] <= steps as f64);
+        curves
+            .rows
+            .retain(|row| row[column("step")] <= steps as f64);
         Ok(curves)
     }
 
@@ -127,7 +135,7 @@ impl Curves {
         let returns: Vec<f64> = self
             .rows
             .iter()
-            .map(|row| row[3])
+            .map(|row| row[column("return")])
             .filter(|r| r.is_finite())
             .collect();
         let n = (returns.len() / 10).max(2);
@@ -156,45 +164,47 @@ impl Curves {
             writeln!(text, "{}", words.join(","))?;
         }
         write(&folder.join("curves.csv"), text.as_bytes())?;
-        let returns = [("return", 3)];
+        let returns = [("return", "return")];
         self.draw(
             &folder.join("return"),
             "return of an episode",
             &returns,
             false,
         )?;
-        let losses = [("critic", 6), ("temperature", 10)];
+        let losses = [("critic", "critic_loss"), ("temperature", "alpha")];
         self.draw(&folder.join("losses"), "loss", &losses, true)?;
-        let gradients = [("rewards", 13), ("imitation", 14)];
+        let gradients = [
+            ("rewards", "reward_gradient"),
+            ("imitation", "imitation_gradient"),
+        ];
         self.draw(
             &folder.join("gradients"),
             "norm of the actor's gradient by its outputs",
             &gradients,
             true,
         )?;
-        let nats = [("entropy", 9), ("imitation", 8)];
+        let nats = [("entropy", "entropy"), ("imitation", "imitation_loss")];
         self.draw(&folder.join("entropy"), "nats", &nats, false)
     }
 
-    /// Draws columns against gradient steps; nothing where there is nothing to draw.
+    /// Draws columns, given as their labels and names, against gradient steps; nothing where there is nothing to draw.
     fn draw(
         &self,
         stem: &Path,
         y_label: &str,
-        columns: &[(&str, usize)],
+        columns: &[(&str, &str)],
         log_y: bool,
     ) -> anyhow::Result<()> {
-        let point = |row: &[f64; N_COLUMNS], column: usize| (row[0], row[column]);
+        let step = column("step");
         let drawable = |p: &(f64, f64)| p.1.is_finite() && (!log_y || p.1 > 0.0);
-        let series = columns.iter().map(|&(name, column)| Series {
-            name: name.to_owned(),
-            points: self
-                .rows
-                .iter()
-                .map(|row| point(row, column))
-                .filter(drawable)
-                .collect(),
-            ..Series::default()
+        let series = columns.iter().map(|&(label, name)| {
+            let value = column(name);
+            let points = self.rows.iter().map(|row| (row[step], row[value]));
+            Series {
+                name: label.to_owned(),
+                points: points.filter(drawable).collect(),
+                ..Series::default()
+            }
         });
         let series: Vec<Series> = series.filter(|s| !s.points.is_empty()).collect();
         if series.is_empty() {

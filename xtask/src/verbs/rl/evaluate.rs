@@ -1,10 +1,13 @@
 //! `rl evaluate`: the paper's columns for any policies in any worlds.
 
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Context as _;
+use gump_eval::benchmarks::ScenarioSetName;
+use gump_eval::closed_loop::checksums;
 use gump_eval::datasets::Split;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
@@ -13,8 +16,8 @@ use gump_rl::{Actor, EnvConfig, Episodes, EvaluatedPolicy, PreparedScenario, eva
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use super::columns::{DriveRecord, Driven, Policy, Tested, report};
-use super::{Notes, RlWorld, Settings, prepared, read};
+use super::columns::{DivergedPolicy, DriveRecord, Driven, Policy, Tested, report};
+use super::{Notes, PreparedSet, RlWorld, Settings, read};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
@@ -37,12 +40,16 @@ pub(crate) struct Args {
     /// log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "log", num_args = 1.., value_delimiter = ',')]
     test_world: Vec<WorldName>,
-    /// A folder with a manifest.toml, whose test scenarios are taken, or any file or folder
-    #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    /// A file, a folder, or LIST.toml#SPLIT; of a list or a folder with a manifest.toml the test
+    /// split
+    #[arg(long, value_name = "SCENARIOS")]
+    scenarios: ScenarioSetName,
     /// Maximum number of scenarios [default: all]
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
+    /// Maximum number of scenarios in learned worlds, which are slow [default: as in the others]
+    #[arg(long, value_name = "N")]
+    model_limit: Option<NonZeroUsize>,
     /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
@@ -81,9 +88,13 @@ pub(super) struct Test<'a> {
     pub(super) candidates: &'a [Candidate],
     pub(super) worlds: Vec<(&'a WorldName, RlWorld)>,
     pub(super) env: &'a EnvConfig,
+    /// Of the scenarios, in worlds that are models; all if none.
+    pub(super) model_limit: Option<NonZeroUsize>,
     pub(super) repeats: usize,
     pub(super) sampling: &'a Sampling,
     pub(super) shard: Shard,
+    /// Policies that were to be tested as well, but diverged while they learned.
+    pub(super) diverged: Vec<DivergedPolicy>,
 }
 
 impl Args {
@@ -92,20 +103,19 @@ impl Args {
             return Err(WrongArguments("--repeats: expected at least 1, found 0".into()).into());
         }
         let (candidates, env) = self.candidates()?;
-        let limit = self.limit;
-        let prepared = run.phase("read", |run| {
-            prepared(run, &self.scenarios, Split::Test, limit)
-        })?;
+        let set = PreparedSet::read(run, &self.scenarios, Split::Test, self.limit)?;
         let worlds = load(run, &self.test_world, &self.sampling)?;
         let test = Test {
             candidates: &candidates,
             worlds,
             env: &env,
+            model_limit: self.model_limit,
             repeats: self.repeats,
             sampling: &self.sampling,
             shard: self.shard,
+            diverged: Vec::new(),
         };
-        test.execute(run, &prepared)
+        test.execute(run, &set)
     }
 
     /// Reads the policies; the environment is that of the config file, else that of the first.
@@ -137,14 +147,26 @@ pub(super) fn load<'a>(
     })
 }
 
+/// Those of these scenarios, which are in order, that are driven in a world: of a model the ones
+/// before the limit.
+fn driven_in<'a>(
+    world: &WorldName,
+    model_limit: Option<NonZeroUsize>,
+    scenarios: &'a [usize],
+) -> &'a [usize] {
+    match (world, model_limit) {
+        (WorldName::Model(_), Some(limit)) => {
+            &scenarios[..scenarios.partition_point(|&index| index < limit.get())]
+        }
+        _ => scenarios,
+    }
+}
+
 impl Test<'_> {
     /// Drives the scenarios whose results the folder does not have yet, and reports on all.
-    pub(super) fn execute(
-        &self,
-        run: &mut Run,
-        prepared: &Arc<[PreparedScenario]>,
-    ) -> anyhow::Result<()> {
-        let tested = self.tested(run, prepared)?;
+    pub(super) fn execute(&self, run: &mut Run, set: &PreparedSet) -> anyhow::Result<()> {
+        let prepared = &set.scenarios;
+        let tested = self.tested(run, set)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard: self.shard,
@@ -155,11 +177,14 @@ impl Test<'_> {
         let todo: Vec<usize> = (0..prepared.len()).filter(missing).collect();
         let (mut steps, began) = (0, Instant::now());
         run.phase("drive", |run| {
-            let n = todo.len() * self.worlds.len() * self.candidates.len();
+            let limit = self.model_limit;
+            let n_driven = |(name, _): &(&WorldName, _)| driven_in(name, limit, &todo).len();
+            let n = self.worlds.iter().map(n_driven).sum::<usize>() * self.candidates.len();
             let progress = run.progress("driving", n as u64, "scenarios x policies x worlds");
             for round in todo.chunks(SCENARIOS_PER_ROUND) {
                 let mut driven = vec![Driven::default(); round.len()];
                 for w in 0..self.worlds.len() {
+                    let round = driven_in(self.worlds[w].0, limit, round);
                     for p in 0..self.candidates.len() {
                         stop_if_interrupted()?;
                         steps += self.drive(run, prepared, (w, p), round, &mut driven)?;
@@ -219,10 +244,15 @@ impl Test<'_> {
         Ok(drives.iter().map(|drive| drive.steps as u32).sum())
     }
 
-    fn tested(&self, run: &Run, prepared: &[PreparedScenario]) -> anyhow::Result<Tested> {
-        let ids: Vec<&str> = prepared.iter().map(|c| c.scenario().id.as_str()).collect();
+    fn tested(&self, run: &Run, set: &PreparedSet) -> anyhow::Result<Tested> {
+        let ids = set.scenarios.iter().map(|one| one.scenario().id.clone());
+        let ids: Vec<String> = ids.collect();
+        let worlds = self.worlds.iter().map(|(name, _)| *name);
         Ok(Tested {
-            scenarios: prepared.len(),
+            set: Some(set.name.clone()),
+            checksums: checksums(&ids, worlds)?,
+            scenarios: ids.len(),
+            model_limit: self.model_limit.map(NonZeroUsize::get),
             sha256_of_ids: sha256(ids.join("\n").as_bytes()),
             repeats: self.repeats,
             seed: run.seed().0.to_string(),
@@ -234,6 +264,7 @@ impl Test<'_> {
                 .map(|(name, _)| name.to_string())
                 .collect(),
             policies: self.candidates.iter().map(Candidate::named).collect(),
+            diverged: self.diverged.clone(),
         })
     }
 }
@@ -296,4 +327,18 @@ impl Candidate {
 fn sha256(bytes: &[u8]) -> String {
     let digest = Sha256::digest(bytes);
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn learned_worlds_have_the_first_scenarios() {
+        let model = WorldName::Model("weights".into());
+        let (limit, of_shard) = (NonZeroUsize::new(4), [1, 3, 5, 7]);
+        assert_eq!(driven_in(&model, limit, &of_shard), [1, 3]);
+        assert_eq!(driven_in(&model, None, &of_shard), of_shard);
+        assert_eq!(driven_in(&WorldName::Idm, limit, &of_shard), of_shard);
+    }
 }

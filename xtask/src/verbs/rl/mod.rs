@@ -14,7 +14,8 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use gump_engine::SamplingConfig;
-use gump_eval::datasets::{self, Part, Split};
+use gump_eval::benchmarks::ScenarioSetName;
+use gump_eval::datasets::{self, Manifest, Part, Split};
 use gump_eval::worlds::{World, WorldName};
 use gump_model::Device;
 use gump_rl::networks::Architecture;
@@ -24,8 +25,8 @@ use serde::{Deserialize, Serialize};
 use toml::Table;
 
 use crate::cli::WrongArguments;
-use crate::config;
 use crate::run::Run;
+use crate::{benchmark, config};
 
 /// Seconds that an action is held: a frame of the world model, as in the paper.
 const STEP: f64 = 0.5;
@@ -119,24 +120,47 @@ impl RlWorld {
     }
 }
 
-/// The scenarios of a path as prepared: of a data set with a manifest those of `split`, else all.
-///
-/// Error: nothing there to read, or a scenario that cannot be driven.
-fn prepared(
-    run: &Run,
-    path: &Path,
-    split: Split,
-    limit: Option<usize>,
-) -> anyhow::Result<Arc<[PreparedScenario]>> {
-    let progress = run.progress("reading", 0, "scenarios");
-    let parts = match datasets::Manifest::of(path)? {
-        Some(_) => datasets::parts(path, split)?,
-        None => vec![Part::whole(path)],
-    };
-    let mut scenarios = datasets::read(&parts, &progress)?;
-    scenarios.truncate(limit.unwrap_or(usize::MAX));
-    anyhow::ensure!(!scenarios.is_empty(), "no scenario in {}", path.display());
-    Ok(PreparedScenario::prepare(scenarios, STEP)?)
+/// Scenarios that are ready to be driven.
+struct PreparedSet {
+    /// Name of their set in results.
+    name: String,
+    scenarios: Arc<[PreparedScenario]>,
+}
+
+impl PreparedSet {
+    /// The scenarios of a name, at most `limit`. Of a folder with a manifest those of the split
+    /// `purpose`, likewise of a list with several splits where the name has none; otherwise all.
+    /// Warns if something is to learn from scenes of a frozen set.
+    ///
+    /// Error: nothing there to read, scenes that differ from their list, or a scenario that cannot
+    /// be driven.
+    fn read(
+        run: &mut Run,
+        name: &ScenarioSetName,
+        purpose: Split,
+        limit: Option<usize>,
+    ) -> anyhow::Result<Self> {
+        let set = benchmark::find_for(run, name, Some(purpose))?;
+        let scenarios = run.phase("read", |run| {
+            let progress = run.progress("reading", 0, "scenarios");
+            let parts: Vec<Part> = match &set.paths[..] {
+                [path] if Manifest::of(path)?.is_some() => datasets::parts(path, purpose)?,
+                paths => paths.iter().map(|path| Part::whole(path)).collect(),
+            };
+            let mut scenarios = datasets::read(&parts, &progress)?;
+            scenarios.truncate(limit.unwrap_or(usize::MAX));
+            anyhow::ensure!(!scenarios.is_empty(), "no scenario in {name}");
+            Ok(scenarios)
+        })?;
+        if purpose == Split::Train {
+            let ids = scenarios.iter().map(|scenario| scenario.id.as_str());
+            benchmark::warn_of_frozen(run, ids, "what who learns from them scores")?;
+        }
+        Ok(Self {
+            name: set.name,
+            scenarios: PreparedScenario::prepare(scenarios, STEP)?,
+        })
+    }
 }
 
 /// Metadata of a stored policy.

@@ -1,45 +1,67 @@
 //! `rl table`: the paper's table in one go, policies first, then their drives.
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
+use anyhow::Context as _;
+use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::datasets::Split;
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
 use gump_rl::sac::Algorithm;
 use gump_scene::Seed;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
+use super::columns::DivergedPolicy;
 use super::evaluate::{Candidate, Test, load};
-use super::train::Job;
-use super::{RlWorld, Settings, prepared};
+use super::train::{Diverged, Job, Place};
+use super::{PreparedSet, Settings, read, write};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
+use crate::sharding::shard;
 
 /// Arguments of `rl table`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// World to train in besides the log: model:WEIGHTS, or any other world
-    #[arg(long, value_name = "W")]
-    world: WorldName,
+    /// Worlds to train in besides the log: model:WEIGHTS, or any others
+    #[arg(long, value_name = "W", required = true, num_args = 1.., value_delimiter = ',')]
+    world: Vec<WorldName>,
     /// Worlds to test in besides the log and --world, such as a model not used in training
-    #[arg(long, value_name = "W", value_delimiter = ',')]
+    #[arg(long, value_name = "W", num_args = 1.., value_delimiter = ',')]
     test_world: Vec<WorldName>,
-    /// Scenarios to train on: a folder with a manifest.toml, or any file or folder
-    #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
-    /// Scenarios to test on [default: the test scenarios of --scenarios]
-    #[arg(long, value_name = "PATH")]
-    test_scenarios: Option<PathBuf>,
+    /// Scenarios to train on: a file, a folder, or LIST.toml#SPLIT; of a list or a folder with a
+    /// manifest.toml the train split
+    #[arg(long, value_name = "SCENARIOS")]
+    scenarios: ScenarioSetName,
+    /// Scenarios to test on, likewise [default: the test split of --scenarios]
+    #[arg(long, value_name = "SCENARIOS")]
+    test_scenarios: Option<ScenarioSetName>,
+    /// Maximum number of test scenarios in learned worlds, which are slow [default: all]
+    #[arg(long, value_name = "N")]
+    model_limit: Option<NonZeroUsize>,
     /// Gradient steps of each policy [default: the configuration's]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
     /// Policies of each kind, which differ in their seeds
     #[arg(long, value_name = "N", default_value_t = 3)]
     policies: u64,
+    /// Policies that learn by imitation [default: as --policies]
+    #[arg(long, value_name = "N")]
+    imitation_policies: Option<u64>,
     /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
+    /// Only train: with --shard, every N-th policy from the K-th on
+    #[arg(long)]
+    train_only: bool,
+    /// Folder of the policies, which all shards share [default: --out]
+    #[arg(long, value_name = "DIR")]
+    policy_folder: Option<PathBuf>,
+    /// Train or test shard K of N; auto: the shard that a cluster's variables name. First with
+    /// --train-only, then without, which needs all policies; merge the latter with `evaluate merge`
+    #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
+    shard: Shard,
     #[command(flatten)]
     #[serde(flatten)]
     sampling: Sampling,
@@ -48,81 +70,254 @@ pub(crate) struct Args {
     pub(crate) common: Common,
 }
 
+/// Policies that differ in their seeds only.
+struct Kind<'a> {
+    algorithm: Algorithm,
+    world: &'a WorldName,
+    /// Beginning of the names of their folders.
+    name: String,
+    policies: u64,
+}
+
+/// What a policy that diverged leaves in its folder, so that the run goes on without it: the same
+/// settings would diverge again.
+#[derive(Debug, Serialize, Deserialize)]
+struct DivergenceRecord {
+    why: String,
+    /// Everything that its training depended on, as TOML.
+    settings: String,
+}
+
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        if self.policies == 0 || self.repeats == 0 {
-            let wrong = "--policies and --repeats: expected at least 1, found 0";
-            return Err(WrongArguments(wrong.into()).into());
-        }
-        if self.world == WorldName::Log {
-            let wrong = "--world: the log is trained in anyway, expected another world";
-            return Err(WrongArguments(wrong.into()).into());
-        }
+        self.check()?;
         let mut settings = Settings::read(self.common.config.as_deref())?;
         settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
         run.setting("env", settings.env)?;
         run.setting("sac", &settings.sac)?;
-        let files = self.train(run, &settings)?;
-        self.test(run, &settings, &files)
+        let kinds = self.kinds();
+        let jobs = self.jobs(run, &kinds, &settings);
+        if self.train_only || self.shard == Shard::WHOLE {
+            self.train(run, &jobs)?;
+        }
+        let mut files = Vec::new();
+        let mut diverged = Vec::new();
+        let mut unfinished = Vec::new();
+        for (_, job) in &jobs {
+            match DivergenceRecord::of(job)? {
+                Some(record) => diverged.push(DivergedPolicy {
+                    policy: job.algorithm.to_string(),
+                    train_world: job.world_name.to_string(),
+                    seed: job.seed.0.to_string(),
+                    why: record.why,
+                }),
+                None if self.train_only => {}
+                None if job.is_done()? => files.push(job.policy()),
+                None => unfinished.push(&job.folder),
+            }
+        }
+        if self.train_only {
+            return run.result("diverged", diverged);
+        }
+        if let Some(first) = unfinished.first() {
+            anyhow::bail!(
+                "expected {} trained policies before a shard is tested, found {} unfinished, {} for \
+                 one: `rl table --train-only` with the same --policy-folder trains them",
+                jobs.len(),
+                unfinished.len(),
+                first.display()
+            );
+        }
+        self.test(run, &settings, &files, diverged)
     }
 
-    /// Trains whatever is not there yet; the files of the policies, kind by kind.
-    fn train(&self, run: &mut Run, settings: &Settings) -> anyhow::Result<Vec<PathBuf>> {
-        let prepared = run.phase("read", |run| {
-            prepared(run, &self.scenarios, Split::Train, None)
-        })?;
-        let sampling = self.sampling.resolve()?;
-        let device = run.device().clone();
-        let world = run.phase("load", |_| RlWorld::load(&device, &self.world, &sampling))?;
-        let (log_name, log) = (WorldName::Log, RlWorld::Log);
-        let mut files = Vec::new();
-        let mut trained = Vec::new();
-        for (algorithm, world_name, world, name) in [
-            (Algorithm::Imitation, &log_name, &log, "imitation"),
-            (Algorithm::Sac, &log_name, &log, "sac-log"),
-            (Algorithm::Sac, &self.world, &world, "sac-world"),
-        ] {
-            for k in 0..self.policies {
-                let folder = run.path(&format!("{name}-{k}"));
-                std::fs::create_dir_all(&folder)?;
+    /// Error: [`WrongArguments`].
+    fn check(&self) -> anyhow::Result<()> {
+        let wrong = |what: String| Err(WrongArguments(what).into());
+        if self.policies == 0 || self.repeats == 0 || self.imitation_policies == Some(0) {
+            return wrong(
+                "--policies, --imitation-policies and --repeats: expected at least 1, found 0"
+                    .into(),
+            );
+        }
+        if self.world.contains(&WorldName::Log) {
+            return wrong("--world: the log is trained in anyway, expected another world".into());
+        }
+        let again = (1..self.world.len()).find(|&i| self.world[..i].contains(&self.world[i]));
+        if let Some(i) = again {
+            return wrong(format!(
+                "--world: expected every world once, found {} twice",
+                self.world[i]
+            ));
+        }
+        if self.train_only && self.shard != Shard::WHOLE && self.policy_folder.is_none() {
+            return wrong("--train-only with --shard needs --policy-folder".into());
+        }
+        Ok(())
+    }
+
+    fn kinds(&self) -> Vec<Kind<'_>> {
+        let kind = |algorithm, world, name: &str, policies| Kind {
+            algorithm,
+            world,
+            name: name.to_owned(),
+            policies,
+        };
+        let imitating = self.imitation_policies.unwrap_or(self.policies);
+        let mut kinds = vec![
+            kind(
+                Algorithm::Imitation,
+                &WorldName::Log,
+                "imitation",
+                imitating,
+            ),
+            kind(Algorithm::Sac, &WorldName::Log, "sac-log", self.policies),
+        ];
+        for (i, world) in self.world.iter().enumerate() {
+            let name = match i {
+                0 => "sac-world".to_owned(),
+                _ => format!("sac-world{}", i + 1),
+            };
+            kinds.push(kind(Algorithm::Sac, world, &name, self.policies));
+        }
+        kinds
+    }
+
+    /// One job per policy with the name of its kind, kind by kind.
+    fn jobs<'a>(
+        &self,
+        run: &Run,
+        kinds: &'a [Kind<'_>],
+        settings: &'a Settings,
+    ) -> Vec<(&'a str, Job<'a>)> {
+        let all = self.policy_folder.as_deref().unwrap_or(run.out());
+        let mut jobs = Vec::new();
+        for kind in kinds {
+            for k in 0..kind.policies {
+                let folder = all.join(format!("{}-{k}", kind.name));
                 let job = Job {
-                    algorithm,
-                    world_name,
-                    world,
-                    prepared: &prepared,
+                    algorithm: kind.algorithm,
+                    world_name: kind.world,
                     settings,
                     seed: Seed(run.seed().0 + k),
                     resume: folder.join("checkpoint.safetensors").exists(),
                     folder,
                     stop_at: usize::MAX,
                 };
-                trained.push(run.phase(name, |run| job.execute(run))?);
-                files.push(job.policy());
+                jobs.push((kind.name.as_str(), job));
             }
         }
-        run.result("trained", trained)?;
-        Ok(files)
+        jobs
+    }
+
+    /// Trains whatever of the shard is not there yet. A policy that diverges leaves a [`DivergenceRecord`], and
+    /// the others go on.
+    fn train(&self, run: &mut Run, jobs: &[(&str, Job<'_>)]) -> anyhow::Result<()> {
+        let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
+        run.result("train_set", &set.name)?;
+        let trained_in = [&WorldName::Log].into_iter().chain(&self.world);
+        let worlds = load(run, trained_in, &self.sampling)?;
+        let mut trained = Vec::new();
+        for (index, (kind, job)) in jobs.iter().enumerate() {
+            if !self.shard.holds(index) {
+                continue;
+            }
+            let record = DivergenceRecord::path(job);
+            if DivergenceRecord::of(job)?.is_some() {
+                run.print(&format!(
+                    "note: {} diverged before, so it is left out; without {} it is trained again",
+                    job.folder.display(),
+                    record.display()
+                ));
+                continue;
+            }
+            std::fs::create_dir_all(&job.folder)
+                .with_context(|| format!("cannot create the folder {}", job.folder.display()))?;
+            let (_, world) = worlds
+                .iter()
+                .find(|(name, _)| *name == job.world_name)
+                .with_context(|| format!("the world {} is not loaded", job.world_name))?;
+            let place = Place {
+                world,
+                prepared: &set.scenarios,
+            };
+            match run.phase(kind, |run| job.execute(run, place)) {
+                Ok(done) => trained.push(done),
+                Err(error) => {
+                    let diverged = error.downcast::<Diverged>()?;
+                    run.print(&format!("warning: {}: {diverged}", job.folder.display()));
+                    DivergenceRecord::write(job, &diverged)?;
+                }
+            }
+        }
+        run.result("trained", trained)
     }
 
     /// Lets all policies, and rules to compare them with, drive everywhere.
-    fn test(&self, run: &mut Run, settings: &Settings, files: &[PathBuf]) -> anyhow::Result<()> {
-        let path = self.test_scenarios.as_ref().unwrap_or(&self.scenarios);
-        let prepared = run.phase("read", |run| prepared(run, path, Split::Test, None))?;
+    fn test(
+        &self,
+        run: &mut Run,
+        settings: &Settings,
+        files: &[PathBuf],
+        diverged: Vec<DivergedPolicy>,
+    ) -> anyhow::Result<()> {
+        let name = self.test_scenarios.as_ref().unwrap_or(&self.scenarios);
+        let set = PreparedSet::read(run, name, Split::Test, None)?;
         let rules = ["random", "brake", "constant-speed"].map(PathBuf::from);
         let all = rules.iter().chain(files);
         let candidates: Vec<Candidate> = all
             .map(|file| Ok(Candidate::read(file)?.0))
             .collect::<anyhow::Result<_>>()?;
-        let trained_in = [&WorldName::Log, &self.world].into_iter();
-        let worlds = load(run, trained_in.chain(&self.test_world), &self.sampling)?;
+        let mut names = vec![&WorldName::Log];
+        for name in self.world.iter().chain(&self.test_world) {
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        let worlds = load(run, names, &self.sampling)?;
         let test = Test {
             candidates: &candidates,
             worlds,
             env: &settings.env,
+            model_limit: self.model_limit,
             repeats: self.repeats,
             sampling: &self.sampling,
-            shard: Shard::WHOLE,
+            shard: self.shard,
+            diverged,
         };
-        test.execute(run, &prepared)
+        test.execute(run, &set)
+    }
+}
+
+impl DivergenceRecord {
+    fn path(job: &Job<'_>) -> PathBuf {
+        job.folder.join("diverged.toml")
+    }
+
+    fn settings(job: &Job<'_>) -> anyhow::Result<String> {
+        let (algorithm, world, seed) = (job.algorithm, job.world_name, job.seed.0);
+        let settings = toml::to_string(job.settings)?;
+        Ok(format!("# {algorithm} in {world}, seed {seed}\n{settings}"))
+    }
+
+    /// The record in the folder of a job, if it is of the same settings.
+    ///
+    /// Error: a record that cannot be read.
+    fn of(job: &Job<'_>) -> anyhow::Result<Option<Self>> {
+        let path = Self::path(job);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let text = String::from_utf8_lossy(&read(&path)?).into_owned();
+        let record: Self = toml::from_str(&text).with_context(|| path.display().to_string())?;
+        Ok(Some(record).filter(|record| Self::settings(job).is_ok_and(|s| s == record.settings)))
+    }
+
+    fn write(job: &Job<'_>, diverged: &Diverged) -> anyhow::Result<()> {
+        let record = Self {
+            why: diverged.to_string(),
+            settings: Self::settings(job)?,
+        };
+        write(&Self::path(job), toml::to_string(&record)?.as_bytes())
     }
 }

@@ -6,15 +6,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
 use gump_rl::sac::{Algorithm, Training};
-use gump_rl::{DrivingEnv, PreparedScenario, demonstrations};
+use gump_rl::{DrivingEnv, PreparedScenario, RlError, demonstrations};
 use gump_scene::Seed;
 use serde::Serialize;
 
 use super::curves::Curves;
-use super::{Notes, RlWorld, Settings, prepared, read, write};
+use super::{Notes, PreparedSet, RlWorld, Settings, read, write};
 use crate::choices::{ALGORITHMS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{self, Common, Run};
@@ -34,9 +35,10 @@ pub(crate) struct Args {
     /// log, idm, constant-velocity or model:WEIGHTS; imitation only with log
     #[arg(long, value_name = "W", default_value = "log")]
     train_world: WorldName,
-    /// A folder with a manifest.toml, or any file or folder of scenarios
-    #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    /// A file, a folder, or LIST.toml#SPLIT; of a list or a folder with a manifest.toml the train
+    /// split
+    #[arg(long, value_name = "SCENARIOS")]
+    scenarios: ScenarioSetName,
     /// Gradient steps [default: the configuration's]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
@@ -58,8 +60,6 @@ pub(crate) struct Args {
 pub(super) struct Job<'a> {
     pub(super) algorithm: Algorithm,
     pub(super) world_name: &'a WorldName,
-    pub(super) world: &'a RlWorld,
-    pub(super) prepared: &'a Arc<[PreparedScenario]>,
     pub(super) settings: &'a Settings,
     pub(super) seed: Seed,
     pub(super) folder: PathBuf,
@@ -68,6 +68,18 @@ pub(super) struct Job<'a> {
     /// Gradient steps after which to stop early.
     pub(super) stop_at: usize,
 }
+
+/// Where a policy learns.
+#[derive(Clone, Copy)]
+pub(super) struct Place<'a> {
+    pub(super) world: &'a RlWorld,
+    pub(super) prepared: &'a Arc<[PreparedScenario]>,
+}
+
+/// A run that ended because a number was not finite.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(super) struct Diverged(String);
 
 /// Result of a [`Job`].
 #[derive(Debug, Serialize)]
@@ -100,9 +112,7 @@ impl Args {
             return Err(WrongArguments(wrong.into()).into());
         }
         let sampling = self.sampling.resolve()?;
-        let prepared = run.phase("read", |run| {
-            prepared(run, &self.scenarios, Split::Train, None)
-        })?;
+        let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
         let device = run.device().clone();
         let world = run.phase("load", |_| {
             RlWorld::load(&device, &self.train_world, &sampling)
@@ -112,16 +122,19 @@ impl Args {
         let job = Job {
             algorithm: self.algorithm,
             world_name: &self.train_world,
-            world: &world,
-            prepared: &prepared,
             settings: &settings,
             seed: run.seed(),
             folder: run.out().to_owned(),
             resume: self.resume,
             stop_at: self.stop_at.unwrap_or(usize::MAX),
         };
-        let trained = run.phase("train", |run| job.execute(run))?;
-        run.result("scenarios", prepared.len())?;
+        run.result("set", &set.name)?;
+        let place = Place {
+            world: &world,
+            prepared: &set.scenarios,
+        };
+        let trained = run.phase("train", |run| job.execute(run, place))?;
+        run.result("scenarios", set.scenarios.len())?;
         let results = serde_json::to_value(&trained)?;
         for (key, value) in results.as_object().into_iter().flatten() {
             run.result(key, value)?;
@@ -136,20 +149,36 @@ impl Job<'_> {
         self.folder.join("policy.safetensors")
     }
 
-    /// Trains to the end, to `stop_at` or to Ctrl-C.
-    ///
-    /// Error: an error of the environment, or a folder whose run cannot be resumed.
-    pub(super) fn execute(&self, run: &Run) -> anyhow::Result<Trained> {
-        let checkpoint = self.folder.join("checkpoint.safetensors");
-        let notes = Notes {
+    /// Path of the file that the run is resumed from.
+    pub(super) fn checkpoint(&self) -> PathBuf {
+        self.folder.join("checkpoint.safetensors")
+    }
+
+    fn notes(&self) -> Notes {
+        Notes {
             algorithm: self.algorithm.to_string(),
             train_world: self.world_name.to_string(),
             env: self.settings.env,
-        };
+        }
+    }
+
+    /// Whether the run in the folder has made all of its gradient steps.
+    ///
+    /// Error: as [`Self::execute`].
+    pub(super) fn is_done(&self) -> anyhow::Result<bool> {
+        let checkpoint = self.checkpoint();
+        Ok(checkpoint.exists() && self.resumed(&checkpoint, &self.notes())?.is_done())
+    }
+
+    /// Trains to the end, to `stop_at` or to Ctrl-C.
+    ///
+    /// Error: [`Diverged`], an error of the environment, or a folder whose run cannot be resumed.
+    pub(super) fn execute(&self, run: &Run, place: Place<'_>) -> anyhow::Result<Trained> {
+        let notes = self.notes();
         let mut training = if self.resume {
-            self.resumed(&checkpoint, &notes)?
+            self.resumed(&self.checkpoint(), &notes)?
         } else {
-            let experts = demonstrations(self.prepared, &self.settings.env)?;
+            let experts = demonstrations(place.prepared, &self.settings.env)?;
             let config = self.settings.sac.clone();
             Training::new(self.algorithm, config, experts, self.seed)?
         };
@@ -161,7 +190,7 @@ impl Job<'_> {
         };
         let (steps, env_steps) = (training.steps(), training.env_steps());
         let began = Instant::now();
-        self.learn(run, &mut training, &mut curves, &notes)?;
+        self.learn(run, place, &mut training, &mut curves)?;
         let seconds = began.elapsed().as_secs_f64();
         let gain = curves.gain();
         let n_env_steps = training.env_steps();
@@ -219,17 +248,18 @@ impl Job<'_> {
     fn learn(
         &self,
         run: &Run,
+        place: Place<'_>,
         training: &mut Training,
         curves: &mut Curves,
-        notes: &Notes,
     ) -> anyhow::Result<()> {
         let total = training.config().steps;
         let label = format!("{} in {}", self.algorithm, self.world_name);
         let progress = run.progress(&label, total as u64, "steps");
         progress.advance(training.steps() as u64);
-        let traffic = self.world.traffic();
-        let mut env = DrivingEnv::new(Arc::clone(self.prepared), traffic, self.settings.env)?;
+        let (prepared, traffic) = (Arc::clone(place.prepared), place.world.traffic());
+        let mut env = DrivingEnv::new(prepared, traffic, self.settings.env)?;
         let mut saved = Instant::now();
+        let mut saved_step = self.resume.then(|| training.steps());
         while training.steps() < total.min(self.stop_at) {
             let observe = |report| {
                 progress.advance(1);
@@ -239,10 +269,11 @@ impl Job<'_> {
                     false => ControlFlow::Continue(()),
                 }
             };
-            match self.algorithm {
-                Algorithm::Imitation => training.imitation_segment(observe)?,
-                _ => training.segment(&mut env, observe)?,
-            }
+            let learned = match self.algorithm {
+                Algorithm::Imitation => training.imitation_segment(observe),
+                _ => training.segment(&mut env, observe),
+            };
+            learned.map_err(|error| self.ended(error, saved_step))?;
             anyhow::ensure!(
                 !run::interrupted(),
                 "stopped by Ctrl-C after step {} of {total}, continue with --resume from the last \
@@ -251,19 +282,42 @@ impl Job<'_> {
             );
             let is_last = training.steps() >= total.min(self.stop_at);
             if is_last || saved.elapsed() > CHECKPOINT_EVERY {
-                self.write(training, curves, notes)?;
-                saved = Instant::now();
+                self.write(training, curves, saved_step)?;
+                (saved, saved_step) = (Instant::now(), Some(training.steps()));
             }
         }
         Ok(())
     }
 
-    /// First the curves: rows beyond the checkpoint are cut off when the run is resumed.
-    fn write(&self, training: &Training, curves: &Curves, notes: &Notes) -> anyhow::Result<()> {
+    /// First the curves: rows beyond the checkpoint are cut off when the run is resumed. Nothing if
+    /// a number of the run is not finite.
+    fn write(
+        &self,
+        training: &Training,
+        curves: &Curves,
+        saved_step: Option<usize>,
+    ) -> anyhow::Result<()> {
+        let notes = self.notes().to_map()?;
+        let run = training.to_bytes(&notes);
+        let run = run.map_err(|error| self.ended(error, saved_step))?;
         curves.write(&self.folder)?;
-        let notes = notes.to_map()?;
-        let checkpoint = self.folder.join("checkpoint.safetensors");
-        write(&checkpoint, &training.to_bytes(&notes)?)?;
+        write(&self.checkpoint(), &run)?;
         write(&self.policy(), &training.actor().to_bytes(&notes)?)
+    }
+
+    /// The error of a run that ended; of one that diverged with the checkpoint that is left, which
+    /// is that of `saved_step`.
+    fn ended(&self, error: RlError, saved_step: Option<usize>) -> anyhow::Error {
+        if !matches!(error, RlError::Diverged { .. }) {
+            return error.into();
+        }
+        let left = match saved_step {
+            Some(step) => format!(
+                "the last good checkpoint is {}, after step {step}",
+                self.checkpoint().display()
+            ),
+            None => "this run has no checkpoint yet".into(),
+        };
+        Diverged(format!("{error}; {left}")).into()
     }
 }

@@ -5,6 +5,7 @@ mod server;
 
 use std::path::PathBuf;
 
+use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
@@ -16,9 +17,10 @@ pub(crate) struct Args {
     /// Socket to listen on
     #[arg(long, value_name = "PATH")]
     socket: PathBuf,
-    /// A file or folder of scenarios to drive through; of a data set those of its train split
-    #[arg(long, value_name = "PATH")]
-    scenarios: PathBuf,
+    /// Scenarios to drive through: a file, a folder, or LIST.toml#SPLIT; of a list or a folder with
+    /// a manifest.toml those of its train split
+    #[arg(long, value_name = "SCENARIOS")]
+    scenarios: ScenarioSetName,
     /// Traffic model: log, idm, constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "log")]
     world: WorldName,

@@ -11,13 +11,11 @@ use gump_rl::{EnvConfig, PreparedScenario, Sampling, TrafficSource};
 
 use super::Args;
 use crate::run::{Run, interrupted};
-use crate::verbs::rl::{RlWorld, prepared};
+use crate::verbs::rl::{PreparedSet, RlWorld};
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let prepared = run.phase("read", |run| {
-            prepared(run, &self.scenarios, Split::Train, self.limit)
-        })?;
+        let prepared = PreparedSet::read(run, &self.scenarios, Split::Train, self.limit)?.scenarios;
         let world = run.phase("load", |run| {
             RlWorld::load(run.device(), &self.world, &SamplingConfig::default())
         })?;
